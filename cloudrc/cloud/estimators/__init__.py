@@ -1,0 +1,44 @@
+"""Delay estimators: what arrives says how long the loop is; one file each, found by its name.
+
+A plug-in file has a `build(**parameters)` with annotated parameters that returns an `Estimator`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class DelaySample:
+    """What one newly echoed command tells about the delays.
+
+    Attributes:
+        loop_delay: Arrival of the echo minus the command's stamp [s]; hold on world included.
+        rtt: The same without the hold [s].
+        applied_minus_stamp: Instant of application on world's clock minus the command's stamp on
+            cloud's [s]: the downlink delay plus the unknown offset world - cloud.
+    """
+
+    loop_delay: float
+    rtt: float
+    applied_minus_stamp: float
+
+
+class Estimator:
+    """Estimates the horizon: from the measurement to the application of the command."""
+
+    def update(self, sample: DelaySample) -> None:
+        """Take in one sample; called once per newly echoed command, never for a repeated echo."""
+        raise NotImplementedError
+
+    def horizon(self, arrival_minus_stamp: float) -> float:
+        """Say how far to look ahead from the newest odometry.
+
+        Args:
+            arrival_minus_stamp: Arrival of that odometry on cloud's clock minus its stamp on
+                world's [s]: its uplink delay plus the unknown offset cloud - world.
+
+        Returns:
+            Horizon [s]; 0 before the first sample.
+        """
+        raise NotImplementedError

@@ -1,0 +1,147 @@
+"""The messages of the loop: what the two ends tell each other and what they record.
+
+Frozen dataclasses in SI units. Every stamp is an integer number of nanoseconds on the monotonic
+clock of the end that is named beside it; two stamps may be subtracted only if they are of one
+clock. Frames: REP-103 (x forward, y left, z up); unmarked vectors are in the world frame, the
+others end in ``_body``. Quaternions are ``wxyz``, as in MuJoCo.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TypeAlias
+
+Vector: TypeAlias = tuple[float, float, float]
+Quaternion: TypeAlias = tuple[float, float, float, float]
+
+ZERO: Vector = (0.0, 0.0, 0.0)
+UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
+NEVER_NS = -1
+"""The stamp of something that has not happened yet."""
+
+
+class GuardState(IntEnum):
+    """What the guard on board lets the robot do."""
+
+    GROUND = 0
+    """Rotors stopped; only an operator's start of a mission leads out."""
+    TRACK = 1
+    """Fresh commands from the cloud are flown."""
+    HOLD = 2
+    """No fresh command: brake, then hold the position with onboard sensing alone."""
+    LAND = 3
+    """Reserved: slow descent after a long HOLD."""
+    ESTOP = 4
+    """Reserved: rotors stopped at once, latched."""
+
+
+class Start(IntEnum):
+    """Where a mission starts from."""
+
+    SPAWN = 0
+    """The world is reset to its spawn under a new epoch."""
+    HERE = 1
+    """The robot goes on from where it is."""
+
+
+class Request(IntEnum):
+    """What the operator asks of the robot itself."""
+
+    START = 0
+    """Begin the mission: arm."""
+    END = 1
+    """The mission is over: hold locally until the next one starts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """Pose and twist of the robot's base at one instant.
+
+    Attributes:
+        stamp_ns: Instant of the measurement [ns], world's clock.
+        position: Of the base [m], world frame, shape (3,).
+        orientation_wxyz: Of the base, unit quaternion, body to world, shape (4,).
+        velocity: Of the base [m/s], world frame, shape (3,).
+        angular_velocity_body: Of the base [rad/s], body frame, shape (3,).
+    """
+
+    stamp_ns: int
+    position: Vector
+    orientation_wxyz: Quaternion
+    velocity: Vector
+    angular_velocity_body: Vector
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """What world sends to cloud at 100 Hz.
+
+    Attributes:
+        stamp_ns: That of the odometry [ns], world's clock.
+        odometry: Measured pose and twist, with sensor noise if there is any.
+        tip_force: Force on the touch sensor at the arm's tip [N].
+        echo_stamp_ns: Stamp of the newest command applied [ns], cloud's clock; NEVER_NS if none.
+        echo_hold_ns: How long world has held that command [ns].
+        slip_ns: By how much world's clock lags its machine's monotonic clock [ns].
+        mission: Number of the last mission request that world has acted on; 0 if none.
+        guard: State of the guard.
+    """
+
+    stamp_ns: int
+    odometry: Odometry
+    tip_force: float
+    echo_stamp_ns: int
+    echo_hold_ns: int
+    slip_ns: int
+    mission: int
+    guard: GuardState
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What cloud sends to world at 100 Hz.
+
+    Attributes:
+        stamp_ns: When it was computed [ns], cloud's clock.
+        basis_stamp_ns: Stamp of the odometry it was computed from [ns], world's clock.
+        basis_hold_ns: How long cloud had held that odometry [ns].
+        velocity: Wanted velocity [m/s], world frame, shape (3,).
+        yaw_rate: Wanted yaw rate [rad/s].
+    """
+
+    stamp_ns: int
+    basis_stamp_ns: int
+    basis_hold_ns: int
+    velocity: Vector
+    yaw_rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorRequest:
+    """What the operator asks of the robot itself; repeated until telemetry shows its number.
+
+    Attributes:
+        number: Rises by one with every request of a session's operator, from 1.
+        request: What is asked.
+        start: Where the mission starts from; only read with Request.START.
+    """
+
+    number: int
+    request: Request
+    start: Start = Start.SPAWN
+
+
+@dataclass(frozen=True, slots=True)
+class Setpoint:
+    """What the controller tracks: teleop to controller.
+
+    Attributes:
+        position: [m], world frame, shape (3,).
+        yaw: [rad].
+        waypoint: Index of the mission's waypoint that it belongs to; -1 if it belongs to none.
+    """
+
+    position: Vector
+    yaw: float = 0.0
+    waypoint: int = -1

@@ -1,0 +1,274 @@
+"""The records of a run: what world, cloud and the drivers note down while they fly.
+
+Every record is a frozen dataclass whose first field is `stamp_ns`, on the clock of the end that
+made it. `record/` turns them into MCAP topics, columns and a hash; `metrics/` turns them into
+numbers. The loop only makes them and hands them over.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetrySent:
+    """World: telemetry left. Topics /odometry and /telemetry.
+
+    Attributes:
+        stamp_ns: [ns], world's clock.
+        epoch: Session it belongs to.
+        counter: Its counter in the header.
+        telemetry: As sent.
+    """
+
+    stamp_ns: int
+    epoch: int
+    counter: int
+    telemetry: Telemetry
+
+
+@dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """World: the true state, at every odometry. Topics /ground_truth and /reference.
+
+    Attributes:
+        stamp_ns: [ns], world's clock.
+        odometry: True pose and twist.
+        tip_force: Force on the touch sensor [N].
+        reference: Velocity that the guard lets the low-level controller follow [m/s], shape (3,).
+    """
+
+    stamp_ns: int
+    odometry: Odometry
+    tip_force: float
+    reference: Vector
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """Either end: a telemetry or command datagram arrived, late ones included.
+
+    Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
+
+    Attributes:
+        stamp_ns: When it arrived [ns], receiver's clock.
+        uplink: True for telemetry at cloud, False for commands at world.
+        epoch: From its header.
+        counter: From its header.
+        delay: One way [s]; NaN if the two ends cannot prove that they share a clock.
+        used: True if it became the newest, False if it was late, stale, repeated or refused.
+    """
+
+    stamp_ns: int
+    uplink: bool
+    epoch: int
+    counter: int
+    delay: float
+    used: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CommandApplied:
+    """World: a command was applied for the first time. Topic /command_applied.
+
+    Attributes:
+        stamp_ns: When the low-level controller first saw it [ns], world's clock.
+        epoch: From its header.
+        counter: From its header; with the epoch it names the `Control` record it came from.
+        basis_stamp_ns: Stamp of the odometry that it was computed from [ns], world's clock.
+        velocity: As commanded, before the caps [m/s], shape (3,).
+    """
+
+    stamp_ns: int
+    epoch: int
+    counter: int
+    basis_stamp_ns: int
+    velocity: Vector
+
+
+@dataclass(frozen=True, slots=True)
+class GuardChange:
+    """World: the guard changed its state. Topic /guard.
+
+    Attributes:
+        stamp_ns: [ns], world's clock.
+        state: The new state.
+        cause: Why, in words: "mission started", "command age 0.252 s above 0.250 s".
+    """
+
+    stamp_ns: int
+    state: GuardState
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """World: the robot began to touch something. Topic /contact.
+
+    Attributes:
+        stamp_ns: [ns], world's clock.
+        body: Name of the scene's body: pipe_1, board, floor.
+        position: Of the base [m], shape (3,).
+        velocity: Of the base just before [m/s], shape (3,).
+        tip_velocity: Of the arm's tip just before [m/s], shape (3,).
+        tip: True if the arm's tip touched, False for any other part.
+    """
+
+    stamp_ns: int
+    body: str
+    position: Vector
+    velocity: Vector
+    tip_velocity: Vector
+    tip: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SessionOpened:
+    """Either end: a session began under a new epoch. Topic /session.
+
+    Attributes:
+        stamp_ns: [ns], own clock.
+        end: "world" or "cloud".
+        epoch: Its number.
+        cause: Why, in words: "cloud said hello", "mission starts from spawn".
+    """
+
+    stamp_ns: int
+    end: str
+    epoch: int
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """Cloud: one period of the control loop.
+
+    Topics /estimated_odometry, /setpoint_position, /cmd_vel, /delay_estimate and /pid.
+
+    Attributes:
+        stamp_ns: [ns], cloud's clock: that of the command.
+        epoch: Session of the command.
+        counter: Of the command, in its header.
+        basis_stamp_ns: Stamp of the odometry used [ns], world's clock.
+        horizon: By how much it was moved ahead [s]: the delay estimate, clamped.
+        rtt: Last round trip, hold excluded [s]; NaN before the first echo.
+        loop_delay: Last `now - echo_stamp`, hold included: the paper's tau_n [s]; NaN likewise.
+        measured: Position in the odometry used [m], shape (3,).
+        position: Predicted [m], shape (3,), for `basis_stamp_ns + horizon`.
+        orientation_wxyz: Predicted, shape (4,).
+        velocity: Predicted [m/s], shape (3,).
+        setpoint: [m], shape (3,).
+        waypoint: Index of the waypoint flown to; -1 if none.
+        command: Velocity commanded [m/s], shape (3,).
+        yaw_rate: Commanded [rad/s].
+        proportional: Term of the controller per axis [m/s], shape (3,).
+        integral: Likewise.
+        derivative: Likewise.
+    """
+
+    stamp_ns: int
+    epoch: int
+    counter: int
+    basis_stamp_ns: int
+    horizon: float
+    rtt: float
+    loop_delay: float
+    measured: Vector
+    position: Vector
+    orientation_wxyz: Quaternion
+    velocity: Vector
+    setpoint: Vector
+    waypoint: int
+    command: Vector
+    yaw_rate: float
+    proportional: Vector
+    integral: Vector
+    derivative: Vector
+
+
+@dataclass(frozen=True, slots=True)
+class MissionEvent:
+    """Cloud: the mission moved on. Topic /mission.
+
+    Attributes:
+        stamp_ns: [ns], cloud's clock.
+        event: "started", "reached", "held", "resumed", "cancelled", "timed_out", "done", "goto".
+        waypoint: Index of the waypoint concerned; -1 if none.
+        text: The same in words.
+    """
+
+    stamp_ns: int
+    event: str
+    waypoint: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Either end: something went wrong that did not stop the flight. Topic /fault.
+
+    Attributes:
+        stamp_ns: [ns], own clock.
+        code: One word: "predictor_raised", "predictor_not_finite", "horizon_clamped".
+        text: What, where, what to do.
+    """
+
+    stamp_ns: int
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Counted:
+    """Either end: how often something has happened so far; once a second. Topic /count.
+
+    Attributes:
+        stamp_ns: [ns], own clock.
+        end: "world", "cloud" or "link".
+        name: "received", "sent", "malformed", "late", "stale", "repeated", "old_epoch",
+            "not_finite", "recorder_dropped"...
+        count: Since the start.
+    """
+
+    stamp_ns: int
+    end: str
+    name: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Lateness:
+    """Driver, in real time only: how late a wake was. Topic /lateness.
+
+    Attributes:
+        stamp_ns: [ns], own clock, when the deadline was handled.
+        end: "world" or "cloud".
+        lateness: Now minus the deadline [s].
+        busy: How long handling it took [s].
+        slip_ns: World's clock behind the machine's [ns]; 0 for cloud.
+    """
+
+    stamp_ns: int
+    end: str
+    lateness: float
+    busy: float
+    slip_ns: int
+
+
+Record: TypeAlias = (
+    TelemetrySent
+    | GroundTruth
+    | Arrival
+    | CommandApplied
+    | GuardChange
+    | Contact
+    | SessionOpened
+    | Control
+    | MissionEvent
+    | Fault
+    | Counted
+    | Lateness
+)
