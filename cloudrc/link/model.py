@@ -1,0 +1,178 @@
+"""The link itself: a datagram's header, size and instant go in, the instants it arrives come out.
+
+Pure: no clock, no socket, no generator whose state others could disturb. The virtual driver and the
+relay ask the same model, so both draw the same delays and losses.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TypeVar
+
+from cloudrc.link.draws import BLOCK, BLOCK_BITS, stream_key
+from cloudrc.link.fates import OVERTAKES, Fate, fates
+from cloudrc.link.profile import DirectionProfile, Loss
+from cloudrc.link.timeline import Conditions, Timeline
+
+HEADER_BYTES = 28
+"""IPv4 and UDP headers, which also take time on the wire [bytes]. Source: RFC 791, RFC 768."""
+
+_Key = TypeVar("_Key")
+
+_TABLES = 64
+_IN_BLOCK = BLOCK - 1
+
+
+class LinkDirection:
+    """One direction of the link.
+
+    What chance does to a packet depends on seed, direction, epoch, kind and counter alone: not on
+    the order of the calls, on the mode, or on other kinds of datagram. Two things cannot be so,
+    because they are about the packets before: the queue of a bottleneck (`rate`) and `keep_order`.
+    With either, call `send` in the order of sending.
+
+    A kind whose counter never moves meets the same fate every time: count repeated hellos, too.
+    """
+
+    def __init__(
+        self, profile: DirectionProfile, seed: int, uplink: bool, origin_ns: int = 0
+    ) -> None:
+        """Set up.
+
+        Args:
+            profile: Conditions.
+            seed: Of the experiment.
+            uplink: True for world to cloud.
+            origin_ns: When the link came up [ns], on the clock of the `now_ns` given to `send`;
+                time line, trace and blackouts count from it.
+        """
+        self._profile = profile
+        self._seed = seed
+        self._uplink = uplink
+        self._origin_ns = origin_ns
+        self._timeline = Timeline(profile)
+        only = self._timeline.only()
+        shaped = only is None or only.blackout or only.rate is not None or profile.keep_order
+        self._always = None if shaped else only
+        self._delays: dict[tuple[int, int, int], list[Fate]] = {}
+        self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
+        self._departures: deque[int] = deque()
+        self._last_release_ns = 0
+        self._passed = self._lost = self._blackout = self._queue = self._duplicated = 0
+
+    def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
+        """Put one packet on the link.
+
+        Args:
+            epoch: From its header.
+            kind: From its header.
+            counter: From its header, >= 0.
+            size: UDP payload [bytes].
+            now_ns: When it is sent [ns].
+
+        Returns:
+            When each copy arrives [ns], none before `now_ns`: () if it is lost, one instant, or two
+            if it is duplicated (the copy second, not necessarily later).
+        """
+        always = self._always
+        if always is None:
+            return self._send_shaped(epoch, kind, counter, size, now_ns)
+        block = counter >> BLOCK_BITS
+        table = self._delays.get((epoch, kind, block))
+        if table is None:
+            table = self._delay_table(epoch, kind, block, always)
+        delays = table[counter & _IN_BLOCK]
+        if len(delays) == 1:
+            self._passed += 1
+            return (now_ns + delays[0],)
+        return self._counted(tuple([now_ns + delay for delay in delays]))
+
+    def counts(self) -> dict[str, int]:
+        """Say how many packets have met which outcome so far.
+
+        `passed` are those of which at least one copy arrives, `duplicated` those of them of which
+        two do; `lost`, `blackout` and `queue` did not arrive, by cause.
+        """
+        return {
+            "passed": self._passed,
+            "lost": self._lost,
+            "blackout": self._blackout,
+            "queue": self._queue,
+            "duplicated": self._duplicated,
+        }
+
+    def _send_shaped(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
+        """Send where conditions change, or where packets before this one matter.
+
+        As in tc-netem, losses come before the bottleneck and a packet that overtakes passes it by.
+        """
+        conditions = self._timeline.at(now_ns - self._origin_ns)
+        if conditions.blackout:
+            self._blackout += 1
+            return ()
+        block = counter >> BLOCK_BITS
+        key = (epoch, kind, block, conditions.jitter, conditions.loss)
+        table = self._fates.get(key) or self._fate_table(key)
+        fate = table[counter & _IN_BLOCK]
+        releases = []
+        for entry in fate:
+            release = now_ns
+            if entry != OVERTAKES:
+                departure = self._departure(size, conditions.rate, now_ns)
+                if departure is None:
+                    continue
+                release = departure + max(0, conditions.delay_ns + entry)
+            if self._profile.keep_order:
+                release = self._last_release_ns = max(release, self._last_release_ns)
+            releases.append(release)
+        if fate and not releases:
+            self._queue += 1
+            return ()
+        return self._counted(tuple(releases))
+
+    def _departure(self, size: int, rate: float | None, now_ns: int) -> int | None:
+        """Queue at the bottleneck; None if the queue is full."""
+        if rate is None:
+            return now_ns
+        departures = self._departures
+        while departures and departures[0] <= now_ns:
+            departures.popleft()
+        if len(departures) >= self._profile.queue_packets:
+            return None
+        start = departures[-1] if departures else now_ns
+        departures.append(start + round((size + HEADER_BYTES) * 8e9 / rate))
+        return departures[-1]
+
+    def _counted(self, releases: Fate) -> Fate:
+        if not releases:
+            self._lost += 1
+        else:
+            self._passed += 1
+            self._duplicated += len(releases) - 1
+        return releases
+
+    def _delay_table(self, epoch: int, kind: int, block: int, always: Conditions) -> list[Fate]:
+        """Make the delays of a block where conditions never change: the fast path of `send`."""
+        base = always.delay_ns
+        key = stream_key(self._seed, self._uplink, epoch, kind)
+        table = [
+            tuple([max(0, base + entry) for entry in fate])
+            for fate in fates(key, block, self._profile, always.jitter, always.loss)
+        ]
+        _forget_oldest(self._delays)
+        self._delays[epoch, kind, block] = table
+        return table
+
+    def _fate_table(self, key: tuple[int, int, int, float, Loss]) -> list[Fate]:
+        """Make the fates of a block under one jitter and loss."""
+        epoch, kind, block, jitter, loss = key
+        stream = stream_key(self._seed, self._uplink, epoch, kind)
+        _forget_oldest(self._fates)
+        table = self._fates[key] = fates(stream, block, self._profile, jitter, loss)
+        return table
+
+
+def _forget_oldest(tables: dict[_Key, list[Fate]]) -> None:
+    """Keep memory bounded: what is forgotten can be made again."""
+    if len(tables) >= _TABLES:
+        del tables[next(iter(tables))]

@@ -1,0 +1,48 @@
+"""Which datagram of a stream counts: newest wins, or the last to arrive as in the paper's code."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+WINDOW = 1024
+"""How far back a counter is remembered [datagrams]."""
+_MASK = (1 << WINDOW) - 1
+
+
+class Outcome(Enum):
+    """What became of a datagram; the value is the name that it is counted under."""
+
+    USED = "used"
+    LATE = "late"
+    REPEATED = "repeated"
+
+
+class Channel:
+    """The receiving end of one stream of counters within one epoch."""
+
+    def __init__(self, newest_wins: bool) -> None:
+        """Start empty.
+
+        Args:
+            newest_wins: True: a datagram older than the newest is late. False: the last to arrive
+                wins, even if it is older (the published code's policy); repeats are still dropped.
+        """
+        self._newest_wins = newest_wins
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: a new epoch begins."""
+        self._newest = -1
+        self._seen = 0  # bit k: newest - k has arrived
+
+    def take(self, counter: int) -> Outcome:
+        """Say what becomes of the datagram with this counter, and remember it."""
+        ahead = counter - self._newest
+        if ahead > 0:
+            self._newest = counter
+            self._seen = ((self._seen << ahead) | 1) & _MASK if ahead < WINDOW else 1
+            return Outcome.USED
+        if ahead <= -WINDOW or self._seen >> -ahead & 1:
+            return Outcome.REPEATED
+        self._seen |= 1 << -ahead
+        return Outcome.LATE if self._newest_wins else Outcome.USED

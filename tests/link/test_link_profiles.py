@@ -1,0 +1,50 @@
+"""The profiles that ship: each loads, says what it is and where its numbers are from."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+
+import pytest
+import yaml
+
+from cloudrc.config.schema import Direction, Profile
+
+FOLDER = files("cloudrc.link") / "profiles"
+TEXTS = {f.name.removesuffix(".yaml"): f.read_text() for f in FOLDER.iterdir()}
+SHIPPED = """ideal paper-p1 paper-p2 paper-p3 wifi lte 5g satellite handover lossy""".split()
+
+
+def load(name: str) -> Profile:
+    return Profile.model_validate_json(json.dumps(yaml.safe_load(TEXTS[name])))
+
+
+def test_all_are_there() -> None:
+    assert set(TEXTS) >= set(SHIPPED)
+
+
+@pytest.mark.parametrize("name", sorted(TEXTS))
+def test_a_profile_loads_and_says_where_it_is_from(name: str) -> None:
+    profile = load(name)
+    assert 10 < len(profile.description) <= 90
+    assert "\n" not in profile.description
+    assert TEXTS[name].startswith("# ")
+    comments = " ".join(line for line in TEXTS[name].splitlines() if line.startswith("#"))
+    assert name == "ideal" or "Source:" in comments or "Chosen:" in comments
+
+
+@pytest.mark.parametrize("name", sorted(TEXTS))
+def test_a_profile_leaves_time_for_a_command_to_come_back(name: str) -> None:
+    """Mean round trip and a period of odometry and of commands stay below the command age limit."""
+    profile = load(name)
+    round_trip = profile.uplink.delay_ms + profile.downlink.delay_ms
+    assert round_trip + 20 < (profile.command_age_max_ms or 250)
+
+
+@pytest.mark.parametrize(
+    ("name", "delay", "jitter"),
+    [("ideal", 0, 0), ("paper-p1", 20, 10), ("paper-p2", 45, 25), ("paper-p3", 70, 40)],
+)
+def test_the_papers_profiles_are_the_papers(name: str, delay: float, jitter: float) -> None:
+    profile = load(name)
+    assert profile.uplink == Direction(delay_ms=delay, jitter_ms=jitter) == profile.downlink
