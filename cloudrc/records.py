@@ -195,7 +195,8 @@ class MissionEvent:
 
     Attributes:
         stamp_ns: [ns], cloud's clock.
-        event: "started", "reached", "held", "resumed", "cancelled", "timed_out", "done", "goto".
+        event: "started", "reached", "held", "resumed", "goto"; at the end its outcome: "done",
+            "cancelled", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped".
         waypoint: Index of the waypoint concerned; -1 if none.
         text: The same in words.
     """

@@ -1,25 +1,52 @@
 """The experiment file as frozen objects: every key, its unit, range and default.
 
 Keys carry their unit (`delay_ms`); `cloudrc/assembly.py` converts them to SI once. Unknown keys
-are refused. Defaults are the paper's scheme with the published gains.
+are refused. Defaults are the paper's scheme with the published gains. An `Experiment` is what a
+file may say; `config.resolved.ResolvedExperiment` is what is flown.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Discriminator, Field, Tag
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+from cloudrc.config.fields import Finite, NotNegative, Positive, Section
+from cloudrc.config.network import (
+    Blackout,
+    Change,
+    Direction,
+    GilbertElliott,
+    Profile,
+)
+
+__all__ = [
+    "Blackout",
+    "Change",
+    "Cloud",
+    "Criteria",
+    "Direction",
+    "Experiment",
+    "GilbertElliott",
+    "Guard",
+    "Link",
+    "LowLevel",
+    "Mission",
+    "PlugIn",
+    "Profile",
+    "Sensors",
+    "Steps",
+    "Tunnel",
+    "Waypoint",
+    "World",
+]
+
+MAX_WAYPOINTS = 10_000
 
 
-class Section(BaseModel):
-    """A part of the experiment file: frozen, closed, strictly typed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+def _form(value: Any) -> str:
+    """Tell a name from what it stands for."""
+    return "<name>" if isinstance(value, str) else "<inline>"
 
 
 class Waypoint(Section):
@@ -46,17 +73,26 @@ class Steps(Section):
 class Mission(Section):
     """What to fly: waypoints, or random steps."""
 
+    description: str = Field("", description="One line for lists")
     start: Literal["spawn", "here"] = Field("spawn", description="Where the mission starts")
-    waypoints: tuple[Waypoint, ...] = Field((), max_length=10_000, description="Points, in order")
+    waypoints: tuple[Waypoint, ...] = Field(
+        (), max_length=MAX_WAYPOINTS, description="Points, in order"
+    )
     steps: Steps | None = Field(None, description="Random steps in place of waypoints")
 
 
 class LowLevel(Section):
     """Onboard velocity and attitude loops (plant.md: the published gains at the true dt)."""
 
-    gain_p: tuple[NotNegative, NotNegative, NotNegative] = Field((4.0, 4.0, 10.0))
-    gain_i: tuple[NotNegative, NotNegative, NotNegative] = Field((1.0, 1.0, 2.5))
-    gain_d: tuple[NotNegative, NotNegative, NotNegative] = Field((0.30, 0.30, 0.50))
+    gain_p: tuple[NotNegative, NotNegative, NotNegative] = Field(
+        (4.0, 4.0, 10.0), description="Per axis [N/(m/s)]"
+    )
+    gain_i: tuple[NotNegative, NotNegative, NotNegative] = Field(
+        (1.0, 1.0, 2.5), description="Per axis [N/m]"
+    )
+    gain_d: tuple[NotNegative, NotNegative, NotNegative] = Field(
+        (0.30, 0.30, 0.50), description="Per axis [N/(m/s^2)]"
+    )
     integral_limit_xy: NotNegative = Field(
         0.10, description="Limit of the integrated velocity error in x and y [m]"
     )
@@ -100,87 +136,34 @@ class Tunnel(Section):
     )
 
 
-class GilbertElliott(Section):
-    """Loss in bursts: a two-state Markov chain that advances with every packet."""
-
-    bad_start: Share = Field(description="Chance per packet to go from the good to the bad state")
-    bad_end: Share = Field(description="Chance per packet to go from the bad to the good state")
-    loss_bad: Share = Field(1.0, description="Loss in the bad state")
-    loss_good: Share = Field(0.0, description="Loss in the good state")
-    delay_bad_ms: NotNegative = Field(0.0, description="Extra delay in the bad state, one way [ms]")
-
-
-class Blackout(Section):
-    """A time in which nothing passes."""
-
-    start_s: NotNegative = Field(description="Since the link came up [s]")
-    duration_s: Positive = Field(description="[s]")
-
-
-class Change(Section):
-    """From `at_s` on these values hold; those not named stay as they are."""
-
-    at_s: NotNegative = Field(description="Since the link came up [s]")
-    delay_ms: NotNegative | None = None
-    jitter_ms: NotNegative | None = None
-    loss: Share | GilbertElliott | None = None
-    rate_kbit: Positive | None = None
-
-
-class Direction(Section):
-    """Network conditions of one direction. All delays are ONE WAY."""
-
-    delay_ms: NotNegative = Field(0.0, description="One way [ms]")
-    jitter_ms: NotNegative = Field(
-        0.0, description="uniform: half width; normal, pareto: standard deviation [ms]"
-    )
-    distribution: Literal["uniform", "normal", "pareto"] = Field("uniform")
-    correlation: Share = Field(0.0, description="Of the jitter of one packet with the next")
-    loss: Share | GilbertElliott = Field(0.0, description="Chance, or bursts")
-    duplicate: Share = Field(0.0, description="Chance that a packet arrives twice")
-    reorder: Share = Field(0.0, description="Chance that a packet overtakes: no delay at all")
-    keep_order: bool = Field(False, description="Packets never overtake each other")
-    rate_kbit: Positive | None = Field(None, description="Rate of the bottleneck [kbit/s]")
-    queue_packets: Annotated[int, Field(ge=1, le=1_000_000)] = Field(
-        1000, description="Packets that wait at the bottleneck before the next is dropped"
-    )
-    changes: tuple[Change, ...] = Field((), description="Time line, rising in at_s")
-    trace: str | None = Field(None, description="CSV file: time_s,delay_ms[,loss]")
-    blackouts: tuple[Blackout, ...] = ()
-
-
-class Profile(Section):
-    """A file under link/profiles."""
-
-    description: str = ""
-    uplink: Direction = Direction()
-    downlink: Direction = Direction()
-    command_age_max_ms: Positive | None = Field(
-        None, description="Command age limit that this link needs [ms]"
-    )
-
-
 class Link(Section):
     """The emulated network: a profile, and single values over it."""
 
     profile: str = Field("paper-p2", description="File name under link/profiles, or a path")
-    uplink: dict[str, Any] = Field({}, description="Overrides of world to cloud")
-    downlink: dict[str, Any] = Field({}, description="Overrides of cloud to world")
+    uplink: Direction = Field(
+        Direction(), description="World to cloud; what is named here overrides the profile"
+    )
+    downlink: Direction = Field(Direction(), description="Cloud to world; likewise")
 
 
 class PlugIn(Section):
     """A plug-in by name, with its parameters beside it."""
 
     model_config = ConfigDict(extra="allow", frozen=True, strict=True)
-    name: str
+    name: str = Field(description="A file's name in the plug-in's folder, or a path")
+
+
+PlugInChoice = Annotated[
+    Annotated[str, Tag("<name>")] | Annotated[PlugIn, Tag("<inline>")], Discriminator(_form)
+]
 
 
 class Cloud(Section):
     """The remote controller."""
 
-    estimator: str | PlugIn = "running_mean"
-    predictor: str | PlugIn = "constant_velocity"
-    controller: str | PlugIn = "pid"
+    estimator: PlugInChoice = Field("running_mean", description="Of the delay")
+    predictor: PlugInChoice = Field("constant_velocity", description="Moves odometry ahead")
+    controller: PlugInChoice = Field("pid", description="Tracks the setpoint")
 
 
 class Criteria(Section):
@@ -194,9 +177,15 @@ class Criteria(Section):
 class Experiment(Section):
     """One experiment file."""
 
-    description: str = ""
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
-    mission: str | Mission = Field("pipes", description="A shipped mission, a file, or inline")
+    # No slash: runs are kept in folders of this name.
+    name: Annotated[str, Field(pattern=r"^[^/\\\x00]*$")] = Field(
+        "", description="Label in reports, without slashes; default: the file's name"
+    )
+    description: str = Field("", description="One line for lists and reports")
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(1, description="Of everything random")
+    mission: Annotated[
+        Annotated[str, Tag("<name>")] | Annotated[Mission, Tag("<inline>")], Discriminator(_form)
+    ] = Field("pipes", description="A shipped mission, a file, or inline")
     world: World = World()
     guard: Guard = Guard()
     tunnel: Tunnel = Tunnel()

@@ -31,12 +31,12 @@ class Estimator:
         """Take in one sample; called once per newly echoed command, never for a repeated echo."""
         raise NotImplementedError
 
-    def horizon(self, arrival_minus_stamp: float) -> float:
-        """Say how far to look ahead from the newest odometry.
+    def horizon(self, age: float) -> float:
+        """Say how far to look ahead from the newest odometry, for a command that leaves now.
 
         Args:
-            arrival_minus_stamp: Arrival of that odometry on cloud's clock minus its stamp on
-                world's [s]: its uplink delay plus the unknown offset cloud - world.
+            age: Now on cloud's clock minus the odometry's stamp on world's [s]: its uplink delay,
+                how long cloud has held it, and the unknown offset cloud - world.
 
         Returns:
             Horizon [s]; 0 before the first sample.

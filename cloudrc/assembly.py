@@ -1,0 +1,187 @@
+"""From an experiment to the parts that fly it: the one place where configuration becomes SI.
+
+Drivers know endpoints by contract only, world and cloud never meet: here they are put together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf, radians
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
+from cloudrc.cloud.loop import ControlLoop
+from cloudrc.cloud.teleop.messages import StartMission
+from cloudrc.cloud.teleop.mission import Teleop
+from cloudrc.cloud.teleop.plan import Leg, Plan
+from cloudrc.config import schema
+from cloudrc.config.parameters import build
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
+from cloudrc.link.trace import read_trace
+from cloudrc.messages import Start
+
+if TYPE_CHECKING:
+    from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
+
+MS_TO_NS = 1_000_000
+
+
+def build_world(
+    experiment: ResolvedExperiment,
+    identity: WorldIdentity,
+    clock: Callable[[], int] = lambda: 0,
+) -> WorldEndpoint:
+    """Put the robot into its scene and give it its end of the tunnel; needs MuJoCo.
+
+    Args:
+        experiment: What to fly.
+        identity: Who this end is.
+        clock: Its monotonic clock [ns]; read last, since a scene takes a while to compile.
+    """
+    from cloudrc.world.endpoint import WorldEndpoint
+    from cloudrc.world.guard import Guard, Limits
+    from cloudrc.world.low_level import LowLevel
+    from cloudrc.world.robot import Robot
+    from cloudrc.world.sensors import Sensors
+    from cloudrc.world.simulator import Simulator
+
+    world, guard = experiment.world, experiment.guard
+    limits = Limits(
+        command_age_max_ns=round(guard.command_age_max_ms * MS_TO_NS),
+        speed_max=guard.speed_max_mps,
+        acceleration_max=guard.acceleration_max_mps2,
+        yaw_rate_max=guard.yaw_rate_max_radps,
+    )
+    robot = Robot(
+        Simulator(world.robot, world.scene), LowLevel(**world.low_level.model_dump()), Guard(limits)
+    )
+    noise = np.random.Generator(np.random.PCG64([experiment.seed, _stream("odometry noise")]))
+    sensors = Sensors(world.sensors.position_noise_m, world.sensors.velocity_noise_mps, noise)
+    return WorldEndpoint(
+        robot,
+        sensors,
+        identity,
+        newest_wins=experiment.tunnel.order == "newest",
+        command_age_max_ns=limits.command_age_max_ns,
+        start_ns=clock(),
+    )
+
+
+def build_cloud(
+    experiment: ResolvedExperiment,
+    identity: CloudIdentity,
+    clock: Callable[[], int] = lambda: 0,
+) -> CloudEndpoint:
+    """Join plug-ins and teleoperation, give them cloud's end of the tunnel, start the mission.
+
+    Args:
+        experiment: What to fly.
+        identity: Who this end is.
+        clock: Its monotonic clock [ns].
+    """
+    cloud = experiment.cloud
+    loop = ControlLoop(
+        lambda: build("estimators", cloud.estimator),
+        build("predictors", cloud.predictor),
+        build("controllers", cloud.controller),
+    )
+    teleop, start_ns = Teleop(), clock()
+    teleop.operate(StartMission(build_plan(experiment)), start_ns)
+    newest_wins = experiment.tunnel.order == "newest"
+    return CloudEndpoint(loop, teleop, identity, newest_wins=newest_wins, start_ns=start_ns)
+
+
+def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:
+    """Make both directions of the emulated network: uplink, downlink."""
+    return (
+        LinkDirection(link_profile(experiment.uplink), experiment.seed, uplink=True),
+        LinkDirection(link_profile(experiment.downlink), experiment.seed, uplink=False),
+    )
+
+
+def build_plan(experiment: ResolvedExperiment) -> Plan:
+    """Turn the mission into legs."""
+    mission = experiment.mission
+    legs = (
+        _step_legs(mission.steps, experiment.seed)
+        if mission.steps is not None
+        else tuple(_leg(waypoint) for waypoint in mission.waypoints)
+    )
+    start = Start.SPAWN if mission.start == "spawn" else Start.HERE
+    return Plan(legs, start, experiment.criteria.time_limit_s)
+
+
+def link_profile(direction: schema.Direction) -> DirectionProfile:
+    """Convert one direction of the link to SI, its trace read in."""
+    return DirectionProfile(
+        delay=direction.delay_ms * 1e-3,
+        jitter=direction.jitter_ms * 1e-3,
+        distribution=direction.distribution,
+        correlation=direction.correlation,
+        loss=_loss(direction.loss),
+        duplicate=direction.duplicate,
+        reorder=direction.reorder,
+        keep_order=direction.keep_order,
+        rate=_scaled(direction.rate_kbit, 1e3),
+        queue_packets=direction.queue_packets,
+        changes=tuple(_change(change) for change in direction.changes),
+        trace=None if direction.trace is None else read_trace(Path(direction.trace)),
+        blackouts=tuple(Blackout(b.start_s, b.duration_s) for b in direction.blackouts),
+    )
+
+
+def _leg(waypoint: schema.Waypoint) -> Leg:
+    return Leg(
+        waypoint.position_m,
+        radians(waypoint.yaw_deg),
+        waypoint.tolerance_m,
+        waypoint.dwell_s,
+        waypoint.time_limit_s,
+    )
+
+
+def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:
+    """Seeded setpoints, each for one period wherever the robot is by then."""
+    rng = np.random.Generator(np.random.PCG64([seed, _stream("steps")]))
+    offsets = rng.uniform(-1.0, 1.0, (steps.count, 3)) * steps.range_m + steps.centre_m
+    limit = 10 * steps.period_s
+    return tuple(
+        Leg((x, y, z), tolerance=inf, dwell=steps.period_s, time_limit=limit)
+        for x, y, z in offsets.tolist()
+    )
+
+
+def _change(change: schema.Change) -> Change:
+    return Change(
+        change.at_s,
+        _scaled(change.delay_ms, 1e-3),
+        _scaled(change.jitter_ms, 1e-3),
+        None if change.loss is None else _loss(change.loss),
+        _scaled(change.rate_kbit, 1e3),
+    )
+
+
+def _loss(loss: float | schema.GilbertElliott) -> Loss:
+    if isinstance(loss, schema.GilbertElliott):
+        return GilbertElliott(
+            loss.bad_start,
+            loss.bad_end,
+            loss.loss_bad,
+            loss.loss_good,
+            loss.delay_bad_ms * 1e-3,
+        )
+    return loss
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else value * factor
+
+
+def _stream(name: str) -> int:
+    """A number for each use of chance, so that none shifts another."""
+    return int.from_bytes(name.encode(), "little")

@@ -1,0 +1,159 @@
+"""Controller: predicted odometry and setpoint come in, a velocity command goes out.
+
+Source: eqs. (4) and (5) of the paper; gains of the published code (plant.md, "Cloud controller").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import atan2, hypot, inf, remainder, tau
+
+from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.cloud.parameters import not_negative, vector
+from cloudrc.messages import ZERO, Odometry, Quaternion, Setpoint, Vector
+
+UNLIMITED: Vector = (inf, inf, inf)
+
+
+class Pid(Controller):
+    """PID on the position; what it commands is a velocity.
+
+    Deviation: with positive gains eq. (4) as printed, estimate minus setpoint, diverges; here
+    error = setpoint - estimate. The derivative acts on the measurement, so that a new setpoint
+    does not kick. An axis whose output is limited does not integrate an error that would push it
+    further (conditional anti-windup). The published code has none of the three limits.
+    """
+
+    def __init__(
+        self,
+        gain_p: Vector,
+        gain_i: Vector,
+        gain_d: Vector,
+        gain_yaw: float,
+        integral_limit: Vector,
+        velocity_max: Vector,
+        speed_max: float,
+    ) -> None:
+        """Start with an empty integral; see `build` for the parameters and their units."""
+        self._gain_p = gain_p
+        self._gain_i = gain_i
+        self._gain_d = gain_d
+        self._gain_yaw = gain_yaw
+        self._integral_limit = integral_limit
+        self._velocity_max = velocity_max
+        self._speed_max = speed_max
+        self._proportional_only = gain_i == ZERO and gain_d == ZERO
+        self._limited = velocity_max != UNLIMITED or speed_max != inf
+        self._integral = ZERO
+
+    def reset(self) -> None:
+        """Empty the integral: a new session or mission begins."""
+        self._integral = ZERO
+
+    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
+        """Compute one command: u = P e + I (integral of e) - D v, then the limits.
+
+        The three terms returned are those before the limits, so they sum to the velocity only
+        while no limit holds it. The integral is that of the errors before this one.
+
+        Source: eq. (5).
+
+        Args:
+            estimate: Predicted position [m] and velocity [m/s], world frame.
+            setpoint: Position [m], yaw [rad].
+            dt: Time since the last call [s], > 0.
+        """
+        px, py, pz = estimate.position
+        sx, sy, sz = setpoint.position
+        gx, gy, gz = self._gain_p
+        ex, ey, ez = sx - px, sy - py, sz - pz
+        wanted = proportional = (gx * ex, gy * ey, gz * ez)
+        integral, derivative = self._integral, ZERO
+        if not self._proportional_only:
+            vx, vy, vz = estimate.velocity
+            gx, gy, gz = self._gain_d
+            derivative = (-gx * vx, -gy * vy, -gz * vz)
+            wanted = _sum(proportional, integral, derivative)
+        velocity = self._limit(wanted) if self._limited else wanted
+        if not self._proportional_only:
+            self._integrate((ex, ey, ez), wanted, velocity, dt)
+        yaw_rate = (
+            self._yaw_rate(estimate.orientation_wxyz, setpoint.yaw) if self._gain_yaw else 0.0
+        )
+        return ControlOutput(velocity, yaw_rate, proportional, integral, derivative)
+
+    def _limit(self, wanted: Vector) -> Vector:
+        """Clamp each axis, then shorten the vector to `speed_max` without turning it."""
+        x, y, z = (
+            max(min(value, limit), -limit)
+            for value, limit in zip(wanted, self._velocity_max, strict=True)
+        )
+        speed = hypot(x, y, z)
+        if speed <= self._speed_max:
+            return (x, y, z)
+        scale = self._speed_max / speed
+        return (x * scale, y * scale, z * scale)
+
+    def _integrate(self, error: Vector, wanted: Vector, velocity: Vector, dt: float) -> None:
+        """Add this error [m] over `dt` [s] where it does not wind up a limited axis."""
+        x, y, z = (
+            max(min(term + gain * e * dt, limit), -limit) if v == u or e * u < 0 else term
+            for term, gain, e, u, v, limit in zip(
+                self._integral,
+                self._gain_i,
+                error,
+                wanted,
+                velocity,
+                self._integral_limit,
+                strict=True,
+            )
+        )
+        self._integral = (x, y, z)
+
+    def _yaw_rate(self, orientation_wxyz: Quaternion, yaw: float) -> float:
+        """Gain times the yaw error [rad], the short way round."""
+        w, x, y, z = orientation_wxyz
+        seen = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return self._gain_yaw * remainder(yaw - seen, tau)
+
+
+def _sum(a: Vector, b: Vector, c: Vector) -> Vector:
+    return (a[0] + b[0] + c[0], a[1] + b[1] + c[1], a[2] + b[2] + c[2])
+
+
+def build(
+    gain_p: Sequence[float] = (0.8, 0.8, 1.5),
+    gain_i: Sequence[float] = ZERO,
+    gain_d: Sequence[float] = ZERO,
+    gain_yaw: float = 0.0,
+    integral_limit: Sequence[float] | None = None,
+    velocity_max: Sequence[float] | None = None,
+    speed_max: float | None = None,
+) -> Pid:
+    """Make the controller; the defaults are the published gains.
+
+    Source: plant.md, "Cloud controller": P .8, .8, 1.5; I 0; D 0; no saturation.
+
+    Args:
+        gain_p: Per axis [1/s], shape (3,).
+        gain_i: Per axis [1/s^2], shape (3,).
+        gain_d: Per axis [1], shape (3,).
+        gain_yaw: [1/s]; 0 commands no yaw rate, since the published low-level controller holds
+            the yaw at 0 whatever is commanded.
+        integral_limit: Largest integral term per axis [m/s], shape (3,); None: no limit.
+        velocity_max: Largest velocity per axis [m/s], shape (3,); None: no limit.
+        speed_max: Largest speed [m/s]; the direction is kept. None: no limit. With an integral
+            it should not exceed the guard's own cap, which the anti-windup cannot see.
+
+    Raises:
+        ValueError: If a parameter is not finite or negative; the message names it.
+    """
+    return Pid(
+        vector("gain_p", gain_p),
+        vector("gain_i", gain_i),
+        vector("gain_d", gain_d),
+        not_negative("gain_yaw", gain_yaw),
+        UNLIMITED if integral_limit is None else vector("integral_limit", integral_limit),
+        UNLIMITED if velocity_max is None else vector("velocity_max", velocity_max),
+        inf if speed_max is None else not_negative("speed_max", speed_max),
+    )

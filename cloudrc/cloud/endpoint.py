@@ -1,0 +1,194 @@
+"""Cloud's end of the tunnel: telemetry comes in, a command leaves every 10 ms.
+
+It asks for a session with a hello that names its process, and takes the epoch that world hands
+out. Teleoperation is joined to it by messages only: what is seen goes there, setpoints and
+operator requests come back.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+from cloudrc.cloud.loop import ControlLoop
+from cloudrc.cloud.teleop.messages import Seen
+from cloudrc.cloud.teleop.mission import Teleop
+from cloudrc.messages import NEVER_NS, OperatorRequest, Setpoint
+from cloudrc.records import Arrival, Counted, Record, SessionOpened
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.channel import Channel, Outcome
+from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Header, Hello, Kind
+from cloudrc.tunnel.session import NO_EPOCH, Session
+
+PERIOD_NS = 10_000_000
+"""Source: control.md, commands at 100 Hz."""
+HELLO_PERIOD_NS = 100_000_000
+SILENCE_NS = 500_000_000
+"""Without telemetry for so long, cloud says hello again: world may have restarted."""
+COUNT_PERIOD_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class CloudIdentity:
+    """Who this end is: 16 bytes for its monotonic clock, 16 for this process."""
+
+    clock_id: bytes
+    nonce: bytes
+
+
+class CloudEndpoint:
+    """The remote controller's end of the tunnel; an `Endpoint`."""
+
+    def __init__(
+        self,
+        loop: ControlLoop,
+        teleop: Teleop,
+        identity: CloudIdentity,
+        *,
+        newest_wins: bool,
+        start_ns: int = 0,
+    ) -> None:
+        """Begin without a session.
+
+        Args:
+            loop: Estimator, predictor and controller.
+            teleop: Where setpoints come from.
+            identity: Who this end is.
+            newest_wins: Policy for late telemetry.
+            start_ns: Cloud's monotonic clock now [ns].
+        """
+        self._loop, self.teleop, self._identity = loop, teleop, identity
+        self._session = Session(Direction.DOWNLINK)
+        self._channel = Channel(newest_wins)
+        self._world_clock_id = b""
+        self._setpoint: Setpoint | None = None
+        self._tick_ns = self._hello_ns = self._heard_ns = start_ns
+        self._count_ns = start_ns + COUNT_PERIOD_NS
+        self._commanded_ns = NEVER_NS
+        self._datagrams: list[bytes] = []
+        self._records: list[Record] = []
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def mission_over(self) -> bool:
+        """Whether the mission has ended and the robot is seen to hold, or cannot be seen to."""
+        return self.teleop.outcome is not None and self.teleop.settled
+
+    def next_deadline_ns(self) -> int:
+        """When the next command is due [ns]."""
+        return self._tick_ns
+
+    def take_datagrams(self) -> list[bytes]:
+        """Hand over the datagrams to send."""
+        datagrams, self._datagrams = self._datagrams, []
+        return datagrams
+
+    def take_records(self) -> list[Record]:
+        """Hand over the records since the last call."""
+        records, self._records = self._records, []
+        return records
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """Send what is due; periods that were missed are skipped, not made up for."""
+        if now_ns < self._tick_ns:
+            return
+        missed = (now_ns - self._tick_ns) // PERIOD_NS
+        self._counts["missed_periods"] += missed
+        self._tick_ns += (missed + 1) * PERIOD_NS
+        self._say_hello_if_needed(now_ns)
+        self.teleop.handle_deadline(now_ns)
+        self._take_from_teleop()
+        if self._session.epoch and self._loop.ready and self._setpoint is not None:
+            self._send_command(self._setpoint, now_ns)
+        if now_ns >= self._count_ns:
+            self._note_counts(now_ns)
+        if self._loop.faults:
+            self._records += self._loop.take_faults()
+
+    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+        """Take in one datagram; what is not valid is counted and dropped."""
+        try:
+            header, body = self._session.open(data)
+            if header.kind == Kind.TELEMETRY:
+                self._receive_telemetry(header, body, now_ns)
+            elif header.kind == Kind.ACCEPT:
+                self._receive_accept(header, codec.decode_accept(body), now_ns)
+            else:
+                raise DecodeError("malformed")
+        except DecodeError as error:
+            self._counts[str(error)] += 1
+
+    def _say_hello_if_needed(self, now_ns: int) -> None:
+        lost = self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
+        if lost and now_ns >= self._hello_ns:
+            self._say_hello(now_ns)
+
+    def _say_hello(self, now_ns: int) -> None:
+        self._hello_ns = now_ns + HELLO_PERIOD_NS
+        hello = Hello(self._identity.nonce, self._identity.clock_id)
+        self._send(Kind.HELLO, codec.encode_hello(hello))
+
+    def _receive_accept(self, header: Header, accept: Accept, now_ns: int) -> None:
+        """Take the epoch that world hands out to this very process, if it is a new one."""
+        if accept.nonce != self._identity.nonce or header.epoch <= self._session.epoch:
+            self._counts["accept_ignored"] += 1
+            return
+        self._session.begin(header.epoch)
+        self._channel.reset()
+        self._loop.reset()
+        self._world_clock_id = accept.clock
+        self._heard_ns = now_ns
+        self._commanded_ns = NEVER_NS
+        self._records.append(SessionOpened(now_ns, "cloud", header.epoch, "world accepted"))
+
+    def _receive_telemetry(self, header: Header, body: bytes, now_ns: int) -> None:
+        if header.epoch != self._session.epoch:
+            self._counts["old_epoch"] += 1
+            if header.epoch > self._session.epoch and now_ns >= self._hello_ns:
+                self._say_hello(now_ns)  # world moved on and its accept was lost
+            return
+        telemetry = codec.decode_telemetry(body)
+        self._heard_ns = now_ns
+        outcome = self._channel.take(header.counter)
+        used = outcome is Outcome.USED
+        shared = self._world_clock_id == self._identity.clock_id
+        sent_ns = telemetry.stamp_ns + telemetry.slip_ns
+        delay = (now_ns - sent_ns) * 1e-9 if shared else float("nan")
+        self._records.append(Arrival(now_ns, True, header.epoch, header.counter, delay, used))
+        self._counts[outcome.value] += 1
+        if not used:
+            return
+        self._loop.observe(telemetry, now_ns)
+        self.teleop.see(
+            Seen(header.epoch, telemetry.odometry.position, telemetry.guard, telemetry.mission),
+            now_ns,
+        )
+        self._take_from_teleop()
+
+    def _take_from_teleop(self) -> None:
+        for message in self.teleop.take_outputs():
+            if isinstance(message, Setpoint):
+                self._setpoint = message
+            elif isinstance(message, OperatorRequest):
+                self._send(Kind.OPERATOR, codec.encode_operator(message))
+            else:
+                self._records.append(message)
+                if message.event == "started":
+                    self._loop.start_mission()
+
+    def _send_command(self, setpoint: Setpoint, now_ns: int) -> None:
+        elapsed_ns = now_ns - self._commanded_ns if self._commanded_ns >= 0 else PERIOD_NS
+        self._commanded_ns = now_ns
+        epoch, counter = self._session.epoch, self._session.next_counter(Kind.COMMAND)
+        command, control = self._loop.command(setpoint, now_ns, elapsed_ns * 1e-9, epoch, counter)
+        self._send(Kind.COMMAND, codec.encode_command(command))
+        self._records.append(control)
+
+    def _note_counts(self, now_ns: int) -> None:
+        self._count_ns += COUNT_PERIOD_NS
+        for name, count in sorted((self._counts + self._loop.counts).items()):
+            self._records.append(Counted(now_ns, "cloud", name, count))
+
+    def _send(self, kind: Kind, body: bytes) -> None:
+        self._datagrams.append(self._session.seal(kind, body))
+        self._counts["sent"] += 1

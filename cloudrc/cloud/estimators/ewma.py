@@ -1,0 +1,46 @@
+"""Delay estimator: loop delays come in, their exponentially weighted average goes out.
+
+Source: control.md, section 4: a gain of 0.05 follows a step of the delay three times as well as
+eq. (1) and is no worse under constant conditions.
+"""
+
+from __future__ import annotations
+
+from cloudrc.cloud import parameters
+from cloudrc.cloud.estimators import DelaySample, Estimator
+
+
+class Ewma(Estimator):
+    """Exponentially weighted moving average of the loop delay; its first sample starts it."""
+
+    def __init__(self, gain: float) -> None:
+        """Start empty.
+
+        Args:
+            gain: Weight of a new sample [1], above 0 and at most 1.
+        """
+        self._gain = gain
+        self._average: float | None = None
+
+    def update(self, sample: DelaySample) -> None:
+        """Add one loop delay [s]: average += gain (sample - average)."""
+        if self._average is None:
+            self._average = sample.loop_delay
+        else:
+            self._average += self._gain * (sample.loop_delay - self._average)
+
+    def horizon(self, age: float) -> float:
+        """Return the average [s]; the age of this very odometry (in [s]) plays no part."""
+        return 0.0 if self._average is None else max(0.0, self._average)
+
+
+def build(gain: float = 0.05) -> Ewma:
+    """Make the estimator.
+
+    Args:
+        gain: Weight of a new sample [1]; 0.05 forgets within about 20 samples, 0.2 s at 100 Hz.
+
+    Raises:
+        ValueError: If `gain` is not above 0 and at most 1.
+    """
+    return Ewma(parameters.gain("gain", gain))

@@ -1,0 +1,48 @@
+"""Delay estimator: a running mean of the loop delay that stops slowing down after 500 samples.
+
+Source: the authors' published controller. It speaks of a window of 500 samples, but computes a
+mean whose gain 1/(k+1) stays at 1/500 from then on: an exponential average.
+"""
+
+from __future__ import annotations
+
+from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.cloud.parameters import positive
+
+
+class CappedRunningMean(Estimator):
+    """Running mean whose gain falls to 1/count_max and no further."""
+
+    def __init__(self, count_max: int) -> None:
+        """Start empty.
+
+        Args:
+            count_max: Number of samples after which the gain stays.
+        """
+        self._count_max = count_max
+        self._count = 0
+        self._mean = 0.0
+
+    def update(self, sample: DelaySample) -> None:
+        """Add one loop delay [s]: mean += (sample - mean) / min(k + 1, count_max)."""
+        if self._count < self._count_max:
+            self._count += 1
+        self._mean += (sample.loop_delay - self._mean) / self._count
+
+    def horizon(self, age: float) -> float:
+        """Return the mean [s]; the age of this very odometry (in [s]) plays no part."""
+        return max(0.0, self._mean)
+
+
+def build(count_max: int = 500) -> CappedRunningMean:
+    """Make the authors' estimator.
+
+    Args:
+        count_max: Number of samples after which the gain stays at 1/count_max.
+
+    Raises:
+        ValueError: If `count_max` is not a whole number above 0.
+    """
+    if positive("count_max", count_max) % 1:
+        raise ValueError(f"count_max: {count_max!r} has to be a whole number")
+    return CappedRunningMean(int(count_max))

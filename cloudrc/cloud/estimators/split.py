@@ -1,0 +1,57 @@
+"""Delay estimator: the age of this very odometry plus the average delay of the way back.
+
+Source: control.md, section 4, "split": the best of those compared, because the jitter of the
+uplink is measured per packet and only that of the downlink has to be guessed.
+
+No synchronised clocks are needed. With `offset` = cloud's clock minus world's,
+
+    now - stamp of the odometry          = its age so far + offset    (exact, this packet)
+    application - stamp of the command   = downlink delay - offset    (averaged)
+
+and the sum is the time from the measurement to the application of the command.
+"""
+
+from __future__ import annotations
+
+from cloudrc.cloud import parameters
+from cloudrc.cloud.estimators import DelaySample, Estimator
+
+
+class Split(Estimator):
+    """Exact uplink age of each packet plus an exponential average of applied minus stamp."""
+
+    def __init__(self, gain: float) -> None:
+        """Start empty.
+
+        Args:
+            gain: Weight of a new sample of the downlink [1], above 0 and at most 1.
+        """
+        self._gain = gain
+        self._applied_minus_stamp: float | None = None
+
+    def update(self, sample: DelaySample) -> None:
+        """Add one applied-minus-stamp [s] to the average of the downlink."""
+        if self._applied_minus_stamp is None:
+            self._applied_minus_stamp = sample.applied_minus_stamp
+        else:
+            self._applied_minus_stamp += self._gain * (
+                sample.applied_minus_stamp - self._applied_minus_stamp
+            )
+
+    def horizon(self, age: float) -> float:
+        """Return the age of this odometry plus the average downlink [s]; the offsets cancel."""
+        if self._applied_minus_stamp is None:
+            return 0.0
+        return max(0.0, age + self._applied_minus_stamp)
+
+
+def build(gain: float = 0.05) -> Split:
+    """Make the estimator.
+
+    Args:
+        gain: Weight of a new sample of the downlink [1].
+
+    Raises:
+        ValueError: If `gain` is not above 0 and at most 1.
+    """
+    return Split(parameters.gain("gain", gain))

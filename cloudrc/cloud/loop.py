@@ -1,0 +1,173 @@
+"""The control loop: the newest telemetry becomes a command, through estimator, predictor, PID.
+
+A plug-in may be wrong: it raises, or returns something that is not finite. Then the loop does the
+careful thing (looks ahead by the last good horizon, uses the last sample, commands zero), counts
+it, and says once what happened; it never stops.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from math import isfinite
+
+from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.cloud.delays import DelayMeter
+from cloudrc.cloud.estimators import Estimator
+from cloudrc.cloud.predictors import Predictor
+from cloudrc.messages import ZERO, Command, Odometry, Setpoint, Telemetry
+from cloudrc.records import Control, Fault
+
+
+class ControlLoop:
+    """Estimator, predictor and controller of one session."""
+
+    def __init__(
+        self,
+        build_estimator: Callable[[], Estimator],
+        predictor: Predictor,
+        controller: Controller,
+    ) -> None:
+        """Join three plug-ins; the estimator is built anew for every session."""
+        self._build_estimator = build_estimator
+        self._predictor = predictor
+        self._controller = controller
+        self.faults: list[Fault] = []
+        self.counts: Counter[str] = Counter()
+        self.reset()
+
+    def reset(self) -> None:
+        """A new session begins: nothing measured in the old one counts."""
+        self._delays = DelayMeter(self._build_estimator(), self.counts)
+        self._predictor.reset()
+        self._controller.reset()
+        self._basis: Odometry | None = None
+        self._basis_arrival_ns = 0
+        self._horizon = 0.0
+
+    def start_mission(self) -> None:
+        """A mission begins within the session: the controller starts anew."""
+        self._controller.reset()
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is telemetry to compute a command from."""
+        return self._basis is not None
+
+    def observe(self, telemetry: Telemetry, now_ns: int) -> None:
+        """Take in telemetry that became the newest, at its arrival [ns, cloud's clock]."""
+        self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
+        try:
+            self._delays.observe(telemetry, now_ns)
+        except Exception as error:  # a plug-in is foreign code: anything may come out of it
+            self._note("estimator", error, now_ns)
+        try:
+            self._predictor.observe(telemetry.odometry)
+        except Exception as error:
+            self._note("predictor", error, now_ns)
+
+    def command(
+        self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
+    ) -> tuple[Command, Control]:
+        """Compute the command that is due now.
+
+        Args:
+            setpoint: Where to be.
+            now_ns: Cloud's clock [ns].
+            dt: Time since the last command [s], > 0.
+            epoch: Of the session, for the record.
+            counter: That the command will carry, for the record.
+        """
+        basis = self._basis
+        assert basis is not None, "ask `ready` first"
+        horizon = self._look_ahead(now_ns)
+        estimate = self._predict(basis, horizon, now_ns)
+        output = self._steer(estimate, setpoint, dt, now_ns)
+        hold_ns = now_ns - self._basis_arrival_ns
+        command = Command(now_ns, basis.stamp_ns, hold_ns, output.velocity, output.yaw_rate)
+        try:
+            self._predictor.commanded(command)
+        except Exception as error:
+            self._note("predictor", error, now_ns)
+        return command, Control(
+            now_ns,
+            epoch,
+            counter,
+            basis.stamp_ns,
+            horizon,
+            self._delays.rtt,
+            self._delays.loop_delay,
+            basis.position,
+            estimate.position,
+            estimate.orientation_wxyz,
+            estimate.velocity,
+            setpoint.position,
+            setpoint.waypoint,
+            output.velocity,
+            output.yaw_rate,
+            output.proportional,
+            output.integral,
+            output.derivative,
+        )
+
+    def take_faults(self) -> list[Fault]:
+        """Hand over what went wrong for the first time since the last call."""
+        faults, self.faults = self.faults, []
+        return faults
+
+    def _look_ahead(self, now_ns: int) -> float:
+        try:
+            self._horizon = self._delays.horizon(now_ns)
+        except Exception as error:
+            self._note("estimator", error, now_ns)
+        return self._horizon
+
+    def _predict(self, basis: Odometry, horizon: float, now_ns: int) -> Odometry:
+        try:
+            estimate = self._predictor.predict(basis, horizon)
+            _check_finite(estimate.position, estimate.velocity, estimate.orientation_wxyz)
+        except Exception as error:
+            self._note("predictor", error, now_ns)
+            return basis
+        return estimate
+
+    def _steer(
+        self, estimate: Odometry, setpoint: Setpoint, dt: float, now_ns: int
+    ) -> ControlOutput:
+        try:
+            output = self._controller.update(estimate, setpoint, dt)
+            _check_finite(output.velocity, (output.yaw_rate,))
+        except Exception as error:
+            self._note("controller", error, now_ns)
+            return ControlOutput(ZERO, 0.0)
+        return output
+
+    def _note(self, kind: str, error: Exception, now_ns: int) -> None:
+        """Count what a plug-in did wrong; report it the first time."""
+        code = f"{kind}_failed"
+        self.counts[code] += 1
+        if self.counts[code] == 1:
+            self.faults.append(Fault(now_ns, code, _explain(kind, error)))
+
+
+_INSTEAD = {
+    "estimator": "the last good horizon is used",
+    "predictor": "the last sample is used unpredicted",
+    "controller": "the command is zero velocity",
+}
+
+
+def _explain(kind: str, error: Exception) -> str:
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"the {kind} failed ({text}); {_INSTEAD[kind]}; mend cloud.{kind} or choose another"
+
+
+def _check_finite(*vectors: tuple[float, ...]) -> None:
+    """Refuse numbers that cannot be flown.
+
+    A sum is finite only if all its terms are; that it can overflow is no loss, since numbers of
+    that size cannot be flown either.
+    """
+    for vector in vectors:
+        if not isfinite(sum(vector)):
+            raise ValueError(f"it returned {vector}")

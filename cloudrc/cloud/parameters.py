@@ -1,0 +1,62 @@
+"""Checks of plug-in parameters: values from the experiment file come in, checked floats go out.
+
+Every error names the parameter, the value and the reason in one line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+
+from cloudrc.messages import Vector
+
+
+def not_negative(name: str, value: object) -> float:
+    """Return `value` if it is a finite number >= 0, whatever its unit.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{name}: {value!r} is not a number")
+    if not isfinite(value) or value < 0:
+        raise ValueError(f"{name}: {value!r} has to be finite and not negative")
+    return float(value)
+
+
+def positive(name: str, value: object) -> float:
+    """Return `value` if it is a finite number > 0, whatever its unit.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    number = not_negative(name, value)
+    if number == 0:
+        raise ValueError(f"{name}: {value!r} has to be above 0")
+    return number
+
+
+def gain(name: str, value: object) -> float:
+    """Return `value` if it can be the gain of an average: above 0, at most 1.
+
+    Raises:
+        ValueError: If it cannot.
+    """
+    number = positive(name, value)
+    if number > 1:
+        raise ValueError(f"{name}: {value!r} has to be at most 1")
+    return number
+
+
+def vector(name: str, value: object) -> Vector:
+    """Return `value` as a tuple if it is three finite numbers >= 0, one per axis.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 3:
+        raise ValueError(f"{name}: {value!r} has to be three numbers, for x, y and z")
+    x, y, z = (
+        not_negative(f"{name}[{axis}]", item) for axis, item in zip("xyz", value, strict=True)
+    )
+    return (x, y, z)

@@ -1,0 +1,55 @@
+"""Predictor: odometry and the last command come in; where that command leads goes out.
+
+Source: the authors' published controller, which multiplies the delay with the velocity that it
+commanded last, not with the measured one of the paper's eq. (3).
+"""
+
+from __future__ import annotations
+
+from cloudrc.cloud.predictors import Predictor
+from cloudrc.cloud.predictors._rotation import rotate_ahead
+from cloudrc.messages import ZERO, Command, Odometry
+
+
+class CommandedVelocity(Predictor):
+    """Last commanded velocity times horizon.
+
+    With a proportional controller u = -K (p + u tau) solves to u = -K p / (1 + K tau): this
+    predictor lowers the gain as the delay grows. It damps well and predicts badly.
+    """
+
+    def __init__(self) -> None:
+        self._commanded = ZERO
+
+    def commanded(self, command: Command) -> None:
+        """Remember the velocity of the newest command [m/s]."""
+        self._commanded = command.velocity
+
+    def reset(self) -> None:
+        """Forget the last command: zero velocity until the next one."""
+        self._commanded = ZERO
+
+    def predict(self, odometry: Odometry, horizon: float) -> Odometry:
+        """Move a sample ahead: p + u tau; the velocity stays as measured.
+
+        Source: the published code; the orientation by its measured rate, as in the others.
+
+        Args:
+            odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.
+            horizon: tau [s], >= 0.
+        """
+        px, py, pz = odometry.position
+        ux, uy, uz = self._commanded
+        rate = odometry.angular_velocity_body
+        return Odometry(
+            odometry.stamp_ns + round(horizon * 1e9),
+            (px + ux * horizon, py + uy * horizon, pz + uz * horizon),
+            rotate_ahead(odometry.orientation_wxyz, rate, horizon),
+            odometry.velocity,
+            rate,
+        )
+
+
+def build() -> CommandedVelocity:
+    """Make the predictor of the published code; it has no parameters."""
+    return CommandedVelocity()

@@ -1,0 +1,97 @@
+"""Predictor: odometry comes in; where it leads at the acceleration of late goes out.
+
+Source: eq. (3) of the paper with its acceleration, which is taken here from recent velocities;
+control.md, section 4, predictor (d).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from cloudrc.cloud.parameters import positive
+from cloudrc.cloud.predictors import Predictor
+from cloudrc.cloud.predictors._rotation import rotate_ahead
+from cloudrc.messages import ZERO, Odometry, Vector
+
+
+class ConstantAcceleration(Predictor):
+    """Measured velocity plus the acceleration between the ends of a short window."""
+
+    def __init__(self, window: float) -> None:
+        """Start without an acceleration.
+
+        Args:
+            window: Longest time between the two velocities that are compared [s].
+        """
+        self._window_ns = round(window * 1e9)
+        self._recent: deque[Odometry] = deque()
+        self._acceleration = ZERO
+
+    def observe(self, odometry: Odometry) -> None:
+        """Take the acceleration [m/s^2] between this sample and the oldest in the window.
+
+        A stamp that does not rise is ignored. After a gap longer than the window the acceleration
+        is zero until the next sample.
+        """
+        recent, stamp_ns = self._recent, odometry.stamp_ns
+        if recent and stamp_ns <= recent[-1].stamp_ns:
+            return
+        recent.append(odometry)
+        while stamp_ns - recent[0].stamp_ns > self._window_ns:
+            recent.popleft()
+        oldest = recent[0]
+        self._acceleration = _mean_acceleration(oldest, odometry) if len(recent) > 1 else ZERO
+
+    def reset(self) -> None:
+        """Forget all samples: no acceleration until there are two again."""
+        self._recent.clear()
+        self._acceleration = ZERO
+
+    def predict(self, odometry: Odometry, horizon: float) -> Odometry:
+        """Move a sample ahead: p + v tau + a tau^2 / 2, v + a tau.
+
+        Source: eq. (3b) for the velocity.
+        Deviation: eq. (3a) as printed has no acceleration in the position.
+
+        Args:
+            odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.
+            horizon: tau [s], >= 0.
+        """
+        px, py, pz = odometry.position
+        vx, vy, vz = odometry.velocity
+        ax, ay, az = self._acceleration
+        rate = odometry.angular_velocity_body
+        # Change of velocity over the horizon; half of it is the change of the mean velocity.
+        ax, ay, az = ax * horizon, ay * horizon, az * horizon
+        return Odometry(
+            odometry.stamp_ns + round(horizon * 1e9),
+            (
+                px + (vx + 0.5 * ax) * horizon,
+                py + (vy + 0.5 * ay) * horizon,
+                pz + (vz + 0.5 * az) * horizon,
+            ),
+            rotate_ahead(odometry.orientation_wxyz, rate, horizon),
+            (vx + ax, vy + ay, vz + az),
+            rate,
+        )
+
+
+def _mean_acceleration(start: Odometry, end: Odometry) -> Vector:
+    """Mean acceleration between two samples [m/s^2], shape (3,)."""
+    per_second = 1e9 / (end.stamp_ns - start.stamp_ns)
+    ax, ay, az = start.velocity
+    bx, by, bz = end.velocity
+    return ((bx - ax) * per_second, (by - ay) * per_second, (bz - az) * per_second)
+
+
+def build(window: float = 0.05) -> ConstantAcceleration:
+    """Make the predictor.
+
+    Args:
+        window: Longest time between the two velocities that are compared [s]; at least one
+            period of the odometry. Longer is calmer under noise and lags more, by half of it.
+
+    Raises:
+        ValueError: If `window` is not above 0.
+    """
+    return ConstantAcceleration(positive("window", window))

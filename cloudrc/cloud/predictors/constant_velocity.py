@@ -1,0 +1,39 @@
+"""Predictor: odometry comes in; where it leads at constant velocity goes out.
+
+Source: eqs. (2) and (3) of the paper, in its text.
+"""
+
+from __future__ import annotations
+
+from cloudrc.cloud.predictors import Predictor
+from cloudrc.cloud.predictors._rotation import rotate_ahead
+from cloudrc.messages import Odometry
+
+
+class ConstantVelocity(Predictor):
+    """Measured velocity times horizon; the orientation turns on at the measured rate."""
+
+    def predict(self, odometry: Odometry, horizon: float) -> Odometry:
+        """Move a sample ahead: p + v tau, v + a tau with a = 0.
+
+        Source: eq. (3a); (3b) with zero acceleration, which the robot does not measure.
+
+        Args:
+            odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.
+            horizon: tau [s], >= 0.
+        """
+        px, py, pz = odometry.position
+        vx, vy, vz = velocity = odometry.velocity
+        rate = odometry.angular_velocity_body
+        return Odometry(
+            odometry.stamp_ns + round(horizon * 1e9),
+            (px + vx * horizon, py + vy * horizon, pz + vz * horizon),
+            rotate_ahead(odometry.orientation_wxyz, rate, horizon),
+            velocity,
+            rate,
+        )
+
+
+def build() -> ConstantVelocity:
+    """Make the predictor of eq. (3); it has no parameters."""
+    return ConstantVelocity()

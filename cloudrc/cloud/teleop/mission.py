@@ -1,0 +1,256 @@
+"""The mission: operator's verbs and the robot as seen come in; setpoints and requests go out.
+
+A pure state machine (`State`), joined to controller and robot by messages only:
+
+    teleop.see(seen, now_ns)            with every telemetry that becomes the newest
+    teleop.operate(verb, now_ns)        when the operator says something
+    teleop.handle_deadline(now_ns)      regularly, at 10 Hz or faster
+    teleop.take_outputs()               after any of them: Setpoint, OperatorRequest, MissionEvent
+
+A `Setpoint` comes out when it changes and holds until the next; an `OperatorRequest` comes out at
+10 Hz until the robot is seen to have acted on it; each `MissionEvent` comes out once.
+
+              StartMission             start seen             every waypoint reached
+        IDLE -------------> STARTING -------------> FLYING --------------------------> DONE
+    (or any end)                                Hold | ^ Resume
+                                                     v |
+                                                     HELD
+
+Cancel leads from STARTING, FLYING and HELD to CANCELLED; a limit of time, a world that restarts
+or a guard that lands lead to FAILED. Every end holds: the robot is asked to hold by itself, and
+the setpoint stays where it was seen. Times are integer nanoseconds of the caller's clock.
+"""
+
+from __future__ import annotations
+
+from math import dist
+
+from cloudrc.cloud.teleop.messages import (
+    Cancel,
+    GoTo,
+    Hold,
+    Outcome,
+    Output,
+    Resume,
+    Seen,
+    StartMission,
+    State,
+    Verb,
+)
+from cloudrc.cloud.teleop.plan import Leg, Plan
+from cloudrc.cloud.teleop.request import Repeater
+from cloudrc.errors import BadInputError
+from cloudrc.messages import ZERO, GuardState, Request, Setpoint, Start, Vector
+from cloudrc.records import MissionEvent
+
+UNDER_WAY = (State.STARTING, State.FLYING, State.HELD)
+NO_WAYPOINT = -1
+NO_PLAN = Plan((Leg(ZERO),))
+"""Stands in until the first mission starts; never flown."""
+
+
+class Teleop:
+    """Flies missions, one after the other.
+
+    Attributes:
+        state: Of the mission.
+        outcome: How it ended; None while there is none or it is under way.
+    """
+
+    def __init__(self) -> None:
+        self.state = State.IDLE
+        self.outcome: Outcome | None = None
+        self._requests = Repeater()
+        self._outputs: list[Output] = []
+        self._seen: Seen | None = None
+        self._plan = NO_PLAN
+        self._leg = 0
+        self._yaw = 0.0
+        self._began_ns = self._leg_began_ns = self._held_ns = 0
+        self._within_since_ns: int | None = None
+
+    @property
+    def settled(self) -> bool:
+        """Whether the robot is seen to have acted on the last request."""
+        return self._requests.settled
+
+    def take_outputs(self) -> list[Output]:
+        """Hand over what teleop has said since the last call, oldest first."""
+        outputs, self._outputs = self._outputs, []
+        return outputs
+
+    def operate(self, verb: Verb, now_ns: int) -> None:
+        """Do what the operator says.
+
+        GoTo is a mission of one waypoint that starts from here; while a mission is held it moves
+        only the point where it is held, and Resume goes on with the leg as before.
+
+        Raises:
+            BadInputError: If the state does not allow it or a value cannot be used; nothing has
+                changed then.
+        """
+        match verb:
+            case StartMission(plan):
+                self._refuse_unless("start", self.state not in UNDER_WAY, "cancel it first")
+                self._start(plan, now_ns)
+            case Hold():
+                self._refuse_unless("hold", self.state is State.FLYING, "it has to be flying")
+                self._hold(now_ns)
+            case Resume():
+                self._refuse_unless("resume", self.state is State.HELD, "it has to be held")
+                self._resume(now_ns)
+            case Cancel():
+                self._refuse_unless("cancel", self.state in UNDER_WAY, "there is none under way")
+                self._end(State.CANCELLED, "cancelled", "mission cancelled", now_ns)
+            case GoTo(position, yaw):
+                leg = Leg(position, yaw)
+                moving = self.state in (State.STARTING, State.FLYING)
+                self._refuse_unless("goto", not moving, "hold or cancel it first")
+                self._go_to(leg, now_ns)
+
+    def see(self, seen: Seen, now_ns: int) -> None:
+        """Take note of the newest telemetry, at the instant [ns] at which it arrives."""
+        before, self._seen = self._seen, seen
+        restarted = before is not None and seen.epoch != before.epoch
+        started = self._requests.see(seen) and self.state is State.STARTING
+        if self.state not in UNDER_WAY:
+            if before is None or restarted:
+                self._aim(seen.position, self._yaw, NO_WAYPOINT)
+        elif restarted and not self._expects_restart():
+            self._fail("world_restarted", f"world restarted {self._where()}", now_ns)
+        elif started:
+            self._begin(now_ns)
+        elif seen.guard > GuardState.HOLD and self.state is not State.STARTING:
+            self._fail("guard_stopped", f"guard went to {seen.guard.name} {self._where()}", now_ns)
+        while self.state is State.FLYING and self._is_reached(seen.position, now_ns):
+            self._advance(now_ns)
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """Check the limits of time and repeat the request that is due at `now_ns` [ns]."""
+        if self.state in UNDER_WAY:
+            self._check_time(now_ns)
+        request = self._requests.due(now_ns)
+        if request is not None:
+            self._outputs.append(request)
+
+    def _start(self, plan: Plan, now_ns: int) -> None:
+        self.state, self.outcome = State.STARTING, None
+        self._plan, self._leg = plan, 0
+        self._began_ns = now_ns
+        self._requests.ask(Request.START, plan.start)
+        # Already now, so that the first command that the started robot gets leads the right way.
+        self._aim_at_leg()
+
+    def _begin(self, now_ns: int) -> None:
+        """The robot is seen to have started: the clocks of mission and leg begin."""
+        plan = self._plan
+        self.state = State.FLYING
+        self._began_ns = now_ns
+        self._begin_leg(now_ns)
+        where = "from the spawn" if plan.start is Start.SPAWN else "from here"
+        self._tell("started", 0, f"mission started {where}, waypoints: {len(plan.legs)}", now_ns)
+
+    def _begin_leg(self, now_ns: int) -> None:
+        self._leg_began_ns = now_ns
+        self._within_since_ns = None
+
+    def _is_reached(self, position: Vector, now_ns: int) -> bool:
+        """True once the robot has been seen near the waypoint for as long as the leg asks."""
+        leg = self._plan.legs[self._leg]
+        if dist(position, leg.position) > leg.tolerance:
+            self._within_since_ns = None
+            return False
+        if self._within_since_ns is None:
+            self._within_since_ns = now_ns
+        return now_ns - self._within_since_ns >= leg.dwell * 1e9
+
+    def _advance(self, now_ns: int) -> None:
+        """The waypoint is reached: on to the next, or done."""
+        index, count = self._leg, len(self._plan.legs)
+        text = f"{self._waypoint_text()} reached at {self._elapsed(now_ns):.2f} s"
+        self._tell("reached", index, text, now_ns)
+        self._leg += 1
+        if self._leg < count:
+            self._begin_leg(now_ns)
+            self._aim_at_leg()
+        else:
+            text = f"mission done at {self._elapsed(now_ns):.2f} s"
+            self._end(State.DONE, "done", text, now_ns)
+
+    def _hold(self, now_ns: int) -> None:
+        self.state = State.HELD
+        self._held_ns = now_ns
+        self._aim_here()
+        self._tell("held", self._leg, f"held {self._where()}", now_ns)
+
+    def _resume(self, now_ns: int) -> None:
+        self.state = State.FLYING
+        self._leg_began_ns += now_ns - self._held_ns
+        self._within_since_ns = None
+        self._aim_at_leg()
+        self._tell("resumed", self._leg, f"resumed {self._where()}", now_ns)
+
+    def _go_to(self, leg: Leg, now_ns: int) -> None:
+        x, y, z = leg.position
+        self._tell("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
+        if self.state is State.HELD:
+            self._aim(leg.position, leg.yaw, NO_WAYPOINT)
+        else:
+            self._start(Plan((leg,), Start.HERE, leg.time_limit), now_ns)
+
+    def _check_time(self, now_ns: int) -> None:
+        plan = self._plan
+        limit, leg = plan.time_limit, plan.legs[self._leg]
+        if now_ns - self._began_ns >= limit * 1e9:
+            if self.state is State.STARTING:
+                text = f"the robot has not started within {limit:g} s; is the link up?"
+            else:
+                text = f"mission not done within {limit:g} s: {self._where()}"
+            self._fail("timed_out", text, now_ns)
+        elif self.state is State.FLYING and now_ns - self._leg_began_ns >= leg.time_limit * 1e9:
+            text = f"{self._waypoint_text()} not reached within {leg.time_limit:g} s"
+            self._fail("leg_timed_out", text, now_ns)
+
+    def _fail(self, code: str, text: str, now_ns: int) -> None:
+        self._end(State.FAILED, code, text, now_ns)
+
+    def _end(self, state: State, code: str, text: str, now_ns: int) -> None:
+        """However the mission ends, the robot is asked to hold where it is."""
+        waypoint = min(self._leg, len(self._plan.legs) - 1)
+        self.state = state
+        self.outcome = Outcome(code, text, waypoint, reached=self._leg)
+        self._requests.ask(Request.END)
+        self._aim_here()
+        self._tell(code, waypoint, text, now_ns)
+
+    def _aim_at_leg(self) -> None:
+        leg = self._plan.legs[self._leg]
+        self._aim(leg.position, leg.yaw, self._leg)
+
+    def _aim_here(self) -> None:
+        if self._seen is not None:
+            self._aim(self._seen.position, self._yaw, NO_WAYPOINT)
+
+    def _aim(self, position: Vector, yaw: float, waypoint: int) -> None:
+        self._yaw = yaw
+        self._outputs.append(Setpoint(position, yaw, waypoint))
+
+    def _tell(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
+        self._outputs.append(MissionEvent(now_ns, event, waypoint, text))
+
+    def _expects_restart(self) -> bool:
+        return self.state is State.STARTING and self._plan.start is Start.SPAWN
+
+    def _elapsed(self, now_ns: int) -> float:
+        """Time since the mission began [s]."""
+        return (now_ns - self._began_ns) * 1e-9
+
+    def _waypoint_text(self) -> str:
+        return f"waypoint {self._leg + 1} of {len(self._plan.legs)}"
+
+    def _where(self) -> str:
+        return f"on the way to {self._waypoint_text()}"
+
+    def _refuse_unless(self, verb: str, allowed: bool, why: str) -> None:
+        if not allowed:
+            raise BadInputError(f"{verb}: the mission is {self.state.name}; {why}")

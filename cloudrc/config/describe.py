@@ -1,0 +1,162 @@
+"""What a key may hold: the schema goes in, words with type, range, unit and neighbours come out."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator, Sequence
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from cloudrc.config.yaml_text import Path
+
+_TYPES = {
+    float: "a number",
+    int: "a whole number",
+    str: "text",
+    bool: "true or false",
+    NoneType: "null",
+}
+_SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
+
+
+def leaves(model: type[BaseModel], above: Path = ()) -> Iterator[tuple[Path, FieldInfo]]:
+    """List all keys that hold no further keys, with their fields; index 0 stands for any."""
+    for key, info in model.model_fields.items():
+        inner = list(_models(info.annotation))
+        many = ("0",) if _is_list(info.annotation) else ()
+        if not inner or str in _types(info.annotation) or float in _types(info.annotation):
+            yield (*above, key), info
+        for section in inner:
+            yield from leaves(section, (*above, key, *many))
+
+
+def field_at(model: type[BaseModel], path: Path) -> FieldInfo | None:
+    """Give the field that the last key of `path` names; None if there is none."""
+    field = None
+    models = [model]
+    for key in path:
+        if key.isdigit():
+            continue
+        found = [inner.model_fields[key] for inner in models if key in inner.model_fields]
+        if not found:
+            return None
+        field = found[0]
+        models = [inner for info in found for inner in _models(info.annotation)]
+    return field
+
+
+def expectation(model: type[BaseModel], path: Path) -> str:
+    """Say what the value at `path` must be: "must be a number >= 0 [ms]"."""
+    field = field_at(model, path)
+    if field is None:
+        return "is not valid"
+    inside_list = path[-1].isdigit()
+    if get_origin(field.annotation) is Literal:
+        return f"must be one of {', '.join(map(repr, get_args(field.annotation)))}"
+    words = [_TYPES[kind] for kind in dict.fromkeys(_types(field.annotation)) if kind in _TYPES]
+    if words and words[0].endswith("number"):
+        words[0] = " ".join([words[0], " and ".join(dict.fromkeys(_limits(field)))]).strip()
+    if any(_models(field.annotation)):
+        words.append("a mapping of keys")
+    if _is_list(field.annotation) and not inside_list:
+        words = [_list_in_words(field.annotation)]
+    return " ".join(["must be", " or ".join(words), _unit(field)]).strip()
+
+
+def nearest_key(model: type[BaseModel], path: Path) -> str:
+    """Say which known key an unknown one may have been meant for."""
+    *above, key = path
+    siblings = _keys_at(model, tuple(above))
+    near = _near(key, siblings)
+    if near:
+        field = field_at(model, (*above, near))
+        unit = _unit(field) if field else ""
+        return f"did you mean {near}{' ' if unit else ''}{unit}?"
+    everywhere = {leaf[-1]: ".".join(leaf) for leaf, _ in reversed(list(leaves(model)))}
+    near = _near(key, list(everywhere))
+    if near:
+        return f"did you mean {everywhere[near]}?"
+    return f"known here: {', '.join(siblings)}" if siblings else "no key is known here"
+
+
+def nearest_choice(detail: ErrorDetails) -> str:
+    """Say which of the allowed words a wrong one may have been meant for."""
+    expected = detail["ctx"]["expected"]
+    near = _near(str(detail["input"]), re.findall(r"'([^']*)'", expected))
+    return f"must be {expected}" + (f"; did you mean {near}?" if near else "")
+
+
+def _near(key: str, known: list[str]) -> str | None:
+    # `delay` means `delay_ms`: units are forgotten more often than letters are swapped.
+    begun = [name for name in known if name.startswith(f"{key}_")]
+    close = difflib.get_close_matches(key, known, n=1)
+    return next(iter(begun or close), None)
+
+
+def _keys_at(model: type[BaseModel], path: Path) -> list[str]:
+    field = field_at(model, path)
+    models = [model] if not path else list(_models(field.annotation)) if field else []
+    return [key for inner in models for key in inner.model_fields]
+
+
+def _types(annotation: Any) -> Iterator[Any]:
+    """List the plain types, models and literals in an annotation, aliases and unions opened."""
+    if get_origin(annotation) is Literal:
+        return
+    arguments = [argument for argument in get_args(annotation) if argument is not Ellipsis]
+    if hasattr(annotation, "__metadata__"):
+        arguments = arguments[:1]
+    if not arguments:
+        yield annotation
+    for argument in arguments:
+        yield from _types(argument)
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    for kind in _types(annotation):
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield kind
+
+
+def _is_list(annotation: Any) -> bool:
+    return any(
+        get_origin(kind) in (tuple, list, Sequence) for kind in (annotation, *get_args(annotation))
+    )
+
+
+def _list_in_words(annotation: Any) -> str:
+    size = len(get_args(annotation)) if get_origin(annotation) is tuple else 0
+    numbers = " numbers" if float in _types(annotation) else ""
+    fixed = size and Ellipsis not in get_args(annotation)
+    null = " or null" if NoneType in get_args(annotation) else ""
+    return (
+        f"a list of {size}{numbers}"
+        if fixed
+        else f"a list{' of' if numbers else ''}{numbers}{null}"
+    )
+
+
+def _limits(part: Any) -> Iterator[str]:
+    """List the limits in a field or an annotation, as ">= 0"."""
+    if isinstance(part, FieldInfo):
+        yield from (text for item in part.metadata for text in _limits(item))
+        yield from _limits(part.annotation)
+    elif type(part) in _SIGNS:
+        limit = next(
+            getattr(part, name) for name in ("ge", "gt", "le", "lt") if hasattr(part, name)
+        )
+        yield f"{_SIGNS[type(part)]} {limit}"
+    else:
+        for item in (*getattr(part, "__metadata__", ()), *get_args(part)):
+            yield from _limits(item)
+
+
+def _unit(field: FieldInfo) -> str:
+    found = re.search(r"\[[^\],]+\]$|\[[^\],]+\](?=[,; ])", field.description or "")
+    return found.group() if found else ""

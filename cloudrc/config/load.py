@@ -1,0 +1,224 @@
+"""Loads experiments: a name or path and `--set` texts go in, a resolved experiment comes out.
+
+In this order: the file is read; `--set` is applied; mission and profile are looked up and put in
+their places, under the values that the experiment gives itself; plug-ins are completed from their
+signatures; and the whole is checked against the schema, the scene and the disk. All that is wrong
+is said at once, each with the line it stands in.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from cloudrc.config import overrides, parameters, problems, shipped, yaml_text
+from cloudrc.config.document import Document
+from cloudrc.config.mission_check import check_mission
+from cloudrc.config.problems import Problem
+from cloudrc.config.resolved import COMMAND_AGE_MAX_MS, ResolvedExperiment
+from cloudrc.config.schema import Experiment, Mission, Profile
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.scene import load_scene
+from cloudrc.link.trace import read_trace
+
+_Model = TypeVar("_Model", bound=BaseModel)
+_DIRECTIONS = ("uplink", "downlink")
+
+
+def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
+    """Load an experiment.
+
+    Args:
+        name: Of a shipped experiment, or the path of a file.
+        settings: `key=value` texts over it, in any order.
+
+    Returns:
+        The experiment, complete and checked; paths in it are absolute.
+
+    Raises:
+        BadInputError: One line, or a summary and one line for each thing that is wrong.
+    """
+    document = shipped.read("experiment", str(name), Path())
+    changes = overrides.parse(settings)
+    _default(document, ("name",), Path(name).stem)
+    before = [change for change in changes if not change.inside_name]
+    if any(change.path in (("link",), ("link", "profile")) for change in before):
+        _forget_profile(document)
+    overrides.apply(document, before)
+    for key in ("world", "guard", "link", "cloud"):
+        _default(document, (key,), {})
+    found = [*_inline_mission(document), *_inline_profile(document)]
+    overrides.apply(document, [change for change in changes if change.inside_name])
+    for key in parameters.KINDS:
+        _default(document, ("cloud", key), Experiment().cloud.model_dump()[key])
+    found += [*parameters.resolve(document), *_resolve_traces(document, ("link",))]
+    found += _check_files(document)
+    experiment = _validate(document, ResolvedExperiment, str(name), found)
+    scene = load_scene(experiment.world.scene)
+    wrong = [
+        Problem(("mission", *problem.path), problem.value, problem.reason)
+        for problem in check_mission(experiment.mission, scene)
+    ]
+    problems.refuse(document, wrong, str(name))
+    return experiment
+
+
+def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
+    """Load a link profile by its name or path (relative to `folder`); raises BadInputError."""
+    return _load_profile(str(name), folder or Path())[1]
+
+
+def load_mission(name: str | Path, folder: Path | None = None) -> Mission:
+    """Load a mission by its name or path (relative to `folder`); raises BadInputError.
+
+    Whether a scene lets it be flown is for `config.mission_check.check_mission` to say.
+    """
+    document = shipped.read("mission", str(name), folder or Path())
+    return _validate(document, Mission, str(name), [])
+
+
+def dump(experiment: ResolvedExperiment) -> str:
+    """Write an experiment as YAML that loads to an equal one and needs no other configuration.
+
+    Traces and plug-ins that lie outside the package are named by their absolute paths; whoever
+    keeps the text may copy a trace beside it and name it relative to it.
+    """
+    return yaml_text.write(experiment.model_dump(mode="json"))
+
+
+def _load_profile(name: str, folder: Path) -> tuple[Document, Profile]:
+    document = shipped.read("profile", name, folder)
+    wrong = _resolve_traces(document, ())
+    return document, _validate(document, Profile, name, wrong)
+
+
+def _validate(document: Document, model: type[_Model], name: str, found: list[Problem]) -> _Model:
+    """Check a document against its model; raise with `found` and all that is wrong with it."""
+    result = None
+    # What is resolved is still described as what a file may say: a mission has a name, too.
+    file_model = Experiment if model is ResolvedExperiment else model
+    try:
+        # YAML's values are JSON's: in its JSON mode pydantic takes lists for tuples, and is strict.
+        result = model.model_validate_json(json.dumps(document.tree))
+    except ValidationError as error:
+        known = {problem.path for problem in found}
+        found = found + [
+            problem
+            for problem in problems.from_pydantic(error, file_model)
+            if problem.path not in known
+        ]
+    problems.refuse(document, found, name)
+    assert result is not None
+    return result
+
+
+def _default(document: Document, path: yaml_text.Path, value: Any) -> None:
+    if document.get(*path) is None and isinstance(document.get(*path[:-1]), dict):
+        document.graft(path, value, document.source(path))
+
+
+def _inline_mission(document: Document) -> list[Problem]:
+    """Put the mission's file in the place of its name."""
+    _default(document, ("mission",), Experiment().mission)
+    name = document.tree["mission"]
+    if not isinstance(name, str):
+        return []
+    source = document.source(("mission",))
+    document.tree["mission"] = {}
+    try:
+        mission = shipped.read("mission", name, source.folder)
+        _validate(mission, Mission, name, [])
+    except BadInputError as error:
+        return [Problem(("mission",), "", str(error))]
+    document.graft(("mission",), mission.tree, mission)
+    return []
+
+
+def _inline_profile(document: Document) -> list[Problem]:
+    """Put the profile under what the experiment itself says about the two directions."""
+    _default(document, ("link", "profile"), Experiment().link.profile)
+    name = document.get("link", "profile")
+    given = {key: document.get("link", key) for key in _DIRECTIONS}
+    if not isinstance(name, str) or all(map(overrides.is_spelled_out, given.values())):
+        return []
+    source = document.source(("link", "profile"))
+    try:
+        file, profile = _load_profile(name, source.folder)
+    except BadInputError as error:
+        return [Problem(("link", "profile"), "", str(error))]
+    if shipped.is_path(name):
+        document.graft(("link", "profile"), str((source.folder / name).resolve()), source)
+    for key in _DIRECTIONS:
+        if isinstance(given[key], dict | None):
+            _lay_under(document, ("link", key), file, key)
+    age_max = profile.command_age_max_ms or COMMAND_AGE_MAX_MS
+    _default(document, ("guard", "command_age_max_ms"), age_max)
+    return []
+
+
+def _lay_under(document: Document, path: yaml_text.Path, file: Document, key: str) -> None:
+    """Fill what is not given at `path` from `key` of another file."""
+    _default(document, path, {})
+    given = document.get(*path)
+    for name, value in (file.get(key) or {}).items():
+        if name not in given:
+            given[name] = value
+            document.sources |= {
+                (*path, *source_path[1:]): source
+                for source_path, source in file.sources.items()
+                if source_path[:2] == (key, name)
+            }
+
+
+def _forget_profile(document: Document) -> None:
+    """Undo in a resolved file what its profile gave, before another profile takes its place."""
+    link, guard = document.get("link"), document.get("guard")
+    if not isinstance(link, dict):
+        return
+    if not all(overrides.is_spelled_out(link.get(key)) for key in _DIRECTIONS):
+        return
+    for key in _DIRECTIONS:
+        del link[key]
+    try:
+        age_max = load_profile(str(link.get("profile"))).command_age_max_ms
+    except BadInputError:
+        age_max = None  # the label of a profile that is gone
+    if isinstance(guard, dict) and guard.get("command_age_max_ms") == (
+        age_max or COMMAND_AGE_MAX_MS
+    ):
+        del guard["command_age_max_ms"]
+
+
+def _resolve_traces(document: Document, above: yaml_text.Path) -> list[Problem]:
+    """Make the paths of traces absolute."""
+    found = []
+    for key in _DIRECTIONS:
+        path = (*above, key, "trace")
+        trace = document.get(*path)
+        if not isinstance(trace, str):
+            continue
+        source = document.source(path)
+        absolute = (source.folder / Path(trace).expanduser()).resolve()
+        document.graft(path, str(absolute), source)
+        try:
+            read_trace(absolute)
+        except BadInputError as error:
+            found.append(Problem(path, "", str(error)))
+    return found
+
+
+def _check_files(document: Document) -> list[Problem]:
+    """Check that robot and scene are files that ship."""
+    found = []
+    for key in ("robot", "scene"):
+        name = document.get("world", key)
+        if isinstance(name, str):
+            try:
+                shipped.check_name(key, name)
+            except BadInputError as error:
+                found.append(Problem(("world", key), "", str(error)))
+    return found

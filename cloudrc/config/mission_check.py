@@ -1,0 +1,96 @@
+"""Whether a mission can be flown: mission and scene go in, what is wrong comes out.
+
+Checked are the fence and, with the base's box and the arm, the walls of the pipes. The board is
+exempt: the paper's last waypoint lies behind it. The rotors are too: they have no say in where the
+base can be asked to go, only in how near the flight comes, which the metrics judge.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cloudrc.config.problems import Problem
+from cloudrc.config.schema import MAX_WAYPOINTS, Mission, Steps
+from cloudrc.geometry import fence
+from cloudrc.geometry.placement import nearest_legal, outside_fence, overlapped_pipe
+from cloudrc.geometry.scene import Scene
+from cloudrc.messages import Vector
+
+_REPORTED = 20  # a mission in wrong units is wrong everywhere: enough is enough
+
+
+def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
+    """List what makes a mission impossible in a scene.
+
+    Args:
+        mission: Waypoints or steps.
+        scene: Where it is to be flown.
+
+    Returns:
+        Problems, their paths below the mission; none if it can be flown.
+    """
+    count = len(mission.waypoints)
+    if mission.steps is not None:
+        if count:
+            reason = "a mission has waypoints or steps, not both; delete one"
+            return [Problem(("steps",), "", reason)]
+        return _check_steps(mission.steps, scene)
+    if count == 0:
+        return [Problem(("waypoints",), "", "none given; give at least one, or steps")]
+    if count > MAX_WAYPOINTS:
+        reason = f"at most {MAX_WAYPOINTS}; split the mission"
+        return [Problem(("waypoints",), str(count), reason)]
+    return _check_waypoints(mission, scene)
+
+
+def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
+    positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
+    yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
+    outside = outside_fence(positions)
+    hit = overlapped_pipe(scene, positions, yaws)
+    wrong = np.flatnonzero(outside | (hit >= 0))
+    problems = []
+    for index in wrong[:_REPORTED]:
+        point = mission.waypoints[index].position_m
+        if outside[index]:
+            reason = f"beyond the fence, {_fence_in_words()}"
+        else:
+            reason = f"base box or arm overlaps the wall of {scene.pipes[hit[index]].name}"
+        near = nearest_legal(scene, point, float(yaws[index]))
+        if near is not None:
+            reason += f"; nearest legal point found: {_point(near)}"
+        path = ("waypoints", str(index), "position_m")
+        problems.append(Problem(path, _point(point), reason))
+    if len(wrong) > _REPORTED:
+        rest = f"{len(wrong) - _REPORTED} more waypoints are beyond the fence or in a pipe's wall"
+        problems.append(Problem(("waypoints",), "", rest))
+    return problems
+
+
+def _check_steps(steps: Steps, scene: Scene) -> list[Problem]:
+    centre, reach = np.array(steps.centre_m), np.array(steps.range_m)
+    axis = np.linspace(-1, 1, 9)
+    box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    with np.errstate(over="ignore"):  # a point at infinity is beyond the fence too
+        positions = centre + box * reach
+    if outside_fence(positions).any():
+        reason = f"steps reach beyond the fence, {_fence_in_words()}; choose a smaller range_m"
+        return [Problem(("steps",), "", reason)]
+    hit = overlapped_pipe(scene, positions, np.zeros(len(positions)))
+    if (hit >= 0).any():
+        name = scene.pipes[hit.max()].name
+        reason = f"steps can end in the wall of {name}; choose another centre_m, range_m or scene"
+        return [Problem(("steps",), "", reason)]
+    return []
+
+
+def _fence_in_words() -> str:
+    spans = (
+        f"{name} {low:g} to {high:g}"
+        for name, low, high in zip("xyz", fence.LOW, fence.HIGH, strict=True)
+    )
+    return f"{', '.join(spans)} [m]"
+
+
+def _point(position: Vector) -> str:
+    return f"[{', '.join(f'{value:g}' for value in position)}]"

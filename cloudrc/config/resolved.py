@@ -1,0 +1,50 @@
+"""An experiment with nothing left to look up: what the ends, the link and the report are made from.
+
+Names have become what they stand for: the mission is inline, the link's directions are spelled
+out, plug-ins carry all their parameters, limits have their values. Written to a file it is still
+an experiment file, and flies the same run again.
+"""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from cloudrc.config.fields import Positive
+from cloudrc.config.schema import Cloud, Direction, Experiment, Guard, Mission, PlugIn
+
+COMMAND_AGE_MAX_MS = 250.0
+"""Where neither the experiment nor the profile says [ms]. Source: DESIGN, section 5."""
+
+
+class ResolvedGuard(Guard):
+    """A guard whose limits are all known."""
+
+    command_age_max_ms: Positive = Field(
+        COMMAND_AGE_MAX_MS, description="A command whose basis is older is not flown [ms]"
+    )
+
+
+class ResolvedCloud(Cloud):
+    """Plug-ins with all their parameters, those of the defaults too."""
+
+    estimator: PlugIn
+    predictor: PlugIn
+    controller: PlugIn
+
+
+class ResolvedExperiment(Experiment):
+    """An experiment with nothing left to look up."""
+
+    mission: Mission
+    guard: ResolvedGuard
+    cloud: ResolvedCloud
+
+    @property
+    def uplink(self) -> Direction:
+        """World to cloud, complete."""
+        return self.link.uplink
+
+    @property
+    def downlink(self) -> Direction:
+        """Cloud to world, complete."""
+        return self.link.downlink

@@ -1,0 +1,87 @@
+"""What a process tells the one that started it: a few of its records, one line of JSON each.
+
+A process in flight writes lines to its standard output, which must never block it: if nobody reads
+them they are lost. The supervisor makes records of them again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from enum import IntEnum
+from typing import Any, get_origin, get_type_hints
+
+from cloudrc import records as kinds
+from cloudrc.records import Control, GuardChange, Lateness, MissionEvent, Record, TelemetrySent
+
+READY = "ready"
+"""The line that a process writes once it can receive."""
+PERIOD_NS = 100_000_000
+EVENTS = (GuardChange, MissionEvent)
+"""Every one of these is told."""
+SAMPLED = (TelemetrySent, Control, Lateness)
+"""Of these one every 100 ms."""
+
+
+class Feed:
+    """The telling end: picks records and writes them to a pipe that does not block."""
+
+    def __init__(self, descriptor: int = 1) -> None:
+        """Write to this file descriptor; standard output if none is given."""
+        self._descriptor = descriptor
+        self._told_ns: dict[type, int] = {}
+        os.set_blocking(descriptor, False)
+
+    def ready(self) -> None:
+        """Say that the process can receive."""
+        self._write(READY)
+
+    def tell(self, records: Iterable[Record]) -> None:
+        """Tell those of the records that somebody who watches wants to see."""
+        for record in records:
+            if isinstance(record, EVENTS) or (isinstance(record, SAMPLED) and self._due(record)):
+                self._write(to_line(record))
+
+    def _due(self, record: Record) -> bool:
+        last_ns = self._told_ns.get(type(record))
+        if last_ns is not None and record.stamp_ns - last_ns < PERIOD_NS:
+            return False
+        self._told_ns[type(record)] = record.stamp_ns
+        return True
+
+    def _write(self, line: str) -> None:
+        try:
+            os.write(self._descriptor, line.encode() + b"\n")
+        except OSError:  # full or closed: to watch is a courtesy, to fly is not
+            pass
+
+
+def to_line(record: Record) -> str:
+    """Write a record as one line of JSON: the name of its type, then its fields in order."""
+    return json.dumps([type(record).__name__, record])
+
+
+def from_line(line: str) -> Record:
+    """Read a record from its line.
+
+    Raises:
+        ValueError: If it is not one.
+    """
+    try:
+        name, values = json.loads(line)
+        record: Record = _build(getattr(kinds, name), values)
+    except (TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"not a record: {line!r}") from error
+    return record
+
+
+def _build(kind: Any, value: Any) -> Any:
+    """Make a value of this type from what JSON has for it."""
+    if hasattr(kind, "_fields"):
+        hints = get_type_hints(kind)
+        fields = zip(kind._fields, value, strict=True)
+        return kind(*[_build(hints[name], item) for name, item in fields])
+    if get_origin(kind) is tuple:
+        return tuple(value)
+    return kind(value) if isinstance(kind, type) and issubclass(kind, IntEnum) else value

@@ -1,0 +1,182 @@
+"""Local mode: relay, world and cloud as three processes on this machine, and who watches them.
+
+The supervisor starts them in the order in which they need each other, reads what they tell, and
+ends all of them when the mission is over, one of them dies, or the user interrupts.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from cloudrc.drivers.feed import READY, from_line
+from cloudrc.errors import CloudrcError, InvalidRunError
+from cloudrc.records import Record
+
+START_LIMIT = 60.0
+"""For a process to become ready [s]; a cold start reads some 100 MB from disk."""
+STOP_LIMIT = 1.5
+"""For a process to end by itself once it is asked to [s]."""
+LOOPBACK = "127.0.0.1"
+
+
+class ProcessDiedError(InvalidRunError):
+    """One of the processes ended before the mission was over."""
+
+
+@dataclass
+class Child:
+    """One of the processes."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    unread: bytes = field(default=b"")
+
+    def last_words(self) -> str:
+        """The last line that it wrote to its log, if any."""
+        lines = self.log.read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "it left no message"
+
+
+class LocalRun:
+    """The three processes of one run."""
+
+    def __init__(self, folder: Path, see: Callable[[list[Record]], None]) -> None:
+        """Prepare; nothing is started yet.
+
+        Args:
+            folder: Of the run; has config.yaml, gets world.mcap, cloud.mcap and three logs.
+            see: Gets the records that the processes tell about.
+        """
+        self._folder, self._see = folder, see
+        self._children: list[Child] = []
+        self._selector = selectors.DefaultSelector()
+
+    def fly(self, limit: float) -> None:
+        """Fly until cloud says that the mission is over.
+
+        Args:
+            limit: Longest duration [s].
+
+        Raises:
+            ProcessDiedError: If a process ends too early; it is named.
+            CloudrcError: If the limit is reached.
+            KeyboardInterrupt: If the user interrupts. The processes have ended in every case.
+        """
+        world, from_world, from_cloud, cloud = _free_addresses(4)
+        try:
+            self._start(
+                "relay",
+                f"--world-side={from_world}",
+                f"--cloud-side={from_cloud}",
+                f"--world={world}",
+                f"--cloud={cloud}",
+            )
+            self._start_end("world", world, from_world)
+            self._wait_until_ready()
+            self._start_end("cloud", cloud, from_cloud)
+            self._watch(limit)
+        finally:
+            self._stop()
+
+    def _start_end(self, name: str, listen: str, peer: str) -> None:
+        record = self._folder / f"{name}.mcap"
+        self._start(name, f"--listen={listen}", f"--peer={peer}", f"--record={record}")
+
+    def _start(self, name: str, *options: str) -> None:
+        log = self._folder / f"{name}.log"
+        config = f"--config={self._folder / 'config.yaml'}"
+        command = [sys.executable, "-m", "cloudrc", name, config, *options]
+        with log.open("wb") as errors:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them
+            )
+        child = Child(name, process, log)
+        assert process.stdout is not None
+        os.set_blocking(process.stdout.fileno(), False)
+        self._selector.register(process.stdout, selectors.EVENT_READ, child)
+        self._children.append(child)
+
+    def _wait_until_ready(self) -> None:
+        waiting = {child.name for child in self._children}
+        until = time.monotonic() + START_LIMIT
+        while waiting:
+            if time.monotonic() > until:
+                raise CloudrcError(f"{' and '.join(waiting)}: not ready within {START_LIMIT:g} s")
+            for child, line in self._lines():
+                if line == READY:
+                    waiting.discard(child.name)
+            self._check_alive()
+
+    def _watch(self, limit: float) -> None:
+        until = time.monotonic() + limit
+        cloud = self._children[-1]
+        while cloud.process.poll() is None:
+            if time.monotonic() > until:
+                raise CloudrcError(f"the flight was ended after {limit:g} s, its limit")
+            self._see([from_line(line) for _, line in self._lines() if line != READY])
+            self._check_alive()
+        self._see([from_line(line) for _, line in self._lines() if line != READY])
+
+    def _lines(self) -> list[tuple[Child, str]]:
+        """What the processes have told since the last call; waits 50 ms at most."""
+        told: list[tuple[Child, str]] = []
+        for key, _ in self._selector.select(0.05):
+            child: Child = key.data
+            data = os.read(key.fd, 65_536)
+            if not data:
+                self._selector.unregister(key.fileobj)
+            *lines, child.unread = (child.unread + data).split(b"\n")
+            told += [(child, line.decode()) for line in lines]
+        return told
+
+    def _check_alive(self) -> None:
+        for child in self._children:
+            code = child.process.poll()
+            if code is None or (child.name == "cloud" and code == 0):
+                continue
+            how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            raise ProcessDiedError(
+                f"the {child.name} process died in flight ({how}): {child.last_words()}; "
+                f"see {child.log}"
+            )
+
+    def _stop(self) -> None:
+        """End what still runs: politely, then for good."""
+        for child in self._children:
+            child.process.terminate()
+        until = time.monotonic() + STOP_LIMIT
+        for child in self._children:
+            try:
+                child.process.wait(max(0.0, until - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                child.process.kill()
+                child.process.wait()
+        self._selector.close()
+        for child in self._children:
+            if child.process.stdout is not None:
+                child.process.stdout.close()
+
+
+def _free_addresses(count: int) -> list[str]:
+    """UDP addresses on 127.0.0.1 that nobody uses now."""
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    try:
+        for udp in sockets:
+            udp.bind((LOOPBACK, 0))
+        return [f"{LOOPBACK}:{udp.getsockname()[1]}" for udp in sockets]
+    finally:
+        for udp in sockets:
+            udp.close()

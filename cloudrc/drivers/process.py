@@ -1,0 +1,80 @@
+"""One end as a process of its own: signals stop it, what it records goes to its file and its feed.
+
+It ends on SIGTERM or SIGINT, and when the process that started it is gone.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from types import FrameType
+
+from cloudrc.drivers.feed import Feed
+from cloudrc.drivers.realtime import Peer, serve
+from cloudrc.drivers.recording import Recorder, RecordingThread
+from cloudrc.endpoint import Endpoint
+from cloudrc.records import Record
+
+
+class StopSignal:
+    """True once the process shall end."""
+
+    def __init__(self) -> None:
+        """Take over SIGTERM and SIGINT, and remember who started this process."""
+        self._asked = False
+        self._parent = os.getppid()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._ask)
+
+    def __call__(self) -> bool:
+        return self._asked or os.getppid() != self._parent
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        self._asked = True
+
+
+class Takes(Recorder):
+    """A recorder that records can be put into; `cloudrc.record.recorder` has it."""
+
+    def put(self, records: list[Record]) -> None:
+        """Take records over; never waits and never raises."""
+
+
+def run_end(
+    endpoint: Endpoint,
+    peer: Peer,
+    recorder: Takes,
+    *,
+    end: str,
+    over: Callable[[], bool] = lambda: False,
+    slip_ns: Callable[[], int] = lambda: 0,
+) -> bool:
+    """Fly one end until it is asked to stop or `over()`; its recording is whole afterwards.
+
+    Args:
+        endpoint: World or cloud.
+        peer: Its socket.
+        recorder: Where its records go.
+        end: "world" or "cloud".
+        over: Whether this end is done by itself.
+        slip_ns: By how much world's clock lags [ns].
+
+    Returns:
+        True if it was done by itself, False if it was stopped.
+    """
+    stop, feed, thread = StopSignal(), Feed(), RecordingThread(recorder)
+
+    def sink(records: list[Record]) -> None:
+        recorder.put(records)
+        feed.tell(records)
+
+    thread.start()
+    feed.ready()
+    try:
+        serve(
+            endpoint, peer, end=end, sink=sink, stop=lambda: stop() or over(), slip_ns=slip_ns
+        )
+    finally:
+        thread.stop()
+    return over()

@@ -1,0 +1,114 @@
+"""Real time: one endpoint, one UDP socket, the machine's monotonic clock.
+
+The loop sleeps until the endpoint's next deadline or the next datagram, whichever comes first.
+All datagrams that are drained in one wake carry the same instant, as the endpoint's contract asks.
+"""
+
+from __future__ import annotations
+
+import gc
+import select
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from cloudrc.endpoint import Endpoint
+from cloudrc.records import Lateness, Record
+from cloudrc.tunnel.codec import DATAGRAM_MAX
+
+DRAIN_MAX = 256
+"""Datagrams taken per wake, so that a flood cannot keep the loop from its deadlines."""
+SINK_PERIOD_NS = 20_000_000
+WAIT_MAX_NS = 100_000_000
+
+
+@dataclass
+class Peer:
+    """A UDP socket and whom it talks to.
+
+    Attributes:
+        socket: Bound, not blocking.
+        address: Of the other end of the tunnel, or of the relay before it.
+    """
+
+    socket: socket.socket
+    address: tuple[str, int]
+    unsent: int = field(default=0)
+
+    @classmethod
+    def bind(cls, listen: tuple[str, int], address: tuple[str, int]) -> Peer:
+        """Bind a socket at `listen`."""
+        return cls(bind(listen), address)
+
+    def receive(self) -> list[bytes]:
+        """Everything that waits in the socket; one byte too many marks an oversized datagram."""
+        datagrams: list[bytes] = []
+        while len(datagrams) < DRAIN_MAX:
+            try:
+                datagrams.append(self.socket.recv(DATAGRAM_MAX + 1))
+            except BlockingIOError:
+                break
+            except ConnectionRefusedError:  # an earlier datagram of ours found nobody listening
+                continue
+        return datagrams
+
+    def send(self, datagrams: list[bytes]) -> None:
+        """Send; what the network refuses counts as lost, as UDP has it."""
+        for data in datagrams:
+            try:
+                self.socket.sendto(data, self.address)
+            except OSError:
+                self.unsent += 1
+
+
+def bind(listen: tuple[str, int]) -> socket.socket:
+    """Open a UDP socket that does not block."""
+    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    udp.setblocking(False)
+    udp.bind(listen)
+    return udp
+
+
+def serve(
+    endpoint: Endpoint,
+    peer: Peer,
+    *,
+    end: str,
+    sink: Callable[[list[Record]], None],
+    stop: Callable[[], bool],
+    slip_ns: Callable[[], int] = lambda: 0,
+) -> None:
+    """Run an endpoint in real time until `stop()` is true.
+
+    Args:
+        endpoint: World or cloud.
+        peer: Its socket.
+        end: "world" or "cloud", for the records.
+        sink: Gets the records, at least every 20 ms; must not block.
+        stop: Asked at every wake, at most 100 ms apart.
+        slip_ns: By how much world's clock lags [ns].
+    """
+    gc.collect()
+    gc.freeze()  # what is loaded now stays: the collector need not look at it in flight
+    sink_ns = time.monotonic_ns()
+    while not stop():
+        deadline_ns = endpoint.next_deadline_ns()
+        wait_ns = min(deadline_ns - time.monotonic_ns(), WAIT_MAX_NS)
+        readable, _, _ = select.select([peer.socket], [], [], max(wait_ns, 0) * 1e-9)
+        now_ns = time.monotonic_ns()
+        if readable:
+            for data in peer.receive():
+                endpoint.receive_datagram(data, now_ns)
+        if now_ns >= deadline_ns:
+            endpoint.handle_deadline(now_ns)
+        peer.send(endpoint.take_datagrams())
+        done_ns = time.monotonic_ns()
+        records = endpoint.take_records() if now_ns >= deadline_ns or now_ns >= sink_ns else []
+        if now_ns >= deadline_ns:
+            late, busy, slip = now_ns - deadline_ns, done_ns - now_ns, slip_ns()
+            records.append(Lateness(now_ns - slip, end, late * 1e-9, busy * 1e-9, slip))
+        if records:
+            sink(records)
+            sink_ns = now_ns + SINK_PERIOD_NS
+    sink(endpoint.take_records())

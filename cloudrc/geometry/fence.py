@@ -1,0 +1,22 @@
+"""The fence of the guard: the box that the robot's base may not leave."""
+
+from __future__ import annotations
+
+from cloudrc.messages import Vector
+
+LOW: Vector = (-3.0, -8.5, 0.0)
+HIGH: Vector = (9.2, 5.5, 2.5)
+"""Corners of the box, base position [m], world frame. Source: plant.md, "Fence of the guard"."""
+
+
+def inside(position: Vector) -> bool:
+    """Say whether a base at `position` [m], world frame, shape (3,), is inside the fence."""
+    return all(low <= value <= high for low, value, high in zip(LOW, position, HIGH, strict=True))
+
+
+def clamp(position: Vector) -> Vector:
+    """Give the point inside the fence nearest to `position` [m], world frame, shape (3,)."""
+    x, y, z = (
+        min(max(value, low), high) for low, value, high in zip(LOW, position, HIGH, strict=True)
+    )
+    return x, y, z

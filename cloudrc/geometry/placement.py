@@ -1,0 +1,80 @@
+"""Where the robot may be asked to go: positions go in, what they would overlap comes out."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cloudrc.geometry import fence
+from cloudrc.geometry.clearance import clearance_per_pipe
+from cloudrc.geometry.robot import Array, hull_points
+from cloudrc.geometry.scene import Scene
+from cloudrc.messages import Vector
+
+_SEARCH = 1.5  # [m] how far away a legal point is looked for
+
+
+def outside_fence(positions: Array) -> NDArray[np.bool_]:
+    """Say which positions of the base [m], world frame, shape (n, 3), are beyond the fence."""
+    outside: NDArray[np.bool_] = np.any((positions < fence.LOW) | (positions > fence.HIGH), axis=1)
+    return outside
+
+
+def overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
+    """Say which pipe's wall the base's box or the arm would overlap.
+
+    The rotors do not count: they have no say in where the base can be asked to go, only in how
+    near the flight comes, which the metrics judge.
+
+    Args:
+        scene: Where the robot is; its board does not count.
+        positions: Of the base [m], world frame, shape (n, 3).
+        yaws: Headings of the level robot [rad], shape (n,).
+
+    Returns:
+        Index of the pipe; -1 where there is none; shape (n,).
+    """
+    result = np.full(len(positions), -1, dtype=np.int64)
+    # Points far beyond the fence would only overflow.
+    near = np.flatnonzero(np.all(np.abs(positions) < 1e3, axis=1))
+    if len(near) == 0 or not scene.pipes:
+        return result
+    facing = np.zeros((len(near), 4))
+    facing[:, 0], facing[:, 3] = np.cos(yaws[near] / 2), np.sin(yaws[near] / 2)
+    distance = clearance_per_pipe(scene, positions[near], facing, hull_points())
+    result[near] = np.where(distance.min(axis=1) < 0, distance.argmin(axis=1), -1)
+    return result
+
+
+def nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | None:
+    """Look for a legal point near by, along the axes and towards and away from the pipes' axes.
+
+    Points are whole centimetres, so that what is printed is what was checked.
+
+    Args:
+        scene: Where the robot is.
+        position: Of the base [m], world frame, shape (3,).
+        yaw: Heading [rad].
+
+    Returns:
+        A point inside the fence at which nothing overlaps [m], shape (3,); None if there is none
+        within 1.5 m.
+    """
+    start = np.array(fence.clamp(position))
+    directions = [*np.eye(3), *-np.eye(3)]
+    for pipe in scene.pipes:
+        relative = start - np.asarray(pipe.centre)
+        radial = relative - (relative @ np.asarray(pipe.axis)) * np.asarray(pipe.axis)
+        norm = float(np.linalg.norm(radial))
+        if 0 < norm < pipe.outer + _SEARCH:
+            directions += [radial / norm, -radial / norm]
+    steps = np.arange(0, _SEARCH, 0.02)
+    around = start + steps[:, None, None] * np.array(directions)
+    candidates = np.round(around.reshape(-1, 3), 2)
+    legal = ~outside_fence(candidates)
+    legal &= overlapped_pipe(scene, candidates, np.full(len(candidates), yaw)) < 0
+    if not legal.any():
+        return None
+    candidates = candidates[legal]
+    best = candidates[np.linalg.norm(candidates - start, axis=1).argmin()]
+    return float(best[0]), float(best[1]), float(best[2])

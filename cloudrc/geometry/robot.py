@@ -1,0 +1,102 @@
+"""The robot as points in its body frame, and where they are when it is somewhere.
+
+Source of all sizes: plant.md, "Robot" and "key points for clearance".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+BASE_HALF = (0.05, 0.05, 0.10)
+"""Half sizes of the base's box [m], body frame."""
+ARM_LENGTH, ARM_HEIGHT, ARM_RADIUS = 0.40, 0.17, 0.01
+"""The arm lies along +x of the body, from its z axis to the tip [m]."""
+ROTOR_ARM, ROTOR_HEIGHT, ROTOR_RADIUS, ROTOR_HALF_THICKNESS = 0.21, 0.05, 0.128, 0.0025
+"""Distance of a rotor's centre from the body's z axis, its height and size [m]."""
+ROD_RADIUS, ROD_BOTTOM, ROD_TOP = 0.05, 0.06, 0.18
+"""The top rod: radius, heights of its ends [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Spheres that stand for the robot.
+
+    Attributes:
+        positions: Centres [m], body frame, shape (k, 3).
+        radii: [m], shape (k,).
+    """
+
+    positions: Array
+    radii: Array
+
+
+def key_points() -> Points:
+    """Give the 225 points that clearance is measured at: rotors, arm, base box, top rod."""
+    rotors = [
+        _ring(x, y, height, ROTOR_RADIUS, 24)
+        for x, y in ((ROTOR_ARM, 0), (0, ROTOR_ARM), (-ROTOR_ARM, 0), (0, -ROTOR_ARM))
+        for height in (ROTOR_HEIGHT - ROTOR_HALF_THICKNESS, ROTOR_HEIGHT + ROTOR_HALF_THICKNESS)
+    ]
+    rod = [_ring(0, 0, height, ROD_RADIUS, 8) for height in (ROD_BOTTOM, ROD_TOP)]
+    return _points([*rotors, _box(2, 2, 2), *rod], arm=9)
+
+
+def hull_points() -> Points:
+    """Give points of the base's box and the arm so dense that no pipe wall slips between them.
+
+    Neighbours are 0.02 m apart in the box and 0.01 m on the arm; a wall is 0.038 m thick.
+    """
+    return _points([_box(6, 6, 11)], arm=41)
+
+
+def place(points: Points, positions: Array, orientations_wxyz: Array) -> Array:
+    """Move the robot's points to where it is.
+
+    Args:
+        points: In the body frame.
+        positions: Of the base [m], world frame, shape (n, 3).
+        orientations_wxyz: Of the base, unit quaternions, body to world, shape (n, 4).
+
+    Returns:
+        Centres [m], world frame, shape (n, k, 3).
+    """
+    w, x, y, z = np.moveaxis(orientations_wxyz, -1, 0)
+    rotation = np.empty((len(w), 3, 3))
+    rotation[:, 0] = np.stack(
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1
+    )
+    rotation[:, 1] = np.stack(
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1
+    )
+    rotation[:, 2] = np.stack(
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1
+    )
+    placed: Array = points.positions @ rotation.transpose(0, 2, 1)
+    placed += positions[:, None, :]
+    return placed
+
+
+def _points(parts: list[Array], arm: int) -> Points:
+    along = np.linspace(0, ARM_LENGTH, arm)
+    arm_points = np.stack([along, np.zeros(arm), np.full(arm, ARM_HEIGHT)], axis=1)
+    positions = np.concatenate([arm_points, *parts])
+    radii = np.zeros(len(positions))
+    radii[:arm] = ARM_RADIUS
+    return Points(positions, radii)
+
+
+def _ring(x: float, y: float, z: float, radius: float, count: int) -> Array:
+    angle = np.arange(count) * (2 * np.pi / count)
+    return np.stack(
+        [x + radius * np.cos(angle), y + radius * np.sin(angle), np.full(count, z)], axis=1
+    )
+
+
+def _box(nx: int, ny: int, nz: int) -> Array:
+    axes = [np.linspace(-half, half, n) for half, n in zip(BASE_HALF, (nx, ny, nz), strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,0 +1,264 @@
+"""World's end of the tunnel: commands come in, the robot flies, telemetry leaves.
+
+Time only moves in `_advance`: whatever comes in, the ticks before it are run first, so the result
+does not depend on when a driver wakes up. World alone hands out epochs: a new cloud process gets a
+new one, and so does a mission that starts from the spawn.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+from cloudrc.messages import (
+    NEVER_NS,
+    Command,
+    Odometry,
+    OperatorRequest,
+    Request,
+    Start,
+    Telemetry,
+)
+from cloudrc.records import (
+    Arrival,
+    CommandApplied,
+    Contact,
+    Counted,
+    GroundTruth,
+    Record,
+    SessionOpened,
+    TelemetrySent,
+)
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.channel import Channel, Outcome
+from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Header, Hello, Kind
+from cloudrc.tunnel.session import Session
+from cloudrc.world.clock import SimulationClock
+from cloudrc.world.robot import Robot
+from cloudrc.world.sensors import Sensors
+
+ODOMETRY_PERIOD_NS = 10_000_000
+"""Source: plant.md, 100 Hz."""
+COUNT_PERIOD_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class WorldIdentity:
+    """Who this end is, and what it must not forget.
+
+    Attributes:
+        clock_id: 16 bytes that name this machine's monotonic clock.
+        nonce: 16 bytes that name this process.
+        last_epoch: The last epoch handed out before this process began.
+    """
+
+    clock_id: bytes
+    nonce: bytes
+    last_epoch: int = 0
+
+
+class WorldEndpoint:
+    """The robot's end of the tunnel; an `Endpoint`."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        sensors: Sensors,
+        identity: WorldIdentity,
+        *,
+        newest_wins: bool,
+        command_age_max_ns: int,
+        start_ns: int = 0,
+    ) -> None:
+        """Begin with the robot on the ground at its spawn.
+
+        Args:
+            robot: At its spawn, its guard in GROUND.
+            sensors: What odometry sees.
+            identity: Who this end is.
+            newest_wins: Policy for late commands.
+            command_age_max_ns: What may have waited longer in the socket is stale [ns].
+            start_ns: The monotonic clock now [ns].
+        """
+        self._robot, self._sensors, self._identity = robot, sensors, identity
+        self._clock = SimulationClock(start_ns)
+        self._session = Session(Direction.UPLINK)
+        self._channel = Channel(newest_wins)
+        self._command_age_max_ns = command_age_max_ns
+        self._last_epoch = identity.last_epoch
+        self._cloud = Hello(b"", b"")
+        self._mission = 0
+        self._stalled_wake_ns = NEVER_NS
+        self._odometry_ns = start_ns
+        self._count_ns = start_ns + COUNT_PERIOD_NS
+        self._waiting: tuple[Header, Command] | None = None
+        self._echo_stamp_ns = self._applied_ns = NEVER_NS
+        self._datagrams: list[bytes] = []
+        self._records: list[Record] = []
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def slip_ns(self) -> int:
+        """By how much world's clock lags the monotonic one [ns]."""
+        return self._clock.slip_ns
+
+    def next_deadline_ns(self) -> int:
+        """When the next odometry is due [ns], monotonic clock."""
+        return self._odometry_ns + self._clock.slip_ns
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """Run every tick up to and including `now_ns`; odometry leaves on its way."""
+        self._advance(self._follow(now_ns) + 1)
+
+    def take_datagrams(self) -> list[bytes]:
+        """Hand over the datagrams to send."""
+        datagrams, self._datagrams = self._datagrams, []
+        return datagrams
+
+    def take_records(self) -> list[Record]:
+        """Hand over the records since the last call."""
+        records, self._records = self._records, []
+        return records
+
+    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+        """Take in one datagram; what is not valid is counted and dropped."""
+        world_ns = self._follow(now_ns)
+        self._advance(world_ns)
+        try:
+            header, body = self._session.open(data)
+            if header.kind == Kind.COMMAND:
+                self._receive_command(header, body, now_ns)
+            elif header.kind == Kind.OPERATOR:
+                self._receive_operator(header, codec.decode_operator(body))
+            elif header.kind == Kind.HELLO:
+                self._receive_hello(codec.decode_hello(body))
+            else:
+                raise DecodeError("malformed")
+        except DecodeError as error:
+            self._counts[str(error)] += 1
+
+    def _follow(self, now_ns: int) -> int:
+        """World time at a wake; remembers a wake after a stall, whose datagrams have waited."""
+        behind = now_ns - self._clock.slip_ns - self._clock.tick_ns
+        if behind > self._command_age_max_ns:
+            self._stalled_wake_ns = now_ns
+            self._counts["stalls"] += 1
+        return self._clock.follow(now_ns)
+
+    def _advance(self, until_ns: int) -> None:
+        """Run all ticks before `until_ns` [world's clock]."""
+        clock = self._clock
+        if clock.tick_ns < until_ns and self._waiting is not None:
+            self._apply(clock.tick_ns)
+        while clock.tick_ns < until_ns:
+            if clock.tick_ns >= self._odometry_ns:
+                self._send_telemetry(clock.tick_ns)
+            clock.tick_ns = self._robot.run(clock.tick_ns, min(until_ns, self._odometry_ns))
+
+    def _apply(self, now_ns: int) -> None:
+        """The waiting command reaches the low-level controller with this tick."""
+        assert self._waiting is not None
+        header, command = self._waiting
+        self._waiting = None
+        self._echo_stamp_ns, self._applied_ns = command.stamp_ns, now_ns
+        basis_ns = command.basis_stamp_ns
+        self._records.append(
+            CommandApplied(now_ns, header.epoch, header.counter, basis_ns, command.velocity)
+        )
+
+    def _send_telemetry(self, now_ns: int) -> None:
+        """Measure, tell cloud, and note down the truth."""
+        robot, records = self._robot, self._records
+        tip_force = robot.simulator.tip_force()
+        readings = robot.simulator.readings
+        truth = Odometry(now_ns, *readings)
+        records.append(GroundTruth(now_ns, truth, tip_force, robot.guard.reference))
+        records += robot.guard.take_changes()
+        for touch in robot.simulator.take_contacts():
+            records.append(Contact(now_ns, **touch._asdict()))
+        if self._session.epoch:
+            telemetry = Telemetry(
+                now_ns,
+                self._sensors.measure(now_ns, readings),
+                tip_force,
+                self._echo_stamp_ns,
+                now_ns - self._applied_ns if self._applied_ns >= 0 else 0,
+                self._clock.slip_ns,
+                self._mission,
+                robot.guard.state,
+            )
+            counter = self._session.next_counter(Kind.TELEMETRY)
+            self._send(Kind.TELEMETRY, codec.encode_telemetry(telemetry))
+            records.append(TelemetrySent(now_ns, self._session.epoch, counter, telemetry))
+        if now_ns >= self._count_ns:
+            self._count_ns += COUNT_PERIOD_NS
+            for name, count in sorted(self._counts.items()):
+                records.append(Counted(now_ns, "world", name, count))
+        self._odometry_ns += ODOMETRY_PERIOD_NS
+
+    def _receive_hello(self, hello: Hello) -> None:
+        if hello.nonce != self._cloud.nonce:
+            self._cloud = hello
+            self._mission = 0
+            self._open_epoch("cloud said hello")
+        self._accept()
+
+    def _open_epoch(self, cause: str) -> None:
+        """Everything that belongs to the old session is forgotten."""
+        self._last_epoch += 1
+        self._session.begin(self._last_epoch)
+        self._channel.reset()
+        self._robot.guard.forget_commands()
+        self._waiting = None
+        self._echo_stamp_ns = self._applied_ns = NEVER_NS
+        self._records.append(SessionOpened(self._clock.tick_ns, "world", self._last_epoch, cause))
+
+    def _accept(self) -> None:
+        identity = self._identity
+        accept = Accept(self._cloud.nonce, identity.nonce, identity.clock_id)
+        self._send(Kind.ACCEPT, codec.encode_accept(accept))
+
+    def _receive_operator(self, header: Header, request: OperatorRequest) -> None:
+        if self._is_of_old_epoch(header) or request.number <= self._mission:
+            return
+        self._mission = request.number
+        guard, now_ns = self._robot.guard, self._clock.tick_ns
+        if request.request is Request.END:
+            guard.end_mission(now_ns)
+            return
+        if request.start is Start.SPAWN:
+            self._robot.put_on_ground(now_ns, "mission starts from spawn")
+            self._open_epoch("mission starts from spawn")
+            self._accept()
+        guard.start_mission(now_ns)
+
+    def _receive_command(self, header: Header, body: bytes, now_ns: int) -> None:
+        """Whatever arrives for this epoch is noted; the newest is offered to the guard."""
+        if self._is_of_old_epoch(header):
+            return
+        command = codec.decode_command(body)
+        outcome = self._channel.take(header.counter)
+        refused = None if outcome is Outcome.USED else outcome.value
+        if refused is None:
+            stalled = now_ns == self._stalled_wake_ns
+            refused = (
+                "stale" if stalled else self._robot.guard.offer(command, self._clock.tick_ns)
+            )
+        shared = self._cloud.clock == self._identity.clock_id
+        delay = (now_ns - command.stamp_ns) * 1e-9 if shared else float("nan")
+        used = refused is None
+        self._records.append(
+            Arrival(now_ns - self._clock.slip_ns, False, header.epoch, header.counter, delay, used)
+        )
+        if used and self._robot.guard.armed:
+            self._waiting = (header, command)
+        self._counts[refused or "used"] += 1
+
+    def _is_of_old_epoch(self, header: Header) -> bool:
+        old = header.epoch != self._session.epoch
+        self._counts["old_epoch"] += old
+        return old
+
+    def _send(self, kind: Kind, body: bytes) -> None:
+        self._datagrams.append(self._session.seal(kind, body))
+        self._counts["sent"] += 1

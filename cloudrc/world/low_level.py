@@ -1,0 +1,191 @@
+"""The onboard low-level controller: readings and a wanted velocity in, rotor speeds out, at 500 Hz.
+
+A velocity PID gives the force that the robot needs; geometric attitude control turns the thrust
+axis towards it; the allocation splits thrust and torque over four rotors. Plain floats: it runs at
+every physics step.
+Source: plant.md, "LLC", which restates the published controller (after Lee, Leok and McClamroch,
+"Geometric tracking control of a quadrotor UAV on SE(3)", CDC 2010).
+Deviation: the published code takes dt = 10 ms while it is called every 2 ms; here dt is the true
+one and the gains are those that the published code then has in effect.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+
+from cloudrc.messages import ZERO, Quaternion, Vector
+from cloudrc.world.readings import Readings, RotorSpeeds
+from cloudrc.world.rotors import ARM, SPEED_MAX, THRUST_COEFFICIENT, TORQUE_RATIO, horizontal_axes
+
+MASS = 1.05
+"""What the controller believes [kg]; the robot has 1.06. Source: plant.md, "LLC"."""
+GRAVITY = 9.81
+"""What the controller believes [m/s^2]; the physics has 9.8066. Source: plant.md, "Robot"."""
+ATTITUDE_GAIN: Vector = (1.0, 1.0, 0.035)
+"""k_R: torque per attitude error [N m], body frame, shape (3,). Source: plant.md, "LLC"."""
+RATE_GAIN: Vector = (0.22, 0.22, 0.01)
+"""k_w: torque per angular velocity [N m s], body frame, shape (3,). Source: plant.md, "LLC"."""
+TINY = 1e-9
+
+
+class LowLevel:
+    """Makes the robot follow a velocity; yaw is held at 0, as in the published controller."""
+
+    def __init__(
+        self,
+        gain_p: Vector = (4.0, 4.0, 10.0),
+        gain_i: Vector = (1.0, 1.0, 2.5),
+        gain_d: Vector = (0.30, 0.30, 0.50),
+        integral_limit_xy: float = 0.10,
+        integral_limit_z: float = 0.40,
+        dt: float = 0.002,
+    ) -> None:
+        """Set the velocity loop up.
+
+        Args:
+            gain_p: Force per velocity error [N s/m], shape (3,).
+            gain_i: Force per integrated velocity error [N/m], shape (3,).
+            gain_d: Force per rate of the velocity error [N s^2/m], shape (3,).
+            integral_limit_xy: Limit of the integrated velocity error in x and y [m].
+            integral_limit_z: Likewise in z [m].
+            dt: Time between two updates [s].
+        """
+        self._gain_p, self._gain_i = gain_p, gain_i
+        self._gain_d_over_dt: Vector = (gain_d[0] / dt, gain_d[1] / dt, gain_d[2] / dt)
+        self._limit_xy, self._limit_z = integral_limit_xy, integral_limit_z
+        self._dt = dt
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the integral and the last error."""
+        self._integral = ZERO
+        self._error: Vector | None = None
+
+    def update(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
+        """Compute the rotor speeds that make the robot follow a velocity; once every `dt`.
+
+        Args:
+            readings: State of the base.
+            velocity_reference: Wanted velocity [m/s], world frame, shape (3,).
+
+        Returns:
+            Front, left, back, right [rad/s], each in [0, 1838].
+        """
+        force = self.force(readings.velocity, velocity_reference)
+        thrust, torque = attitude(force, readings.orientation_wxyz, readings.angular_velocity_body)
+        return allocate(thrust, torque)
+
+    def force(self, velocity: Vector, reference: Vector) -> Vector:
+        """Compute the force that the robot needs, and move the integral on by one `dt`.
+
+        e = v - v_ref;  F = -(Kp e + Ki int(e dt) + Kd de/dt) + (0, 0, m g), int(e dt) clamped.
+        Source: plant.md, "LLC".
+
+        Args:
+            velocity: [m/s], world frame, shape (3,).
+            reference: [m/s], world frame, shape (3,).
+
+        Returns:
+            [N], world frame, shape (3,).
+        """
+        dt, limit_xy, limit_z = self._dt, self._limit_xy, self._limit_z
+        px, py, pz = self._gain_p
+        ix, iy, iz = self._gain_i
+        dx, dy, dz = self._gain_d_over_dt
+
+        ex, ey, ez = (
+            velocity[0] - reference[0],
+            velocity[1] - reference[1],
+            velocity[2] - reference[2],
+        )
+        error = (ex, ey, ez)
+        # The first error after a reset has no predecessor: its rate counts as 0.
+        last_x, last_y, last_z = self._error or error
+        self._error = error
+
+        sx, sy, sz = self._integral
+        sx += ex * dt
+        sy += ey * dt
+        sz += ez * dt
+        sx = limit_xy if sx > limit_xy else -limit_xy if sx < -limit_xy else sx
+        sy = limit_xy if sy > limit_xy else -limit_xy if sy < -limit_xy else sy
+        sz = limit_z if sz > limit_z else -limit_z if sz < -limit_z else sz
+        self._integral = (sx, sy, sz)
+
+        return (
+            -(px * ex + ix * sx + dx * (ex - last_x)),
+            -(py * ey + iy * sy + dy * (ey - last_y)),
+            -(pz * ez + iz * sz + dz * (ez - last_z)) + MASS * GRAVITY,
+        )
+
+
+def attitude(force: Vector, orientation_wxyz: Quaternion, rate: Vector) -> tuple[float, Vector]:
+    """Turn the thrust axis towards `force`, nose along +x.
+
+    z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
+    e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R e_R + k_w w); thrust = F . (R z).
+    Source: plant.md, "LLC", with yaw and yaw rate reference 0.
+
+    Args:
+        force: Wanted [N], world frame, shape (3,).
+        orientation_wxyz: Of the base, body to world, shape (4,).
+        rate: Angular velocity [rad/s], body frame, shape (3,).
+
+    Returns:
+        Thrust [N] and torque [N m], body frame, shape (3,).
+    """
+    fx, fy, fz = force
+    x_axis, y_axis = horizontal_axes(orientation_wxyz)
+    xx, xy, xz = x_axis
+    yx, yy, yz = y_axis
+    zx, zy, zz = xy * yz - xz * yy, xz * yx - xx * yz, xx * yy - xy * yx
+
+    # A force that vanishes or points along the nose leaves an axis undefined: no torque from it.
+    scale = 1.0 / (sqrt(fx * fx + fy * fy + fz * fz) or TINY)
+    dzx, dzy, dzz = fx * scale, fy * scale, fz * scale
+    scale = 1.0 / (sqrt(dzy * dzy + dzz * dzz) or TINY)
+    dyy, dyz = dzz * scale, -dzy * scale
+    dxx, dxy, dxz = dyy * dzz - dyz * dzy, dyz * dzx, -dyy * dzx
+
+    roll = 0.5 * (dzx * yx + dzy * yy + dzz * yz - dyy * zy - dyz * zz)
+    pitch = 0.5 * (dxx * zx + dxy * zy + dxz * zz - dzx * xx - dzy * xy - dzz * xz)
+    yaw = 0.5 * (dyy * xy + dyz * xz - dxx * yx - dxy * yy - dxz * yz)
+    torque = (
+        -(ATTITUDE_GAIN[0] * roll + RATE_GAIN[0] * rate[0]),
+        -(ATTITUDE_GAIN[1] * pitch + RATE_GAIN[1] * rate[1]),
+        -(ATTITUDE_GAIN[2] * yaw + RATE_GAIN[2] * rate[2]),
+    )
+    return fx * zx + fy * zy + fz * zz, torque
+
+
+def allocate(thrust: float, torque: Vector) -> RotorSpeeds:
+    """Split thrust and torque over the rotors.
+
+    f = T/4 + (-ty/2l + tz/4km, tx/2l - tz/4km, ty/2l + tz/4km, -tx/2l - tz/4km) for front, left,
+    back, right; w = sqrt(f/kf), within [0, 1838 rad/s].
+    Source: plant.md, "LLC".
+
+    Args:
+        thrust: [N].
+        torque: [N m], body frame, shape (3,).
+
+    Returns:
+        Front, left, back, right [rad/s].
+    """
+    roll, pitch = torque[0] / (2.0 * ARM), torque[1] / (2.0 * ARM)
+    yaw = torque[2] / (4.0 * TORQUE_RATIO)
+    with_yaw, against_yaw = 0.25 * thrust + yaw, 0.25 * thrust - yaw
+    return (
+        _speed(with_yaw - pitch),
+        _speed(against_yaw + roll),
+        _speed(with_yaw + pitch),
+        _speed(against_yaw - roll),
+    )
+
+
+def _speed(force: float) -> float:
+    """Return the rotor speed [rad/s] that gives a thrust [N]; a rotor cannot pull."""
+    if force <= 0.0:
+        return 0.0
+    speed = sqrt(force / THRUST_COEFFICIENT)
+    return speed if speed < SPEED_MAX else SPEED_MAX

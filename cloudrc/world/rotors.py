@@ -1,0 +1,109 @@
+"""The rotors between command and force: commanded speeds in, thrusts and a drag wrench out.
+
+Pure functions of plain floats; they run at every physics step. Order of the rotors everywhere:
+front (+x), left (+y), back, right. Front and back give a positive reaction torque about z for
+their thrust, left and right a negative one.
+Source: plant.md, "Robot", which restates the RotorS model of the paper's world.
+"""
+
+from __future__ import annotations
+
+from math import exp
+from typing import TypeAlias
+
+from cloudrc.messages import Quaternion
+from cloudrc.world.readings import Readings, RotorSpeeds
+
+THRUST_COEFFICIENT = 9.9865e-6
+"""kf: thrust over speed squared [N s^2]."""
+TORQUE_RATIO = 0.016
+"""km: reaction torque about the rotor's axis over thrust [m]."""
+SPEED_MAX = 1838.0
+"""[rad/s]"""
+TIME_CONSTANT_UP = 0.0125
+"""Of a rotor that speeds up [s]."""
+TIME_CONSTANT_DOWN = 0.025
+"""Of a rotor that slows down [s]."""
+DRAG_COEFFICIENT = 8.06428e-5
+"""Drag over speed and velocity across the axis [N s^2/m]."""
+ARM = 0.21
+"""Distance of a rotor's axis from the base's z axis [m]."""
+HEIGHT = 0.05
+"""Height of the rotors above the base's origin [m]."""
+
+Wrench: TypeAlias = tuple[float, float, float, float, float, float]
+"""Force in the world frame [N] and torque in the body frame [N m]: a free joint's convention."""
+
+
+class RotorLag:
+    """First-order lag of the rotors, exact for a command that is constant over a step.
+
+    w(t + dt) = w + (command - w) (1 - exp(-dt/T)), T = 12.5 ms up, 25 ms down.
+    Source: plant.md, "rotor speed".
+    """
+
+    def __init__(self, dt: float) -> None:
+        """Prepare for steps of `dt` [s]."""
+        self._up = 1.0 - exp(-dt / TIME_CONSTANT_UP)
+        self._down = 1.0 - exp(-dt / TIME_CONSTANT_DOWN)
+
+    def step(self, speeds: RotorSpeeds, commands: RotorSpeeds) -> RotorSpeeds:
+        """Move the speeds [rad/s] one step towards the commanded ones [rad/s]."""
+        up, down = self._up, self._down
+        front, left, back, right = speeds
+        to_front, to_left, to_back, to_right = commands
+        return (
+            front + (to_front - front) * (up if to_front > front else down),
+            left + (to_left - left) * (up if to_left > left else down),
+            back + (to_back - back) * (up if to_back > back else down),
+            right + (to_right - right) * (up if to_right > right else down),
+        )
+
+
+def drag(speeds: RotorSpeeds, readings: Readings) -> Wrench:
+    """Sum the drag of the four rotors into one wrench at the base's origin.
+
+    At each rotor F = -w c v, v being the part of the hub's velocity across the rotor's axis. With
+    body velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h) that part is
+    (u + q h - r y, v + r x - p h). Summed over x = (l, 0, -l, 0), y = (0, l, 0, -l):
+    torque = sum of r x F = (-h Fy, h Fx, sum of x Fy - y Fx).
+    Source: plant.md, "rotor drag"; the RotorS motor model's air drag.
+
+    Args:
+        speeds: Of the rotors [rad/s], shape (4,).
+        readings: State of the base; the air stands still.
+
+    Returns:
+        Force in the world frame [N], torque in the body frame [N m], shape (6,).
+    """
+    front, left, back, right = speeds
+    (xx, xy, xz), (yx, yy, yz) = horizontal_axes(readings.orientation_wxyz)
+    vx, vy, vz = readings.velocity
+    p, q, r = readings.angular_velocity_body
+
+    total = DRAG_COEFFICIENT * (front + left + back + right)
+    across_x = DRAG_COEFFICIENT * ARM * (front - back)
+    across_y = DRAG_COEFFICIENT * ARM * (left - right)
+    u = xx * vx + xy * vy + xz * vz + q * HEIGHT
+    v = yx * vx + yy * vy + yz * vz - p * HEIGHT
+    force_x = r * across_y - total * u
+    force_y = -r * across_x - total * v
+    return (
+        xx * force_x + yx * force_y,
+        xy * force_x + yy * force_y,
+        xz * force_x + yz * force_y,
+        -HEIGHT * force_y,
+        HEIGHT * force_x,
+        across_y * u - across_x * v - ARM * ARM * total * r,
+    )
+
+
+def horizontal_axes(
+    orientation_wxyz: Quaternion,
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return the body's x and y axes in the world frame, each shape (3,)."""
+    w, x, y, z = orientation_wxyz
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
+        (2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
+    )

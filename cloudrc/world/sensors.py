@@ -1,0 +1,50 @@
+"""The sensors of the loop: true readings in, odometry with seeded noise out, at 100 Hz.
+
+Only what goes to the cloud is noisy; the onboard controller sees the true state.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cloudrc.messages import Odometry, Vector
+from cloudrc.world.readings import Readings
+
+
+class Sensors:
+    """White Gaussian noise, independent per axis and sample, on position and velocity."""
+
+    def __init__(
+        self, position_noise: float, velocity_noise: float, rng: np.random.Generator
+    ) -> None:
+        """Set the noise.
+
+        Args:
+            position_noise: Standard deviation per axis [m]; 0 draws nothing.
+            velocity_noise: Standard deviation per axis [m/s]; 0 draws nothing.
+            rng: Where the noise is drawn from.
+        """
+        self._position_noise, self._velocity_noise = position_noise, velocity_noise
+        self._rng = rng
+
+    def measure(self, stamp_ns: int, readings: Readings) -> Odometry:
+        """Make the odometry of one instant.
+
+        Args:
+            stamp_ns: That instant [ns], world's clock.
+            readings: True state at it.
+        """
+        return Odometry(
+            stamp_ns,
+            self._noisy(readings.position, self._position_noise),
+            readings.orientation_wxyz,
+            self._noisy(readings.velocity, self._velocity_noise),
+            readings.angular_velocity_body,
+        )
+
+    def _noisy(self, true: Vector, deviation: float) -> Vector:
+        if deviation == 0.0:
+            return true
+        x, y, z = true
+        noise_x, noise_y, noise_z = self._rng.normal(0.0, deviation, 3).tolist()
+        return (x + noise_x, y + noise_y, z + noise_z)

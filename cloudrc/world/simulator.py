@@ -1,0 +1,166 @@
+"""The physics of the loop: commanded rotor speeds in, readings and contacts out.
+
+Rotors (lag, thrust, drag) are computed here in plain floats, the rest is one `mj_step`. MuJoCo's
+arrays are read and written through memory views: to write four elements takes a quarter of the
+time of a numpy slice assignment, and to unpack one is a little faster than `tolist`.
+"""
+
+from __future__ import annotations
+
+from math import dist
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cloudrc.messages import Vector
+from cloudrc.world.readings import Readings, RotorSpeeds, Touch
+from cloudrc.world.rotors import THRUST_COEFFICIENT, RotorLag, drag, horizontal_axes
+from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
+
+STOPPED: RotorSpeeds = (0.0, 0.0, 0.0, 0.0)
+TOUCH_GAP = 0.1
+"""Something counts as newly touched after this long without contact [s]."""
+
+_mj_step = mujoco.mj_step
+
+
+class State(NamedTuple):
+    """All that decides how the physics goes on; `replay` starts from it.
+
+    Attributes:
+        physics: Of `mjSTATE_FULLPHYSICS`: time [s], positions, velocities, shape (n,).
+        warmstart: Accelerations that the contact solver starts from, shape (nv,).
+    """
+
+    physics: npt.NDArray[np.float64]
+    warmstart: npt.NDArray[np.float64]
+
+
+class Simulator:
+    """The robot in its scene.
+
+    Attributes:
+        model: The compiled `MjModel`.
+        dt: Duration of a step [s].
+        readings: State of the base after the last step.
+        tape: If set to a list, every step appends what it gave to MuJoCo: four thrusts [N] and the
+            wrench of the drag [N], [N m], as one tuple of ten floats; `replay` plays it again.
+    """
+
+    def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
+        """Compile `robot` in `scene` (names or paths) and put it at its spawn.
+
+        Raises:
+            BadInputError: If there is no such file, or the loop cannot fly what is in it.
+        """
+        self.model = model = compile_model(robot, scene)
+        self.dt: float = model.opt.timestep
+        self.tape: list[tuple[float, ...]] | None = None
+        self._data = data = mujoco.MjData(model)
+        self._lag = RotorLag(self.dt)
+
+        self._qpos: memoryview[float] = memoryview(data.qpos)
+        self._qvel: memoryview[float] = memoryview(data.qvel)
+        self._ctrl: memoryview[float] = memoryview(data.ctrl)
+        self._applied: memoryview[float] = memoryview(data.qfrc_applied)
+        self._sensors: memoryview[float] = memoryview(data.sensordata)
+        self._tip_sensor: int = model.sensor(f"{ROBOT_PREFIX}tip").adr[0]
+        self._tip = model.site(f"{ROBOT_PREFIX}tip").id
+        self._tip_offset: Vector = tuple(model.site_pos[self._tip].tolist())
+        self._tip_radius = float(model.site_size[self._tip, 0])
+        names = [model.geom(number).name for number in range(model.ngeom)]
+        # The robot's geoms have the empty name: of a touching pair the other one counts.
+        self._bodies = ["" if n.startswith(ROBOT_PREFIX) else n.split("/")[0] for n in names]
+        self._gap_steps = round(TOUCH_GAP / self.dt)
+        self.reset()
+
+    def reset(self) -> None:
+        """Put the robot back to its spawn, at rest, rotors stopped."""
+        mujoco.mj_resetData(self.model, self._data)
+        mujoco.mj_forward(self.model, self._data)
+        self._speeds = STOPPED
+        self._steps = 0
+        self._touches: list[Touch] = []
+        # It stands on the floor: to touch that is news only after it has been in the air.
+        self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
+        self.readings = self._read()
+
+    def step(self, rotor_speeds: RotorSpeeds) -> None:
+        """Go on by `dt` with these commanded rotor speeds [rad/s], shape (4,).
+
+        Thrust kf w^2 and drag are those of the speeds at the end of the step, the drag with the
+        velocity at its beginning.
+        """
+        before = self.readings
+        speeds = self._speeds = self._lag.step(self._speeds, rotor_speeds)
+        front, left, back, right = speeds
+        ctrl = self._ctrl
+        ctrl[0] = THRUST_COEFFICIENT * front * front
+        ctrl[1] = THRUST_COEFFICIENT * left * left
+        ctrl[2] = THRUST_COEFFICIENT * back * back
+        ctrl[3] = THRUST_COEFFICIENT * right * right
+        applied = self._applied
+        applied[0], applied[1], applied[2], applied[3], applied[4], applied[5] = drag(
+            speeds, before
+        )
+        if self.tape is not None:
+            self.tape.append((*ctrl, *applied))
+
+        _mj_step(self.model, self._data)
+        self._steps += 1
+        self.readings = self._read()
+        if self._data.ncon:
+            self._note_contacts(before)
+
+    def tip_force(self) -> float:
+        """Return the normal force on the arm's tip [N], as of the beginning of the last step."""
+        return self._sensors[self._tip_sensor]
+
+    def take_contacts(self) -> list[Touch]:
+        """Hand over what the robot began to touch since the last call, oldest first."""
+        touches, self._touches = self._touches, []
+        return touches
+
+    def state(self) -> State:
+        """Copy the state that `replay` starts from and ends in."""
+        spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        physics = np.empty(mujoco.mj_stateSize(self.model, spec))
+        mujoco.mj_getState(self.model, self._data, physics, spec)
+        return State(physics, self._data.qacc_warmstart.copy())
+
+    def _read(self) -> Readings:
+        x, y, z, qw, qx, qy, qz = self._qpos
+        vx, vy, vz, p, q, r = self._qvel
+        return Readings((x, y, z), (qw, qx, qy, qz), (vx, vy, vz), (p, q, r))
+
+    def _note_contacts(self, before: Readings) -> None:
+        """Note which contacts are new. MuJoCo found them in the state `before` the step."""
+        contact = self._data.contact
+        tip = self._data.site_xpos[self._tip].tolist()
+        pairs, places = contact.geom.tolist(), contact.pos.tolist()
+        for (first, second), place in zip(pairs, places, strict=True):
+            body = self._bodies[first] or self._bodies[second]
+            touched = (body, dist(place, tip) <= self._tip_radius)
+            last = self._last_touch.get(touched)
+            if last is None or self._steps - last > self._gap_steps:
+                tip_velocity = _velocity_at(before, self._tip_offset)
+                self._touches.append(
+                    Touch(*touched, before.position, before.velocity, tip_velocity)
+                )
+            self._last_touch[touched] = self._steps
+
+
+def _velocity_at(readings: Readings, offset: Vector) -> Vector:
+    """Return the velocity [m/s], world frame, of a point fixed to the base at `offset` [m]."""
+    (xx, xy, xz), (yx, yy, yz) = horizontal_axes(readings.orientation_wxyz)
+    zx, zy, zz = xy * yz - xz * yy, xz * yx - xx * yz, xx * yy - xy * yx
+    p, q, r = readings.angular_velocity_body
+    x, y, z = offset
+    u, v, w = q * z - r * y, r * x - p * z, p * y - q * x
+    vx, vy, vz = readings.velocity
+    return (
+        vx + xx * u + yx * v + zx * w,
+        vy + xy * u + yy * v + zy * w,
+        vz + xz * u + yz * v + zz * w,
+    )

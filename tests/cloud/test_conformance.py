@@ -1,0 +1,206 @@
+"""Every plug-in file is found in its folder and held to the contract of its kind."""
+
+import importlib
+import inspect
+import pkgutil
+from math import isfinite, pi, sqrt
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.cloud import controllers, estimators, predictors
+from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.cloud.predictors import Predictor
+from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry, Setpoint
+
+KINDS = {estimators: Estimator, predictors: Predictor, controllers: Controller}
+
+
+def discover(package):
+    return [
+        importlib.import_module(f"{package.__name__}.{found.name}")
+        for found in pkgutil.iter_modules(package.__path__)
+        if not found.name.startswith("_")
+    ]
+
+
+def short(module):
+    return module.__name__.removeprefix("cloudrc.cloud.")
+
+
+PLUGINS = [(module, kind) for package, kind in KINDS.items() for module in discover(package)]
+every_plugin = pytest.mark.parametrize(
+    ("module", "kind"), PLUGINS, ids=[short(module) for module, _ in PLUGINS]
+)
+every_estimator = pytest.mark.parametrize("module", discover(estimators), ids=short)
+every_predictor = pytest.mark.parametrize("module", discover(predictors), ids=short)
+every_controller = pytest.mark.parametrize("module", discover(controllers), ids=short)
+fewer = settings(max_examples=40, deadline=None)
+
+numbers = st.floats(-1e6, 1e6)
+vectors = st.tuples(numbers, numbers, numbers)
+delays = st.floats(0.0, 10.0)
+samples = st.builds(DelaySample, delays, delays, numbers)
+axes = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(c * c for c in q) > 1e-3)
+quaternions = axes.map(lambda q: tuple(c / sqrt(sum(c * c for c in q)) for c in q))
+odometry = st.builds(
+    Odometry, st.integers(0, 10**15), vectors, quaternions, vectors, st.tuples(*[numbers] * 3)
+)
+commands = st.builds(
+    Command, st.integers(0, 10**15), st.integers(0, 10**15), st.just(0), vectors, numbers
+)
+setpoints = st.builds(Setpoint, vectors, st.floats(-10 * pi, 10 * pi))
+
+
+def are_finite(*values):
+    return all(isfinite(number) for value in values for number in value)
+
+
+def test_the_shipped_plugins_are_found():
+    names = {short(module) for module, _ in PLUGINS}
+    assert {"estimators.split", "predictors.constant_velocity", "controllers.pid"} <= names
+    assert not any("._" in name for name in names)
+
+
+@every_plugin
+def test_build_needs_no_parameter_annotates_all_and_makes_its_kind(module, kind):
+    signature = inspect.signature(module.build, eval_str=True)
+    for parameter in signature.parameters.values():
+        assert parameter.annotation is not parameter.empty, parameter
+        assert parameter.default is not parameter.empty, parameter
+    assert issubclass(signature.return_annotation, kind)
+    assert type(module.build()) is signature.return_annotation
+
+
+@every_plugin
+def test_the_docstrings_say_what_it_is_where_it_comes_from_and_what_parameters_mean(module, kind):
+    assert "Source:" in module.__doc__
+    assert inspect.getdoc(type(module.build()))
+    for name in inspect.signature(module.build).parameters:
+        assert f"    {name}: " in inspect.getdoc(module.build)
+
+
+@every_plugin
+def test_two_builds_share_nothing(module, kind):
+    assert module.build() is not module.build()
+    if kind is Estimator:
+        module.build().update(DelaySample(0.5, 0.5, 0.5))
+        assert module.build().horizon(0.5) == 0.0
+
+
+@every_estimator
+def test_horizon_is_zero_before_the_first_sample(module):
+    assert module.build().horizon(12.3) == 0.0
+
+
+@every_estimator
+@given(given_samples=st.lists(samples, max_size=30), age=numbers)
+@fewer
+def test_horizon_is_finite_and_never_negative(module, given_samples, age):
+    estimator = module.build()
+    for sample in given_samples:
+        estimator.update(sample)
+        assert 0.0 <= estimator.horizon(age) < float("inf")
+
+
+@every_estimator
+@given(uplink=st.floats(0, 0.5), downlink=st.floats(0, 0.5), hold=st.floats(0, 0.01))
+@fewer
+def test_horizon_of_a_constant_loop_is_its_delay(module, uplink, downlink, hold):
+    """It may count the hold on the robot, as the paper's tau_n does, but nothing more."""
+    estimator, offset, rtt = module.build(), 3.0, uplink + downlink
+    for _ in range(300):
+        estimator.update(DelaySample(rtt + hold, rtt, downlink - offset))
+    assert rtt - 1e-9 <= estimator.horizon(uplink + offset) <= rtt + hold + 1e-9
+
+
+@every_predictor
+@given(sample=odometry)
+@fewer
+def test_a_horizon_of_zero_changes_nothing(module, sample):
+    predictor = module.build()
+    predictor.observe(sample)
+    assert predictor.predict(sample, 0.0) == sample
+
+
+@every_predictor
+@given(
+    history=st.lists(odometry, min_size=1, max_size=10),
+    command=commands,
+    horizon=st.floats(0.0, 1.0),
+)
+@fewer
+def test_a_prediction_is_finite_later_and_a_rotation(module, history, command, horizon):
+    predictor = module.build()
+    for sample in sorted(history, key=lambda sample: sample.stamp_ns):
+        predictor.observe(sample)
+    predictor.commanded(command)
+    prediction = predictor.predict(sample, horizon)
+    assert prediction.stamp_ns == sample.stamp_ns + round(horizon * 1e9)
+    assert are_finite(prediction.position, prediction.velocity, prediction.angular_velocity_body)
+    assert sum(c * c for c in prediction.orientation_wxyz) == pytest.approx(1.0)
+
+
+@every_predictor
+def test_predicting_twice_gives_the_same(module):
+    predictor, sample = module.build(), Odometry(10, ZERO, UPRIGHT, (1.0, 2.0, 3.0), ZERO)
+    predictor.observe(sample)
+    assert predictor.predict(sample, 0.1) == predictor.predict(sample, 0.1)
+
+
+@every_predictor
+def test_a_predictor_forgets_everything_when_it_is_reset(module):
+    used, fresh = module.build(), module.build()
+    for k in range(20):
+        used.observe(Odometry(k * 10**7, ZERO, UPRIGHT, (0.1 * k * k, -k, 2.0), (1.0, 2.0, 3.0)))
+        used.commanded(Command(k, k, 0, (1.0, 2.0, 3.0), 0.5))
+    used.reset()
+    # The stamps of a new session may begin anywhere, earlier ones included.
+    for k in range(5):
+        sample = Odometry(k * 10**7, ZERO, UPRIGHT, (0.2 * k, 0.0, 1.0), ZERO)
+        used.observe(sample)
+        fresh.observe(sample)
+        assert used.predict(sample, 0.1) == fresh.predict(sample, 0.1)
+
+
+@every_controller
+@given(estimates=st.lists(odometry, min_size=1, max_size=10), setpoint=setpoints)
+@fewer
+def test_a_command_is_finite(module, estimates, setpoint):
+    controller = module.build()
+    for estimate in estimates:
+        output = controller.update(estimate, setpoint, 0.01)
+        assert isinstance(output, ControlOutput)
+        assert are_finite(output.velocity, (output.yaw_rate,))
+        assert are_finite(output.proportional, output.integral, output.derivative)
+
+
+@every_controller
+@given(position=vectors)
+@fewer
+def test_a_robot_at_rest_on_its_setpoint_is_left_there(module, position):
+    estimate = Odometry(0, position, UPRIGHT, ZERO, ZERO)
+    assert module.build().update(estimate, Setpoint(position), 0.01).velocity == ZERO
+
+
+@every_controller
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_command_leads_towards_the_setpoint(module, axis, sign):
+    wanted = tuple(sign if index == axis else 0.0 for index in range(3))
+    estimate = Odometry(0, ZERO, UPRIGHT, ZERO, ZERO)
+    velocity = module.build().update(estimate, Setpoint(wanted), 0.01).velocity
+    assert velocity[axis] * sign > 0.0
+
+
+@every_controller
+def test_a_controller_forgets_everything_when_it_is_reset(module):
+    used, fresh = module.build(), module.build()
+    estimate = Odometry(0, ZERO, UPRIGHT, (1.0, 0.0, 0.0), ZERO)
+    for _ in range(50):
+        used.update(estimate, Setpoint((3.0, 2.0, 1.0)), 0.01)
+    used.reset()
+    setpoint = Setpoint((-1.0, 2.0, 0.5))
+    assert used.update(estimate, setpoint, 0.01) == fresh.update(estimate, setpoint, 0.01)

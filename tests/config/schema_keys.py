@@ -1,0 +1,71 @@
+"""Every key of the schema with a valid value and what it needs beside it: for generated tests."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, Literal, get_args, get_origin
+
+from cloudrc.config import describe
+from cloudrc.config.schema import Experiment
+
+LEAVES = {".".join(path): field for path, field in describe.leaves(Experiment)}
+
+SPECIAL: dict[str, Any] = {
+    "mission": "hover",
+    "mission.waypoints.0.position_m": [0.6, 0.1, 0.8],
+    "mission.steps.centre_m": [0.1, 0.2, 1.1],
+    "mission.steps.range_m": [0.5, 0.5, 0.5],
+    "world.robot": "pelican",
+    "world.scene": "empty",
+    "link.profile": "paper-p3",
+    "link.uplink.trace": None,
+    "link.downlink.trace": None,
+    "cloud.estimator": "split",
+    "cloud.estimator.name": "ewma",
+    "cloud.predictor": "last_sample",
+    "cloud.predictor.name": "last_sample",
+    "cloud.controller": "pid",
+    "cloud.controller.name": "pid",
+}
+
+
+def valid(key: str) -> Any:
+    """A value that this key takes and that is not its default, if there is another."""
+    if key in SPECIAL:
+        return SPECIAL[key]
+    field = LEAVES[key]
+    if get_origin(field.annotation) is Literal:
+        return get_args(field.annotation)[-1]
+    words = describe.expectation(Experiment, tuple(key.split(".")))
+    if "list of 3" in words:
+        return [0.25, 0.5, 0.75]
+    if "whole number" in words:
+        return 7
+    if "number" in words:
+        return 0.5
+    return (not field.default) if "true or false" in words else "some text"
+
+
+def beside(key: str) -> list[str]:
+    """Settings without which the key makes no sense."""
+    above, _, last = key.rpartition(".")
+    if above.endswith(".loss") and last in ("loss_bad", "loss_good", "delay_bad_ms"):
+        return [f"{above}.bad_start=.1", f"{above}.bad_end=.5", *beside(above)]
+    if above.endswith(".loss"):
+        other = {"bad_start": "bad_end", "bad_end": "bad_start"}[last]
+        return [f"{above}.{other}=.5", *beside(above)]
+    if above.endswith("changes.0") and last != "at_s":
+        return [f"{above}.at_s=3"]
+    if above.endswith("blackouts.0"):
+        other = {"start_s": "duration_s", "duration_s": "start_s"}[last]
+        return [f"{above}.{other}=2"]
+    return []
+
+
+def base(key: str) -> str:
+    """The shipped experiment to set the key in."""
+    return "steps" if key.startswith("mission.steps") else "paper"
+
+
+def setting(key: str, value: Any) -> str:
+    return f"{key}={json.dumps(value)}"

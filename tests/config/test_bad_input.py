@@ -1,0 +1,196 @@
+"""Bad input ends in one clear message: what, where, how to mend it; all of a file's at once."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from cloudrc.config.load import load_experiment, load_mission, load_profile
+from cloudrc.errors import BadInputError
+
+
+def refused(path: Path, text: str, *settings: str) -> str:
+    path.write_text(text, "utf-8")
+    with pytest.raises(BadInputError) as caught:
+        load_experiment(path, settings)
+    assert caught.value.exit_code == 2
+    return str(caught.value).replace(f"{path.parent}/", "")
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    return tmp_path / "mine.yaml"
+
+
+def test_all_problems_are_listed_with_their_lines(mine: Path) -> None:
+    text = refused(
+        mine,
+        "seed: one\n"
+        "guard: {speed_max: 2}\n"
+        "link:\n"
+        "  profile: paper-p2\n"
+        "  uplink:\n"
+        "    delay_ms: -3\n"
+        "    loss: 1.2\n"
+        "cloud:\n"
+        "  predictor: last_sampel\n"
+        "  controller: {name: pid, sped_max: 2}\n"
+        "world: {scene: pipe}\n",
+    )
+    first, *rest = text.splitlines()
+    assert first == "mine.yaml has 7 problems:"
+    assert sorted(line.strip() for line in rest) == sorted([
+        "mine.yaml:1: seed: 'one': must be a whole number >= 0 and < 9223372036854775808",
+        "mine.yaml:2: guard.speed_max: unknown key; did you mean speed_max_mps [m/s]?",
+        "mine.yaml:6: link.uplink.delay_ms: -3: must be a number >= 0 [ms]",
+        "mine.yaml:7: link.uplink.loss: 1.2: "
+        "must be a number >= 0 and <= 1 or a mapping of keys",
+        "mine.yaml:9: cloud.predictor: no predictor named 'last_sampel'; available: "
+        "commanded_velocity, constant_acceleration, constant_velocity, last_sample; "
+        "did you mean last_sample?",
+        "mine.yaml:10: cloud.controller.sped_max: unknown key; did you mean speed_max?",
+        "mine.yaml:11: world.scene: no scene named 'pipe'; available: empty, pipes; "
+        "did you mean pipes?",
+    ])  # fmt: skip
+
+
+def test_thousands_of_problems_are_not(mine: Path) -> None:
+    points = ", ".join(["{position_m: [0, 0, 1], dwell_s: -1}"] * 2000)
+    text = refused(mine, f"mission: {{waypoints: [{points}]}}\n")
+    assert "mine.yaml has 2000 problems:" in text
+    assert text.endswith("and 1950 more")
+    assert len(text.splitlines()) == 52
+
+
+@pytest.mark.parametrize(
+    ("typo", "meant"),
+    [
+        ("link: {uplink: {delay: 3}}", "did you mean delay_ms [ms]?"),
+        ("link: {uplink: {delay_s: 3}}", "did you mean delay_ms [ms]?"),
+        ("delay_ms: 3", "did you mean link.uplink.delay_ms?"),
+        ("missoin: pipes", "did you mean mission?"),
+        ("zzz: 3", "known here: name, description, seed, mission"),
+    ],
+)
+def test_unknown_keys_and_forgotten_units(mine: Path, typo: str, meant: str) -> None:
+    assert meant in refused(mine, typo)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("seed: 1\nseed: 2", "mine.yaml:2: the key 'seed' stands here twice"),
+        ("seed: [", "mine.yaml:"),
+        ("", "mine.yaml: must be a mapping"),
+        ("- 1", "mine.yaml: must be a mapping"),
+        ("seed: !!python/name:os.system x", "mine.yaml:1"),
+        ("[" * 100_000, "nested more than 50 deep"),
+        ("a: &a [*a]", "a value contains itself"),
+        ("a: " + "9" * 5000, "not readable"),
+        ("world: 3", "mine.yaml:1: world: 3: must be a mapping"),
+        ("mission: 3", "mine.yaml:1: mission: 3: must be text or a mapping"),
+        ("link: {uplink: 3}", "link.uplink: 3: must be a mapping"),
+        ("cloud: [pid]", "cloud: ['pid']: must be a mapping"),
+        ("tunnel: {order: newset}", "did you mean newest?"),
+        ("link: {profile: paper-p9}", "link.profile: no profile named 'paper-p9'; available: 5g"),
+        ("name: ../../x", "name: '../../x': must be text without slashes"),
+        ("mission: ./nowhere.yaml", "mission: no such file:"),
+    ],
+)
+def test_files_that_cannot_be_used(mine: Path, text: str, reason: str) -> None:
+    found = refused(mine, text)
+    assert reason in found
+    assert "\n" not in found
+
+
+def test_aliases_of_aliases_do_not_fill_the_memory(mine: Path) -> None:
+    levels = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 10)]
+    assert "more than" in refused(mine, "\n".join(["a0: &a0 [1]", *levels]))
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    for name, reason in ((tmp_path / "no.yaml", "no such file"), (tmp_path / ".", "cannot be read"),
+                         ("papr", "did you mean paper?")):  # fmt: skip
+        with pytest.raises(BadInputError, match=reason.replace("?", r"\?")):
+            load_experiment(f"{name}/" if reason == "cannot be read" else name)
+    (tmp_path / "latin.yaml").write_bytes(b"description: \xff\xfe")
+    with pytest.raises(BadInputError, match="is not UTF-8 text"):
+        load_experiment(tmp_path / "latin.yaml")
+
+
+@pytest.mark.parametrize("text", ["seed", "=3", "a..b=1", ".=1", "seed=["])
+def test_settings_that_are_none(text: str) -> None:
+    with pytest.raises(BadInputError, match="--set"):
+        load_experiment("paper", [text])
+
+
+def test_an_index_behind_the_end() -> None:
+    with pytest.raises(BadInputError, match="entries 0 to 6; use one of these, or 7 to append"):
+        load_experiment("paper", ["mission.waypoints.9.dwell_s=1"])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("uplink: {delay_ms: -1}", "mine.yaml:1: uplink.delay_ms: -1: must be a number >= 0 [ms]"),
+        ("uplink: {loss: 1.2}", "uplink.loss: 1.2: must be a number >= 0 and <= 1"),
+        ("uplink: {loss: {bad_start: .1, bad_end: 0}}", "uplink.loss: bad_end must be above 0"),
+        ("uplink: {loss: {bad_start: .1}}", "uplink.loss.bad_end: is missing; must be a number"),
+        ("uplink: {jitter_ms: 3, distribution: gauss}", "must be 'uniform', 'normal' or 'pareto'"),
+        ("uplink: {changes: [{at_s: 5}, {at_s: 5}]}", "uplink.changes: at_s must rise: entry 1"),
+        ("uplink: {queue_packets: 1.5}", "must be a whole number >= 1"),
+        ("uplink: {keep_order: yes}", "must be true or false"),
+        ("uplink: {trace: nowhere.csv}", "uplink.trace: trace "),
+        ("delay_ms: 3", "delay_ms: unknown key; did you mean uplink.delay_ms?"),
+    ],
+)
+def test_bad_profiles(mine: Path, text: str, reason: str) -> None:
+    mine.write_text(text)
+    with pytest.raises(BadInputError) as caught:
+        load_profile(mine)
+    assert reason in str(caught.value)
+    with pytest.raises(BadInputError) as caught:
+        load_experiment("paper", [f"link.profile={mine}"])
+    assert str(caught.value).startswith("--set: link.profile: ")
+    assert reason in str(caught.value)
+
+
+def test_a_trace_out_of_order_is_refused_with_the_key_that_names_it(tmp_path: Path) -> None:
+    trace = tmp_path / "trace.csv"
+    trace.write_text("time_s,delay_ms\n1,20\n0,20\n")
+    with pytest.raises(BadInputError, match=r"link\.uplink\.trace: .*line 3"):
+        load_experiment("paper", [f"link.uplink.trace={trace}"])
+
+
+@pytest.mark.parametrize(
+    ("waypoints", "reason"),
+    [
+        ("[]", "mission.waypoints: none given; give at least one, or steps"),
+        ("[{position_m: [.nan, 0, 1]}]", "waypoints.0.position_m.0: nan: must be finite"),
+        ("[{position_m: [0, 1]}]", "position_m.2: is missing; must be a number"),
+        ("[{position_m: [0, 0, 1, 2]}]", "at most 3 entries"),
+        ("[{tolerance_m: 1}]", "position_m: is missing; must be a list of 3 numbers [m]"),
+        ("[{position_m: [0, 0, 3]}]", "[0, 0, 3]: beyond the fence, x -3 to 9.2, y -8.5 to 5.5, "
+         "z 0 to 2.5 [m]; nearest legal point found: [0, 0, 2.5]"),
+        ("[{position_m: [0.5, 0, .7]}, {position_m: [-.6, 0, .8]}]",
+         "waypoints.1.position_m: [-0.6, 0, 0.8]: base box or arm overlaps the wall of pipe_1; "
+         "nearest legal point found: [-0.78, 0, 0.8]"),
+    ],
+)  # fmt: skip
+def test_bad_missions(mine: Path, waypoints: str, reason: str) -> None:
+    found = refused(mine, f"mission: {{waypoints: {waypoints}}}")
+    assert reason in found
+    assert found.startswith("mine.yaml:1: mission.waypoints")
+
+
+def test_a_hundred_thousand_waypoints_are_refused_at_once(tmp_path: Path) -> None:
+    mission = tmp_path / "long.yaml"
+    mission.write_text("waypoints:\n" + "- {position_m: [0.5, 0.0, 0.7], dwell_s: 0}\n" * 100_000)
+    start = time.perf_counter()
+    with pytest.raises(BadInputError, match=r"long\.yaml: waypoints: 100000: at most 10000; split"):
+        load_mission(mission)
+    with pytest.raises(BadInputError, match="waypoints: 100000: at most 10000"):
+        load_experiment("paper", [f"mission={mission}"])
+    assert time.perf_counter() - start < 2

@@ -1,0 +1,196 @@
+"""Loading experiments: what is looked up, what is laid over what, and that a dump flies again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.config import shipped, yaml_text
+from cloudrc.config.load import dump, load_experiment, load_mission, load_profile
+from cloudrc.config.resolved import ResolvedExperiment
+
+EXPERIMENTS = shipped.names("experiment")
+PROFILES = shipped.names("profile")
+
+
+def again(experiment: ResolvedExperiment, folder: Path, *settings: str) -> ResolvedExperiment:
+    path = folder / "config.yaml"
+    path.write_text(dump(experiment), "utf-8")
+    return load_experiment(path, settings)
+
+
+def test_the_experiments_of_the_paper_ship() -> None:
+    assert {"paper", "paper-verbatim", "steps", "hover"} <= set(EXPERIMENTS)
+    assert {"pipes", "steps", "hover"} <= set(shipped.names("mission"))
+
+
+@pytest.mark.parametrize("kind", ["experiment", "mission", "profile"])
+def test_every_shipped_file_is_described(kind: str) -> None:
+    for name in shipped.names(kind):
+        assert shipped.describe(kind, name), f"{kind} {name} has no description"
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_dump_loads_to_the_same(experiment: str, profile: str, tmp_path: Path) -> None:
+    loaded = load_experiment(experiment, [f"link.profile={profile}"])
+    assert again(loaded, tmp_path) == loaded
+    assert loaded.link.profile == profile
+    assert loaded.uplink == load_profile(profile).uplink
+    assert loaded.downlink == load_profile(profile).downlink
+
+
+def test_a_dump_needs_no_profile_file(tmp_path: Path) -> None:
+    profile = tmp_path / "mine.yaml"
+    profile.write_text("uplink: {delay_ms: 12}\n")
+    loaded = load_experiment("paper", [f"link.profile={profile}"])
+    profile.unlink()
+    assert again(loaded, tmp_path) == loaded
+    assert loaded.uplink.delay_ms == 12
+
+
+def test_paper_is_the_published_scheme() -> None:
+    paper = load_experiment("paper")
+    assert (paper.name, paper.link.profile, paper.tunnel.order) == ("paper", "paper-p2", "newest")
+    assert (paper.uplink.delay_ms, paper.uplink.jitter_ms) == (45, 25)
+    assert paper.cloud.estimator.name == "running_mean"
+    assert paper.cloud.predictor.name == "constant_velocity"
+    assert (paper.cloud.controller.model_extra or {})["gain_p"] == [0.8, 0.8, 1.5]
+    assert len(paper.mission.waypoints) == 7
+    assert paper.mission.waypoints[-1].position_m == (8.235, -6.422, 0.7)
+    assert (paper.guard.command_age_max_ms, paper.criteria.contact) == (250, True)
+
+
+def test_verbatim_lets_the_last_arrival_win() -> None:
+    verbatim = load_experiment("paper-verbatim")
+    assert (verbatim.tunnel.order, verbatim.guard.command_age_max_ms) == ("arrival", 400)
+
+
+@pytest.mark.parametrize("name", ["steps", "hover"])
+def test_free_air_has_nothing_to_touch(name: str) -> None:
+    experiment = load_experiment(name)
+    assert (experiment.world.scene, experiment.criteria.contact) == ("empty", False)
+
+
+def test_age_limit_is_the_experiments_own_else_the_profiles_else_250() -> None:
+    def age(experiment: str, profile: str) -> float:
+        loaded = load_experiment(experiment, [f"link.profile={profile}"])
+        return loaded.guard.command_age_max_ms
+
+    assert age("paper", "paper-p3") == 250
+    assert age("paper", "satellite") == load_profile("satellite").command_age_max_ms != 250
+    assert age("paper-verbatim", "satellite") == 400
+
+
+def test_another_profile_takes_the_place_of_a_resolved_one(tmp_path: Path) -> None:
+    for experiment in ("paper", "paper-verbatim"):
+        flown = load_experiment(experiment, ["link.profile=satellite"])
+        changed = again(flown, tmp_path, "link.profile=paper-p3")
+        assert changed == load_experiment(experiment, ["link.profile=paper-p3"])
+
+
+def test_single_values_lie_over_the_profile(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("link: {profile: lossy, uplink: {delay_ms: 120}}\n")
+    experiment = load_experiment(path)
+    assert experiment.name == "mine"
+    assert experiment.uplink == load_profile("lossy").uplink.model_copy(update={"delay_ms": 120.0})
+    assert experiment.downlink == load_profile("lossy").downlink
+    other = load_experiment(path, ["link.profile=paper-p1"])
+    assert (other.uplink.delay_ms, other.uplink.jitter_ms) == (120, 10)
+
+
+def test_set_opens_a_name(tmp_path: Path) -> None:
+    experiment = load_experiment("paper", ["cloud.controller.speed_max=2"])
+    assert experiment.cloud.controller.name == "pid"
+    assert (experiment.cloud.controller.model_extra or {})["speed_max"] == 2.0
+    empty = tmp_path / "short.yaml"
+    empty.write_text("seed: 3\n")
+    assert load_experiment(empty, ["cloud.controller.speed_max=2"]).cloud == experiment.cloud
+
+
+def test_set_reaches_into_mission_and_time_line_by_index() -> None:
+    waypoints = load_experiment("paper", ["mission.waypoints.0.tolerance_m=.2"]).mission.waypoints
+    assert [point.tolerance_m for point in waypoints[:2]] == [0.2, 0.3]
+    before = load_profile("handover").uplink.changes
+    changes = load_experiment(
+        "paper", ["link.profile=handover", "link.uplink.changes.1.delay_ms=99"]
+    ).uplink.changes
+    assert [change.delay_ms for change in changes[:2]] == [before[0].delay_ms, 99]
+    assert len(changes) == len(before)
+    gains = load_experiment("paper", ["world.low_level.gain_p.1=5"]).world.low_level.gain_p
+    assert gains == (4, 5, 10)
+
+
+def test_set_appends_one_behind_the_last() -> None:
+    experiment = load_experiment("hover", ["mission.waypoints.1.position_m=[0, 1, 1]"])
+    assert experiment.mission.waypoints[1].position_m == (0, 1, 1)
+
+
+def test_the_order_of_settings_does_not_matter() -> None:
+    texts = ["mission.steps.count=3", "mission=steps", "world.scene=empty"]
+    assert load_experiment("paper", texts) == load_experiment("paper", texts[::-1])
+
+
+def test_paths_are_relative_to_the_file_that_names_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    links = tmp_path / "links"
+    links.mkdir()
+    (links / "trace.csv").write_text("time_s,delay_ms\n0,20\n1,40\n")
+    (links / "traced.yaml").write_text("uplink: {trace: trace.csv}\n")
+    (tmp_path / "there.yaml").write_text("waypoints: [{position_m: [0, 0, 1]}]\n")
+    (tmp_path / "still.py").write_text(
+        "from cloudrc.cloud.predictors import Predictor\n\ndef build() -> Predictor:\n"
+        "    return Predictor()\n"
+    )
+    (tmp_path / "mine.yaml").write_text(
+        "world: {scene: empty}\nmission: ./there.yaml\nlink: {profile: links/traced.yaml}\n"
+        "cloud: {predictor: still.py}\n"
+    )
+    experiment = load_experiment(tmp_path / "mine.yaml")
+    assert experiment.uplink.trace == str(links / "trace.csv")
+    assert experiment.link.profile == str(links / "traced.yaml")
+    assert experiment.cloud.predictor.name == str(tmp_path / "still.py")
+    assert experiment.mission.waypoints[0].position_m == (0, 0, 1)
+    assert again(experiment, links) == experiment
+    monkeypatch.chdir(links)
+    assert load_experiment("paper", ["link.downlink.trace=trace.csv"]).downlink.trace == str(
+        links / "trace.csv"
+    )
+
+
+def test_a_mission_by_path(tmp_path: Path) -> None:
+    path = tmp_path / "line.yaml"
+    path.write_text("waypoints:\n- position_m: [1, 0, 1]\n")
+    assert load_mission(path).waypoints[0].tolerance_m == 0.10
+    assert load_mission("line.yaml", tmp_path) == load_mission(path)
+
+
+# PyYAML itself turns Unicode's other line ends into line feeds.
+texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\x85\u2028\u2029"))
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | texts,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(plain)
+def test_yaml_comes_back_as_it_was_written(value: object) -> None:
+    if "<<" not in repr(value):
+        assert yaml_text.parse(yaml_text.write(value), "text")[0] == value
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1e-3", 1e-3), (".2", 0.2), ("-3", -3), ("on", "on"), ("12:30", "12:30"), ("~", None),
+     ("true", True), ("2024-01-01", "2024-01-01"), ("010", 10), ("'1'", "1")],
+)  # fmt: skip
+def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
+    found = yaml_text.parse(text, "text")[0]
+    assert (found, type(found)) == (value, type(value))

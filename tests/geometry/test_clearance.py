@@ -1,0 +1,132 @@
+"""Clearance: hand-worked distances, the plant's published ones, and a brute force beside them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.geometry.clearance import (
+    clearance,
+    clearance_per_pipe,
+    distance_to_pipe,
+    inside_pipe,
+    pipe_index,
+)
+from cloudrc.geometry.robot import hull_points, key_points, place
+from cloudrc.geometry.scene import Pipe, Scene, load_scene
+
+PIPES = load_scene("pipes")
+ALONG_X = Pipe("pipe_x", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.700)
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("point", "distance"),
+    [
+        ((0, 0, 0), 0.662),  # on the axis
+        ((0, 0.6, 0), 0.062),  # in the bore
+        ((1, 0, 1.0), 0.300),  # outside
+        ((0, 0.681, 0), -0.019),  # in the middle of the wall
+        ((0, -0.67, 0), -0.008),  # nearer to the inner face
+        ((2.499, 0, 0.681), -0.001),  # nearer to the flat end
+        ((2.6, 0.681, 0), 0.100),  # before the flat end
+        ((-2.53, 0, 0.740), 0.050),  # 3-4-5 from the outer edge
+        ((2.8, 0, 0.262), 0.500),  # 3-4-5 from the inner edge
+    ],
+)
+def test_distance_to_a_hollow_cylinder(point: tuple[float, ...], distance: float) -> None:
+    found = distance_to_pipe(ALONG_X, np.array([point], dtype=float))
+    assert found == pytest.approx([distance], abs=1e-9)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.tuples(*[st.floats(-4, 4)] * 3),
+    st.tuples(*[st.floats(-4, 4)] * 3),
+)
+def test_distance_changes_no_faster_than_the_point(
+    one: tuple[float, ...], other: tuple[float, ...]
+) -> None:
+    a, b = distance_to_pipe(PIPES.pipes[1], np.array([one, other]))
+    assert abs(a - b) <= math.dist(one, other) + 1e-9
+
+
+@pytest.mark.parametrize(("height", "expected"), [(0.8, (0.217, 0.326, 0.320)),
+                                                  (0.7, (0.246, 0.365, 0.320))])  # fmt: skip
+def test_clearance_on_the_axis_is_that_of_the_plant(
+    height: float, expected: tuple[float, ...]
+) -> None:
+    """Source: control.md, section 1, yaw 0."""
+    at = [(x, y, height) for x, y, _ in (pipe.centre for pipe in PIPES.pipes)]
+    found = clearance(PIPES, at, [LEVEL] * 3)
+    assert found == pytest.approx(expected, abs=2e-3)
+    per_pipe = clearance_per_pipe(PIPES, at, [LEVEL] * 3)
+    assert per_pipe.shape == (3, 3)
+    assert np.array_equal(np.diag(per_pipe), found)
+
+
+def test_clearance_turns_with_the_robot() -> None:
+    """Along the pipe every pipe leaves .320. Source: control.md, section 1."""
+    for pipe in PIPES.pipes:
+        yaw = math.atan2(pipe.axis[1], pipe.axis[0])
+        facing = (math.cos(yaw / 2), 0, 0, math.sin(yaw / 2))
+        assert clearance(PIPES, pipe.centre, facing) == pytest.approx([0.320], abs=1e-3)
+
+
+def test_the_spawn_trap() -> None:
+    """Straight up from the spawn the rear rotor ends in the outside of pipe 1; x = .2 is clear."""
+    heights = np.arange(0.1, 1.6, 0.01)
+    at = np.stack([np.zeros_like(heights), np.zeros_like(heights), heights], axis=1)
+    facing = np.tile(LEVEL, (len(at), 1))
+    assert clearance(PIPES, at, facing).min() == pytest.approx(-0.019, abs=1e-3)
+    # The trap is 0.338 - (1 - 0.7) = 0.038 deep; the wall is as thick, half of it is deepest.
+    aside = at + np.array([0.2, 0, 0])
+    assert clearance(PIPES, aside, facing).min() == pytest.approx(0.162, abs=2e-3)
+
+
+def test_the_tip_touches_at_the_contact_pose() -> None:
+    tip = place(key_points(), np.array([[8.135, -6.422, 0.7]]), np.array([LEVEL]))[0, 8]
+    assert tip == pytest.approx((8.535, -6.422, 0.87))
+
+
+def test_nobody_is_near_in_an_empty_scene() -> None:
+    assert clearance(Scene("empty"), [(0, 0, 1), (1, 0, 1)], [LEVEL] * 2).tolist() == [math.inf] * 2
+    assert clearance(PIPES, np.empty((0, 3)), np.empty((0, 4))).shape == (0,)
+
+
+def test_many_poses_are_the_same_as_each_alone() -> None:
+    rng = np.random.default_rng(1)
+    at = rng.uniform((-2, -8, 0), (9, 4, 2), (333, 3))
+    facing = rng.normal(size=(333, 4))
+    facing /= np.linalg.norm(facing, axis=1)[:, None]
+    together = clearance(PIPES, at, facing)
+    alone = [clearance(PIPES, at[i], facing[i])[0] for i in range(0, 333, 50)]
+    assert together[::50] == pytest.approx(alone, abs=1e-12)
+
+
+def test_rotation_is_that_of_the_quaternion() -> None:
+    # A third of a turn about (1, 1, 1) takes x to y, y to z, z to x.
+    placed = place(key_points(), np.zeros((1, 3)), np.array([[0.5, 0.5, 0.5, 0.5]]))[0]
+    assert placed == pytest.approx(key_points().positions[:, [2, 0, 1]])
+
+
+def test_points_are_those_of_the_plant() -> None:
+    points = key_points()
+    assert points.positions.shape == (225, 3)
+    assert np.abs(points.positions[:, 0]).max() == pytest.approx(0.4)
+    assert points.positions[:, 1].max() == pytest.approx(0.338)
+    assert (points.positions[:, 2].min(), points.positions[:, 2].max()) == (-0.1, 0.18)
+    assert sorted(set(points.radii)) == [0, 0.01]
+    assert len(hull_points().radii) == 41 + 6 * 6 * 11
+
+
+def test_inside_a_pipe_is_in_its_bore_and_between_its_ends() -> None:
+    at = [(-1, 2.5, 0.8), (-1, 2.501, 0.8), (-1, 0, 0.8 + 0.661), (-1, 0, 0.8 + 0.663),
+          (5.66, -6.42, 0.8), (0.5, 0, 0.7)]  # fmt: skip
+    assert inside_pipe(PIPES, at).tolist() == [True, False, True, False, True, False]
+    assert pipe_index(PIPES, at).tolist() == [0, -1, 0, -1, 2, -1]
+    assert inside_pipe(Scene("empty"), at).tolist() == [False] * 6

@@ -1,0 +1,106 @@
+"""Where the base may be asked to go: overlaps with walls, and legal points near by."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.config.load import load_mission
+from cloudrc.config.mission_check import check_mission
+from cloudrc.config.schema import Mission, Steps, Waypoint
+from cloudrc.geometry.placement import nearest_legal, outside_fence, overlapped_pipe
+from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.messages import Vector
+
+PIPES = load_scene("pipes")
+
+
+def hit(position: Vector, yaw: float = 0.0) -> int:
+    return int(overlapped_pipe(PIPES, np.array([position]), np.array([yaw]))[0])
+
+
+@pytest.mark.parametrize(
+    ("position", "yaw", "pipe"),
+    [
+        ((-1.0, 0.0, 0.8), 0, -1),
+        # The arm's tip is at x + .40, z + .17: from x = -.77 on it is in the wall of pipe 1.
+        ((-0.78, 0.0, 0.8), 0, -1),
+        ((-0.76, 0.0, 0.8), 0, 0),
+        # Beyond that the tip is outside and the arm goes through the wall.
+        ((-0.60, 0.0, 0.8), 0, 0),
+        # Turned along the pipe the arm is out of the way.
+        ((-0.76, 0.0, 0.8), math.pi / 2, -1),
+        # The bottom of the base's box: z - .10 against the bore's z - .662.
+        ((-1.0, 0.0, 0.25), math.pi / 2, -1),
+        ((-1.0, 0.0, 0.23), math.pi / 2, 0),
+        # The wall inside of the box: all its corners are outside of the material.
+        ((-1.0, 0.0, 0.119), math.pi / 2, 0),
+        # At (0, 0) only the rotors are in the way: they do not count.
+        ((0.0, 0.0, 0.8), 0, -1),
+        # Behind the board.
+        ((8.235, -6.422, 0.7), 0, -1),
+    ],
+)
+def test_overlaps(position: Vector, yaw: float, pipe: int) -> None:
+    assert hit(position, yaw) == pipe
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-1, 3)),
+    st.floats(-math.pi, math.pi),
+)
+def test_the_nearest_legal_point_is_legal(position: Vector, yaw: float) -> None:
+    found = nearest_legal(PIPES, position, yaw)
+    assert found is not None
+    assert hit(found, yaw) == -1
+    assert not outside_fence(np.array([found]))[0]
+
+
+def test_a_legal_point_is_its_own_nearest() -> None:
+    assert nearest_legal(PIPES, (-1.0, 0.0, 0.7), 0.0) == (-1, 0, 0.7)
+
+
+@pytest.mark.parametrize(("mission", "scene"), [("pipes", "pipes"), ("steps", "empty"),
+                                                ("hover", "empty")])  # fmt: skip
+def test_shipped_missions_can_be_flown(mission: str, scene: str) -> None:
+    assert check_mission(load_mission(mission), load_scene(scene)) == []
+
+
+def test_every_bad_waypoint_is_named_up_to_a_number() -> None:
+    bad = Waypoint(position_m=(-1.0, 0.0, 0.15))
+    good = Waypoint(position_m=(-1.0, 0.0, 0.7))
+    problems = check_mission(Mission(waypoints=(good, bad) * 30), PIPES)
+    assert len(problems) == 21
+    assert str(problems[0]).startswith("waypoints.1.position_m: [-1, 0, 0.15]: base box or arm")
+    assert str(problems[-1]).startswith("waypoints: 10 more waypoints")
+
+
+def test_none_and_both_are_refused() -> None:
+    assert "none given" in str(check_mission(Mission(), PIPES)[0])
+    both = Mission(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps())
+    assert "not both" in str(check_mission(both, Scene("empty"))[0])
+
+
+@pytest.mark.parametrize(
+    ("steps", "scene", "reason"),
+    [
+        (Steps(centre_m=(0.0, 0.0, 2.0)), "empty", "beyond the fence"),
+        (Steps(centre_m=(1e308, 0.0, 1.0), range_m=(1e308, 0.0, 0.0)), "empty", "beyond the fence"),
+        (Steps(), "pipes", "can end in the wall of pipe_1"),
+    ],
+)
+def test_steps_that_can_end_in_a_wall_are_refused(steps: Steps, scene: str, reason: str) -> None:
+    (problem,) = check_mission(Mission(steps=steps), load_scene(scene))
+    assert problem.path == ("steps",)
+    assert reason in problem.reason
+
+
+def test_points_beyond_all_bounds_are_refused_without_an_overflow() -> None:
+    far = Mission(waypoints=(Waypoint(position_m=(1e300, 0.0, 1.0), yaw_deg=1e300),))
+    (problem,) = check_mission(far, PIPES)
+    assert "beyond the fence" in problem.reason

@@ -1,0 +1,103 @@
+"""The wire: what goes in comes out again, and nothing else gets in."""
+
+import struct
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.messages import Command, GuardState, Odometry, OperatorRequest, Request, Start, Telemetry
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.codec import DecodeError, Kind
+
+stamps = st.integers(-(2**63), 2**63 - 1)
+floats = st.floats(allow_nan=False)
+vectors = st.tuples(floats, floats, floats)
+telemetries = st.builds(
+    lambda stamp, rest, position, orientation, velocity, rate: Telemetry(
+        stamp, Odometry(stamp, position, orientation, velocity, rate), *rest
+    ),
+    stamps,
+    st.tuples(floats, stamps, stamps, stamps, st.integers(0, 2**32 - 1), st.sampled_from(GuardState)),
+    vectors,
+    st.tuples(floats, floats, floats, floats),
+    vectors,
+    vectors,
+)
+commands = st.builds(Command, stamps, stamps, stamps, vectors, floats)
+requests = st.builds(
+    OperatorRequest, st.integers(0, 2**32 - 1), st.sampled_from(Request), st.sampled_from(Start)
+)
+
+
+def datagram(kind: Kind, body: bytes) -> bytes:
+    return codec.encode_header(kind, 0, 1, 2) + body
+
+
+@given(telemetries)
+@settings(max_examples=50, deadline=None)
+def test_telemetry_comes_back_as_it_was(telemetry):
+    assert codec.decode_telemetry(codec.encode_telemetry(telemetry)) == telemetry
+
+
+@given(commands)
+@settings(max_examples=50, deadline=None)
+def test_a_command_comes_back_as_it_was(command):
+    assert codec.decode_command(codec.encode_command(command)) == command
+
+
+@given(requests)
+@settings(max_examples=50, deadline=None)
+def test_a_request_comes_back_as_it_was(request_):
+    assert codec.decode_operator(codec.encode_operator(request_)) == request_
+
+
+def test_the_header_lies_where_the_design_puts_it():
+    data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788)
+    assert data == bytes([1, 4, 1, 0]) + bytes([4, 3, 2, 1]) + bytes.fromhex("8877665544332211")
+
+
+def test_a_command_is_laid_out_as_documented():
+    body = codec.encode_command(Command(1, 2, 3, (4.0, 5.0, 6.0), 7.0))
+    assert body == struct.pack("<qqqdddd", 1, 2, 3, 4.0, 5.0, 6.0, 7.0)
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+def test_every_wrong_length_is_refused(kind):
+    whole = datagram(kind, bytes(codec.BODY_SIZES[kind]))
+    codec.decode_header(whole)
+    for length in (*range(len(whole)), len(whole) + 1, 2048):
+        with pytest.raises(DecodeError, match="malformed"):
+            codec.decode_header(whole[:length].ljust(length, b"\0"))
+
+
+def test_another_version_is_refused_by_name():
+    data = bytearray(datagram(Kind.COMMAND, bytes(codec.BODY_SIZES[Kind.COMMAND])))
+    data[0] = codec.VERSION + 1
+    with pytest.raises(DecodeError, match="version"):
+        codec.decode_header(bytes(data))
+
+
+@given(st.binary(max_size=400))
+@settings(max_examples=300, deadline=None)
+def test_garbage_raises_nothing_but_decode_errors(data):
+    for read in (codec.decode_header, codec.peek):
+        try:
+            read(data)
+        except DecodeError:
+            pass
+
+
+@pytest.mark.parametrize(("offset", "value"), [(4, 9), (5, 9)])
+def test_a_request_that_does_not_exist_is_refused(offset, value):
+    body = bytearray(codec.encode_operator(OperatorRequest(1, Request.START, Start.HERE)))
+    body[offset] = value
+    with pytest.raises(DecodeError):
+        codec.decode_operator(bytes(body))
+
+
+def test_a_guard_state_that_does_not_exist_is_refused():
+    body = bytearray(codec.BODY_SIZES[Kind.TELEMETRY])
+    body[-1] = 200
+    with pytest.raises(DecodeError):
+        codec.decode_telemetry(bytes(body))

@@ -1,0 +1,24 @@
+"""Scenes with another spawn, so that a test can begin in the air or beside the board."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cloudrc.world.scene import FOLDER
+
+SPAWN = 'name="spawn" pos="0 0 .1"'
+
+
+@pytest.fixture
+def scene_at(tmp_path: Path) -> Callable[..., str]:
+    """Write a shipped scene with the spawn at (x, y, z) [m]; returns its path."""
+
+    def write(x: float, y: float, z: float, scene: str = "pipes") -> str:
+        text = (FOLDER / "scenes" / f"{scene}.xml").read_text()
+        assert SPAWN in text
+        path = tmp_path / f"{scene}_{x}_{y}_{z}.xml"
+        path.write_text(text.replace(SPAWN, f'name="spawn" pos="{x} {y} {z}"'))
+        return str(path)
+
+    return write

@@ -1,0 +1,135 @@
+"""The low-level controller's equations, by numbers worked by hand."""
+
+from math import cos, isfinite, radians, sin
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.messages import UPRIGHT, ZERO
+from cloudrc.world.low_level import LowLevel, allocate, attitude
+from cloudrc.world.readings import Readings
+
+WEIGHT = 10.3005  # 1.05 kg * 9.81 m/s^2
+KF = 9.9865e-6
+AT_REST = Readings(ZERO, UPRIGHT, ZERO, ZERO)
+
+
+def test_at_rest_the_force_is_the_weight_that_the_controller_believes_in():
+    assert LowLevel().force(ZERO, ZERO) == pytest.approx((0, 0, WEIGHT))
+
+
+def test_hover_is_508_rad_per_s_on_every_rotor():
+    # 10.3005 / 4 = 2.575125 N; / 9.9865e-6 = 257860.6; root 507.80.
+    assert LowLevel().update(AT_REST, ZERO) == pytest.approx((507.80,) * 4, abs=0.005)
+
+
+def test_proportional_and_integral_force_against_the_velocity_error():
+    # e = v - v_ref = (.1, -.1, .1): P = 4, 4, 10 times; the integral after 2 ms is .0002.
+    force = LowLevel().force((0.1, 0.1, 0.3), (0.0, 0.2, 0.2))
+    assert force == pytest.approx((-0.4002, 0.4002, WEIGHT - 1.0005))
+
+
+def test_derivative_is_that_of_the_error_reference_included():
+    # A reference that jumps by .1 m/s within 2 ms: .3 * .1 / .002 = 15 N, .5 * .1 / .002 = 25 N.
+    low_level = LowLevel(gain_p=ZERO, gain_i=ZERO)
+    low_level.force(ZERO, ZERO)
+    assert low_level.force(ZERO, (0.1, 0.0, 0.1)) == pytest.approx((15, 0, WEIGHT + 25))
+    assert low_level.force(ZERO, (0.1, 0.0, 0.1)) == pytest.approx((0, 0, WEIGHT))
+
+
+def test_the_first_error_has_no_rate():
+    low_level = LowLevel(gain_p=ZERO, gain_i=ZERO)
+    assert low_level.force((1.0, 1.0, 1.0), ZERO) == pytest.approx((0, 0, WEIGHT))
+
+
+@pytest.mark.parametrize(("limit", "force"), [(0.10, 0.1), (0.30, 0.3)])
+def test_the_integral_force_in_x_and_y_is_limited(limit, force):
+    low_level = LowLevel(integral_limit_xy=limit)
+    for _ in range(1000):  # 2 s of 1 m/s would integrate to 2 m
+        low_level.force((-1.0, 1.0, -1.0), ZERO)
+    low_level.force(ZERO, ZERO)
+    assert low_level.force(ZERO, ZERO) == pytest.approx((force, -force, WEIGHT + 2.5 * 0.40))
+
+
+def test_reset_forgets_integral_and_last_error():
+    low_level = LowLevel()
+    fresh = low_level.update(AT_REST, (0.3, 0.2, 0.1))
+    assert low_level.update(AT_REST, (0.5, 0.5, 0.5)) != fresh
+    low_level.reset()
+    assert low_level.update(AT_REST, (0.3, 0.2, 0.1)) == fresh
+
+
+@pytest.mark.parametrize(("axis", "gain"), [((1, 0, 0), 1.0), ((0, 1, 0), 1.0), ((0, 0, 1), 0.035)])
+def test_attitude_error_is_the_sine_of_the_angle(axis, gain):
+    # Rolled, pitched or yawed by 20 deg while the force is straight up: e_R = sin 20 deg.
+    half = radians(10.0)
+    tilted = (cos(half), *(sin(half) * a for a in axis))
+    thrust, torque = attitude((0.0, 0.0, 10.0), tilted, ZERO)
+    assert torque == pytest.approx([-gain * sin(radians(20.0)) * a for a in axis])
+    assert thrust == pytest.approx(10.0 * (1.0 if axis[2] else cos(radians(20.0))))
+
+
+def test_a_forward_force_pitches_the_nose_down():
+    # Wanted tilt atan(3/4) about +y, so e_R = -sin = -.6; thrust is the force's part along z.
+    thrust, torque = attitude((3.0, 0.0, 4.0), UPRIGHT, ZERO)
+    assert torque == pytest.approx((0, 0.6, 0))
+    assert thrust == pytest.approx(4.0)
+
+
+def test_rates_are_damped():
+    _, torque = attitude((0.0, 0.0, 10.0), UPRIGHT, (1.0, 2.0, 3.0))
+    assert torque == pytest.approx((-0.22, -0.44, -0.03))
+
+
+unit = st.floats(-1.0, 1.0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    force=st.tuples(unit, unit, st.floats(0.2, 2.0)),
+    quaternion=st.tuples(*[unit] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
+)
+def test_attitude_is_the_matrix_formula(force, quaternion):
+    w, *q = np.array(quaternion) / np.linalg.norm(quaternion)
+    cross = np.array([[0, -q[2], q[1]], [q[2], 0, -q[0]], [-q[1], q[0], 0]])
+    rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    z_d = np.array(force) / np.linalg.norm(force)
+    y_d = np.cross(z_d, (1.0, 0.0, 0.0))
+    y_d /= np.linalg.norm(y_d)
+    error = np.column_stack([np.cross(y_d, z_d), y_d, z_d]).T @ rotation
+    error = 0.5 * (error - error.T)
+    thrust, torque = attitude(force, (w, *q), ZERO)
+    assert thrust == pytest.approx(np.dot(force, rotation[:, 2]), abs=1e-9)
+    assert torque == pytest.approx((-error[2, 1], -error[0, 2], -0.035 * error[1, 0]), abs=1e-9)
+
+
+@pytest.mark.parametrize("force", [ZERO, (5.0, 0.0, 0.0), (0.0, 0.0, -5.0)])
+def test_no_force_leaves_the_attitude_undefined(force):
+    thrust, torque = attitude(force, UPRIGHT, ZERO)
+    assert isfinite(thrust)
+    assert all(isfinite(t) for t in torque)
+
+
+small = st.floats(-0.1, 0.1)
+
+
+@settings(max_examples=50, deadline=None)
+@given(thrust=st.floats(6.0, 20.0), roll=small, pitch=small, yaw=st.floats(-0.02, 0.02))
+def test_allocation_gives_thrust_and_torque(thrust, roll, pitch, yaw):
+    front, left, back, right = (KF * w * w for w in allocate(thrust, (roll, pitch, yaw)))
+    # r x F for rotors at (.21, 0), (0, .21), (-.21, 0), (0, -.21) that push up.
+    assert front + left + back + right == pytest.approx(thrust)
+    assert 0.21 * (left - right) == pytest.approx(roll, abs=1e-12)
+    assert -0.21 * (front - back) == pytest.approx(pitch, abs=1e-12)
+    assert 0.016 * (front - left + back - right) == pytest.approx(yaw, abs=1e-12)
+
+
+@pytest.mark.parametrize(("thrust", "speed"), [(-5.0, 0.0), (0.0, 0.0), (200.0, 1838.0)])
+def test_rotor_speeds_stay_within_their_range(thrust, speed):
+    assert allocate(thrust, ZERO) == (speed,) * 4
+
+
+def test_a_slower_loop_integrates_over_its_own_period():
+    assert LowLevel(dt=0.01).force((0.1, 0.0, 0.0), ZERO)[0] == pytest.approx(-0.401)

@@ -1,0 +1,207 @@
+"""Robot and scene hold to plant.md: masses, pipes, board, contact, and bad files are refused."""
+
+from math import pi, sin, tan
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from cloudrc.errors import BadInputError
+from cloudrc.world.scene import FOLDER, compile_model, mujoco
+from cloudrc.world.simulator import STOPPED, Simulator
+
+ROBOTS = sorted(path.stem for path in (FOLDER / "robots").glob("*.xml"))
+SCENES = sorted(path.stem for path in (FOLDER / "scenes").glob("*.xml"))
+BASE = 1  # the only moving body, once the static ones are fused
+
+
+@pytest.fixture(scope="module")
+def pipes():
+    return compile_model("pelican", "pipes")
+
+
+def facts(scene: str) -> dict[str, list[float]]:
+    """What readers without MuJoCo see."""
+    root = ElementTree.parse(FOLDER / "scenes" / f"{scene}.xml").getroot()
+    return {n.get("name"): [float(x) for x in n.get("data").split()] for n in root.iter("numeric")}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    model = compile_model(robot, scene)
+    assert model.opt.timestep == 0.002
+    assert model.opt.gravity.tolist() == [0.0, 0.0, -9.8066]
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert not list(tmp_path.iterdir()), "MuJoCo wrote a log"
+
+
+def test_mass_centre_and_inertia_are_the_sum_of_the_parts(pipes):
+    def rod(radius, length):  # across and along its axis, 10 g
+        return 0.01 * (3 * radius**2 + length**2) / 12, 0.01 * radius**2 / 2
+
+    across, along = rod(0.01, 0.4)
+    flat, spin = rod(0.128, 0.005)
+    parts = [
+        (1.0, (0, 0, 0), (0.01, 0.01, 0.02)),
+        (0.01, (0, 0, 0.12), (1.825e-5, 1.825e-5, 1.25e-5)),
+        (0.01, (0.2, 0, 0.17), (along, across, across)),
+        *(
+            (0.01, (x, y, 0.05), (flat, flat, spin))
+            for x, y in [(0.21, 0), (0, 0.21), (-0.21, 0), (0, -0.21)]
+        ),
+    ]
+    mass = sum(m for m, _, _ in parts)
+    centre = sum(m * np.array(r) for m, r, _ in parts) / mass
+    inertia = np.zeros((3, 3))
+    for m, r, diagonal in parts:
+        d = np.array(r) - centre
+        inertia += np.diag(diagonal) + m * (d @ d * np.eye(3) - np.outer(d, d))
+
+    assert pipes.body_mass[BASE] == pytest.approx(mass) == pytest.approx(1.06)
+    assert pipes.body_ipos[BASE] == pytest.approx(centre, abs=1e-9)
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, pipes.body_iquat[BASE])
+    axes = rotation.reshape(3, 3)
+    assert axes @ np.diag(pipes.body_inertia[BASE]) @ axes.T == pytest.approx(inertia, abs=1e-9)
+
+
+@pytest.mark.parametrize(("rotor", "x", "y", "sign"), [
+    ("front", 0.21, 0, 1), ("left", 0, 0.21, -1), ("back", -0.21, 0, 1), ("right", 0, -0.21, -1),
+])  # fmt: skip
+def test_rotors_push_along_z_where_they_are(pipes, rotor, x, y, sign):
+    actuator = pipes.actuator(f"robot/rotor_{rotor}")
+    site = pipes.site(actuator.trnid[0])
+    assert site.pos.tolist() == pytest.approx([x, y, 0.05])
+    assert actuator.gear.tolist() == [0, 0, 1, 0, 0, sign * 0.016]
+
+
+def test_readers_without_mujoco_see_what_is_compiled(pipes):
+    told = facts("pipes")
+    assert list(told) == ["pipe_1", "pipe_2", "pipe_3", "board"]
+    for name, numbers in told.items():
+        assert pipes.numeric(name).data.tolist() == numbers
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("pipe_1", (-1, 0, 0.8, 0, -1, 0)),
+        ("pipe_2", (0.96, -4.61, 0.8, sin(0.8), -sin(pi / 2 - 0.8), 0)),
+        ("pipe_3", (5.66, -6.42, 0.8, sin(1.57), -sin(pi / 2 - 1.57), 0)),
+    ],
+)
+def test_staves_are_tangent_to_the_pipe(pipes, name, expected):
+    numbers = facts("pipes")[name]
+    assert numbers == pytest.approx((*expected, 5.0, 0.662, 0.700), abs=1e-9)
+    centre, axis = np.array(numbers[:3]), np.array(numbers[3:6])
+    data = mujoco.MjData(pipes)
+    mujoco.mj_kinematics(pipes, data)
+    staves = [i for i in range(pipes.ngeom) if pipes.geom(i).name.startswith(f"{name}/")]
+    assert len(staves) == 24
+    directions = []
+    for stave in staves:
+        out = data.geom_xpos[stave] - centre
+        frame = data.geom_xmat[stave].reshape(3, 3)
+        thickness, width, length = pipes.geom_size[stave]
+        assert out @ axis == pytest.approx(0, abs=1e-9)
+        assert abs(frame[:, 2] @ axis) == pytest.approx(1)
+        assert frame[:, 0] @ out == pytest.approx(np.linalg.norm(out))
+        assert np.linalg.norm(out) - thickness == pytest.approx(0.662)
+        assert np.linalg.norm(out) + thickness == pytest.approx(0.700)
+        assert width == pytest.approx(0.700 * tan(pi / 24), abs=1e-4)
+        assert length == 2.5
+        directions.append(out / np.linalg.norm(out))
+    assert np.sum(directions, axis=0) == pytest.approx([0, 0, 0], abs=1e-9)
+
+
+def test_the_board_is_where_it_is_said_to_be(pipes):
+    x, y_min, y_max, z_min, z_max = facts("pipes")["board"]
+    assert (x, y_min, y_max, z_min, z_max) == (8.535, -6.82, -6.02, 0.025, 1.225)
+    geoms = [pipes.geom(number) for number in range(pipes.ngeom)]
+    (board,) = [geom for geom in geoms if geom.name.startswith("board/")]
+    low, high = board.pos - board.size, board.pos + board.size
+    assert low.tolist() == pytest.approx([x, y_min, z_min])
+    assert high[1:].tolist() == pytest.approx([y_max, z_max])
+
+
+def touched_at(scene: str) -> set[str]:
+    """What the robot touches where it spawns, apart from the floor that it stands on."""
+    simulator = Simulator("pelican", scene)
+    simulator.step(STOPPED)
+    return {touch.body for touch in simulator.take_contacts()}
+
+
+def test_the_spawn_is_free_but_straight_above_is_pipe_1(scene_at):
+    assert touched_at("pipes") == set()
+    # The rear rotor's rim reaches x = -.338; pipe 1's outside is at -1 + .7 = -.3.
+    assert touched_at(scene_at(0.0, 0.0, 0.75)) == {"pipe_1"}
+    for height in (0.3, 0.5, 0.75, 1.0):
+        assert touched_at(scene_at(0.2, 0.0, height)) == set()
+
+
+def test_the_tip_meets_the_board_with_the_base_at_8_135(scene_at):
+    assert touched_at(scene_at(8.134, -6.42, 0.7)) == set()
+    assert touched_at(scene_at(8.136, -6.42, 0.7)) == {"board"}
+
+
+def test_a_contact_has_the_stiffness_and_friction_of_the_scene(scene_at):
+    simulator = Simulator("pelican", scene_at(8.136, -6.42, 0.7))
+    contact = simulator._data.contact
+    assert contact.solref[0].tolist() == [0.005, 1.0]
+    assert contact.friction[0, 0] == 0.6
+
+
+GOOD = (FOLDER / "robots" / "pelican.xml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("robot", "message"),
+    [
+        (GOOD.replace("</mujoco>", ""), "does not compile"),
+        (GOOD.replace('size=".05 .05 .10"', 'size=".05 nan .10"'), "does not compile"),
+        (GOOD.replace('name="rotor_left" site', 'name="rotor_5" site'), "needs the actuators"),
+        (GOOD.replace('touch name="tip"', 'touch name="hand"'), "needs a sensor named tip"),
+        (GOOD.replace('<freejoint name="base"/>', ""), "freejoint"),
+    ],
+)
+def test_a_robot_that_cannot_fly_is_refused(tmp_path, monkeypatch, robot, message):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "robot.xml"
+    path.write_text(robot)
+    with pytest.raises(BadInputError, match=message) as error:
+        compile_model(str(path), "empty")
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == [path], "MuJoCo wrote a log"
+
+
+SCENE = (FOLDER / "scenes" / "empty.xml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("scene", "message"),
+    [
+        (SCENE.replace('name="spawn"', 'name="start"'), "needs a frame named spawn"),
+        (SCENE.replace('timestep=".002"', 'timestep=".01"'), "timestep is 0.01, not 0.002"),
+        (SCENE.replace('<body name="floor">', '<body><freejoint/><geom size="1"/></body><body>'),
+         "nothing else may move"),
+    ],
+)  # fmt: skip
+def test_a_scene_that_cannot_be_flown_in_is_refused(tmp_path, scene, message):
+    path = tmp_path / "scene.xml"
+    path.write_text(scene)
+    with pytest.raises(BadInputError, match=message) as error:
+        compile_model("pelican", str(path))
+    assert str(path) in str(error.value)
+
+
+def test_an_unknown_name_lists_those_that_there_are():
+    with pytest.raises(BadInputError, match=r"no robot named 'pelikan'; available: pelican"):
+        compile_model("pelikan", "pipes")
+    with pytest.raises(BadInputError, match=r"no scene named 'tubes'; available: empty, pipes"):
+        compile_model("pelican", "tubes")
+    with pytest.raises(BadInputError, match="no scene named"):
+        compile_model("pelican", "/nowhere/scene.xml")

@@ -1,0 +1,160 @@
+"""The physics: rotors and drag by their formulas, hover as predicted, replay bit-equal."""
+
+from math import exp
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.messages import UPRIGHT, ZERO
+from cloudrc.world.low_level import LowLevel, allocate
+from cloudrc.world.readings import Readings
+from cloudrc.world.replay import replay
+from cloudrc.world.rotors import RotorLag, drag
+from cloudrc.world.simulator import Simulator
+
+HOVER = 10.394996  # 1.06 kg * 9.8066 m/s^2
+
+
+def fly(simulator, low_level, reference, duration):
+    """Follow a velocity [m/s] for a duration [s]."""
+    for _ in range(round(duration / simulator.dt)):
+        simulator.step(low_level.update(simulator.readings, reference))
+
+
+def test_rotors_are_faster_up_than_down():
+    # One time constant: 1 - 1/e of the way up in 12.5 ms; down only 1 - exp(-1/2).
+    up, same, down, off = RotorLag(0.0125).step(
+        (0.0, 500.0, 1000.0, 800.0), (100.0, 500.0, 0.0, 0.0)
+    )
+    assert up == pytest.approx(63.212, abs=1e-3)
+    assert same == 500.0
+    assert down == pytest.approx(606.531, abs=1e-3)
+    assert off == pytest.approx(800.0 * exp(-0.5))
+
+
+def test_the_lag_does_not_depend_on_the_step():
+    coarse = RotorLag(0.01).step((0.0,) * 4, (100.0,) * 4)
+    fine, lag = (0.0,) * 4, RotorLag(0.002)
+    for _ in range(5):
+        fine = lag.step(fine, (100.0,) * 4)
+    assert fine == pytest.approx(coarse)
+
+
+def test_drag_of_level_flight_by_hand():
+    # Four rotors at 500 rad/s: 8.06428e-5 * 2000 = .1612856 N s/m. At 2 m/s: -.3225712 N, and it
+    # acts .05 m above the base: torque .05 * -.3225712 about y.
+    wrench = drag((500.0,) * 4, Readings(ZERO, UPRIGHT, (2.0, 0.0, 1.0), ZERO))
+    assert wrench == pytest.approx((-0.3225712, 0, 0, 0, -0.01612856, 0))
+
+
+unit = st.floats(-1.0, 1.0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    speeds=st.tuples(*[st.floats(0.0, 1838.0)] * 4),
+    quaternion=st.tuples(*[unit] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
+    velocity=st.tuples(*[st.floats(-5.0, 5.0)] * 3),
+    rate=st.tuples(*[st.floats(-5.0, 5.0)] * 3),
+)
+def test_drag_is_the_sum_over_the_rotors(speeds, quaternion, velocity, rate):
+    w, *q = np.array(quaternion) / np.linalg.norm(quaternion)
+    cross = np.array([[0, -q[2], q[1]], [q[2], 0, -q[0]], [-q[1], q[0], 0]])
+    rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    force, torque = np.zeros(3), np.zeros(3)
+    hubs = [(0.21, 0, 0.05), (0, 0.21, 0.05), (-0.21, 0, 0.05), (0, -0.21, 0.05)]
+    for speed, hub in zip(speeds, hubs, strict=True):
+        across = (rotation.T @ velocity + np.cross(rate, hub)) * (1, 1, 0)
+        force += -speed * 8.06428e-5 * across
+        torque += np.cross(hub, -speed * 8.06428e-5 * across)
+    wrench = drag(speeds, Readings(ZERO, (w, *q), velocity, rate))
+    assert wrench == pytest.approx([*(rotation @ force), *torque], abs=1e-9)
+
+
+def test_it_stands_at_its_spawn():
+    simulator = Simulator("pelican", "pipes")
+    assert simulator.readings == Readings((0.0, 0.0, 0.1), UPRIGHT, ZERO, ZERO)
+    for _ in range(500):
+        simulator.step((0.0,) * 4)
+    assert simulator.readings.position == pytest.approx((0, 0, 0.1), abs=1e-3)
+    assert simulator.take_contacts() == []
+
+
+def test_free_fall_then_thrust(scene_at):
+    simulator = Simulator("pelican", scene_at(0, 0, 5, "empty"))
+    for _ in range(100):
+        simulator.step((0.0,) * 4)
+    assert simulator.readings.velocity[2] == pytest.approx(-9.8066 * 0.2, rel=1e-4)
+    assert simulator.tip_force() == 0.0
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_torque_allocated_is_the_torque_that_turns(scene_at, axis, sign):
+    torque = [0.0, 0.0, 0.0]
+    torque[axis] = sign * 0.02
+    turned, straight = (Simulator("pelican", scene_at(0, 0, 5, "empty")) for _ in range(2))
+    for _ in range(50):
+        turned.step(allocate(HOVER, tuple(torque)))
+        straight.step(allocate(HOVER, ZERO))
+    rates = zip(
+        turned.readings.angular_velocity_body, straight.readings.angular_velocity_body, strict=True
+    )
+    change = [a - b for a, b in rates]
+    # .02 N m for .1 s, less the rotors' lag of about 12.5 ms, over the moment of inertia.
+    inertia = (0.0116, 0.0121, 0.0226)[axis]
+    assert change[axis] == pytest.approx(sign * 0.02 * 0.0875 / inertia, rel=0.1)
+
+
+def test_hover_without_position_feedback_drifts_forward_by_26_mm_per_s(scene_at):
+    # The arm's moment of .01 kg * .2 m * 9.81 m/s^2 tilts the robot by .0196 rad (k_R = 1), that is
+    # .204 N forward. The integral takes .1 N of it; the rest drives it on at 4 v = .104 N.
+    simulator = Simulator("pelican", scene_at(0, 0, 3, "empty"))
+    fly(simulator, LowLevel(), ZERO, 10.0)
+    assert simulator.readings.velocity == pytest.approx((0.026, 0, 0), abs=0.002)
+    assert simulator.readings.orientation_wxyz == pytest.approx((1, 0, 0, 0), abs=0.02)
+
+
+def test_with_the_higher_integral_limit_it_stands_still(scene_at):
+    simulator = Simulator("pelican", scene_at(0, 0, 3, "empty"))
+    fly(simulator, LowLevel(integral_limit_xy=0.30), ZERO, 25.0)
+    assert simulator.readings.velocity == pytest.approx(ZERO, abs=0.001)
+
+
+def test_a_velocity_is_followed(scene_at):
+    simulator = Simulator("pelican", scene_at(0, 0, 3, "empty"))
+    fly(simulator, LowLevel(integral_limit_xy=0.30), (0.5, -0.3, 0.2), 8.0)
+    assert simulator.readings.velocity == pytest.approx((0.5, -0.3, 0.2), abs=0.05)
+
+
+def test_reset_gives_the_same_flight_again():
+    simulator, low_level = Simulator("pelican", "pipes"), LowLevel()
+    ends = []
+    for _ in range(2):
+        simulator.reset()
+        low_level.reset()
+        assert simulator.readings.position == (0.0, 0.0, 0.1)
+        fly(simulator, low_level, (0.2, 0.0, 0.3), 1.0)
+        ends.append(simulator.readings)
+    assert ends[0] == ends[1]
+    assert ends[0].position[2] > 0.2
+
+
+@pytest.mark.parametrize("before", [0.2, 1.5])
+def test_the_tape_replays_to_the_same_bits_through_contact(scene_at, before):
+    # It begins before the board is touched, or while the tip presses on it.
+    simulator, low_level = Simulator("pelican", scene_at(8.0, -6.42, 0.9)), LowLevel()
+    fly(simulator, low_level, (0.2, 0.0, 0.0), before)
+    assert (simulator.tip_force() > 0.0) == (before > 1.0)
+    start, simulator.tape = simulator.state(), []
+    fly(simulator, low_level, (0.2, 0.05, 0.0), 2.0)
+    assert [touch.body for touch in simulator.take_contacts()] == ["board"]
+    assert len(simulator.tape) == 1000
+    assert replay(simulator.model, start, simulator.tape).tobytes() == (
+        simulator.state().physics.tobytes()
+    )
+    # The drag on the tape matters: without it the flight ends elsewhere.
+    still = [(*controls[:4], *(0.0,) * 6) for controls in simulator.tape]
+    assert replay(simulator.model, start, still).tobytes() != simulator.state().physics.tobytes()
