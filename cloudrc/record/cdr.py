@@ -1,0 +1,190 @@
+"""The edge to ROS 2: rows of topics go in, CDR bytes of ROS messages come out, and back again.
+
+Here and nowhere else quaternions turn from `wxyz` to `xyzw` and an odometry's velocity from the
+world frame to the body frame. Every message opens with a `std_msgs/Header` whose stamp is the
+row's; the frames are `world` and `base_link`. rosbags does the encoding.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from cloudrc.messages import Quaternion, Vector
+from cloudrc.record.ros_types import STORE
+from cloudrc.record.schema import Kind, Topic, Values
+from cloudrc.record.topics import TOPICS
+
+_SECOND_NS = 1_000_000_000
+_ENCAPSULATION = 4
+"""Bytes ahead of the message proper; the second one is 1 if it is little-endian."""
+
+_type: dict[str, Any] = dict(STORE.types)
+_Time, _Header = _type["builtin_interfaces/msg/Time"], _type["std_msgs/msg/Header"]
+_Vector3, _Point = _type["geometry_msgs/msg/Vector3"], _type["geometry_msgs/msg/Point"]
+_Quaternion, _Pose = _type["geometry_msgs/msg/Quaternion"], _type["geometry_msgs/msg/Pose"]
+_PoseWithCovariance = _type["geometry_msgs/msg/PoseWithCovariance"]
+_Twist, _TwistStamped = _type["geometry_msgs/msg/Twist"], _type["geometry_msgs/msg/TwistStamped"]
+_TwistWithCovariance = _type["geometry_msgs/msg/TwistWithCovariance"]
+_Odometry = _type["nav_msgs/msg/Odometry"]
+_PointStamped = _type["geometry_msgs/msg/PointStamped"]
+
+_NO_COVARIANCE = np.zeros(36)
+_UNKNOWN = _Vector3(np.nan, np.nan, np.nan)
+
+
+def encode(topic: Topic, stamp_ns: int, values: Values) -> bytes:
+    """Turn a row into the CDR bytes of its ROS message.
+
+    Args:
+        topic: The row's.
+        stamp_ns: The row's [ns]; it becomes the header's stamp.
+        values: In the order of the topic's fields.
+
+    Returns:
+        Little-endian CDR with its encapsulation header.
+    """
+    sec, nanosec = divmod(stamp_ns, _SECOND_NS)
+    build = _CODECS[topic.name][0]
+    message = build(_Header(_Time(sec, nanosec), "world"), values)
+    return bytes(STORE.serialize_cdr(message, topic.ros_type, little_endian=True))
+
+
+def decode(topic: Topic, data: bytes) -> tuple[int, Values]:
+    """Turn the CDR bytes of a ROS message back into a row.
+
+    Args:
+        topic: The one that the message was recorded under.
+        data: CDR with its encapsulation header.
+
+    Returns:
+        The stamp [ns] and the values in the order of the topic's fields.
+    """
+    message: Any = STORE.deserialize_cdr(data, topic.ros_type)
+    stamp = message.header.stamp
+    return stamp.sec * _SECOND_NS + stamp.nanosec, _CODECS[topic.name][1](message)
+
+
+def shifted(data: bytes, offset_ns: int) -> bytes:
+    """Move a message's stamp without decoding the rest of it.
+
+    Args:
+        data: CDR of any of our messages: all of them open with the stamp of their header.
+        offset_ns: Added to the stamp [ns].
+    """
+    if offset_ns == 0:
+        return data
+    stamp = struct.Struct("<iI" if data[1] else ">iI")
+    sec, nanosec = stamp.unpack_from(data, _ENCAPSULATION)
+    moved = stamp.pack(*divmod(sec * _SECOND_NS + nanosec + offset_ns, _SECOND_NS))
+    return data[:_ENCAPSULATION] + moved + data[_ENCAPSULATION + stamp.size :]
+
+
+def _rotate(orientation_wxyz: Quaternion, vector: Vector) -> Vector:
+    """Turn a vector from the body frame to the world frame: v + 2 u x (u x v + w v).
+
+    Source: Rodrigues' formula for the unit quaternion (w, u).
+    """
+    w, x, y, z = orientation_wxyz
+    a, b, c = vector
+    p, q, r = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
+    return a + 2 * (y * r - z * q), b + 2 * (z * p - x * r), c + 2 * (x * q - y * p)
+
+
+def _build_odometry(header: Any, values: Values) -> Any:
+    position, (w, x, y, z), velocity = values[:3]
+    rates = _Vector3(*values[3]) if len(values) > 3 else _UNKNOWN
+    pose = _Pose(_Point(*position), _Quaternion(x, y, z, w))
+    twist = _Twist(_Vector3(*_rotate((w, -x, -y, -z), velocity)), rates)
+    with_pose = _PoseWithCovariance(pose, _NO_COVARIANCE)
+    return _Odometry(header, "base_link", with_pose, _TwistWithCovariance(twist, _NO_COVARIANCE))
+
+
+def _parse_odometry(message: Any) -> Values:
+    pose, twist = message.pose.pose, message.twist.twist
+    q = pose.orientation
+    wxyz = (q.w, q.x, q.y, q.z)
+    return _xyz(pose.position), wxyz, _rotate(wxyz, _xyz(twist.linear)), _xyz(twist.angular)
+
+
+def _parse_odometry_without_rates(message: Any) -> Values:
+    return _parse_odometry(message)[:3]
+
+
+def _build_twist(header: Any, values: Values) -> Any:
+    yaw_rate = values[1] if len(values) > 1 else 0.0
+    return _TwistStamped(header, _Twist(_Vector3(*values[0]), _Vector3(0.0, 0.0, yaw_rate)))
+
+
+def _parse_twist(message: Any) -> Values:
+    return (_xyz(message.twist.linear),)
+
+
+def _parse_twist_with_yaw_rate(message: Any) -> Values:
+    return _xyz(message.twist.linear), message.twist.angular.z
+
+
+def _build_point(header: Any, values: Values) -> Any:
+    return _PointStamped(header, _Point(*values[0]))
+
+
+def _parse_point(message: Any) -> Values:
+    return (_xyz(message.point),)
+
+
+def _xyz(vector: Any) -> Vector:
+    return vector.x, vector.y, vector.z
+
+
+def _printable(text: str) -> str:
+    return text if text.isascii() else text.encode("utf-8", "replace").decode()
+
+
+_TO_ROS: dict[Kind, Callable[[Any], Any]] = {
+    "int": int,
+    "float": float,
+    "bool": bool,
+    "string": _printable,
+    "vector": lambda vector: _Vector3(*vector),
+    "quaternion": lambda q: _Quaternion(q[1], q[2], q[3], q[0]),
+}
+_FROM_ROS: dict[Kind, Callable[[Any], Any]] = {
+    "vector": _xyz,
+    "quaternion": lambda q: (q.w, q.x, q.y, q.z),
+}
+_Codec: TypeAlias = tuple[Callable[[Any, Values], Any], Callable[[Any], Values]]
+
+
+def _own_codec(topic: Topic) -> _Codec:
+    cls = _type[topic.ros_type]
+    to_ros = [_TO_ROS[field.kind] for field in topic.fields]
+    from_ros = [(field.name, _FROM_ROS.get(field.kind)) for field in topic.fields]
+
+    def build(header: Any, values: Values) -> Any:
+        return cls(header, *[turn(value) for turn, value in zip(to_ros, values, strict=True)])
+
+    def parse(message: Any) -> Values:
+        raw = [(getattr(message, name), turn) for name, turn in from_ros]
+        return tuple([turn(value) if turn else value for value, turn in raw])
+
+    return build, parse
+
+
+def _codec(topic: Topic) -> _Codec:
+    several = len(topic.fields)
+    match topic.ros_type:
+        case "nav_msgs/msg/Odometry":
+            parse = _parse_odometry if several == 4 else _parse_odometry_without_rates
+            return _build_odometry, parse
+        case "geometry_msgs/msg/TwistStamped":
+            return _build_twist, _parse_twist if several == 1 else _parse_twist_with_yaw_rate
+        case "geometry_msgs/msg/PointStamped":
+            return _build_point, _parse_point
+        case _:
+            return _own_codec(topic)
+
+
+_CODECS: dict[str, _Codec] = {name: _codec(topic) for name, topic in TOPICS.items()}

@@ -1,0 +1,177 @@
+"""The recording as numbers: records or a file go in, one table of arrays per topic comes out.
+
+    recording = Recording.read(path)
+    recording["/odometry"]["position"]  # shape (n, 3)
+
+A topic that nothing was recorded under is a table without rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from itertools import repeat
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cloudrc.record.order import merged
+from cloudrc.record.schema import Kind, Topic, Values
+from cloudrc.record.topics import TOPICS
+from cloudrc.records import Record
+
+if TYPE_CHECKING:
+    from cloudrc.record.reader import Contents
+
+Column: TypeAlias = NDArray[Any]
+_Rows: TypeAlias = dict[str, list[tuple[int, Values]]]
+
+_TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
+    "int": (np.int64, ()),
+    "float": (np.float64, ()),
+    "bool": (np.bool_, ()),
+    "string": (np.object_, ()),
+    "vector": (np.float64, (3,)),
+    "quaternion": (np.float64, (4,)),
+}
+
+
+class Table:
+    """The rows of one topic, column by column; its length is the number of rows n.
+
+    Integers are int64, floats and vectors float64, truth values bool, strings objects; vectors
+    have shape (n, 3), quaternions (n, 4), all others (n,).
+    """
+
+    def __init__(self, topic: Topic, rows: list[tuple[int, Values]]) -> None:
+        """Turn rows into columns.
+
+        Args:
+            topic: Says what the values are.
+            rows: Stamp [ns] and values of each.
+        """
+        stamps = [stamp_ns for stamp_ns, _ in rows]
+        columns = zip(*[values for _, values in rows], strict=True) if rows else repeat(())
+        self._columns = {"stamp_ns": _column("int", stamps)}
+        for field, values in zip(topic.fields, columns, strict=False):
+            self._columns[field.name] = _column(field.kind, values)
+        self.topic = topic
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The columns' names, `stamp_ns` first."""
+        return tuple(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns["stamp_ns"])
+
+    def __getitem__(self, name: str) -> Column:
+        try:
+            return self._columns[name]
+        except KeyError:
+            known = ", ".join(self.names)
+            raise KeyError(f"no column {name!r} in {self.topic.name}; it has: {known}") from None
+
+
+class Recording:
+    """Everything that was recorded of a flight, by topic.
+
+    Attributes:
+        metadata: Of the file: clock, offset between the clocks; empty if made from records.
+        attachments: Files attached to it, by name.
+        note: What is missing, in words; "" if nothing is.
+    """
+
+    def __init__(self, rows: _Rows, contents: Contents | None = None) -> None:
+        """Take rows by topic; most callers want `read` or `from_records`.
+
+        Args:
+            rows: Stamp [ns] and values of each row, in order, by topic.
+            contents: The file that they come from, if they do.
+        """
+        self._rows = rows
+        self._tables: dict[str, Table] = {}
+        self.metadata: Mapping[str, str] = contents.metadata if contents else {}
+        self.attachments: Mapping[str, bytes] = contents.attachments if contents else {}
+        self.note = contents.note if contents else ""
+
+    @property
+    def complete(self) -> bool:
+        """True if nothing is missing."""
+        return not self.note
+
+    @classmethod
+    def from_records(
+        cls,
+        world_records: Iterable[Record],
+        cloud_records: Iterable[Record] = (),
+        offset_ns: int = 0,
+    ) -> Self:
+        """Make a recording in memory, equal to the one that a merged file gives.
+
+        Args:
+            world_records: Oldest first, on world's clock.
+            cloud_records: Oldest first, on cloud's clock.
+            offset_ns: World's clock minus cloud's [ns].
+        """
+        rows: _Rows = {name: [] for name in TOPICS}
+        for _, (topic, stamp_ns, values) in merged(world_records, cloud_records, offset_ns):
+            rows[topic].append((stamp_ns, values))
+        return cls(rows)
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read an MCAP file as far as it goes.
+
+        Args:
+            path: Whole or torn.
+
+        Raises:
+            BadInputError: If nothing in it can be read.
+            MissingPrerequisiteError: If `cloudrc[record]` is not installed.
+        """
+        from cloudrc.record.reader import read_contents
+
+        return cls.from_contents(read_contents(path))
+
+    @classmethod
+    def from_contents(cls, contents: Contents) -> Self:
+        """Decode what a file held.
+
+        Args:
+            contents: As read.
+        """
+        from cloudrc.record.cdr import decode
+
+        rows: _Rows = {name: [] for name in TOPICS}
+        unreadable = 0
+        for topic, _, data in contents.messages:
+            try:
+                rows[topic].append(decode(TOPICS[topic], data))
+            except Exception:  # rosbags on bytes that are not what they claim to be
+                unreadable += 1
+        recording = cls(rows, contents)
+        if unreadable:
+            recording.note += f"{'; ' * bool(recording.note)}{unreadable} messages are not readable"
+        return recording
+
+    def __getitem__(self, topic: str) -> Table:
+        if topic not in self._tables:
+            if topic not in TOPICS:
+                raise KeyError(f"no topic {topic!r}; there are: {', '.join(TOPICS)}")
+            self._tables[topic] = Table(TOPICS[topic], self._rows.get(topic, []))
+        return self._tables[topic]
+
+    def get(self, topic: str) -> Table:
+        """Look a topic up, like `recording[topic]`: without rows if none were recorded.
+
+        Args:
+            topic: A name of the table of topics.
+        """
+        return self[topic]
+
+
+def _column(kind: Kind, values: Iterable[Any]) -> Column:
+    dtype, shape = _TYPES[kind]
+    return np.array(values, dtype=dtype).reshape(-1, *shape)

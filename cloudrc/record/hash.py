@@ -1,0 +1,99 @@
+"""The identity of a run: records go in, one SHA-256 over all of them comes out.
+
+A record's bytes are little-endian and do not depend on the process: the length and name of its
+type, then its numbers (integers as 64 bit, floats as IEEE 754 doubles, truth values as one byte),
+then its vectors, then its strings as UTF-8 after their 32-bit length; within each of the three,
+in the order of the fields, a nested record in place of its field.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from enum import IntEnum
+from itertools import chain
+from operator import attrgetter
+from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
+
+from cloudrc.records import Record
+
+_Pack: TypeAlias = Callable[[Any], bytes]
+_flatten = chain.from_iterable
+
+
+class RecordHash:
+    """SHA-256 over records in the order in which they are given, however they are batched."""
+
+    def __init__(self) -> None:
+        self._sha256 = hashlib.sha256()
+
+    def update(self, records: Iterable[Record]) -> None:
+        """Take in more records.
+
+        Args:
+            records: Oldest first.
+        """
+        packers = _PACKERS
+        self._sha256.update(b"".join([packers[type(record)](record) for record in records]))
+
+    def hexdigest(self) -> str:
+        """Say the hash of all records so far, as 64 hexadecimal digits."""
+        return self._sha256.hexdigest()
+
+
+class _Packers(dict[type, _Pack]):
+    """Packers by class, each made when the first record of its class comes."""
+
+    def __missing__(self, cls: type) -> _Pack:
+        packer = self[cls] = _packer(cls)
+        return packer
+
+
+_PACKERS = _Packers()
+
+
+def _packer(cls: type) -> _Pack:
+    leaves = list(_leaves(cls, ""))
+    numbers = _getter([path for path, code in leaves if len(code) == 1 and code != "s"])
+    vectors = _getter([path for path, code in leaves if len(code) > 1])
+    strings = _getter([path for path, code in leaves if code == "s"])
+    codes = sorted((code for _, code in leaves if code != "s"), key=lambda code: len(code) > 1)
+    name = cls.__name__.encode()
+    pack = struct.Struct(f"<B{len(name)}s" + "".join(codes)).pack
+    size = len(name)
+
+    def fixed(record: Any) -> bytes:
+        return pack(size, name, *numbers(record), *_flatten(vectors(record)))
+
+    def with_strings(record: Any) -> bytes:
+        return fixed(record) + b"".join(map(_packed_string, strings(record)))
+
+    return with_strings if any(code == "s" for _, code in leaves) else fixed
+
+
+def _leaves(cls: type, prefix: str) -> Iterator[tuple[str, str]]:
+    """List the path of every plain value of a record with its code for `struct`."""
+    for name, kind in get_type_hints(cls).items():
+        path = prefix + name
+        if hasattr(kind, "_fields"):
+            yield from _leaves(kind, f"{path}.")
+        elif get_origin(kind) is tuple:
+            yield path, "d" * len(get_args(kind))
+        else:
+            yield path, "q" if issubclass(kind, IntEnum) else _CODES[kind]
+
+
+_CODES = {int: "q", float: "d", bool: "?", str: "s"}
+
+
+def _getter(paths: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+    if not paths:
+        return lambda record: ()
+    get = attrgetter(*paths)
+    return get if len(paths) > 1 else lambda record: (get(record),)
+
+
+def _packed_string(text: str) -> bytes:
+    data = text.encode("utf-8", "surrogatepass")
+    return len(data).to_bytes(4, "little") + data

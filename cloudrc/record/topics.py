@@ -1,0 +1,295 @@
+"""The recording's one table: records go in, rows of topics come out.
+
+A record fans out to one or more topics; a topic is a table whose columns are the fields below,
+named as in `cloudrc/records.py`, after the column `stamp_ns`. MCAP, columns, documentation and
+tests all read this table; quaternions are `wxyz` and velocities in the world frame here, whatever
+the ROS message type asks for (`cloudrc/record/cdr.py` converts).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from operator import attrgetter
+from typing import TypeAlias
+
+from cloudrc import records as rec
+from cloudrc.record.schema import Field, Row, Topic, Values
+from cloudrc.records import Record
+
+__all__ = ["TOPICS", "rows"]
+
+
+def _pose_and_twist(path: str) -> tuple[Field, ...]:
+    wxyz, rates = "orientation_wxyz", "angular_velocity_body"
+    return (
+        Field("position", "vector", "m", "of the base, world frame", f"{path}position"),
+        Field(wxyz, "quaternion", "1", "of the base, body to world", f"{path}{wxyz}"),
+        Field("velocity", "vector", "m/s", "of the base, world frame", f"{path}velocity"),
+        Field(rates, "vector", "rad/s", "of the base, body frame", f"{path}{rates}"),
+    )
+
+
+_EPOCH = Field("epoch", "int", "", "session it belongs to")
+_COUNTER = Field("counter", "int", "", "counter in the datagram's header")
+_BASIS = Field("basis_stamp_ns", "int", "ns", "stamp of the odometry used, world's clock")
+_END = Field("end", "string", "", "who recorded it: world, cloud or link")
+_SLIP = Field("slip_ns", "int", "ns", "world's clock behind its machine's monotonic clock")
+_GUARD = "0 GROUND, 1 TRACK, 2 HOLD, 3 LAND, 4 ESTOP"
+_ECHO = "stamp of the newest command applied, cloud's clock; -1 if none"
+_ARRIVAL = (
+    _EPOCH,
+    _COUNTER,
+    Field("delay", "float", "s", "one way; NaN if the ends cannot prove that they share a clock"),
+    Field("used", "bool", "", "true if it became the newest, false if late, repeated or refused"),
+)
+
+_TABLE = (
+    Topic(
+        "/odometry",
+        "nav_msgs/msg/Odometry",
+        rec.TelemetrySent,
+        "world",
+        "Measured pose and twist as sent, at the instant of the measurement, world's clock",
+        _pose_and_twist("telemetry.odometry."),
+        "telemetry.odometry.stamp_ns",
+    ),
+    Topic(
+        "/telemetry",
+        "cloudrc_msgs/msg/Telemetry",
+        rec.TelemetrySent,
+        "world",
+        "The rest of the telemetry that left, world's clock",
+        (
+            _EPOCH,
+            _COUNTER,
+            Field("odometry_stamp_ns", "int", "ns", "its odometry's stamp", "telemetry.stamp_ns"),
+            Field("tip_force", "float", "N", "on the arm's tip", "telemetry.tip_force"),
+            Field("echo_stamp_ns", "int", "ns", _ECHO, "telemetry.echo_stamp_ns"),
+            Field("echo_hold_ns", "int", "ns", "world held it so long", "telemetry.echo_hold_ns"),
+            Field("slip_ns", "int", "ns", _SLIP.text, "telemetry.slip_ns"),
+            Field("mission", "int", "", "last mission request acted on", "telemetry.mission"),
+            Field("guard", "int", "", _GUARD, "telemetry.guard"),
+        ),
+    ),
+    Topic(
+        "/ground_truth",
+        "nav_msgs/msg/Odometry",
+        rec.GroundTruth,
+        "world",
+        "True pose and twist, world's clock",
+        _pose_and_twist("odometry."),
+        "odometry.stamp_ns",
+    ),
+    Topic(
+        "/contact_force",
+        "cloudrc_msgs/msg/ContactForce",
+        rec.GroundTruth,
+        "world",
+        "Force on the touch sensor, world's clock",
+        (Field("tip_force", "float", "N", "on the arm's tip"),),
+    ),
+    Topic(
+        "/reference",
+        "geometry_msgs/msg/TwistStamped",
+        rec.GroundTruth,
+        "world",
+        "Velocity that the guard lets the low-level controller follow, world's clock",
+        (Field("reference", "vector", "m/s", "world frame"),),
+    ),
+    Topic(
+        "/uplink_delay",
+        "cloudrc_msgs/msg/Arrival",
+        rec.Arrival,
+        "cloud",
+        "Telemetry arrived at cloud, late ones included, cloud's clock",
+        _ARRIVAL,
+    ),
+    Topic(
+        "/downlink_delay",
+        "cloudrc_msgs/msg/Arrival",
+        rec.Arrival,
+        "world",
+        "A command arrived at world, late ones included, world's clock",
+        _ARRIVAL,
+    ),
+    Topic(
+        "/command_applied",
+        "cloudrc_msgs/msg/CommandApplied",
+        rec.CommandApplied,
+        "world",
+        "A command was applied for the first time, world's clock",
+        (_EPOCH, _COUNTER, _BASIS, Field("velocity", "vector", "m/s", "before the caps")),
+    ),
+    Topic(
+        "/guard",
+        "cloudrc_msgs/msg/GuardChange",
+        rec.GuardChange,
+        "world",
+        "The guard changed its state, world's clock",
+        (
+            Field("state", "int", "", _GUARD),
+            Field("cause", "string", "", "why, in words"),
+        ),
+    ),
+    Topic(
+        "/contact",
+        "cloudrc_msgs/msg/Contact",
+        rec.Contact,
+        "world",
+        "The robot began to touch something, world's clock",
+        (
+            Field("body", "string", "", "the scene's body: pipe_1, board, floor"),
+            Field("position", "vector", "m", "of the base, world frame"),
+            Field("velocity", "vector", "m/s", "of the base just before, world frame"),
+            Field("tip_velocity", "vector", "m/s", "of the arm's tip just before, world frame"),
+            Field("tip", "bool", "", "true if the arm's tip touched, false for any other part"),
+        ),
+    ),
+    Topic(
+        "/session",
+        "cloudrc_msgs/msg/SessionOpened",
+        rec.SessionOpened,
+        "either",
+        "A session began under a new epoch, clock of its end",
+        (_END, _EPOCH, Field("cause", "string", "", "why, in words")),
+    ),
+    Topic(
+        "/estimated_odometry",
+        "nav_msgs/msg/Odometry",
+        rec.Control,
+        "cloud",
+        "Prediction that the controller used, stamped as the command, cloud's clock; it predicts"
+        " for basis_stamp_ns + horizon of /delay_estimate",
+        _pose_and_twist("")[:3],
+    ),
+    Topic(
+        "/setpoint_position",
+        "geometry_msgs/msg/PointStamped",
+        rec.Control,
+        "cloud",
+        "What the controller tracks, cloud's clock",
+        (Field("setpoint", "vector", "m", "world frame"),),
+    ),
+    Topic(
+        "/cmd_vel",
+        "geometry_msgs/msg/TwistStamped",
+        rec.Control,
+        "cloud",
+        "Velocity commanded, cloud's clock",
+        (
+            Field("command", "vector", "m/s", "world frame"),
+            Field("yaw_rate", "float", "rad/s", "about the world's z axis"),
+        ),
+    ),
+    Topic(
+        "/delay_estimate",
+        "cloudrc_msgs/msg/DelayEstimate",
+        rec.Control,
+        "cloud",
+        "The delay that the prediction bridged, cloud's clock",
+        (
+            _EPOCH,
+            _COUNTER,
+            _BASIS,
+            Field("horizon", "float", "s", "by how much the odometry was moved ahead"),
+            Field("rtt", "float", "s", "last round trip, hold excluded; NaN before the first"),
+            Field("loop_delay", "float", "s", "last round trip, hold included: tau_n of the paper"),
+            Field("measured", "vector", "m", "position in the odometry used, world frame"),
+        ),
+    ),
+    Topic(
+        "/pid",
+        "cloudrc_msgs/msg/Pid",
+        rec.Control,
+        "cloud",
+        "Terms of the controller, cloud's clock",
+        (
+            Field("waypoint", "int", "", "index of the waypoint flown to; -1 if none"),
+            Field("proportional", "vector", "m/s", "term per axis, world frame"),
+            Field("integral", "vector", "m/s", "term per axis, world frame"),
+            Field("derivative", "vector", "m/s", "term per axis, world frame"),
+        ),
+    ),
+    Topic(
+        "/mission",
+        "cloudrc_msgs/msg/MissionEvent",
+        rec.MissionEvent,
+        "cloud",
+        "The mission moved on, cloud's clock",
+        (
+            Field("event", "string", "", "started, reached, held, resumed, cancelled, done..."),
+            Field("waypoint", "int", "", "index of the waypoint concerned; -1 if none"),
+            Field("text", "string", "", "the same in words"),
+        ),
+    ),
+    Topic(
+        "/fault",
+        "cloudrc_msgs/msg/Fault",
+        rec.Fault,
+        "either",
+        "Something went wrong that did not stop the flight, clock of its end",
+        (
+            Field("code", "string", "", "one word"),
+            Field("text", "string", "", "what, where, what to do"),
+        ),
+    ),
+    Topic(
+        "/count",
+        "cloudrc_msgs/msg/Counted",
+        rec.Counted,
+        "either",
+        "How often something has happened so far, clock of its end",
+        (
+            _END,
+            Field("name", "string", "", "what is counted"),
+            Field("total", "int", "", "since the start"),
+        ),
+    ),
+    Topic(
+        "/lateness",
+        "cloudrc_msgs/msg/Lateness",
+        rec.Lateness,
+        "either",
+        "How late a wake was, in real time only, clock of its end",
+        (
+            _END,
+            Field("lateness", "float", "s", "now minus the deadline"),
+            Field("busy", "float", "s", "how long handling it took"),
+            _SLIP,
+        ),
+    ),
+)
+
+TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
+"""Every topic of a recording by its name."""
+
+_Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Values]]
+
+
+def _extractor(topic: Topic) -> _Extract:
+    paths = [field.path or field.name for field in topic.fields]
+    get = attrgetter(*paths)
+    values = get if len(paths) > 1 else lambda record: (get(record),)
+    return topic.name, attrgetter(topic.stamp_path), values
+
+
+_EXTRACT: dict[type[Record], tuple[_Extract, ...]] = {
+    source: tuple(_extractor(topic) for topic in _TABLE if topic.source is source)
+    for source in {topic.source for topic in _TABLE}
+}
+_UPLINK, _DOWNLINK = _EXTRACT.pop(rec.Arrival)
+
+
+def rows(record: Record) -> list[Row]:
+    """Fan a record out to its topics.
+
+    Args:
+        record: Any record of either end.
+
+    Returns:
+        One row per topic, in the order of the table.
+    """
+    if isinstance(record, rec.Arrival):
+        name, stamp, values = _UPLINK if record.uplink else _DOWNLINK
+        return [(name, stamp(record), values(record))]
+    return [(name, stamp(record), values(record)) for name, stamp, values in _EXTRACT[type(record)]]

@@ -1,0 +1,145 @@
+"""The recording's way out: records go in, an MCAP file that ROS 2 tools read comes out.
+
+Profile `ros2`, schemas as `ros2msg`, messages as `cdr`, chunks compressed by zstd with their CRC.
+A chunk is closed and handed to the operating system after at most half a second of recording, so
+that a process that is killed loses no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import IO, Any, Self
+
+from cloudrc import __version__
+from cloudrc.record.cdr import encode
+from cloudrc.record.packages import missing
+from cloudrc.record.ros_types import definition, type_hash
+from cloudrc.record.schema import Row
+from cloudrc.record.topics import TOPICS, rows
+from cloudrc.records import Record
+
+try:
+    import zstandard  # noqa: F401  (mcap finds it by itself, but says less if it is missing)
+    from mcap.writer import CompressionType, Writer
+except ImportError as error:
+    raise missing(error) from error
+
+CHUNK_NS = 500_000_000
+"""Longest time between the first and the last message of a chunk [ns]."""
+METADATA = "cloudrc"
+"""Name of the metadata record that says whose clock the file is on."""
+
+
+class McapWriter:
+    """Writes the rows of one end, or of a whole mission, to one MCAP file."""
+
+    def __init__(self, target: Path | IO[bytes], *, clock: str, clock_id: str = "") -> None:
+        """Open the file and write its head.
+
+        Args:
+            target: A path, overwritten if it exists, or a binary stream that the caller closes.
+            clock: Whose clock the stamps are on: "world" or "cloud".
+            clock_id: What names that clock, such as the kernel's boot id; two files with the same
+                one can be merged as they are; "" if nothing names it.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        self._owned = isinstance(target, Path)
+        self._stream = target.open("wb") if isinstance(target, Path) else target
+        # Any, because mcap's writer is not annotated throughout.
+        self._mcap: Any = Writer(self._stream, compression=CompressionType.ZSTD)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._latest_ns = 0
+        self._chunk_start_ns: int | None = None
+        self._mcap.start(profile="ros2", library=f"cloudrc {__version__}")
+        self.note({"clock": clock, "clock_id": clock_id, "version": __version__})
+
+    def write(self, records: Iterable[Record]) -> None:
+        """Record everything that the records fan out to.
+
+        Args:
+            records: Oldest first.
+        """
+        for record in records:
+            for row in rows(record):
+                self.write_row(row, row[1])
+
+    def write_row(self, row: Row, log_time_ns: int) -> None:
+        """Record one row.
+
+        Args:
+            row: Topic, stamp and values.
+            log_time_ns: As of `write_message`.
+        """
+        topic, stamp_ns, values = row
+        self.write_message(topic, log_time_ns, encode(TOPICS[topic], stamp_ns, values))
+
+    def write_message(self, topic: str, log_time_ns: int, data: bytes) -> None:
+        """Record a message that is encoded already.
+
+        Args:
+            topic: A name of the table of topics.
+            log_time_ns: When it was recorded [ns]; raised to that of the last message, or zero.
+            data: Its CDR bytes.
+        """
+        now_ns = self._latest_ns = max(self._latest_ns, log_time_ns)
+        if self._chunk_start_ns is None:
+            self._chunk_start_ns = now_ns
+        elif now_ns - self._chunk_start_ns >= CHUNK_NS:
+            self.flush()
+            self._chunk_start_ns = now_ns
+        channel = self._channels.get(topic) or self._open_channel(topic)
+        self._mcap.add_message(channel, log_time=now_ns, data=data, publish_time=now_ns)
+
+    def note(self, metadata: Mapping[str, str]) -> None:
+        """Add to the file's metadata; a later value of a key replaces an earlier one.
+
+        Args:
+            metadata: Such as the epoch, once it is known.
+        """
+        self._mcap.add_metadata(METADATA, dict(metadata))
+
+    def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
+        """Put a whole file into the recording.
+
+        Args:
+            name: Such as config.yaml or report.json.
+            data: Its bytes.
+            media_type: Such as application/json.
+        """
+        self._mcap.add_attachment(0, self._latest_ns, name, media_type, data)
+
+    def flush(self) -> None:
+        """Close the chunk and hand it to the operating system."""
+        self._chunk_start_ns = None
+        self._mcap.flush()
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        try:
+            self._mcap.finish()
+            self._stream.flush()
+        finally:
+            if self._owned:
+                self._stream.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _open_channel(self, topic: str) -> int:
+        ros_type = TOPICS[topic].ros_type
+        if ros_type not in self._schemas:
+            text = definition(ros_type).encode()
+            self._schemas[ros_type] = self._mcap.register_schema(ros_type, "ros2msg", text)
+        # Both keys are those of rosbag2's own files.
+        metadata = {"offered_qos_profiles": "", "topic_type_hash": type_hash(ros_type)}
+        schema = self._schemas[ros_type]
+        channel = int(self._mcap.register_channel(topic, "cdr", schema, metadata))
+        self._channels[topic] = channel
+        return channel

@@ -1,0 +1,116 @@
+"""Records to test with: any record (hypothesis), and a short flight of both ends."""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+from hypothesis import strategies as st
+
+from cloudrc import records as rec
+from cloudrc.messages import GuardState, Odometry, Telemetry
+from cloudrc.record.columns import Recording
+from cloudrc.record.topics import TOPICS
+from cloudrc.record.writer import McapWriter
+from cloudrc.records import Record
+
+MS = 1_000_000
+SECOND = 1000 * MS
+CLASSES: tuple[type[Any], ...] = get_args(Record)
+
+_stamps = st.integers(0, 2**31 * SECOND - 1)
+_integers = st.integers(-(2**63), 2**63 - 1)
+_metres = st.floats(-1e6, 1e6)
+_directions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1)
+
+
+def _unit(q: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(component / math.hypot(*q) for component in q)
+
+
+def _strategy(name: str, kind: Any) -> st.SearchStrategy[Any]:
+    if hasattr(kind, "_fields"):
+        return instances(kind)
+    if get_origin(kind) is tuple:
+        return st.tuples(*[_metres] * 3) if len(get_args(kind)) == 3 else _directions.map(_unit)
+    if issubclass(kind, IntEnum):
+        return st.sampled_from(kind)
+    if name == "stamp_ns":
+        return _stamps
+    return {int: _integers, float: st.floats(), bool: st.booleans(), str: st.text()}[kind]
+
+
+def instances(cls: type[Any]) -> st.SearchStrategy[Any]:
+    """Any instance of a record of the loop."""
+    hints = get_type_hints(cls)
+    return st.builds(cls, **{name: _strategy(name, kind) for name, kind in hints.items()})
+
+
+def any_record() -> st.SearchStrategy[Record]:
+    return st.one_of(*map(instances, CLASSES))
+
+
+def world_records(count: int, start_ns: int = 0) -> list[Record]:
+    """World at 100 Hz: the command of each period was sent 30 ms before it arrived."""
+    records: list[Record] = [
+        rec.SessionOpened(start_ns, "world", 1, "cloud said hello"),
+        rec.GuardChange(start_ns, GuardState.TRACK, "mission started"),
+    ]
+    for n in range(count):
+        now = start_ns + n * 10 * MS
+        position, velocity = (0.01 * n, math.sin(n), 1.0), (1.0, math.cos(n), 0.1)
+        turn = (math.cos(n), 0.0, 0.0, math.sin(n))
+        odometry = Odometry(now, position, turn, velocity, (0.0, 0.1, 0.2))
+        telemetry = Telemetry(now, odometry, 0.1, now - 5, 7, 0, 1, GuardState.TRACK)
+        records += [
+            rec.TelemetrySent(now, 1, n, telemetry),
+            rec.GroundTruth(now, odometry, 0.2, velocity),
+        ]
+        if n >= 3:
+            records += [
+                rec.Arrival(now + 3 * MS, False, 1, n - 3, 0.03, True),
+                rec.CommandApplied(now + 4 * MS, 1, n - 3, now - 60 * MS, velocity),
+            ]
+    contact = rec.Contact(now, "board", position, velocity, (0.1, 0.0, 0.0), True)
+    return [*records, contact, rec.Counted(now, "world", "sent", count)]
+
+
+def cloud_records(count: int, start_ns: int = 0, up_ns: int = 40 * MS) -> list[Record]:
+    """Cloud at 100 Hz, a command 3 ms after each period; telemetry was `up_ns` under way."""
+    records: list[Record] = [rec.SessionOpened(start_ns, "cloud", 1, "world said yes")]
+    v = (0.1, 0.2, 0.3)
+    for n in range(count):
+        now = start_ns + n * 10 * MS
+        period = now + 3 * MS
+        turn = (math.cos(n), math.sin(n), 0.0, 0.0)
+        records.append(rec.Arrival(now + up_ns, True, 1, n, math.nan, n % 7 > 0))
+        records.append(
+            rec.Control(
+                period, 1, n, now - 1, 0.08, 0.07, math.nan, v, v, turn, v, v, 2, v, 0.1, v, v, v
+            )
+        )
+    records.append(rec.MissionEvent(period, "done", 2, "mission done — ça va"))
+    return [*records, rec.Fault(period, "horizon_clamped", ""), rec.Counted(period, "cloud", "", 3)]
+
+
+def write(path: Path, records: list[Record], clock: str = "world", clock_id: str = "") -> Path:
+    with McapWriter(path, clock=clock, clock_id=clock_id) as writer:
+        writer.write(records)
+    return path
+
+
+def assert_equal(one: Recording, other: Recording) -> None:
+    """Every column of every topic equal; turning a velocity twice costs its last digits."""
+    for topic in TOPICS:
+        assert one[topic].names == other[topic].names
+        for name in one[topic].names:
+            first, second = one[topic][name], other[topic][name]
+            assert first.dtype == second.dtype, (topic, name)
+            assert first.shape == second.shape, (topic, name)
+            if TOPICS[topic].ros_type == "nav_msgs/msg/Odometry" and name == "velocity":
+                np.testing.assert_allclose(first, second, rtol=1e-12, atol=1e-8)
+            else:
+                np.testing.assert_array_equal(first, second, err_msg=f"{topic} {name}")

@@ -1,0 +1,113 @@
+"""ROS messages say the same as the rows, in ROS's own conventions."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from cloudrc import records as rec
+from cloudrc.messages import Odometry
+from cloudrc.record.cdr import decode, encode, shifted
+from cloudrc.record.ros_types import definition, is_known, type_hash
+from cloudrc.record.topics import TOPICS, rows
+from tests.record.samples import any_record
+
+TYPES = sorted({topic.ros_type for topic in TOPICS.values()})
+
+
+def standard(ros_type: str, data: bytes) -> Any:
+    """A message as any ROS 2 tool sees it that knows only the standard types."""
+    return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, ros_type)
+
+
+def test_an_odometry_is_converted_at_the_edge() -> None:
+    half = math.sqrt(0.5)
+    # A quarter turn to the left: forward along the world's y, what moves along x drifts right.
+    odometry = Odometry(
+        2_500_000_000, (1.0, 2.0, 3.0), (half, 0.0, 0.0, half), (4.0, 1.0, 0.5), (0.1, 0.2, 0.3)
+    )
+    name, stamp_ns, values = rows(rec.GroundTruth(0, odometry, 0.0, (0.0, 0.0, 0.0)))[0]
+    message = standard("nav_msgs/msg/Odometry", encode(TOPICS[name], stamp_ns, values))
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (2, 500_000_000)
+    assert (message.header.frame_id, message.child_frame_id) == ("world", "base_link")
+    pose, twist = message.pose.pose, message.twist.twist
+    assert (pose.position.x, pose.position.y, pose.position.z) == (1.0, 2.0, 3.0)
+    turn = pose.orientation
+    assert (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, half, half)
+    linear = (twist.linear.x, twist.linear.y, twist.linear.z)
+    assert linear == pytest.approx((1.0, -4.0, 0.5), abs=1e-12)
+    assert (twist.angular.x, twist.angular.y, twist.angular.z) == (0.1, 0.2, 0.3)
+
+
+def test_what_is_not_predicted_is_not_zero() -> None:
+    values = ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    data = encode(TOPICS["/estimated_odometry"], 0, values)
+    assert math.isnan(standard("nav_msgs/msg/Odometry", data).twist.twist.angular.z)
+
+
+def test_a_command_is_a_twist_with_its_yaw_rate() -> None:
+    data = encode(TOPICS["/cmd_vel"], 1, ((1.0, 2.0, 3.0), 0.4))
+    twist = standard("geometry_msgs/msg/TwistStamped", data).twist
+    assert (twist.linear.x, twist.linear.y, twist.linear.z) == (1.0, 2.0, 3.0)
+    assert (twist.angular.x, twist.angular.y, twist.angular.z) == (0.0, 0.0, 0.4)
+
+
+@given(any_record())
+@settings(max_examples=150, deadline=None)
+def test_rows_come_back_from_their_bytes(record: Any) -> None:
+    for name, stamp_ns, values in rows(record):
+        found_ns, found = decode(TOPICS[name], encode(TOPICS[name], stamp_ns, values))
+        assert found_ns == stamp_ns
+        for field, value, back in zip(TOPICS[name].fields, values, found, strict=True):
+            if field.name == "velocity" and "Odometry" in TOPICS[name].ros_type:
+                np.testing.assert_allclose(back, value, rtol=1e-12, atol=1e-8)
+            else:
+                np.testing.assert_equal(back, value)
+
+
+def test_text_that_is_not_unicode_is_recorded_as_far_as_it_is() -> None:
+    topic = TOPICS["/fault"]
+    assert decode(topic, encode(topic, 0, ("bad_name", "file \udcff")))[1][1] == "file ?"
+
+
+@pytest.mark.parametrize("offset_ns", [0, 1, -1, -3_000_000_001, 10**15])
+def test_a_stamp_is_moved_and_nothing_else(offset_ns: int) -> None:
+    topic, values = TOPICS["/cmd_vel"], ((1.0, 2.0, 3.0), 0.4)
+    data = shifted(encode(topic, 2_000_000_000, values), offset_ns)
+    assert decode(topic, data) == (2_000_000_000 + offset_ns, values)
+
+
+@pytest.mark.parametrize("ros_type", TYPES)
+def test_a_definition_stands_on_its_own(ros_type: str) -> None:
+    text = definition(ros_type)
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, ros_type))
+    assert store.hash_rihs01(ros_type) == type_hash(ros_type)
+    assert is_known(ros_type, text)
+
+
+def test_our_own_types_explain_every_field() -> None:
+    own, _, _ = definition("cloudrc_msgs/msg/DelayEstimate").partition("=" * 80)
+    assert "float64 horizon  # [s] by how much the odometry was moved ahead" in own
+    assert all("#" in line for line in own.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("change", "known"),
+    [
+        (("# [s]", "# seconds:"), True),
+        (("float64 delay", "float32 delay"), False),
+        (("bool used", "bool use"), False),
+        (("int64 epoch  # session it belongs to\n", ""), False),
+        (("int64 epoch", "int64 ("), False),
+    ],
+)
+def test_another_layout_is_noticed(change: tuple[str, str], known: bool) -> None:
+    text = definition("cloudrc_msgs/msg/Arrival")
+    assert change[0] in text
+    assert is_known("cloudrc_msgs/msg/Arrival", text.replace(*change)) is known

@@ -1,0 +1,77 @@
+"""Columns are the records' values, whether they come from memory or from a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc import records as rec
+from cloudrc.messages import GuardState
+from cloudrc.record.columns import Recording
+from cloudrc.record.topics import TOPICS
+from tests.record.samples import any_record, assert_equal, cloud_records, world_records, write
+
+SHAPES = {"vector": (0, 3), "quaternion": (0, 4)}
+
+
+def test_columns_hold_the_records_values() -> None:
+    records = [rec.CommandApplied(n, 1, n + 5, n - 9, (n, 0.5, -n)) for n in range(4)]
+    table = Recording.from_records(records)["/command_applied"]
+    assert table.names == ("stamp_ns", "epoch", "counter", "basis_stamp_ns", "velocity")
+    assert len(table) == 4
+    assert table["stamp_ns"].tolist() == [0, 1, 2, 3]
+    assert table["counter"].tolist() == [5, 6, 7, 8]
+    assert table["velocity"].tolist() == [[n, 0.5, -n] for n in range(4)]
+
+
+def test_kinds_have_their_types() -> None:
+    recording = Recording.from_records(world_records(3), cloud_records(3))
+    assert recording["/guard"]["state"].dtype == np.int64
+    assert recording["/guard"]["state"].tolist() == [GuardState.TRACK]
+    assert recording["/guard"]["cause"].tolist() == ["mission started"]
+    assert recording["/uplink_delay"]["used"].dtype == np.bool_
+    assert recording["/uplink_delay"]["delay"].dtype == np.float64
+    assert recording["/estimated_odometry"]["orientation_wxyz"].shape == (3, 4)
+
+
+@pytest.mark.parametrize("name", TOPICS)
+def test_a_topic_without_rows_is_an_empty_table(name: str) -> None:
+    recording = Recording.from_records([])
+    table = recording.get(name)
+    assert len(table) == len(table["stamp_ns"]) == 0
+    for field in TOPICS[name].fields:
+        assert table[field.name].shape == SHAPES.get(field.kind, (0,))
+    assert table is recording[name]
+
+
+def test_what_does_not_exist_is_answered_with_what_does() -> None:
+    recording = Recording.from_records([])
+    with pytest.raises(KeyError, match="no topic '/odometri'; there are: /odometry, /telemetry"):
+        recording["/odometri"]
+    with pytest.raises(KeyError, match="no column 'x' in /guard; it has: stamp_ns, state, cause"):
+        recording["/guard"]["x"]
+
+
+@given(st.lists(any_record(), max_size=12))
+@settings(max_examples=60, deadline=None)
+def test_a_file_gives_what_memory_gives(
+    tmp_path_factory: pytest.TempPathFactory, records: list[Any]
+) -> None:
+    path = write(tmp_path_factory.getbasetemp() / "any.mcap", records)
+    recording = Recording.read(path)
+    assert recording.complete
+    assert_equal(recording, Recording.from_records(records))
+
+
+def test_columns_cannot_change_what_others_see(tmp_path: Path) -> None:
+    records = world_records(5)
+    first = Recording.from_records(records)
+    first["/odometry"]["position"][:] = 7.0
+    assert_equal(
+        Recording.read(write(tmp_path / "a.mcap", records)), Recording.from_records(records)
+    )

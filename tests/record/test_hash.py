@@ -1,0 +1,97 @@
+"""The hash is of what the records say and of nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc import records as rec
+from cloudrc.messages import GuardState
+from cloudrc.record.hash import RecordHash
+from tests.record.samples import CLASSES, any_record, cloud_records, world_records
+
+
+def digest(*records: Any) -> str:
+    found = RecordHash()
+    found.update(records)
+    return found.hexdigest()
+
+
+def test_the_bytes_are_those_that_the_module_promises() -> None:
+    applied = rec.CommandApplied(1, 2, 3, -4, (0.5, 1.0, 2.0))
+    data = b"\x0eCommandApplied" + struct.pack("<4q3d", 1, 2, 3, -4, 0.5, 1.0, 2.0)
+    change = rec.GuardChange(5, GuardState.HOLD, "né")
+    data += b"\x0bGuardChange" + struct.pack("<2qI", 5, 2, 3) + b"n\xc3\xa9"
+    assert digest(applied, change) == hashlib.sha256(data).hexdigest()
+
+
+@given(st.lists(any_record(), max_size=6), st.integers(0, 6))
+@settings(max_examples=60, deadline=None)
+def test_batches_do_not_matter(records: list[Any], cut: int) -> None:
+    found = RecordHash()
+    found.update(records[:cut])
+    found.update(iter(records[cut:]))
+    assert found.hexdigest() == digest(*records)
+
+
+def changed(value: Any) -> Any:
+    """Something of the same type that is not equal."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, GuardState):
+        return GuardState((value + 1) % len(GuardState))
+    if isinstance(value, tuple):
+        return (*value[:-1], changed(value[-1]))
+    return value + ("x" if isinstance(value, str) else 1)
+
+
+def variants(instance: Any) -> list[Any]:
+    """The instance with each of its values changed in turn."""
+    found = []
+    for name in instance._fields:
+        value = getattr(instance, name)
+        inner = variants(value) if hasattr(value, "_fields") else [changed(value)]
+        found += [instance._replace(**{name: each}) for each in inner]
+    return found
+
+
+@pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
+def test_every_value_counts(cls: type[Any]) -> None:
+    every = [*world_records(9), *cloud_records(9), rec.Lateness(1, "world", 0.1, 0.2, 3)]
+    record = next(each for each in every if type(each) is cls)
+    if cls is rec.Control:
+        record = record._replace(loop_delay=0.1)  # in place of NaN, which no change changes
+    if cls is rec.Arrival:
+        record = record._replace(delay=0.1)
+    digests = [digest(record), *map(digest, variants(record))]
+    assert len(set(digests)) == len(digests) > len(record._fields)
+
+
+def test_order_counts() -> None:
+    one, other = world_records(3)[:2]
+    assert digest(one, other) != digest(other, one)
+
+
+def test_text_cannot_pass_for_the_next_field() -> None:
+    assert digest(rec.Fault(1, "ab", "c")) != digest(rec.Fault(1, "a", "bc"))
+
+
+@pytest.mark.parametrize("seed", ["0", "4711"])
+def test_another_process_with_another_hash_seed_agrees(seed: str) -> None:
+    code = (
+        "from tests.record.test_hash import *\n"
+        "print(digest(*world_records(20), *cloud_records(20)))"
+    )
+    environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(sys.path)}
+    found = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert found.stdout.strip() == digest(*world_records(20), *cloud_records(20))

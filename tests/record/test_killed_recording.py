@@ -1,0 +1,52 @@
+"""A process that is killed loses at most half a second of its recording."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cloudrc.record.columns import Recording
+
+FLIGHT = """
+import sys, time
+from pathlib import Path
+from cloudrc.drivers.recording import RecordingThread
+from cloudrc.record.recorder import Recorder
+from cloudrc.record.writer import McapWriter
+from cloudrc.records import Counted
+
+recorder = Recorder(Path(sys.argv[1]), lambda path: McapWriter(path, clock="world"))
+RecordingThread(recorder).start()
+start = time.monotonic_ns()
+for n in range(10_000):
+    now = time.monotonic_ns() - start
+    recorder.put([Counted(now, "world", "sent", n)])
+    print(now, flush=True)
+    time.sleep(0.005)
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("after", [0.9, 1.3])
+def test_sigkill_loses_at_most_half_a_second(tmp_path: Path, after: float) -> None:
+    path = tmp_path / "world.mcap"
+    command = [sys.executable, "-c", FLIGHT, str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            last_ns = int(line)
+            if last_ns * 1e-9 >= after:
+                break
+        process.send_signal(signal.SIGKILL)
+        rest = process.stdout.read().split()
+    last_ns = int(rest[-1]) if rest else last_ns
+    recording = Recording.read(path)
+    assert recording.note.startswith("cut short")
+    stamps = recording["/count"]["stamp_ns"]
+    assert (last_ns - stamps[-1]) * 1e-9 <= 0.5
+    counts = recording["/count"]["total"]
+    assert counts.tolist() == list(range(len(counts)))

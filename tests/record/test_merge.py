@@ -1,0 +1,173 @@
+"""Both ends' recordings become one on world's clock, and say how well the clocks are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc import records as rec
+from cloudrc.errors import BadInputError
+from cloudrc.record.columns import Recording
+from cloudrc.record.merge import merge, write_mission
+from cloudrc.record.offset import ClockOffset, clock_offset
+from cloudrc.record.topics import TOPICS
+from cloudrc.record.writer import McapWriter
+from cloudrc.records import Record
+from tests.record.samples import MS, SECOND, assert_equal, cloud_records, world_records, write
+
+
+def files(
+    folder: Path, world: list[Record], cloud: list[Record], ids: tuple[str, str]
+) -> tuple[Path, Path]:
+    return (
+        write(folder / "world.mcap", world, "world", ids[0]),
+        write(folder / "cloud.mcap", cloud, "cloud", ids[1]),
+    )
+
+
+@pytest.mark.parametrize(
+    ("start", "ahead"),
+    [(4 * SECOND, 0), (9 * SECOND, 5 * SECOND), (4 * SECOND, -3 * SECOND - 1), (0, -SECOND)],
+)
+def test_two_clocks_are_related_by_the_packets(tmp_path: Path, start: int, ahead: int) -> None:
+    """Up 40 ms, down 30 ms: the middle is 5 ms off, inside half of the 70 ms.
+
+    The last case puts cloud's first stamps below zero, where MCAP has no log times.
+    """
+    world, cloud = world_records(60, start), cloud_records(60, start - ahead)
+    mission = merge(*files(tmp_path, world, cloud, ("", "")))
+    assert mission.offset == ClockOffset(ahead - 5 * MS, 35 * MS, "packets")
+    target = tmp_path / "mission.mcap"
+    mission.write(target)
+    recording = Recording.read(target)
+    assert recording.complete
+    noted = {
+        "clock": "world",
+        "clock_offset_ns": str(ahead - 5 * MS),
+        "clock_offset_uncertainty_ns": str(35 * MS),
+        "clock_offset_method": "packets",
+    }
+    assert noted.items() <= recording.metadata.items()
+    assert_equal(recording, Recording.from_records(world, cloud, ahead - 5 * MS))
+    assert_equal(recording, mission.recording())
+
+
+@given(
+    st.integers(-(10**12), 10**12),
+    st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 10**9)), min_size=1, max_size=20),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_true_offset_is_within_the_uncertainty(
+    ahead: int, delays: list[tuple[int, int]]
+) -> None:
+    """World's clock is `ahead` of cloud's; the quickest packet need not be the first."""
+    v = (0.0, 0.0, 0.0)
+    world: list[Record] = []
+    cloud: list[Record] = []
+    for n, (up, down) in enumerate(delays):
+        sent = n * 10 * MS  # on cloud's clock
+        telemetry = world_records(1)[2].telemetry
+        world.append(rec.TelemetrySent(sent + ahead, 1, n, telemetry))
+        cloud.append(rec.Arrival(sent + up, True, 1, n, 0.0, True))
+        control = cloud_records(1)[2]
+        cloud.append(rec.Control(sent, 1, n, 0, *[0.0] * 3, *control_tail(control, v)))
+        world.append(rec.Arrival(sent + down + ahead, False, 1, n, 0.0, True))
+    found = clock_offset(Recording.from_records(world), Recording.from_records([], cloud))
+    assert found.method == "packets"
+    assert found.uncertainty_ns is not None
+    assert abs(found.offset_ns - ahead) <= found.uncertainty_ns
+    smallest = min(up for up, _ in delays) + min(down for _, down in delays)
+    assert found.uncertainty_ns == (smallest + 1) // 2
+
+
+def control_tail(control: rec.Control, v: tuple[float, float, float]) -> list[object]:
+    return [v, v, control.orientation_wxyz, v, v, 0, v, 0.0, v, v, v]
+
+
+def test_the_same_clock_is_left_as_it_is(tmp_path: Path) -> None:
+    world, cloud = world_records(20), cloud_records(20)
+    mission = merge(*files(tmp_path, world, cloud, ("boot", "boot")))
+    assert mission.offset == ClockOffset(0, 0, "same clock")
+    mission.write(tmp_path / "mission.mcap")
+    write_mission(tmp_path / "memory.mcap", world, cloud)
+    merged = Recording.read(tmp_path / "mission.mcap")
+    assert_equal(merged, Recording.read(tmp_path / "memory.mcap"))
+    assert_equal(merged, Recording.from_records(world, cloud))
+
+
+def test_rows_of_both_ends_stand_in_order_of_time(tmp_path: Path) -> None:
+    world: list[Record] = [rec.Counted(t, "world", "sent", t) for t in (0, 10, 20, 20)]
+    cloud: list[Record] = [rec.Counted(t, "cloud", "sent", t) for t in (5, 20, 30)]
+    expected = ["world", "cloud", "world", "world", "world", "cloud", "cloud"]
+    assert Recording.from_records(world, cloud)["/count"]["end"].tolist() == expected
+    write_mission(tmp_path / "m.mcap", world, cloud)
+    assert Recording.read(tmp_path / "m.mcap")["/count"]["end"].tolist() == expected
+
+
+def test_clocks_that_nothing_relates_begin_together(tmp_path: Path) -> None:
+    world, cloud = world_records(2, 7 * SECOND), cloud_records(2, SECOND)
+    cloud = [record for record in cloud if not isinstance(record, rec.Arrival)]
+    mission = merge(*files(tmp_path, world, cloud, ("a", "b")))
+    assert mission.offset == ClockOffset(6 * SECOND, None, "first records")
+    assert "clock_offset_uncertainty_ns" not in mission.contents.metadata
+    assert mission.recording()["/session"]["stamp_ns"].tolist() == [7 * SECOND, 7 * SECOND]
+
+
+def test_attachments_of_both_ends_and_new_ones_are_kept(tmp_path: Path) -> None:
+    for end in ("world", "cloud"):
+        with McapWriter(tmp_path / f"{end}.mcap", clock=end, clock_id="x") as writer:
+            writer.attach(f"{end}.txt", end.encode())
+            writer.attach("config.yaml", end.encode())
+    mission = merge(tmp_path / "world.mcap", tmp_path / "cloud.mcap")
+    mission.write(tmp_path / "m.mcap", {"report.json": b"{}"})
+    assert Recording.read(tmp_path / "m.mcap").attachments == {
+        "world.txt": b"world",
+        "cloud.txt": b"cloud",
+        "config.yaml": b"world",
+        "report.json": b"{}",
+    }
+
+
+def test_torn_files_are_merged_as_far_as_they_go(tmp_path: Path) -> None:
+    world, cloud = files(tmp_path, world_records(150), cloud_records(150), ("x", "x"))
+    cloud.write_bytes(cloud.read_bytes()[: cloud.stat().st_size // 2])
+    mission = merge(world, cloud)
+    assert mission.contents.note.startswith("cloud: cut short: ")
+    mission.write(tmp_path / "m.mcap")
+    recording = Recording.read(tmp_path / "m.mcap")
+    assert recording.note == mission.contents.note
+    assert not recording.complete
+    assert len(recording["/odometry"]) == 150
+    assert 50 <= len(recording["/pid"]) == len(recording["/cmd_vel"]) < 150
+
+
+@pytest.mark.parametrize("lost", ["world", "cloud"])
+def test_one_end_alone_is_better_than_nothing(tmp_path: Path, lost: str) -> None:
+    world, cloud = files(tmp_path, world_records(9), cloud_records(9), ("x", "y"))
+    (tmp_path / f"{lost}.mcap").write_bytes(b"")
+    mission = merge(world, cloud)
+    mission.write(tmp_path / "m.mcap")
+    recording = Recording.read(tmp_path / "m.mcap")
+    assert f"{lost}.mcap: holds no readable message" in recording.note
+    assert recording.metadata["clock"] != lost
+    ours = {"world": "/odometry", "cloud": "/pid"}
+    assert len(recording[ours.pop(lost)]) == 0
+    assert [len(recording[topic]) for topic in ours.values()] == [9]
+
+
+def test_nothing_at_all_is_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"world\.mcap: cannot be read"):
+        merge(tmp_path / "world.mcap", tmp_path / "cloud.mcap")
+
+
+def test_the_table_s_ends_are_the_ends_that_record() -> None:
+    for own, other, records in (
+        ("world", "cloud", world_records(9)),
+        ("cloud", "world", cloud_records(9)),
+    ):
+        recording = Recording.from_records(records)
+        assert not any(len(recording[t.name]) for t in TOPICS.values() if t.end == other)
+        assert any(len(recording[t.name]) for t in TOPICS.values() if t.end == own)

@@ -1,0 +1,46 @@
+"""What recording needs is asked for by name, and only where it is needed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+BLOCK = "import sys; sys.modules.update(dict.fromkeys({names!r}))\n"
+NEEDED = ["mcap", "rosbags", "zstandard"]
+
+
+def run(code: str, without: list[str]) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", BLOCK.format(names=without) + code], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize("module", ["reader", "writer", "merge"])
+def test_a_missing_package_is_named_with_its_remedy(module: str) -> None:
+    code = (
+        "from cloudrc.errors import MissingPrerequisiteError\n"
+        f"try: import cloudrc.record.{module}\n"
+        "except MissingPrerequisiteError as error: print(error.exit_code, error)"
+    )
+    for name in NEEDED:
+        text = run(code, [name])
+        assert text.startswith(f"3 recording needs the package {name}, which is not installed")
+        assert text.endswith("install it with: pip install 'cloudrc[record]'")
+
+
+def test_flying_needs_none_of_them() -> None:
+    code = (
+        "from cloudrc.record import columns, hash, offset, order, recorder, topics\n"
+        "import cloudrc.drivers.recording\n"
+        "print(len(columns.Recording.from_records([])['/pid']))"
+    )
+    assert run(code, NEEDED) == "0"
+
+
+def test_hash_and_recorder_do_not_even_need_numpy() -> None:
+    code = "from cloudrc.record import hash, order, recorder, topics; print('numpy' in sys.modules)"
+    assert run(code, []) == "False"

@@ -1,0 +1,177 @@
+"""The recorder takes everything without waiting and survives whatever the disk does."""
+
+from __future__ import annotations
+
+import errno
+import io
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cloudrc.drivers.recording import RecordingThread
+from cloudrc.record.columns import Recording
+from cloudrc.record.recorder import Recorder
+from cloudrc.record.writer import McapWriter
+from cloudrc.records import Counted, Record
+from tests.record.samples import MS, assert_equal, world_records
+
+NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
+
+
+def counted(count: int) -> list[Record]:
+    return [Counted(n * 10 * MS, "world", "sent", n) for n in range(count)]
+
+
+def open_mcap(path: Path) -> McapWriter:
+    return McapWriter(path, clock="world")
+
+
+class Disk(io.BytesIO):
+    """A file on a disk that has room for so many bytes."""
+
+    def __init__(self, room: int) -> None:
+        super().__init__()
+        self.room = room
+
+    def write(self, data: Any) -> int:
+        if self.tell() + len(data) > self.room:
+            raise NO_SPACE
+        return super().write(data)
+
+
+class Shelf:
+    """A sink that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+        self.closed = False
+
+    def write(self, records: Iterable[Record]) -> None:
+        self.records += records
+
+    def flush(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_the_oldest_are_dropped_and_counted() -> None:
+    shelf, records = Shelf(), counted(25)
+    recorder = Recorder(Path("x"), lambda path: shelf, capacity=10)
+    for record in records:
+        recorder.put([record])
+    assert recorder.dropped == 15
+    assert recorder.drain(4) == 4
+    recorder.put(records[:2])
+    assert recorder.dropped == 15
+    recorder.put(records[2:5])
+    assert recorder.dropped == 16
+    recorder.close()
+    assert shelf.closed
+    assert shelf.records == [*records[15:19], *records[20:], *records[:5]]
+    assert recorder.error == ""
+
+
+def test_a_drain_takes_no_more_than_it_may() -> None:
+    recorder = Recorder(Path("x"), lambda path: Shelf())
+    recorder.put(counted(10))
+    assert [recorder.drain(4) for _ in range(4)] == [4, 4, 2, 0]
+
+
+def test_what_is_recorded_can_be_read(tmp_path: Path) -> None:
+    path, records = tmp_path / "world.mcap", world_records(30)
+    recorder = Recorder(path, open_mcap)
+    recorder.put(records)
+    recorder.close()
+    assert_equal(Recording.read(path), Recording.from_records(records))
+    assert (recorder.dropped, recorder.error) == (0, "")
+
+
+def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
+    disk, records = Disk(60_000), world_records(400)
+    recorder = Recorder(Path("world.mcap"), lambda path: McapWriter(disk, clock="world"))
+    for record in records:
+        recorder.put([record])
+        recorder.drain()
+        recorder.flush()
+    recorder.close()
+    assert recorder.error == (
+        "world.mcap: recording stopped: No space left on device;"
+        " make room or choose another folder; the flight goes on"
+    )
+    assert 0 < recorder.dropped < len(records)
+    path = tmp_path / "kept.mcap"
+    path.write_bytes(disk.getvalue())
+    assert len(Recording.read(path)["/odometry"]) > 50
+
+
+def test_a_disk_that_fills_up_at_the_very_end_raises_nothing() -> None:
+    recorder = Recorder(Path("w.mcap"), lambda path: McapWriter(Disk(1500), clock="world"))
+    recorder.put(counted(20))
+    recorder.close()
+    assert "No space left on device" in recorder.error
+
+
+def test_a_folder_that_is_not_there_stops_the_recording_only(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "absent" / "world.mcap", open_mcap)
+    recorder.put(counted(7))
+    assert recorder.drain() == 7
+    recorder.put(counted(3))
+    recorder.flush()
+    recorder.close()
+    assert recorder.dropped == 10
+    assert "world.mcap: recording stopped: No such file or directory" in recorder.error
+
+
+def test_a_record_that_cannot_be_written_costs_only_itself(tmp_path: Path) -> None:
+    path, bad = tmp_path / "w.mcap", Counted(1, "world", "sent", 2**70)
+    recorder = Recorder(path, open_mcap)
+    recorder.put([*counted(1), bad, *counted(3)])
+    recorder.close()
+    assert recorder.dropped == 1
+    assert "a record of type Counted cannot be written" in recorder.error
+    assert len(Recording.read(path)["/count"]) == 4
+
+
+def test_the_thread_writes_everything_before_it_ends(tmp_path: Path) -> None:
+    path, records = tmp_path / "world.mcap", world_records(200)
+    recorder = Recorder(path, open_mcap)
+    thread = RecordingThread(recorder)
+    thread.start()
+    for record in records:
+        recorder.put([record])
+    assert thread.stop(timeout=10.0)
+    recording = Recording.read(path)
+    assert recording.complete
+    assert_equal(recording, Recording.from_records(records))
+
+
+def test_a_disk_that_hangs_does_not_keep_the_process() -> None:
+    release = threading.Event()
+
+    class Hanging(Shelf):
+        def write(self, records: Iterable[Record]) -> None:
+            release.wait(10.0)
+
+    recorder = Recorder(Path("x"), lambda path: Hanging(), capacity=5)
+    recorder.put(counted(5))
+    thread = RecordingThread(recorder)
+    thread.start()
+    recorder.put(counted(20))
+    assert not thread.stop(timeout=0.05)
+    assert recorder.dropped >= 15
+    release.set()
+    assert thread.stop(timeout=10.0)
+
+
+@pytest.mark.parametrize("room", [0, 10, 100])
+def test_a_disk_without_room_for_the_head_raises_nothing(room: int) -> None:
+    recorder = Recorder(Path("w.mcap"), lambda path: McapWriter(Disk(room), clock="world"))
+    recorder.put(counted(5))
+    recorder.close()
+    assert recorder.dropped == 5
+    assert "No space left on device" in recorder.error

@@ -1,0 +1,144 @@
+"""The file is an MCAP that others can read, and is never more than half a second behind."""
+
+from __future__ import annotations
+
+import io
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+
+from cloudrc.messages import GuardState
+from cloudrc.record.columns import Recording
+from cloudrc.record.topics import TOPICS, rows
+from cloudrc.record.writer import CHUNK_NS, McapWriter
+from cloudrc.records import GuardChange
+from tests.record.samples import MS, SECOND, assert_equal, cloud_records, world_records, write
+
+RECORDS = [*world_records(150), *cloud_records(150, 1500 * MS)]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("flight") / "both.mcap", RECORDS)
+
+
+def test_the_file_is_what_ros_tools_expect(flight: Path) -> None:
+    with flight.open("rb") as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == sum(len(rows(record)) for record in RECORDS)
+        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+        assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
+        for channel in summary.channels.values():
+            ros_type = summary.schemas[channel.schema_id].name
+            assert ros_type == TOPICS[channel.topic].ros_type
+            assert channel.metadata["topic_type_hash"].startswith("RIHS01_")
+
+
+def test_chunks_are_compressed_checked_and_short(flight: Path) -> None:
+    with flight.open("rb") as stream:
+        records = StreamReader(stream, emit_chunks=True).records
+        chunks = [record for record in records if isinstance(record, Chunk)]
+    assert len(chunks) >= 6
+    for chunk in chunks:
+        assert chunk.compression == "zstd"
+        assert chunk.uncompressed_crc != 0
+        assert chunk.message_end_time - chunk.message_start_time < CHUNK_NS
+
+
+def test_log_times_never_fall_on_a_topic(tmp_path: Path) -> None:
+    states = [GuardChange(stamp, GuardState.HOLD, "") for stamp in (5, 9, 7, 8, 12)]
+    path = write(tmp_path / "back.mcap", states)
+    times = defaultdict(list)
+    with path.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            times[channel.topic].append(message.log_time)
+    assert times == {"/guard": [5, 9, 9, 9, 12]}
+    assert Recording.read(path)["/guard"]["stamp_ns"].tolist() == [5, 9, 7, 8, 12]
+
+
+def test_what_is_older_than_half_a_second_is_with_the_operating_system() -> None:
+    stream = io.BytesIO()
+    writer = McapWriter(stream, clock="world")
+    states = [GuardChange(n * 10 * MS, GuardState.HOLD, str(n)) for n in range(200)]
+    for state in states:
+        writer.write([state])
+        seen = stream.getvalue()
+        assert state.stamp_ns < CHUNK_NS or state.stamp_ns - newest(seen) <= CHUNK_NS
+    writer.close()
+
+
+def newest(data: bytes) -> int:
+    """Log time [ns] of the last whole chunk's last message."""
+    end = 0
+    try:
+        for record in StreamReader(io.BytesIO(data), emit_chunks=True).records:
+            end = record.message_end_time if isinstance(record, Chunk) else end
+    except Exception:  # it has no end yet
+        return end
+    raise AssertionError("the file is not yet ended")
+
+
+def test_attachments_and_metadata_come_back(tmp_path: Path) -> None:
+    path, report = tmp_path / "a.mcap", b'{"verdict": "success"}'
+    with McapWriter(path, clock="cloud", clock_id="boot-1") as writer:
+        writer.write(cloud_records(3))
+        writer.note({"epoch": "1"})
+        writer.note({"epoch": "2"})
+        writer.attach("report.json", report, "application/json")
+        writer.attach("empty", b"")
+    recording = Recording.read(path)
+    assert recording.complete
+    assert recording.attachments == {"report.json": report, "empty": b""}
+    expected = {"clock": "cloud", "clock_id": "boot-1", "epoch": "2"}
+    assert expected.items() <= recording.metadata.items()
+    assert recording.metadata["version"]
+
+
+def test_rosbags_own_reader_agrees(flight: Path) -> None:
+    positions = []
+    with AnyReader([flight]) as reader:
+        chosen = [each for each in reader.connections if each.topic == "/odometry"]
+        for connection, _, data in reader.messages(chosen):
+            position = reader.deserialize(data, connection.msgtype).pose.pose.position
+            positions.append((position.x, position.y, position.z))
+    np.testing.assert_array_equal(positions, Recording.read(flight)["/odometry"]["position"])
+
+
+def same(one: Any, other: Any) -> bool:
+    """Compare messages of two decoders, field by field."""
+    if hasattr(one, "__dataclass_fields__"):
+        names = one.__dataclass_fields__
+        return all(same(getattr(one, n), getattr(other, n)) for n in names if n != "__msgtype__")
+    return bool(np.array_equal(one, other, equal_nan=not isinstance(one, str)))
+
+
+def test_another_decoder_gives_the_same_values(flight: Path) -> None:
+    decoder = pytest.importorskip("mcap_ros2.decoder", reason="needs mcap-ros2-support")
+    seen = set()
+    with AnyReader([flight]) as bag, flight.open("rb") as stream:
+        ours = iter(bag.messages())
+        reader = make_reader(stream, decoder_factories=[decoder.DecoderFactory()])
+        found = [(c.topic, m.data, d) for _, c, m, d in reader.iter_decoded_messages()]
+        by_bytes = {(topic, data): message for topic, data, message in found}
+        for connection, _, data in ours:
+            message = bag.deserialize(data, connection.msgtype)
+            assert same(message, by_bytes[connection.topic, bytes(data)])
+            seen.add(connection.topic)
+    assert seen == set(TOPICS) - {"/lateness"}
+
+
+def test_a_flight_of_an_hour_may_start_late(tmp_path: Path) -> None:
+    records = world_records(5, start_ns=10**6 * SECOND)
+    path = write(tmp_path / "late.mcap", records)
+    assert_equal(Recording.read(path), Recording.from_records(records))
