@@ -1,16 +1,17 @@
 """The messages of the loop: what the two ends tell each other and what they record.
 
-Frozen dataclasses in SI units. Every stamp is an integer number of nanoseconds on the monotonic
-clock of the end that is named beside it; two stamps may be subtracted only if they are of one
-clock. Frames: REP-103 (x forward, y left, z up); unmarked vectors are in the world frame, the
-others end in ``_body``. Quaternions are ``wxyz``, as in MuJoCo.
+Named tuples in SI units: they cannot be changed, and one is made in a quarter of the time that a
+frozen dataclass takes, which counts where a dozen are made in every 10 ms of flight. Every stamp
+is an integer number of nanoseconds on the monotonic clock of the end that is named beside it; two
+stamps may be subtracted only if they are of one clock. Frames: REP-103 (x forward, y left, z up);
+unmarked vectors are in the world frame, the others end in ``_body``. Quaternions are ``wxyz``, as
+in MuJoCo.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -54,8 +55,7 @@ class Request(IntEnum):
     """The mission is over: hold locally until the next one starts."""
 
 
-@dataclass(frozen=True, slots=True)
-class Odometry:
+class Odometry(NamedTuple):
     """Pose and twist of the robot's base at one instant.
 
     Attributes:
@@ -73,8 +73,7 @@ class Odometry:
     angular_velocity_body: Vector
 
 
-@dataclass(frozen=True, slots=True)
-class Telemetry:
+class Telemetry(NamedTuple):
     """What world sends to cloud at 100 Hz.
 
     Attributes:
@@ -98,8 +97,7 @@ class Telemetry:
     guard: GuardState
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """What cloud sends to world at 100 Hz.
 
     Attributes:
@@ -117,8 +115,7 @@ class Command:
     yaw_rate: float
 
 
-@dataclass(frozen=True, slots=True)
-class OperatorRequest:
+class OperatorRequest(NamedTuple):
     """What the operator asks of the robot itself; repeated until telemetry shows its number.
 
     Attributes:
@@ -132,8 +129,7 @@ class OperatorRequest:
     start: Start = Start.SPAWN
 
 
-@dataclass(frozen=True, slots=True)
-class Setpoint:
+class Setpoint(NamedTuple):
     """What the controller tracks: teleop to controller.
 
     Attributes:

@@ -1,20 +1,18 @@
 """The records of a run: what world, cloud and the drivers note down while they fly.
 
-Every record is a frozen dataclass whose first field is `stamp_ns`, on the clock of the end that
+Every record is a named tuple whose first field is `stamp_ns`, on the clock of the end that
 made it. `record/` turns them into MCAP topics, columns and a hash; `metrics/` turns them into
 numbers. The loop only makes them and hands them over.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
 
 
-@dataclass(frozen=True, slots=True)
-class TelemetrySent:
+class TelemetrySent(NamedTuple):
     """World: telemetry left. Topics /odometry and /telemetry.
 
     Attributes:
@@ -30,8 +28,7 @@ class TelemetrySent:
     telemetry: Telemetry
 
 
-@dataclass(frozen=True, slots=True)
-class GroundTruth:
+class GroundTruth(NamedTuple):
     """World: the true state, at every odometry. Topics /ground_truth and /reference.
 
     Attributes:
@@ -47,8 +44,7 @@ class GroundTruth:
     reference: Vector
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
+class Arrival(NamedTuple):
     """Either end: a telemetry or command datagram arrived, late ones included.
 
     Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
@@ -70,8 +66,7 @@ class Arrival:
     used: bool
 
 
-@dataclass(frozen=True, slots=True)
-class CommandApplied:
+class CommandApplied(NamedTuple):
     """World: a command was applied for the first time. Topic /command_applied.
 
     Attributes:
@@ -89,8 +84,7 @@ class CommandApplied:
     velocity: Vector
 
 
-@dataclass(frozen=True, slots=True)
-class GuardChange:
+class GuardChange(NamedTuple):
     """World: the guard changed its state. Topic /guard.
 
     Attributes:
@@ -104,8 +98,7 @@ class GuardChange:
     cause: str
 
 
-@dataclass(frozen=True, slots=True)
-class Contact:
+class Contact(NamedTuple):
     """World: the robot began to touch something. Topic /contact.
 
     Attributes:
@@ -125,8 +118,7 @@ class Contact:
     tip: bool
 
 
-@dataclass(frozen=True, slots=True)
-class SessionOpened:
+class SessionOpened(NamedTuple):
     """Either end: a session began under a new epoch. Topic /session.
 
     Attributes:
@@ -142,8 +134,7 @@ class SessionOpened:
     cause: str
 
 
-@dataclass(frozen=True, slots=True)
-class Control:
+class Control(NamedTuple):
     """Cloud: one period of the control loop.
 
     Topics /estimated_odometry, /setpoint_position, /cmd_vel, /delay_estimate and /pid.
@@ -189,8 +180,7 @@ class Control:
     derivative: Vector
 
 
-@dataclass(frozen=True, slots=True)
-class MissionEvent:
+class MissionEvent(NamedTuple):
     """Cloud: the mission moved on. Topic /mission.
 
     Attributes:
@@ -207,8 +197,7 @@ class MissionEvent:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Fault:
+class Fault(NamedTuple):
     """Either end: something went wrong that did not stop the flight. Topic /fault.
 
     Attributes:
@@ -222,8 +211,7 @@ class Fault:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Counted:
+class Counted(NamedTuple):
     """Either end: how often something has happened so far; once a second. Topic /count.
 
     Attributes:
@@ -231,17 +219,16 @@ class Counted:
         end: "world", "cloud" or "link".
         name: "received", "sent", "malformed", "late", "stale", "repeated", "old_epoch",
             "not_finite", "recorder_dropped"...
-        count: Since the start.
+        total: Since the start.
     """
 
     stamp_ns: int
     end: str
     name: str
-    count: int
+    total: int
 
 
-@dataclass(frozen=True, slots=True)
-class Lateness:
+class Lateness(NamedTuple):
     """Driver, in real time only: how late a wake was. Topic /lateness.
 
     Attributes:

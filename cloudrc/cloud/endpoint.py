@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from math import nan
 
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.teleop.messages import Seen
@@ -16,8 +17,8 @@ from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.messages import NEVER_NS, OperatorRequest, Setpoint
 from cloudrc.records import Arrival, Counted, Record, SessionOpened
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import Channel, Outcome
-from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Header, Hello, Kind
+from cloudrc.tunnel.channel import USED, Channel
+from cloudrc.tunnel.codec import Accept, Datagram, DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.session import NO_EPOCH, Session
 
 PERIOD_NS = 10_000_000
@@ -26,6 +27,7 @@ HELLO_PERIOD_NS = 100_000_000
 SILENCE_NS = 500_000_000
 """Without telemetry for so long, cloud says hello again: world may have restarted."""
 COUNT_PERIOD_NS = 1_000_000_000
+COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,7 @@ class CloudEndpoint:
         self._loop, self.teleop, self._identity = loop, teleop, identity
         self._session = Session(Direction.DOWNLINK)
         self._channel = Channel(newest_wins)
-        self._world_clock_id = b""
+        self._clock_is_shared = False
         self._setpoint: Setpoint | None = None
         self._tick_ns = self._hello_ns = self._heard_ns = start_ns
         self._count_ns = start_ns + COUNT_PERIOD_NS
@@ -93,7 +95,8 @@ class CloudEndpoint:
         if now_ns < self._tick_ns:
             return
         missed = (now_ns - self._tick_ns) // PERIOD_NS
-        self._counts["missed_periods"] += missed
+        if missed:
+            self._counts["missed_periods"] += missed
         self._tick_ns += (missed + 1) * PERIOD_NS
         self._say_hello_if_needed(now_ns)
         self.teleop.handle_deadline(now_ns)
@@ -108,11 +111,11 @@ class CloudEndpoint:
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
         """Take in one datagram; what is not valid is counted and dropped."""
         try:
-            header, body = self._session.open(data)
-            if header.kind == Kind.TELEMETRY:
-                self._receive_telemetry(header, body, now_ns)
-            elif header.kind == Kind.ACCEPT:
-                self._receive_accept(header, codec.decode_accept(body), now_ns)
+            datagram = self._session.open(data)
+            if datagram.kind == TELEMETRY:
+                self._receive_telemetry(datagram, now_ns)
+            elif datagram.kind == Kind.ACCEPT:
+                self._receive_accept(datagram, now_ns)
             else:
                 raise DecodeError("malformed")
         except DecodeError as error:
@@ -128,42 +131,42 @@ class CloudEndpoint:
         hello = Hello(self._identity.nonce, self._identity.clock_id)
         self._send(Kind.HELLO, codec.encode_hello(hello))
 
-    def _receive_accept(self, header: Header, accept: Accept, now_ns: int) -> None:
+    def _receive_accept(self, datagram: Datagram, now_ns: int) -> None:
         """Take the epoch that world hands out to this very process, if it is a new one."""
-        if accept.nonce != self._identity.nonce or header.epoch <= self._session.epoch:
+        accept, epoch = codec.decode_accept(datagram.body), datagram.epoch
+        if accept.nonce != self._identity.nonce or epoch <= self._session.epoch:
             self._counts["accept_ignored"] += 1
             return
-        self._session.begin(header.epoch)
+        self._session.begin(epoch)
         self._channel.reset()
         self._loop.reset()
-        self._world_clock_id = accept.clock
+        self._clock_is_shared = accept.clock == self._identity.clock_id
         self._heard_ns = now_ns
         self._commanded_ns = NEVER_NS
-        self._records.append(SessionOpened(now_ns, "cloud", header.epoch, "world accepted"))
+        self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
-    def _receive_telemetry(self, header: Header, body: bytes, now_ns: int) -> None:
-        if header.epoch != self._session.epoch:
+    def _receive_telemetry(self, datagram: Datagram, now_ns: int) -> None:
+        """Whatever arrives for this epoch is noted; loop and teleop get the newest."""
+        _, _, epoch, counter, body = datagram
+        if epoch != self._session.epoch:
             self._counts["old_epoch"] += 1
-            if header.epoch > self._session.epoch and now_ns >= self._hello_ns:
+            if epoch > self._session.epoch and now_ns >= self._hello_ns:
                 self._say_hello(now_ns)  # world moved on and its accept was lost
             return
-        telemetry = codec.decode_telemetry(body)
         self._heard_ns = now_ns
-        outcome = self._channel.take(header.counter)
-        used = outcome is Outcome.USED
-        shared = self._world_clock_id == self._identity.clock_id
-        sent_ns = telemetry.stamp_ns + telemetry.slip_ns
-        delay = (now_ns - sent_ns) * 1e-9 if shared else float("nan")
-        self._records.append(Arrival(now_ns, True, header.epoch, header.counter, delay, used))
-        self._counts[outcome.value] += 1
-        if not used:
-            return
-        self._loop.observe(telemetry, now_ns)
-        self.teleop.see(
-            Seen(header.epoch, telemetry.odometry.position, telemetry.guard, telemetry.mission),
-            now_ns,
-        )
-        self._take_from_teleop()
+        outcome = self._channel.take(counter)
+        self._counts[outcome] += 1
+        delay = nan
+        if self._clock_is_shared:
+            stamp_ns, slip_ns = codec.decode_stamps(body)
+            delay = (now_ns - stamp_ns - slip_ns) * 1e-9
+        self._records.append(Arrival(now_ns, True, epoch, counter, delay, outcome == USED))
+        if outcome == USED:
+            telemetry = codec.decode_telemetry(body)
+            position, guard = telemetry.odometry.position, telemetry.guard
+            self._loop.observe(telemetry, now_ns)
+            self.teleop.see(Seen(epoch, position, guard, telemetry.mission), now_ns)
+            self._take_from_teleop()
 
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():
@@ -179,9 +182,9 @@ class CloudEndpoint:
     def _send_command(self, setpoint: Setpoint, now_ns: int) -> None:
         elapsed_ns = now_ns - self._commanded_ns if self._commanded_ns >= 0 else PERIOD_NS
         self._commanded_ns = now_ns
-        epoch, counter = self._session.epoch, self._session.next_counter(Kind.COMMAND)
+        epoch, counter = self._session.epoch, self._session.next_counter(COMMAND)
         command, control = self._loop.command(setpoint, now_ns, elapsed_ns * 1e-9, epoch, counter)
-        self._send(Kind.COMMAND, codec.encode_command(command))
+        self._send(COMMAND, codec.encode_command(command))
         self._records.append(control)
 
     def _note_counts(self, now_ns: int) -> None:
@@ -189,6 +192,6 @@ class CloudEndpoint:
         for name, count in sorted((self._counts + self._loop.counts).items()):
             self._records.append(Counted(now_ns, "cloud", name, count))
 
-    def _send(self, kind: Kind, body: bytes) -> None:
+    def _send(self, kind: int, body: bytes) -> None:
         self._datagrams.append(self._session.seal(kind, body))
         self._counts["sent"] += 1

@@ -122,10 +122,15 @@ class ControlLoop:
             self._note("estimator", error, now_ns)
         return self._horizon
 
+    # A sum is finite only if all its terms are. That it can overflow is no loss: numbers of that
+    # size cannot be flown either.
+
     def _predict(self, basis: Odometry, horizon: float, now_ns: int) -> Odometry:
         try:
             estimate = self._predictor.predict(basis, horizon)
-            _check_finite(estimate.position, estimate.velocity, estimate.orientation_wxyz)
+            numbers = sum(estimate.position) + sum(estimate.velocity)
+            if not isfinite(numbers + sum(estimate.orientation_wxyz)):
+                raise ValueError(f"it returned {estimate}")
         except Exception as error:
             self._note("predictor", error, now_ns)
             return basis
@@ -136,7 +141,8 @@ class ControlLoop:
     ) -> ControlOutput:
         try:
             output = self._controller.update(estimate, setpoint, dt)
-            _check_finite(output.velocity, (output.yaw_rate,))
+            if not isfinite(sum(output.velocity) + output.yaw_rate):
+                raise ValueError(f"it returned {output}")
         except Exception as error:
             self._note("controller", error, now_ns)
             return ControlOutput(ZERO, 0.0)
@@ -160,14 +166,3 @@ _INSTEAD = {
 def _explain(kind: str, error: Exception) -> str:
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return f"the {kind} failed ({text}); {_INSTEAD[kind]}; mend cloud.{kind} or choose another"
-
-
-def _check_finite(*vectors: tuple[float, ...]) -> None:
-    """Refuse numbers that cannot be flown.
-
-    A sum is finite only if all its terms are; that it can overflow is no loss, since numbers of
-    that size cannot be flown either.
-    """
-    for vector in vectors:
-        if not isfinite(sum(vector)):
-            raise ValueError(f"it returned {vector}")

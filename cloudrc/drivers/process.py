@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import FrameType
+from typing import Protocol
 
 from cloudrc.drivers.feed import Feed
 from cloudrc.drivers.realtime import Peer, serve
@@ -34,10 +35,10 @@ class StopSignal:
         self._asked = True
 
 
-class Takes(Recorder):
+class Takes(Recorder, Protocol):
     """A recorder that records can be put into; `cloudrc.record.recorder` has it."""
 
-    def put(self, records: list[Record]) -> None:
+    def put(self, records: Iterable[Record]) -> None:
         """Take records over; never waits and never raises."""
 
 

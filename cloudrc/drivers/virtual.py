@@ -18,7 +18,8 @@ from cloudrc.tunnel.codec import peek
 
 Sink = Callable[[list[Record], list[Record]], None]
 """Takes the records of world and of cloud since the last call."""
-SINK_PERIOD_NS = 100_000_000
+PERIOD_NS = 100_000_000
+"""How often records are handed over, and whether it is over is asked [ns]."""
 
 
 class Link(Protocol):
@@ -57,7 +58,7 @@ class VirtualRun:
         self.now_ns = 0
 
     def fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
-        """Go on until `until()` is true, asked after each of cloud's deadlines, or to the limit.
+        """Go on until `until()` is true, asked every 100 ms of virtual time, or to the limit.
 
         Args:
             until: Whether it is over.
@@ -74,7 +75,7 @@ class VirtualRun:
 
     def _fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
         world, cloud, flying, offset_ns = self._world, self._cloud, self._flying, self._offset_ns
-        sink_ns = self.now_ns
+        asked_ns = self.now_ns
         while self.now_ns < limit_ns:
             world_ns = world.next_deadline_ns()
             cloud_ns = cloud.next_deadline_ns() - offset_ns
@@ -83,31 +84,37 @@ class VirtualRun:
             elif world_ns <= cloud_ns:
                 self.now_ns = world_ns
                 world.handle_deadline(world_ns)
-                self._send(world.take_datagrams(), self._uplink, to_world=False)
+                self._send_up()
             else:
                 self.now_ns = cloud_ns
                 cloud.handle_deadline(cloud_ns + offset_ns)
-                self._send(cloud.take_datagrams(), self._downlink, to_world=True)
-                over = until()
-                if over or cloud_ns >= sink_ns:
-                    sink_ns = cloud_ns + SINK_PERIOD_NS
+                self._send_down()
+                if cloud_ns >= asked_ns + PERIOD_NS:
+                    asked_ns = cloud_ns
                     sink(world.take_records(), cloud.take_records())
-                if over:
-                    return
+                    if until():
+                        return
         sink(world.take_records(), cloud.take_records())
 
     def _deliver(self) -> None:
         self.now_ns, _, to_world, data = heappop(self._flying)
         if to_world:
             self._world.receive_datagram(data, self.now_ns)
-            self._send(self._world.take_datagrams(), self._uplink, to_world=False)
+            self._send_up()
         else:
             self._cloud.receive_datagram(data, self.now_ns + self._offset_ns)
-            self._send(self._cloud.take_datagrams(), self._downlink, to_world=True)
+            self._send_down()
 
-    def _send(self, datagrams: list[bytes], link: Link, *, to_world: bool) -> None:
-        for data in datagrams:
-            kind, epoch, counter = peek(data)
-            for arrival_ns in link.send(epoch, kind, counter, len(data), self.now_ns):
-                heappush(self._flying, (arrival_ns, self._sent, to_world, data))
-                self._sent += 1
+    def _send_up(self) -> None:
+        for data in self._world.take_datagrams():
+            self._send(data, self._uplink, to_world=False)
+
+    def _send_down(self) -> None:
+        for data in self._cloud.take_datagrams():
+            self._send(data, self._downlink, to_world=True)
+
+    def _send(self, data: bytes, link: Link, *, to_world: bool) -> None:
+        kind, epoch, counter = peek(data)
+        for arrival_ns in link.send(epoch, kind, counter, len(data), self.now_ns):
+            self._sent += 1
+            heappush(self._flying, (arrival_ns, self._sent, to_world, data))

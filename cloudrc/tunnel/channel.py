@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from enum import Enum
-
 WINDOW = 1024
 """How far back a counter is remembered [datagrams]."""
 _MASK = (1 << WINDOW) - 1
 
 
-class Outcome(Enum):
-    """What became of a datagram; the value is the name that it is counted under."""
-
-    USED = "used"
-    LATE = "late"
-    REPEATED = "repeated"
+# What became of a datagram, by the name that it is counted under.
+USED = "used"
+LATE = "late"
+REPEATED = "repeated"
 
 
 class Channel:
@@ -35,14 +31,14 @@ class Channel:
         self._newest = -1
         self._seen = 0  # bit k: newest - k has arrived
 
-    def take(self, counter: int) -> Outcome:
-        """Say what becomes of the datagram with this counter, and remember it."""
+    def take(self, counter: int) -> str:
+        """Say what becomes of the datagram with this counter, USED, LATE or REPEATED; remember it."""
         ahead = counter - self._newest
         if ahead > 0:
             self._newest = counter
             self._seen = ((self._seen << ahead) | 1) & _MASK if ahead < WINDOW else 1
-            return Outcome.USED
+            return USED
         if ahead <= -WINDOW or self._seen >> -ahead & 1:
-            return Outcome.REPEATED
+            return REPEATED
         self._seen |= 1 << -ahead
-        return Outcome.LATE if self._newest_wins else Outcome.USED
+        return LATE if self._newest_wins else USED

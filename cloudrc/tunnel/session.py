@@ -9,12 +9,11 @@ none: a link decides by the counter, and a repeated one would meet the same fate
 from __future__ import annotations
 
 from cloudrc.tunnel.codec import (
-    HEADER_SIZE,
+    Datagram,
     DecodeError,
     Direction,
-    Header,
     Kind,
-    decode_header,
+    decode,
     encode_header,
 )
 
@@ -48,16 +47,16 @@ class Session:
         epoch = NO_EPOCH if kind == Kind.HELLO else self.epoch
         return encode_header(kind, self._sends, epoch, counter) + body
 
-    def open(self, data: bytes) -> tuple[Header, bytes]:
-        """Check a datagram and take its body out; nothing changes, whatever it is.
+    def open(self, data: bytes) -> Datagram:
+        """Check a datagram and take it apart; nothing changes, whatever it is.
 
         Raises:
             DecodeError: "malformed", "version", or "direction" for one of our own direction.
         """
-        header = decode_header(data)
-        if header.direction == self._sends:
+        datagram = decode(data)
+        if datagram.direction == self._sends:
             raise DecodeError("direction")
-        return header, data[HEADER_SIZE:]
+        return datagram
 
     def next_counter(self, kind: int) -> int:
         """The counter that the next datagram of this kind will carry."""

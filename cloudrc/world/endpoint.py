@@ -14,7 +14,6 @@ from cloudrc.messages import (
     NEVER_NS,
     Command,
     Odometry,
-    OperatorRequest,
     Request,
     Start,
     Telemetry,
@@ -30,16 +29,17 @@ from cloudrc.records import (
     TelemetrySent,
 )
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import Channel, Outcome
-from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Header, Hello, Kind
+from cloudrc.tunnel.channel import USED, Channel
+from cloudrc.tunnel.codec import Accept, Datagram, DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.session import Session
-from cloudrc.world.clock import SimulationClock
+from cloudrc.world.clock import CATCH_UP_NS, SimulationClock
 from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 
 ODOMETRY_PERIOD_NS = 10_000_000
 """Source: plant.md, 100 Hz."""
 COUNT_PERIOD_NS = 1_000_000_000
+COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class WorldEndpoint:
             command_age_max_ns: What may have waited longer in the socket is stale [ns].
             start_ns: The monotonic clock now [ns].
         """
-        self._robot, self._sensors, self._identity = robot, sensors, identity
+        self.robot, self._sensors, self._identity = robot, sensors, identity
         self._clock = SimulationClock(start_ns)
         self._session = Session(Direction.UPLINK)
         self._channel = Channel(newest_wins)
@@ -91,7 +91,7 @@ class WorldEndpoint:
         self._stalled_wake_ns = NEVER_NS
         self._odometry_ns = start_ns
         self._count_ns = start_ns + COUNT_PERIOD_NS
-        self._waiting: tuple[Header, Command] | None = None
+        self._waiting: tuple[int, int, Command] | None = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._datagrams: list[bytes] = []
         self._records: list[Record] = []
@@ -125,13 +125,13 @@ class WorldEndpoint:
         world_ns = self._follow(now_ns)
         self._advance(world_ns)
         try:
-            header, body = self._session.open(data)
-            if header.kind == Kind.COMMAND:
-                self._receive_command(header, body, now_ns)
-            elif header.kind == Kind.OPERATOR:
-                self._receive_operator(header, codec.decode_operator(body))
-            elif header.kind == Kind.HELLO:
-                self._receive_hello(codec.decode_hello(body))
+            datagram = self._session.open(data)
+            if datagram.kind == COMMAND:
+                self._receive_command(datagram, now_ns)
+            elif datagram.kind == Kind.OPERATOR:
+                self._receive_operator(datagram)
+            elif datagram.kind == Kind.HELLO:
+                self._receive_hello(codec.decode_hello(datagram.body))
             else:
                 raise DecodeError("malformed")
         except DecodeError as error:
@@ -139,11 +139,11 @@ class WorldEndpoint:
 
     def _follow(self, now_ns: int) -> int:
         """World time at a wake; remembers a wake after a stall, whose datagrams have waited."""
-        behind = now_ns - self._clock.slip_ns - self._clock.tick_ns
-        if behind > self._command_age_max_ns:
+        behind_ns = now_ns - self._clock.slip_ns - self._clock.tick_ns
+        if behind_ns > self._command_age_max_ns:
             self._stalled_wake_ns = now_ns
             self._counts["stalls"] += 1
-        return self._clock.follow(now_ns)
+        return self._clock.follow(now_ns) if behind_ns > CATCH_UP_NS else now_ns - self._clock.slip_ns
 
     def _advance(self, until_ns: int) -> None:
         """Run all ticks before `until_ns` [world's clock]."""
@@ -153,25 +153,24 @@ class WorldEndpoint:
         while clock.tick_ns < until_ns:
             if clock.tick_ns >= self._odometry_ns:
                 self._send_telemetry(clock.tick_ns)
-            clock.tick_ns = self._robot.run(clock.tick_ns, min(until_ns, self._odometry_ns))
+            clock.tick_ns = self.robot.run(clock.tick_ns, min(until_ns, self._odometry_ns))
 
     def _apply(self, now_ns: int) -> None:
         """The waiting command reaches the low-level controller with this tick."""
         assert self._waiting is not None
-        header, command = self._waiting
+        epoch, counter, command = self._waiting
         self._waiting = None
         self._echo_stamp_ns, self._applied_ns = command.stamp_ns, now_ns
         basis_ns = command.basis_stamp_ns
         self._records.append(
-            CommandApplied(now_ns, header.epoch, header.counter, basis_ns, command.velocity)
+            CommandApplied(now_ns, epoch, counter, basis_ns, command.velocity)
         )
 
     def _send_telemetry(self, now_ns: int) -> None:
         """Measure, tell cloud, and note down the truth."""
-        robot, records = self._robot, self._records
+        robot, records = self.robot, self._records
         tip_force = robot.simulator.tip_force()
-        readings = robot.simulator.readings
-        truth = Odometry(now_ns, *readings)
+        truth = Odometry(now_ns, *robot.simulator.readings[:4])
         records.append(GroundTruth(now_ns, truth, tip_force, robot.guard.reference))
         records += robot.guard.take_changes()
         for touch in robot.simulator.take_contacts():
@@ -179,7 +178,7 @@ class WorldEndpoint:
         if self._session.epoch:
             telemetry = Telemetry(
                 now_ns,
-                self._sensors.measure(now_ns, readings),
+                self._sensors.measure(truth),
                 tip_force,
                 self._echo_stamp_ns,
                 now_ns - self._applied_ns if self._applied_ns >= 0 else 0,
@@ -187,8 +186,8 @@ class WorldEndpoint:
                 self._mission,
                 robot.guard.state,
             )
-            counter = self._session.next_counter(Kind.TELEMETRY)
-            self._send(Kind.TELEMETRY, codec.encode_telemetry(telemetry))
+            counter = self._session.next_counter(TELEMETRY)
+            self._send(TELEMETRY, codec.encode_telemetry(telemetry))
             records.append(TelemetrySent(now_ns, self._session.epoch, counter, telemetry))
         if now_ns >= self._count_ns:
             self._count_ns += COUNT_PERIOD_NS
@@ -208,7 +207,7 @@ class WorldEndpoint:
         self._last_epoch += 1
         self._session.begin(self._last_epoch)
         self._channel.reset()
-        self._robot.guard.forget_commands()
+        self.robot.guard.forget_commands()
         self._waiting = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._records.append(SessionOpened(self._clock.tick_ns, "world", self._last_epoch, cause))
@@ -218,47 +217,48 @@ class WorldEndpoint:
         accept = Accept(self._cloud.nonce, identity.nonce, identity.clock_id)
         self._send(Kind.ACCEPT, codec.encode_accept(accept))
 
-    def _receive_operator(self, header: Header, request: OperatorRequest) -> None:
-        if self._is_of_old_epoch(header) or request.number <= self._mission:
+    def _receive_operator(self, datagram: Datagram) -> None:
+        request = codec.decode_operator(datagram.body)
+        if self._is_of_old_epoch(datagram) or request.number <= self._mission:
             return
         self._mission = request.number
-        guard, now_ns = self._robot.guard, self._clock.tick_ns
+        guard, now_ns = self.robot.guard, self._clock.tick_ns
         if request.request is Request.END:
             guard.end_mission(now_ns)
             return
         if request.start is Start.SPAWN:
-            self._robot.put_on_ground(now_ns, "mission starts from spawn")
+            self.robot.put_on_ground(now_ns, "mission starts from spawn")
             self._open_epoch("mission starts from spawn")
             self._accept()
         guard.start_mission(now_ns)
 
-    def _receive_command(self, header: Header, body: bytes, now_ns: int) -> None:
+    def _receive_command(self, datagram: Datagram, now_ns: int) -> None:
         """Whatever arrives for this epoch is noted; the newest is offered to the guard."""
-        if self._is_of_old_epoch(header):
+        if self._is_of_old_epoch(datagram):
             return
-        command = codec.decode_command(body)
-        outcome = self._channel.take(header.counter)
-        refused = None if outcome is Outcome.USED else outcome.value
-        if refused is None:
+        epoch, counter = datagram.epoch, datagram.counter
+        command = codec.decode_command(datagram.body)
+        outcome = self._channel.take(counter)
+        if outcome == USED:
             stalled = now_ns == self._stalled_wake_ns
-            refused = (
-                "stale" if stalled else self._robot.guard.offer(command, self._clock.tick_ns)
-            )
+            guard, tick_ns = self.robot.guard, self._clock.tick_ns
+            outcome = "stale" if stalled else guard.offer(command, tick_ns) or USED
         shared = self._cloud.clock == self._identity.clock_id
         delay = (now_ns - command.stamp_ns) * 1e-9 if shared else float("nan")
-        used = refused is None
+        used = outcome == USED
         self._records.append(
-            Arrival(now_ns - self._clock.slip_ns, False, header.epoch, header.counter, delay, used)
+            Arrival(now_ns - self._clock.slip_ns, False, epoch, counter, delay, used)
         )
-        if used and self._robot.guard.armed:
-            self._waiting = (header, command)
-        self._counts[refused or "used"] += 1
+        if used and self.robot.guard.armed:
+            self._waiting = (epoch, counter, command)
+        self._counts[outcome] += 1
 
-    def _is_of_old_epoch(self, header: Header) -> bool:
-        old = header.epoch != self._session.epoch
-        self._counts["old_epoch"] += old
-        return old
+    def _is_of_old_epoch(self, datagram: Datagram) -> bool:
+        if datagram.epoch == self._session.epoch:
+            return False
+        self._counts["old_epoch"] += 1
+        return True
 
-    def _send(self, kind: Kind, body: bytes) -> None:
+    def _send(self, kind: int, body: bytes) -> None:
         self._datagrams.append(self._session.seal(kind, body))
         self._counts["sent"] += 1

@@ -13,6 +13,9 @@ from math import isfinite, sqrt
 
 from cloudrc.messages import NEVER_NS, ZERO, Command, GuardState, Vector
 from cloudrc.records import GuardChange
+from cloudrc.world.readings import Readings
+
+TRACK = GuardState.TRACK  # looked up in every tick
 
 BRAKE = 3.0
 """Deceleration in HOLD [m/s^2]; the stop rule of the design assumes it."""
@@ -47,7 +50,7 @@ class Guard:
         self._changes: list[GuardChange] = []
         self.state = GuardState.GROUND
         self.armed = False  # true from the operator's start of a mission to its end
-        self._basis_ns = NEVER_NS
+        self._fresh_until_ns = NEVER_NS
         self._wanted = ZERO
         self.reference: Vector = ZERO
         self._anchor: Vector | None = None
@@ -68,12 +71,12 @@ class Guard:
     def end_mission(self, now_ns: int) -> None:
         """The mission is over: hold here until the operator starts the next one."""
         self.armed = False
-        if self.state is GuardState.TRACK:
+        if self.state is TRACK:
             self._enter(GuardState.HOLD, now_ns, "mission ended")
 
     def forget_commands(self) -> None:
         """A new session begins: what came in the old one is no longer fresh."""
-        self._basis_ns = NEVER_NS
+        self._fresh_until_ns = NEVER_NS
         self._wanted = ZERO
 
     def offer(self, command: Command, now_ns: int) -> str | None:
@@ -93,32 +96,31 @@ class Guard:
         if not 0 <= age_ns <= self._limits.command_age_max_ns:
             return "stale"
         if self.armed:
-            self._basis_ns = command.basis_stamp_ns
+            self._fresh_until_ns = command.basis_stamp_ns + self._limits.command_age_max_ns
             self._wanted = _shortened(command.velocity, self._limits.speed_max)
-            if self.state is not GuardState.TRACK:
-                self._enter(GuardState.TRACK, now_ns, "fresh command")
+            if self.state is not TRACK:
+                self._enter(TRACK, now_ns, "fresh command")
         return None
 
-    def tick(self, now_ns: int, position: Vector, velocity: Vector, dt: float) -> Vector:
+    def tick(self, now_ns: int, readings: Readings, dt: float) -> Vector:
         """Say what the low-level controller shall follow now; not to be called in GROUND.
 
         Args:
             now_ns: World's clock [ns].
-            position: Sensed on board [m], shape (3,).
-            velocity: Sensed on board [m/s], shape (3,).
+            readings: Of the sensors on board.
             dt: Time since the last tick [s].
 
         Returns:
             Velocity reference [m/s], shape (3,).
         """
-        if self.state is GuardState.TRACK:
-            if now_ns - self._basis_ns <= self._limits.command_age_max_ns:
-                if self.reference != self._wanted:
+        if self.state is TRACK:
+            if now_ns <= self._fresh_until_ns:
+                if self.reference is not self._wanted:
                     step = self._limits.acceleration_max * dt
                     self.reference = _towards(self.reference, self._wanted, step)
                 return self.reference
             self._lose_link(now_ns)
-        return self._hold(position, velocity, dt)
+        return self._hold(readings.position, readings.velocity, dt)
 
     def take_changes(self) -> list[GuardChange]:
         """Hand over the changes of state since the last call."""
@@ -126,7 +128,8 @@ class Guard:
         return changes
 
     def _lose_link(self, now_ns: int) -> None:
-        age, limit = (now_ns - self._basis_ns) * 1e-9, self._limits.command_age_max_ns * 1e-9
+        limit_ns = self._limits.command_age_max_ns
+        age, limit = (now_ns - self._fresh_until_ns + limit_ns) * 1e-9, limit_ns * 1e-9
         self._enter(GuardState.HOLD, now_ns, f"command age {age:.3f} s above {limit:.3f} s")
 
     def _hold(self, position: Vector, velocity: Vector, dt: float) -> Vector:

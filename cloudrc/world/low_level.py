@@ -13,18 +13,20 @@ from __future__ import annotations
 
 from math import sqrt
 
-from cloudrc.messages import ZERO, Quaternion, Vector
+from cloudrc.messages import ZERO, Vector
 from cloudrc.world.readings import Readings, RotorSpeeds
-from cloudrc.world.rotors import ARM, SPEED_MAX, THRUST_COEFFICIENT, TORQUE_RATIO, horizontal_axes
+from cloudrc.world.rotors import ARM, SPEED_MAX, THRUST_COEFFICIENT, TORQUE_RATIO
 
 MASS = 1.05
 """What the controller believes [kg]; the robot has 1.06. Source: plant.md, "LLC"."""
 GRAVITY = 9.81
 """What the controller believes [m/s^2]; the physics has 9.8066. Source: plant.md, "Robot"."""
-ATTITUDE_GAIN: Vector = (1.0, 1.0, 0.035)
-"""k_R: torque per attitude error [N m], body frame, shape (3,). Source: plant.md, "LLC"."""
-RATE_GAIN: Vector = (0.22, 0.22, 0.01)
-"""k_w: torque per angular velocity [N m s], body frame, shape (3,). Source: plant.md, "LLC"."""
+TILT_GAIN, YAW_GAIN = 1.0, 0.035
+"""k_R: torque per attitude error about x and y, about z [N m]. Source: plant.md, "LLC"."""
+TILT_RATE_GAIN, YAW_RATE_GAIN = 0.22, 0.01
+"""k_w: torque per angular velocity, likewise [N m s]. Source: plant.md, "LLC"."""
+THRUST_MAX = THRUST_COEFFICIENT * SPEED_MAX**2
+"""Of one rotor [N]."""
 TINY = 1e-9
 
 
@@ -72,7 +74,7 @@ class LowLevel:
             Front, left, back, right [rad/s], each in [0, 1838].
         """
         force = self.force(readings.velocity, velocity_reference)
-        thrust, torque = attitude(force, readings.orientation_wxyz, readings.angular_velocity_body)
+        thrust, torque = attitude(force, readings)
         return allocate(thrust, torque)
 
     def force(self, velocity: Vector, reference: Vector) -> Vector:
@@ -119,7 +121,7 @@ class LowLevel:
         )
 
 
-def attitude(force: Vector, orientation_wxyz: Quaternion, rate: Vector) -> tuple[float, Vector]:
+def attitude(force: Vector, readings: Readings) -> tuple[float, Vector]:
     """Turn the thrust axis towards `force`, nose along +x.
 
     z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
@@ -128,16 +130,13 @@ def attitude(force: Vector, orientation_wxyz: Quaternion, rate: Vector) -> tuple
 
     Args:
         force: Wanted [N], world frame, shape (3,).
-        orientation_wxyz: Of the base, body to world, shape (4,).
-        rate: Angular velocity [rad/s], body frame, shape (3,).
+        readings: State of the base.
 
     Returns:
         Thrust [N] and torque [N m], body frame, shape (3,).
     """
     fx, fy, fz = force
-    x_axis, y_axis = horizontal_axes(orientation_wxyz)
-    xx, xy, xz = x_axis
-    yx, yy, yz = y_axis
+    _, _, _, (p, q, r), (xx, xy, xz), (yx, yy, yz) = readings
     zx, zy, zz = xy * yz - xz * yy, xz * yx - xx * yz, xx * yy - xy * yx
 
     # A force that vanishes or points along the nose leaves an axis undefined: no torque from it.
@@ -151,9 +150,9 @@ def attitude(force: Vector, orientation_wxyz: Quaternion, rate: Vector) -> tuple
     pitch = 0.5 * (dxx * zx + dxy * zy + dxz * zz - dzx * xx - dzy * xy - dzz * xz)
     yaw = 0.5 * (dyy * xy + dyz * xz - dxx * yx - dxy * yy - dxz * yz)
     torque = (
-        -(ATTITUDE_GAIN[0] * roll + RATE_GAIN[0] * rate[0]),
-        -(ATTITUDE_GAIN[1] * pitch + RATE_GAIN[1] * rate[1]),
-        -(ATTITUDE_GAIN[2] * yaw + RATE_GAIN[2] * rate[2]),
+        -(TILT_GAIN * roll + TILT_RATE_GAIN * p),
+        -(TILT_GAIN * pitch + TILT_RATE_GAIN * q),
+        -(YAW_GAIN * yaw + YAW_RATE_GAIN * r),
     )
     return fx * zx + fy * zy + fz * zz, torque
 
@@ -175,17 +174,15 @@ def allocate(thrust: float, torque: Vector) -> RotorSpeeds:
     roll, pitch = torque[0] / (2.0 * ARM), torque[1] / (2.0 * ARM)
     yaw = torque[2] / (4.0 * TORQUE_RATIO)
     with_yaw, against_yaw = 0.25 * thrust + yaw, 0.25 * thrust - yaw
-    return (
-        _speed(with_yaw - pitch),
-        _speed(against_yaw + roll),
-        _speed(with_yaw + pitch),
-        _speed(against_yaw - roll),
-    )
+    front, back = with_yaw - pitch, with_yaw + pitch
+    left, right = against_yaw + roll, against_yaw - roll
+    if 0.0 <= front <= THRUST_MAX and 0.0 <= back <= THRUST_MAX:
+        if 0.0 <= left <= THRUST_MAX and 0.0 <= right <= THRUST_MAX:
+            k = THRUST_COEFFICIENT
+            return sqrt(front / k), sqrt(left / k), sqrt(back / k), sqrt(right / k)
+    return _speed(front), _speed(left), _speed(back), _speed(right)
 
 
-def _speed(force: float) -> float:
-    """Return the rotor speed [rad/s] that gives a thrust [N]; a rotor cannot pull."""
-    if force <= 0.0:
-        return 0.0
-    speed = sqrt(force / THRUST_COEFFICIENT)
-    return speed if speed < SPEED_MAX else SPEED_MAX
+def _speed(thrust: float) -> float:
+    """Return the rotor speed [rad/s] for a thrust [N] beyond its limits: it cannot pull."""
+    return sqrt(min(max(thrust, 0.0), THRUST_MAX) / THRUST_COEFFICIENT)

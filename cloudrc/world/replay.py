@@ -6,7 +6,6 @@ the comparison is fair.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from cloudrc.world.scene import mujoco
 from cloudrc.world.simulator import State
 
 
-def replay(model: Any, start: State, tape: Sequence[tuple[float, ...]]) -> npt.NDArray[np.float64]:
+def replay(model: Any, start: State, tape: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Play a `Simulator.tape` again with `mujoco.rollout`, one thread.
 
     Args:
@@ -34,7 +33,7 @@ def replay(model: Any, start: State, tape: Sequence[tuple[float, ...]]) -> npt.N
         model,
         mujoco.MjData(model),
         start.physics,
-        np.array(tape),
+        np.asarray(tape),
         control_spec=state.mjSTATE_CTRL | state.mjSTATE_QFRC_APPLIED,
         initial_warmstart=start.warmstart,
     )

@@ -34,12 +34,14 @@ class Robot:
             The first tick that has not been run [ns, world's clock].
         """
         simulator, guard, low_level = self.simulator, self.guard, self._low_level
+        # Only commands and requests lead off the ground and back to it, and none comes in here.
+        on_ground = guard.state is GuardState.GROUND
         while tick_ns < until_ns:
-            if guard.state is GuardState.GROUND:
+            if on_ground:
                 simulator.step(STOPPED)
             else:
                 readings = simulator.readings
-                reference = guard.tick(tick_ns, readings.position, readings.velocity, STEP)
+                reference = guard.tick(tick_ns, readings, STEP)
                 simulator.step(low_level.update(readings, reference))
             tick_ns += STEP_NS
         return tick_ns

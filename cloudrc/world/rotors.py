@@ -77,9 +77,7 @@ def drag(speeds: RotorSpeeds, readings: Readings) -> Wrench:
         Force in the world frame [N], torque in the body frame [N m], shape (6,).
     """
     front, left, back, right = speeds
-    (xx, xy, xz), (yx, yy, yz) = horizontal_axes(readings.orientation_wxyz)
-    vx, vy, vz = readings.velocity
-    p, q, r = readings.angular_velocity_body
+    _, _, (vx, vy, vz), (p, q, r), (xx, xy, xz), (yx, yy, yz) = readings
 
     total = DRAG_COEFFICIENT * (front + left + back + right)
     across_x = DRAG_COEFFICIENT * ARM * (front - back)
@@ -95,15 +93,4 @@ def drag(speeds: RotorSpeeds, readings: Readings) -> Wrench:
         -HEIGHT * force_y,
         HEIGHT * force_x,
         across_y * u - across_x * v - ARM * ARM * total * r,
-    )
-
-
-def horizontal_axes(
-    orientation_wxyz: Quaternion,
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Return the body's x and y axes in the world frame, each shape (3,)."""
-    w, x, y, z = orientation_wxyz
-    return (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
-        (2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
     )

@@ -1,4 +1,4 @@
-"""The sensors of the loop: true readings in, odometry with seeded noise out, at 100 Hz.
+"""The sensors of the loop: true odometry in, odometry with seeded noise out, at 100 Hz.
 
 Only what goes to the cloud is noisy; the onboard controller sees the true state.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 from cloudrc.messages import Odometry, Vector
-from cloudrc.world.readings import Readings
 
 
 class Sensors:
@@ -27,19 +26,13 @@ class Sensors:
         self._position_noise, self._velocity_noise = position_noise, velocity_noise
         self._rng = rng
 
-    def measure(self, stamp_ns: int, readings: Readings) -> Odometry:
-        """Make the odometry of one instant.
-
-        Args:
-            stamp_ns: That instant [ns], world's clock.
-            readings: True state at it.
-        """
-        return Odometry(
-            stamp_ns,
-            self._noisy(readings.position, self._position_noise),
-            readings.orientation_wxyz,
-            self._noisy(readings.velocity, self._velocity_noise),
-            readings.angular_velocity_body,
+    def measure(self, truth: Odometry) -> Odometry:
+        """Make the odometry that goes to the cloud out of the true one; the same if noise-free."""
+        if self._position_noise == self._velocity_noise == 0.0:
+            return truth
+        return truth._replace(
+            position=self._noisy(truth.position, self._position_noise),
+            velocity=self._noisy(truth.velocity, self._velocity_noise),
         )
 
     def _noisy(self, true: Vector, deviation: float) -> Vector:

@@ -8,6 +8,7 @@ time of a numpy slice assignment, and to unpack one is a little faster than `tol
 from __future__ import annotations
 
 from math import dist
+from struct import Struct
 from typing import NamedTuple
 
 import numpy as np
@@ -15,14 +16,18 @@ import numpy.typing as npt
 
 from cloudrc.messages import Vector
 from cloudrc.world.readings import Readings, RotorSpeeds, Touch
-from cloudrc.world.rotors import THRUST_COEFFICIENT, RotorLag, drag, horizontal_axes
+from cloudrc.world.rotors import THRUST_COEFFICIENT, RotorLag, drag
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
 
 STOPPED: RotorSpeeds = (0.0, 0.0, 0.0, 0.0)
 TOUCH_GAP = 0.1
 """Something counts as newly touched after this long without contact [s]."""
+LOOK_STEPS = 5
+"""While their number stays the same, contacts are looked at this often: it costs a whole step."""
 
 _mj_step = mujoco.mj_step
+_pack_ctrl = Struct("4d").pack_into
+_pack_applied = Struct("6d").pack_into
 
 
 class State(NamedTuple):
@@ -44,8 +49,9 @@ class Simulator:
         model: The compiled `MjModel`.
         dt: Duration of a step [s].
         readings: State of the base after the last step.
-        tape: If set to a list, every step appends what it gave to MuJoCo: four thrusts [N] and the
-            wrench of the drag [N], [N m], as one tuple of ten floats; `replay` plays it again.
+        tape: If set to a list, every step since the last reset appends what it gave to MuJoCo: four
+            thrusts [N] and the wrench of the drag [N], [N m], as one tuple of ten floats; `replay`
+            plays it again.
     """
 
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
@@ -62,8 +68,7 @@ class Simulator:
 
         self._qpos: memoryview[float] = memoryview(data.qpos)
         self._qvel: memoryview[float] = memoryview(data.qvel)
-        self._ctrl: memoryview[float] = memoryview(data.ctrl)
-        self._applied: memoryview[float] = memoryview(data.qfrc_applied)
+        self._ctrl, self._applied = memoryview(data.ctrl), memoryview(data.qfrc_applied)
         self._sensors: memoryview[float] = memoryview(data.sensordata)
         self._tip_sensor: int = model.sensor(f"{ROBOT_PREFIX}tip").adr[0]
         self._tip = model.site(f"{ROBOT_PREFIX}tip").id
@@ -80,7 +85,9 @@ class Simulator:
         mujoco.mj_resetData(self.model, self._data)
         mujoco.mj_forward(self.model, self._data)
         self._speeds = STOPPED
-        self._steps = 0
+        self._steps = self._contacts = 0
+        if self.tape is not None:
+            self.tape.clear()
         self._touches: list[Touch] = []
         # It stands on the floor: to touch that is news only after it has been in the air.
         self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
@@ -95,23 +102,21 @@ class Simulator:
         before = self.readings
         speeds = self._speeds = self._lag.step(self._speeds, rotor_speeds)
         front, left, back, right = speeds
-        ctrl = self._ctrl
-        ctrl[0] = THRUST_COEFFICIENT * front * front
-        ctrl[1] = THRUST_COEFFICIENT * left * left
-        ctrl[2] = THRUST_COEFFICIENT * back * back
-        ctrl[3] = THRUST_COEFFICIENT * right * right
-        applied = self._applied
-        applied[0], applied[1], applied[2], applied[3], applied[4], applied[5] = drag(
-            speeds, before
-        )
+        k = THRUST_COEFFICIENT
+        ctrl = (k * front * front, k * left * left, k * back * back, k * right * right)
+        applied = drag(speeds, before)
+        _pack_ctrl(self._ctrl, 0, *ctrl)
+        _pack_applied(self._applied, 0, *applied)
         if self.tape is not None:
-            self.tape.append((*ctrl, *applied))
+            self.tape.append(ctrl + applied)
 
         _mj_step(self.model, self._data)
         self._steps += 1
         self.readings = self._read()
-        if self._data.ncon:
+        contacts = self._data.ncon
+        if contacts and (contacts != self._contacts or self._steps % LOOK_STEPS == 0):
             self._note_contacts(before)
+        self._contacts = contacts
 
     def tip_force(self) -> float:
         """Return the normal force on the arm's tip [N], as of the beginning of the last step."""
@@ -132,7 +137,7 @@ class Simulator:
     def _read(self) -> Readings:
         x, y, z, qw, qx, qy, qz = self._qpos
         vx, vy, vz, p, q, r = self._qvel
-        return Readings((x, y, z), (qw, qx, qy, qz), (vx, vy, vz), (p, q, r))
+        return Readings.of((x, y, z), (qw, qx, qy, qz), (vx, vy, vz), (p, q, r))
 
     def _note_contacts(self, before: Readings) -> None:
         """Note which contacts are new. MuJoCo found them in the state `before` the step."""
@@ -153,7 +158,7 @@ class Simulator:
 
 def _velocity_at(readings: Readings, offset: Vector) -> Vector:
     """Return the velocity [m/s], world frame, of a point fixed to the base at `offset` [m]."""
-    (xx, xy, xz), (yx, yy, yz) = horizontal_axes(readings.orientation_wxyz)
+    (xx, xy, xz), (yx, yy, yz) = readings.x_axis, readings.y_axis
     zx, zy, zz = xy * yz - xz * yy, xz * yx - xx * yz, xx * yy - xy * yx
     p, q, r = readings.angular_velocity_body
     x, y, z = offset

@@ -1,6 +1,5 @@
 """Predictors by hand-worked numbers."""
 
-from dataclasses import replace
 from math import pi, sqrt
 
 import pytest
@@ -31,14 +30,14 @@ def command(velocity):
 def accelerate(predictor, velocities, period_ns=10_000_000):
     """Let it observe these x velocities; return the last sample."""
     for k, velocity in enumerate(velocities):
-        sample = replace(SAMPLE, stamp_ns=k * period_ns, velocity=(velocity, 0.0, 0.0))
+        sample = SAMPLE._replace(stamp_ns=k * period_ns, velocity=(velocity, 0.0, 0.0))
         predictor.observe(sample)
     return sample
 
 
 def test_last_sample_moves_nothing_but_the_stamp():
     prediction = last_sample.build().predict(SAMPLE, 0.1)
-    assert prediction == replace(SAMPLE, stamp_ns=1_100_000_000)
+    assert prediction == SAMPLE._replace(stamp_ns=1_100_000_000)
 
 
 def test_constant_velocity_is_equation_3():
@@ -57,7 +56,7 @@ def test_a_quarter_turn_about_z_takes_one_second_at_half_pi(module):
 
 @pytest.mark.parametrize("module", TURNING)
 def test_the_rate_turns_about_the_axes_of_the_body(module):
-    rolled = replace(SAMPLE, orientation_wxyz=(HALF, HALF, 0.0, 0.0))
+    rolled = SAMPLE._replace(orientation_wxyz=(HALF, HALF, 0.0, 0.0))
     prediction = module.build().predict(rolled, 1.0)
     # q * exp(z): about the world's z axis it would be (.5, .5, .5, .5).
     assert prediction.orientation_wxyz == pytest.approx((0.5, 0.5, -0.5, 0.5))
@@ -65,7 +64,7 @@ def test_the_rate_turns_about_the_axes_of_the_body(module):
 
 @pytest.mark.parametrize("module", TURNING)
 def test_a_body_that_does_not_turn_keeps_its_orientation(module):
-    still = replace(SAMPLE, angular_velocity_body=(0.0, 0.0, 0.0))
+    still = SAMPLE._replace(angular_velocity_body=(0.0, 0.0, 0.0))
     assert module.build().predict(still, 1.0).orientation_wxyz == UPRIGHT
 
 
@@ -100,8 +99,8 @@ def test_constant_acceleration_ignores_a_repeated_or_late_stamp():
     predictor, other = constant_acceleration.build(), constant_acceleration.build()
     newest = accelerate(predictor, [0.0, 0.1, 0.2])
     accelerate(other, [0.0, 0.1, 0.2])
-    predictor.observe(replace(newest, velocity=(5.0, 5.0, 5.0)))
-    predictor.observe(replace(newest, stamp_ns=5_000_000, velocity=(5.0, 5.0, 5.0)))
+    predictor.observe(newest._replace(velocity=(5.0, 5.0, 5.0)))
+    predictor.observe(newest._replace(stamp_ns=5_000_000, velocity=(5.0, 5.0, 5.0)))
     assert predictor.predict(newest, 0.1) == other.predict(newest, 0.1)
 
 
@@ -114,7 +113,7 @@ def test_constant_acceleration_forgets_what_is_older_than_its_window():
 def test_constant_acceleration_starts_anew_after_a_gap():
     predictor = constant_acceleration.build()
     accelerate(predictor, [0.0, 1.0])
-    late = replace(SAMPLE, stamp_ns=10_000_000_000, velocity=(3.0, 0.0, 0.0))
+    late = SAMPLE._replace(stamp_ns=10_000_000_000, velocity=(3.0, 0.0, 0.0))
     predictor.observe(late)
     assert predictor.predict(late, 0.1).velocity == pytest.approx((3.0, 0.0, 0.0))
 

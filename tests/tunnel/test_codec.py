@@ -65,23 +65,23 @@ def test_a_command_is_laid_out_as_documented():
 @pytest.mark.parametrize("kind", list(Kind))
 def test_every_wrong_length_is_refused(kind):
     whole = datagram(kind, bytes(codec.BODY_SIZES[kind]))
-    codec.decode_header(whole)
+    codec.decode(whole)
     for length in (*range(len(whole)), len(whole) + 1, 2048):
         with pytest.raises(DecodeError, match="malformed"):
-            codec.decode_header(whole[:length].ljust(length, b"\0"))
+            codec.decode(whole[:length].ljust(length, b"\0"))
 
 
 def test_another_version_is_refused_by_name():
     data = bytearray(datagram(Kind.COMMAND, bytes(codec.BODY_SIZES[Kind.COMMAND])))
     data[0] = codec.VERSION + 1
     with pytest.raises(DecodeError, match="version"):
-        codec.decode_header(bytes(data))
+        codec.decode(bytes(data))
 
 
 @given(st.binary(max_size=400))
 @settings(max_examples=300, deadline=None)
 def test_garbage_raises_nothing_but_decode_errors(data):
-    for read in (codec.decode_header, codec.peek):
+    for read in (codec.decode, codec.peek):
         try:
             read(data)
         except DecodeError:

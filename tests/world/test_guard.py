@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.messages import Command, GuardState
+from cloudrc.messages import UPRIGHT, Command, GuardState
 from cloudrc.world.guard import BRAKE, HOLD_SPEED_MAX, Guard, Limits
+from cloudrc.world.readings import Readings
 
 MS = 1_000_000
 TICK = 2 * MS
@@ -18,6 +19,10 @@ LIMITS = Limits(command_age_max_ns=250 * MS, speed_max=6.0, acceleration_max=12.
 
 def command(velocity=(1.0, 0.0, 0.0), basis_ns=0, yaw_rate=0.0):
     return Command(0, basis_ns, 0, velocity, yaw_rate)
+
+
+def sensed(position, velocity):
+    return Readings.of(position, UPRIGHT, velocity, STILL)
 
 
 @pytest.fixture
@@ -37,7 +42,7 @@ def tracking(velocity, now_ns=0):
 def run(guard, start_ns, end_ns, position=HERE, velocity=STILL):
     """Tick through a time; returns the references."""
     return [
-        guard.tick(now_ns, position, velocity, 0.002) for now_ns in range(start_ns, end_ns, TICK)
+        guard.tick(now_ns, sensed(position, velocity), 0.002) for now_ns in range(start_ns, end_ns, TICK)
     ]
 
 
@@ -81,7 +86,7 @@ def test_the_speed_is_capped_and_keeps_its_direction():
     assert reference[1] / reference[0] == pytest.approx(4 / 3)
     guard = tracking((30.0, 40.0, 0.0))
     guard.reference = (3.6, 4.8, 0.0)
-    assert guard.tick(0, HERE, STILL, 0.002) == pytest.approx((3.6, 4.8, 0.0))
+    assert guard.tick(0, sensed(HERE, STILL), 0.002) == pytest.approx((3.6, 4.8, 0.0))
 
 
 def test_hold_begins_with_the_first_tick_after_the_age_limit():
@@ -160,7 +165,7 @@ def test_whatever_is_commanded_the_reference_stays_inside_the_caps(velocities, s
         guard.offer(command(velocity, basis_ns=number * TICK), number * TICK)
         if guard.state is GuardState.GROUND:
             continue
-        after = guard.tick(number * TICK, HERE, STILL, 0.002)
+        after = guard.tick(number * TICK, sensed(HERE, STILL), 0.002)
         assert hypot(*after) <= speed_max * (1 + 1e-12)
         step = hypot(*(b - a for a, b in zip(before, after, strict=True)))
         assert step <= 12.0 * 0.002 * (1 + 1e-9)

@@ -13,7 +13,7 @@ from cloudrc.world.readings import Readings
 
 WEIGHT = 10.3005  # 1.05 kg * 9.81 m/s^2
 KF = 9.9865e-6
-AT_REST = Readings(ZERO, UPRIGHT, ZERO, ZERO)
+AT_REST = Readings.of(ZERO, UPRIGHT, ZERO, ZERO)
 
 
 def test_at_rest_the_force_is_the_weight_that_the_controller_believes_in():

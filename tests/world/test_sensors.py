@@ -7,7 +7,7 @@ from cloudrc.messages import Odometry
 from cloudrc.world.readings import Readings
 from cloudrc.world.sensors import Sensors
 
-READINGS = Readings((1.0, 2.0, 3.0), (0.6, 0.0, 0.8, 0.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0))
+READINGS = Readings.of((1.0, 2.0, 3.0), (0.6, 0.0, 0.8, 0.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0))
 
 
 def test_without_noise_odometry_is_the_truth_and_nothing_is_drawn():

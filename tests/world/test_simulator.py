@@ -45,7 +45,7 @@ def test_the_lag_does_not_depend_on_the_step():
 def test_drag_of_level_flight_by_hand():
     # Four rotors at 500 rad/s: 8.06428e-5 * 2000 = .1612856 N s/m. At 2 m/s: -.3225712 N, and it
     # acts .05 m above the base: torque .05 * -.3225712 about y.
-    wrench = drag((500.0,) * 4, Readings(ZERO, UPRIGHT, (2.0, 0.0, 1.0), ZERO))
+    wrench = drag((500.0,) * 4, Readings.of(ZERO, UPRIGHT, (2.0, 0.0, 1.0), ZERO))
     assert wrench == pytest.approx((-0.3225712, 0, 0, 0, -0.01612856, 0))
 
 
@@ -69,13 +69,13 @@ def test_drag_is_the_sum_over_the_rotors(speeds, quaternion, velocity, rate):
         across = (rotation.T @ velocity + np.cross(rate, hub)) * (1, 1, 0)
         force += -speed * 8.06428e-5 * across
         torque += np.cross(hub, -speed * 8.06428e-5 * across)
-    wrench = drag(speeds, Readings(ZERO, (w, *q), velocity, rate))
+    wrench = drag(speeds, Readings.of(ZERO, (w, *q), velocity, rate))
     assert wrench == pytest.approx([*(rotation @ force), *torque], abs=1e-9)
 
 
 def test_it_stands_at_its_spawn():
     simulator = Simulator("pelican", "pipes")
-    assert simulator.readings == Readings((0.0, 0.0, 0.1), UPRIGHT, ZERO, ZERO)
+    assert simulator.readings == Readings.of((0.0, 0.0, 0.1), UPRIGHT, ZERO, ZERO)
     for _ in range(500):
         simulator.step((0.0,) * 4)
     assert simulator.readings.position == pytest.approx((0, 0, 0.1), abs=1e-3)

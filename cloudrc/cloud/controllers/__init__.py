@@ -5,13 +5,12 @@ A plug-in file has a `build(**parameters)` with annotated parameters that return
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
 
 
-@dataclass(frozen=True, slots=True)
-class ControlOutput:
+class ControlOutput(NamedTuple):
     """What a controller wants, and why.
 
     Attributes:

@@ -5,11 +5,10 @@ A plug-in file has a `build(**parameters)` with annotated parameters that return
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class DelaySample:
+class DelaySample(NamedTuple):
     """What one newly echoed command tells about the delays.
 
     Attributes:

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from cloudrc.cloud.teleop.plan import Plan
 from cloudrc.messages import GuardState, OperatorRequest, Setpoint, Vector
 from cloudrc.records import MissionEvent
 
 
-@dataclass(frozen=True, slots=True)
-class Seen:
+class Seen(NamedTuple):
     """What the newest telemetry says, as it arrives: cloud to teleop.
 
     Attributes:

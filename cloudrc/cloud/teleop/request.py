@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from cloudrc.cloud.teleop.messages import Seen
 from cloudrc.messages import OperatorRequest, Request, Start
 
@@ -55,7 +53,7 @@ class Repeater:
             return None
         if pending.number == UNNUMBERED:
             self._number = max(self._number, seen.mission) + 1
-            pending = self._pending = replace(pending, number=self._number)
+            pending = self._pending = pending._replace(number=self._number)
             self._asked_epoch = seen.epoch
         elif now_ns < self._due_ns:
             return None

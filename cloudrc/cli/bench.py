@@ -1,0 +1,151 @@
+"""`cloudrc bench`: what the closed loop costs on this machine, against physics alone.
+
+The yardstick is `mj_step` in C (`mujoco.rollout`, one thread), given the very thrusts and drag that
+the loop gave to the simulator. It has to end in the same bits, or the comparison is not fair. All
+parts are measured in turns, and of each the fastest counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.extras import require
+from cloudrc.cli.output import table
+from cloudrc.errors import CloudrcError
+
+if TYPE_CHECKING:
+    from cloudrc.cloud.endpoint import CloudEndpoint
+    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.drivers.virtual import VirtualRun
+    from cloudrc.records import Record
+    from cloudrc.world.endpoint import WorldEndpoint
+
+EPILOG = """\
+raw replays the thrusts and the drag of the very same flight in C and has to
+end in the same bits. Close other programs before you compare two machines;
+ratios of one run can be compared anywhere."""
+STEP = 0.002  # [s] of physics
+LIMIT_NS = 120_000_000_000
+CLOCK = bytes(16)
+
+Play = Callable[[], int]  # does its work and says how many physics steps it took
+Keep = Callable[["list[Record]"], object]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        "-o", "--output", choices=("table", "json"), default="table", help="default: table"
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=7, metavar="N", help="of each part (default: 7)"
+    )
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Measure and print."""
+    require("the bench", ("world",))
+    from cloudrc.config.load import load_experiment
+
+    costs = measure(load_experiment("paper"), max(1, options.repeats))
+    raw = costs["raw mj_step"]
+    figures = {
+        name: {"us_per_step": cost * 1e6, "ratio": raw / cost, "real_time_factor": STEP / cost}
+        for name, cost in costs.items()
+    }
+    if options.output == "json":
+        print(json.dumps(figures, indent=2))
+        return 0
+    rows = [("experiment paper, mode virtual", "us a step", "ratio to raw", "x real time")]
+    for name, figure in figures.items():
+        cost, ratio, factor = figure.values()
+        rows.append((name, f"{cost:.2f}", f"{ratio:.3f}", f"{factor:.0f}"))
+    print(table(rows, right=(1, 2, 3)))
+    print("\nraw replayed the same controls and ended in the same bits")
+    return 0
+
+
+def measure(experiment: ResolvedExperiment, repeats: int) -> dict[str, float]:
+    """Fly and replay in turns.
+
+    Returns:
+        Processor time per physics step [s], by part.
+    """
+    from cloudrc.record.hash import RecordHash
+
+    replay = _replay(experiment)
+    parts: dict[str, Callable[[], Play]] = {
+        "raw mj_step": lambda: replay,
+        "closed loop, records in memory": lambda: _flight(experiment, _memory()),
+        "closed loop, records hashed": lambda: _flight(experiment, RecordHash().update),
+    }
+    costs = dict.fromkeys(parts, float("inf"))
+    for _ in range(repeats):
+        for name, prepare in parts.items():
+            costs[name] = min(costs[name], _cost(prepare()))
+    return costs
+
+
+def _memory() -> Keep:
+    records: list[Record] = []
+    return records.extend
+
+
+def _cost(play: Play) -> float:
+    gc.collect()
+    start = time.process_time()
+    steps = play()
+    return (time.process_time() - start) / steps
+
+
+def _replay(experiment: ResolvedExperiment) -> Play:
+    """Fly once with a tape, to be replayed."""
+    import numpy as np
+
+    from cloudrc.world.replay import replay
+
+    world, cloud, run = _assemble(experiment)
+    simulator = world.robot.simulator
+    start, simulator.tape = simulator.state(), []
+    run.fly(lambda: cloud.mission_over, LIMIT_NS, lambda of_world, of_cloud: None)
+    tape, end = np.array(simulator.tape), simulator.state().physics
+
+    def play() -> int:
+        if (replay(simulator.model, start, tape) != end).any():
+            raise CloudrcError("the replay does not end in the state of the flight; report this")
+        return len(tape)
+
+    return play
+
+
+def _flight(experiment: ResolvedExperiment, keep: Keep) -> Play:
+    """Get a flight ready whose records are kept in some way."""
+    _, cloud, run = _assemble(experiment)
+
+    def sink(of_world: list[Record], of_cloud: list[Record]) -> None:
+        keep(of_world)
+        keep(of_cloud)
+
+    def play() -> int:
+        run.fly(lambda: cloud.mission_over, LIMIT_NS, sink)
+        return round(run.now_ns * 1e-9 / STEP)
+
+    return play
+
+
+def _assemble(
+    experiment: ResolvedExperiment,
+) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
+    from cloudrc import assembly
+    from cloudrc.cloud.endpoint import CloudIdentity
+    from cloudrc.drivers.virtual import VirtualRun
+    from cloudrc.world.endpoint import WorldIdentity
+
+    world = assembly.build_world(experiment, WorldIdentity(CLOCK, b"world".ljust(16)))
+    cloud = assembly.build_cloud(experiment, CloudIdentity(CLOCK, b"cloud".ljust(16)))
+    return world, cloud, VirtualRun(world, cloud, *assembly.build_links(experiment))

@@ -1,0 +1,77 @@
+"""The last words of a run: a report comes in; verdict, main numbers and an exit code go out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cloudrc.cli.output import paint, table
+
+EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
+COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
+
+# The numbers that one looks at first; the page and report.json have all of them.
+MAIN = {
+    "duration": "mission took",
+    "contact_time": "arm touches the board at",
+    "tip_speed": "with the tip at",
+    "steady_contact_force": "and then presses with",
+    "min_clearance": "least clearance in the pipes",
+    "rtt_mean": "round trip, mean",
+    "prediction_error_rms": "prediction error, RMS",
+    "hold_count": "times in HOLD",
+    "real_time_factor": "real-time factor",
+}
+
+
+def exit_code(report: Mapping[str, Any]) -> int:
+    """Give the exit code that belongs to a verdict."""
+    return EXIT_CODES[report["verdict"]]
+
+
+def show(report: Mapping[str, Any], folder: Path) -> None:
+    """Print verdict, main numbers and, as the last line, where to look."""
+    print()
+    print(verdict(report))
+    print()
+    print(main_numbers(report))
+    faults = report["numbers"].get("fault_count", {"value": 0})["value"]
+    if faults:
+        print(paint(f"  faults noted in flight: {faults:.0f}, see the report", "yellow"))
+    print()
+    print(folder / "report.html")
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """Say in one line what became of the run; every broken rule follows on its own line."""
+    outcome = report["verdict"]
+    word = paint(outcome.upper(), COLOURS[outcome])
+    failures = report["failures"]
+    if not failures:
+        return f"{word}: every waypoint reached, every criterion met"
+    return "\n".join([f"{word}: {failures[0]['text']}", *(_line(f) for f in failures[1:])])
+
+
+def _line(failure: Mapping[str, Any]) -> str:
+    time = failure.get("time")
+    when = f" (at {time:.2f} s)" if time is not None else ""
+    return f"  also: {failure['text']}{when}"
+
+
+def main_numbers(report: Mapping[str, Any]) -> str:
+    """Lay out the numbers that one looks at first; those that are unknown are left out."""
+    numbers = report["numbers"]
+    rows = [
+        (f"  {label}", *_cells(name, numbers[name]))
+        for name, label in MAIN.items()
+        if name in numbers
+    ]
+    return table(rows, right=[1]) if rows else "  no numbers: nothing was flown"
+
+
+def _cells(name: str, entry: Mapping[str, Any]) -> tuple[str, str]:
+    from cloudrc.metrics import Number
+    from cloudrc.report.numbers import handy
+
+    return handy(name, Number(entry["value"], entry["unit"], ""))

@@ -1,0 +1,34 @@
+"""`cloudrc completion SHELL`: a static script, so that a press of Tab starts no Python."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+
+from cloudrc.errors import MissingPrerequisiteError
+
+SHELLS = ("bash", "zsh", "fish")
+EPILOG = """\
+install it:
+  cloudrc completion bash > ~/.local/share/bash-completion/completions/cloudrc
+  cloudrc completion zsh > ~/.zfunc/_cloudrc     (~/.zfunc must be in $fpath)
+  cloudrc completion fish > ~/.config/fish/completions/cloudrc.fish"""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("shell", choices=SHELLS, help="the shell that you use")
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Print the script."""
+    if importlib.util.find_spec("shtab") is None:
+        raise MissingPrerequisiteError(
+            "completion needs shtab, which is not installed; run: pip install shtab"
+        )
+    import shtab
+
+    from cloudrc.cli.parser import COMMANDS, build
+
+    print(shtab.complete(build(COMMANDS, for_completion=True), options.shell))
+    return 0

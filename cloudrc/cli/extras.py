@@ -1,0 +1,43 @@
+"""What can be installed beside the base, and what to do where it is missing."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterable
+
+from cloudrc.errors import MissingPrerequisiteError
+
+# Extra of pyproject.toml -> the modules that it brings (the distributions have the same names).
+EXTRAS: dict[str, tuple[str, ...]] = {
+    "world": ("mujoco",),
+    "record": ("mcap", "rosbags", "zstandard"),
+    "report": ("matplotlib",),
+    "kube": ("kubernetes",),
+    "api": ("fastapi", "uvicorn"),
+}
+
+
+def missing(extra: str) -> list[str]:
+    """Name the modules of an extra that are not installed; nothing is imported."""
+    return [module for module in EXTRAS[extra] if importlib.util.find_spec(module) is None]
+
+
+def require(purpose: str, extras: Iterable[str]) -> None:
+    """Refuse to go on without some extras.
+
+    Args:
+        purpose: What needs them: "mode virtual".
+        extras: Names in `EXTRAS`.
+
+    Raises:
+        MissingPrerequisiteError: If a module is missing; names it and how to install it.
+    """
+    absent = {extra: missing(extra) for extra in extras}
+    absent = {extra: modules for extra, modules in absent.items() if modules}
+    if absent:
+        modules = ", ".join(module for names in absent.values() for module in names)
+        verb = "is" if modules.count(",") == 0 else "are"
+        raise MissingPrerequisiteError(
+            f"{purpose} needs {modules}, which {verb} not installed; "
+            f"run: pip install 'cloudrc[{','.join(absent)}]'"
+        )

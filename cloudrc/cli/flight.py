@@ -1,0 +1,149 @@
+"""One flight: an experiment and a folder come in; the folder is filled, its report goes out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cloudrc.errors import CloudrcError
+
+if TYPE_CHECKING:
+    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.record.columns import Recording
+    from cloudrc.records import Record
+    from cloudrc.report.document import Run
+
+GRACE = 30.0
+"""What a flight may last beyond its mission's limit before it is ended in any case [s]."""
+
+See = Callable[["list[Record]"], None]
+"""Shows records of a flight while it lasts."""
+
+
+def fly(
+    experiment: ResolvedExperiment, mode: str, folder: Path, see: See, *, page: bool = True
+) -> dict[str, Any]:
+    """Fly one experiment and write everything that a run leaves.
+
+    Args:
+        experiment: Complete and checked.
+        mode: "virtual" or "local".
+        folder: Empty; gets configuration, recording and report.
+        see: Gets records while it flies: in virtual mode all of them, else a choice.
+        page: Whether to draw figures and page; the numbers are written in any case.
+
+    Returns:
+        What report.json holds.
+
+    Raises:
+        CloudrcError: If the flight could not be ended as planned; what was recorded until then is
+            kept, and reported as interrupted.
+    """
+    from cloudrc.config.load import dump
+
+    (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+    fly_mode = _fly_virtual if mode == "virtual" else _fly_local
+    return fly_mode(experiment, folder, see, page)
+
+
+def _fly_virtual(
+    experiment: ResolvedExperiment, folder: Path, see: See, page: bool
+) -> dict[str, Any]:
+    from cloudrc.record.columns import Recording
+    from cloudrc.record.hash import RecordHash
+    from cloudrc.record.merge import write_mission
+    from cloudrc.report.document import Run
+
+    world: list[Record] = []
+    cloud: list[Record] = []
+    digest = RecordHash()
+
+    def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+        for kept, new in ((cloud, from_cloud), (world, from_world)):
+            kept.extend(new)
+            digest.update(new)
+            see(new)
+
+    interrupted = False
+    try:
+        _virtual_run(experiment, sink)
+    except KeyboardInterrupt:
+        interrupted = True
+    run = Run("virtual", "virtual", digest.hexdigest(), interrupted)
+    try:
+        recording = Recording.from_records(world, cloud)
+        return _report(folder, recording, experiment, run, page=page)
+    finally:
+        # Whatever becomes of the report, the recording is kept.
+        write_mission(folder / "mission.mcap", world, cloud, attachments=_attachments(folder))
+
+
+def _virtual_run(
+    experiment: ResolvedExperiment, sink: Callable[[list[Record], list[Record]], None]
+) -> None:
+    from cloudrc import assembly
+    from cloudrc.cloud.endpoint import CloudIdentity
+    from cloudrc.drivers.virtual import VirtualRun
+    from cloudrc.world.endpoint import WorldIdentity
+
+    clock = bytes(16)  # one process, one clock
+    world = assembly.build_world(experiment, WorldIdentity(clock, b"world".ljust(16)))
+    cloud = assembly.build_cloud(experiment, CloudIdentity(clock, b"cloud".ljust(16)))
+    limit_ns = round((experiment.criteria.time_limit_s + GRACE) * 1e9)
+    run = VirtualRun(world, cloud, *assembly.build_links(experiment))
+    run.fly(lambda: cloud.mission_over, limit_ns, sink)
+
+
+def _fly_local(
+    experiment: ResolvedExperiment, folder: Path, see: See, page: bool
+) -> dict[str, Any]:
+    from cloudrc.drivers.local import LocalRun
+    from cloudrc.report.document import Run
+
+    run, trouble = Run("local", "relay"), None
+    try:
+        LocalRun(folder, see).fly(experiment.criteria.time_limit_s + GRACE)
+    except KeyboardInterrupt:
+        run = replace(run, interrupted=True)
+    except CloudrcError as error:
+        run, trouble = replace(run, interrupted=True, notes=(str(error),)), error
+    document = _report_ends(folder, experiment, run, page, trouble)
+    if trouble is not None:
+        raise trouble
+    return document
+
+
+def _report_ends(
+    folder: Path,
+    experiment: ResolvedExperiment,
+    run: Run,
+    page: bool,
+    trouble: CloudrcError | None,
+) -> dict[str, Any]:
+    """Merge what both ends recorded, and report on it."""
+    from cloudrc.record.merge import merge
+
+    try:
+        mission = merge(folder / "world.mcap", folder / "cloud.mcap")
+    except CloudrcError as error:  # nothing was recorded: say why rather than that
+        raise trouble or error from None
+    try:
+        return _report(folder, mission.recording(), experiment, run, page=page)
+    finally:
+        mission.write(folder / "mission.mcap", _attachments(folder))
+
+
+def _report(
+    folder: Path, recording: Recording, experiment: ResolvedExperiment, run: Run, *, page: bool
+) -> dict[str, Any]:
+    from cloudrc.report.write import write_report
+
+    return write_report(folder, recording, experiment, run, page=page)
+
+
+def _attachments(folder: Path) -> dict[str, bytes]:
+    """What goes into the recording: how it was configured and how it ended."""
+    paths = (folder / "config.yaml", folder / "report.json")
+    return {path.name: path.read_bytes() for path in paths if path.exists()}

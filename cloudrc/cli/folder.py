@@ -1,0 +1,49 @@
+"""Where a run is written: a folder of its own, which nothing later overwrites."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from cloudrc.errors import BadInputError
+
+RUNS = Path("runs")
+
+
+def new_folder(out: Path | None, name: str) -> Path:
+    """Make the folder of a run.
+
+    Args:
+        out: As the user asked; None for the next free `runs/<name>-<n>`.
+        name: Experiment, mode and seed in one word.
+
+    Raises:
+        BadInputError: If `out` exists and is not an empty folder.
+    """
+    if out is not None:
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise BadInputError(
+                f"--out {out}: it is there already; name a new folder, runs are never overwritten"
+            )
+        out.mkdir(parents=True, exist_ok=True)
+        return out
+    RUNS.mkdir(exist_ok=True)
+    n = 1
+    while True:
+        folder = RUNS / f"{name}-{n}"
+        try:
+            folder.mkdir()  # fails if another process takes the same number at the same time
+        except FileExistsError:
+            n += 1
+            continue
+        _point_latest_to(folder)
+        return folder
+
+
+def _point_latest_to(folder: Path) -> None:
+    """Let `runs/latest` lead to the newest run; a file system without links goes without."""
+    latest = folder.parent / "latest"
+    with contextlib.suppress(OSError):
+        if latest.is_symlink():
+            latest.unlink()
+        latest.symlink_to(folder.name, target_is_directory=True)

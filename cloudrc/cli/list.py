@@ -1,0 +1,85 @@
+"""`cloudrc list`: what can be named in an experiment, one line each, from the files themselves."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+import sys
+import textwrap
+
+from cloudrc.cli.output import paint
+
+PLUGINS = ("estimators", "predictors", "controllers", "metrics")
+YAML = ("experiments", "missions", "profiles")
+XML = ("robots", "scenes")
+KINDS = (*YAML, *PLUGINS, *XML)
+EPILOG = """\
+examples:
+  cloudrc list
+  cloudrc list profiles
+  cloudrc run --set link.profile=satellite --mode virtual"""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        "what", nargs="?", choices=KINDS, metavar="WHAT", help=f"one of {', '.join(KINDS)}"
+    )
+    parser.add_argument(
+        "-o", "--output", choices=("table", "json"), default="table", help="default: table"
+    )
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Print every kind that was asked for."""
+    kinds = [options.what] if options.what else list(KINDS)
+    found = {kind: describe_all(kind) for kind in kinds}
+    if options.output == "json":
+        entries = {
+            kind: [{"name": name, "description": text} for name, text in lines.items()]
+            for kind, lines in found.items()
+        }
+        print(json.dumps({"schemaVersion": 1, **entries}, indent=2))
+        return 0
+    print("\n\n".join(f"{paint(kind, 'bold')}\n{_block(lines)}" for kind, lines in found.items()))
+    return 0
+
+
+def _block(lines: dict[str, str]) -> str:
+    """Lay names and their lines out; on a terminal long ones are wrapped, elsewhere never."""
+    indent = max(map(len, lines), default=0) + 4
+    columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+    wrap = textwrap.TextWrapper(max(columns, indent + 20), subsequent_indent=" " * indent)
+    return "\n".join(wrap.fill(f"  {name:<{indent - 2}}{line}") for name, line in lines.items())
+
+
+def describe_all(kind: str) -> dict[str, str]:
+    """Give name -> one line for everything of a kind, sorted by name."""
+    from cloudrc import plugins
+    from cloudrc.config import shipped
+
+    if kind in PLUGINS:
+        lines = {name: plugins.describe(kind, name) for name in plugins.names(kind)}
+    else:
+        one = kind.removesuffix("s")
+        describe = shipped.describe if kind in YAML else _comment
+        lines = {name: describe(one, name) for name in shipped.names(one)}
+    return {name: _plain(line, kind) for name, line in lines.items()}
+
+
+def _plain(line: str, kind: str) -> str:
+    """Leave out what the heading says already: "Predictor: odometry comes in..."."""
+    before, colon, rest = line.rstrip(".").partition(": ")
+    said = colon and kind.startswith(before.lower().rpartition(" ")[2])
+    return rest[:1].upper() + rest[1:] if said else line.rstrip(".")
+
+
+def _comment(kind: str, name: str) -> str:
+    """Read the first sentence of the comment that an MJCF file opens with."""
+    from cloudrc.config import shipped
+
+    text = (shipped.FOLDERS[kind] / f"{name}.xml").read_text("utf-8")
+    comment = re.search(r"<!--(.*?)-->", text, re.DOTALL)
+    return " ".join(comment[1].split()).partition(". ")[0] if comment else ""

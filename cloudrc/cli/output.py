@@ -1,0 +1,54 @@
+"""Text for people: tables in plain columns, colour on a terminal only."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import TextIO
+
+_CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1", "dim": "2"}
+
+
+def is_live(stream: TextIO) -> bool:
+    """Say whether a stream can show a line that is rewritten in place."""
+    dull = os.environ.get("TERM", "") in ("", "dumb") or bool(os.environ.get("CI"))
+    return stream.isatty() and not dull
+
+
+def paint(text: str, colour: str, stream: TextIO | None = None) -> str:
+    """Colour a text, if the stream (default: stdout) is a terminal that wants colour."""
+    if os.environ.get("NO_COLOR") or not is_live(stream or sys.stdout):
+        return text
+    return f"\x1b[{_CODES[colour]}m{text}\x1b[0m"
+
+
+def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
+    """Align rows in columns.
+
+    Args:
+        rows: Cells, as text; all rows of one length.
+        right: Indices of the columns that are aligned to the right: numbers.
+
+    Returns:
+        Lines without trailing blanks, joined by newlines.
+    """
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.rjust(width) if i in right else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
+
+
+def number(value: float) -> str:
+    """Write a number with four significant digits, without an exponent where it can be helped."""
+    if float(value).is_integer() and abs(value) < 1e5:
+        return f"{value:.0f}"  # counts
+    if 1e-4 <= abs(value) < 1e5:
+        digits = f"{value:#.4g}"
+        return digits.rstrip(".") if abs(value) >= 1000 else digits
+    return f"{value:.3e}"

@@ -1,0 +1,127 @@
+"""The parser of all commands: the table of what there is becomes argparse and its help."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import importlib
+import re
+from collections.abc import Iterable, Sequence
+from typing import NoReturn
+
+from cloudrc import __version__
+from cloudrc.errors import BadInputError
+
+# Name -> one line for the help, by group. The file of a command is `cloudrc/cli/<name>.py`.
+GROUPS: dict[str, dict[str, str]] = {
+    "fly": {
+        "run": "fly an experiment and write its report",
+        "report": "write the report of a recorded run again",
+        "bench": "measure how fast the closed loop runs here",
+    },
+    "look around": {
+        "list": "experiments, profiles, predictors and what else there is",
+        "doctor": "check whether this machine can fly, and say what to mend",
+        "completion": "print a completion script for your shell",
+    },
+    "processes (started by 'run --mode local')": {
+        "world": "the robot: physics, sensors, guard, low-level control",
+        "cloud": "the remote controller",
+        "relay": "the emulated link between them",
+    },
+}
+COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
+
+ABOUT = "Fly a simulated drone from a simulated cloud, over a network that is measured."
+EXAMPLES = """\
+examples:
+  cloudrc run                          the paper's mission in real time
+  cloudrc run --mode virtual           the same in virtual time: a few seconds
+  cloudrc run steps --mode virtual --seeds 10 --set cloud.predictor=last_sample
+  cloudrc list predictors
+  cloudrc run --help                   every command explains itself
+
+exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
+  3 missing prerequisite, 4 timeout, 5 cluster or API error,
+  6 run invalid (not real time), 130 interrupted"""
+
+_CHOICE = re.compile(r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)\)")
+
+
+class Parser(argparse.ArgumentParser):
+    """An argparse parser that raises its errors in one line, for `main` to print."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what is wrong and where to read on."""
+        choice = _CHOICE.fullmatch(message)
+        if choice:
+            argument, given, valid = choice.groups()
+            names = [name.strip(" '") for name in valid.split(",")]
+            message = f"{argument}: {unknown(given, names)}"
+        raise BadInputError(f"{message}; see '{self.prog} --help'")
+
+
+def unknown(given: str, names: Iterable[str]) -> str:
+    """Say that a name is unknown, with the nearest known one or all of them."""
+    known = sorted(names)
+    near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
+    return f"no '{given}'; " + (f"did you mean '{near[0]}'?" if near else f"choose {_or(known)}")
+
+
+def _or(names: Sequence[str]) -> str:
+    return ", ".join(names[:-1]) + f" or {names[-1]}" if len(names) > 1 else "".join(names)
+
+
+def build(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
+    """Build the parser.
+
+    Args:
+        wanted: Commands whose files are imported; of the others only the names are known.
+        for_completion: Let argparse itself list the commands; our help does it in groups.
+    """
+    common = Parser(add_help=False)
+    common.add_argument(
+        "--debug",
+        action="store_true",
+        default=argparse.SUPPRESS,
+        help="show the traceback of an error",
+    )
+    parser = Parser(
+        prog="cloudrc",
+        usage="cloudrc [-h] [--version] [--debug] COMMAND ...",
+        description=ABOUT + "\n\n" + _groups(),
+        epilog=EXAMPLES,
+        formatter_class=_formatter,
+        allow_abbrev=False,
+        parents=[common],
+    )
+    parser.add_argument("--version", action="version", version=f"cloudrc {__version__}")
+    shown = "what to do" if for_completion else argparse.SUPPRESS
+    commands = parser.add_subparsers(dest="command", help=shown, prog="cloudrc")
+    for name, line in COMMANDS.items():
+        module = importlib.import_module(f"cloudrc.cli.{name}") if name in set(wanted) else None
+        command = commands.add_parser(
+            name,
+            help=line,
+            description=line[0].upper() + line[1:] + ".",
+            epilog=getattr(module, "EPILOG", None),
+            formatter_class=_formatter,
+            allow_abbrev=False,
+            parents=[common],
+        )
+        if module is not None:
+            module.arguments(command)
+            command.set_defaults(execute=module.execute)
+    return parser
+
+
+def _groups() -> str:
+    blocks = []
+    for title, commands in GROUPS.items():
+        lines = [f"  {name:<12}{line}" for name, line in commands.items()]
+        blocks.append("\n".join([f"{title}:", *lines]))
+    return "\n\n".join(blocks)
+
+
+def _formatter(prog: str) -> argparse.HelpFormatter:
+    return argparse.RawDescriptionHelpFormatter(prog, max_help_position=26, width=80)

@@ -1,0 +1,144 @@
+"""`cloudrc run`: an experiment and a mode come in; its run folder and a verdict go out."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.extras import require
+from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
+
+if TYPE_CHECKING:
+    from cloudrc.records import Record
+
+MODES = ("local", "virtual", "cluster")
+EPILOG = """\
+modes:
+  local    real time: world, cloud and relay as processes, UDP on 127.0.0.1
+  virtual  one process, virtual time: the same flight in seconds, repeatable
+  cluster  comes with the Helm chart, in a later release
+
+examples:
+  cloudrc run
+  cloudrc run paper --mode virtual --set link.profile=satellite
+  cloudrc run steps --seeds 10 --set cloud.predictor=last_sample
+  cloudrc run my.yaml --mode virtual --set cloud.predictor=./my_predictor.py
+  cloudrc run runs/latest/config.yaml --mode virtual     the same run again
+
+'cloudrc list' names experiments, profiles and plug-ins. The last line that
+is printed is the path of the report."""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        "experiment",
+        nargs="?",
+        default="paper",
+        metavar="EXPERIMENT",
+        help="a shipped experiment or a file (default: paper)",
+    )
+    parser.add_argument("--mode", choices=MODES, help="default: local; with --seeds: virtual")
+    many = parser.add_mutually_exclusive_group()
+    many.add_argument(
+        "--seed", type=_whole, metavar="S", help="seed of this run, in place of the experiment's"
+    )
+    many.add_argument(
+        "--seeds", type=_count, metavar="N", help="fly seeds 1 to N, on all cores, and tabulate"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="change one key of the experiment; may be repeated",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder to write (default: the next in runs/)"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        choices=("table", "json"),
+        default="table",
+        help="json: report.json on stdout and nothing else (default: table)",
+    )
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Fly once or many times."""
+    mode = options.mode or ("virtual" if options.seeds else "local")
+    if mode == "cluster":
+        raise MissingPrerequisiteError(
+            "--mode cluster comes with the Helm chart, in a later release; "
+            "use --mode local or --mode virtual"
+        )
+    if options.seeds and mode != "virtual":
+        raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
+    require(f"mode {mode}", ("world", "record", "report"))
+    overrides = list(options.set)
+    if options.seeds:
+        from cloudrc.cli import sweep
+
+        return sweep.fly_seeds(options, overrides)
+    if options.seed is not None:
+        overrides.append(f"seed={options.seed}")
+    return _fly_once(options, mode, overrides)
+
+
+def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> int:
+    from cloudrc.cli.closing import exit_code, show
+    from cloudrc.cli.flight import fly
+    from cloudrc.cli.folder import new_folder
+    from cloudrc.cli.live import FlightView
+    from cloudrc.cli.output import is_live
+    from cloudrc.config.load import load_experiment
+
+    experiment = load_experiment(options.experiment, overrides)
+    name = experiment.name
+    folder = new_folder(options.out, f"{name}-{mode}-seed{experiment.seed}")
+    as_json = options.output == "json"
+    stream = sys.stderr if as_json else sys.stdout
+    mission = experiment.mission
+    waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
+    if not as_json:
+        print(
+            f"{name}: mode {mode}, seed {experiment.seed}, link {experiment.link.profile},"
+            f" {waypoints} waypoint{'s' if waypoints != 1 else ''}",
+            flush=True,
+        )
+    # A run that is to be stopped from outside is interrupted like one that is stopped by Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    view = FlightView(stream, waypoints) if is_live(stream) or not as_json else None
+    try:
+        report = fly(experiment, mode, folder, view.see if view else _see_nothing)
+    except CloudrcError:
+        print(f"what was recorded is in {folder}", file=sys.stderr)
+        raise
+    finally:
+        if view:
+            view.close()
+    if as_json:
+        print((folder / "report.json").read_text(), end="")
+    else:
+        show(report, folder)
+    return exit_code(report)
+
+
+def _see_nothing(records: list[Record]) -> None:
+    """Nobody watches."""
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number >= 0")
+    return int(text)
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seeds, 1 to 100000")
+    return int(text)

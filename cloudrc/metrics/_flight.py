@@ -1,0 +1,200 @@
+"""The flight as the metrics see it: a recording, cut to its mission, with what they share.
+
+Records come in as columns, on world's clock; the derived columns that several metrics need (true
+position at any instant, commands joined with what they were computed from, clearance) go out,
+computed once. Time zero is the instant at which the guard first lets commands through (TRACK):
+only from there on does the robot move. The flight ends with the mission's last event, or with the
+recording where there is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cloudrc.config.schema import Criteria
+from cloudrc.geometry.clearance import clearance, inside_pipe, pipe_index
+from cloudrc.geometry.scene import Scene
+from cloudrc.messages import GuardState
+from cloudrc.record.columns import Recording, Table
+
+Array: TypeAlias = NDArray[Any]
+Columns: TypeAlias = Mapping[str, Array]
+
+CONTROL_TOPICS = (
+    "/estimated_odometry",
+    "/setpoint_position",
+    "/cmd_vel",
+    "/delay_estimate",
+    "/pid",
+)
+"""What one period of the control loop is recorded as."""
+UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
+"""Events of a mission that goes on; every other event ends it."""
+
+
+@dataclass(frozen=True, slots=True)
+class AppliedCommands:
+    """Commands that reached the low-level controller, joined with what cloud knew; n rows.
+
+    Attributes:
+        stamp_ns: Instant of application [ns], world's clock, shape (n,).
+        basis_stamp_ns: Stamp of the odometry it was computed from [ns], world's clock, shape (n,).
+        horizon: By how much cloud looked ahead of that [s], shape (n,).
+        predicted: Position that cloud expected [m], shape (n, 3).
+    """
+
+    stamp_ns: Array
+    basis_stamp_ns: Array
+    horizon: Array
+    predicted: Array
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A recording and what is needed to judge it.
+
+    Attributes:
+        recording: All topics, cloud's shifted to world's clock.
+        criteria: What makes a flight a success.
+        waypoints: How many the mission has.
+        scene: Pipes and board.
+    """
+
+    recording: Recording
+    criteria: Criteria
+    waypoints: int
+    scene: Scene
+
+    @cached_property
+    def start_ns(self) -> int | None:
+        """Time zero [ns], world's clock; None if the robot never flew."""
+        guard = self.recording["/guard"]
+        tracking = guard["stamp_ns"][guard["state"] == GuardState.TRACK]
+        return int(tracking[0]) if len(tracking) else None
+
+    @cached_property
+    def end_ns(self) -> int | None:
+        """The mission's last event, or the last true state [ns]; None if the robot never flew."""
+        if self.start_ns is None:
+            return None
+        if self.ending is not None:
+            return self.ending[0]
+        stamps = self.recording["/ground_truth"]["stamp_ns"]
+        return int(stamps[-1]) if len(stamps) else self.start_ns
+
+    @cached_property
+    def ending(self) -> tuple[int, str, str] | None:
+        """Stamp [ns], event and text of the event that ended the mission; None if none did."""
+        mission = self.recording["/mission"]
+        rows = zip(mission["stamp_ns"], mission["event"], mission["text"], strict=True)
+        for stamp, event, text in rows:
+            if self.start_ns is not None and stamp > self.start_ns and event not in UNDER_WAY:
+                return int(stamp), str(event), str(text)
+        return None
+
+    def seconds(self, stamp_ns: Any) -> Any:
+        """Convert stamps on world's clock [ns] to the time since the start [s]."""
+        return (stamp_ns - (self.start_ns or 0)) * 1e-9
+
+    def during(self, topic: str) -> dict[str, Array]:
+        """Take the rows of a topic from the start to the end of the flight, both included."""
+        return _within(_columns(self.recording[topic]), self.start_ns, self.end_ns)
+
+    def true_position(self, stamp_ns: Array) -> Array:
+        """Interpolate the true position of the base.
+
+        Args:
+            stamp_ns: Instants [ns], world's clock, shape (n,).
+
+        Returns:
+            Positions [m], shape (n, 3); NaN outside the recording.
+        """
+        truth = self.recording["/ground_truth"]
+        stamps, positions = truth["stamp_ns"], truth["position"]
+        if len(stamps) == 0:
+            return np.full((len(stamp_ns), 3), np.nan)
+        # Differences to the first stamp are exact in float64; the stamps themselves need not be.
+        at, known = (stamp_ns - stamps[0]).astype(float), (stamps - stamps[0]).astype(float)
+        axes = [np.interp(at, known, positions[:, i], np.nan, np.nan) for i in range(3)]
+        return np.stack(axes, axis=1)
+
+    @cached_property
+    def truth(self) -> dict[str, Array]:
+        """True states during the flight."""
+        return self.during("/ground_truth")
+
+    @cached_property
+    def control(self) -> dict[str, Array]:
+        """Periods of the control loop during the flight, joined from their topics."""
+        return _within(self._control, self.start_ns, self.end_ns)
+
+    @cached_property
+    def _control(self) -> dict[str, Array]:
+        tables = [_columns(self.recording[topic]) for topic in CONTROL_TOPICS]
+        # A torn recording may end with a period of which some topics are missing.
+        stamps = reduce(np.intersect1d, [table["stamp_ns"] for table in tables])
+        columns: dict[str, Array] = {}
+        for table in tables:
+            rows = np.searchsorted(table["stamp_ns"], stamps)
+            columns |= {name: column[rows] for name, column in table.items()}
+        return columns
+
+    @cached_property
+    def clearance(self) -> Array:
+        """Distance to the nearest pipe wall [m] per row of `truth`; empty without pipes."""
+        if not self.scene.pipes or not len(self.truth["stamp_ns"]):
+            return np.zeros(0)
+        return clearance(self.scene, self.truth["position"], self.truth["orientation_wxyz"])
+
+    @cached_property
+    def inside(self) -> Array:
+        """Whether the base is inside a pipe, per row of `truth`; empty without pipes."""
+        if not self.scene.pipes or not len(self.truth["stamp_ns"]):
+            return np.zeros(0, dtype=bool)
+        return inside_pipe(self.scene, self.truth["position"])
+
+    @cached_property
+    def pipes_flown(self) -> int:
+        """How many different pipes the base was inside of."""
+        if not len(self.truth["stamp_ns"]):
+            return 0
+        indices = np.unique(pipe_index(self.scene, self.truth["position"]))
+        return int((indices >= 0).sum())
+
+    @cached_property
+    def applied(self) -> AppliedCommands:
+        """Commands applied during the flight whose control period was recorded."""
+        applied, control = self.during("/command_applied"), self._control
+        rows = {
+            key: row
+            for row, key in enumerate(zip(control["epoch"], control["counter"], strict=True))
+        }
+        keys = zip(applied["epoch"], applied["counter"], strict=True)
+        joined = np.array([rows.get(key, -1) for key in keys], dtype=np.int64)
+        source = joined[joined >= 0]
+        return AppliedCommands(
+            applied["stamp_ns"][joined >= 0],
+            applied["basis_stamp_ns"][joined >= 0],
+            control["horizon"][source],
+            control["position"][source],
+        )
+
+
+def _columns(table: Table) -> dict[str, Array]:
+    return {name: table[name] for name in table.names}
+
+
+def _within(columns: Columns, start_ns: int | None, end_ns: int | None) -> dict[str, Array]:
+    """Take the rows from `start_ns` to `end_ns`, both included; none if there is no start."""
+    stamps = columns["stamp_ns"]
+    if start_ns is None or end_ns is None:
+        rows = np.zeros(len(stamps), dtype=bool)
+    else:
+        rows = (stamps >= start_ns) & (stamps <= end_ns)
+    return {name: column[rows] for name, column in columns.items()}

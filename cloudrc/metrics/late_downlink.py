@@ -1,0 +1,13 @@
+"""Share of the datagrams from cloud to world that arrived but came too late to be used."""
+
+from __future__ import annotations
+
+from cloudrc.metrics import Flight
+from cloudrc.metrics._link import late
+
+UNIT = "1"
+
+
+def measure(flight: Flight) -> float | None:
+    """Unused by arrived [1]."""
+    return late(flight, "/downlink_delay")

@@ -1,0 +1,17 @@
+"""Distance between the setpoint and the measurement that cloud used: RMS.
+
+Source: the paper's error figure. It is dominated by how far away the next waypoint is, and says
+nothing about how accurate the estimate is; for that read estimate_error_rms.
+"""
+
+from __future__ import annotations
+
+from cloudrc.metrics import Flight
+from cloudrc.metrics._statistics import rms
+
+UNIT = "m"
+
+
+def measure(flight: Flight) -> float | None:
+    """RMS length over all control periods [m]."""
+    return rms(flight.control["setpoint"] - flight.control["measured"])

@@ -1,0 +1,13 @@
+"""One-way delay from world to cloud: mean over all datagrams that arrived, late ones included."""
+
+from __future__ import annotations
+
+from cloudrc.metrics import Flight
+from cloudrc.metrics._statistics import mean
+
+UNIT = "s"
+
+
+def measure(flight: Flight) -> float | None:
+    """Mean [s]; None where the two ends could not prove that they share a clock."""
+    return mean(flight.during("/uplink_delay")["delay"])

@@ -1,0 +1,120 @@
+"""Figure of the delays: every datagram one way, and the loop with what was estimated of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cloudrc.metrics._flight import Array
+from cloudrc.metrics._round_trip import round_trips
+from cloudrc.report.figures import band
+from cloudrc.report.figures.events import legend, mark_events
+from cloudrc.report.figures.style import (
+    BLACK,
+    DOWNLINK,
+    GREEN,
+    LIGHT,
+    PAGE,
+    SKY,
+    UPLINK,
+    legend_above,
+    new_figure,
+    panel,
+    time_axis,
+)
+from cloudrc.report.figures.subject import Subject
+
+ALT = "Two scatter plots over time: one-way delays, and the loop delay with its estimate."
+CAPTION = (
+    "Delays. (a) Each dot is one datagram that arrived, one way, late ones included; the band is "
+    "what the link profile asks for. (b) Each dot is one echo: the loop delay from a command's "
+    "stamp to its echo (the paper's τₙ); the line is the estimate by which the controller looks "
+    "ahead, the band the sum of both directions of the profile, dashed its mean. Echoes are of "
+    "commands that were applied; where the newest wins these are the quick ones, so the loop lies "
+    "below the profile's mean."
+)
+MARGIN = 1.25
+"""Room above the highest delay that the axis has to show."""
+
+
+def caption(subject: Subject) -> str:
+    """Say what is seen."""
+    return CAPTION + legend(subject)
+
+
+def draw(subject: Subject) -> Figure:
+    """Draw both panels."""
+    figure = new_figure(PAGE, 2.6)
+    one_way, loop = figure.subplots(1, 2)
+    _draw_one_way(one_way, subject)
+    _draw_loop(loop, subject)
+    return figure
+
+
+def _draw_one_way(axes: Axes, subject: Subject) -> None:
+    panel(axes, "a")
+    shown = []
+    for topic, name, colour in (
+        ("/uplink_delay", "uplink", UPLINK),
+        ("/downlink_delay", "downlink", DOWNLINK),
+    ):
+        arrivals = subject.flight.during(topic)
+        time, delay = subject.flight.seconds(arrivals["stamp_ns"]), arrivals["delay"] * 1e3
+        if np.isfinite(delay).any():
+            _dots(axes, time, delay, colour, name)
+            shown.append(delay)
+    if not shown:
+        text = "not known: the two ends\ndo not share a clock"
+        axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
+    bounds = [band.band(direction) for direction in (subject.uplink, subject.downlink)]
+    time = np.linspace(0.0, subject.duration, 600)
+    tops: list[Array] = []
+    for index, steps in enumerate(bounds):
+        if steps is not None:
+            low, high = band.at(steps, time - subject.link_start)
+            label = "_" if index and tops else "profile"
+            axes.fill_between(time, low * 1e3, high * 1e3, color=LIGHT, lw=0, label=label, zorder=1)
+            tops.append(high * 1e3)
+    _finish(axes, subject, "one-way delay (ms)", [*shown, *tops])
+
+
+def _draw_loop(axes: Axes, subject: Subject) -> None:
+    panel(axes, "b")
+    echoes, control = round_trips(subject.flight), subject.flight.control
+    loop_delay = echoes["loop_delay"] * 1e3
+    _dots(axes, subject.flight.seconds(echoes["stamp_ns"]), loop_delay, SKY, "loop delay")
+    horizon = control["horizon"] * 1e3
+    time = subject.flight.seconds(control["stamp_ns"])
+    axes.plot(time, horizon, color=BLACK, label="estimate", zorder=4)
+    shown = [loop_delay, horizon]
+    both = [band.band(direction) for direction in (subject.uplink, subject.downlink)]
+    if both[0] is not None and both[1] is not None:
+        time = np.linspace(0.0, subject.duration, 600)
+        bounds = [band.at(steps, time - subject.link_start) for steps in both if steps is not None]
+        low, high = (sum(pair) * 1e3 for pair in zip(*bounds, strict=True))
+        axes.fill_between(time, low, high, color=LIGHT, lw=0, label="profile", zorder=1)
+        axes.plot(time, (low + high) / 2, color=GREEN, lw=0.8, ls="--", label="mean", zorder=3)
+        shown.append(high)
+    _finish(axes, subject, "loop delay (ms)", shown)
+
+
+def _dots(axes: Axes, time: Array, delay: Array, colour: str, name: str) -> None:
+    # Thousands of dots: as a picture inside the vector file they stay small and quick to show.
+    axes.plot(time, delay, ".", ms=1.8, mew=0, color=colour, rasterized=True, zorder=2)
+    axes.plot([], [], "o", ms=3.5, mew=0, color=colour, label=name)
+
+
+def _finish(axes: Axes, subject: Subject, label: str, shown: list[Array]) -> None:
+    """Scale the axis so that a single outlier does not flatten the rest, and say what is cut."""
+    values = [v[np.isfinite(v)] for v in shown]
+    top = max((float(np.percentile(v, 99.5)) for v in values if len(v)), default=1.0) * MARGIN
+    top = max(top, 1.0)
+    axes.set_ylim(0.0, top)
+    above = sum(int((v > top).sum()) for v in values)
+    if above:
+        axes.text(0.99, 0.97, f"{above} above", ha="right", va="top", transform=axes.transAxes)
+    mark_events(axes, subject)
+    time_axis(axes, subject.duration)
+    axes.set_ylabel(label)
+    legend_above(axes, 4)

@@ -1,0 +1,98 @@
+"""Figure of the errors: what the paper plots, and beside it how accurate the estimate was."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cloudrc.metrics._flight import Array
+from cloudrc.metrics._statistics import rms
+from cloudrc.report.figures.events import legend, mark_events
+from cloudrc.report.figures.style import (
+    ESTIMATED,
+    MEASURED,
+    PAGE,
+    SKY,
+    legend_above,
+    new_figure,
+    panel,
+    time_axis,
+)
+from cloudrc.report.figures.subject import Subject
+
+ALT = "Two line plots over time: distance to the setpoint, and the error of the estimate."
+CAPTION = (
+    "Errors, with their RMS. (a) Distance from the reference to the measured and to the estimated "
+    "position, as in the paper. It is dominated by how far away the next waypoint is; that the "
+    "estimated curve lies lower says nothing about how accurate the estimate is. (b) How accurate "
+    "it was: distance from the estimate behind each command to the true position at the instant at "
+    "which that command was applied; each one as a dot, and the RMS over half a second as a line. "
+    "In brackets the RMS over the whole flight."
+)
+SPAN = 0.5
+"""Over which the RMS moves [s]."""
+
+
+def caption(subject: Subject) -> str:
+    """Say what is seen."""
+    return CAPTION + legend(subject)
+
+
+def draw(subject: Subject) -> Figure:
+    """Draw both panels."""
+    figure = new_figure(PAGE, 2.6)
+    tracking, accuracy = figure.subplots(1, 2)
+    _draw_tracking(tracking, subject)
+    _draw_accuracy(accuracy, subject)
+    return figure
+
+
+def _draw_tracking(axes: Axes, subject: Subject) -> None:
+    panel(axes, "a")
+    control = subject.flight.control
+    time = subject.flight.seconds(control["stamp_ns"])
+    for name, column, colour, width in (
+        ("measured", "measured", MEASURED, 1.8),
+        ("estimated", "position", ESTIMATED, 1.1),
+    ):
+        error = control["setpoint"] - control[column]
+        label = f"{name}{_rms(rms(error), 'm', 1.0)}"
+        axes.plot(time, np.linalg.norm(error, axis=1), color=colour, lw=width, label=label)
+    _finish(axes, subject, "distance to reference (m)")
+
+
+def _draw_accuracy(axes: Axes, subject: Subject) -> None:
+    panel(axes, "b")
+    applied = subject.flight.applied
+    error = applied.predicted - subject.flight.true_position(applied.stamp_ns)
+    time = subject.flight.seconds(applied.stamp_ns)
+    distance = np.linalg.norm(error, axis=1) * 1e3
+    axes.plot(time, distance, ".", ms=2.0, mew=0, color=SKY, rasterized=True)
+    axes.plot([], [], "o", ms=3.5, mew=0, color=SKY, label="each command")
+    label = f"over {SPAN:g} s{_rms(rms(error), 'mm', 1e3)}"
+    axes.plot(time, _moving_rms(time, distance), color=ESTIMATED, label=label)
+    _finish(axes, subject, "distance to truth (mm)")
+
+
+def _moving_rms(time: Array, values: Array) -> Array:
+    """Root mean square of the values in the last `SPAN` seconds, at each instant."""
+    known = np.isfinite(values)
+    squares = np.concatenate([[0.0], np.cumsum(np.where(known, np.square(values), 0.0))])
+    counts = np.concatenate([[0], np.cumsum(known)])
+    first = np.searchsorted(time, time - SPAN)
+    rows = np.arange(1, len(time) + 1)
+    means: Array = (squares[rows] - squares[first]) / np.maximum(counts[rows] - counts[first], 1)
+    return np.asarray(np.sqrt(means))
+
+
+def _rms(value: float | None, unit: str, scale: float) -> str:
+    return "" if value is None else f" (RMS {value * scale:.3g} {unit})"
+
+
+def _finish(axes: Axes, subject: Subject, label: str) -> None:
+    axes.set_ylim(bottom=0.0)
+    mark_events(axes, subject)
+    time_axis(axes, subject.duration)
+    axes.set_ylabel(label)
+    legend_above(axes, 2)

@@ -1,0 +1,198 @@
+"""Figure of the flight: from above, from the side and along the way, coloured by clearance."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from cloudrc.geometry.clearance import pipe_index
+from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH, ARM_RADIUS, Points, place
+from cloudrc.geometry.scene import Pipe
+from cloudrc.metrics._contact import first_touch
+from cloudrc.metrics._flight import Array
+from cloudrc.report.figures.style import BLACK, GREY, PAGE, VERMILION, new_figure, panel
+from cloudrc.report.figures.subject import Subject
+
+ALT = "The flown path from above and from the side through the pipes, coloured by clearance."
+CAPTION_PIPES = (
+    "Flight. (a) From above: pipes cut open, waypoints numbered, the board as a bar, a star where "
+    "the arm first touches it. (b) Height along the way, unrolled, with the bore of each pipe. "
+    "(c) Distance from the robot's outline (rotors, arm, body) to the nearest wall. "
+    "The colour is that distance in all three panels."
+)
+CAPTION_FREE = "Flight. (a) From above, waypoints numbered. (b) Height along the way, unrolled."
+COLOURS = "viridis"
+CLEARANCE_SHOWN = 0.40
+"""Larger clearances [m] all have the last colour: in a pipe there is no more."""
+
+
+def caption(subject: Subject) -> str:
+    """Say what is seen: without pipes there is no clearance to show."""
+    return CAPTION_PIPES if subject.flight.scene.pipes else CAPTION_FREE
+
+
+def draw(subject: Subject) -> Figure:
+    """Draw the three panels and the colour bar."""
+    figure = new_figure(PAGE, 3.5)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.0, 1.05))
+    top = figure.add_subplot(grid[:, 0])
+    position = subject.flight.truth["position"]
+    way = _way(position)
+    coloured = _draw_top(top, subject, position)
+    if not len(subject.flight.clearance):
+        side = figure.add_subplot(grid[:, 1])
+        _draw_side(side, subject, way, position)
+        side.set_xlabel("distance flown (m)")
+        return figure
+    side = figure.add_subplot(grid[0, 1])
+    _draw_side(side, subject, way, position)
+    side.tick_params(labelbottom=False)
+    margin = figure.add_subplot(grid[1, 1], sharex=side)
+    _draw_clearance(margin, subject, way)
+    if coloured is not None:
+        bar = figure.colorbar(coloured, ax=[side, margin], extend="max", aspect=40, pad=0.01)
+        bar.set_label("clearance (m)")
+        bar.outline.set_linewidth(0.5)
+    return figure
+
+
+def _way(position: Array) -> Array:
+    """Distance flown up to each sample [m]."""
+    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    return np.concatenate([np.zeros(min(len(position), 1)), np.cumsum(steps)])
+
+
+def _coloured(axes: Axes, subject: Subject, x: Array, y: Array) -> LineCollection | None:
+    """Draw a path whose colour is the clearance; plain where there is nothing to be clear of."""
+    clearance = subject.flight.clearance
+    if len(clearance) != len(x) or len(x) < 2:
+        axes.plot(x, y, color=BLACK, lw=1.4)
+        return None
+    # 20 points a second are smooth; 100 only make the file larger.
+    ends = np.append(np.arange(0, len(x) - 1, 5), len(x) - 1)
+    points = np.stack([x, y], axis=1)[ends]
+    axes.plot(*points.T, color=BLACK, lw=3.0, solid_capstyle="round", zorder=3)
+    lines = LineCollection(
+        list(np.stack([points[:-1], points[1:]], axis=1)),
+        cmap=COLOURS,
+        norm=Normalize(0.0, CLEARANCE_SHOWN),
+        lw=1.8,
+        capstyle="round",
+        zorder=4,
+    )
+    lines.set_array(np.minimum.reduceat(clearance, ends[:-1]))
+    axes.add_collection(lines)
+    axes.autoscale_view()
+    return lines
+
+
+def _draw_top(axes: Axes, subject: Subject, position: Array) -> LineCollection | None:
+    panel(axes, "a", "from above")
+    for pipe in subject.flight.scene.pipes:
+        _draw_pipe(axes, pipe)
+    board = subject.flight.scene.board
+    if board is not None:
+        axes.plot([board.x, board.x], board.y, color=BLACK, lw=3, solid_capstyle="butt", zorder=3)
+    coloured = _coloured(axes, subject, position[:, 0], position[:, 1])
+    for index, (x, y, _) in subject.waypoints.items():
+        axes.plot(x, y, "o", ms=8, mfc="white", mec=BLACK, mew=0.6, zorder=5)
+        axes.text(x, y, str(index + 1), ha="center", va="center_baseline", fontsize=6.5, zorder=6)
+    tip = _touch(subject)
+    if tip is not None:
+        axes.plot(*tip[:2], "*", ms=9, color=VERMILION, mec="white", mew=0.5, zorder=7)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("$x$ (m)")
+    axes.set_ylabel("$y$ (m)")
+    return coloured
+
+
+def _touch(subject: Subject) -> Array | None:
+    """Where the arm's tip first touched the board [m], shape (3,)."""
+    touch, truth = first_touch(subject.flight), subject.flight.truth
+    if touch is None or not len(truth["stamp_ns"]):
+        return None
+    rows = np.searchsorted(truth["stamp_ns"], touch["stamp_ns"], side="right") - 1
+    tip = Points(np.array([[ARM_LENGTH, 0.0, ARM_HEIGHT]]), np.array([ARM_RADIUS]))
+    placed = place(tip, touch["position"][None], truth["orientation_wxyz"][rows][None])
+    return np.asarray(placed[0, 0])
+
+
+def _draw_pipe(axes: Axes, pipe: Pipe) -> None:
+    """Draw a pipe from above, cut along its axis: two walls and the bore between them."""
+    centre, along = np.array(pipe.centre[:2]), np.array(pipe.axis[:2])
+    across = np.array([-along[1], along[0]])
+    half = along * pipe.length / 2
+    bore = [
+        centre - half - across * pipe.inner,
+        centre + half - across * pipe.inner,
+        centre + half + across * pipe.inner,
+        centre - half + across * pipe.inner,
+    ]
+    axes.add_patch(Polygon(bore, closed=True, fc="#f4f4f4", ec="none", zorder=1))
+    for side in (-1, 1):
+        wall = [
+            centre + sign * half + side * across * radius
+            for sign, radius in (
+                (-1, pipe.inner),
+                (1, pipe.inner),
+                (1, pipe.outer),
+                (-1, pipe.outer),
+            )
+        ]
+        axes.add_patch(Polygon(wall, closed=True, fc=GREY, ec="none", zorder=2))
+
+
+def _draw_side(axes: Axes, subject: Subject, way: Array, position: Array) -> None:
+    panel(axes, "b", "height along the way")
+    for pipe, begin, end in _passages(subject, way, position):
+        low, high = pipe.centre[2] - pipe.inner, pipe.centre[2] + pipe.inner
+        axes.fill_between([begin, end], low, high, color="#f4f4f4", lw=0, zorder=1)
+        axes.hlines([low, high], begin, end, color=GREY, lw=1.5, zorder=2)
+    axes.axhline(subject.flight.scene.floor, color=BLACK, lw=0.8)
+    _coloured(axes, subject, way, position[:, 2])
+    axes.margins(y=0.12)
+    axes.set_ylabel("$z$ (m)")
+
+
+def _passages(subject: Subject, way: Array, position: Array) -> list[tuple[Pipe, float, float]]:
+    """List the pipes in the order flown, with the distance [m] at which each begins and ends."""
+    inside = pipe_index(subject.flight.scene, position)
+    changes = np.flatnonzero(np.diff(inside, prepend=-1, append=-1))
+    spans = []
+    for first, last in pairwise(changes):
+        if inside[first] >= 0:
+            pipe = subject.flight.scene.pipes[inside[first]]
+            spans.append((pipe, float(way[first]), float(way[last - 1])))
+    return spans
+
+
+def _draw_clearance(axes: Axes, subject: Subject, way: Array) -> None:
+    panel(axes, "c", "clearance along the way")
+    axes.set_ylabel("clearance (m)")
+    axes.set_xlabel("distance flown (m)")
+    clearance = subject.flight.clearance
+    position = subject.flight.truth["position"]
+    for _, begin, end in _passages(subject, way, position):
+        axes.axvspan(begin, end, color="#f4f4f4", lw=0, zorder=0)
+    _coloured(axes, subject, way, clearance)
+    axes.set_ylim(min(0.0, float(clearance.min())), 2 * CLEARANCE_SHOWN)
+    axes.set_xlim(0.0, max(float(way[-1]), 1e-3))
+    lowest = np.where(subject.flight.inside, clearance, np.inf).argmin()
+    if subject.flight.inside.any():
+        axes.plot(way[lowest], clearance[lowest], "o", ms=4, mfc="none", mec=VERMILION, zorder=6)
+        text = f"{clearance[lowest]:.3f} m"
+        axes.annotate(
+            text,
+            (way[lowest], clearance[lowest]),
+            (0, -11 if clearance[lowest] > 0.1 else 7),
+            textcoords="offset points",
+            ha="center",
+            color=VERMILION,
+            fontsize=8,
+        )

@@ -1,0 +1,53 @@
+"""Figure of the position: measured, estimated and reference, one panel per axis."""
+
+from __future__ import annotations
+
+from matplotlib.figure import Figure
+
+from cloudrc.report.figures.events import legend, mark_events
+from cloudrc.report.figures.style import (
+    ESTIMATED,
+    MEASURED,
+    PAGE,
+    REFERENCE,
+    legend_above,
+    new_figure,
+    panel,
+    time_axis,
+)
+from cloudrc.report.figures.subject import Subject
+
+ALT = "Three line plots of the x, y and z position over time: reference, measured, estimated."
+CAPTION = (
+    "Position per axis, as cloud knew it: the reference is the setpoint that the controller "
+    "tracks, measured the newest odometry that had come in, estimated the prediction that the "
+    "command was computed from."
+)
+
+
+def caption(subject: Subject) -> str:
+    """Say what is seen."""
+    return CAPTION + legend(subject)
+
+
+def draw(subject: Subject) -> Figure:
+    """Draw the three panels over one time axis."""
+    figure = new_figure(PAGE, 4.2)
+    control = subject.flight.control
+    time = subject.flight.seconds(control["stamp_ns"])
+    rows = figure.subplots(3, 1, sharex=True)
+    for index, (axes, name) in enumerate(zip(rows, "xyz", strict=True)):
+        panel(axes, "abc"[index])
+        setpoint = control["setpoint"][:, index]
+        axes.plot(
+            time, setpoint, color=REFERENCE, ls="--", drawstyle="steps-post", label="reference"
+        )
+        axes.plot(time, control["measured"][:, index], color=MEASURED, lw=1.8, label="measured")
+        axes.plot(time, control["position"][:, index], color=ESTIMATED, label="estimated")
+        mark_events(axes, subject)
+        axes.set_ylabel(f"${name}$ (m)")
+        axes.margins(y=0.12)
+    time_axis(rows[-1], subject.duration)
+    legend_above(rows[0], 3)
+    figure.align_ylabels(rows)
+    return figure

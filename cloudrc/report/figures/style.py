@@ -1,0 +1,82 @@
+"""How figures look: fonts, colours and sizes of a two-column paper, and what all of them share.
+
+Colours are those of Okabe and Ito, which readers with any colour vision can tell apart.
+Source: M. Okabe, K. Ito, "Color Universal Design", 2008.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLUMN, PAGE = 3.5, 7.16
+"""Widths of one and of two columns [in]. Source: IEEE conference template."""
+BLACK, GREY, LIGHT = "#1a1a1a", "#6b6b6b", "#d9d9d9"
+BLUE, SKY, GREEN = "#0072B2", "#56B4E9", "#009E73"
+ORANGE, VERMILION, PURPLE = "#E69F00", "#D55E00", "#CC79A7"
+UPLINK, DOWNLINK = BLUE, ORANGE
+REFERENCE, MEASURED, ESTIMATED = BLACK, ORANGE, BLUE
+
+RC: dict[Any, Any] = {
+    "font.family": "STIXGeneral",  # comes with matplotlib: the same picture on every machine
+    "mathtext.fontset": "stix",
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.labelsize": 9.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "axes.linewidth": 0.6,
+    "axes.edgecolor": BLACK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.1,
+    "xtick.direction": "out",
+    "ytick.direction": "out",
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 3.0,
+    "ytick.major.size": 3.0,
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "legend.borderaxespad": 0.2,
+    "hatch.linewidth": 0.5,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "cloudrc",  # the same flight gives the same file, byte by byte
+    "savefig.dpi": 200,
+    "figure.dpi": 100,
+}
+"""Settings of matplotlib while a figure is drawn and saved; `figures.drawing()` puts them back."""
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Make an empty figure of a size [in] that needs no display and no pyplot."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def time_axis(axes: Axes, duration: float) -> None:
+    """Label the abscissa as time since the mission's start, from 0 to `duration` [s]."""
+    axes.set_xlim(0.0, max(duration, 1e-3))
+    axes.set_xlabel("time since start (s)")
+
+
+def panel(axes: Axes, letter: str, title: str = "") -> None:
+    """Head a panel with its letter, as captions refer to it, and perhaps a title."""
+    axes.set_title(f"({letter}) {title}".rstrip(), loc="left")
+
+
+def legend_above(axes: Axes, columns: int) -> None:
+    """Put the legend over the panel, where it cannot hide data."""
+    axes.legend(
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=columns,
+        columnspacing=1.0,
+        handletextpad=0.4,
+    )

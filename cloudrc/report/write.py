@@ -1,0 +1,156 @@
+"""Writes a report: a run's folder and its recording go in; page, figures and numbers come out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.geometry.scene import load_scene
+from cloudrc.metrics import METRIC_NOTE, Flight, Number, measure_all
+from cloudrc.record.columns import Recording
+from cloudrc.report.document import Run, environment_document, report_document, write_json
+from cloudrc.report.verdict import Verdict, judge
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """A run, measured and judged.
+
+    Attributes:
+        run: What the recording does not say.
+        experiment: That was flown.
+        flight: As recorded.
+        numbers: Measured; those that cannot be known are absent.
+        verdict: Success, or what went wrong.
+        notes: What a reader should know, a sentence each.
+        document: What report.json says.
+    """
+
+    run: Run
+    experiment: ResolvedExperiment
+    flight: Flight
+    numbers: dict[str, Number]
+    verdict: Verdict
+    notes: tuple[str, ...]
+    document: dict[str, Any]
+
+
+def assess(recording: Recording, experiment: ResolvedExperiment, run: Run) -> Assessment:
+    """Measure and judge a run; nothing is written and no picture drawn.
+
+    Args:
+        recording: Of both ends, on world's clock.
+        experiment: That was flown.
+        run: What the recording does not say.
+    """
+    mission = experiment.mission
+    waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
+    scene = load_scene(experiment.world.scene)
+    flight = Flight(recording, experiment.criteria, waypoints, scene)
+    numbers, troubles = measure_all(flight)
+    torn = not recording.complete
+    verdict = judge(
+        flight,
+        numbers,
+        real_time=run.mode != "virtual",
+        interrupted=run.interrupted or torn,
+    )
+    incomplete = (f"The recording is incomplete: {recording.note}.",) if torn else ()
+    notes = tuple(dict.fromkeys((*run.notes, *incomplete, *troubles)))
+    document = report_document(run, experiment, verdict, numbers, notes, complete=not torn)
+    return Assessment(run, experiment, flight, numbers, verdict, notes, document)
+
+
+def write_report(
+    folder: Path,
+    recording: Recording,
+    experiment: ResolvedExperiment,
+    run: Run,
+    *,
+    page: bool = True,
+) -> dict[str, Any]:
+    """Write report.json and environment.json, and report.html with its figures.
+
+    Args:
+        folder: Of the run; what an earlier report left there is replaced.
+        recording: Of both ends, on world's clock.
+        experiment: That was flown.
+        run: What the recording does not say.
+        page: Whether to draw figures and page; the numbers are written in any case.
+
+    Returns:
+        What report.json holds.
+
+    Raises:
+        MissingPrerequisiteError: If the page is wanted and matplotlib is not installed; the numbers
+            are written before.
+    """
+    assessment = assess(recording, experiment, run)
+    write_json(folder / "report.json", assessment.document)
+    environment = environment_document()
+    write_json(folder / "environment.json", environment)
+    if page:
+        _write_page(folder, assessment, environment)
+    return assessment.document
+
+
+def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
+    """Read what a run left, whole or torn: the arguments of `write_report`.
+
+    Raises:
+        BadInputError: If the folder holds no experiment or no recording that can be read.
+    """
+    for name in ("config.yaml", "mission.mcap"):
+        if not (folder / name).is_file():
+            raise BadInputError(f"{folder}: has no {name}; name the folder of a run")
+    recording = Recording.read(folder / "mission.mcap")
+    return recording, load_experiment(folder / "config.yaml"), _read_run(folder, recording)
+
+
+def _read_run(folder: Path, recording: Recording) -> Run:
+    """Learn what the recording does not say from the report that was written before, if any."""
+    try:
+        before = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        run = Run(str(before["mode"]), str(before["shaper"]), before.get("records_sha256"))
+    except (OSError, ValueError, KeyError, TypeError):
+        # Only in real time do the drivers note how late they are.
+        real_time = len(recording["/lateness"]) > 0
+        return Run("local", "relay") if real_time else Run("virtual", "virtual")
+    # What metrics had to say they say again, unless they have been mended since.
+    notes = tuple(n for n in before.get("notes", ()) if not n.startswith(METRIC_NOTE))
+    return replace(run, interrupted=before.get("verdict") == "interrupted", notes=notes)
+
+
+def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any]) -> None:
+    try:
+        from cloudrc.report.figures import Subject, draw_all
+    except ImportError as error:
+        raise MissingPrerequisiteError(
+            f"report.html needs {error.name}, which is not installed; report.json is written; "
+            "for the page run: pip install 'cloudrc[report]'"
+        ) from error
+    from cloudrc.report.page import render
+
+    experiment = assessment.experiment
+    subject = Subject(assessment.flight, experiment.uplink, experiment.downlink)
+    pictures = draw_all(subject)
+    (folder / "figures").mkdir(exist_ok=True)
+    for picture in pictures:
+        (folder / "figures" / f"{picture.name}.png").write_bytes(picture.png)
+        (folder / "figures" / f"{picture.name}.svg").write_bytes(picture.svg)
+    text = render(
+        assessment.run,
+        experiment,
+        assessment.flight,
+        assessment.verdict,
+        assessment.numbers,
+        assessment.notes,
+        pictures,
+        environment,
+    )
+    (folder / "report.html").write_text(text, encoding="utf-8")

@@ -1,0 +1,71 @@
+"""The doctor: every line has a mend, and only what the mode needs blocks it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli import checks, doctor, extras
+from cloudrc.cli.checks import Check
+from cloudrc.cli.main import main
+from cloudrc.errors import MissingPrerequisiteError
+
+GOOD = Check("python", "ok", "3.12.1", "", ("local", "virtual"))
+NO_HELM = Check("helm", "missing", "not in PATH", "https://helm.sh", ("cluster",))
+NO_UDP = Check("udp loopback", "missing", "refused", "allow UDP", ("local",))
+
+
+@pytest.mark.parametrize(
+    ("mode", "found", "code"),
+    [
+        ("local", [GOOD, NO_HELM], 0),
+        ("cluster", [GOOD, NO_HELM], 3),
+        ("local", [GOOD, NO_UDP], 3),
+        ("virtual", [GOOD, NO_UDP], 0),
+    ],
+)
+def test_only_what_the_mode_needs_ends_with_3(
+    mode: str,
+    found: list[Check],
+    code: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(doctor, "all_checks", lambda: iter(found))
+    assert main(["doctor", "--mode", mode]) == code
+    text = capsys.readouterr().out
+    assert text.splitlines()[-1].startswith(f"Mode {mode} can")
+    assert all(check.fix in text for check in found)
+    assert main(["doctor", "--mode", mode, "-o", "json"]) == code
+    assert json.loads(capsys.readouterr().out)["ready"] is (code == 0)
+
+
+def test_whatever_is_not_ok_says_how_to_mend_it() -> None:
+    for check in checks.all_checks():
+        assert check.state == "ok" or check.fix, check.name
+        assert len(f"  missing  {check.name}  {check.found}") < 160
+
+
+def test_a_missing_program_is_found_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert checks.executable("helm").state == "missing"
+
+
+def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(extras.EXTRAS, "world", ("no_such_module",))
+    assert checks.packages("world").fix == "pip install 'cloudrc[world]'"
+    with pytest.raises(MissingPrerequisiteError, match=r"mode virtual needs no_such_module.*world"):
+        extras.require("mode virtual", ["world", "record"])
+
+
+def test_the_table_of_extras_is_that_of_pyproject() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    declared = project["optional-dependencies"]
+    for extra, modules in extras.EXTRAS.items():
+        text = " ".join(declared[extra])
+        assert all(module in text for module in modules), extra
+    assert set(extras.EXTRAS) | {"all", "dev"} == set(declared)

@@ -1,0 +1,33 @@
+"""Run folders: counted up, never overwritten, `latest` leads to the newest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.folder import new_folder
+from cloudrc.errors import BadInputError
+
+
+def test_folders_are_counted_and_latest_is_the_newest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = [new_folder(None, "paper-local-seed1").as_posix() for _ in range(3)]
+    assert names == [f"runs/paper-local-seed1-{n}" for n in (1, 2, 3)]
+    assert Path("runs/latest").resolve() == Path(names[-1]).resolve()
+
+
+def test_an_empty_or_new_folder_is_taken(tmp_path: Path) -> None:
+    assert new_folder(tmp_path, "x") == tmp_path
+    assert new_folder(tmp_path / "a" / "b", "x").is_dir()
+
+
+@pytest.mark.parametrize("name", ["full", "file"])
+def test_what_is_there_is_not_overwritten(name: str, tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "report.json").write_text("{}")
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(BadInputError, match=r"never overwritten"):
+        new_folder(tmp_path / name, "x")

@@ -1,0 +1,131 @@
+"""The front door: help, versions, errors in one line, exit codes, broken pipes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from cloudrc.cli.main import INTERNAL, main
+from cloudrc.cli.parser import COMMANDS, build, unknown
+from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError
+
+HEAVY = ("numpy", "mujoco", "matplotlib", "pydantic", "yaml", "kubernetes", "rosbags", "mcap")
+QUIET = f"""
+import sys
+from cloudrc.cli.main import main
+try:
+    main(["--help"])
+except SystemExit:
+    pass
+print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
+"""
+
+
+def test_help_imports_nothing_heavy() -> None:
+    done = subprocess.run([sys.executable, "-c", QUIET], capture_output=True, text=True)
+    assert done.stderr.strip() == "[]"
+
+
+def test_help_answers_within_150_ms() -> None:
+    took = []
+    for _ in range(3):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "cloudrc", "--help"], check=True, capture_output=True)
+        took.append(time.perf_counter() - start)
+    assert min(took) < 0.150
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_fits_80_columns(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([command, "--help"] if command else ["--help"])
+    text = capsys.readouterr().out
+    assert end.value.code == 0
+    assert max(map(len, text.splitlines())) <= 80
+    assert all(name in text for name in COMMANDS) or command
+
+
+def test_every_command_is_built_with_its_file() -> None:
+    parser = build(COMMANDS)
+    for name in set(COMMANDS) - {"run", "report", "world", "cloud", "relay", "completion"}:
+        assert callable(parser.parse_args([name]).execute)
+
+
+def test_no_argument_prints_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert "examples:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("rnu", "did you mean 'run'"),
+        ("zzz", "choose "),
+        ("-q", "-q"),
+        ("doctor --mode vitual", "did you mean 'virtual'"),
+        ("doctor --nonsense", "--nonsense"),
+        ("list predictor", "did you mean 'predictors'"),
+        ("completion ksh", "zsh"),
+        ("completion", "required: shell"),
+    ],
+)
+def test_a_wrong_line_is_refused_in_one_line(
+    line: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(line.split()) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("cloudrc: error: ")
+    assert captured.err.count("\n") == 1
+    assert words in captured.err
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (BadInputError("key x"), 2, "key x"),
+        (MissingPrerequisiteError("no mujoco"), 3, "no mujoco"),
+        (InvalidRunError("fell behind"), 6, "fell behind"),
+        (PermissionError(13, "Permission denied", "/root/x"), 2, "/root/x: Permission denied"),
+        (ZeroDivisionError("two\nlines"), INTERNAL, "ZeroDivisionError: two lines"),
+    ],
+)
+def test_an_error_is_one_line_and_its_exit_code(
+    error: Exception,
+    code: int,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(options: object) -> int:
+        raise error
+
+    monkeypatch.setattr("cloudrc.cli.list.execute", fail)
+    assert main(["list"]) == code
+    message = capsys.readouterr().err
+    assert message.startswith("cloudrc: error: ")
+    assert message.count("\n") == 1
+    assert words in message
+    with pytest.raises(type(error)):
+        main(["list", "--debug"])
+
+
+def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(options: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cloudrc.cli.list.execute", interrupt)
+    assert main(["list"]) == 130
+
+
+def test_a_reader_that_leaves_does_no_harm() -> None:
+    line = f"{sys.executable} -m cloudrc list -o json | true; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("0\n", "")
+
+
+def test_unknown_names_all_when_none_is_near() -> None:
+    assert unknown("x", ["bash", "fish"]) == "no 'x'; choose bash or fish"

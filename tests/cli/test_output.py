@@ -1,0 +1,49 @@
+"""Text: columns that line up, numbers one can read, colour only where it is wanted."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+
+from cloudrc.cli.output import is_live, number, paint, table
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture(autouse=True)
+def plain_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CI", raising=False)
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm-256color")
+
+
+def test_columns_line_up_and_numbers_are_right_aligned() -> None:
+    assert table([("name", "value"), ("a", "1.5"), ("longer", "10.5")], right=[1]) == (
+        "name    value\na         1.5\nlonger   10.5"
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.1474, "0.1474"), (26.96, "26.96"), (0.0, "0"), (1234.5, "1234"), (-3e-7, "-3.000e-07")],
+)
+def test_numbers_have_four_digits(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+@pytest.mark.parametrize("variable", ["NO_COLOR", "CI"])
+def test_colour_is_left_out_on_request(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert paint("x", "red", Terminal()) == "\x1b[31mx\x1b[0m"
+    monkeypatch.setenv(variable, "1")
+    assert paint("x", "red", Terminal()) == "x"
+
+
+def test_a_dumb_terminal_and_a_file_get_no_living_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert is_live(Terminal())
+    assert not is_live(io.StringIO())
+    monkeypatch.setenv("TERM", "dumb")
+    assert not is_live(Terminal())

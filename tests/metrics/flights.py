@@ -1,0 +1,192 @@
+"""Flights made by hand, of which every number is known.
+
+The robot flies at 1 m/s along x from the origin at height 1; 25 telemetries and commands a second.
+Its mission starts at 10 s on both clocks, which are one, and is done at 20 s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+
+from cloudrc.assembly import build_cloud, build_links, build_world
+from cloudrc.cloud.endpoint import CloudIdentity
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.schema import Criteria
+from cloudrc.drivers.virtual import VirtualRun
+from cloudrc.geometry.scene import Board, Pipe, Scene
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry, Vector
+from cloudrc.metrics import Flight
+from cloudrc.record.columns import Recording
+from cloudrc.records import (
+    Arrival,
+    CommandApplied,
+    Contact,
+    Control,
+    GroundTruth,
+    GuardChange,
+    MissionEvent,
+    Record,
+    SessionOpened,
+    TelemetrySent,
+)
+from cloudrc.world.endpoint import WorldIdentity
+
+SECOND = 1_000_000_000
+START = 10 * SECOND
+DONE = 20 * SECOND
+END = 25 * SECOND
+PERIOD = 40_000_000
+UPLINK, DOWNLINK, HORIZON = 0.05, 0.04, 0.08
+
+OPEN_AIR = Scene("empty")
+ONE_PIPE = Scene(
+    "pipe",
+    (Pipe("pipe_1", (4.5, 0.0, 1.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.7),),
+    Board(10.0, (-0.5, 0.5), (0.0, 1.5)),
+)
+
+
+def at(seconds: float) -> int:
+    """Stamp of an instant [s] after the start."""
+    return START + round(seconds * SECOND)
+
+
+def straight(seconds: float) -> Vector:
+    return (seconds, 0.0, 1.0)
+
+
+@dataclass
+class Log:
+    """Records of both ends, to be changed by a test before they become a flight."""
+
+    world: list[Record] = field(default_factory=list)
+    cloud: list[Record] = field(default_factory=list)
+
+    def change(self, kind: type, how: Callable[[int, Record], Record | None]) -> None:
+        """Replace the n-th record of a class by `how(n, record)`; None takes it out."""
+        for records in (self.world, self.cloud):
+            n, changed = 0, []
+            for record in records:
+                if isinstance(record, kind):
+                    new = how(n, record)
+                    n += 1
+                    changed += [] if new is None else [new]
+                else:
+                    changed.append(record)
+            records[:] = changed
+
+    def flight(
+        self,
+        scene: Scene = OPEN_AIR,
+        *,
+        contact: bool = False,
+        waypoints: int = 1,
+        time_limit: float = 60.0,
+    ) -> Flight:
+        # Stable: records of one instant stay as they were put in.
+        world, cloud = (sorted(r, key=lambda record: record.stamp_ns) for r in self._both())
+        criteria = Criteria(contact=contact, time_limit_s=time_limit)
+        return Flight(Recording.from_records(world, cloud), criteria, waypoints, scene)
+
+    def _both(self) -> tuple[list[Record], list[Record]]:
+        return self.world, self.cloud
+
+
+def flown(path: Callable[[float], Vector] = straight) -> Log:
+    """Log a flight along `path`, the position [m] as a function of the time since the start [s]."""
+    log = Log()
+    log.world += [
+        SessionOpened(START - SECOND, "world", 1, "cloud said hello"),
+        SessionOpened(START, "world", 2, "mission starts from spawn"),
+        GuardChange(START - SECOND, GuardState.GROUND, "at the spawn"),
+        GuardChange(START, GuardState.TRACK, "fresh command"),
+        GuardChange(DONE + PERIOD, GuardState.HOLD, "mission ended"),
+    ]
+    log.cloud += [
+        MissionEvent(START - SECOND, "started", 0, "mission started"),
+        MissionEvent(DONE, "reached", 0, "waypoint 1 reached"),
+        MissionEvent(DONE, "done", 0, "mission done"),
+    ]
+    for counter, stamp in enumerate(range(START - SECOND, END + 1, PERIOD)):
+        _step(log, counter, stamp, path)
+    return log
+
+
+def _step(log: Log, counter: int, stamp: int, path: Callable[[float], Vector]) -> None:
+    position = path((stamp - START) / SECOND)
+    odometry = Odometry(stamp, position, UPRIGHT, (1.0, 0.0, 0.0), ZERO)
+    telemetry = Telemetry(stamp, odometry, 0.0, 0, 0, 0, 1, GuardState.TRACK)
+    arrival, applied = stamp + round(UPLINK * SECOND), stamp + round(DOWNLINK * SECOND)
+    basis = stamp - round(UPLINK * SECOND)
+    x, y, z = path((applied - START) / SECOND)
+    log.world += [
+        TelemetrySent(stamp, 2, counter, telemetry),
+        GroundTruth(stamp, odometry, 0.0, ZERO),
+        Arrival(applied, False, 2, counter, DOWNLINK, True),
+        CommandApplied(applied, 2, counter, basis, ZERO),
+    ]
+    measured = path((basis - START) / SECOND)
+    log.cloud += [
+        Arrival(arrival, True, 2, counter, UPLINK, True),
+        Control(
+            stamp_ns=stamp,
+            epoch=2,
+            counter=counter,
+            basis_stamp_ns=basis,
+            horizon=HORIZON,
+            rtt=UPLINK + DOWNLINK,
+            loop_delay=UPLINK + DOWNLINK + 0.005,
+            measured=measured,
+            position=(x + 0.003, y + 0.004, z),
+            orientation_wxyz=UPRIGHT,
+            velocity=(1.0, 0.0, 0.0),
+            setpoint=(measured[0] + 0.3, measured[1] + 0.4, measured[2]),
+            waypoint=0,
+            command=ZERO,
+            yaw_rate=0.0,
+            proportional=ZERO,
+            integral=ZERO,
+            derivative=ZERO,
+        ),
+    ]
+
+
+@cache
+def straight_flight() -> Flight:
+    """The plain flight through open air; not to be changed."""
+    return flown().flight()
+
+
+def touch(seconds: float, body: str = "board", *, tip: bool = True) -> Contact:
+    """A contact with the tip at 0.15 m/s."""
+    return Contact(at(seconds), body, straight(seconds), ZERO, (0.12, 0.09, 0.0), tip)
+
+
+def pressing(log: Log, since: float, force: Callable[[int], float]) -> None:
+    """Let a force act on the tip from an instant on [s since the start]."""
+
+    def how(n: int, record: Record) -> Record:
+        assert isinstance(record, GroundTruth)
+        return record._replace(tip_force=force(n) if record.stamp_ns >= at(since) else 0.0)
+
+    log.change(GroundTruth, how)
+
+
+@cache
+def paper() -> tuple[ResolvedExperiment, Recording]:
+    """The shipped experiment, flown once in virtual time."""
+    experiment = load_experiment("paper")
+    world = build_world(experiment, WorldIdentity(bytes(16), b"w" * 16))
+    cloud = build_cloud(experiment, CloudIdentity(bytes(16), b"c" * 16))
+    records: tuple[list[Record], list[Record]] = ([], [])
+
+    def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+        records[0].extend(from_world)
+        records[1].extend(from_cloud)
+
+    run = VirtualRun(world, cloud, *build_links(experiment))
+    run.fly(lambda: cloud.teleop.outcome is not None, 60 * SECOND, sink)
+    return experiment, Recording.from_records(*records)

@@ -1,0 +1,75 @@
+"""report.json and environment.json: their names, what is absent, and what they never say."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import platform
+from pathlib import Path
+
+import pytest
+
+from cloudrc.report.document import Run, environment_document, write_json
+from cloudrc.report.write import assess
+from tests.metrics.flights import paper
+
+RUN = Run("virtual", "virtual", "0" * 64)
+
+
+def document() -> dict[str, object]:
+    experiment, recording = paper()
+    return assess(recording, experiment, RUN).document
+
+
+def test_names() -> None:
+    assert set(document()) == {
+        *("schemaVersion", "verdict", "failures", "experiment", "mode", "seed", "shaper"),
+        *("records_sha256", "numbers", "complete", "notes"),
+    }
+
+
+def test_values() -> None:
+    report = document()
+    assert report["schemaVersion"] == 1
+    assert report["verdict"] == "success"
+    assert report["failures"] == []
+    assert (report["experiment"], report["mode"], report["seed"]) == ("paper", "virtual", 1)
+    assert report["shaper"] == "virtual"
+    assert report["complete"] is True
+    assert all(set(number) == {"value", "unit"} for number in report["numbers"].values())
+
+
+def test_what_is_not_known_is_absent() -> None:
+    experiment, recording = paper()
+    report = assess(recording, experiment, Run("virtual", "virtual")).document
+    assert "records_sha256" not in report
+    assert "real_time_factor" not in report["numbers"]
+    assert "null" not in json.dumps(report)
+
+
+def test_failures_say_code_text_time_and_place() -> None:
+    experiment, recording = paper()
+    strict = experiment.criteria.model_copy(update={"time_limit_s": 5.0})
+    failed = experiment.model_copy(update={"criteria": strict})
+    (failure,) = assess(recording, failed, RUN).document["failures"]
+    assert set(failure) == {"code", "text", "time", "place"}
+    assert failure["code"] == "time_limit_exceeded"
+    assert len(failure["place"]) == 3
+
+
+def test_the_same_flight_gives_the_same_document() -> None:
+    assert json.dumps(document()) == json.dumps(document())
+
+
+def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_json(tmp_path / "report.json", {"value": float("nan")})
+
+
+def test_the_environment_names_the_software_but_no_user_and_no_machine() -> None:
+    environment = environment_document()
+    assert environment["packages"]["numpy"]
+    assert environment["cores"] >= 1
+    words = json.dumps(environment).replace('"', " ").split()
+    assert getpass.getuser() not in words
+    assert platform.node() not in words

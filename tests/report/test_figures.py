@@ -1,0 +1,72 @@
+"""Figures mark what happened to the link, and draw flights with little to show."""
+
+from __future__ import annotations
+
+import importlib
+
+import matplotlib
+import pytest
+
+from cloudrc.config.schema import Blackout, Change, Direction
+from cloudrc.messages import GuardState
+from cloudrc.records import Control, GuardChange
+from cloudrc.report.figures import NAMES
+from cloudrc.report.figures.events import LEGEND, legend, mark_events
+from cloudrc.report.figures.style import RC, new_figure
+from cloudrc.report.figures.subject import Subject
+from tests.metrics.flights import ONE_PIPE, START, Log, at, flown
+
+CALM = Direction(delay_ms=50.0)
+
+
+def subject_of(log: Log, uplink: Direction = CALM) -> Subject:
+    return Subject(log.flight(ONE_PIPE), uplink, CALM)
+
+
+@pytest.mark.parametrize("empty", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_little_to_show_is_no_error(name: str, empty: bool) -> None:
+    """Nobody flew, or nothing but one instant is recorded."""
+    log = flown()
+    log.world = [] if empty else [record for record in log.world if record.stamp_ns <= START]
+    log.cloud = [] if empty else [record for record in log.cloud if record.stamp_ns <= START]
+    drawing = importlib.import_module(f"cloudrc.report.figures.{name}")
+    subject = subject_of(log)
+    with matplotlib.rc_context(RC):
+        drawing.draw(subject).draw_without_rendering()
+    assert drawing.caption(subject)
+
+
+def test_a_calm_flight_has_no_marks() -> None:
+    assert legend(subject_of(flown())) == ""
+
+
+def test_holds_blackouts_and_changes_are_marked() -> None:
+    log = flown()
+    log.world += [
+        GuardChange(at(2), GuardState.HOLD, "command age"),
+        GuardChange(at(3), GuardState.TRACK, "fresh command"),
+    ]
+    # The link came up one second before the mission began.
+    uplink = Direction(
+        blackouts=(Blackout(start_s=3.0, duration_s=1.0), Blackout(start_s=500.0, duration_s=1.0)),
+        changes=(Change(at_s=0.5, delay_ms=1.0), Change(at_s=6.0, delay_ms=9.0)),
+    )
+    subject = subject_of(log, uplink)
+    assert legend(subject) == LEGEND
+    axes = new_figure(3.0, 2.0).subplots()
+    mark_events(axes, subject)
+    spans = [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
+    assert spans == [pytest.approx((2.0, 3.0)), pytest.approx((2.0, 3.0))]
+    assert [line.get_xdata()[0] for line in axes.lines] == pytest.approx([5.0])
+
+
+def test_waypoints_are_where_the_setpoint_was_when_they_were_new() -> None:
+    log = flown()
+
+    def fly_to(n: int, control: Control) -> Control:
+        waypoint = -1 if control.stamp_ns < at(1) else 0 if control.stamp_ns < at(4) else 1
+        return control._replace(waypoint=waypoint, setpoint=(float(waypoint), 2.0, 3.0))
+
+    log.change(Control, fly_to)
+    assert subject_of(log).waypoints == {0: (0.0, 2.0, 3.0), 1: (1.0, 2.0, 3.0)}

@@ -1,0 +1,168 @@
+"""The page: one file that asks the network for nothing, with words, numbers and figures in it."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import matplotlib
+import pytest
+
+from cloudrc.metrics import Number
+from cloudrc.report import numbers as table
+from cloudrc.report import prose
+from cloudrc.report.document import Run, environment_document
+from cloudrc.report.figures import NAMES, Picture
+from cloudrc.report.page import render
+from cloudrc.report.verdict import Failure, Verdict
+from cloudrc.report.write import assess, write_report
+from tests.metrics.flights import ONE_PIPE, flown, paper, touch
+
+
+class Reader(HTMLParser):
+    """Collects what a browser would fetch, and checks that tags are closed."""
+
+    VOID = ("meta", "img", "br", "link", "hr", "input")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.fetched: list[str] = []
+        self.alts: list[str | None] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in self.VOID:
+            self.open.append(tag)
+        known = dict(attrs)
+        self.fetched += [known[name] or "" for name in ("src", "srcset", "data") if name in known]
+        if tag == "img":
+            self.alts.append(known.get("alt"))
+        assert tag not in ("script", "link", "iframe", "object", "base")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The whole report of the shipped experiment: every figure is drawn, once."""
+    path = tmp_path_factory.mktemp("run")
+    before = dict(matplotlib.rcParams)
+    experiment, recording = paper()
+    write_report(path, recording, experiment, Run("virtual", "virtual", "a" * 64))
+    assert dict(matplotlib.rcParams) == before
+    return path
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path) -> str:
+    return (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_it_fetches_nothing(page: str) -> None:
+    reader = Reader(page)
+    assert reader.open == []
+    assert len(reader.fetched) == len(NAMES)
+    assert all(source.startswith("data:image/svg+xml;base64,") for source in reader.fetched)
+    assert not re.search(r"""@import|url\(|(?:href|src|action)\s*=\s*["']?(?:https?:)?//""", page)
+
+
+def test_every_picture_is_described(page: str) -> None:
+    alts = Reader(page).alts
+    assert len(alts) == len(NAMES)
+    assert all(alt and len(alt) > 20 for alt in alts)
+
+
+def test_it_says_what_happened_in_words(page: str) -> None:
+    text = re.sub(r"\s", " ", re.sub(r"<[^>]+>", "", page))
+    assert "The mission succeeded." in text
+    assert "The drone reached all 7 waypoints in 30.9 s" in text
+    assert "It flew through 3 pipes, never nearer than 152 mm to a wall." in text
+    assert "Its arm touched the board after 27.6 s at 0.12 m/s" in text
+    assert "cloudrc run config.yaml --mode virtual" in text
+    assert "a" * 64 in text
+
+
+def test_every_number_is_in_it_with_its_meaning(page: str) -> None:
+    experiment, recording = paper()
+    for name, number in assess(recording, experiment, Run("virtual", "virtual")).numbers.items():
+        assert f"<code>{name}</code>" in page
+        assert number.meaning.split("'")[0] in page
+
+
+def test_figures_are_written_as_png_and_svg(folder: Path) -> None:
+    for name in NAMES:
+        assert (folder / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        svg = ElementTree.parse(folder / "figures" / f"{name}.svg").getroot()
+        assert svg.tag.endswith("svg")
+        assert len(svg.findall(".//{*}path")) > 10
+    assert set(NAMES) >= {"delay", "odom", "error"}
+
+
+def test_the_paper_error_figure_is_not_sold_as_accuracy(page: str) -> None:
+    assert "says nothing about how accurate the estimate is" in " ".join(page.split())
+
+
+def render_with(failures: tuple[Failure, ...], notes: tuple[str, ...] = ()) -> str:
+    assessment = assess(*reversed(paper()), Run("local", "relay"))
+    verdict = Verdict("failure", failures)
+    picture = Picture("delay", b"", b"<svg/>", "Caption.", "A picture of something.")
+    return render(
+        assessment.run,
+        assessment.experiment,
+        assessment.flight,
+        verdict,
+        assessment.numbers,
+        notes,
+        [picture],
+        environment_document(),
+    )
+
+
+def test_failures_say_what_when_and_where() -> None:
+    page = render_with((Failure("pipe_touched", "it hit", 3.5, (1.0, -2.0, 0.7)),))
+    assert "The mission failed." in page
+    assert "it hit, at 3.50 s, x 1.00, y -2.00, z 0.70 m <code>pipe_touched</code>" in page
+
+
+def test_what_strangers_wrote_cannot_break_out_of_the_page() -> None:
+    page = render_with((Failure("x", "<script>alert(1)</script>"),), ("metric <b> & 'c'",))
+    assert "<script>" not in page
+    assert "metric &lt;b&gt; &amp;" in page
+    Reader(page)
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "expected"),
+    [
+        ("duration", Number(27.6021, "s", ""), ("27.60", "s")),
+        ("rtt_mean", Number(0.069325, "s", ""), ("69.33", "ms")),
+        ("min_clearance", Number(0.15179, "m", ""), ("0.152", "m")),
+        ("prediction_error_rms", Number(0.0199667, "m", ""), ("19.97", "mm")),
+        ("distance_flown", Number(1234.56, "m", ""), ("1235", "m")),
+        ("hold_count", Number(3.0, "1", ""), ("3", "")),
+        ("loss_uplink", Number(0.0123, "1", ""), ("1.23", "%")),
+        ("real_time_factor", Number(0.99876, "1", ""), ("0.9988", "")),
+        ("hold_time", Number(0.0, "s", ""), ("0", "s")),
+    ],
+)
+def test_numbers_in_handy_units(name: str, number: Number, expected: tuple[str, str]) -> None:
+    assert table.handy(name, number) == expected
+
+
+def test_words_for_a_flight_that_went_wrong() -> None:
+    log = flown()
+    log.world.append(touch(3, "pipe_1"))
+    flight = log.flight(ONE_PIPE, contact=True, waypoints=2)
+    values = {
+        **{"duration": 10.0, "waypoints_reached": 1.0, "hold_count": 1.0, "hold_time": 2.5},
+        **{"pipe_contacts": 1.0, "min_clearance": -0.01},
+    }
+    text = prose.summary(flight, {name: Number(v, "", "") for name, v in values.items()})
+    assert text == (
+        "The drone reached 1 of 2 waypoints in 10.0 s. It flew through one pipe and touched a wall "
+        "once. It never touched the board. The guard on board took over once, for 2.5 s in all."
+    )

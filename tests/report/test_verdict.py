@@ -1,0 +1,184 @@
+"""Each rule of the verdict: what breaks it, when and where it says so, and what outranks what."""
+
+from __future__ import annotations
+
+import pytest
+
+from cloudrc import plugins
+from cloudrc.messages import GuardState
+from cloudrc.metrics import Flight, Number
+from cloudrc.records import Contact, GuardChange, Lateness, MissionEvent, SessionOpened
+from cloudrc.report.verdict import REAL_TIME_FACTOR_MIN, SLIP_MAX, Verdict, judge
+from tests.metrics.flights import ONE_PIPE, SECOND, Log, at, flown, touch
+
+
+def good() -> Log:
+    log = flown()
+    log.world.append(touch(8))
+    return log
+
+
+def judged(flight: Flight, *, real_time: bool = False, interrupted: bool = False) -> Verdict:
+    numbers = {
+        name: Number(value, "", "")
+        for name in ("waypoints_reached", "real_time_factor", "world_slip")
+        if (value := plugins.find("metrics", name).measure(flight)) is not None
+    }
+    return judge(flight, numbers, real_time=real_time, interrupted=interrupted)
+
+
+def codes(verdict: Verdict) -> list[str]:
+    return [failure.code for failure in verdict.failures]
+
+
+def test_success() -> None:
+    assert judged(good().flight(ONE_PIPE, contact=True)) == Verdict("success", ())
+
+
+def test_a_waypoint_was_not_reached() -> None:
+    verdict = judged(good().flight(ONE_PIPE, contact=True, waypoints=3))
+    assert verdict.outcome == "failure"
+    assert codes(verdict) == ["waypoint_not_reached"]
+    assert verdict.failures[0].text == "1 of 3 waypoints reached"
+
+
+def test_the_board_was_not_touched() -> None:
+    assert codes(judged(flown().flight(ONE_PIPE, contact=True))) == ["board_not_touched"]
+    assert judged(flown().flight(ONE_PIPE, contact=False)).outcome == "success"
+
+
+@pytest.mark.parametrize(("speed", "ok"), [(0.249, True), (0.25, False), (0.4, False)])
+def test_the_board_has_to_be_touched_gently(speed: float, ok: bool) -> None:
+    log = flown()
+    still = (0.0, 0.0, 0.0)
+    log.world.append(Contact(at(8), "board", still, still, (speed, 0.0, 0.0), True))
+    verdict = judged(log.flight(ONE_PIPE, contact=True))
+    assert codes(verdict) == ([] if ok else ["contact_too_fast"])
+
+
+def test_a_pipe_was_touched() -> None:
+    log = good()
+    log.world += [touch(4, "pipe_1", tip=False), touch(3, "pipe_1", tip=False)]
+    (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
+    assert failure.code == "pipe_touched"
+    assert failure.text == "the robot touched pipe_1 (2 times)"
+    assert failure.time == pytest.approx(3.0)
+    assert failure.place == pytest.approx((3.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize("state", [GuardState.LAND, GuardState.ESTOP, GuardState.GROUND])
+def test_the_guard_went_beyond_hold(state: GuardState) -> None:
+    log = good()
+    log.world.append(GuardChange(at(5), state, "held for 60 s"))
+    (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
+    assert failure.code == "guard_intervened"
+    assert state.name in failure.text
+    assert "held for 60 s" in failure.text
+    assert failure.time == pytest.approx(5.0)
+
+
+def test_hold_is_no_failure() -> None:
+    log = good()
+    log.world.append(GuardChange(at(5), GuardState.HOLD, "command age"))
+    assert judged(log.flight(ONE_PIPE, contact=True)).outcome == "success"
+
+
+def test_the_time_limit() -> None:
+    assert judged(good().flight(ONE_PIPE, contact=True, time_limit=10.0)).outcome == "success"
+    verdict = judged(good().flight(ONE_PIPE, contact=True, time_limit=9.9))
+    assert codes(verdict) == ["time_limit_exceeded"]
+
+
+def test_world_restarted() -> None:
+    log = good()
+    log.world.append(SessionOpened(at(6), "world", 3, "world restarted"))
+    log.cloud.append(SessionOpened(at(6.1), "cloud", 3, "world accepted"))
+    (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
+    assert failure.code == "world_restarted"
+    assert failure.time == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize("event", ["cancelled", "timed_out", "leg_timed_out", "guard_stopped"])
+def test_the_mission_failed(event: str) -> None:
+    log = good()
+    log.change(MissionEvent, lambda n, e: e._replace(event=event, text="why") if n == 2 else e)
+    (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
+    assert (failure.code, failure.text) == (event, "why")
+
+
+def without_end(log: Log) -> Log:
+    log.change(MissionEvent, lambda n, event: None if n else event)
+    return log
+
+
+def test_a_mission_without_an_end() -> None:
+    verdict = judged(without_end(good()).flight(ONE_PIPE, contact=True))
+    assert verdict.outcome == "failure"
+    assert set(codes(verdict)) == {"mission_not_ended", "waypoint_not_reached"}
+
+
+def test_the_robot_never_flew() -> None:
+    log = flown()
+    log.change(GuardChange, lambda n, change: None)
+    assert codes(judged(log.flight(ONE_PIPE, contact=True))) == ["not_started"]
+
+
+def test_interrupted_before_the_end_says_only_what_is_sure() -> None:
+    log = without_end(flown())
+    log.world.append(touch(3, "pipe_1"))
+    verdict = judged(log.flight(ONE_PIPE, contact=True), interrupted=True)
+    assert verdict.outcome == "interrupted"
+    assert codes(verdict) == ["interrupted", "pipe_touched"]
+
+
+def test_interrupted_after_the_end_changes_nothing() -> None:
+    assert judged(good().flight(ONE_PIPE, contact=True), interrupted=True).outcome == "success"
+
+
+def test_the_earliest_failure_comes_first() -> None:
+    log = flown()
+    log.world += [touch(7, "pipe_1"), GuardChange(at(2), GuardState.LAND, "")]
+    verdict = judged(log.flight(ONE_PIPE, contact=True, waypoints=2))
+    assert codes(verdict) == [
+        "guard_intervened",
+        "pipe_touched",
+        "waypoint_not_reached",
+        "board_not_touched",
+    ]
+
+
+def in_time(slip: float, factor: float) -> dict[str, Number]:
+    values = {"waypoints_reached": 1.0, "world_slip": slip, "real_time_factor": factor}
+    return {name: Number(value, "", "") for name, value in values.items()}
+
+
+@pytest.mark.parametrize(
+    ("slip", "factor", "outcome"),
+    [
+        (0.0, 1.0, "success"),
+        (SLIP_MAX, REAL_TIME_FACTOR_MIN, "success"),
+        (SLIP_MAX + 1e-6, 0.99, "invalid"),
+        (0.1, REAL_TIME_FACTOR_MIN - 1e-6, "invalid"),
+    ],
+)
+def test_real_time_is_kept_or_the_run_is_invalid(slip: float, factor: float, outcome: str) -> None:
+    flight = good().flight(ONE_PIPE, contact=True)
+    verdict = judge(flight, in_time(slip, factor), real_time=True, interrupted=False)
+    assert verdict.outcome == outcome
+    assert codes(verdict) == ([] if outcome == "success" else ["not_real_time"])
+    # Virtual time has no machine to keep up with.
+    verdict = judge(flight, in_time(slip, factor), real_time=False, interrupted=False)
+    assert verdict.outcome == "success"
+
+
+def test_a_slow_run_is_invalid_from_its_records() -> None:
+    log = good()
+    log.world += [Lateness(at(n), "world", 0.0, 0.0, n * SECOND // 10) for n in range(11)]
+    verdict = judged(log.flight(ONE_PIPE, contact=True), real_time=True)
+    assert codes(verdict) == ["not_real_time"]
+    assert "0.909" in verdict.failures[0].text  # 10 s took 11
+
+
+def test_without_proof_of_real_time_a_run_is_invalid() -> None:
+    verdict = judged(good().flight(ONE_PIPE, contact=True), real_time=True)
+    assert verdict.outcome == "invalid"

@@ -1,0 +1,169 @@
+"""The import rules, read from the syntax tree: who may know whom, and who may touch the world."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "cloudrc"
+FILES = sorted(PACKAGE.rglob("*.py"))
+EVERYTHING = {"*"}
+
+# Part of cloudrc -> the parts it may import besides itself, errors, messages and records.
+MAY_IMPORT: dict[str, set[str]] = {
+    "errors": set(),
+    "messages": set(),
+    "records": set(),
+    "endpoint": set(),
+    "geometry": set(),
+    "plugins": set(),
+    "tunnel": {"endpoint"},
+    "link": {"config"},
+    "config": {"plugins", "geometry", "link"},
+    "world": {"endpoint", "tunnel", "config", "plugins", "geometry"},
+    "cloud": {"endpoint", "tunnel", "config", "plugins", "geometry"},
+    "drivers": {"endpoint", "tunnel", "link", "metrics", "config"},
+    "record": {"endpoint"},
+    "metrics": {"record", "config", "geometry", "plugins"},
+    "report": {"record", "metrics", "config", "geometry"},
+    "assembly": EVERYTHING,
+    "bench": EVERYTHING,
+    "cli": EVERYTHING,
+    "__main__": {"cli"},
+    "__init__": set(),
+}
+ALWAYS = {"errors", "messages", "records", "__version__"}
+
+# Module from outside -> the places (path prefixes below cloudrc/) that may import it.
+RESERVED: dict[str, tuple[str, ...]] = {
+    "mujoco": ("world/", "bench"),
+    # The simulator packs forces straight into MuJoCo's buffers: nothing else is as fast.
+    "struct": ("tunnel/codec", "record/", "world/simulator"),
+    "yaml": ("config/", "link/", "record/", "report/", "cli/"),
+    "pydantic": ("config/", "link/", "cli/"),
+    "matplotlib": ("report/",),
+    "mcap": ("record/",),
+    "rosbags": ("record/",),
+    "kubernetes": ("cluster/",),
+    "prometheus_client": ("drivers/",),
+    "argparse": ("cli/",),
+    "importlib.metadata": ("plugins", "cli/", "report/"),
+    "pkgutil": ("plugins",),
+    "subprocess": ("drivers/", "cli/", "cluster/"),
+    "multiprocessing": ("drivers/", "cli/"),
+    "concurrent": ("cli/",),
+    **dict.fromkeys(
+        ("time", "socket", "selectors", "select", "threading", "asyncio", "signal"),
+        ("drivers/", "link/relay", "cli/", "bench"),
+    ),
+    **dict.fromkeys(("random", "secrets", "uuid"), ("drivers/", "cli/")),
+    **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
+}
+FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__"}
+
+
+def part_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(tree: ast.AST) -> Iterator[str]:
+    """Full dotted names of everything imported, wherever in the file."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def violations(place: str, tree: ast.AST) -> list[str]:
+    """What a file at `place` (a path below cloudrc/) imports or calls that it may not."""
+    part = place.split("/")[0].removesuffix(".py")
+    allowed = MAY_IMPORT[part] | ALWAYS | {part}
+    found = []
+    for name in imports(tree):
+        top, _, rest = name.partition(".")
+        if top == "cloudrc":
+            if rest.split(".")[0] not in allowed and allowed.isdisjoint(EVERYTHING):
+                found.append(f"imports {name}")
+            continue
+        for reserved, places in RESERVED.items():
+            mine = name == reserved or name.startswith(reserved + ".")
+            if mine and not place.startswith(places):
+                found.append(f"imports {name}")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            if node.func.id in FORBIDDEN_CALLS:
+                found.append(f"calls {node.func.id}")
+            if node.func.id == "print" and part != "cli":
+                found.append("calls print")
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_a_file_imports_only_what_its_part_may(path: Path) -> None:
+    tree = ast.parse(path.read_text())
+    assert violations(path.relative_to(PACKAGE).as_posix(), tree) == []
+
+
+@pytest.mark.parametrize(
+    ("place", "code"),
+    [
+        ("world/guard.py", "from cloudrc.cloud import endpoint"),
+        ("cloud/endpoint.py", "import cloudrc.world.guard"),
+        ("drivers/virtual.py", "from cloudrc.world.endpoint import WorldEndpoint"),
+        ("cloud/estimators/ewma.py", "import time"),
+        ("link/model.py", "def f():\n    import random"),
+        ("world/sensors.py", "from time import monotonic_ns"),
+        ("tunnel/channel.py", "import struct"),
+        ("cloud/endpoint.py", "import mujoco"),
+        ("cli/run.py", "import pickle"),
+        ("record/mcap.py", "eval('1')"),
+        ("metrics/rtt.py", "print('x')"),
+    ],
+)
+def test_a_breach_is_found(place: str, code: str) -> None:
+    assert violations(place, ast.parse(code))
+
+
+@pytest.mark.parametrize(
+    "path", FILES + sorted((ROOT / "tests").rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT))
+)
+def test_no_file_is_longer_than_300_lines(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= 300
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_no_function_is_longer_than_50_lines(path: Path) -> None:
+    long = [
+        f"{node.name}: {length}"
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and (length := (node.end_lineno or 0) - node.lineno + 1) > 50
+    ]
+    assert long == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_every_module_says_what_it_is(path: Path) -> None:
+    tree = ast.parse(path.read_text())
+    assert not tree.body or ast.get_docstring(tree), "a module opens with one sentence"
+
+
+def test_numpy_gives_no_global_chance() -> None:
+    """`numpy.random.default_rng(seed)` is an injected generator; everything else is global."""
+    allowed = {"default_rng", "Generator", "Philox", "PCG64", "SeedSequence"}
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if (
+                isinstance(node, ast.Attribute)
+                and isinstance(node.value, ast.Attribute)
+                and node.value.attr == "random"
+                and isinstance(node.value.value, ast.Name)
+                and node.value.value.id in ("np", "numpy")
+            ):
+                assert node.attr in allowed, f"{path}:{node.lineno}: numpy.random.{node.attr}"

@@ -1,0 +1,112 @@
+"""The README keeps its word: its commands, files and links, taken from its text, work."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+
+BLOCK = re.compile(r"(?:<!-- test: (\S+) -->\n)?```(\w+)\n(.*?)```", re.DOTALL)
+FILES = {name: body for name, _, body in BLOCK.findall(README) if name}
+LINES = [
+    line.partition(" #")[0].strip()
+    for _, language, body in BLOCK.findall(README)
+    if language == "bash"
+    for line in body.splitlines()
+]
+SETUP = ". .venv/bin/activate"
+COMMANDS = [line for line in LINES if line and line != SETUP]
+
+
+def is_slow(command: str) -> bool:
+    """Real time, or many flights."""
+    return command.startswith("make") or "--mode local" in command or "--seeds" in command
+
+
+def execute(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    words = shlex.split(command)
+    if words[0] == "cloudrc":
+        words = [sys.executable, "-m", *words]
+    where = ROOT if words[0] == "make" else folder
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
+    return subprocess.run(words, cwd=where, capture_output=True, text=True, env=environment)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A working folder with the files that the README tells one to write."""
+    path = tmp_path_factory.mktemp("readme")
+    for name, body in FILES.items():
+        (path / name).write_text(body)
+    return path
+
+
+def test_the_first_screen_is_one_command_and_a_picture() -> None:
+    head = README.splitlines()[:22]
+    assert "make demo" in head
+    assert any(line.startswith("![") for line in head)
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if not is_slow(c)])
+def test_a_command_works(command: str, folder: Path) -> None:
+    done = execute(command, folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stderr == ""
+    assert "faults noted" not in done.stdout
+    if command.startswith("cloudrc run"):
+        assert (folder / done.stdout.splitlines()[-1]).name == "report.html"
+        assert (folder / done.stdout.splitlines()[-1]).is_file()
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("command", [c for c in COMMANDS if is_slow(c)])
+def test_a_slow_command_works(command: str, folder: Path) -> None:
+    done = execute(command, folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    where = ROOT if command.startswith("make") else folder
+    assert (where / done.stdout.splitlines()[-1]).is_file()
+
+
+def test_the_recording_is_read_as_the_readme_says(folder: Path) -> None:
+    assert execute("cloudrc run hover --mode virtual", folder).returncode == 0
+    done = execute(f"{sys.executable} read_recording.py", folder)
+    assert done.returncode == 0, done.stderr
+    assert "the base is at" in done.stdout
+
+
+def test_the_predictor_is_less_exact_than_the_one_that_trusts_velocity(folder: Path) -> None:
+    """The worked example does what it says: a share of 1 is `constant_velocity`, 0.5 is worse."""
+    errors = []
+    for share in ("0.5", "1.0"):
+        command = (
+            "cloudrc run steps --mode virtual -o json --set mission.steps.count=3 "
+            f"--set cloud.predictor=./my_predictor.py --set cloud.predictor.share={share}"
+        )
+        report = execute(command, folder).stdout
+        found = re.search(r'"prediction_error_rms":\s*{\s*"value":\s*([\d.e-]+)', report)
+        assert found is not None, report
+        errors.append(float(found[1]))
+    assert errors[0] > 1.5 * errors[1]
+
+
+def test_local_links_and_pictures_exist() -> None:
+    targets = re.findall(r"\]\((?!https?:)([^)#]+)\)", README)
+    assert len(targets) >= 5
+    assert [target for target in targets if not (ROOT / target).is_file()] == []
+
+
+def test_the_loop_is_drawn_for_light_and_dark_pages() -> None:
+    """Every text of the figure stands on one of its own light panels."""
+    svg = (ROOT / "docs" / "loop.svg").read_text()
+    panels = re.findall(r'class="panel" x="(\d+)" y="\d+" width="(\d+)"', svg)
+    assert len(panels) == 3
+    for x in map(float, re.findall(r'<text [^>]*x="(\d+)"', svg)):
+        assert any(float(left) < x < float(left) + float(width) for left, width in panels)
