@@ -56,6 +56,7 @@ def report_document(
     numbers: Mapping[str, Number],
     notes: Sequence[str],
     *,
+    clock_offset: Mapping[str, Any] | None,
     complete: bool,
 ) -> dict[str, Any]:
     """Put together what report.json says.
@@ -66,6 +67,7 @@ def report_document(
         verdict: Of it.
         numbers: Measured; what is not in it cannot be known and stays absent.
         notes: What a reader should know, a sentence each.
+        clock_offset: How cloud's stamps came on world's clock, by `clock_offset_document`.
         complete: False if the recording is torn.
     """
     document = {
@@ -80,10 +82,28 @@ def report_document(
         "numbers": {
             name: {"value": number.value, "unit": number.unit} for name, number in numbers.items()
         },
+        "clock_offset": clock_offset,
         "complete": complete,
         "notes": list(notes),
     }
     return _known(document)
+
+
+def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
+    """Say how cloud's stamps were put on world's clock.
+
+    Args:
+        metadata: Of the recording.
+
+    Returns:
+        The method and, where it is known, the uncertainty; None if both ends share a clock.
+    """
+    method = metadata.get("clock_offset_method", "same clock")
+    if method == "same clock":
+        return None
+    uncertainty_ns = metadata.get("clock_offset_uncertainty_ns")
+    known = None if uncertainty_ns is None else {"value": int(uncertainty_ns) * 1e-9, "unit": "s"}
+    return _known({"method": method, "uncertainty": known})
 
 
 def environment_document() -> dict[str, Any]:

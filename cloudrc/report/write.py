@@ -13,7 +13,13 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import METRIC_NOTE, Flight, Number, measure_all
 from cloudrc.record.columns import Recording
-from cloudrc.report.document import Run, environment_document, report_document, write_json
+from cloudrc.report.document import (
+    Run,
+    clock_offset_document,
+    environment_document,
+    report_document,
+    write_json,
+)
 from cloudrc.report.verdict import Verdict, judge
 
 
@@ -62,7 +68,15 @@ def assess(recording: Recording, experiment: ResolvedExperiment, run: Run) -> As
     )
     incomplete = (f"The recording is incomplete: {recording.note}.",) if torn else ()
     notes = tuple(dict.fromkeys((*run.notes, *incomplete, *troubles)))
-    document = report_document(run, experiment, verdict, numbers, notes, complete=not torn)
+    document = report_document(
+        run,
+        experiment,
+        verdict,
+        numbers,
+        notes,
+        clock_offset=clock_offset_document(recording.metadata),
+        complete=not torn,
+    )
     return Assessment(run, experiment, flight, numbers, verdict, notes, document)
 
 

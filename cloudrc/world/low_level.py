@@ -29,6 +29,10 @@ THRUST_MAX = THRUST_COEFFICIENT * SPEED_MAX**2
 """Of one rotor [N]."""
 TINY = 1e-9
 
+_WEIGHT = MASS * GRAVITY
+_HALF_TILT_GAIN, _HALF_YAW_GAIN = 0.5 * TILT_GAIN, 0.5 * YAW_GAIN
+_TWO_ARMS, _FOUR_RATIOS = 2.0 * ARM, 4.0 * TORQUE_RATIO
+
 
 class LowLevel:
     """Makes the robot follow a velocity; yaw is held at 0, as in the published controller."""
@@ -94,13 +98,10 @@ class LowLevel:
         px, py, pz = self._gain_p
         ix, iy, iz = self._gain_i
         dx, dy, dz = self._gain_d_over_dt
-
-        ex, ey, ez = (
-            velocity[0] - reference[0],
-            velocity[1] - reference[1],
-            velocity[2] - reference[2],
-        )
-        error = (ex, ey, ez)
+        vx, vy, vz = velocity
+        rx, ry, rz = reference
+        # Of opposite sign to the equation's, which saves turning every term.
+        ex, ey, ez = error = (rx - vx, ry - vy, rz - vz)
         # The first error after a reset has no predecessor: its rate counts as 0.
         last_x, last_y, last_z = self._error or error
         self._error = error
@@ -109,15 +110,18 @@ class LowLevel:
         sx += ex * dt
         sy += ey * dt
         sz += ez * dt
-        sx = limit_xy if sx > limit_xy else -limit_xy if sx < -limit_xy else sx
-        sy = limit_xy if sy > limit_xy else -limit_xy if sy < -limit_xy else sy
-        sz = limit_z if sz > limit_z else -limit_z if sz < -limit_z else sz
+        if not -limit_xy <= sx <= limit_xy:
+            sx = limit_xy if sx > 0.0 else -limit_xy
+        if not -limit_xy <= sy <= limit_xy:
+            sy = limit_xy if sy > 0.0 else -limit_xy
+        if not -limit_z <= sz <= limit_z:
+            sz = limit_z if sz > 0.0 else -limit_z
         self._integral = (sx, sy, sz)
 
         return (
-            -(px * ex + ix * sx + dx * (ex - last_x)),
-            -(py * ey + iy * sy + dy * (ey - last_y)),
-            -(pz * ez + iz * sz + dz * (ez - last_z)) + MASS * GRAVITY,
+            px * ex + ix * sx + dx * (ex - last_x),
+            py * ey + iy * sy + dy * (ey - last_y),
+            pz * ez + iz * sz + dz * (ez - last_z) + _WEIGHT,
         )
 
 
@@ -126,6 +130,7 @@ def attitude(force: Vector, readings: Readings) -> tuple[float, Vector]:
 
     z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
     e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R e_R + k_w w); thrust = F . (R z).
+    Worked out in the body frame, where the vectors wanted are the rows of Q.
     Source: plant.md, "LLC", with yaw and yaw rate reference 0.
 
     Args:
@@ -136,25 +141,25 @@ def attitude(force: Vector, readings: Readings) -> tuple[float, Vector]:
         Thrust [N] and torque [N m], body frame, shape (3,).
     """
     fx, fy, fz = force
-    _, _, _, (p, q, r), (xx, xy, xz), (yx, yy, yz) = readings
-    zx, zy, zz = xy * yz - xz * yy, xz * yx - xx * yz, xx * yy - xy * yx
+    _, _, _, (p, q, r), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = readings
+    thrust = fx * zx + fy * zy + fz * zz
 
     # A force that vanishes or points along the nose leaves an axis undefined: no torque from it.
-    scale = 1.0 / (sqrt(fx * fx + fy * fy + fz * fz) or TINY)
-    dzx, dzy, dzz = fx * scale, fy * scale, fz * scale
-    scale = 1.0 / (sqrt(dzy * dzy + dzz * dzz) or TINY)
-    dyy, dyz = dzz * scale, -dzy * scale
-    dxx, dxy, dxz = dyy * dzz - dyz * dzy, dyz * dzx, -dyy * dzx
+    across = fy * fy + fz * fz
+    scale = 1.0 / (sqrt(fx * fx + across) or TINY)
+    z0 = scale * (fx * xx + fy * xy + fz * xz)
+    z1 = scale * (fx * yx + fy * yy + fz * yz)
+    z2 = scale * thrust
+    scale = 1.0 / (sqrt(across) or TINY)
+    y0 = scale * (fz * xy - fy * xz)
+    y1 = scale * (fz * yy - fy * yz)
+    y2 = scale * (fz * zy - fy * zz)
 
-    roll = 0.5 * (dzx * yx + dzy * yy + dzz * yz - dyy * zy - dyz * zz)
-    pitch = 0.5 * (dxx * zx + dxy * zy + dxz * zz - dzx * xx - dzy * xy - dzz * xz)
-    yaw = 0.5 * (dyy * xy + dyz * xz - dxx * yx - dxy * yy - dxz * yz)
-    torque = (
-        -(TILT_GAIN * roll + TILT_RATE_GAIN * p),
-        -(TILT_GAIN * pitch + TILT_RATE_GAIN * q),
-        -(YAW_GAIN * yaw + YAW_RATE_GAIN * r),
+    return thrust, (
+        -_HALF_TILT_GAIN * (z1 - y2) - TILT_RATE_GAIN * p,
+        -_HALF_TILT_GAIN * (y0 * z1 - y1 * z0 - z0) - TILT_RATE_GAIN * q,
+        -_HALF_YAW_GAIN * (y0 - y2 * z0 + y0 * z2) - YAW_RATE_GAIN * r,
     )
-    return fx * zx + fy * zy + fz * zz, torque
 
 
 def allocate(thrust: float, torque: Vector) -> RotorSpeeds:
@@ -171,15 +176,16 @@ def allocate(thrust: float, torque: Vector) -> RotorSpeeds:
     Returns:
         Front, left, back, right [rad/s].
     """
-    roll, pitch = torque[0] / (2.0 * ARM), torque[1] / (2.0 * ARM)
-    yaw = torque[2] / (4.0 * TORQUE_RATIO)
-    with_yaw, against_yaw = 0.25 * thrust + yaw, 0.25 * thrust - yaw
+    roll, pitch, yaw = torque
+    roll, pitch, yaw = roll / _TWO_ARMS, pitch / _TWO_ARMS, yaw / _FOUR_RATIOS
+    share = 0.25 * thrust
+    with_yaw, against_yaw = share + yaw, share - yaw
     front, back = with_yaw - pitch, with_yaw + pitch
     left, right = against_yaw + roll, against_yaw - roll
-    if 0.0 <= front <= THRUST_MAX and 0.0 <= back <= THRUST_MAX:
-        if 0.0 <= left <= THRUST_MAX and 0.0 <= right <= THRUST_MAX:
-            k = THRUST_COEFFICIENT
-            return sqrt(front / k), sqrt(left / k), sqrt(back / k), sqrt(right / k)
+    if thrust <= THRUST_MAX and front >= 0.0 and left >= 0.0 and back >= 0.0 and right >= 0.0:
+        # None pulls and they sum to the thrust, so none is above the limit either.
+        k = THRUST_COEFFICIENT
+        return sqrt(front / k), sqrt(left / k), sqrt(back / k), sqrt(right / k)
     return _speed(front), _speed(left), _speed(back), _speed(right)
 
 

@@ -6,61 +6,64 @@ can live in different processes. This module needs no MuJoCo.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple, TypeAlias
 
 from cloudrc.messages import Quaternion, Vector
 
 RotorSpeeds: TypeAlias = tuple[float, float, float, float]
 """Front, left, back, right [rad/s], >= 0."""
+Axes: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
+_new = tuple.__new__
 
 
 class Readings(NamedTuple):
     """The true state of the robot's base, as ideal onboard sensors see it.
-
-    A tuple, because one is made at every physics step and it is made five times faster than a
-    frozen dataclass.
 
     Attributes:
         position: Of the base's origin [m], world frame, shape (3,).
         orientation_wxyz: Body to world, unit quaternion, shape (4,).
         velocity: Of the base's origin [m/s], world frame, shape (3,).
         angular_velocity_body: [rad/s], body frame, shape (3,).
-        x_axis: The body's x axis in the world frame, shape (3,): the orientation once more, because
-            both the drag and the low-level controller need it at every step.
-        y_axis: Its y axis, likewise.
+        axes: The body's x, y and z axis in the world frame, one after the other, shape (9,): the
+            orientation once more, because drag and low-level controller need it at every step.
     """
 
     position: Vector
     orientation_wxyz: Quaternion
     velocity: Vector
     angular_velocity_body: Vector
-    x_axis: Vector
-    y_axis: Vector
+    axes: Axes
 
     @classmethod
-    def of(
-        cls, position: Vector, orientation_wxyz: Quaternion, velocity: Vector, rate: Vector
-    ) -> Readings:
-        """Make readings, the axes from the orientation.
+    def of(cls, pose: Iterable[float], twist: Iterable[float]) -> Readings:
+        """Make readings of what MuJoCo knows of a free joint.
+
+        The axes are the columns of the rotation matrix of the unit quaternion (w, x, y, z).
 
         Args:
-            position: [m], world frame, shape (3,).
-            orientation_wxyz: Body to world, unit quaternion, shape (4,).
-            velocity: [m/s], world frame, shape (3,).
-            rate: Angular velocity [rad/s], body frame, shape (3,).
+            pose: Position [m] and orientation (wxyz, unit) in the world frame, shape (7,).
+            twist: Velocity [m/s], world frame, and angular velocity [rad/s], body frame, shape (6,).
         """
-        w, x, y, z = orientation_wxyz
-        xx, yy, zz = 2.0 * x * x, 2.0 * y * y, 2.0 * z * z
-        xy, xz, yz = 2.0 * x * y, 2.0 * x * z, 2.0 * y * z
-        wx, wy, wz = 2.0 * w * x, 2.0 * w * y, 2.0 * w * z
-        return cls(
-            position,
-            orientation_wxyz,
-            velocity,
-            rate,
-            (1.0 - yy - zz, xy + wz, xz - wy),
-            (xy - wz, 1.0 - xx - zz, yz + wx),
+        px, py, pz, w, x, y, z = pose
+        vx, vy, vz, p, q, r = twist
+        x2, y2, z2 = x + x, y + y, z + z
+        wx, wy, wz = w * x2, w * y2, w * z2
+        xx, xy, xz = x * x2, x * y2, x * z2
+        yy, yz, zz = y * y2, y * z2, z * z2
+        axes = (
+            1.0 - yy - zz,
+            xy + wz,
+            xz - wy,
+            xy - wz,
+            1.0 - xx - zz,
+            yz + wx,
+            xz + wy,
+            yz - wx,
+            1.0 - xx - yy,
         )
+        # Made at every physics step: the class's own constructor takes twice the time.
+        return _new(cls, ((px, py, pz), (w, x, y, z), (vx, vy, vz), (p, q, r), axes))
 
 
 class Touch(NamedTuple):

@@ -11,7 +11,6 @@ from __future__ import annotations
 from math import exp
 from typing import TypeAlias
 
-from cloudrc.messages import Quaternion
 from cloudrc.world.readings import Readings, RotorSpeeds
 
 THRUST_COEFFICIENT = 9.9865e-6
@@ -30,6 +29,9 @@ ARM = 0.21
 """Distance of a rotor's axis from the base's z axis [m]."""
 HEIGHT = 0.05
 """Height of the rotors above the base's origin [m]."""
+
+_DRAG_ARM = DRAG_COEFFICIENT * ARM
+_ARM_SQUARED = ARM * ARM
 
 Wrench: TypeAlias = tuple[float, float, float, float, float, float]
 """Force in the world frame [N] and torque in the body frame [N m]: a free joint's convention."""
@@ -77,20 +79,20 @@ def drag(speeds: RotorSpeeds, readings: Readings) -> Wrench:
         Force in the world frame [N], torque in the body frame [N m], shape (6,).
     """
     front, left, back, right = speeds
-    _, _, (vx, vy, vz), (p, q, r), (xx, xy, xz), (yx, yy, yz) = readings
+    _, _, (vx, vy, vz), (p, q, r), (xx, xy, xz, yx, yy, yz, _, _, _) = readings
 
     total = DRAG_COEFFICIENT * (front + left + back + right)
-    across_x = DRAG_COEFFICIENT * ARM * (front - back)
-    across_y = DRAG_COEFFICIENT * ARM * (left - right)
+    across_x = _DRAG_ARM * (front - back)
+    across_y = _DRAG_ARM * (left - right)
     u = xx * vx + xy * vy + xz * vz + q * HEIGHT
     v = yx * vx + yy * vy + yz * vz - p * HEIGHT
-    force_x = r * across_y - total * u
-    force_y = -r * across_x - total * v
+    force_x = across_y * r - total * u
+    force_y = -across_x * r - total * v
     return (
         xx * force_x + yx * force_y,
         xy * force_x + yy * force_y,
         xz * force_x + yz * force_y,
         -HEIGHT * force_y,
         HEIGHT * force_x,
-        across_y * u - across_x * v - ARM * ARM * total * r,
+        across_y * u - across_x * v - _ARM_SQUARED * total * r,
     )

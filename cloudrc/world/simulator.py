@@ -91,7 +91,7 @@ class Simulator:
         self._touches: list[Touch] = []
         # It stands on the floor: to touch that is news only after it has been in the air.
         self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
-        self.readings = self._read()
+        self.readings = Readings.of(self._qpos, self._qvel)
 
     def step(self, rotor_speeds: RotorSpeeds) -> None:
         """Go on by `dt` with these commanded rotor speeds [rad/s], shape (4,).
@@ -99,24 +99,19 @@ class Simulator:
         Thrust kf w^2 and drag are those of the speeds at the end of the step, the drag with the
         velocity at its beginning.
         """
-        before = self.readings
+        before, data, k = self.readings, self._data, THRUST_COEFFICIENT
         speeds = self._speeds = self._lag.step(self._speeds, rotor_speeds)
-        front, left, back, right = speeds
-        k = THRUST_COEFFICIENT
-        ctrl = (k * front * front, k * left * left, k * back * back, k * right * right)
-        applied = drag(speeds, before)
-        _pack_ctrl(self._ctrl, 0, *ctrl)
-        _pack_applied(self._applied, 0, *applied)
+        a, b, c, d = speeds
+        _pack_ctrl(self._ctrl, 0, k * a * a, k * b * b, k * c * c, k * d * d)
+        _pack_applied(self._applied, 0, *drag(speeds, before))
         if self.tape is not None:
-            self.tape.append(ctrl + applied)
+            self.tape.append((*self._ctrl, *self._applied))
 
-        _mj_step(self.model, self._data)
+        _mj_step(self.model, data)
         self._steps += 1
-        self.readings = self._read()
-        contacts = self._data.ncon
-        if contacts and (contacts != self._contacts or self._steps % LOOK_STEPS == 0):
-            self._note_contacts(before)
-        self._contacts = contacts
+        self.readings = Readings.of(self._qpos, self._qvel)
+        if data.ncon or self._contacts:
+            self._look_at_contacts(data.ncon, before)
 
     def tip_force(self) -> float:
         """Return the normal force on the arm's tip [N], as of the beginning of the last step."""
@@ -134,10 +129,11 @@ class Simulator:
         mujoco.mj_getState(self.model, self._data, physics, spec)
         return State(physics, self._data.qacc_warmstart.copy())
 
-    def _read(self) -> Readings:
-        x, y, z, qw, qx, qy, qz = self._qpos
-        vx, vy, vz, p, q, r = self._qvel
-        return Readings.of((x, y, z), (qw, qx, qy, qz), (vx, vy, vz), (p, q, r))
+    def _look_at_contacts(self, contacts: int, before: Readings) -> None:
+        """Note them if their number has changed, else every few steps."""
+        if contacts and (contacts != self._contacts or self._steps % LOOK_STEPS == 0):
+            self._note_contacts(before)
+        self._contacts = contacts
 
     def _note_contacts(self, before: Readings) -> None:
         """Note which contacts are new. MuJoCo found them in the state `before` the step."""
@@ -158,8 +154,7 @@ class Simulator:
 
 def _velocity_at(readings: Readings, offset: Vector) -> Vector:
     """Return the velocity [m/s], world frame, of a point fixed to the base at `offset` [m]."""
-    (xx, xy, xz), (yx, yy, yz) = readings.x_axis, readings.y_axis
-    zx, zy, zz = xy * yz - xz * yy, xz * yx - xx * yz, xx * yy - xy * yx
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = readings.axes
     p, q, r = readings.angular_velocity_body
     x, y, z = offset
     u, v, w = q * z - r * y, r * x - p * z, p * y - q * x

@@ -232,3 +232,15 @@ def test_a_verb_that_does_not_fit_is_refused_and_changes_nothing(state, verb):
     with pytest.raises(BadInputError, match=rf"^{verb}: the mission is {state}; "):
         flight.operate(VERBS[verb])
     assert (flight.state, flight.said) == (state, before)
+
+
+def test_time_in_hold_is_no_dwell():
+    flight = flying()
+    flight.guard = GuardState.HOLD
+    flight.step(position=A, seconds=2.0)
+    assert [event.event for event in flight.events] == ["started"]
+    flight.guard = GuardState.TRACK
+    flight.step(seconds=0.4)
+    assert last_event(flight) == "started"
+    flight.step(seconds=0.2)
+    assert last_event(flight) == "reached"

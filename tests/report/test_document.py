@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.report.document import Run, environment_document, write_json
+from cloudrc.report.document import Run, clock_offset_document, environment_document, write_json
 from cloudrc.report.write import assess
 from tests.metrics.flights import paper
 
@@ -59,6 +59,17 @@ def test_failures_say_code_text_time_and_place() -> None:
 
 def test_the_same_flight_gives_the_same_document() -> None:
     assert json.dumps(document()) == json.dumps(document())
+
+
+def test_an_offset_between_the_clocks_comes_with_its_uncertainty() -> None:
+    metadata = {"clock_offset_method": "packets", "clock_offset_uncertainty_ns": "1500000"}
+    uncertainty = {"value": pytest.approx(0.0015), "unit": "s"}
+    assert clock_offset_document(metadata) == {"method": "packets", "uncertainty": uncertainty}
+    assert clock_offset_document({"clock_offset_method": "first records"}) == {
+        "method": "first records"
+    }
+    assert clock_offset_document({"clock_offset_method": "same clock"}) is None
+    assert clock_offset_document({}) is None
 
 
 def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:

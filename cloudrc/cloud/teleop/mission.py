@@ -122,7 +122,7 @@ class Teleop:
             self._begin(now_ns)
         elif seen.guard > GuardState.HOLD and self.state is not State.STARTING:
             self._fail("guard_stopped", f"guard went to {seen.guard.name} {self._where()}", now_ns)
-        while self.state is State.FLYING and self._is_reached(seen.position, now_ns):
+        while self.state is State.FLYING and self._is_reached(seen, now_ns):
             self._advance(now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
@@ -154,10 +154,14 @@ class Teleop:
         self._leg_began_ns = now_ns
         self._within_since_ns = None
 
-    def _is_reached(self, position: Vector, now_ns: int) -> bool:
-        """True once the robot has been seen near the waypoint for as long as the leg asks."""
+    def _is_reached(self, seen: Seen, now_ns: int) -> bool:
+        """True once the robot has been seen near the waypoint for as long as the leg asks.
+
+        Time in HOLD does not count: the robot then waits on its own and does not do what the leg
+        is for, such as pressing on the board.
+        """
         leg = self._plan.legs[self._leg]
-        if dist(position, leg.position) > leg.tolerance:
+        if dist(seen.position, leg.position) > leg.tolerance or seen.guard is GuardState.HOLD:
             self._within_since_ns = None
             return False
         if self._within_since_ns is None:

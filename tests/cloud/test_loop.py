@@ -1,0 +1,131 @@
+"""The control loop: what telemetry says about delays, and what plug-ins may do to it."""
+
+from math import inf, nan
+
+import pytest
+
+from cloudrc.cloud.controllers import Controller
+from cloudrc.cloud.controllers.pid import build as pid
+from cloudrc.cloud.estimators import Estimator
+from cloudrc.cloud.estimators.running_mean import build as running_mean
+from cloudrc.cloud.estimators.split import build as split
+from cloudrc.cloud.loop import ControlLoop
+from cloudrc.cloud.predictors import Predictor
+from cloudrc.cloud.predictors.last_sample import build as last_sample
+from cloudrc.messages import NEVER_NS, UPRIGHT, ZERO, GuardState, Odometry, Setpoint, Telemetry
+
+MS = 1_000_000
+HERE = (1.0, 2.0, 3.0)
+THERE = Setpoint((2.0, 2.0, 3.0))
+
+
+def telemetry(stamp_ms, echo_ms=None, hold_ms=0):
+    odometry = Odometry(stamp_ms * MS, HERE, UPRIGHT, ZERO, ZERO)
+    echo_ns = NEVER_NS if echo_ms is None else echo_ms * MS
+    return Telemetry(stamp_ms * MS, odometry, 0.0, echo_ns, hold_ms * MS, 0, 1, GuardState.TRACK)
+
+
+def loop(estimator=running_mean, predictor=None, controller=None):
+    return ControlLoop(estimator, predictor or last_sample(), controller or pid())
+
+
+def command(a_loop, now_ms):
+    return a_loop.command(THERE, now_ms * MS, 0.01, 1, 0)
+
+
+def test_round_trip_and_loop_delay_differ_by_the_hold():
+    a_loop = loop()
+    a_loop.observe(telemetry(100, echo_ms=1000, hold_ms=7), 1090 * MS)
+    _, control = command(a_loop, 1092)
+    assert control.loop_delay == pytest.approx(0.090)
+    assert control.rtt == pytest.approx(0.083)
+    assert control.horizon == pytest.approx(0.090)
+
+
+def test_a_command_names_its_basis_and_how_long_it_was_held():
+    a_loop = loop()
+    a_loop.observe(telemetry(100), 1090 * MS)
+    sent, _ = command(a_loop, 1094)
+    assert (sent.basis_stamp_ns, sent.basis_hold_ns) == (100 * MS, 4 * MS)
+    assert sent.velocity == pytest.approx((0.8, 0.0, 0.0))  # published gain, 1 m away
+
+
+def test_a_repeated_echo_is_no_sample():
+    """While the downlink is silent one command is echoed over and over, older each time."""
+    a_loop = loop()
+    a_loop.observe(telemetry(100, echo_ms=1000), 1090 * MS)
+    for k in range(1, 2000):
+        a_loop.observe(telemetry(100 + 10 * k, echo_ms=1000, hold_ms=10 * k), (1090 + 10 * k) * MS)
+    _, control = command(a_loop, 21_090)
+    assert control.horizon == pytest.approx(0.090)
+
+
+def test_split_counts_how_long_cloud_has_held_the_odometry():
+    a_loop = loop(estimator=split)
+    # Applied at 95 ms of world's clock, 5 ms before the odometry, sent at 1000 ms of cloud's.
+    a_loop.observe(telemetry(100, echo_ms=1000, hold_ms=5), 1090 * MS)
+    _, control = command(a_loop, 1093)
+    assert control.horizon == pytest.approx((1093 - 100 + 95 - 1000) * 1e-3)
+
+
+@pytest.mark.parametrize(("horizon", "clamped"), [(3.0, 1.0), (-0.5, 0.0)])
+def test_a_horizon_out_of_range_is_clamped_and_counted(horizon, clamped):
+    class Wild(Estimator):
+        def update(self, sample):
+            pass
+
+        def horizon(self, age):
+            return horizon
+
+    a_loop = loop(estimator=Wild)
+    a_loop.observe(telemetry(100), 1090 * MS)
+    _, control = command(a_loop, 1094)
+    assert control.horizon == clamped
+    assert a_loop.counts["horizon_clamped"] == 1
+
+
+class Raising(Estimator, Predictor, Controller):
+    def update(self, *arguments):
+        raise RuntimeError("out of\nluck")
+
+    horizon = observe = predict = update
+
+
+class NotFinite(Estimator, Predictor, Controller):
+    def horizon(self, age):
+        return nan
+
+    def predict(self, odometry, horizon):
+        return odometry._replace(position=(inf, 0.0, 0.0))
+
+    def update(self, *arguments):
+        from cloudrc.cloud.controllers import ControlOutput
+
+        return ControlOutput((0.0, nan, 0.0), 0.0)
+
+
+@pytest.mark.parametrize("bad", [Raising, NotFinite])
+@pytest.mark.parametrize("kind", ["estimator", "predictor", "controller"])
+def test_a_plug_in_that_fails_is_replaced_counted_and_reported_once(kind, bad):
+    broken = {kind: bad if kind == "estimator" else bad()}
+    a_loop = loop(**broken)
+    for k in range(3):
+        a_loop.observe(telemetry(100 + 10 * k), (1090 + 10 * k) * MS)
+        sent, control = command(a_loop, 1094 + 10 * k)
+    assert control.position == HERE  # the last sample, not moved
+    assert sent.velocity == (ZERO if kind == "controller" else pytest.approx((0.8, 0.0, 0.0)))
+    assert a_loop.counts[f"{kind}_failed"] >= 3
+    (fault,) = a_loop.take_faults()
+    assert fault.code == f"{kind}_failed"
+    assert "\n" not in fault.text
+    assert f"mend cloud.{kind}" in fault.text
+
+
+def test_a_new_session_forgets_what_was_measured():
+    a_loop = loop()
+    a_loop.observe(telemetry(100, echo_ms=1000), 1090 * MS)
+    a_loop.reset()
+    assert not a_loop.ready
+    a_loop.observe(telemetry(200), 1190 * MS)
+    _, control = command(a_loop, 1194)
+    assert control.horizon == 0.0
