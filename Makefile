@@ -17,7 +17,7 @@ test: $(VENV)/dev ## run the default tests on all cores
 	$(bin)/pytest -n auto
 
 process: $(VENV)/dev ## run the tests that start processes and take real time
-	$(bin)/pytest -m process
+	$(bin)/pytest -m 'process and not full'
 
 nightly: $(VENV)/dev ## run every test, with the full numbers: minutes
 	$(bin)/pytest -n auto -m 'not process'

@@ -123,12 +123,14 @@ def _report_ends(
     trouble: CloudrcError | None,
 ) -> dict[str, Any]:
     """Merge what both ends recorded, and report on it."""
+    from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge
 
     try:
         mission = merge(folder / "world.mcap", folder / "cloud.mcap")
     except CloudrcError as error:  # nothing was recorded: say why rather than that
         raise trouble or error from None
+    run = replace(run, records_sha256=messages_sha256(mission.contents.messages))
     try:
         return _report(folder, mission.recording(), experiment, run, page=page)
     finally:

@@ -9,7 +9,7 @@ from typing import TextIO
 
 from cloudrc.cli.output import is_live, paint
 from cloudrc.messages import NEVER_NS, GuardState, Vector
-from cloudrc.records import Control, GuardChange, MissionEvent, Record, TelemetrySent
+from cloudrc.records import Control, Fault, GuardChange, MissionEvent, Record, TelemetrySent
 
 ENDINGS = ("done", "cancelled", "timed_out")
 REDRAW_PERIOD = 0.1  # [s]: faster than one can read, slow enough to cost nothing
@@ -49,6 +49,8 @@ class FlightView:
                     # That the robot holds once its mission has ended is no news.
                     if record.state > GuardState.TRACK and not self._ended:
                         self._event(f"{record.state.name}: {record.cause}")
+                case Fault():
+                    self._event(record.text)
                 case MissionEvent():
                     self._ended = record.event in ENDINGS
                     self._event(record.text)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import signal
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -70,6 +71,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Fly once or many times."""
+    # An orderly end, with a report, whoever asks for it: a person or a batch system.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     mode = options.mode or ("virtual" if options.seeds else "local")
     if mode == "cluster":
         raise MissingPrerequisiteError(

@@ -13,14 +13,14 @@ from enum import IntEnum
 from typing import Any, get_origin, get_type_hints
 
 from cloudrc import records as kinds
-from cloudrc.records import Control, GuardChange, Lateness, MissionEvent, Record, TelemetrySent
+from cloudrc.records import Control, Fault, GuardChange, MissionEvent, Record, TelemetrySent
 
 READY = "ready"
 """The line that a process writes once it can receive."""
 PERIOD_NS = 100_000_000
-EVENTS = (GuardChange, MissionEvent)
+EVENTS = (GuardChange, MissionEvent, Fault)
 """Every one of these is told."""
-SAMPLED = (TelemetrySent, Control, Lateness)
+SAMPLED = (TelemetrySent, Control)
 """Of these one every 100 ms."""
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Callable, Iterable
 from types import FrameType
 from typing import Protocol
@@ -15,7 +16,7 @@ from cloudrc.drivers.feed import Feed
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.drivers.recording import Recorder, RecordingThread
 from cloudrc.endpoint import Endpoint
-from cloudrc.records import Record
+from cloudrc.records import Counted, Fault, Record
 
 
 class StopSignal:
@@ -36,7 +37,17 @@ class StopSignal:
 
 
 class Takes(Recorder, Protocol):
-    """A recorder that records can be put into; `cloudrc.record.recorder` has it."""
+    """A recorder that records can be put into; `cloudrc.record.recorder` has it.
+
+    Attributes:
+        error: Why something was not recorded, in words; "" if all is well.
+        dropped: How many records did not reach the file.
+    """
+
+    error: str
+
+    @property
+    def dropped(self) -> int: ...
 
     def put(self, records: Iterable[Record]) -> None:
         """Take records over; never waits and never raises."""
@@ -65,17 +76,22 @@ def run_end(
         True if it was done by itself, False if it was stopped.
     """
     stop, feed, thread = StopSignal(), Feed(), RecordingThread(recorder)
+    trouble = ""
 
     def sink(records: list[Record]) -> None:
+        nonlocal trouble
         recorder.put(records)
         feed.tell(records)
+        if records and recorder.error != trouble:
+            trouble = recorder.error
+            feed.tell([Fault(records[-1].stamp_ns, "recorder", trouble)])
 
     thread.start()
     feed.ready()
     try:
-        serve(
-            endpoint, peer, end=end, sink=sink, stop=lambda: stop() or over(), slip_ns=slip_ns
-        )
+        serve(endpoint, peer, end=end, sink=sink, stop=lambda: stop() or over(), slip_ns=slip_ns)
     finally:
+        now_ns = time.monotonic_ns() - slip_ns()
+        recorder.put([Counted(now_ns, end, "recorder_dropped", recorder.dropped)])
         thread.stop()
     return over()

@@ -42,6 +42,19 @@ class RecordHash:
         return self._sha256.hexdigest()
 
 
+def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
+    """Hash what was recorded in real time, where no record but its message has come down to us.
+
+    Args:
+        messages: Topic, log time [ns] and CDR bytes of each, in the order of the file.
+    """
+    sha256 = hashlib.sha256()
+    for topic, log_time_ns, data in messages:
+        sha256.update(b"%s %d %d " % (topic.encode(), log_time_ns, len(data)))
+        sha256.update(data)
+    return sha256.hexdigest()
+
+
 class _Packers(dict[type, _Pack]):
     """Packers by class, each made when the first record of its class comes."""
 

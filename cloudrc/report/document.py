@@ -37,7 +37,8 @@ class Run:
     Attributes:
         mode: "virtual", "local" or "cluster".
         shaper: What emulated the link: "virtual", "relay" or "netem".
-        records_sha256: Of all records, by `record.hash`; None if they are not all there.
+        records_sha256: Of all records in virtual time, of all messages in real time, by
+            `record.hash`; None if they are not all there.
         interrupted: True if somebody stopped it.
         notes: What a reader should know, a sentence each.
     """

@@ -56,9 +56,9 @@ class LowLevel:
             integral_limit_z: Likewise in z [m].
             dt: Time between two updates [s].
         """
-        self._gain_p, self._gain_i = gain_p, gain_i
-        self._gain_d_over_dt: Vector = (gain_d[0] / dt, gain_d[1] / dt, gain_d[2] / dt)
-        self._limit_xy, self._limit_z = integral_limit_xy, integral_limit_z
+        dx, dy, dz = gain_d
+        self._gains = (*gain_p, *gain_i, dx / dt, dy / dt, dz / dt)
+        self._limits = (integral_limit_xy, integral_limit_z)
         self._dt = dt
         self.reset()
 
@@ -94,10 +94,8 @@ class LowLevel:
         Returns:
             [N], world frame, shape (3,).
         """
-        dt, limit_xy, limit_z = self._dt, self._limit_xy, self._limit_z
-        px, py, pz = self._gain_p
-        ix, iy, iz = self._gain_i
-        dx, dy, dz = self._gain_d_over_dt
+        px, py, pz, ix, iy, iz, dx, dy, dz = self._gains
+        (limit_xy, limit_z), dt = self._limits, self._dt
         vx, vy, vz = velocity
         rx, ry, rz = reference
         # Of opposite sign to the equation's, which saves turning every term.
@@ -110,12 +108,9 @@ class LowLevel:
         sx += ex * dt
         sy += ey * dt
         sz += ez * dt
-        if not -limit_xy <= sx <= limit_xy:
-            sx = limit_xy if sx > 0.0 else -limit_xy
-        if not -limit_xy <= sy <= limit_xy:
-            sy = limit_xy if sy > 0.0 else -limit_xy
-        if not -limit_z <= sz <= limit_z:
-            sz = limit_z if sz > 0.0 else -limit_z
+        sx = limit_xy if sx > limit_xy else -limit_xy if sx < -limit_xy else sx
+        sy = limit_xy if sy > limit_xy else -limit_xy if sy < -limit_xy else sy
+        sz = limit_z if sz > limit_z else -limit_z if sz < -limit_z else sz
         self._integral = (sx, sy, sz)
 
         return (

@@ -10,7 +10,10 @@ from cloudrc.messages import GuardState
 from cloudrc.world.clock import STEP, STEP_NS
 from cloudrc.world.guard import Guard
 from cloudrc.world.low_level import LowLevel
-from cloudrc.world.simulator import STOPPED, Simulator
+from cloudrc.world.rotors import STOPPED
+from cloudrc.world.simulator import Simulator
+
+GROUND = GuardState.GROUND  # an enum's member is slow to look up
 
 
 class Robot:
@@ -34,14 +37,14 @@ class Robot:
             The first tick that has not been run [ns, world's clock].
         """
         simulator, guard, low_level = self.simulator, self.guard, self._low_level
+        ticks = range(tick_ns, until_ns, STEP_NS)
         # Only commands and requests lead off the ground and back to it, and none comes in here.
-        on_ground = guard.state is GuardState.GROUND
-        while tick_ns < until_ns:
-            if on_ground:
+        if guard.state is GROUND:
+            for _ in ticks:
                 simulator.step(STOPPED)
-            else:
+        else:
+            for now_ns in ticks:
                 readings = simulator.readings
-                reference = guard.tick(tick_ns, readings, STEP)
+                reference = guard.tick(now_ns, readings, STEP)
                 simulator.step(low_level.update(readings, reference))
-            tick_ns += STEP_NS
-        return tick_ns
+        return tick_ns + len(ticks) * STEP_NS

@@ -1,7 +1,6 @@
 """The rotors between command and force: commanded speeds in, thrusts and a drag wrench out.
 
-Pure functions of plain floats; they run at every physics step. Order of the rotors everywhere:
-front (+x), left (+y), back, right. Front and back give a positive reaction torque about z for
+Plain floats; this runs at every physics step. Order of the rotors everywhere: front (+x), left (+y), back, right. Front and back give a positive reaction torque about z for
 their thrust, left and right a negative one.
 Source: plant.md, "Robot", which restates the RotorS model of the paper's world.
 """
@@ -30,69 +29,72 @@ ARM = 0.21
 HEIGHT = 0.05
 """Height of the rotors above the base's origin [m]."""
 
+STOPPED: RotorSpeeds = (0.0, 0.0, 0.0, 0.0)
+
 _DRAG_ARM = DRAG_COEFFICIENT * ARM
 _ARM_SQUARED = ARM * ARM
 
-Wrench: TypeAlias = tuple[float, float, float, float, float, float]
-"""Force in the world frame [N] and torque in the body frame [N m]: a free joint's convention."""
+Controls: TypeAlias = tuple[
+    float, float, float, float, float, float, float, float, float, float
+]
+"""What goes to MuJoCo: four thrusts [N], and the drag as a wrench at the base's origin, its force in
+the world frame [N], its torque in the body frame [N m], as a free joint wants it."""
 
 
-class RotorLag:
-    """First-order lag of the rotors, exact for a command that is constant over a step.
+class Rotors:
+    """Four rotors with lag, thrust and drag.
 
-    w(t + dt) = w + (command - w) (1 - exp(-dt/T)), T = 12.5 ms up, 25 ms down.
-    Source: plant.md, "rotor speed".
+    Attributes:
+        speeds: Front, left, back, right [rad/s].
     """
 
     def __init__(self, dt: float) -> None:
-        """Prepare for steps of `dt` [s]."""
+        """Start with rotors that stand still, for steps of `dt` [s]."""
         self._up = 1.0 - exp(-dt / TIME_CONSTANT_UP)
         self._down = 1.0 - exp(-dt / TIME_CONSTANT_DOWN)
+        self.speeds = STOPPED
 
-    def step(self, speeds: RotorSpeeds, commands: RotorSpeeds) -> RotorSpeeds:
-        """Move the speeds [rad/s] one step towards the commanded ones [rad/s]."""
-        up, down = self._up, self._down
-        front, left, back, right = speeds
+    def step(self, commands: RotorSpeeds, readings: Readings) -> Controls:
+        """Move the speeds on by `dt`, and say what they do to the robot then.
+
+        Lag: w(t + dt) = w + (command - w) (1 - exp(-dt/T)), T = 12.5 ms up, 25 ms down; exact for a
+        command that is constant over a step. Thrust: kf w^2.
+        Drag: at each rotor F = -w c v, v being the part of the hub's velocity across the rotor's
+        axis. With body velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h) that part is
+        (u + q h - r y, v + r x - p h). Summed over x = (l, 0, -l, 0), y = (0, l, 0, -l):
+        torque = sum of r x F = (-h Fy, h Fx, sum of x Fy - y Fx).
+        Source: plant.md, "rotor speed", "rotor drag"; the RotorS motor model.
+
+        Args:
+            commands: [rad/s], shape (4,).
+            readings: State of the base, for the drag; the air stands still.
+        """
+        up, down, k = self._up, self._down, THRUST_COEFFICIENT
+        front, left, back, right = self.speeds
         to_front, to_left, to_back, to_right = commands
+        front += (to_front - front) * (up if to_front > front else down)
+        left += (to_left - left) * (up if to_left > left else down)
+        back += (to_back - back) * (up if to_back > back else down)
+        right += (to_right - right) * (up if to_right > right else down)
+        self.speeds = (front, left, back, right)
+
+        _, _, (vx, vy, vz), (p, q, r), (xx, xy, xz, yx, yy, yz, _, _, _) = readings
+        total = DRAG_COEFFICIENT * (front + left + back + right)
+        across_x = _DRAG_ARM * (front - back)
+        across_y = _DRAG_ARM * (left - right)
+        u = xx * vx + xy * vy + xz * vz + q * HEIGHT
+        v = yx * vx + yy * vy + yz * vz - p * HEIGHT
+        force_x = across_y * r - total * u
+        force_y = -across_x * r - total * v
         return (
-            front + (to_front - front) * (up if to_front > front else down),
-            left + (to_left - left) * (up if to_left > left else down),
-            back + (to_back - back) * (up if to_back > back else down),
-            right + (to_right - right) * (up if to_right > right else down),
+            k * front * front,
+            k * left * left,
+            k * back * back,
+            k * right * right,
+            xx * force_x + yx * force_y,
+            xy * force_x + yy * force_y,
+            xz * force_x + yz * force_y,
+            -HEIGHT * force_y,
+            HEIGHT * force_x,
+            across_y * u - across_x * v - _ARM_SQUARED * total * r,
         )
-
-
-def drag(speeds: RotorSpeeds, readings: Readings) -> Wrench:
-    """Sum the drag of the four rotors into one wrench at the base's origin.
-
-    At each rotor F = -w c v, v being the part of the hub's velocity across the rotor's axis. With
-    body velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h) that part is
-    (u + q h - r y, v + r x - p h). Summed over x = (l, 0, -l, 0), y = (0, l, 0, -l):
-    torque = sum of r x F = (-h Fy, h Fx, sum of x Fy - y Fx).
-    Source: plant.md, "rotor drag"; the RotorS motor model's air drag.
-
-    Args:
-        speeds: Of the rotors [rad/s], shape (4,).
-        readings: State of the base; the air stands still.
-
-    Returns:
-        Force in the world frame [N], torque in the body frame [N m], shape (6,).
-    """
-    front, left, back, right = speeds
-    _, _, (vx, vy, vz), (p, q, r), (xx, xy, xz, yx, yy, yz, _, _, _) = readings
-
-    total = DRAG_COEFFICIENT * (front + left + back + right)
-    across_x = _DRAG_ARM * (front - back)
-    across_y = _DRAG_ARM * (left - right)
-    u = xx * vx + xy * vy + xz * vz + q * HEIGHT
-    v = yx * vx + yy * vy + yz * vz - p * HEIGHT
-    force_x = across_y * r - total * u
-    force_y = -across_x * r - total * v
-    return (
-        xx * force_x + yx * force_y,
-        xy * force_x + yy * force_y,
-        xz * force_x + yz * force_y,
-        -HEIGHT * force_y,
-        HEIGHT * force_x,
-        across_y * u - across_x * v - _ARM_SQUARED * total * r,
-    )

@@ -16,10 +16,9 @@ import numpy.typing as npt
 
 from cloudrc.messages import Vector
 from cloudrc.world.readings import Readings, RotorSpeeds, Touch
-from cloudrc.world.rotors import THRUST_COEFFICIENT, RotorLag, drag
+from cloudrc.world.rotors import STOPPED, Controls, Rotors
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
 
-STOPPED: RotorSpeeds = (0.0, 0.0, 0.0, 0.0)
 TOUCH_GAP = 0.1
 """Something counts as newly touched after this long without contact [s]."""
 LOOK_STEPS = 5
@@ -49,9 +48,8 @@ class Simulator:
         model: The compiled `MjModel`.
         dt: Duration of a step [s].
         readings: State of the base after the last step.
-        tape: If set to a list, every step since the last reset appends what it gave to MuJoCo: four
-            thrusts [N] and the wrench of the drag [N], [N m], as one tuple of ten floats; `replay`
-            plays it again.
+        tape: If set to a list, every step since the last reset appends what it gave to MuJoCo;
+            `replay` plays it again.
     """
 
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
@@ -62,9 +60,9 @@ class Simulator:
         """
         self.model = model = compile_model(robot, scene)
         self.dt: float = model.opt.timestep
-        self.tape: list[tuple[float, ...]] | None = None
+        self.tape: list[Controls] | None = None
         self._data = data = mujoco.MjData(model)
-        self._lag = RotorLag(self.dt)
+        self._rotors = Rotors(self.dt)
 
         self._qpos: memoryview[float] = memoryview(data.qpos)
         self._qvel: memoryview[float] = memoryview(data.qvel)
@@ -84,7 +82,7 @@ class Simulator:
         """Put the robot back to its spawn, at rest, rotors stopped."""
         mujoco.mj_resetData(self.model, self._data)
         mujoco.mj_forward(self.model, self._data)
-        self._speeds = STOPPED
+        self._rotors.speeds = STOPPED
         self._steps = self._contacts = 0
         if self.tape is not None:
             self.tape.clear()
@@ -99,13 +97,13 @@ class Simulator:
         Thrust kf w^2 and drag are those of the speeds at the end of the step, the drag with the
         velocity at its beginning.
         """
-        before, data, k = self.readings, self._data, THRUST_COEFFICIENT
-        speeds = self._speeds = self._lag.step(self._speeds, rotor_speeds)
-        a, b, c, d = speeds
-        _pack_ctrl(self._ctrl, 0, k * a * a, k * b * b, k * c * c, k * d * d)
-        _pack_applied(self._applied, 0, *drag(speeds, before))
+        before, data = self.readings, self._data
+        controls = self._rotors.step(rotor_speeds, before)
+        front, left, back, right, fx, fy, fz, tx, ty, tz = controls
+        _pack_ctrl(self._ctrl, 0, front, left, back, right)
+        _pack_applied(self._applied, 0, fx, fy, fz, tx, ty, tz)
         if self.tape is not None:
-            self.tape.append((*self._ctrl, *self._applied))
+            self.tape.append(controls)
 
         _mj_step(self.model, data)
         self._steps += 1

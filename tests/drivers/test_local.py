@@ -57,11 +57,12 @@ def alive(pid: int) -> bool:
     return True
 
 
-def test_ctrl_c_ends_all_processes_within_two_seconds_and_leaves_a_report(tmp_path):
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_all_processes_within_two_seconds_and_leaves_a_report(tmp_path, how):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
     assert set(pids) == {"relay", "world", "cloud"}
-    os.kill(run.pid, signal.SIGINT)
+    os.kill(run.pid, how)
     asked = time.monotonic()
     while any(alive(pid) for pid in pids.values()):
         assert time.monotonic() - asked < 2.0

@@ -8,7 +8,8 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.world.scene import FOLDER, compile_model, mujoco
-from cloudrc.world.simulator import STOPPED, Simulator
+from cloudrc.world.rotors import STOPPED
+from cloudrc.world.simulator import Simulator
 
 ROBOTS = sorted(path.stem for path in (FOLDER / "robots").glob("*.xml"))
 SCENES = sorted(path.stem for path in (FOLDER / "scenes").glob("*.xml"))

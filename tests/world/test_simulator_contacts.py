@@ -4,7 +4,8 @@ import pytest
 
 from cloudrc.messages import ZERO
 from cloudrc.world.low_level import LowLevel
-from cloudrc.world.simulator import STOPPED, Simulator
+from cloudrc.world.rotors import STOPPED
+from cloudrc.world.simulator import Simulator
 
 STEP = 0.002
 
