@@ -7,7 +7,7 @@ operator requests come back.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass
 from math import nan
 
@@ -18,7 +18,7 @@ from cloudrc.messages import NEVER_NS, OperatorRequest, Setpoint
 from cloudrc.records import Arrival, Counted, Record, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import USED, Channel
-from cloudrc.tunnel.codec import Accept, Datagram, DecodeError, Direction, Hello, Kind
+from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.session import NO_EPOCH, Session
 
 PERIOD_NS = 10_000_000
@@ -69,7 +69,7 @@ class CloudEndpoint:
         self._commanded_ns = NEVER_NS
         self._datagrams: list[bytes] = []
         self._records: list[Record] = []
-        self._counts: Counter[str] = Counter()
+        self._counts: defaultdict[str, int] = defaultdict(int)
 
     @property
     def mission_over(self) -> bool:
@@ -98,9 +98,11 @@ class CloudEndpoint:
         if missed:
             self._counts["missed_periods"] += missed
         self._tick_ns += (missed + 1) * PERIOD_NS
-        self._say_hello_if_needed(now_ns)
+        if self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS:
+            self._say_hello_if_due(now_ns)
         self.teleop.handle_deadline(now_ns)
-        self._take_from_teleop()
+        if self.teleop.outputs:
+            self._take_from_teleop()
         if self._session.epoch and self._loop.ready and self._setpoint is not None:
             self._send_command(self._setpoint, now_ns)
         if now_ns >= self._count_ns:
@@ -111,29 +113,25 @@ class CloudEndpoint:
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
         """Take in one datagram; what is not valid is counted and dropped."""
         try:
-            datagram = self._session.open(data)
-            if datagram.kind == TELEMETRY:
-                self._receive_telemetry(datagram, now_ns)
-            elif datagram.kind == Kind.ACCEPT:
-                self._receive_accept(datagram, now_ns)
+            kind, _, epoch, counter, body = self._session.open(data)
+            if kind == TELEMETRY:
+                self._receive_telemetry(epoch, counter, body, now_ns)
+            elif kind == Kind.ACCEPT:
+                self._receive_accept(epoch, codec.decode_accept(body), now_ns)
             else:
                 raise DecodeError("malformed")
         except DecodeError as error:
             self._counts[str(error)] += 1
 
-    def _say_hello_if_needed(self, now_ns: int) -> None:
-        lost = self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
-        if lost and now_ns >= self._hello_ns:
-            self._say_hello(now_ns)
-
-    def _say_hello(self, now_ns: int) -> None:
+    def _say_hello_if_due(self, now_ns: int) -> None:
+        if now_ns < self._hello_ns:
+            return
         self._hello_ns = now_ns + HELLO_PERIOD_NS
         hello = Hello(self._identity.nonce, self._identity.clock_id)
         self._send(Kind.HELLO, codec.encode_hello(hello))
 
-    def _receive_accept(self, datagram: Datagram, now_ns: int) -> None:
+    def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
         """Take the epoch that world hands out to this very process, if it is a new one."""
-        accept, epoch = codec.decode_accept(datagram.body), datagram.epoch
         if accept.nonce != self._identity.nonce or epoch <= self._session.epoch:
             self._counts["accept_ignored"] += 1
             return
@@ -145,28 +143,28 @@ class CloudEndpoint:
         self._commanded_ns = NEVER_NS
         self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
-    def _receive_telemetry(self, datagram: Datagram, now_ns: int) -> None:
+    def _receive_telemetry(self, epoch: int, counter: int, body: bytes, now_ns: int) -> None:
         """Whatever arrives for this epoch is noted; loop and teleop get the newest."""
-        _, _, epoch, counter, body = datagram
         if epoch != self._session.epoch:
             self._counts["old_epoch"] += 1
-            if epoch > self._session.epoch and now_ns >= self._hello_ns:
-                self._say_hello(now_ns)  # world moved on and its accept was lost
+            if epoch > self._session.epoch:
+                self._say_hello_if_due(now_ns)  # world moved on and its accept was lost
             return
         self._heard_ns = now_ns
         outcome = self._channel.take(counter)
         self._counts[outcome] += 1
-        delay = nan
+        used, delay = outcome == USED, nan
         if self._clock_is_shared:
             stamp_ns, slip_ns = codec.decode_stamps(body)
             delay = (now_ns - stamp_ns - slip_ns) * 1e-9
-        self._records.append(Arrival(now_ns, True, epoch, counter, delay, outcome == USED))
-        if outcome == USED:
+        self._records.append(Arrival(now_ns, True, epoch, counter, delay, used))
+        if used:
             telemetry = codec.decode_telemetry(body)
             position, guard = telemetry.odometry.position, telemetry.guard
             self._loop.observe(telemetry, now_ns)
             self.teleop.see(Seen(epoch, position, guard, telemetry.mission), now_ns)
-            self._take_from_teleop()
+            if self.teleop.outputs:
+                self._take_from_teleop()
 
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():
@@ -189,7 +187,7 @@ class CloudEndpoint:
 
     def _note_counts(self, now_ns: int) -> None:
         self._count_ns += COUNT_PERIOD_NS
-        for name, count in sorted((self._counts + self._loop.counts).items()):
+        for name, count in sorted((self._counts | self._loop.counts).items()):
             self._records.append(Counted(now_ns, "cloud", name, count))
 
     def _send(self, kind: int, body: bytes) -> None:

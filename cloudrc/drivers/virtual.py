@@ -74,47 +74,45 @@ class VirtualRun:
                 gc.enable()
 
     def _fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
-        world, cloud, flying, offset_ns = self._world, self._cloud, self._flying, self._offset_ns
-        asked_ns = self.now_ns
         while self.now_ns < limit_ns:
-            world_ns = world.next_deadline_ns()
-            cloud_ns = cloud.next_deadline_ns() - offset_ns
-            if flying and flying[0][0] <= world_ns and flying[0][0] <= cloud_ns:
-                self._deliver()
-            elif world_ns <= cloud_ns:
-                self.now_ns = world_ns
-                world.handle_deadline(world_ns)
-                self._send_up()
+            self._advance(min(self.now_ns + PERIOD_NS, limit_ns))
+            sink(self._world.take_records(), self._cloud.take_records())
+            if until():
+                return
+
+    def _advance(self, end_ns: int) -> None:
+        """Let happen what is due up to and including `end_ns` [ns], one event after the other."""
+        world, cloud, flying, offset_ns = self._world, self._cloud, self._flying, self._offset_ns
+        world_ns, cloud_ns = world.next_deadline_ns(), cloud.next_deadline_ns() - offset_ns
+        while True:
+            deadline_ns = world_ns if world_ns <= cloud_ns else cloud_ns
+            if flying and flying[0][0] <= deadline_ns:
+                if flying[0][0] > end_ns:
+                    break
+                self.now_ns, _, to_world, data = heappop(flying)
+                if to_world:
+                    world.receive_datagram(data, self.now_ns)
+                else:
+                    cloud.receive_datagram(data, self.now_ns + offset_ns)
+            elif deadline_ns > end_ns:
+                break
             else:
-                self.now_ns = cloud_ns
-                cloud.handle_deadline(cloud_ns + offset_ns)
-                self._send_down()
-                if cloud_ns >= asked_ns + PERIOD_NS:
-                    asked_ns = cloud_ns
-                    sink(world.take_records(), cloud.take_records())
-                    if until():
-                        return
-        sink(world.take_records(), cloud.take_records())
+                self.now_ns = deadline_ns
+                if to_world := world_ns <= cloud_ns:
+                    world.handle_deadline(deadline_ns)
+                else:
+                    cloud.handle_deadline(deadline_ns + offset_ns)
+            if to_world:
+                world_ns = world.next_deadline_ns()
+                self._send(world.take_datagrams(), self._uplink, to_world=False)
+            else:
+                cloud_ns = cloud.next_deadline_ns() - offset_ns
+                self._send(cloud.take_datagrams(), self._downlink, to_world=True)
+        self.now_ns = end_ns
 
-    def _deliver(self) -> None:
-        self.now_ns, _, to_world, data = heappop(self._flying)
-        if to_world:
-            self._world.receive_datagram(data, self.now_ns)
-            self._send_up()
-        else:
-            self._cloud.receive_datagram(data, self.now_ns + self._offset_ns)
-            self._send_down()
-
-    def _send_up(self) -> None:
-        for data in self._world.take_datagrams():
-            self._send(data, self._uplink, to_world=False)
-
-    def _send_down(self) -> None:
-        for data in self._cloud.take_datagrams():
-            self._send(data, self._downlink, to_world=True)
-
-    def _send(self, data: bytes, link: Link, *, to_world: bool) -> None:
-        kind, epoch, counter = peek(data)
-        for arrival_ns in link.send(epoch, kind, counter, len(data), self.now_ns):
-            self._sent += 1
-            heappush(self._flying, (arrival_ns, self._sent, to_world, data))
+    def _send(self, datagrams: list[bytes], link: Link, *, to_world: bool) -> None:
+        for data in datagrams:
+            kind, epoch, counter = peek(data)
+            for arrival_ns in link.send(epoch, kind, counter, len(data), self.now_ns):
+                self._sent += 1
+                heappush(self._flying, (arrival_ns, self._sent, to_world, data))

@@ -97,7 +97,8 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
         return list(normals(key, purpose, block, correlation))
     if distribution == "uniform":
         if not correlation:
-            return [2.0 * u - 1.0 for u in uniforms(key, purpose, block).tolist()]
+            drawn: list[float] = (2.0 * uniforms(key, purpose, block) - 1.0).tolist()
+            return drawn
         return [erf(_HALF_ROOT * z) for z in normals(key, purpose, block, correlation)]
     if correlation:
         correlated = normals(key, purpose, block, correlation)
@@ -116,8 +117,9 @@ def _offsets(
     """Scale the jitter of a block to [ns]."""
     if not jitter:
         return [0] * BLOCK
-    scale = jitter * 1e9
-    return [round(scale * x) for x in shape(key, purpose, block, profile)]
+    scaled = jitter * 1e9 * np.array(shape(key, purpose, block, profile))
+    offsets: list[int] = np.rint(scaled).astype(np.int64).tolist()
+    return offsets
 
 
 def _chosen(key: StreamKey, purpose: Purpose, block: int, chance: float) -> list[int]:

@@ -32,7 +32,7 @@ class Channel:
         self._seen = 0  # bit k: newest - k has arrived
 
     def take(self, counter: int) -> str:
-        """Say what becomes of the datagram with this counter, USED, LATE or REPEATED; remember it."""
+        """Say what becomes of the datagram with this counter: USED, LATE or REPEATED."""
         ahead = counter - self._newest
         if ahead > 0:
             self._newest = counter

@@ -11,9 +11,17 @@ from __future__ import annotations
 
 import struct
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
-from cloudrc.messages import Command, GuardState, Odometry, OperatorRequest, Request, Start, Telemetry
+from cloudrc.messages import (
+    Command,
+    GuardState,
+    Odometry,
+    OperatorRequest,
+    Request,
+    Start,
+    Telemetry,
+)
 
 VERSION = 1
 DATAGRAM_MAX = 512
@@ -41,14 +49,8 @@ class DecodeError(ValueError):
     """Bytes that are not one of our datagrams; the text is the outcome that is counted."""
 
 
-class Datagram(NamedTuple):
-    """One datagram: the values of its header, which is in the clear, and its body."""
-
-    kind: int
-    direction: int
-    epoch: int
-    counter: int
-    body: bytes
+Datagram: TypeAlias = tuple[int, int, int, int, bytes]
+"""Kind, direction, epoch and counter, which are in the clear in its header, and its body."""
 
 
 class Hello(NamedTuple):
@@ -75,6 +77,7 @@ _OPERATOR = struct.Struct("<IBB")
 _HELLO = struct.Struct("<16s16s")
 _ACCEPT = struct.Struct("<16s16s16s")
 
+_unpack_header = _HEADER.unpack_from
 HEADER_SIZE = _HEADER.size
 BODY_SIZES = {
     Kind.HELLO: _HELLO.size,
@@ -99,12 +102,12 @@ def decode(data: bytes) -> Datagram:
     """
     if len(data) < HEADER_SIZE:
         raise DecodeError("malformed")
-    version, kind, direction, epoch, counter = _HEADER.unpack_from(data)
+    version, kind, direction, epoch, counter = _unpack_header(data)
     if version != VERSION:
         raise DecodeError("version")
     if _SIZES.get(kind) != len(data) or direction > 1:
         raise DecodeError("malformed")
-    return Datagram(kind, direction, epoch, counter, data[HEADER_SIZE:])
+    return kind, direction, epoch, counter, data[HEADER_SIZE:]
 
 
 def peek(data: bytes) -> tuple[int, int, int]:
@@ -115,43 +118,27 @@ def peek(data: bytes) -> tuple[int, int, int]:
     """
     if len(data) < HEADER_SIZE:
         raise DecodeError("malformed")
-    _, kind, _, epoch, counter = _HEADER.unpack_from(data)
+    _, kind, _, epoch, counter = _unpack_header(data)
     return kind, epoch, counter
 
 
 def encode_telemetry(telemetry: Telemetry) -> bytes:
     """Lay out the body of a TELEMETRY datagram."""
-    odometry = telemetry.odometry
-    return _TELEMETRY.pack(
-        telemetry.stamp_ns,
-        *odometry.position,
-        *odometry.orientation_wxyz,
-        *odometry.velocity,
-        *odometry.angular_velocity_body,
-        telemetry.tip_force,
-        telemetry.echo_stamp_ns,
-        telemetry.echo_hold_ns,
-        telemetry.slip_ns,
-        telemetry.mission,
-        telemetry.guard,
-    )
+    stamp_ns, odometry, tip_force, echo_ns, hold_ns, slip_ns, mission, guard = telemetry
+    _, position, orientation, velocity, rate = odometry
+    numbers = position + orientation + velocity + rate
+    return _TELEMETRY.pack(stamp_ns, *numbers, tip_force, echo_ns, hold_ns, slip_ns, mission, guard)
 
 
 def decode_telemetry(body: bytes) -> Telemetry:
     """Read the body of a TELEMETRY datagram; numbers may be anything, NaN included."""
     values = _TELEMETRY.unpack(body)
-    stamp_ns = values[0]
-    if values[19] >= len(_GUARD_STATES):
+    stamp_ns, (tip_force, echo_ns, hold_ns, slip_ns, mission, guard) = values[0], values[14:]
+    if guard >= len(_GUARD_STATES):
         raise DecodeError("malformed")
+    odometry = Odometry(stamp_ns, values[1:4], values[4:8], values[8:11], values[11:14])
     return Telemetry(
-        stamp_ns,
-        Odometry(stamp_ns, values[1:4], values[4:8], values[8:11], values[11:14]),
-        values[14],
-        values[15],
-        values[16],
-        values[17],
-        values[18],
-        _GUARD_STATES[values[19]],
+        stamp_ns, odometry, tip_force, echo_ns, hold_ns, slip_ns, mission, _GUARD_STATES[guard]
     )
 
 
@@ -164,13 +151,8 @@ def decode_stamps(body: bytes) -> tuple[int, int]:
 
 def encode_command(command: Command) -> bytes:
     """Lay out the body of a COMMAND datagram."""
-    return _COMMAND.pack(
-        command.stamp_ns,
-        command.basis_stamp_ns,
-        command.basis_hold_ns,
-        *command.velocity,
-        command.yaw_rate,
-    )
+    stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate = command
+    return _COMMAND.pack(stamp_ns, basis_stamp_ns, basis_hold_ns, x, y, z, yaw_rate)
 
 
 def decode_command(body: bytes) -> Command:

@@ -17,6 +17,7 @@ from cloudrc.tunnel.codec import (
     encode_header,
 )
 
+HELLO = int(Kind.HELLO)  # an enum's member is slow to look up
 NO_EPOCH = 0
 """The epoch of an end that has no session, and of every hello."""
 
@@ -37,14 +38,14 @@ class Session:
     def begin(self, epoch: int) -> None:
         """Begin a new epoch: all counters but that of hellos start again."""
         self.epoch = epoch
-        hellos = self._counters[Kind.HELLO]
-        self._counters = dict.fromkeys(self._counters, 0) | {int(Kind.HELLO): hellos}
+        hellos = self._counters[HELLO]
+        self._counters = dict.fromkeys(self._counters, 0) | {HELLO: hellos}
 
     def seal(self, kind: int, body: bytes) -> bytes:
         """Make the datagram that carries `body`."""
         counter = self._counters[kind]
         self._counters[kind] = counter + 1
-        epoch = NO_EPOCH if kind == Kind.HELLO else self.epoch
+        epoch = NO_EPOCH if kind == HELLO else self.epoch
         return encode_header(kind, self._sends, epoch, counter) + body
 
     def open(self, data: bytes) -> Datagram:
@@ -54,7 +55,7 @@ class Session:
             DecodeError: "malformed", "version", or "direction" for one of our own direction.
         """
         datagram = decode(data)
-        if datagram.direction == self._sends:
+        if datagram[1] == self._sends:
             raise DecodeError("direction")
         return datagram
 

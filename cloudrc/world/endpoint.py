@@ -1,19 +1,21 @@
 """World's end of the tunnel: commands come in, the robot flies, telemetry leaves.
 
-Time only moves in `_advance`: whatever comes in, the ticks before it are run first, so the result
-does not depend on when a driver wakes up. World alone hands out epochs: a new cloud process gets a
-new one, and so does a mission that starts from the spawn.
+Time only moves in `_advance`: before anything that comes in has an effect, the ticks before it are
+run, so the result does not depend on when a driver wakes up. World alone hands out epochs: a new
+cloud process gets a new one, and so does a mission that starts from the spawn.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass
+from math import nan
 
 from cloudrc.messages import (
     NEVER_NS,
     Command,
     Odometry,
+    OperatorRequest,
     Request,
     Start,
     Telemetry,
@@ -30,7 +32,7 @@ from cloudrc.records import (
 )
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import USED, Channel
-from cloudrc.tunnel.codec import Accept, Datagram, DecodeError, Direction, Hello, Kind
+from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.session import Session
 from cloudrc.world.clock import CATCH_UP_NS, SimulationClock
 from cloudrc.world.robot import Robot
@@ -87,6 +89,7 @@ class WorldEndpoint:
         self._command_age_max_ns = command_age_max_ns
         self._last_epoch = identity.last_epoch
         self._cloud = Hello(b"", b"")
+        self._clock_is_shared = False
         self._mission = 0
         self._stalled_wake_ns = NEVER_NS
         self._odometry_ns = start_ns
@@ -95,7 +98,7 @@ class WorldEndpoint:
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._datagrams: list[bytes] = []
         self._records: list[Record] = []
-        self._counts: Counter[str] = Counter()
+        self._counts: defaultdict[str, int] = defaultdict(int)
 
     @property
     def slip_ns(self) -> int:
@@ -123,15 +126,16 @@ class WorldEndpoint:
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
         """Take in one datagram; what is not valid is counted and dropped."""
         world_ns = self._follow(now_ns)
-        self._advance(world_ns)
         try:
-            datagram = self._session.open(data)
-            if datagram.kind == COMMAND:
-                self._receive_command(datagram, now_ns)
-            elif datagram.kind == Kind.OPERATOR:
-                self._receive_operator(datagram)
-            elif datagram.kind == Kind.HELLO:
-                self._receive_hello(codec.decode_hello(datagram.body))
+            kind, _, epoch, counter, body = self._session.open(data)
+            if kind == COMMAND:
+                self._receive_command(epoch, counter, body, now_ns, world_ns)
+            elif kind == Kind.OPERATOR:
+                self._advance(world_ns)
+                self._receive_operator(epoch, codec.decode_operator(body))
+            elif kind == Kind.HELLO:
+                self._advance(world_ns)
+                self._receive_hello(codec.decode_hello(body))
             else:
                 raise DecodeError("malformed")
         except DecodeError as error:
@@ -143,17 +147,21 @@ class WorldEndpoint:
         if behind_ns > self._command_age_max_ns:
             self._stalled_wake_ns = now_ns
             self._counts["stalls"] += 1
-        return self._clock.follow(now_ns) if behind_ns > CATCH_UP_NS else now_ns - self._clock.slip_ns
+        if behind_ns > CATCH_UP_NS:
+            return self._clock.follow(now_ns)
+        return now_ns - self._clock.slip_ns
 
     def _advance(self, until_ns: int) -> None:
         """Run all ticks before `until_ns` [world's clock]."""
-        clock = self._clock
-        if clock.tick_ns < until_ns and self._waiting is not None:
-            self._apply(clock.tick_ns)
-        while clock.tick_ns < until_ns:
-            if clock.tick_ns >= self._odometry_ns:
-                self._send_telemetry(clock.tick_ns)
-            clock.tick_ns = self.robot.run(clock.tick_ns, min(until_ns, self._odometry_ns))
+        clock, tick_ns = self._clock, self._clock.tick_ns
+        if tick_ns < until_ns and self._waiting is not None:
+            self._apply(tick_ns)
+        while tick_ns < until_ns:
+            if tick_ns >= self._odometry_ns:
+                self._send_telemetry(tick_ns)
+            odometry_ns = self._odometry_ns
+            stop_ns = odometry_ns if odometry_ns < until_ns else until_ns
+            tick_ns = clock.tick_ns = self.robot.run(tick_ns, stop_ns)
 
     def _apply(self, now_ns: int) -> None:
         """The waiting command reaches the low-level controller with this tick."""
@@ -162,20 +170,22 @@ class WorldEndpoint:
         self._waiting = None
         self._echo_stamp_ns, self._applied_ns = command.stamp_ns, now_ns
         basis_ns = command.basis_stamp_ns
-        self._records.append(
-            CommandApplied(now_ns, epoch, counter, basis_ns, command.velocity)
-        )
+        self._records.append(CommandApplied(now_ns, epoch, counter, basis_ns, command.velocity))
 
     def _send_telemetry(self, now_ns: int) -> None:
         """Measure, tell cloud, and note down the truth."""
-        robot, records = self.robot, self._records
-        tip_force = robot.simulator.tip_force()
-        truth = Odometry(now_ns, *robot.simulator.readings[:4])
-        records.append(GroundTruth(now_ns, truth, tip_force, robot.guard.reference))
-        records += robot.guard.take_changes()
-        for touch in robot.simulator.take_contacts():
-            records.append(Contact(now_ns, **touch._asdict()))
-        if self._session.epoch:
+        simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
+        tip_force = simulator.tip_force()
+        position, orientation, velocity, rate, _ = simulator.readings
+        truth = Odometry(now_ns, position, orientation, velocity, rate)
+        records.append(GroundTruth(now_ns, truth, tip_force, guard.reference))
+        if guard.changes:
+            records += guard.take_changes()
+        if simulator.touches:
+            for touch in simulator.take_contacts():
+                records.append(Contact(now_ns, **touch._asdict()))
+        epoch = self._session.epoch
+        if epoch:
             telemetry = Telemetry(
                 now_ns,
                 self._sensors.measure(truth),
@@ -184,11 +194,11 @@ class WorldEndpoint:
                 now_ns - self._applied_ns if self._applied_ns >= 0 else 0,
                 self._clock.slip_ns,
                 self._mission,
-                robot.guard.state,
+                guard.state,
             )
             counter = self._session.next_counter(TELEMETRY)
             self._send(TELEMETRY, codec.encode_telemetry(telemetry))
-            records.append(TelemetrySent(now_ns, self._session.epoch, counter, telemetry))
+            records.append(TelemetrySent(now_ns, epoch, counter, telemetry))
         if now_ns >= self._count_ns:
             self._count_ns += COUNT_PERIOD_NS
             for name, count in sorted(self._counts.items()):
@@ -198,6 +208,7 @@ class WorldEndpoint:
     def _receive_hello(self, hello: Hello) -> None:
         if hello.nonce != self._cloud.nonce:
             self._cloud = hello
+            self._clock_is_shared = hello.clock == self._identity.clock_id
             self._mission = 0
             self._open_epoch("cloud said hello")
         self._accept()
@@ -217,9 +228,11 @@ class WorldEndpoint:
         accept = Accept(self._cloud.nonce, identity.nonce, identity.clock_id)
         self._send(Kind.ACCEPT, codec.encode_accept(accept))
 
-    def _receive_operator(self, datagram: Datagram) -> None:
-        request = codec.decode_operator(datagram.body)
-        if self._is_of_old_epoch(datagram) or request.number <= self._mission:
+    def _receive_operator(self, epoch: int, request: OperatorRequest) -> None:
+        if epoch != self._session.epoch:
+            self._counts["old_epoch"] += 1
+            return
+        if request.number <= self._mission:
             return
         self._mission = request.number
         guard, now_ns = self.robot.guard, self._clock.tick_ns
@@ -232,32 +245,25 @@ class WorldEndpoint:
             self._accept()
         guard.start_mission(now_ns)
 
-    def _receive_command(self, datagram: Datagram, now_ns: int) -> None:
+    def _receive_command(
+        self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
+    ) -> None:
         """Whatever arrives for this epoch is noted; the newest is offered to the guard."""
-        if self._is_of_old_epoch(datagram):
+        if epoch != self._session.epoch:
+            self._counts["old_epoch"] += 1
             return
-        epoch, counter = datagram.epoch, datagram.counter
-        command = codec.decode_command(datagram.body)
+        command, guard = codec.decode_command(body), self.robot.guard
         outcome = self._channel.take(counter)
         if outcome == USED:
+            self._advance(world_ns)
             stalled = now_ns == self._stalled_wake_ns
-            guard, tick_ns = self.robot.guard, self._clock.tick_ns
-            outcome = "stale" if stalled else guard.offer(command, tick_ns) or USED
-        shared = self._cloud.clock == self._identity.clock_id
-        delay = (now_ns - command.stamp_ns) * 1e-9 if shared else float("nan")
+            outcome = "stale" if stalled else guard.offer(command, self._clock.tick_ns) or USED
         used = outcome == USED
-        self._records.append(
-            Arrival(now_ns - self._clock.slip_ns, False, epoch, counter, delay, used)
-        )
-        if used and self.robot.guard.armed:
+        delay = (now_ns - command.stamp_ns) * 1e-9 if self._clock_is_shared else nan
+        self._records.append(Arrival(world_ns, False, epoch, counter, delay, used))
+        if used and guard.armed:
             self._waiting = (epoch, counter, command)
         self._counts[outcome] += 1
-
-    def _is_of_old_epoch(self, datagram: Datagram) -> bool:
-        if datagram.epoch == self._session.epoch:
-            return False
-        self._counts["old_epoch"] += 1
-        return True
 
     def _send(self, kind: int, body: bytes) -> None:
         self._datagrams.append(self._session.seal(kind, body))

@@ -47,7 +47,7 @@ class Guard:
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._changes: list[GuardChange] = []
+        self.changes: list[GuardChange] = []  # since the last `take_changes`
         self.state = GuardState.GROUND
         self.armed = False  # true from the operator's start of a mission to its end
         self._fresh_until_ns = NEVER_NS
@@ -124,7 +124,7 @@ class Guard:
 
     def take_changes(self) -> list[GuardChange]:
         """Hand over the changes of state since the last call."""
-        changes, self._changes = self._changes, []
+        changes, self.changes = self.changes, []
         return changes
 
     def _lose_link(self, now_ns: int) -> None:
@@ -146,7 +146,7 @@ class Guard:
     def _enter(self, state: GuardState, now_ns: int, cause: str) -> None:
         self.state = state
         self._anchor = None
-        self._changes.append(GuardChange(now_ns, state, cause))
+        self.changes.append(GuardChange(now_ns, state, cause))
 
 
 def _norm(a: Vector) -> float:
@@ -174,9 +174,10 @@ def _shortened(a: Vector, length_max: float) -> Vector:
 
 def _towards(start: Vector, end: Vector, step: float) -> Vector:
     """The point on the way from `start` to `end` that is at most `step` away from `start`."""
-    way = _minus(end, start)
-    length = _norm(way)
+    (ax, ay, az), (bx, by, bz) = start, end
+    x, y, z = bx - ax, by - ay, bz - az
+    length = sqrt(x * x + y * y + z * z)
     if length <= step:
         return end
-    way = _scaled(way, step / length)
-    return (start[0] + way[0], start[1] + way[1], start[2] + way[2])
+    share = step / length
+    return (ax + share * x, ay + share * y, az + share * z)

@@ -12,6 +12,7 @@ one and the gains are those that the published code then has in effect.
 from __future__ import annotations
 
 from math import sqrt
+from typing import TypeAlias
 
 from cloudrc.messages import ZERO, Vector
 from cloudrc.world.readings import Readings, RotorSpeeds
@@ -28,6 +29,9 @@ TILT_RATE_GAIN, YAW_RATE_GAIN = 0.22, 0.01
 THRUST_MAX = THRUST_COEFFICIENT * SPEED_MAX**2
 """Of one rotor [N]."""
 TINY = 1e-9
+
+Effort: TypeAlias = tuple[float, float, float, float]
+"""Thrust [N] and torque about x, y, z [N m], body frame."""
 
 _WEIGHT = MASS * GRAVITY
 _HALF_TILT_GAIN, _HALF_YAW_GAIN = 0.5 * TILT_GAIN, 0.5 * YAW_GAIN
@@ -57,9 +61,9 @@ class LowLevel:
             dt: Time between two updates [s].
         """
         dx, dy, dz = gain_d
+        # Of the error, its integral and its change in a tick: one tuple is fast to unpack.
         self._gains = (*gain_p, *gain_i, dx / dt, dy / dt, dz / dt)
-        self._limits = (integral_limit_xy, integral_limit_z)
-        self._dt = dt
+        self._limits = (integral_limit_xy, integral_limit_z, dt)
         self.reset()
 
     def reset(self) -> None:
@@ -78,8 +82,7 @@ class LowLevel:
             Front, left, back, right [rad/s], each in [0, 1838].
         """
         force = self.force(readings.velocity, velocity_reference)
-        thrust, torque = attitude(force, readings)
-        return allocate(thrust, torque)
+        return allocate(attitude(force, readings))
 
     def force(self, velocity: Vector, reference: Vector) -> Vector:
         """Compute the force that the robot needs, and move the integral on by one `dt`.
@@ -95,7 +98,7 @@ class LowLevel:
             [N], world frame, shape (3,).
         """
         px, py, pz, ix, iy, iz, dx, dy, dz = self._gains
-        (limit_xy, limit_z), dt = self._limits, self._dt
+        limit_xy, limit_z, dt = self._limits
         vx, vy, vz = velocity
         rx, ry, rz = reference
         # Of opposite sign to the equation's, which saves turning every term.
@@ -120,7 +123,7 @@ class LowLevel:
         )
 
 
-def attitude(force: Vector, readings: Readings) -> tuple[float, Vector]:
+def attitude(force: Vector, readings: Readings) -> Effort:
     """Turn the thrust axis towards `force`, nose along +x.
 
     z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
@@ -133,7 +136,7 @@ def attitude(force: Vector, readings: Readings) -> tuple[float, Vector]:
         readings: State of the base.
 
     Returns:
-        Thrust [N] and torque [N m], body frame, shape (3,).
+        Thrust [N] and torque [N m], body frame, shape (4,).
     """
     fx, fy, fz = force
     _, _, _, (p, q, r), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = readings
@@ -150,14 +153,15 @@ def attitude(force: Vector, readings: Readings) -> tuple[float, Vector]:
     y1 = scale * (fz * yy - fy * yz)
     y2 = scale * (fz * zy - fy * zz)
 
-    return thrust, (
-        -_HALF_TILT_GAIN * (z1 - y2) - TILT_RATE_GAIN * p,
-        -_HALF_TILT_GAIN * (y0 * z1 - y1 * z0 - z0) - TILT_RATE_GAIN * q,
-        -_HALF_YAW_GAIN * (y0 - y2 * z0 + y0 * z2) - YAW_RATE_GAIN * r,
+    return (
+        thrust,
+        _HALF_TILT_GAIN * (y2 - z1) - TILT_RATE_GAIN * p,
+        _HALF_TILT_GAIN * (z0 + y1 * z0 - y0 * z1) - TILT_RATE_GAIN * q,
+        _HALF_YAW_GAIN * (y2 * z0 - y0 * z2 - y0) - YAW_RATE_GAIN * r,
     )
 
 
-def allocate(thrust: float, torque: Vector) -> RotorSpeeds:
+def allocate(effort: Effort) -> RotorSpeeds:
     """Split thrust and torque over the rotors.
 
     f = T/4 + (-ty/2l + tz/4km, tx/2l - tz/4km, ty/2l + tz/4km, -tx/2l - tz/4km) for front, left,
@@ -165,13 +169,12 @@ def allocate(thrust: float, torque: Vector) -> RotorSpeeds:
     Source: plant.md, "LLC".
 
     Args:
-        thrust: [N].
-        torque: [N m], body frame, shape (3,).
+        effort: Thrust [N] and torque [N m], body frame, shape (4,).
 
     Returns:
         Front, left, back, right [rad/s].
     """
-    roll, pitch, yaw = torque
+    thrust, roll, pitch, yaw = effort
     roll, pitch, yaw = roll / _TWO_ARMS, pitch / _TWO_ARMS, yaw / _FOUR_RATIOS
     share = 0.25 * thrust
     with_yaw, against_yaw = share + yaw, share - yaw

@@ -43,7 +43,7 @@ class Readings(NamedTuple):
 
         Args:
             pose: Position [m] and orientation (wxyz, unit) in the world frame, shape (7,).
-            twist: Velocity [m/s], world frame, and angular velocity [rad/s], body frame, shape (6,).
+            twist: Velocity [m/s], world frame; angular velocity [rad/s], body frame; shape (6,).
         """
         px, py, pz, w, x, y, z = pose
         vx, vy, vz, p, q, r = twist

@@ -1,7 +1,8 @@
 """The rotors between command and force: commanded speeds in, thrusts and a drag wrench out.
 
-Plain floats; this runs at every physics step. Order of the rotors everywhere: front (+x), left (+y), back, right. Front and back give a positive reaction torque about z for
-their thrust, left and right a negative one.
+Plain floats; this runs at every physics step. Order of the rotors everywhere: front (+x), left
+(+y), back, right. Front and back give a positive reaction torque about z for their thrust, left and
+right a negative one.
 Source: plant.md, "Robot", which restates the RotorS model of the paper's world.
 """
 
@@ -34,11 +35,9 @@ STOPPED: RotorSpeeds = (0.0, 0.0, 0.0, 0.0)
 _DRAG_ARM = DRAG_COEFFICIENT * ARM
 _ARM_SQUARED = ARM * ARM
 
-Controls: TypeAlias = tuple[
-    float, float, float, float, float, float, float, float, float, float
-]
-"""What goes to MuJoCo: four thrusts [N], and the drag as a wrench at the base's origin, its force in
-the world frame [N], its torque in the body frame [N m], as a free joint wants it."""
+Controls: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
+"""What goes to MuJoCo: four thrusts [N]; the drag as a wrench at the base's origin, as a free joint
+wants it, force in the world frame [N], torque in the body frame [N m]."""
 
 
 class Rotors:

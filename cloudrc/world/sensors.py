@@ -25,10 +25,11 @@ class Sensors:
         """
         self._position_noise, self._velocity_noise = position_noise, velocity_noise
         self._rng = rng
+        self._exact = position_noise == velocity_noise == 0.0
 
     def measure(self, truth: Odometry) -> Odometry:
         """Make the odometry that goes to the cloud out of the true one; the same if noise-free."""
-        if self._position_noise == self._velocity_noise == 0.0:
+        if self._exact:
             return truth
         return truth._replace(
             position=self._noisy(truth.position, self._position_noise),

@@ -48,6 +48,7 @@ class Simulator:
         model: The compiled `MjModel`.
         dt: Duration of a step [s].
         readings: State of the base after the last step.
+        touches: What the robot began to touch since the last `take_contacts`.
         tape: If set to a list, every step since the last reset appends what it gave to MuJoCo;
             `replay` plays it again.
     """
@@ -86,7 +87,7 @@ class Simulator:
         self._steps = self._contacts = 0
         if self.tape is not None:
             self.tape.clear()
-        self._touches: list[Touch] = []
+        self.touches: list[Touch] = []
         # It stands on the floor: to touch that is news only after it has been in the air.
         self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
         self.readings = Readings.of(self._qpos, self._qvel)
@@ -117,7 +118,7 @@ class Simulator:
 
     def take_contacts(self) -> list[Touch]:
         """Hand over what the robot began to touch since the last call, oldest first."""
-        touches, self._touches = self._touches, []
+        touches, self.touches = self.touches, []
         return touches
 
     def state(self) -> State:
@@ -144,9 +145,7 @@ class Simulator:
             last = self._last_touch.get(touched)
             if last is None or self._steps - last > self._gap_steps:
                 tip_velocity = _velocity_at(before, self._tip_offset)
-                self._touches.append(
-                    Touch(*touched, before.position, before.velocity, tip_velocity)
-                )
+                self.touches.append(Touch(*touched, before.position, before.velocity, tip_velocity))
             self._last_touch[touched] = self._steps
 
 

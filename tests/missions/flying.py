@@ -56,7 +56,9 @@ def records(experiment: ResolvedExperiment, **options: int) -> tuple[list[Record
 def fly(name: str, *settings: str) -> Assessment:
     """Fly; numbers and verdict."""
     experiment = load_experiment(name, settings)
-    return assess(Recording.from_records(*records(experiment)), experiment, Run("virtual", "virtual"))
+    return assess(
+        Recording.from_records(*records(experiment)), experiment, Run("virtual", "virtual")
+    )
 
 
 def numbers(assessment: Assessment) -> dict[str, float]:

@@ -51,9 +51,10 @@ class Talk:
 
     def hello(self, nonce):
         self.send(self.session.seal(Kind.HELLO, codec.encode_hello(Hello(nonce.ljust(16), CLOCK))))
-        accepts = [d for d in map(codec.decode, self.world.take_datagrams()) if d.kind == Kind.ACCEPT]
-        self.session.begin(accepts[-1].epoch)
-        return accepts[-1].epoch
+        datagrams = map(codec.decode, self.world.take_datagrams())
+        epoch = [epoch for kind, _, epoch, _, _ in datagrams if kind == Kind.ACCEPT][-1]
+        self.session.begin(epoch)
+        return epoch
 
     def request(self, number, request, start):
         from cloudrc.messages import OperatorRequest
@@ -249,7 +250,9 @@ def test_a_restarted_world_opens_a_higher_epoch_and_fails_the_mission():
 def test_a_restarted_cloud_gets_a_new_epoch_and_flies_its_mission():
     def restart(ends):
         identity = CloudIdentity(CLOCK, b"another cloud".ljust(16))
-        experiment = load_experiment("hover", ["mission.start=here", "mission.waypoints.0.dwell_s=1"])
+        experiment = load_experiment(
+            "hover", ["mission.start=here", "mission.waypoints.0.dwell_s=1"]
+        )
         cloud = assembly.build_cloud(experiment, identity, lambda: ends.run.now_ns)
         ends.run._cloud = cloud
         return ends._replace(cloud=cloud)

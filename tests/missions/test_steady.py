@@ -22,7 +22,9 @@ def prediction_error(predictor, seeds):
 
 def test_constant_velocity_predicts_far_better_than_nothing():
     seeds = (1, 2)
-    assert prediction_error("constant_velocity", seeds) < 0.3 * prediction_error("last_sample", seeds)
+    assert prediction_error("constant_velocity", seeds) < 0.3 * prediction_error(
+        "last_sample", seeds
+    )
 
 
 @pytest.mark.full

@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.messages import Command, GuardState, Odometry, OperatorRequest, Request, Start, Telemetry
+from cloudrc.messages import (
+    Command,
+    GuardState,
+    Odometry,
+    OperatorRequest,
+    Request,
+    Start,
+    Telemetry,
+)
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Kind
 
@@ -18,7 +26,9 @@ telemetries = st.builds(
         stamp, Odometry(stamp, position, orientation, velocity, rate), *rest
     ),
     stamps,
-    st.tuples(floats, stamps, stamps, stamps, st.integers(0, 2**32 - 1), st.sampled_from(GuardState)),
+    st.tuples(
+        floats, stamps, stamps, stamps, st.integers(0, 2**32 - 1), st.sampled_from(GuardState)
+    ),
     vectors,
     st.tuples(floats, floats, floats, floats),
     vectors,

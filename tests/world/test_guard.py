@@ -22,7 +22,7 @@ def command(velocity=(1.0, 0.0, 0.0), basis_ns=0, yaw_rate=0.0):
 
 
 def sensed(position, velocity):
-    return Readings.of(position, UPRIGHT, velocity, STILL)
+    return Readings.of((*position, *UPRIGHT), (*velocity, *STILL))
 
 
 @pytest.fixture
@@ -42,7 +42,8 @@ def tracking(velocity, now_ns=0):
 def run(guard, start_ns, end_ns, position=HERE, velocity=STILL):
     """Tick through a time; returns the references."""
     return [
-        guard.tick(now_ns, sensed(position, velocity), 0.002) for now_ns in range(start_ns, end_ns, TICK)
+        guard.tick(now_ns, sensed(position, velocity), 0.002)
+        for now_ns in range(start_ns, end_ns, TICK)
     ]
 
 

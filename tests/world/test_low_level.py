@@ -13,7 +13,13 @@ from cloudrc.world.readings import Readings
 
 WEIGHT = 10.3005  # 1.05 kg * 9.81 m/s^2
 KF = 9.9865e-6
-AT_REST = Readings.of(ZERO, UPRIGHT, ZERO, ZERO)
+
+
+def turned(orientation, rate=ZERO):
+    return Readings.of((*ZERO, *orientation), (*ZERO, *rate))
+
+
+AT_REST = turned(UPRIGHT)
 
 
 def test_at_rest_the_force_is_the_weight_that_the_controller_believes_in():
@@ -66,21 +72,21 @@ def test_attitude_error_is_the_sine_of_the_angle(axis, gain):
     # Rolled, pitched or yawed by 20 deg while the force is straight up: e_R = sin 20 deg.
     half = radians(10.0)
     tilted = (cos(half), *(sin(half) * a for a in axis))
-    thrust, torque = attitude((0.0, 0.0, 10.0), tilted, ZERO)
+    thrust, *torque = attitude((0.0, 0.0, 10.0), turned(tilted))
     assert torque == pytest.approx([-gain * sin(radians(20.0)) * a for a in axis])
     assert thrust == pytest.approx(10.0 * (1.0 if axis[2] else cos(radians(20.0))))
 
 
 def test_a_forward_force_pitches_the_nose_down():
     # Wanted tilt atan(3/4) about +y, so e_R = -sin = -.6; thrust is the force's part along z.
-    thrust, torque = attitude((3.0, 0.0, 4.0), UPRIGHT, ZERO)
-    assert torque == pytest.approx((0, 0.6, 0))
+    thrust, *torque = attitude((3.0, 0.0, 4.0), AT_REST)
+    assert torque == pytest.approx([0, 0.6, 0])
     assert thrust == pytest.approx(4.0)
 
 
 def test_rates_are_damped():
-    _, torque = attitude((0.0, 0.0, 10.0), UPRIGHT, (1.0, 2.0, 3.0))
-    assert torque == pytest.approx((-0.22, -0.44, -0.03))
+    _, *torque = attitude((0.0, 0.0, 10.0), turned(UPRIGHT, (1.0, 2.0, 3.0)))
+    assert torque == pytest.approx([-0.22, -0.44, -0.03])
 
 
 unit = st.floats(-1.0, 1.0)
@@ -100,14 +106,14 @@ def test_attitude_is_the_matrix_formula(force, quaternion):
     y_d /= np.linalg.norm(y_d)
     error = np.column_stack([np.cross(y_d, z_d), y_d, z_d]).T @ rotation
     error = 0.5 * (error - error.T)
-    thrust, torque = attitude(force, (w, *q), ZERO)
+    thrust, *torque = attitude(force, turned((w, *q)))
     assert thrust == pytest.approx(np.dot(force, rotation[:, 2]), abs=1e-9)
-    assert torque == pytest.approx((-error[2, 1], -error[0, 2], -0.035 * error[1, 0]), abs=1e-9)
+    assert torque == pytest.approx([-error[2, 1], -error[0, 2], -0.035 * error[1, 0]], abs=1e-9)
 
 
 @pytest.mark.parametrize("force", [ZERO, (5.0, 0.0, 0.0), (0.0, 0.0, -5.0)])
 def test_no_force_leaves_the_attitude_undefined(force):
-    thrust, torque = attitude(force, UPRIGHT, ZERO)
+    thrust, *torque = attitude(force, AT_REST)
     assert isfinite(thrust)
     assert all(isfinite(t) for t in torque)
 
@@ -118,7 +124,7 @@ small = st.floats(-0.1, 0.1)
 @settings(max_examples=50, deadline=None)
 @given(thrust=st.floats(6.0, 20.0), roll=small, pitch=small, yaw=st.floats(-0.02, 0.02))
 def test_allocation_gives_thrust_and_torque(thrust, roll, pitch, yaw):
-    front, left, back, right = (KF * w * w for w in allocate(thrust, (roll, pitch, yaw)))
+    front, left, back, right = (KF * w * w for w in allocate((thrust, roll, pitch, yaw)))
     # r x F for rotors at (.21, 0), (0, .21), (-.21, 0), (0, -.21) that push up.
     assert front + left + back + right == pytest.approx(thrust)
     assert 0.21 * (left - right) == pytest.approx(roll, abs=1e-12)
@@ -128,7 +134,7 @@ def test_allocation_gives_thrust_and_torque(thrust, roll, pitch, yaw):
 
 @pytest.mark.parametrize(("thrust", "speed"), [(-5.0, 0.0), (0.0, 0.0), (200.0, 1838.0)])
 def test_rotor_speeds_stay_within_their_range(thrust, speed):
-    assert allocate(thrust, ZERO) == (speed,) * 4
+    assert allocate((thrust, *ZERO)) == (speed,) * 4
 
 
 def test_a_slower_loop_integrates_over_its_own_period():

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.world.scene import FOLDER, compile_model, mujoco
 from cloudrc.world.rotors import STOPPED
+from cloudrc.world.scene import FOLDER, compile_model, mujoco
 from cloudrc.world.simulator import Simulator
 
 ROBOTS = sorted(path.stem for path in (FOLDER / "robots").glob("*.xml"))
@@ -101,7 +101,7 @@ def test_staves_are_tangent_to_the_pipe(pipes, name, expected):
     data = mujoco.MjData(pipes)
     mujoco.mj_kinematics(pipes, data)
     staves = [i for i in range(pipes.ngeom) if pipes.geom(i).name.startswith(f"{name}/")]
-    assert len(staves) == 24
+    assert len(staves) == 32
     directions = []
     for stave in staves:
         out = data.geom_xpos[stave] - centre
@@ -112,7 +112,7 @@ def test_staves_are_tangent_to_the_pipe(pipes, name, expected):
         assert frame[:, 0] @ out == pytest.approx(np.linalg.norm(out))
         assert np.linalg.norm(out) - thickness == pytest.approx(0.662)
         assert np.linalg.norm(out) + thickness == pytest.approx(0.700)
-        assert width == pytest.approx(0.700 * tan(pi / 24), abs=1e-4)
+        assert width == pytest.approx(0.700 * tan(pi / 32), abs=1e-4)
         assert length == 2.5
         directions.append(out / np.linalg.norm(out))
     assert np.sum(directions, axis=0) == pytest.approx([0, 0, 0], abs=1e-9)

@@ -11,10 +11,11 @@ from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.world.low_level import LowLevel, allocate
 from cloudrc.world.readings import Readings
 from cloudrc.world.replay import replay
-from cloudrc.world.rotors import RotorLag, drag
+from cloudrc.world.rotors import Rotors
 from cloudrc.world.simulator import Simulator
 
 HOVER = 10.394996  # 1.06 kg * 9.8066 m/s^2
+AT_REST = Readings.of((*ZERO, *UPRIGHT), (*ZERO, *ZERO))
 
 
 def fly(simulator, low_level, reference, duration):
@@ -23,11 +24,19 @@ def fly(simulator, low_level, reference, duration):
         simulator.step(low_level.update(simulator.readings, reference))
 
 
+def steady(speeds, readings):
+    """What rotors do to the robot that turn as commanded."""
+    rotors = Rotors(0.002)
+    rotors.speeds = speeds
+    return rotors.step(speeds, readings)
+
+
 def test_rotors_are_faster_up_than_down():
     # One time constant: 1 - 1/e of the way up in 12.5 ms; down only 1 - exp(-1/2).
-    up, same, down, off = RotorLag(0.0125).step(
-        (0.0, 500.0, 1000.0, 800.0), (100.0, 500.0, 0.0, 0.0)
-    )
+    rotors = Rotors(0.0125)
+    rotors.speeds = (0.0, 500.0, 1000.0, 800.0)
+    rotors.step((100.0, 500.0, 0.0, 0.0), AT_REST)
+    up, same, down, off = rotors.speeds
     assert up == pytest.approx(63.212, abs=1e-3)
     assert same == 500.0
     assert down == pytest.approx(606.531, abs=1e-3)
@@ -35,18 +44,27 @@ def test_rotors_are_faster_up_than_down():
 
 
 def test_the_lag_does_not_depend_on_the_step():
-    coarse = RotorLag(0.01).step((0.0,) * 4, (100.0,) * 4)
-    fine, lag = (0.0,) * 4, RotorLag(0.002)
+    coarse, fine = Rotors(0.01), Rotors(0.002)
+    coarse.step((100.0,) * 4, AT_REST)
     for _ in range(5):
-        fine = lag.step(fine, (100.0,) * 4)
-    assert fine == pytest.approx(coarse)
+        fine.step((100.0,) * 4, AT_REST)
+    assert fine.speeds == pytest.approx(coarse.speeds)
+
+
+def test_thrust_grows_with_the_square_of_the_speed():
+    # 9.9865e-6 * 500^2 = 2.496625 N.
+    assert steady((500.0, 1000.0, 0.0, 250.0), AT_REST)[:4] == pytest.approx(
+        (2.496625, 4 * 2.496625, 0.0, 2.496625 / 4)
+    )
 
 
 def test_drag_of_level_flight_by_hand():
     # Four rotors at 500 rad/s: 8.06428e-5 * 2000 = .1612856 N s/m. At 2 m/s: -.3225712 N, and it
     # acts .05 m above the base: torque .05 * -.3225712 about y.
-    wrench = drag((500.0,) * 4, Readings.of(ZERO, UPRIGHT, (2.0, 0.0, 1.0), ZERO))
-    assert wrench == pytest.approx((-0.3225712, 0, 0, 0, -0.01612856, 0))
+    readings = Readings.of((*ZERO, *UPRIGHT), (2.0, 0.0, 1.0, *ZERO))
+    assert steady((500.0,) * 4, readings)[4:] == pytest.approx(
+        (-0.3225712, 0, 0, 0, -0.01612856, 0)
+    )
 
 
 unit = st.floats(-1.0, 1.0)
@@ -69,13 +87,13 @@ def test_drag_is_the_sum_over_the_rotors(speeds, quaternion, velocity, rate):
         across = (rotation.T @ velocity + np.cross(rate, hub)) * (1, 1, 0)
         force += -speed * 8.06428e-5 * across
         torque += np.cross(hub, -speed * 8.06428e-5 * across)
-    wrench = drag(speeds, Readings.of(ZERO, (w, *q), velocity, rate))
+    wrench = steady(speeds, Readings.of((*ZERO, w, *q), (*velocity, *rate)))[4:]
     assert wrench == pytest.approx([*(rotation @ force), *torque], abs=1e-9)
 
 
 def test_it_stands_at_its_spawn():
     simulator = Simulator("pelican", "pipes")
-    assert simulator.readings == Readings.of((0.0, 0.0, 0.1), UPRIGHT, ZERO, ZERO)
+    assert simulator.readings == Readings.of((0.0, 0.0, 0.1, *UPRIGHT), (*ZERO, *ZERO))
     for _ in range(500):
         simulator.step((0.0,) * 4)
     assert simulator.readings.position == pytest.approx((0, 0, 0.1), abs=1e-3)
@@ -97,8 +115,8 @@ def test_the_torque_allocated_is_the_torque_that_turns(scene_at, axis, sign):
     torque[axis] = sign * 0.02
     turned, straight = (Simulator("pelican", scene_at(0, 0, 5, "empty")) for _ in range(2))
     for _ in range(50):
-        turned.step(allocate(HOVER, tuple(torque)))
-        straight.step(allocate(HOVER, ZERO))
+        turned.step(allocate((HOVER, *torque)))
+        straight.step(allocate((HOVER, *ZERO)))
     rates = zip(
         turned.readings.angular_velocity_body, straight.readings.angular_velocity_body, strict=True
     )

@@ -43,7 +43,9 @@ from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO, GuardState, Request, Setpoint, Start, Vector
 from cloudrc.records import MissionEvent
 
-UNDER_WAY = (State.STARTING, State.FLYING, State.HELD)
+# An enum's member is slow to look up; these are asked for in every period.
+FLYING, WORST_GUARD = State.FLYING, GuardState.HOLD
+UNDER_WAY = (FLYING, State.STARTING, State.HELD)
 NO_WAYPOINT = -1
 NO_PLAN = Plan((Leg(ZERO),))
 """Stands in until the first mission starts; never flown."""
@@ -55,13 +57,14 @@ class Teleop:
     Attributes:
         state: Of the mission.
         outcome: How it ended; None while there is none or it is under way.
+        outputs: What it has said since the last `take_outputs`.
     """
 
     def __init__(self) -> None:
         self.state = State.IDLE
         self.outcome: Outcome | None = None
         self._requests = Repeater()
-        self._outputs: list[Output] = []
+        self.outputs: list[Output] = []
         self._seen: Seen | None = None
         self._plan = NO_PLAN
         self._leg = 0
@@ -76,7 +79,7 @@ class Teleop:
 
     def take_outputs(self) -> list[Output]:
         """Hand over what teleop has said since the last call, oldest first."""
-        outputs, self._outputs = self._outputs, []
+        outputs, self.outputs = self.outputs, []
         return outputs
 
     def operate(self, verb: Verb, now_ns: int) -> None:
@@ -120,9 +123,9 @@ class Teleop:
             self._fail("world_restarted", f"world restarted {self._where()}", now_ns)
         elif started:
             self._begin(now_ns)
-        elif seen.guard > GuardState.HOLD and self.state is not State.STARTING:
+        elif seen.guard > WORST_GUARD and self.state is not State.STARTING:
             self._fail("guard_stopped", f"guard went to {seen.guard.name} {self._where()}", now_ns)
-        while self.state is State.FLYING and self._is_reached(seen, now_ns):
+        while self.state is FLYING and self._is_reached(seen, now_ns):
             self._advance(now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
@@ -131,7 +134,7 @@ class Teleop:
             self._check_time(now_ns)
         request = self._requests.due(now_ns)
         if request is not None:
-            self._outputs.append(request)
+            self.outputs.append(request)
 
     def _start(self, plan: Plan, now_ns: int) -> None:
         self.state, self.outcome = State.STARTING, None
@@ -211,7 +214,7 @@ class Teleop:
             else:
                 text = f"mission not done within {limit:g} s: {self._where()}"
             self._fail("timed_out", text, now_ns)
-        elif self.state is State.FLYING and now_ns - self._leg_began_ns >= leg.time_limit * 1e9:
+        elif self.state is FLYING and now_ns - self._leg_began_ns >= leg.time_limit * 1e9:
             text = f"{self._waypoint_text()} not reached within {leg.time_limit:g} s"
             self._fail("leg_timed_out", text, now_ns)
 
@@ -237,10 +240,10 @@ class Teleop:
 
     def _aim(self, position: Vector, yaw: float, waypoint: int) -> None:
         self._yaw = yaw
-        self._outputs.append(Setpoint(position, yaw, waypoint))
+        self.outputs.append(Setpoint(position, yaw, waypoint))
 
     def _tell(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
-        self._outputs.append(MissionEvent(now_ns, event, waypoint, text))
+        self.outputs.append(MissionEvent(now_ns, event, waypoint, text))
 
     def _expects_restart(self) -> bool:
         return self.state is State.STARTING and self._plan.start is Start.SPAWN
