@@ -30,6 +30,7 @@ class StopSignal:
             signal.signal(number, self._ask)
 
     def __call__(self) -> bool:
+        """Say whether somebody has asked for the end, or nobody is left to ask."""
         return self._asked or os.getppid() != self._parent
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
@@ -47,7 +48,8 @@ class Takes(Recorder, Protocol):
     error: str
 
     @property
-    def dropped(self) -> int: ...
+    def dropped(self) -> int:
+        """Number of records that did not reach the file."""
 
     def put(self, records: Iterable[Record]) -> None:
         """Take records over; never waits and never raises."""

@@ -16,7 +16,7 @@ def sent(stamp_ns):
     return TelemetrySent(stamp_ns, 1, 2, telemetry)
 
 
-EVENT = MissionEvent(5, "reached", 1, 'waypoint "2" of 7 – reached')
+EVENT = MissionEvent(5, "reached", 1, 'waypoint "2" of 7 \u2013 reached')
 
 
 @pytest.mark.parametrize("record", [sent(7), EVENT, GuardChange(1, GuardState.HOLD, "why")])

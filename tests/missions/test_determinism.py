@@ -1,4 +1,4 @@
-"""The same experiment and seed give the same records, bit by bit; time zones of clocks do not matter."""
+"""The same experiment and seed give the same records, bit by bit, whatever the clocks say."""
 
 import os
 import subprocess
