@@ -25,3 +25,15 @@ class InvalidRunError(CloudrcError):
     """The run was not what was asked for: not in real time, or a process died."""
 
     exit_code = 6
+
+
+class TimedOutError(CloudrcError):
+    """Something did not happen in the time that it had."""
+
+    exit_code = 4
+
+
+class InterruptedRunError(CloudrcError):
+    """A person ended the run before there was anything to report."""
+
+    exit_code = 130

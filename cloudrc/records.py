@@ -202,7 +202,8 @@ class Fault(NamedTuple):
 
     Attributes:
         stamp_ns: [ns], own clock.
-        code: One word: "predictor_raised", "predictor_not_finite", "horizon_clamped".
+        code: One word: "estimator_failed", "predictor_failed", "controller_failed", "recorder",
+            "late".
         text: What, where, what to do.
     """
 

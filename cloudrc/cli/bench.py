@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import table
+from cloudrc.cli.parser import count
 from cloudrc.errors import CloudrcError
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", choices=("table", "json"), default="table", help="default: table"
     )
     parser.add_argument(
-        "--repeats", type=int, default=7, metavar="N", help="of each part (default: 7)"
+        "--repeats", type=count, default=7, metavar="N", help="of each part (default: 7)"
     )
 
 
@@ -52,7 +53,7 @@ def execute(options: argparse.Namespace) -> int:
     require("the bench", ("world",))
     from cloudrc.config.load import load_experiment
 
-    costs = measure(load_experiment("paper"), max(1, options.repeats))
+    costs = measure(load_experiment("paper"), options.repeats)
     raw = costs["raw mj_step"]
     figures = {
         name: {"us_per_step": cost * 1e6, "ratio": raw / cost, "real_time_factor": STEP / cost}

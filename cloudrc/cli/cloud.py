@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import end_arguments, open_recorder, warn_if_exposed
+from cloudrc.cli.ends import end_arguments, listening, open_recorder, warn_if_exposed
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +28,8 @@ def execute(options: argparse.Namespace) -> int:
     warn_if_exposed(options.listen)
     experiment, clock = load_experiment(str(options.config)), clock_id()
     recorder = open_recorder(options.record, "cloud", clock)
-    peer = Peer.bind(options.listen, options.peer)
+    with listening("--listen", options.listen):
+        peer = Peer.bind(options.listen, options.peer)
     identity = CloudIdentity(clock, os.urandom(16))
     cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns)
     run_end(cloud, peer, recorder, end="cloud", over=lambda: cloud.mission_over)

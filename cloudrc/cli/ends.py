@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.record.recorder import Recorder
@@ -42,6 +46,18 @@ def warn_if_exposed(listen: Address) -> None:
     """Say so if others than this machine can send to an address."""
     if not listen[0].startswith("127."):
         print(f"cloudrc: warning: {listen[0]} can be reached from outside", file=sys.stderr)
+
+
+@contextmanager
+def listening(flag: str, listen: Address) -> Iterator[None]:
+    """Open a socket at an address inside; if that fails, say which flag asked for what."""
+    try:
+        yield
+    except OSError as error:
+        raise BadInputError(
+            f"{flag} {listen[0]}:{listen[1]}: cannot receive there: {error.strerror or error};"
+            " name an address of this machine and a port that is free"
+        ) from error
 
 
 def open_recorder(path: Path | None, clock: str, clock_id: bytes) -> Recorder:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.errors import CloudrcError
+from cloudrc.errors import CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
@@ -43,9 +43,15 @@ def fly(
     """
     from cloudrc.config.load import dump
 
-    (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
     fly_mode = _fly_virtual if mode == "virtual" else _fly_local
-    return fly_mode(experiment, folder, see, page)
+    try:
+        (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+        return fly_mode(experiment, folder, see, page)
+    except OSError as error:
+        where = error.filename or folder
+        raise CloudrcError(
+            f"{where}: {error.strerror or error}; make room or choose another folder with --out"
+        ) from error
 
 
 def _fly_virtual(
@@ -53,31 +59,36 @@ def _fly_virtual(
 ) -> dict[str, Any]:
     from cloudrc.record.columns import Recording
     from cloudrc.record.hash import RecordHash
-    from cloudrc.record.merge import write_mission
+    from cloudrc.record.order import merged
+    from cloudrc.record.writer import McapWriter
     from cloudrc.report.document import Run
 
     world: list[Record] = []
     cloud: list[Record] = []
     digest = RecordHash()
+    # Written while it flies: whatever becomes of the run or its report, the recording is kept.
+    with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
-    def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-        for kept, new in ((cloud, from_cloud), (world, from_world)):
-            kept.extend(new)
-            digest.update(new)
-            see(new)
+        def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+            for log_time_ns, row in merged(from_world, from_cloud):
+                writer.write_row(row, log_time_ns)
+            for kept, new in ((cloud, from_cloud), (world, from_world)):
+                kept.extend(new)
+                digest.update(new)
+                see(new)
 
-    interrupted = False
-    try:
-        _virtual_run(experiment, sink)
-    except KeyboardInterrupt:
-        interrupted = True
-    run = Run("virtual", "virtual", digest.hexdigest(), interrupted)
-    try:
+        interrupted = False
+        try:
+            _virtual_run(experiment, sink)
+        except KeyboardInterrupt:
+            interrupted = True
+        run = Run("virtual", "virtual", digest.hexdigest(), interrupted)
         recording = Recording.from_records(world, cloud)
-        return _report(folder, recording, experiment, run, page=page)
-    finally:
-        # Whatever becomes of the report, the recording is kept.
-        write_mission(folder / "mission.mcap", world, cloud, attachments=_attachments(folder))
+        try:
+            return _report(folder, recording, experiment, run, page=page)
+        finally:
+            for name, data in _attachments(folder).items():
+                writer.attach(name, data)
 
 
 def _virtual_run(
@@ -103,13 +114,14 @@ def _fly_local(
     from cloudrc.report.document import Run
 
     run, trouble = Run("local", "relay"), None
+    nothing = InterruptedRunError("interrupted before anything was recorded")
     try:
         LocalRun(folder, see).fly(experiment.criteria.time_limit_s + GRACE)
     except KeyboardInterrupt:
         run = replace(run, interrupted=True)
     except CloudrcError as error:
         run, trouble = replace(run, interrupted=True, notes=(str(error),)), error
-    document = _report_ends(folder, experiment, run, page, trouble)
+    document = _report_ends(folder, experiment, run, page, trouble or nothing)
     if trouble is not None:
         raise trouble
     return document
@@ -120,7 +132,7 @@ def _report_ends(
     experiment: ResolvedExperiment,
     run: Run,
     page: bool,
-    trouble: CloudrcError | None,
+    trouble: CloudrcError,
 ) -> dict[str, Any]:
     """Merge what both ends recorded, and report on it."""
     from cloudrc.record.hash import messages_sha256
@@ -129,7 +141,7 @@ def _report_ends(
     try:
         mission = merge(folder / "world.mcap", folder / "cloud.mcap")
     except CloudrcError as error:  # nothing was recorded: say why rather than that
-        raise trouble or error from None
+        raise trouble if run.interrupted else error from None
     run = replace(run, records_sha256=messages_sha256(mission.contents.messages))
     try:
         return _report(folder, mission.recording(), experiment, run, page=page)
@@ -142,7 +154,13 @@ def _report(
 ) -> dict[str, Any]:
     from cloudrc.report.write import write_report
 
-    return write_report(folder, recording, experiment, run, page=page)
+    try:
+        return write_report(folder, recording, experiment, run, page=page)
+    except KeyboardInterrupt:
+        raise InterruptedRunError(
+            f"interrupted; the recording is kept, the report is not written: "
+            f"run 'cloudrc report {folder}'"
+        ) from None
 
 
 def _attachments(folder: Path) -> dict[str, bytes]:

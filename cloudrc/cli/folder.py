@@ -18,8 +18,17 @@ def new_folder(out: Path | None, name: str) -> Path:
         name: Experiment, mode and seed in one word.
 
     Raises:
-        BadInputError: If `out` exists and is not an empty folder.
+        BadInputError: If `out` exists and is not an empty folder, or if it cannot be made.
     """
+    try:
+        return _new_folder(out, name)
+    except OSError as error:
+        where = f"--out {out}" if out else f"{RUNS}/ in the working folder"
+        remedy = "name another folder" if out else "name a folder that you may write in with --out"
+        raise BadInputError(f"{where}: cannot be made: {error.strerror}; {remedy}") from error
+
+
+def _new_folder(out: Path | None, name: str) -> Path:
     if out is not None:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise BadInputError(

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+import textwrap
 import time
 from collections.abc import Callable, Iterable
 from typing import TextIO
 
-from cloudrc.cli.output import is_live, paint
+from cloudrc.cli.output import columns, is_live, paint, unread_is_fine
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import Control, Fault, GuardChange, MissionEvent, Record, TelemetrySent
 
 ENDINGS = ("done", "cancelled", "timed_out")
 REDRAW_PERIOD = 0.1  # [s]: faster than one can read, slow enough to cost nothing
+FILE_COLUMNS = 100
+"""What an event's line may take where there is no terminal."""
+NARROW = ("factor", "delay", "place", "waypoint")
+"""What the living line goes without, one after the other, until it fits."""
 
 
 class FlightView:
@@ -43,7 +48,9 @@ class FlightView:
                 case TelemetrySent():
                     self._see_telemetry(record)
                 case Control():
-                    self._delay, self._waypoint = record.horizon, record.waypoint
+                    # Before the first round trip the horizon is 0 and means nothing.
+                    self._delay = math.nan if math.isnan(record.rtt) else record.horizon
+                    self._waypoint = record.waypoint
                 case GuardChange():
                     self._guard = record.state
                     # That the robot holds once its mission has ended is no news.
@@ -56,8 +63,8 @@ class FlightView:
                     self._event(record.text)
         if self._live and self._clock() - self._drawn >= REDRAW_PERIOD:
             self._drawn = self._clock()
-            self._stream.write("\r\x1b[2K" + self.line())
-            self._stream.flush()
+            # One column is left free: some terminals begin a new line once the last is written.
+            self._write("\r\x1b[2K" + self.line(columns(self._stream) - 1))
 
     def _see_telemetry(self, record: TelemetrySent) -> None:
         if self._first_ns == NEVER_NS:
@@ -70,32 +77,58 @@ class FlightView:
         """Time since the first telemetry [s], world's clock."""
         return (self._now_ns - self._first_ns) * 1e-9
 
-    def line(self) -> str:
-        """Say in one line of at most 80 columns how the flight goes."""
+    def line(self, width: int = 80) -> str:
+        """Say in one line of at most `width` columns how the flight goes."""
         elapsed = self._clock() - self._began
-        factor = f"x{self.flown / elapsed:.3g}" if elapsed > 0 and self.flown > 0 else ""
+        moving = elapsed > 0 and self.flown > 0
+        number = self._waypoint + 1
+        cells = {
+            "time": f"{self.flown:6.1f} s",
+            "waypoint": f"waypoint {number}/{self._waypoints}" if number else "",
+            "place": self._place(),
+            "delay": self._late(),
+            "guard": f"{self._guard.name:<6}",
+            "factor": f"x{self.flown / elapsed:.2f}" if moving else "",
+        }
+        for name in NARROW:
+            if len(_joined(cells.values())) > width:
+                cells[name] = ""
+        fitting = _joined(cells.values())[:width]
         colour = "green" if self._guard == GuardState.TRACK else "yellow"
-        guard = paint(f"{self._guard.name:<6}", colour, self._stream)
-        return (
-            f"{self.flown:6.1f} s  waypoint {self._waypoint + 1}/{self._waypoints}"
-            f"  {self._where()}  {guard} {factor}"
-        )
+        guard = paint(self._guard.name, colour, self._stream)
+        return fitting.replace(self._guard.name, guard)
 
-    def _where(self) -> str:
-        x, y, z = self._position
-        if math.isnan(x):
-            return ""
-        late = "" if math.isnan(self._delay) else f"  delay {self._delay * 1e3:3.0f} ms"
-        return f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m{late}"
+    def _place(self) -> str:
+        """Where the robot is [m]."""
+        # Rounded first: 0.0 added to a negative zero is a plain one.
+        x, y, z = (round(coordinate, 2) + 0.0 for coordinate in self._position)
+        return "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"
+
+    def _late(self) -> str:
+        return "" if math.isnan(self._delay) else f"delay {self._delay * 1e3:3.0f} ms"
 
     def _event(self, text: str) -> None:
-        if self._live:
-            self._stream.write("\r\x1b[2K")
-        self._stream.write(f"  {text:<45}{self._where()}\n")
-        self._stream.flush()
+        """Write a line that stays; where it fits also where and how late that was."""
+        width = columns(self._stream, FILE_COLUMNS)
+        lines = [_joined((f"  {text:<44}", self._place(), late)) for late in (self._late(), "")]
+        fitting = [line for line in lines if len(line) <= width]
+        if not self._live:
+            self._write(f"{fitting[0] if fitting else f'  {text}'}\n")
+            return
+        wrapped = textwrap.fill(f"  {text}", width, subsequent_indent="    ")
+        self._write(f"\r\x1b[2K{fitting[0] if fitting else wrapped}\n")
 
     def close(self) -> None:
         """Take the living line away."""
         if self._live:
-            self._stream.write("\r\x1b[2K")
+            self._write("\r\x1b[2K")
+
+    def _write(self, text: str) -> None:
+        """Write at once; a flight does not end because nobody looks at it any more."""
+        with unread_is_fine(self._stream):
+            self._stream.write(text)
             self._stream.flush()
+
+
+def _joined(cells: Iterable[str]) -> str:
+    return "  ".join(cell for cell in cells if cell).rstrip()

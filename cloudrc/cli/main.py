@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-import os
+import errno
 import sys
 from collections.abc import Sequence
 
+from cloudrc.cli.output import silence
 from cloudrc.cli.parser import COMMANDS, build, unknown
 from cloudrc.errors import BadInputError, CloudrcError
 
 INTERRUPTED = 130
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: ours to mend, not the user's
+
+NOT_ALLOWED = "choose a file or folder that you may use"
+REMEDIES = {
+    errno.EACCES: NOT_ALLOWED,
+    errno.EPERM: NOT_ALLOWED,
+    errno.EROFS: NOT_ALLOWED,
+    errno.ENOENT: "check the path",
+    errno.ENOTDIR: "check the path",
+    errno.EISDIR: "name a file in it",
+    errno.ENOSPC: "make room or choose another disk",
+}
+"""What to do about errors of the operating system that were not expected."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,8 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:
-        # The reader (head, less) has left. Python would complain when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        silence(sys.stdout)  # the reader (head, less) has left
         return 0
     except Exception as error:
         if "--debug" in given:
@@ -61,7 +73,8 @@ def _explain(error: Exception) -> tuple[str, int]:
         return str(error).rstrip(), error.exit_code  # one line, or one for each wrong key
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        return f"{where}{error.strerror or error}", BadInputError.exit_code
+        remedy = REMEDIES.get(error.errno or 0, "'--debug' shows where")
+        return f"{where}{error.strerror or error}; {remedy}", BadInputError.exit_code
     kind = type(error).__name__
     text = " ".join(str(error).split())
     return f"internal error: {kind}: {text}; '--debug' shows where, please report it", INTERNAL

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TextIO
 
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1", "dim": "2"}
@@ -14,6 +15,34 @@ def is_live(stream: TextIO) -> bool:
     """Say whether a stream can show a line that is rewritten in place."""
     dull = os.environ.get("TERM", "") in ("", "dumb") or bool(os.environ.get("CI"))
     return stream.isatty() and not dull
+
+
+def columns(stream: TextIO, elsewhere: int = 80) -> int:
+    """Count the columns of the terminal that a stream leads to, `elsewhere` if to none."""
+    try:
+        return os.get_terminal_size(stream.fileno()).columns or elsewhere
+    except (OSError, ValueError):
+        return elsewhere
+
+
+@contextlib.contextmanager
+def unread_is_fine(stream: TextIO) -> Iterator[None]:
+    """Print what may find no reader: if `head` or `less` has left, nobody is told, now or later.
+
+    Flush inside: what is only buffered fails where nobody expects it.
+    """
+    try:
+        yield
+    except OSError:
+        silence(stream)
+
+
+def silence(stream: TextIO) -> None:
+    """Let all that is still written to a stream go nowhere; Python flushes once more at exit."""
+    with contextlib.suppress(OSError, ValueError):  # a stream of a test has no file
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 def paint(text: str, colour: str, stream: TextIO | None = None) -> str:

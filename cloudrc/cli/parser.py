@@ -31,6 +31,7 @@ GROUPS: dict[str, dict[str, str]] = {
     },
 }
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
+COUNT_MAX = 100_000
 
 ABOUT = "Fly a simulated drone from a simulated cloud, over a network that is measured."
 EXAMPLES = """\
@@ -70,6 +71,13 @@ def unknown(given: str, names: Iterable[str]) -> str:
 
 def _or(names: Sequence[str]) -> str:
     return ", ".join(names[:-1]) + f" or {names[-1]}" if len(names) > 1 else "".join(names)
+
+
+def count(text: str) -> int:
+    """Read a number of things that are done one after the other, as argparse calls it."""
+    if not text.isdecimal() or not 1 <= int(text) <= COUNT_MAX:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 1 to {COUNT_MAX}")
+    return int(text)
 
 
 def build(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:

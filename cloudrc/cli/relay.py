@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import address, process_arguments, warn_if_exposed
+from cloudrc.cli.ends import address, listening, process_arguments, warn_if_exposed
 
 ADDRESSES = {
     "--world-side": "where to receive from world",
@@ -34,18 +34,24 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.tunnel.codec import peek
 
     uplink, downlink = assembly.build_links(load_experiment(str(options.config)))
-    for listen in (options.world_side, options.cloud_side):
+    sides = []
+    for flag, listen in (
+        ("--world-side", options.world_side),
+        ("--cloud-side", options.cloud_side),
+    ):
         warn_if_exposed(listen)
+        with listening(flag, listen):
+            sides.append(bind(listen))
     relay = Relay(
         uplink,
         downlink,
         peek,
-        world_side=bind(options.world_side),
-        cloud_side=bind(options.cloud_side),
+        world_side=sides[0],
+        cloud_side=sides[1],
         world_peer=options.world,
         cloud_peer=options.cloud,
     )
-    Feed().ready()
+    Feed.on_stdout().ready()
     relay.run(StopSignal())
     counts = ", ".join(f"{name} {count:g}" for name, count in relay.counts().items())
     print(f"cloudrc relay: {counts}", file=sys.stderr)

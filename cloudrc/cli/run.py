@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
+from cloudrc.cli.parser import count
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--seed", type=_whole, metavar="S", help="seed of this run, in place of the experiment's"
     )
     many.add_argument(
-        "--seeds", type=_count, metavar="N", help="fly seeds 1 to N, on all cores, and tabulate"
+        "--seeds", type=count, metavar="N", help="fly seeds 1 to N, on all cores, and tabulate"
     )
     parser.add_argument(
         "--set",
@@ -96,7 +97,7 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
     from cloudrc.cli.flight import fly
     from cloudrc.cli.folder import new_folder
     from cloudrc.cli.live import FlightView
-    from cloudrc.cli.output import is_live
+    from cloudrc.cli.output import is_live, unread_is_fine
     from cloudrc.config.load import load_experiment
 
     experiment = load_experiment(options.experiment, overrides)
@@ -107,13 +108,12 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
     mission = experiment.mission
     waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
     if not as_json:
-        print(
-            f"{name}: mode {mode}, seed {experiment.seed}, link {experiment.link.profile},"
-            f" {waypoints} waypoint{'s' if waypoints != 1 else ''}",
-            flush=True,
-        )
-    # A run that is to be stopped from outside is interrupted like one that is stopped by Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with unread_is_fine(stream):
+            print(
+                f"{name}: mode {mode}, seed {experiment.seed}, link {experiment.link.profile},"
+                f" {waypoints} waypoint{'s' if waypoints != 1 else ''}",
+                flush=True,
+            )
     view = FlightView(stream, waypoints) if is_live(stream) or not as_json else None
     try:
         report = fly(experiment, mode, folder, view.see if view else _see_nothing)
@@ -123,10 +123,13 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
     finally:
         if view:
             view.close()
-    if as_json:
-        print((folder / "report.json").read_text(), end="")
-    else:
-        show(report, folder)
+    text = (folder / "report.json").read_text()
+    with unread_is_fine(sys.stdout):
+        if as_json:
+            print(text, end="")
+        else:
+            show(report, folder)
+        sys.stdout.flush()
     return exit_code(report)
 
 
@@ -137,10 +140,4 @@ def _see_nothing(records: list[Record]) -> None:
 def _whole(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number >= 0")
-    return int(text)
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seeds, 1 to 100000")
     return int(text)

@@ -6,60 +6,98 @@ import argparse
 import json
 import multiprocessing
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.closing import EXIT_CODES
 from cloudrc.cli.folder import new_folder
+from cloudrc.cli.output import unread_is_fine
 from cloudrc.cli.statistics import as_csv, as_table, summarise
 
 
 def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
-    """Fly seeds 1 to N; exit 0 only if each of them succeeds."""
+    """Fly seeds 1 to N; exit 0 only if each of them succeeds.
+
+    Who interrupts gets the table of the seeds that are finished.
+    """
     from cloudrc.config.load import load_experiment
 
     # Loaded here too: a mistake is told once, not N times.
     name = load_experiment(options.experiment, overrides).name
     folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds")
     seeds = range(1, options.seeds + 1)
+    reports: list[dict[str, Any]] = []
+    interrupted = False
+    try:
+        with closing(_reports(options.experiment, overrides, folder, seeds)) as finished:
+            for report in finished:
+                reports.append(report)
+                _tell(options, report, f"{len(reports)}/{len(seeds)}")
+    except KeyboardInterrupt:
+        interrupted = True
+        count = f"{len(reports)} of {len(seeds)} seeds are finished"
+        with unread_is_fine(sys.stderr):
+            print(f"\ncloudrc: interrupted: {count}", file=sys.stderr, flush=True)
+    reports.sort(key=lambda report: int(report["seed"]))
+    summary = _write(folder, name, reports, interrupted)
+    with unread_is_fine(sys.stdout):
+        if options.output == "json":
+            print((folder / "sweep.json").read_text(), end="", flush=True)
+        else:
+            print(f"\n{as_table(summary)}\n\n{folder / 'sweep.json'}", flush=True)
+    if interrupted:
+        return EXIT_CODES["interrupted"]
+    return max(EXIT_CODES[report["verdict"]] for report in reports)
+
+
+def _tell(options: argparse.Namespace, report: dict[str, Any], count: str) -> None:
     stream = sys.stderr if options.output == "json" else sys.stdout
-    reports = []
-    for report in _reports(options.experiment, overrides, folder, seeds):
-        reports.append(report)
-        if options.output == "table" or stream.isatty():
-            failures = "".join(f": {f['text']}" for f in report["failures"][:1])
-            count = f"{len(reports)}/{len(seeds)}"
+    if options.output == "table" or stream.isatty():
+        failures = "".join(f": {f['text']}" for f in report["failures"][:1])
+        with unread_is_fine(stream):
             line = f"{count:>7}  seed {report['seed']}  {report['verdict']}{failures}"
             print(line, file=stream, flush=True)
-    reports.sort(key=lambda report: int(report["seed"]))
-    summary = _write(folder, name, reports)
-    if options.output == "json":
-        print((folder / "sweep.json").read_text(), end="")
-    else:
-        print(f"\n{as_table(summary)}\n\n{folder / 'sweep.json'}")
-    return max(EXIT_CODES[report["verdict"]] for report in reports)
 
 
 def _reports(
     experiment: str, overrides: list[str], folder: Path, seeds: range
 ) -> Iterator[dict[str, Any]]:
-    """Fly every seed; reports come as they are finished."""
+    """Fly every seed; reports come as they are finished. Who stops listening ends the flights."""
     # Spawned, not forked: a child starts clean, whatever threads the libraries here have begun.
     context = multiprocessing.get_context("spawn")
     workers = min(os.cpu_count() or 1, len(seeds))
     with ProcessPoolExecutor(workers, context) as pool:
-        futures: list[Future[dict[str, Any]]] = [
-            pool.submit(_fly_one, experiment, overrides, folder, seed) for seed in seeds
-        ]
         try:
+            with _born_deaf_to_interrupts():
+                futures: list[Future[dict[str, Any]]] = [
+                    pool.submit(_fly_one, experiment, overrides, folder, seed) for seed in seeds
+                ]
             for future in as_completed(futures):
                 yield future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            # Leaving `with` waits for the workers, and they for the end of their flights.
+            for worker in multiprocessing.active_children():
+                worker.terminate()
             raise
+
+
+@contextmanager
+def _born_deaf_to_interrupts() -> Iterator[None]:
+    """Let processes that begin here ignore Ctrl-C, which a terminal sends to all of a group.
+
+    What ends them is their parent; a signal that is ignored stays so across the start of a program.
+    """
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _fly_one(experiment: str, overrides: list[str], folder: Path, seed: int) -> dict[str, Any]:
@@ -72,11 +110,14 @@ def _fly_one(experiment: str, overrides: list[str], folder: Path, seed: int) -> 
     return fly(loaded, "virtual", own, lambda records: None, page=False)
 
 
-def _write(folder: Path, name: str, reports: list[dict[str, Any]]) -> dict[str, Any]:
+def _write(
+    folder: Path, name: str, reports: list[dict[str, Any]], interrupted: bool
+) -> dict[str, Any]:
     runs = [
         {"seed": r["seed"], "verdict": r["verdict"], "folder": f"seed-{r['seed']}"} for r in reports
     ]
-    summary = {"schemaVersion": 1, "experiment": name, "mode": "virtual", **summarise(reports)}
+    head = {"schemaVersion": 1, "experiment": name, "mode": "virtual", "interrupted": interrupted}
+    summary = {**head, **summarise(reports)}
     text = json.dumps({**summary, "runs": runs}, indent=2)
     (folder / "sweep.json").write_text(text + "\n")
     (folder / "sweep.csv").write_text(as_csv(reports))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import end_arguments, open_recorder, warn_if_exposed
+from cloudrc.cli.ends import end_arguments, listening, open_recorder, warn_if_exposed
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +28,8 @@ def execute(options: argparse.Namespace) -> int:
     warn_if_exposed(options.listen)
     experiment, clock = load_experiment(str(options.config)), clock_id()
     recorder = open_recorder(options.record, "world", clock)
-    peer = Peer.bind(options.listen, options.peer)
+    with listening("--listen", options.listen):
+        peer = Peer.bind(options.listen, options.peer)
     identity = WorldIdentity(clock, os.urandom(16))
     world = assembly.build_world(experiment, identity, time.monotonic_ns)
     run_end(world, peer, recorder, end="world", slip_ns=lambda: world.slip_ns)

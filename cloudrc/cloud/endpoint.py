@@ -15,7 +15,7 @@ from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.teleop.messages import Seen
 from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.messages import NEVER_NS, OperatorRequest, Setpoint
-from cloudrc.records import Arrival, Counted, Record, SessionOpened
+from cloudrc.records import Arrival, Counted, Fault, Record, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import USED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Hello, Kind
@@ -27,6 +27,8 @@ HELLO_PERIOD_NS = 100_000_000
 SILENCE_NS = 500_000_000
 """Without telemetry for so long, cloud says hello again: world may have restarted."""
 COUNT_PERIOD_NS = 1_000_000_000
+MISSED_MAX = 50
+"""So many missed periods are a fault worth telling; a few happen on any machine."""
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 
 
@@ -96,7 +98,7 @@ class CloudEndpoint:
             return
         missed = (now_ns - self._tick_ns) // PERIOD_NS
         if missed:
-            self._counts["missed_periods"] += missed
+            self._count_missed(missed, now_ns)
         self._tick_ns += (missed + 1) * PERIOD_NS
         if self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS:
             self._say_hello_if_due(now_ns)
@@ -122,6 +124,16 @@ class CloudEndpoint:
                 raise DecodeError("malformed")
         except DecodeError as error:
             self._counts[str(error)] += 1
+
+    def _count_missed(self, missed: int, now_ns: int) -> None:
+        before = self._counts["missed_periods"]
+        self._counts["missed_periods"] += missed
+        if before < MISSED_MAX <= before + missed:
+            text = (
+                f"cloud has let {before + missed} periods of 10 ms pass without a command: "
+                "a plug-in is slow or the machine is busy"
+            )
+            self._records.append(Fault(now_ns, "late", text))
 
     def _say_hello_if_due(self, now_ns: int) -> None:
         if now_ns < self._hello_ns:

@@ -18,6 +18,9 @@ from cloudrc.cloud.predictors import Predictor
 from cloudrc.messages import ZERO, Command, Odometry, Setpoint, Telemetry
 from cloudrc.records import Control, Fault
 
+PLUG_IN_ERRORS = (Exception, SystemExit)
+"""A plug-in is foreign code: anything may come out of it; a person's Ctrl-C is not its own."""
+
 
 class ControlLoop:
     """Estimator, predictor and controller of one session."""
@@ -59,11 +62,11 @@ class ControlLoop:
         self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
         try:
             self._delays.observe(telemetry, now_ns)
-        except Exception as error:  # a plug-in is foreign code: anything may come out of it
+        except PLUG_IN_ERRORS as error:
             self._note("estimator", error, now_ns)
         try:
             self._predictor.observe(telemetry.odometry)
-        except Exception as error:
+        except PLUG_IN_ERRORS as error:
             self._note("predictor", error, now_ns)
 
     def command(
@@ -87,7 +90,7 @@ class ControlLoop:
         command = Command(now_ns, basis.stamp_ns, hold_ns, output.velocity, output.yaw_rate)
         try:
             self._predictor.commanded(command)
-        except Exception as error:
+        except PLUG_IN_ERRORS as error:
             self._note("predictor", error, now_ns)
         return command, Control(
             now_ns,
@@ -118,7 +121,7 @@ class ControlLoop:
     def _look_ahead(self, now_ns: int) -> float:
         try:
             self._horizon = self._delays.horizon(now_ns)
-        except Exception as error:
+        except PLUG_IN_ERRORS as error:
             self._note("estimator", error, now_ns)
         return self._horizon
 
@@ -131,7 +134,7 @@ class ControlLoop:
             numbers = sum(estimate.position) + sum(estimate.velocity)
             if not isfinite(numbers + sum(estimate.orientation_wxyz)):
                 raise ValueError(f"it returned {estimate}")
-        except Exception as error:
+        except PLUG_IN_ERRORS as error:
             self._note("predictor", error, now_ns)
             return basis
         return estimate
@@ -143,12 +146,12 @@ class ControlLoop:
             output = self._controller.update(estimate, setpoint, dt)
             if not isfinite(sum(output.velocity) + output.yaw_rate):
                 raise ValueError(f"it returned {output}")
-        except Exception as error:
+        except PLUG_IN_ERRORS as error:
             self._note("controller", error, now_ns)
             return ControlOutput(ZERO, 0.0)
         return output
 
-    def _note(self, kind: str, error: Exception, now_ns: int) -> None:
+    def _note(self, kind: str, error: BaseException, now_ns: int) -> None:
         """Count what a plug-in did wrong; report it the first time."""
         code = f"{kind}_failed"
         self.counts[code] += 1
@@ -163,6 +166,6 @@ _INSTEAD = {
 }
 
 
-def _explain(kind: str, error: Exception) -> str:
+def _explain(kind: str, error: BaseException) -> str:
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return f"the {kind} failed ({text}); {_INSTEAD[kind]}; mend cloud.{kind} or choose another"

@@ -19,7 +19,7 @@ from cloudrc.config import overrides, parameters, problems, shipped, yaml_text
 from cloudrc.config.document import Document
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem
-from cloudrc.config.resolved import COMMAND_AGE_MAX_MS, ResolvedExperiment
+from cloudrc.config.resolved import COMMAND_AGE_MAX_MS, ResolvedExperiment, speed_cap
 from cloudrc.config.schema import Experiment, Mission, Profile
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
@@ -157,6 +157,9 @@ def _inline_profile(document: Document) -> list[Problem]:
             _lay_under(document, ("link", key), file, key)
     age_max = profile.command_age_max_ms or COMMAND_AGE_MAX_MS
     _default(document, ("guard", "command_age_max_ms"), age_max)
+    age_max = document.get("guard", "command_age_max_ms")
+    if isinstance(age_max, int | float) and age_max > 0:
+        _default(document, ("guard", "speed_max_mps"), speed_cap(age_max))
     return []
 
 
@@ -187,10 +190,14 @@ def _forget_profile(document: Document) -> None:
         age_max = load_profile(str(link.get("profile"))).command_age_max_ms
     except BadInputError:
         age_max = None  # the label of a profile that is gone
-    if isinstance(guard, dict) and guard.get("command_age_max_ms") == (
-        age_max or COMMAND_AGE_MAX_MS
-    ):
-        del guard["command_age_max_ms"]
+    age_max = age_max or COMMAND_AGE_MAX_MS
+    if isinstance(guard, dict):
+        for key, implied in (
+            ("command_age_max_ms", age_max),
+            ("speed_max_mps", speed_cap(age_max)),
+        ):
+            if guard.get(key) == implied:
+                del guard[key]
 
 
 def _resolve_traces(document: Document, above: yaml_text.Path) -> list[Problem]:

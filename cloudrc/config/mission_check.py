@@ -16,6 +16,7 @@ from cloudrc.geometry.placement import nearest_legal, outside_fence, overlapped_
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 
+_YAW = "the onboard controller holds yaw at 0, as the published one does; leave it out"
 _REPORTED = 20  # a mission in wrong units is wrong everywhere: enough is enough
 
 
@@ -49,7 +50,10 @@ def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
     outside = outside_fence(positions)
     hit = overlapped_pipe(scene, positions, yaws)
     wrong = np.flatnonzero(outside | (hit >= 0))
-    problems = []
+    problems = [
+        Problem(("waypoints", str(index), "yaw_deg"), f"{mission.waypoints[index].yaw_deg:g}", _YAW)
+        for index in np.flatnonzero(yaws)[:_REPORTED]
+    ]
     for index in wrong[:_REPORTED]:
         point = mission.waypoints[index].position_m
         if outside[index]:

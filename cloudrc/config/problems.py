@@ -50,7 +50,7 @@ def from_pydantic(
 
 def refuse(document: Document, problems: Iterable[Problem], name: str) -> None:
     """Raise a BadInputError that lists all problems, each with its place; none raises nothing."""
-    every = list(problems)
+    every = _finest(problems)
     lines = [f"{document.source(problem.path).label}: {problem}" for problem in every[:_LISTED]]
     if len(every) == 1:
         raise BadInputError(lines[0])
@@ -58,6 +58,16 @@ def refuse(document: Document, problems: Iterable[Problem], name: str) -> None:
         lines.append(f"and {len(every) - _LISTED} more")
     if every:
         raise BadInputError("\n  ".join([f"{name} has {len(every)} problems:", *lines]))
+
+
+def _finest(problems: Iterable[Problem]) -> list[Problem]:
+    """Leave out what follows from another problem: a value is wrong where a part of it is.
+
+    A plug-in that lacks a parameter, say, stays a name, and the schema asks for what it would be.
+    """
+    every = list(problems)
+    above = {problem.path[:n] for problem in every for n in range(1, len(problem.path))}
+    return [problem for problem in every if problem.path not in above]
 
 
 def in_words(value: Any) -> str:

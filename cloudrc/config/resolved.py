@@ -7,6 +7,8 @@ an experiment file, and flies the same run again.
 
 from __future__ import annotations
 
+from math import sqrt
+
 from pydantic import Field
 
 from cloudrc.config.fields import Positive
@@ -16,11 +18,24 @@ COMMAND_AGE_MAX_MS = 250.0
 """Where neither the experiment nor the profile says [ms]. Source: DESIGN, section 5."""
 
 
+def speed_cap(command_age_max_ms: float) -> float:
+    """Give the speed [m/s] at which the robot still comes to rest in time.
+
+    It flies on for the age limit and 0.2 s, then brakes at 3 m/s^2: v (T + 0.2) + v^2 / 6 = 8.7 m.
+    Source: DESIGN, section 5.
+    """
+    blind = command_age_max_ms * 1e-3 + 0.2
+    return round(3.0 * (sqrt(blind * blind + 8.7 / 1.5) - blind), 6)
+
+
 class ResolvedGuard(Guard):
     """A guard whose limits are all known."""
 
     command_age_max_ms: Positive = Field(
         COMMAND_AGE_MAX_MS, description="A command whose basis is older is not flown [ms]"
+    )
+    speed_max_mps: Positive = Field(
+        speed_cap(COMMAND_AGE_MAX_MS), description="Cap on the commanded speed [m/s]"
     )
 
 

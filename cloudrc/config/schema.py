@@ -123,7 +123,11 @@ class Guard(Section):
         description="A command whose basis is older is not flown [ms]; "
         "default: the link profile's own, else 250",
     )
-    speed_max_mps: Positive = Field(6.0, description="Cap on the commanded speed [m/s]")
+    speed_max_mps: Positive | None = Field(
+        None,
+        description="Cap on the commanded speed [m/s]; default: what can be stopped from within "
+        "8.7 m although commands may be that old, 6 at 250 ms",
+    )
     acceleration_max_mps2: Positive = Field(12.0, description="Cap on its change [m/s^2]")
     yaw_rate_max_radps: Positive = Field(1.0, description="Cap on the yaw rate [rad/s]")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
 
 from cloudrc.config import document
@@ -45,7 +46,7 @@ def read(kind: str, name: str, folder: Path) -> Document:
     if is_path(name):
         path = folder / Path(name).expanduser()
         if not path.exists():
-            raise BadInputError(f"no such file: {path}")
+            raise BadInputError(f"no such file: {path}; {_shipped_instead(kind, path.stem)}")
         return document.read(path, name)
     check_name(kind, name)
     return document.read(FOLDERS[kind] / f"{name}.yaml", f"{name}.yaml")
@@ -56,6 +57,14 @@ def check_name(kind: str, name: str) -> None:
     available = names(kind)
     if name not in available:
         raise BadInputError(unknown(kind, name, available))
+
+
+def _shipped_instead(kind: str, name: str) -> str:
+    """Say how the shipped files are named, to one who gave a path that leads nowhere."""
+    available = names(kind)
+    near = difflib.get_close_matches(name, available, n=1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    return f"shipped {kind}s go by their names: {', '.join(available)}{hint}"
 
 
 def is_path(name: str) -> bool:

@@ -1,7 +1,8 @@
 """What a process tells the one that started it: a few of its records, one line of JSON each.
 
 A process in flight writes lines to its standard output, which must never block it: if nobody reads
-them they are lost. The supervisor makes records of them again.
+them they are lost. The supervisor makes records of them again. What a plug-in prints must not get
+among them: it goes to standard error, that is to the process's log.
 """
 
 from __future__ import annotations
@@ -27,11 +28,18 @@ SAMPLED = (TelemetrySent, Control)
 class Feed:
     """The telling end: picks records and writes them to a pipe that does not block."""
 
-    def __init__(self, descriptor: int = 1) -> None:
-        """Write to this file descriptor; standard output if none is given."""
+    def __init__(self, descriptor: int) -> None:
+        """Write to this file descriptor."""
         self._descriptor = descriptor
         self._told_ns: dict[type, int] = {}
         os.set_blocking(descriptor, False)
+
+    @classmethod
+    def on_stdout(cls) -> Feed:
+        """Keep standard output for the feed alone; whoever prints writes to standard error now."""
+        feed = cls(os.dup(1))
+        os.dup2(2, 1)
+        return feed
 
     def ready(self) -> None:
         """Say that the process can receive."""

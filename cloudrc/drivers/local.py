@@ -17,13 +17,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from cloudrc.drivers.feed import READY, from_line
-from cloudrc.errors import CloudrcError, InvalidRunError
+from cloudrc.errors import InvalidRunError, TimedOutError
 from cloudrc.records import Record
 
 START_LIMIT = 60.0
 """For a process to become ready [s]; a cold start reads some 100 MB from disk."""
 STOP_LIMIT = 1.5
 """For a process to end by itself once it is asked to [s]."""
+SILENCE_LIMIT = 5.0
+"""A process that has told something and then nothing for so long hangs [s]."""
 LOOPBACK = "127.0.0.1"
 
 
@@ -39,6 +41,8 @@ class Child:
     process: subprocess.Popen[bytes]
     log: Path
     unread: bytes = field(default=b"")
+    heard: float | None = field(default=None)
+    ready: bool = field(default=False)
 
     def last_words(self) -> str:
         """The last line that it wrote to its log, if any."""
@@ -68,7 +72,7 @@ class LocalRun:
 
         Raises:
             ProcessDiedError: If a process ends too early; it is named.
-            CloudrcError: If the limit is reached.
+            TimedOutError: If the limit is reached, or one falls silent; it is named.
             KeyboardInterrupt: If the user interrupts. The processes have ended in every case.
         """
         world, from_world, from_cloud, cloud = _free_addresses(4)
@@ -110,14 +114,11 @@ class LocalRun:
         self._children.append(child)
 
     def _wait_until_ready(self) -> None:
-        waiting = {child.name for child in self._children}
         until = time.monotonic() + START_LIMIT
-        while waiting:
+        while waiting := [child.name for child in self._children if not child.ready]:
             if time.monotonic() > until:
-                raise CloudrcError(f"{' and '.join(waiting)}: not ready within {START_LIMIT:g} s")
-            for child, line in self._lines():
-                if line == READY:
-                    waiting.discard(child.name)
+                raise TimedOutError(f"{' and '.join(waiting)}: not ready within {START_LIMIT:g} s")
+            self._listen()
             self._check_alive()
 
     def _watch(self, limit: float) -> None:
@@ -125,22 +126,37 @@ class LocalRun:
         cloud = self._children[-1]
         while cloud.process.poll() is None:
             if time.monotonic() > until:
-                raise CloudrcError(f"the flight was ended after {limit:g} s, its limit")
-            self._see([from_line(line) for _, line in self._lines() if line != READY])
+                raise TimedOutError(f"the flight was ended after {limit:g} s, its limit")
+            self._see(self._listen())
             self._check_alive()
-        self._see([from_line(line) for _, line in self._lines() if line != READY])
+            self._check_awake()
+        self._see(self._listen())
 
-    def _lines(self) -> list[tuple[Child, str]]:
+    def _listen(self) -> list[Record]:
         """What the processes have told since the last call; waits 50 ms at most."""
-        told: list[tuple[Child, str]] = []
+        told: list[Record] = []
         for key, _ in self._selector.select(0.05):
             child: Child = key.data
             data = os.read(key.fd, 65_536)
             if not data:
                 self._selector.unregister(key.fileobj)
             *lines, child.unread = (child.unread + data).split(b"\n")
-            told += [(child, line.decode()) for line in lines]
+            for line in lines:
+                if line.decode() == READY:
+                    child.ready = True
+                else:
+                    told.append(from_line(line.decode()))
+                    child.heard = time.monotonic()
         return told
+
+    def _check_awake(self) -> None:
+        now = time.monotonic()
+        for child in self._children:
+            if child.heard is not None and now - child.heard > SILENCE_LIMIT:
+                raise TimedOutError(
+                    f"the {child.name} process has been silent for {SILENCE_LIMIT:g} s and was "
+                    f"ended; see {child.log}"
+                )
 
     def _check_alive(self) -> None:
         for child in self._children:

@@ -77,7 +77,7 @@ def run_end(
     Returns:
         True if it was done by itself, False if it was stopped.
     """
-    stop, feed, thread = StopSignal(), Feed(), RecordingThread(recorder)
+    stop, feed, thread = StopSignal(), Feed.on_stdout(), RecordingThread(recorder)
     trouble = ""
 
     def sink(records: list[Record]) -> None:

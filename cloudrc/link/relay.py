@@ -69,7 +69,8 @@ class Relay:
         """Set up; the sockets stay the caller's to close.
 
         Args:
-            uplink: World to cloud. Its time begins with 0 now: leave its origin at 0.
+            uplink: World to cloud. Its time begins with 0 at the first datagram, as in virtual
+                time, whatever the processes take to start: leave its origin at 0.
             downlink: Cloud to world, likewise.
             peek: Reads kind, epoch and counter of a datagram.
             world_side: Bound UDP socket that world sends to.
@@ -85,7 +86,7 @@ class Relay:
         # Due instant [ns], a number that keeps equal instants in order, data, where it goes.
         self._in_flight: list[tuple[int, int, bytes, _Side]] = []
         self._numbers = count()
-        self._origin_ns = time.monotonic_ns()
+        self._origin_ns: int | None = None
         self._errors_ns: deque[int] = deque(maxlen=_ERRORS_KEPT)
         self._received = self._forwarded = self._lost = 0
         self._malformed = self._overflow = self._unsent = 0
@@ -129,7 +130,9 @@ class Relay:
         return counts
 
     def _now_ns(self) -> int:
-        """Time since the link came up [ns]."""
+        """Time since the link came up [ns]: since the first datagram."""
+        if self._origin_ns is None:
+            self._origin_ns = time.monotonic_ns()
         return time.monotonic_ns() - self._origin_ns
 
     def _take_in(self, source: _Side, target: _Side) -> None:

@@ -43,7 +43,13 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "commands_applied",
     ),
     "Guard and faults": ("hold_count", "hold_time", "fault_count", "recorder_dropped"),
-    "Real time": ("real_time_factor", "world_slip", "world_lateness_p99", "cloud_lateness_p99"),
+    "Real time": (
+        "real_time_factor",
+        "world_slip",
+        "world_lateness_p99",
+        "cloud_lateness_p99",
+        "missed_periods",
+    ),
 }
 """Groups of the table in its order; a metric that is in none comes last, under "Others"."""
 SHARES = ("loss_", "late_")

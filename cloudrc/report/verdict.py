@@ -100,7 +100,7 @@ def _not_real_time(numbers: Mapping[str, Number]) -> Iterator[Failure]:
 def _missed(flight: Flight, numbers: Mapping[str, Number]) -> Iterator[Failure]:
     """What the mission was to reach and did not."""
     if flight.start_ns is None or flight.end_ns is None:
-        yield Failure("not_started", "the robot never left the ground: no fresh command came")
+        yield Failure("not_started", f"the robot never left the ground: {_why_grounded(flight)}")
         return
     ending = flight.ending
     if ending is None:
@@ -117,6 +117,33 @@ def _missed(flight: Flight, numbers: Mapping[str, Number]) -> Iterator[Failure]:
     if flight.seconds(flight.end_ns) > limit:
         text = f"the mission took {flight.seconds(flight.end_ns):.1f} s, more than {limit:g} s"
         yield _failure(flight, "time_limit_exceeded", text, flight.end_ns)
+
+
+def _why_grounded(flight: Flight) -> str:
+    """Say what kept the commands of a flight that never began from being flown."""
+    arrivals, control = flight.recording["/downlink_delay"], flight.recording["/delay_estimate"]
+    if not len(control):
+        return "its telemetry or cloud's answers were lost, so cloud computed no command"
+    if not len(arrivals):
+        return "no command came"
+    # The start opens a session of its own: what was fresh before it does not count.
+    last = arrivals["epoch"] == arrivals["epoch"].max()
+    if arrivals["used"][last].any():
+        return "fresh commands came, but no request to start"
+    keys = zip(control["epoch"], control["counter"], strict=True)
+    basis_ns = dict(zip(keys, control["basis_stamp_ns"], strict=True))
+    rows = (arrivals[name][last] for name in ("epoch", "counter", "stamp_ns"))
+    ages_ns = [
+        stamp_ns - basis_ns[epoch, counter]
+        for epoch, counter, stamp_ns in zip(*rows, strict=True)
+        if (epoch, counter) in basis_ns
+    ]
+    if not ages_ns:
+        return "no fresh command came"
+    return (
+        f"the odometry behind each command was {min(ages_ns) * 1e-9:.3f} s old or older when the"
+        " command came, beyond the limit guard.command_age_max_ms; shorten the delay or raise it"
+    )
 
 
 def _harm(flight: Flight) -> Iterator[Failure]:

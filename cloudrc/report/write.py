@@ -67,7 +67,8 @@ def assess(recording: Recording, experiment: ResolvedExperiment, run: Run) -> As
         interrupted=run.interrupted or torn,
     )
     incomplete = (f"The recording is incomplete: {recording.note}.",) if torn else ()
-    notes = tuple(dict.fromkeys((*run.notes, *incomplete, *troubles)))
+    faults = tuple(f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text)
+    notes = tuple(dict.fromkeys((*run.notes, *incomplete, *faults, *troubles)))
     document = report_document(
         run,
         experiment,
@@ -116,14 +117,38 @@ def write_report(
 def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     """Read what a run left, whole or torn: the arguments of `write_report`.
 
+    If the run died before it could join the recordings of both ends, they are joined now.
+
     Raises:
         BadInputError: If the folder holds no experiment or no recording that can be read.
     """
-    for name in ("config.yaml", "mission.mcap"):
-        if not (folder / name).is_file():
-            raise BadInputError(f"{folder}: has no {name}; name the folder of a run")
-    recording = Recording.read(folder / "mission.mcap")
-    return recording, load_experiment(folder / "config.yaml"), _read_run(folder, recording)
+    if not (folder / "config.yaml").is_file():
+        raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
+    experiment = load_experiment(folder / "config.yaml")
+    recording = _read_recording(folder)
+    return recording, experiment, _read_run(folder, recording)
+
+
+def _read_recording(folder: Path) -> Recording:
+    joined = folder / "mission.mcap"
+    ends = folder / "world.mcap", folder / "cloud.mcap"
+    if not any(path.is_file() for path in (joined, *ends)):
+        raise BadInputError(f"{folder}: has no mission.mcap; name the folder of a run")
+    try:
+        recording = Recording.read(joined)
+        if recording.complete:
+            return recording
+    except (BadInputError, FileNotFoundError):
+        if not any(path.is_file() for path in ends):
+            raise
+    else:
+        if not all(path.is_file() for path in ends):
+            return recording
+    from cloudrc.record.merge import merge
+
+    mission = merge(*ends)
+    mission.write(joined)
+    return mission.recording()
 
 
 def _read_run(folder: Path, recording: Recording) -> Run:

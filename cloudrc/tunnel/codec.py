@@ -2,7 +2,7 @@
 
 A datagram is a 16-byte header (version, kind, direction, epoch, counter) and a body of exactly the
 length that its kind has. Whatever does not fit raises DecodeError, which names the outcome that it
-is counted under; no other exception leaves `parse` or the decoders.
+is counted under; no other exception leaves `decode` or the decoders.
 
 Deviation: the paper's tunnel sends pickled ROS messages, which execute code and weigh 1 kB.
 """

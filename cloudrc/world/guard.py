@@ -53,6 +53,7 @@ class Guard:
         self._fresh_until_ns = NEVER_NS
         self._wanted = ZERO
         self.reference: Vector = ZERO
+        self.yaw_rate = 0.0  # capped; the published low-level controller holds yaw at 0 regardless
         self._anchor: Vector | None = None
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
@@ -78,6 +79,7 @@ class Guard:
         """A new session begins: what came in the old one is no longer fresh."""
         self._fresh_until_ns = NEVER_NS
         self._wanted = ZERO
+        self.yaw_rate = 0.0
 
     def offer(self, command: Command, now_ns: int) -> str | None:
         """Take a command that the tunnel lets through.
@@ -98,6 +100,8 @@ class Guard:
         if self.armed:
             self._fresh_until_ns = command.basis_stamp_ns + self._limits.command_age_max_ns
             self._wanted = _shortened(command.velocity, self._limits.speed_max)
+            yaw_rate_max = self._limits.yaw_rate_max
+            self.yaw_rate = min(max(command.yaw_rate, -yaw_rate_max), yaw_rate_max)
             if self.state is not TRACK:
                 self._enter(TRACK, now_ns, "fresh command")
         return None

@@ -91,6 +91,13 @@ class Raising(Estimator, Predictor, Controller):
     horizon = observe = predict = update
 
 
+class Leaving(Estimator, Predictor, Controller):
+    def update(self, *arguments):
+        raise SystemExit("enough")
+
+    horizon = observe = predict = update
+
+
 class NotFinite(Estimator, Predictor, Controller):
     def horizon(self, age):
         return nan
@@ -104,7 +111,7 @@ class NotFinite(Estimator, Predictor, Controller):
         return ControlOutput((0.0, nan, 0.0), 0.0)
 
 
-@pytest.mark.parametrize("bad", [Raising, NotFinite])
+@pytest.mark.parametrize("bad", [Raising, Leaving, NotFinite])
 @pytest.mark.parametrize("kind", ["estimator", "predictor", "controller"])
 def test_a_plug_in_that_fails_is_replaced_counted_and_reported_once(kind, bad):
     broken = {kind: bad if kind == "estimator" else bad()}

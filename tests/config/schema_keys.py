@@ -13,6 +13,7 @@ LEAVES = {".".join(path): field for path, field in describe.leaves(Experiment)}
 SPECIAL: dict[str, Any] = {
     "mission": "hover",
     "mission.waypoints.0.position_m": [0.6, 0.1, 0.8],
+    "mission.waypoints.0.yaw_deg": 0,  # the only heading that the onboard controller holds
     "mission.steps.centre_m": [0.1, 0.2, 1.1],
     "mission.steps.range_m": [0.5, 0.5, 0.5],
     "world.robot": "pelican",

@@ -68,7 +68,7 @@ def test_wrong_type_is_refused(key: str) -> None:
 )
 def test_text_is_no_number_but_an_integer_is(key: str) -> None:
     assert "must be a number" in refusal(key, "1", *beside(key))
-    load_experiment(base(key), [*beside(key), setting(key, 1)])
+    load_experiment(base(key), [*beside(key), setting(key, 0 if key.endswith("yaw_deg") else 1)])
 
 
 @pytest.mark.parametrize("key", RANGED)

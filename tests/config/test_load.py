@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from cloudrc.config import shipped, yaml_text
 from cloudrc.config.load import dump, load_experiment, load_mission, load_profile
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.errors import BadInputError
 
 EXPERIMENTS = shipped.names("experiment")
 PROFILES = shipped.names("profile")
@@ -194,3 +195,30 @@ def test_yaml_comes_back_as_it_was_written(value: object) -> None:
 def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
     found = yaml_text.parse(text, "text")[0]
     assert (found, type(found)) == (value, type(value))
+
+
+@pytest.mark.parametrize(
+    ("settings", "cap"),
+    [
+        ((), 6.0),
+        (("guard.command_age_max_ms=400",), 5.645805),
+        (("link.profile=satellite",), 4.823043),
+        (("link.profile=satellite", "guard.speed_max_mps=2"), 2.0),
+    ],
+)
+def test_the_speed_cap_falls_with_the_age_that_commands_may_have(settings, cap) -> None:
+    # v (T + 0.2) + v^2 / 6 = 8.7 m, solved by hand for T = 0.25, 0.4 and 0.8 s.
+    assert load_experiment("paper", settings).guard.speed_max_mps == pytest.approx(cap, abs=1e-5)
+
+
+def test_another_profile_on_a_resolved_file_brings_its_own_limits(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(
+        dump(load_experiment("paper", ["link.profile=satellite"]))
+    )
+    again = load_experiment(tmp_path / "config.yaml", ["link.profile=paper-p1"])
+    assert (again.guard.command_age_max_ms, again.guard.speed_max_mps) == (250.0, 6.0)
+
+
+def test_a_heading_that_would_not_be_flown_is_refused() -> None:
+    with pytest.raises(BadInputError, match="holds yaw at 0"):
+        load_experiment("paper", ["mission.waypoints.2.yaw_deg=90"])

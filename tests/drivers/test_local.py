@@ -12,6 +12,8 @@ import pytest
 
 pytestmark = pytest.mark.process
 
+FLOWN = (0, 6)
+"""Done, or done but not in real time: a busy machine is not what is tested here."""
 HOVER = ["hover", "--mode", "local", "--set", "mission.waypoints.0.dwell_s={dwell}"]
 
 
@@ -98,27 +100,70 @@ def test_the_processes_end_when_the_one_that_started_them_is_killed(tmp_path):
         time.sleep(0.05)
 
 
-SLOW = '''
-"""A predictor that takes 50 ms."""
+PREDICTOR = '''
+"""A predictor that {does}."""
 import time
 from cloudrc.cloud.predictors import Predictor
-class Slow(Predictor):
+class Odd(Predictor):
     def predict(self, odometry, horizon):
-        time.sleep(0.05)
+        {statement}
         return odometry
 def build() -> Predictor:
     """Make it."""
-    return Slow()
+    return Odd()
 '''
 
 
-def test_a_slow_predictor_is_counted_and_the_flight_goes_on(tmp_path):
-    (tmp_path / "slow.py").write_text(SLOW)
-    run = start(tmp_path / "run", f"cloud.predictor={tmp_path}/slow.py", dwell=2.0)
-    _, errors = run.communicate(timeout=90)
-    numbers = report(tmp_path / "run")["numbers"]
-    assert run.returncode == 0, errors
-    assert numbers["cloud_lateness_p99"]["value"] > 0.02
+def predictor(folder: Path, does: str, statement: str) -> str:
+    """Write such a plug-in; gives the setting that chooses it."""
+    (folder / "odd.py").write_text(PREDICTOR.format(does=does, statement=statement))
+    return f"cloud.predictor={folder}/odd.py"
+
+
+def test_a_slow_predictor_is_counted_and_told_and_the_flight_goes_on(tmp_path):
+    run = start(tmp_path / "run", predictor(tmp_path, "is slow", "time.sleep(0.05)"), dwell=2.0)
+    output, errors = run.communicate(timeout=90)
+    document = report(tmp_path / "run")
+    assert run.returncode in FLOWN, errors
+    assert document["numbers"]["cloud_lateness_p99"]["value"] > 0.02
+    assert document["numbers"]["missed_periods"]["value"] > 100
+    assert "a plug-in is slow" in output
+    assert any("a plug-in is slow" in note for note in document["notes"])
+
+
+def test_what_a_plug_in_prints_goes_to_the_log(tmp_path):
+    run = start(tmp_path / "run", predictor(tmp_path, "talks", "print('hello')"), dwell=0.5)
+    _, errors = run.communicate(timeout=60)
+    assert run.returncode in FLOWN, errors
+    assert "hello" in (tmp_path / "run" / "cloud.log").read_text()
+
+
+def test_a_process_that_hangs_ends_the_run_and_is_named(tmp_path):
+    run = start(tmp_path / "run")
+    pids = wait_until_flying(run)
+    os.kill(pids["world"], signal.SIGSTOP)
+    _, errors = run.communicate(timeout=60)
+    assert run.returncode == 4
+    assert "the world process has been silent" in errors
+    assert not any(alive(pid) for pid in pids.values())
+
+
+def test_a_report_is_written_of_a_run_whose_supervisor_was_killed(tmp_path):
+    folder = tmp_path / "run"
+    run = start(folder)
+    pids = wait_until_flying(run)
+    time.sleep(1.0)
+    run.kill()
+    run.communicate()
+    until = time.monotonic() + 3.0
+    while any(alive(pid) for pid in pids.values()) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not (folder / "mission.mcap").exists()
+    command = [sys.executable, "-m", "cloudrc", "report", str(folder)]
+    subprocess.run(command, check=False, capture_output=True)
+    assert report(folder)["numbers"]["commands_applied"]["value"] > 10
+    assert (folder / "mission.mcap").exists()
+    assert (folder / "report.html").exists()
 
 
 @pytest.mark.full

@@ -19,7 +19,6 @@ from cloudrc.records import (
     MissionEvent,
 )
 from tests.metrics.flights import (
-    DONE,
     ONE_PIPE,
     PERIOD,
     SECOND,
@@ -238,10 +237,12 @@ def test_real_time() -> None:
 
 def test_faults_and_drops() -> None:
     log = flown()
-    log.cloud += [Fault(at(1), "predictor_raised", "..."), Fault(DONE + PERIOD, "late", "...")]
+    # A fault that repeats is told once, here before the mission began, and counted every time.
+    log.cloud += [Fault(START - PERIOD, "predictor_failed", "..."), Fault(at(1), "late", "...")]
+    log.cloud += [Counted(at(n), "cloud", "predictor_failed", 7 * n) for n in (1, 2)]
     log.world += [Counted(at(n), "world", "recorder_dropped", n) for n in (1, 2)]
     log.cloud += [Counted(at(n), "cloud", "recorder_dropped", 10 * n) for n in (1, 2)]
-    assert measured("fault_count", log.flight()) == 1.0
+    assert measured("fault_count", log.flight()) == 15.0
     assert measured("recorder_dropped", log.flight()) == 22.0
 
 

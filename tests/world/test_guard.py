@@ -171,3 +171,9 @@ def test_whatever_is_commanded_the_reference_stays_inside_the_caps(velocities, s
         step = hypot(*(b - a for a, b in zip(before, after, strict=True)))
         assert step <= 12.0 * 0.002 * (1 + 1e-9)
         before = after
+
+
+@pytest.mark.parametrize(("asked", "allowed"), [(0.4, 0.4), (7.0, 1.0), (-7.0, -1.0)])
+def test_the_yaw_rate_is_capped(guard, asked, allowed):
+    guard.offer(command(yaw_rate=asked), 0)
+    assert guard.yaw_rate == allowed

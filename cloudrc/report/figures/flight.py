@@ -24,17 +24,22 @@ CAPTION_PIPES = (
     "Flight. (a) From above: pipes cut open, waypoints numbered, the board as a bar, a star where "
     "the arm first touches it. (b) Height along the way, unrolled, with the bore of each pipe. "
     "(c) Distance from the robot's outline (rotors, arm, body) to the nearest wall. "
-    "The colour is that distance in all three panels."
+    "The colour is that distance in all three panels. Panel (c) ends at {ceiling:.1f} m: in free "
+    "air the robot is farther away."
 )
 CAPTION_FREE = "Flight. (a) From above, waypoints numbered. (b) Height along the way, unrolled."
 COLOURS = "viridis"
 CLEARANCE_SHOWN = 0.40
 """Larger clearances [m] all have the last colour: in a pipe there is no more."""
+CEILING = 2 * CLEARANCE_SHOWN
+"""Largest clearance in panel (c) [m]."""
 
 
 def caption(subject: Subject) -> str:
     """Say what is seen: without pipes there is no clearance to show."""
-    return CAPTION_PIPES if subject.flight.scene.pipes else CAPTION_FREE
+    if not subject.flight.scene.pipes:
+        return CAPTION_FREE
+    return CAPTION_PIPES.format(ceiling=CEILING)
 
 
 def draw(subject: Subject) -> Figure:
@@ -181,7 +186,7 @@ def _draw_clearance(axes: Axes, subject: Subject, way: Array) -> None:
     for _, begin, end in _passages(subject, way, position):
         axes.axvspan(begin, end, color="#f4f4f4", lw=0, zorder=0)
     _coloured(axes, subject, way, clearance)
-    axes.set_ylim(min(0.0, float(clearance.min())), 2 * CLEARANCE_SHOWN)
+    axes.set_ylim(min(0.0, float(clearance.min())), CEILING)
     axes.set_xlim(0.0, max(float(way[-1]), 1e-3))
     lowest = np.where(subject.flight.inside, clearance, np.inf).argmin()
     if subject.flight.inside.any():

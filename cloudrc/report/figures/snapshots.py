@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.metrics._contact import first_touch
 from cloudrc.metrics._flight import Array
-from cloudrc.report.figures.solids import Face, board_faces, pipe_faces, robot_faces
+from cloudrc.report.figures.solids import Face, board_faces, is_swallowed, pipe_faces, robot_faces
 from cloudrc.report.figures.style import BLUE, LIGHT, PAGE, new_figure
 from cloudrc.report.figures.subject import Subject
 
@@ -87,7 +87,10 @@ def _draw_panel(axes: Axes, subject: Subject, row: int, letter: str) -> None:
     position, orientation = truth["position"][row], truth["orientation_wxyz"][row]
     eye = _eye(_heading(subject, row))
     around = [
-        face for pipe in scene.pipes for face in pipe_faces(pipe, eye.towards, position, REACH)
+        face
+        for pipe in scene.pipes
+        for face in pipe_faces(pipe, eye.towards, position, REACH)
+        if not any(is_swallowed(face, other) for other in scene.pipes if other is not pipe)
     ]
     around += board_faces(scene.board) if scene.board else []
     _draw_floor(axes, eye, position, scene.floor)

@@ -99,6 +99,19 @@ def pipe_faces(pipe: Pipe, towards_eye: Array, near: Array, reach: float) -> lis
     return faces
 
 
+def is_swallowed(face: Face, other: Pipe) -> bool:
+    """Say whether a cut through a pipe's wall lies in another pipe: where two meet there is none.
+
+    Sorted by depth such a face would show in patches between the faces of the other.
+    """
+    if face.colour != WALL_COLOUR:
+        return False
+    offset = face.corners.mean(axis=0) - np.array(other.centre)
+    along = float(offset @ np.array(other.axis))
+    across = float(np.linalg.norm(offset - along * np.array(other.axis)))
+    return abs(along) < other.length / 2 and across < other.outer
+
+
 def board_faces(board: Board) -> list[Face]:
     """Build the board, 5 cm thick behind its front face."""
     half = np.array([0.025, (board.y[1] - board.y[0]) / 2, (board.z[1] - board.z[0]) / 2])
