@@ -149,7 +149,7 @@ class Control(NamedTuple):
         loop_delay: Last `now - echo_stamp`, hold included: the paper's tau_n [s]; NaN likewise.
         measured: Position in the odometry used [m], shape (3,).
         position: Predicted [m], shape (3,), for `basis_stamp_ns + horizon`.
-        orientation_wxyz: Predicted, shape (4,).
+        orientation_wxyz: Predicted, unit quaternion, shape (4,).
         velocity: Predicted [m/s], shape (3,).
         setpoint: [m], shape (3,).
         waypoint: Index of the waypoint flown to; -1 if none.

@@ -109,14 +109,14 @@ class FlightView:
 
     def _event(self, text: str) -> None:
         """Write a line that stays; where it fits also where and how late that was."""
-        width = columns(self._stream, FILE_COLUMNS)
+        width = columns(self._stream) if self._live else FILE_COLUMNS
         lines = [_joined((f"  {text:<44}", self._place(), late)) for late in (self._late(), "")]
         fitting = [line for line in lines if len(line) <= width]
         if not self._live:
             self._write(f"{fitting[0] if fitting else f'  {text}'}\n")
             return
-        wrapped = textwrap.fill(f"  {text}", width, subsequent_indent="    ")
-        self._write(f"\r\x1b[2K{fitting[0] if fitting else wrapped}\n")
+        wrap = textwrap.TextWrapper(width, subsequent_indent="    ", break_on_hyphens=False)
+        self._write(f"\r\x1b[2K{fitting[0] if fitting else wrap.fill(f'  {text}')}\n")
 
     def close(self) -> None:
         """Take the living line away."""

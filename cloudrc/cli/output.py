@@ -17,12 +17,12 @@ def is_live(stream: TextIO) -> bool:
     return stream.isatty() and not dull
 
 
-def columns(stream: TextIO, elsewhere: int = 80) -> int:
-    """Count the columns of the terminal that a stream leads to, `elsewhere` if to none."""
+def columns(stream: TextIO) -> int:
+    """Count the columns of the terminal that a stream leads to; 80 if it does not say."""
     try:
-        return os.get_terminal_size(stream.fileno()).columns or elsewhere
+        return os.get_terminal_size(stream.fileno()).columns or 80
     except (OSError, ValueError):
-        return elsewhere
+        return 80
 
 
 @contextlib.contextmanager
@@ -74,7 +74,7 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
 
 
 def number(value: float) -> str:
-    """Write a number with four significant digits, without an exponent where it can be helped."""
+    """Write a value of any unit with four significant digits, if possible without an exponent."""
     if float(value).is_integer() and abs(value) < 1e5:
         return f"{value:.0f}"  # counts
     if 1e-4 <= abs(value) < 1e5:

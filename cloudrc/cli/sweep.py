@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -66,7 +66,7 @@ def _tell(options: argparse.Namespace, report: dict[str, Any], count: str) -> No
 
 def _reports(
     experiment: str, overrides: list[str], folder: Path, seeds: range
-) -> Iterator[dict[str, Any]]:
+) -> Generator[dict[str, Any]]:
     """Fly every seed; reports come as they are finished. Who stops listening ends the flights."""
     # Spawned, not forked: a child starts clean, whatever threads the libraries here have begun.
     context = multiprocessing.get_context("spawn")

@@ -21,7 +21,8 @@ COMMAND_AGE_MAX_MS = 250.0
 def speed_cap(command_age_max_ms: float) -> float:
     """Give the speed [m/s] at which the robot still comes to rest in time.
 
-    It flies on for the age limit and 0.2 s, then brakes at 3 m/s^2: v (T + 0.2) + v^2 / 6 = 8.7 m.
+    It flies on for `command_age_max_ms` [ms] and 0.2 s, then brakes at 3 m/s^2:
+    v (T + 0.2) + v^2 / 6 = 8.7 m.
     Source: DESIGN, section 5.
     """
     blind = command_age_max_ms * 1e-3 + 0.2

@@ -35,7 +35,16 @@ class ProcessDiedError(InvalidRunError):
 
 @dataclass
 class Child:
-    """One of the processes."""
+    """One of the processes.
+
+    Attributes:
+        name: Of its command.
+        process: Running or ended.
+        log: Gets what it writes to standard error.
+        unread: The beginning of a line of its feed whose end has not come yet.
+        heard: When it last told something [s], monotonic clock; None before the first time.
+        ready: Whether it has said so.
+    """
 
     name: str
     process: subprocess.Popen[bytes]

@@ -66,7 +66,11 @@ def bind(listen: tuple[str, int]) -> socket.socket:
     """Open a UDP socket that does not block."""
     udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     udp.setblocking(False)
-    udp.bind(listen)
+    try:
+        udp.bind(listen)
+    except OSError:
+        udp.close()
+        raise
     return udp
 
 

@@ -97,8 +97,8 @@ class DirectionProfile:
         distribution: Of the delay about its mean.
         correlation: Of the jitter of one packet with the next, in [0, 1].
         loss: Chance, or bursts.
-        duplicate: Chance that a packet arrives twice; the copy draws a delay of its own.
-        reorder: Chance that a packet overtakes: neither queue nor delay.
+        duplicate: Chance in [0, 1] that a packet arrives twice; the copy draws a delay of its own.
+        reorder: Chance in [0, 1] that a packet overtakes: neither queue nor delay.
         keep_order: Packets never overtake each other (this undoes `reorder`).
         rate: Of the bottleneck [bit/s]; None has none.
         queue_packets: Packets at the bottleneck, the one on the wire included, beyond which the

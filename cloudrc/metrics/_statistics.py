@@ -8,13 +8,18 @@ from cloudrc.metrics._flight import Array
 
 
 def mean(values: Array) -> float | None:
-    """Average the finite values of an array, shape (n,); None if there are none."""
+    """Average the finite ones of `values`, shape (n,), any unit; None if there are none."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
 
 
 def percentile(values: Array, percent: float) -> float | None:
-    """Take a percentile of the finite values of an array, shape (n,); None if there are none."""
+    """Take a percentile; None if nothing is finite.
+
+    Args:
+        values: Shape (n,), any unit; those that are not finite do not count.
+        percent: Share of them that lie below [%].
+    """
     finite = values[np.isfinite(values)]
     return float(np.percentile(finite, percent)) if len(finite) else None
 

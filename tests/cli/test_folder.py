@@ -24,6 +24,17 @@ def test_an_empty_or_new_folder_is_taken(tmp_path: Path) -> None:
     assert new_folder(tmp_path / "a" / "b", "x").is_dir()
 
 
+def test_what_cannot_be_made_is_said_with_a_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("runs").write_text("a file")
+    with pytest.raises(BadInputError, match=r"^runs/ in the working folder: .*with --out$"):
+        new_folder(None, "x")
+    with pytest.raises(BadInputError, match=r"^--out runs/x: .*name another folder$"):
+        new_folder(Path("runs/x"), "x")
+
+
 @pytest.mark.parametrize("name", ["full", "file"])
 def test_what_is_there_is_not_overwritten(name: str, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()

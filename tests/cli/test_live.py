@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
+import math
 
 import pytest
 
-from cloudrc.cli.live import FlightView
+from cloudrc.cli.live import FILE_COLUMNS, FlightView
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
-from cloudrc.records import Control, GuardChange, MissionEvent, Record, TelemetrySent
+from cloudrc.records import Control, Fault, GuardChange, MissionEvent, Record, TelemetrySent
 
 SECOND = 1_000_000_000
 CONTROL = Control(
@@ -44,18 +45,47 @@ def seen(stream: io.StringIO, *records: Record) -> FlightView:
     return view
 
 
-def test_the_line_says_where_the_flight_is() -> None:
+def flying(stamp_ns: int = 3 * SECOND) -> FlightView:
     guard = GuardChange(0, GuardState.TRACK, "mission started")
-    view = seen(io.StringIO(), telemetry(SECOND), CONTROL, guard, telemetry(3 * SECOND))
+    return seen(io.StringIO(), telemetry(SECOND), CONTROL, guard, telemetry(stamp_ns))
+
+
+def test_the_line_says_where_the_flight_is() -> None:
     # Two seconds of flight; the clock above gave one second between first telemetry and now.
-    assert view.line() == (
-        "   2.0 s  waypoint 3/7  (-1.00,  2.50, 0.70) m  delay  96 ms  TRACK  x2"
+    assert flying().line() == (
+        "   2.0 s  waypoint 3/7  (-1.00,  2.50, 0.70) m  delay  96 ms  TRACK   x2.00"
     )
 
 
-def test_the_line_fits_80_columns_at_its_longest() -> None:
-    view = seen(io.StringIO(), telemetry(0), CONTROL, telemetry(1000 * SECOND))
-    assert len(view.line()) <= 80
+@pytest.mark.parametrize(
+    ("width", "line"),
+    [
+        (120, "1000.0 s  waypoint 3/7  (-1.00,  2.50, 0.70) m  delay  96 ms  TRACK   x1000.00"),
+        (76, "1000.0 s  waypoint 3/7  (-1.00,  2.50, 0.70) m  delay  96 ms  TRACK"),
+        (60, "1000.0 s  waypoint 3/7  (-1.00,  2.50, 0.70) m  TRACK"),
+        (40, "1000.0 s  waypoint 3/7  TRACK"),
+        (20, "1000.0 s  TRACK"),
+        (12, "1000.0 s  TR"),
+    ],
+)
+def test_a_narrow_terminal_gets_less_in_one_line(width: int, line: str) -> None:
+    assert flying(1001 * SECOND).line(width) == line
+    assert len(line) <= width
+
+
+def test_what_is_not_known_yet_is_not_shown() -> None:
+    early = CONTROL._replace(horizon=0.0, rtt=math.nan, waypoint=-1)
+    assert seen(io.StringIO(), telemetry(0), early).line() == (
+        "   0.0 s  (-1.00,  2.50, 0.70) m  GROUND"
+    )
+    assert seen(io.StringIO()).line() == "   0.0 s  GROUND"
+
+
+def test_no_zero_has_a_sign() -> None:
+    sent = telemetry(0)
+    odometry = sent.telemetry.odometry._replace(position=(-0.004, -0.0, -1e-9))
+    sent = sent._replace(telemetry=sent.telemetry._replace(odometry=odometry))
+    assert "( 0.00,  0.00, 0.00) m" in seen(io.StringIO(), sent).line()
 
 
 def test_a_terminal_gets_a_line_that_is_rewritten_and_taken_away() -> None:
@@ -79,3 +109,29 @@ def test_a_file_gets_plain_lines_for_events_only() -> None:
         "HOLD: command age 0.252 s above 0.250 s (-1.00, 2.50, 0.70) m delay 96 ms",
     ]
     assert "\x1b" not in stream.getvalue()
+
+
+@pytest.mark.parametrize("length", [10, 44, 45, 60])
+def test_a_text_is_never_glued_to_the_position(length: int) -> None:
+    stream = io.StringIO()
+    seen(stream, telemetry(0), CONTROL, MissionEvent(0, "reached", 1, "x" * length))
+    assert "x  " in stream.getvalue()
+    assert len(stream.getvalue().rstrip("\n")) <= FILE_COLUMNS
+
+
+def test_a_long_text_stands_alone_and_is_wrapped_on_a_terminal_only() -> None:
+    text, file, terminal = " ".join(["plug-in"] * 20), io.StringIO(), Terminal()
+    for stream in (file, terminal):
+        seen(stream, telemetry(0), CONTROL, Fault(0, "late", text))
+    assert file.getvalue() == f"  {text}\n"
+    lines = terminal.getvalue().split("\r\x1b[2K")[1].splitlines()
+    assert max(map(len, lines)) <= 80
+    assert all(line.startswith("    plug-in") for line in lines[1:])
+
+
+def test_a_stream_that_nobody_reads_does_not_end_the_flight() -> None:
+    class Closed(Terminal):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError
+
+    seen(Closed(), telemetry(0), CONTROL, MissionEvent(0, "reached", 1, "reached")).close()

@@ -70,6 +70,8 @@ def test_no_argument_prints_help(capsys: pytest.CaptureFixture[str]) -> None:
         ("list predictor", "did you mean 'predictors'"),
         ("completion ksh", "zsh"),
         ("completion", "required: shell"),
+        ("bench --repeats 0", "'0' is not a whole number from 1 to 100000"),
+        ("bench --repeats=-3", "'-3' is not a whole number from 1 to 100000"),
     ],
 )
 def test_a_wrong_line_is_refused_in_one_line(
@@ -89,7 +91,17 @@ def test_a_wrong_line_is_refused_in_one_line(
         (BadInputError("key x"), 2, "key x"),
         (MissingPrerequisiteError("no mujoco"), 3, "no mujoco"),
         (InvalidRunError("fell behind"), 6, "fell behind"),
-        (PermissionError(13, "Permission denied", "/root/x"), 2, "/root/x: Permission denied"),
+        (
+            PermissionError(13, "Permission denied", "/root/x"),
+            2,
+            "/root/x: Permission denied; choose a file",
+        ),
+        (
+            FileNotFoundError(2, "No such file or directory", "x"),
+            2,
+            "x: No such file or directory; ",
+        ),
+        (OSError("no errno"), 2, "no errno; '--debug' shows where"),
         (ZeroDivisionError("two\nlines"), INTERNAL, "ZeroDivisionError: two lines"),
     ],
 )

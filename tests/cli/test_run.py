@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,7 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ("--mode cluster", 3, "Helm chart"),
         ("--mode local --seeds 3", 2, "virtual time"),
-        ("--seeds 0", 2, "'0' is not a number of seeds"),
+        ("--seeds 0", 2, "'0' is not a whole number from 1 to 100000"),
         ("--seed -1", 2, "--seed"),
         ("--seed 1 --seeds 2", 2, "not allowed with"),
         ("papper", 2, "paper"),
@@ -114,19 +115,29 @@ def test_the_resolved_file_flies_the_same_run_again(folder: Path) -> None:
     assert hashes[0] == hashes[1]
 
 
-def test_many_seeds_become_one_table(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "steps", "--seeds", "2", *SHORT, "--out", "sweep"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == "sweep/sweep.json"
-    assert "done 2/2" in lines
-    assert any(line.startswith("prediction_error_rms") for line in lines)
-    sweep = json.loads((folder / "sweep/sweep.json").read_text())
-    assert [run["seed"] for run in sweep["runs"]] == [1, 2]
-    assert (sweep["done"], sweep["count"]) == (2, 2)
-    assert len((folder / "sweep/sweep.csv").read_text().splitlines()) == 3
+@pytest.mark.parametrize("output", ["table", "json"])
+@pytest.mark.usefixtures("no_page")
+def test_a_reader_that_leaves_does_not_end_the_run(
+    output: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in `cloudrc run | head -1`; the exit code stays that of the verdict: 1 here."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as nobody:
+        monkeypatch.setattr("sys.stdout", nobody)
+        line = ["run", "steps", "--mode", "virtual", "--out", "here", "-o", output, *SHORT]
+        assert main([*line, "--set", "criteria.contact=true"]) == 1
+    left = {path.name for path in (folder / "here").iterdir()}
+    assert {"mission.mcap", "report.json", "config.yaml"} <= left
 
 
-def test_a_report_is_written_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_report_is_written_again(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write_page(folder: Path, *assessment: object) -> None:
+        (folder / "report.html").write_text("drawn elsewhere")
+
+    monkeypatch.setattr("cloudrc.report.write._write_page", write_page)
     assert main(["run", "steps", "--mode", "virtual", *SHORT, "--out", "run"]) == 0
     before = (folder / "run/report.json").read_text()
     for name in ("report.json", "report.html"):

@@ -37,7 +37,7 @@ every_plugin = pytest.mark.parametrize(
 every_estimator = pytest.mark.parametrize("module", discover(estimators), ids=short)
 every_predictor = pytest.mark.parametrize("module", discover(predictors), ids=short)
 every_controller = pytest.mark.parametrize("module", discover(controllers), ids=short)
-fewer = settings(max_examples=40, deadline=None)
+fewer = settings(max_examples=20, deadline=None)
 
 numbers = st.floats(-1e6, 1e6)
 vectors = st.tuples(numbers, numbers, numbers)

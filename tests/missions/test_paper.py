@@ -61,7 +61,9 @@ def test_verbatim_flies_although_late_commands_win():
     assert numbers(flight)["loop_delay_mean"] > numbers(fly("paper"))["loop_delay_mean"]
 
 
-@pytest.mark.parametrize("profile", ["ideal", "wifi", "lte", "5g", "handover", "lossy"])
+@pytest.mark.parametrize(
+    "profile", ["ideal", "wifi", "lte", "5g", "handover", "lossy", "satellite"]
+)
 def test_every_other_profile_flies_too(profile):
     flight = fly("paper", f"link.profile={profile}")
     assert flight.verdict.failures == ()

@@ -58,7 +58,7 @@ def test_a_command_is_a_twist_with_its_yaw_rate() -> None:
 
 
 @given(any_record())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_rows_come_back_from_their_bytes(record: Any) -> None:
     for name, stamp_ns, values in rows(record):
         found_ns, found = decode(TOPICS[name], encode(TOPICS[name], stamp_ns, values))

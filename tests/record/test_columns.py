@@ -58,7 +58,7 @@ def test_what_does_not_exist_is_answered_with_what_does() -> None:
 
 
 @given(st.lists(any_record(), max_size=12))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_a_file_gives_what_memory_gives(
     tmp_path_factory: pytest.TempPathFactory, records: list[Any]
 ) -> None:

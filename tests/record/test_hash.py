@@ -34,7 +34,7 @@ def test_the_bytes_are_those_that_the_module_promises() -> None:
 
 
 @given(st.lists(any_record(), max_size=6), st.integers(0, 6))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_batches_do_not_matter(records: list[Any], cut: int) -> None:
     found = RecordHash()
     found.update(records[:cut])

@@ -59,7 +59,7 @@ def test_two_clocks_are_related_by_the_packets(tmp_path: Path, start: int, ahead
     st.integers(-(10**12), 10**12),
     st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 10**9)), min_size=1, max_size=20),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_the_true_offset_is_within_the_uncertainty(
     ahead: int, delays: list[tuple[int, int]]
 ) -> None:

@@ -21,13 +21,16 @@ def run(code: str, without: list[str]) -> str:
 
 @pytest.mark.parametrize("module", ["reader", "writer", "merge"])
 def test_a_missing_package_is_named_with_its_remedy(module: str) -> None:
-    code = (
-        "from cloudrc.errors import MissingPrerequisiteError\n"
-        f"try: import cloudrc.record.{module}\n"
-        "except MissingPrerequisiteError as error: print(error.exit_code, error)"
-    )
-    for name in NEEDED:
-        text = run(code, [name])
+    code = f"""
+from cloudrc.errors import MissingPrerequisiteError
+for name in {NEEDED}:
+    for loaded in [m for m in sys.modules if m.startswith(("cloudrc.record", *{NEEDED}))]:
+        del sys.modules[loaded]
+    sys.modules[name] = None
+    try: import cloudrc.record.{module}
+    except MissingPrerequisiteError as error: print(error.exit_code, error)
+"""
+    for name, text in zip(NEEDED, run(code, []).splitlines(), strict=True):
         assert text.startswith(f"3 recording needs the package {name}, which is not installed")
         assert text.endswith("install it with: pip install 'cloudrc[record]'")
 

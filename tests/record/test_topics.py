@@ -27,7 +27,7 @@ def leaves(cls: type[Any], prefix: str = "") -> set[str]:
 
 
 @given(any_record())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_rows_hold_the_record_s_own_values(record: Any) -> None:
     found = rows(record)
     assert found

@@ -94,7 +94,7 @@ def note_or_refusal(path: Path) -> str:
 
 
 @given(st.integers(0, len(WHOLE) - 1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_no_cut_ends_in_a_traceback(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
     path = torn(tmp_path_factory.getbasetemp(), cut)
     refusal = note_or_refusal(path)
@@ -106,7 +106,7 @@ def test_no_cut_ends_in_a_traceback(tmp_path_factory: pytest.TempPathFactory, cu
 
 
 @given(st.integers(0, len(WHOLE) - 1), st.integers(1, 255))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_no_flipped_byte_ends_in_a_traceback(
     tmp_path_factory: pytest.TempPathFactory, at: int, flip: int
 ) -> None:

@@ -12,6 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
+from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from cloudrc.messages import GuardState
@@ -124,11 +125,10 @@ def same(one: Any, other: Any) -> bool:
 
 
 def test_another_decoder_gives_the_same_values(flight: Path) -> None:
-    decoder = pytest.importorskip("mcap_ros2.decoder", reason="needs mcap-ros2-support")
     seen = set()
     with AnyReader([flight]) as bag, flight.open("rb") as stream:
         ours = iter(bag.messages())
-        reader = make_reader(stream, decoder_factories=[decoder.DecoderFactory()])
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         found = [(c.topic, m.data, d) for _, c, m, d in reader.iter_decoded_messages()]
         by_bytes = {(topic, data): message for topic, data, message in found}
         for connection, _, data in ours:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import importlib
 
 import matplotlib
+import numpy as np
 import pytest
 
 from cloudrc.config.schema import Blackout, Change, Direction
+from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.records import Control, GuardChange
-from cloudrc.report.figures import NAMES
+from cloudrc.report.figures import NAMES, flight
 from cloudrc.report.figures.events import LEGEND, legend, mark_events
+from cloudrc.report.figures.solids import WALL_COLOUR, is_swallowed, pipe_faces
 from cloudrc.report.figures.style import RC, new_figure
 from cloudrc.report.figures.subject import Subject
 from tests.metrics.flights import ONE_PIPE, START, Log, at, flown
@@ -35,6 +38,24 @@ def test_little_to_show_is_no_error(name: str, empty: bool) -> None:
     with matplotlib.rc_context(RC):
         drawing.draw(subject).draw_without_rendering()
     assert drawing.caption(subject)
+
+
+def test_where_pipes_meet_no_rim_is_drawn_in_the_other() -> None:
+    """Sorted by depth its faces would show in patches between those of the other pipe."""
+    first, second, _ = load_scene("pipes").pipes
+    centre = np.array(second.centre)
+    faces = pipe_faces(second, np.array([0.0, 0.0, 1.0]), centre, second.length)
+    met = [face for face in faces if is_swallowed(face, first)]
+    assert 0 < len(met) < len(faces)
+    assert {face.colour for face in met} == {WALL_COLOUR}
+    for face in met:
+        offset = face.corners.mean(axis=0) - np.array(first.centre)
+        assert np.hypot(offset[0], offset[2]) < first.outer  # its axis is y
+        assert abs(offset[1]) < first.length / 2
+
+
+def test_the_caption_says_where_the_clearance_is_cut_off() -> None:
+    assert "Panel (c) ends at 0.8 m" in flight.caption(subject_of(flown()))
 
 
 def test_a_calm_flight_has_no_marks() -> None:

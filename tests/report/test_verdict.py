@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from cloudrc import plugins
 from cloudrc.messages import GuardState
 from cloudrc.metrics import Flight, Number
-from cloudrc.records import Contact, GuardChange, Lateness, MissionEvent, SessionOpened
+from cloudrc.records import (
+    Arrival,
+    Contact,
+    Control,
+    GuardChange,
+    Lateness,
+    MissionEvent,
+    SessionOpened,
+)
 from cloudrc.report.verdict import REAL_TIME_FACTOR_MIN, SLIP_MAX, Verdict, judge
 from tests.metrics.flights import ONE_PIPE, SECOND, Log, at, flown, touch
 
@@ -120,7 +130,37 @@ def test_a_mission_without_an_end() -> None:
 def test_the_robot_never_flew() -> None:
     log = flown()
     log.change(GuardChange, lambda n, change: None)
-    assert codes(judged(log.flight(ONE_PIPE, contact=True))) == ["not_started"]
+    (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
+    assert failure.code == "not_started"
+    assert failure.text.endswith("fresh commands came, but no request to start")
+
+
+@pytest.mark.parametrize(
+    ("arrived", "words"),
+    [
+        (lambda n, a: a._replace(used=False), "was 0.090 s old or older when the command came"),
+        (lambda n, a: a._replace(used=False), "guard.command_age_max_ms"),
+        # The start opens a session of its own: what was fresh before it does not count.
+        (lambda n, a: a._replace(used=n < 9, epoch=1 if n < 9 else 2), "command_age_max_ms"),
+        (lambda n, a: a if a.uplink else None, "no command came"),
+    ],
+)
+def test_why_the_robot_never_flew(
+    arrived: Callable[[int, Arrival], Arrival | None], words: str
+) -> None:
+    log = flown()
+    log.change(GuardChange, lambda n, change: None)
+    log.change(Arrival, arrived)
+    (failure,) = judged(log.flight()).failures
+    assert words in failure.text
+
+
+def test_without_a_period_of_control_the_robot_never_flew() -> None:
+    log = flown()
+    log.change(GuardChange, lambda n, change: None)
+    log.change(Control, lambda n, control: None)
+    (failure,) = judged(log.flight()).failures
+    assert failure.text.endswith("cloud computed no command")
 
 
 def test_interrupted_before_the_end_says_only_what_is_sure() -> None:

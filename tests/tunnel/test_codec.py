@@ -89,7 +89,7 @@ def test_another_version_is_refused_by_name():
 
 
 @given(st.binary(max_size=400))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_garbage_raises_nothing_but_decode_errors(data):
     for read in (codec.decode, codec.peek):
         try:

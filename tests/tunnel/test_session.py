@@ -74,7 +74,7 @@ def test_a_jump_over_the_window_forgets_what_was_before():
 
 
 @given(st.lists(st.integers(0, 40), max_size=60), st.booleans())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_the_window_agrees_with_a_set(counters, newest_wins):
     channel, seen = Channel(newest_wins), set()
     for counter in counters:

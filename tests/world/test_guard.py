@@ -157,7 +157,7 @@ def test_back_on_the_ground_nothing_is_armed():
     st.lists(st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3), max_size=20),
     st.floats(0.5, 20.0),
 )
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_whatever_is_commanded_the_reference_stays_inside_the_caps(velocities, speed_max):
     guard = Guard(Limits(speed_max=speed_max))
     guard.start_mission(0)

@@ -92,7 +92,7 @@ def test_rates_are_damped():
 unit = st.floats(-1.0, 1.0)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     force=st.tuples(unit, unit, st.floats(0.2, 2.0)),
     quaternion=st.tuples(*[unit] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
@@ -121,7 +121,7 @@ def test_no_force_leaves_the_attitude_undefined(force):
 small = st.floats(-0.1, 0.1)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(thrust=st.floats(6.0, 20.0), roll=small, pitch=small, yaw=st.floats(-0.02, 0.02))
 def test_allocation_gives_thrust_and_torque(thrust, roll, pitch, yaw):
     front, left, back, right = (KF * w * w for w in allocate((thrust, roll, pitch, yaw)))

@@ -34,7 +34,17 @@ class Pid(Controller):
         velocity_max: Vector,
         speed_max: float,
     ) -> None:
-        """Start with an empty integral; see `build` for the parameters and their units."""
+        """Start with an empty integral; what limits nothing is infinite.
+
+        Args:
+            gain_p: Velocity per position error [1/s], shape (3,).
+            gain_i: Velocity per integral of the position error [1/s^2], shape (3,).
+            gain_d: Velocity taken back per velocity [1], shape (3,).
+            gain_yaw: Yaw rate per yaw error [1/s].
+            integral_limit: Of the integral term [m/s], shape (3,).
+            velocity_max: Per axis [m/s], shape (3,).
+            speed_max: Of the whole [m/s].
+        """
         self._gain_p = gain_p
         self._gain_i = gain_i
         self._gain_d = gain_d

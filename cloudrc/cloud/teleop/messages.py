@@ -101,13 +101,11 @@ class Outcome:
             "guard_stopped".
         text: The same in words.
         waypoint: Index of the waypoint that was flown to at the end.
-        reached: Number of waypoints reached.
     """
 
     code: str
     text: str
     waypoint: int
-    reached: int
 
     @property
     def success(self) -> bool:

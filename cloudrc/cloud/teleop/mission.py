@@ -225,7 +225,7 @@ class Teleop:
         """However the mission ends, the robot is asked to hold where it is."""
         waypoint = min(self._leg, len(self._plan.legs) - 1)
         self.state = state
-        self.outcome = Outcome(code, text, waypoint, reached=self._leg)
+        self.outcome = Outcome(code, text, waypoint)
         self._requests.ask(Request.END)
         self._aim_here()
         self._tell(code, waypoint, text, now_ns)

@@ -52,7 +52,7 @@ def band(direction: Direction) -> Band | None:
 
 
 def at(steps: Band, time: Array) -> tuple[Array, Array]:
-    """Look up the lower and upper bound [s] at instants [s] since the link came up."""
+    """Look up the lower and upper bound [s] at each `time` [s] since the link came up."""
     rows = np.maximum(np.searchsorted(steps.time, time, side="right") - 1, 0)
     return steps.low[rows], steps.high[rows]
 

@@ -56,7 +56,7 @@ RC: dict[Any, Any] = {
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Make an empty figure of a size [in] that needs no display and no pyplot."""
+    """Make an empty figure, `width` by `height` [in], that needs no display and no pyplot."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
