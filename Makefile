@@ -3,12 +3,26 @@ PYTHON ?= python3
 VENV ?= .venv
 EXPERIMENT ?= paper
 bin := $(VENV)/bin
+VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' cloudrc/__init__.py)
+# Put before the images' names, with a slash at its end: make images REGISTRY=ghcr.io/me/
+REGISTRY ?=
+CLUSTER ?= cloudrc
+IMAGES := world cloud prometheus
+SCRIPTS := .ci/run
+BUILD_ARGS := --build-arg VERSION=$(VERSION) \
+	--build-arg SOURCE=$(or $(filter https://%,$(shell git config remote.origin.url)),unpublished) \
+	--build-arg REVISION=$(or $(shell git rev-parse HEAD 2>/dev/null),unknown)
+# Universal in the processor: the hashes of all wheels for Linux are in the lock.
+COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python-platform linux \
+	--generate-hashes --no-emit-index-url --custom-compile-command 'make lock'
+# MuJoCo's viewers: a pod draws nothing, and they are a tenth of the image.
+DRAWING := glfw pyopengl mujoco-studio websockets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process nightly lint types bench pictures clean
+.PHONY: help demo test process e2e test-netem nightly lint types bench pictures docs images kind-load lock chart-docs clean
 
 help: ## print this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(VENV)/all ## fly the paper's mission in real time and write its report
 	$(bin)/cloudrc run $(EXPERIMENT) --mode local
@@ -19,13 +33,23 @@ test: $(VENV)/dev ## run the default tests on all cores
 process: $(VENV)/dev ## run the tests that start processes and take real time
 	$(bin)/pytest -m 'process and not full'
 
+e2e: $(VENV)/dev ## fly on a kind cluster (KEEP=1 leaves it); needs Docker, kind, helm, kubectl
+	$(bin)/pytest -m e2e tests/e2e $(if $(KEEP),--keep)
+
+test-netem: $(VENV)/dev ## run the tests of the kernel's netem; needs root and sch_netem
+	$(bin)/pytest -m netem tests/link
+
 nightly: $(VENV)/dev ## run every test, with the full numbers: minutes
-	$(bin)/pytest -n auto -m 'not process'
+	$(bin)/pytest -n auto -m 'not process and not e2e and not netem'
 	$(bin)/pytest -m process
 
 lint: $(VENV)/dev ## check format and rules
 	$(bin)/ruff format --check .
 	$(bin)/ruff check .
+	$(bin)/hadolint images/*/Dockerfile
+	$(bin)/shellcheck $(SCRIPTS)
+	@if command -v helm >/dev/null; then helm lint --quiet --strict charts/cloudrc; \
+		else echo "no helm here: the chart is checked by 'make test' alone"; fi
 
 types: $(VENV)/dev ## check types
 	$(bin)/mypy
@@ -37,6 +61,37 @@ pictures: $(VENV)/all ## draw the README's picture from a flight
 	rm -rf build/pictures
 	$(bin)/cloudrc run paper --mode virtual --out build/pictures
 	cp build/pictures/figures/flight.png docs/flight.png
+
+docs: $(VENV)/all ## write docs/metrics.md from the table of metrics
+	$(bin)/python -m cloudrc.exposition.document > docs/metrics.md
+
+images: ## build the containers' images; needs Docker
+	@command -v docker >/dev/null || { \
+		echo "make images needs Docker: https://docs.docker.com/engine/install" >&2; exit 3; }
+	for role in $(IMAGES); do \
+		DOCKER_BUILDKIT=1 docker build --quiet --file images/$$role/Dockerfile \
+			--tag $(REGISTRY)cloudrc/$$role:$(VERSION) $(BUILD_ARGS) . || exit 1; \
+	done
+
+kind-load: ## load the images into the kind cluster CLUSTER (cloudrc)
+	@command -v kind >/dev/null || { \
+		echo "make kind-load needs kind: https://kind.sigs.k8s.io" >&2; exit 3; }
+	@kind get clusters 2>/dev/null | grep -qx $(CLUSTER) || { \
+		echo "no kind cluster '$(CLUSTER)': kind create cluster --config kind-config.yaml" >&2; \
+		exit 3; }
+	kind load docker-image --name $(CLUSTER) $(IMAGES:%=$(REGISTRY)cloudrc/%:$(VERSION))
+
+lock: $(VENV)/bin/python ## write the requirements of images and tests again
+	$(bin)/python -m pip install --quiet uv
+	$(COMPILE) pyproject.toml --extra world --extra record --output-file images/world/requirements.txt \
+		$(DRAWING:%=--no-emit-package %)
+	$(COMPILE) pyproject.toml --extra record --extra api --output-file images/cloud/requirements.txt
+	echo hatchling | $(COMPILE) - --output-file images/build-requirements.txt
+	$(COMPILE) pyproject.toml --extra dev --no-emit-package cloudrc \
+		--output-file tests/requirements.txt
+
+chart-docs: $(VENV)/dev ## write the chart's values, schema and tables from the models
+	$(bin)/python tools/chart_docs.py
 
 clean: ## remove the environment and what tools left
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

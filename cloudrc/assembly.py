@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
+from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity, Operator
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.teleop.messages import StartMission
 from cloudrc.cloud.teleop.mission import Teleop
@@ -76,6 +76,7 @@ def build_cloud(
     experiment: ResolvedExperiment,
     identity: CloudIdentity,
     clock: Callable[[], int] = lambda: 0,
+    teleop: Operator | None = None,
 ) -> CloudEndpoint:
     """Join plug-ins and teleoperation, give them cloud's end of the tunnel, start the mission.
 
@@ -83,6 +84,7 @@ def build_cloud(
         experiment: What to fly.
         identity: Who this end is.
         clock: Its monotonic clock [ns].
+        teleop: Where setpoints come from; None for a machine within, which starts the mission.
     """
     cloud = experiment.cloud
     loop = ControlLoop(
@@ -90,8 +92,10 @@ def build_cloud(
         build("predictors", cloud.predictor),
         build("controllers", cloud.controller),
     )
-    teleop, start_ns = Teleop(), clock()
-    teleop.operate(StartMission(build_plan(experiment)), start_ns)
+    start_ns = clock()
+    if teleop is None:
+        teleop = Teleop()
+        teleop.operate(StartMission(build_plan(experiment)), start_ns)
     newest_wins = experiment.tunnel.order == "newest"
     return CloudEndpoint(loop, teleop, identity, newest_wins=newest_wins, start_ns=start_ns)
 
@@ -105,15 +109,24 @@ def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDire
 
 
 def build_plan(experiment: ResolvedExperiment) -> Plan:
-    """Turn the mission into legs."""
-    mission = experiment.mission
+    """Turn the experiment's mission into legs."""
+    return mission_plan(experiment.mission, experiment.criteria.time_limit_s, experiment.seed)
+
+
+def mission_plan(mission: schema.Mission, time_limit: float, seed: int = 0) -> Plan:
+    """Turn a mission into legs.
+
+    Args:
+        mission: Checked.
+        time_limit: Of the whole mission [s].
+        seed: Of random steps.
+    """
     legs = (
-        _step_legs(mission.steps, experiment.seed)
+        _step_legs(mission.steps, seed)
         if mission.steps is not None
         else tuple(_leg(waypoint) for waypoint in mission.waypoints)
     )
-    start = Start.SPAWN if mission.start == "spawn" else Start.HERE
-    return Plan(legs, start, experiment.criteria.time_limit_s)
+    return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
 
 def link_profile(direction: schema.Direction) -> DirectionProfile:

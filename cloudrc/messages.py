@@ -11,6 +11,7 @@ in MuJoCo.
 from __future__ import annotations
 
 from enum import IntEnum
+from math import nan
 from typing import NamedTuple, TypeAlias
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -85,6 +86,9 @@ class Telemetry(NamedTuple):
         slip_ns: By how much world's clock lags its machine's monotonic clock [ns].
         mission: Number of the last mission request that world has acted on; 0 if none.
         guard: State of the guard.
+        pipe_contacts: How often the robot has begun to touch a pipe in this mission.
+        touch_speed: Of the tip when it first touched the board in this mission [m/s]; NaN if it has
+            not yet.
     """
 
     stamp_ns: int
@@ -95,6 +99,8 @@ class Telemetry(NamedTuple):
     slip_ns: int
     mission: int
     guard: GuardState
+    pipe_contacts: int = 0
+    touch_speed: float = nan
 
 
 class Command(NamedTuple):

@@ -58,11 +58,12 @@ def test_the_wheel_holds_every_file_of_the_package(tmp_path: Path) -> None:
         if path.suffix in SHIPPED and "__pycache__" not in path.parts
     }
     assert source <= packed
+    assert {"cloudrc/_chart/Chart.yaml", "cloudrc/_chart/templates/NOTES.txt"} <= packed
 
 
 def test_make_prints_every_target() -> None:
     done = subprocess.run(["make", "-C", ROOT], check=True, capture_output=True, text=True)
-    targets = re.findall(r"^\s+make (\w+)", done.stdout, re.MULTILINE)
+    targets = re.findall(r"^\s+make ([\w-]+)", done.stdout, re.MULTILINE)
     phony = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert phony is not None
     assert targets == phony[1].split()

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import end_arguments, listening, open_recorder, warn_if_exposed
+from cloudrc.cli.ends import end_arguments, open_exporter, open_peer, open_recorder
+
+if TYPE_CHECKING:
+    from cloudrc.cloud.endpoint import Operator
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     end_arguments(parser)
+    parser.add_argument(
+        "--teleop",
+        type=Path,
+        metavar="DIR",
+        help="missions come from 'cloudrc teleop --socket DIR' (default: the experiment's, here)",
+    )
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -23,14 +34,33 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.config.load import load_experiment
     from cloudrc.drivers.machine import clock_id
     from cloudrc.drivers.process import run_end
-    from cloudrc.drivers.realtime import Peer
 
-    warn_if_exposed(options.listen)
+    exporter = open_exporter(options, "cloud")
     experiment, clock = load_experiment(str(options.config)), clock_id()
     recorder = open_recorder(options.record, "cloud", clock)
-    with listening("--listen", options.listen):
-        peer = Peer.bind(options.listen, options.peer)
+    peer = open_peer(options)
     identity = CloudIdentity(clock, os.urandom(16))
-    cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns)
-    run_end(cloud, peer, recorder, end="cloud", over=lambda: cloud.mission_over)
+    teleop = _join(options.teleop) if options.teleop else None
+    cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns, teleop)
+    run_end(
+        cloud,
+        peer,
+        recorder,
+        end="cloud",
+        over=lambda: cloud.mission_over,
+        exporter=exporter,
+        watched=options.feed,
+    )
     return 0
+
+
+def _join(folder: Path) -> Operator:
+    """Join the process of teleop, which may come and go."""
+    import time
+
+    from cloudrc.cloud.teleop import wire
+    from cloudrc.drivers.teleop import RemoteTeleop
+    from cloudrc.drivers.unix import UnixPeer
+
+    peer = UnixPeer(folder / "cloud.sock", folder / "teleop.sock")
+    return RemoteTeleop(peer, wire.encode, wire.decode, time.monotonic_ns())

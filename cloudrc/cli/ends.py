@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
+    from cloudrc.drivers.exporter import Exporter
+    from cloudrc.drivers.realtime import Peer
     from cloudrc.record.recorder import Recorder
 
 Address = tuple[str, int]
@@ -24,14 +26,33 @@ It ends on SIGTERM, on Ctrl-C, and when the process that started it is gone."""
 def process_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what every process takes."""
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="the experiment")
+    parser.add_argument(
+        "--feed", action="store_true", help="tell a supervisor on stdout; else only events are said"
+    )
+    parser.add_argument(
+        "--metrics",
+        type=address,
+        metavar="HOST:PORT",
+        help="serve /metrics, /healthz and /readyz here (default: not at all)",
+    )
 
 
 def end_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what an end of the tunnel takes."""
     process_arguments(parser)
     parser.add_argument("--record", type=Path, metavar="FILE", help="MCAP file to write")
-    for flag, text in (("--listen", "where to receive"), ("--peer", "where to send")):
-        parser.add_argument(flag, type=address, required=True, metavar="HOST:PORT", help=text)
+    parser.add_argument(
+        "--listen", type=address, required=True, metavar="HOST:PORT", help="where to receive"
+    )
+    target = parser.add_mutually_exclusive_group(required=True)
+    target.add_argument("--peer", type=address, metavar="HOST:PORT", help="where to send")
+    target.add_argument(
+        "--route",
+        type=Path,
+        metavar="FILE",
+        help="file that says where to send, HOST:PORT with the host as a number; it is waited for"
+        " and followed",
+    )
 
 
 def address(text: str) -> Address:
@@ -46,6 +67,32 @@ def warn_if_exposed(listen: Address) -> None:
     """Say so if others than this machine can send to an address."""
     if not listen[0].startswith("127."):
         print(f"cloudrc: warning: {listen[0]} can be reached from outside", file=sys.stderr)
+
+
+def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
+    """Serve a process's metrics where its flags say; None if they do not."""
+    if options.metrics is None:
+        return None
+    from cloudrc.drivers.exporter import Exporter
+
+    warn_if_exposed(options.metrics)
+    exporter = Exporter(role)
+    exporter.serve(options.metrics)
+    return exporter
+
+
+def open_peer(options: argparse.Namespace) -> Peer:
+    """Bind the socket of an end, which sends to its peer or where its route leads."""
+    from cloudrc.drivers.realtime import Peer
+    from cloudrc.drivers.route import Route
+
+    warn_if_exposed(options.listen)
+    with listening("--listen", options.listen):
+        if options.route is None:
+            return Peer.bind(options.listen, options.peer)
+        if not options.route.exists():
+            print(f"cloudrc: nothing is sent until there is {options.route}", file=sys.stderr)
+        return Peer.bind(options.listen, Route(options.route))
 
 
 @contextmanager

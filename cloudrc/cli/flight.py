@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cloudrc.cli.extras import missing
 from cloudrc.errors import CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
@@ -87,7 +89,7 @@ def _fly_virtual(
         try:
             return _report(folder, recording, experiment, run, page=page)
         finally:
-            for name, data in _attachments(folder).items():
+            for name, data in attachments(folder).items():
                 writer.attach(name, data)
 
 
@@ -115,8 +117,15 @@ def _fly_local(
 
     run, trouble = Run("local", "relay"), None
     nothing = InterruptedRunError("interrupted before anything was recorded")
+    absent = missing("api")
+    if absent:
+        print(
+            f"cloudrc: no operator's API in this run: {', '.join(absent)} not installed; "
+            "run: pip install 'cloudrc[api]'",
+            file=sys.stderr,
+        )
     try:
-        LocalRun(folder, see).fly(experiment.criteria.time_limit_s + GRACE)
+        LocalRun(folder, see, api=not absent).fly(experiment.criteria.time_limit_s + GRACE)
     except KeyboardInterrupt:
         run = replace(run, interrupted=True)
     except CloudrcError as error:
@@ -146,7 +155,7 @@ def _report_ends(
     try:
         return _report(folder, mission.recording(), experiment, run, page=page)
     finally:
-        mission.write(folder / "mission.mcap", _attachments(folder))
+        mission.write(folder / "mission.mcap", attachments(folder))
 
 
 def _report(
@@ -163,7 +172,7 @@ def _report(
         ) from None
 
 
-def _attachments(folder: Path) -> dict[str, bytes]:
+def attachments(folder: Path) -> dict[str, bytes]:
     """What goes into the recording: how it was configured and how it ended."""
     paths = (folder / "config.yaml", folder / "report.json")
     return {path.name: path.read_bytes() for path in paths if path.exists()}

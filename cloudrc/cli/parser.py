@@ -16,6 +16,7 @@ from cloudrc.errors import BadInputError
 GROUPS: dict[str, dict[str, str]] = {
     "fly": {
         "run": "fly an experiment and write its report",
+        "mission": "fly and steer missions, here or in a cluster",
         "report": "write the report of a recorded run again",
         "bench": "measure how fast the closed loop runs here",
     },
@@ -27,7 +28,9 @@ GROUPS: dict[str, dict[str, str]] = {
     "processes (started by 'run --mode local')": {
         "world": "the robot: physics, sensors, guard, low-level control",
         "cloud": "the remote controller",
+        "teleop": "missions, operator and their HTTP API",
         "relay": "the emulated link between them",
+        "link": "the emulated link of one pod: 'cloudrc link run'",
     },
 }
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}

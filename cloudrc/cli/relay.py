@@ -4,9 +4,23 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import address, listening, process_arguments, warn_if_exposed
+from cloudrc.cli.ends import (
+    address,
+    listening,
+    open_exporter,
+    process_arguments,
+    warn_if_exposed,
+)
+
+if TYPE_CHECKING:
+    from cloudrc.drivers.exporter import Exporter
+    from cloudrc.link.relay import Relay
+
+COUNT_PERIOD_NS = 1_000_000_000
 
 ADDRESSES = {
     "--world-side": "where to receive from world",
@@ -33,7 +47,9 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.link.relay import Relay
     from cloudrc.tunnel.codec import peek
 
-    uplink, downlink = assembly.build_links(load_experiment(str(options.config)))
+    stop, exporter = StopSignal(), open_exporter(options, "link")
+    experiment = load_experiment(str(options.config))
+    uplink, downlink = assembly.build_links(experiment)
     sides = []
     for flag, listen in (
         ("--world-side", options.world_side),
@@ -52,7 +68,34 @@ def execute(options: argparse.Namespace) -> int:
         cloud_peer=options.cloud,
     )
     Feed.on_stdout().ready()
-    relay.run(StopSignal())
+    if exporter is None:
+        relay.run(stop)
+    else:
+        for way, asked in (("uplink", experiment.uplink), ("downlink", experiment.downlink)):
+            exporter.shaped("relay", way, "relay")
+            exporter.asked(way, asked.delay_ms * 1e-3)
+        exporter.ready(True)
+        relay.run(_counting(stop, relay, exporter))
     counts = ", ".join(f"{name} {count:g}" for name, count in relay.counts().items())
     print(f"cloudrc relay: {counts}", file=sys.stderr)
     return 0
+
+
+def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Callable[[], bool]:
+    """Ask `stop`, and once a second tell the exporter what the relay has counted."""
+    import time
+
+    from cloudrc.records import Counted
+
+    due_ns = 0
+
+    def ask() -> bool:
+        nonlocal due_ns
+        now_ns = time.monotonic_ns()
+        if now_ns >= due_ns:
+            due_ns = now_ns + COUNT_PERIOD_NS
+            outcomes = relay.outcomes().items()
+            exporter.see([Counted(now_ns, "link", name, total) for name, total in outcomes])
+        return stop()
+
+    return ask

@@ -5,28 +5,41 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TextIO
 
+from cloudrc.cli.cluster_flags import place, place_arguments, timeout_argument
 from cloudrc.cli.extras import require
 from cloudrc.cli.parser import count
-from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
+from cloudrc.errors import BadInputError, CloudrcError
 
 if TYPE_CHECKING:
+    from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.records import Record
 
+Flight = Callable[[Path, TextIO, int], dict[str, Any]]
+"""Folder to fill, stream to show itself on, number of waypoints -> the report."""
+
 MODES = ("local", "virtual", "cluster")
+EXTRAS = {
+    "local": ("world", "record", "report"),
+    "virtual": ("world", "record", "report"),
+    "cluster": ("kube", "record", "report"),
+}
+"""What has to be installed, by mode."""
 EPILOG = """\
 modes:
   local    real time: world, cloud and relay as processes, UDP on 127.0.0.1
   virtual  one process, virtual time: the same flight in seconds, repeatable
-  cluster  comes with the Helm chart, in a later release
+  cluster  Kubernetes: installs the chart, flies by a Job, fetches the recording
 
 examples:
   cloudrc run
   cloudrc run paper --mode virtual --set link.profile=satellite
   cloudrc run steps --seeds 10 --set cloud.predictor=last_sample
   cloudrc run my.yaml --mode virtual --set cloud.predictor=./my_predictor.py
+  cloudrc run --mode cluster --context kind-cloudrc -n demo --release demo
   cloudrc run runs/latest/config.yaml --mode virtual     the same run again
 
 'cloudrc list' names experiments, profiles and plug-ins. The last line that
@@ -67,6 +80,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         default="table",
         help="json: report.json on stdout and nothing else (default: table)",
     )
+    place_arguments(parser)
+    timeout_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -74,14 +89,9 @@ def execute(options: argparse.Namespace) -> int:
     # An orderly end, with a report, whoever asks for it: a person or a batch system.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     mode = options.mode or ("virtual" if options.seeds else "local")
-    if mode == "cluster":
-        raise MissingPrerequisiteError(
-            "--mode cluster comes with the Helm chart, in a later release; "
-            "use --mode local or --mode virtual"
-        )
     if options.seeds and mode != "virtual":
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
-    require(f"mode {mode}", ("world", "record", "report"))
+    require(f"mode {mode}", EXTRAS[mode])
     overrides = list(options.set)
     if options.seeds:
         from cloudrc.cli import sweep
@@ -94,13 +104,13 @@ def execute(options: argparse.Namespace) -> int:
 
 def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> int:
     from cloudrc.cli.closing import exit_code, show
-    from cloudrc.cli.flight import fly
     from cloudrc.cli.folder import new_folder
-    from cloudrc.cli.live import FlightView
-    from cloudrc.cli.output import is_live, unread_is_fine
+    from cloudrc.cli.output import unread_is_fine
     from cloudrc.config.load import load_experiment
 
     experiment = load_experiment(options.experiment, overrides)
+    # What is wrong with the place is said before a folder is made for the run.
+    flight = _in_cluster(experiment, options) if mode == "cluster" else _here(experiment, mode)
     name = experiment.name
     folder = new_folder(options.out, f"{name}-{mode}-seed{experiment.seed}")
     as_json = options.output == "json"
@@ -114,15 +124,11 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
                 f" {waypoints} waypoint{'s' if waypoints != 1 else ''}",
                 flush=True,
             )
-    view = FlightView(stream, waypoints) if is_live(stream) or not as_json else None
     try:
-        report = fly(experiment, mode, folder, view.see if view else _see_nothing)
+        report = flight(folder, stream, waypoints)
     except CloudrcError:
         print(f"what was recorded is in {folder}", file=sys.stderr)
         raise
-    finally:
-        if view:
-            view.close()
     text = (folder / "report.json").read_text()
     with unread_is_fine(sys.stdout):
         if as_json:
@@ -131,6 +137,44 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
             show(report, folder)
         sys.stdout.flush()
     return exit_code(report)
+
+
+def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
+    """Prepare a flight on this machine."""
+
+    def flight(folder: Path, stream: TextIO, waypoints: int) -> dict[str, Any]:
+        from cloudrc.cli.flight import fly
+        from cloudrc.cli.live import FlightView
+        from cloudrc.cli.output import is_live
+
+        quiet = stream is sys.stderr and not is_live(stream)
+        view = None if quiet else FlightView(stream, waypoints)
+        try:
+            return fly(experiment, mode, folder, view.see if view else _see_nothing)
+        finally:
+            if view:
+                view.close()
+
+    return flight
+
+
+def _in_cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> Flight:
+    """Prepare a flight in the cluster that the flags name."""
+    from cloudrc.cli.cluster_flight import fly_in_cluster, refuse_local_files
+    from cloudrc.cluster.tools import program
+
+    refuse_local_files(experiment)
+    release = place(options)
+    for name in ("helm", "kubectl"):
+        program(name)
+
+    def flight(folder: Path, stream: TextIO, waypoints: int) -> dict[str, Any]:
+        def tell(text: str) -> None:
+            print(f"  {text}", file=stream, flush=True)
+
+        return fly_in_cluster(experiment, folder, release, options.timeout, tell)
+
+    return flight
 
 
 def _see_nothing(records: list[Record]) -> None:

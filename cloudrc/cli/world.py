@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import end_arguments, listening, open_recorder, warn_if_exposed
+from cloudrc.cli.ends import end_arguments, open_exporter, open_peer, open_recorder
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,15 +22,21 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.config.load import load_experiment
     from cloudrc.drivers.machine import clock_id
     from cloudrc.drivers.process import run_end
-    from cloudrc.drivers.realtime import Peer
     from cloudrc.world.endpoint import WorldIdentity
 
-    warn_if_exposed(options.listen)
+    exporter = open_exporter(options, "world")
     experiment, clock = load_experiment(str(options.config)), clock_id()
     recorder = open_recorder(options.record, "world", clock)
-    with listening("--listen", options.listen):
-        peer = Peer.bind(options.listen, options.peer)
+    peer = open_peer(options)
     identity = WorldIdentity(clock, os.urandom(16))
     world = assembly.build_world(experiment, identity, time.monotonic_ns)
-    run_end(world, peer, recorder, end="world", slip_ns=lambda: world.slip_ns)
+    run_end(
+        world,
+        peer,
+        recorder,
+        end="world",
+        slip_ns=lambda: world.slip_ns,
+        exporter=exporter,
+        watched=options.feed,
+    )
     return 0

@@ -8,14 +8,15 @@ operator requests come back.
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import nan
+from typing import Protocol
 
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.cloud.teleop.messages import Seen
-from cloudrc.cloud.teleop.mission import Teleop
-from cloudrc.messages import NEVER_NS, OperatorRequest, Setpoint
-from cloudrc.records import Arrival, Counted, Fault, Record, SessionOpened
+from cloudrc.cloud.teleop.messages import Outcome, Output, Seen
+from cloudrc.messages import NEVER_NS, OperatorRequest, Setpoint, Telemetry
+from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import USED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Hello, Kind
@@ -40,13 +41,38 @@ class CloudIdentity:
     nonce: bytes
 
 
+class Operator(Protocol):
+    """Teleop as cloud knows it: the machine itself, or the socket behind which it lives."""
+
+    @property
+    def outputs(self) -> Sequence[Output | Fault]:
+        """What it has said since the last call of `take_outputs`."""
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """How the mission ended; None while there is none, or cloud has to go on anyway."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether the robot is seen to have acted on the last request."""
+
+    def see(self, seen: Seen, now_ns: int) -> None:
+        """Take note of the newest telemetry."""
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """Do what is due."""
+
+    def take_outputs(self) -> Sequence[Output | Fault]:
+        """Hand over what it has said since the last call."""
+
+
 class CloudEndpoint:
     """The remote controller's end of the tunnel; an `Endpoint`."""
 
     def __init__(
         self,
         loop: ControlLoop,
-        teleop: Teleop,
+        teleop: Operator,
         identity: CloudIdentity,
         *,
         newest_wins: bool,
@@ -66,6 +92,8 @@ class CloudEndpoint:
         self._channel = Channel(newest_wins)
         self._clock_is_shared = False
         self._setpoint: Setpoint | None = None
+        self._world = ""
+        self._delays = (nan, nan, nan)
         self._tick_ns = self._hello_ns = self._heard_ns = start_ns
         self._count_ns = start_ns + COUNT_PERIOD_NS
         self._commanded_ns = NEVER_NS
@@ -144,12 +172,16 @@ class CloudEndpoint:
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
         """Take the epoch that world hands out to this very process, if it is a new one."""
-        if accept.nonce != self._identity.nonce or epoch <= self._session.epoch:
+        world = accept.world_nonce.hex()
+        # A restarted world may count its epochs from 1 again.
+        is_old = epoch <= self._session.epoch and world == self._world
+        if accept.nonce != self._identity.nonce or is_old:
             self._counts["accept_ignored"] += 1
             return
         self._session.begin(epoch)
         self._channel.reset()
         self._loop.reset()
+        self._world = world
         self._clock_is_shared = accept.clock == self._identity.clock_id
         self._heard_ns = now_ns
         self._commanded_ns = NEVER_NS
@@ -172,11 +204,23 @@ class CloudEndpoint:
         self._records.append(Arrival(now_ns, True, epoch, counter, delay, used))
         if used:
             telemetry = codec.decode_telemetry(body)
-            position, guard = telemetry.odometry.position, telemetry.guard
             self._loop.observe(telemetry, now_ns)
-            self.teleop.see(Seen(epoch, position, guard, telemetry.mission), now_ns)
+            self.teleop.see(self._seen(telemetry, epoch), now_ns)
             if self.teleop.outputs:
                 self._take_from_teleop()
+
+    def _seen(self, telemetry: Telemetry, epoch: int) -> Seen:
+        return Seen(
+            epoch,
+            telemetry.odometry.position,
+            telemetry.guard,
+            telemetry.mission,
+            self._world,
+            telemetry.pipe_contacts,
+            telemetry.touch_speed,
+            telemetry.slip_ns,
+            *self._delays,
+        )
 
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():
@@ -186,7 +230,7 @@ class CloudEndpoint:
                 self._send(Kind.OPERATOR, codec.encode_operator(message))
             else:
                 self._records.append(message)
-                if message.event == "started":
+                if isinstance(message, MissionEvent) and message.event == "started":
                     self._loop.start_mission()
 
     def _send_command(self, setpoint: Setpoint, now_ns: int) -> None:
@@ -196,6 +240,7 @@ class CloudEndpoint:
         command, control = self._loop.command(setpoint, now_ns, elapsed_ns * 1e-9, epoch, counter)
         self._send(COMMAND, codec.encode_command(command))
         self._records.append(control)
+        self._delays = (control.horizon, control.rtt, control.loop_delay)
 
     def _note_counts(self, now_ns: int) -> None:
         self._count_ns += COUNT_PERIOD_NS

@@ -28,16 +28,22 @@ SAMPLED = (TelemetrySent, Control)
 class Feed:
     """The telling end: picks records and writes them to a pipe that does not block."""
 
-    def __init__(self, descriptor: int) -> None:
-        """Write to this file descriptor."""
-        self._descriptor = descriptor
+    def __init__(self, descriptor: int, *, watched: bool = True) -> None:
+        """Begin.
+
+        Args:
+            descriptor: Where to write.
+            watched: Whether a supervisor reads it. Where none does, as in a container, what is
+                written becomes a log: the events alone, in words.
+        """
+        self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
         os.set_blocking(descriptor, False)
 
     @classmethod
-    def on_stdout(cls) -> Feed:
+    def on_stdout(cls, *, watched: bool = True) -> Feed:
         """Keep standard output for the feed alone; whoever prints writes to standard error now."""
-        feed = cls(os.dup(1))
+        feed = cls(os.dup(1), watched=watched)
         os.dup2(2, 1)
         return feed
 
@@ -48,7 +54,9 @@ class Feed:
     def tell(self, records: Iterable[Record]) -> None:
         """Tell those of the records that somebody who watches wants to see."""
         for record in records:
-            if isinstance(record, EVENTS) or (isinstance(record, SAMPLED) and self._due(record)):
+            if isinstance(record, EVENTS):
+                self._write(to_line(record) if self._watched else in_words(record))
+            elif self._watched and isinstance(record, SAMPLED) and self._due(record):
                 self._write(to_line(record))
 
     def _due(self, record: Record) -> bool:
@@ -68,6 +76,13 @@ class Feed:
 def to_line(record: Record) -> str:
     """Write a record as one line of JSON: the name of its type, then its fields in order."""
     return json.dumps([type(record).__name__, record])
+
+
+def in_words(event: GuardChange | MissionEvent | Fault) -> str:
+    """Say what has happened, for a log."""
+    if isinstance(event, GuardChange):
+        return f"guard: {event.state.name}, {event.cause}"
+    return event.text
 
 
 def from_line(line: str) -> Record:

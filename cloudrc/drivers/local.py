@@ -1,7 +1,8 @@
-"""Local mode: relay, world and cloud as three processes on this machine, and who watches them.
+"""Local mode: relay, world, teleop and cloud as processes on this machine, and who watches them.
 
 The supervisor starts them in the order in which they need each other, reads what they tell, and
-ends all of them when the mission is over, one of them dies, or the user interrupts.
+ends all of them when teleop ends because the mission is over, when another one dies, or when the
+user interrupts.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import selectors
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -24,9 +26,12 @@ START_LIMIT = 60.0
 """For a process to become ready [s]; a cold start reads some 100 MB from disk."""
 STOP_LIMIT = 1.5
 """For a process to end by itself once it is asked to [s]."""
+TELL_ALWAYS = ("world", "cloud")
 SILENCE_LIMIT = 5.0
 """A process that has told something and then nothing for so long hangs [s]."""
 LOOPBACK = "127.0.0.1"
+API_FILE = "api.json"
+"""In the folder of a run that flies: where its operator's API is."""
 
 
 class ProcessDiedError(InvalidRunError):
@@ -60,21 +65,24 @@ class Child:
 
 
 class LocalRun:
-    """The three processes of one run."""
+    """The four processes of one run."""
 
-    def __init__(self, folder: Path, see: Callable[[list[Record]], None]) -> None:
+    def __init__(
+        self, folder: Path, see: Callable[[list[Record]], None], *, api: bool = True
+    ) -> None:
         """Prepare; nothing is started yet.
 
         Args:
-            folder: Of the run; has config.yaml, gets world.mcap, cloud.mcap and three logs.
+            folder: Of the run; has config.yaml, gets world.mcap, cloud.mcap and four logs.
             see: Gets the records that the processes tell about.
+            api: Whether the operator gets an API while it flies; api.json then says where.
         """
-        self._folder, self._see = folder, see
+        self._folder, self._see, self._api = folder, see, api
         self._children: list[Child] = []
         self._selector = selectors.DefaultSelector()
 
     def fly(self, limit: float) -> None:
-        """Fly until cloud says that the mission is over.
+        """Fly until teleop says that the mission is over.
 
         Args:
             limit: Longest duration [s].
@@ -84,6 +92,11 @@ class LocalRun:
             TimedOutError: If the limit is reached, or one falls silent; it is named.
             KeyboardInterrupt: If the user interrupts. The processes have ended in every case.
         """
+        # A socket's path is short; that of the run's folder need not be.
+        with tempfile.TemporaryDirectory(prefix="cloudrc-") as sockets:
+            self._fly(limit, sockets)
+
+    def _fly(self, limit: float, sockets: str) -> None:
         world, from_world, from_cloud, cloud = _free_addresses(4)
         try:
             self._start(
@@ -94,20 +107,26 @@ class LocalRun:
                 f"--cloud={cloud}",
             )
             self._start_end("world", world, from_world)
+            self._start_teleop(sockets)
             self._wait_until_ready()
-            self._start_end("cloud", cloud, from_cloud)
+            self._start_end("cloud", cloud, from_cloud, f"--teleop={sockets}")
             self._watch(limit)
         finally:
             self._stop()
+            (self._folder / API_FILE).unlink(missing_ok=True)
 
-    def _start_end(self, name: str, listen: str, peer: str) -> None:
+    def _start_end(self, name: str, listen: str, peer: str, *options: str) -> None:
         record = self._folder / f"{name}.mcap"
-        self._start(name, f"--listen={listen}", f"--peer={peer}", f"--record={record}")
+        self._start(name, f"--listen={listen}", f"--peer={peer}", f"--record={record}", *options)
+
+    def _start_teleop(self, sockets: str) -> None:
+        api = [f"--api={LOOPBACK}:0", f"--api-file={self._folder / API_FILE}"] if self._api else []
+        self._start("teleop", f"--socket={sockets}", "--start", *api)
 
     def _start(self, name: str, *options: str) -> None:
         log = self._folder / f"{name}.log"
         config = f"--config={self._folder / 'config.yaml'}"
-        command = [sys.executable, "-m", "cloudrc", name, config, *options]
+        command = [sys.executable, "-m", "cloudrc", name, config, "--feed", *options]
         with log.open("wb") as errors:
             process = subprocess.Popen(
                 command,
@@ -132,13 +151,14 @@ class LocalRun:
 
     def _watch(self, limit: float) -> None:
         until = time.monotonic() + limit
-        cloud = self._children[-1]
-        while cloud.process.poll() is None:
+        teleop = next(child for child in self._children if child.name == "teleop")
+        while teleop.process.poll() is None:
             if time.monotonic() > until:
                 raise TimedOutError(f"the flight was ended after {limit:g} s, its limit")
             self._see(self._listen())
             self._check_alive()
             self._check_awake()
+        self._check_alive()
         self._see(self._listen())
 
     def _listen(self) -> list[Record]:
@@ -155,7 +175,8 @@ class LocalRun:
                     child.ready = True
                 else:
                     told.append(from_line(line.decode()))
-                    child.heard = time.monotonic()
+                    if child.name in TELL_ALWAYS:
+                        child.heard = time.monotonic()
         return told
 
     def _check_awake(self) -> None:
@@ -170,7 +191,7 @@ class LocalRun:
     def _check_alive(self) -> None:
         for child in self._children:
             code = child.process.poll()
-            if code is None or (child.name == "cloud" and code == 0):
+            if code is None or (child.name == "teleop" and code == 0):
                 continue
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             raise ProcessDiedError(

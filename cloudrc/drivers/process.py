@@ -10,13 +10,16 @@ import signal
 import time
 from collections.abc import Callable, Iterable
 from types import FrameType
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from cloudrc.drivers.feed import Feed
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.drivers.recording import Recorder, RecordingThread
 from cloudrc.endpoint import Endpoint
 from cloudrc.records import Counted, Fault, Record
+
+if TYPE_CHECKING:
+    from cloudrc.drivers.exporter import Exporter
 
 
 class StopSignal:
@@ -63,6 +66,8 @@ def run_end(
     end: str,
     over: Callable[[], bool] = lambda: False,
     slip_ns: Callable[[], int] = lambda: 0,
+    exporter: Exporter | None = None,
+    watched: bool = True,
 ) -> bool:
     """Fly one end until it is asked to stop or `over()`; its recording is whole afterwards.
 
@@ -73,17 +78,24 @@ def run_end(
         end: "world" or "cloud".
         over: Whether this end is done by itself.
         slip_ns: By how much world's clock lags [ns].
+        exporter: Gets the records too, if they are to become metrics.
+        watched: Whether a supervisor reads the feed.
 
     Returns:
         True if it was done by itself, False if it was stopped.
     """
-    stop, feed, thread = StopSignal(), Feed.on_stdout(), RecordingThread(recorder)
-    trouble = ""
+    stop, feed, thread = StopSignal(), Feed.on_stdout(watched=watched), RecordingThread(recorder)
+    trouble, dropped = "", 0
 
     def sink(records: list[Record]) -> None:
-        nonlocal trouble
+        nonlocal trouble, dropped
         recorder.put(records)
         feed.tell(records)
+        if exporter is not None:
+            exporter.see(records)
+            if records and recorder.dropped != dropped:
+                dropped = recorder.dropped
+                exporter.see([_lost(records[-1].stamp_ns, end, recorder)])
         if records and recorder.error != trouble:
             trouble = recorder.error
             feed.tell([Fault(records[-1].stamp_ns, "recorder", trouble)])
@@ -93,7 +105,10 @@ def run_end(
     try:
         serve(endpoint, peer, end=end, sink=sink, stop=lambda: stop() or over(), slip_ns=slip_ns)
     finally:
-        now_ns = time.monotonic_ns() - slip_ns()
-        recorder.put([Counted(now_ns, end, "recorder_dropped", recorder.dropped)])
+        recorder.put([_lost(time.monotonic_ns() - slip_ns(), end, recorder)])
         thread.stop()
     return over()
+
+
+def _lost(stamp_ns: int, end: str, recorder: Takes) -> Counted:
+    return Counted(stamp_ns, end, "recorder_dropped", recorder.dropped)

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from cloudrc.drivers.route import Route
 from cloudrc.endpoint import Endpoint
 from cloudrc.records import Lateness, Record
 from cloudrc.tunnel.codec import DATAGRAM_MAX
@@ -21,6 +22,8 @@ DRAIN_MAX = 256
 """Datagrams taken per wake, so that a flood cannot keep the loop from its deadlines."""
 SINK_PERIOD_NS = 20_000_000
 WAIT_MAX_NS = 100_000_000
+ROUTE_PERIOD_NS = 500_000_000
+"""How often it is asked whether the route has changed [ns]."""
 
 
 @dataclass
@@ -29,17 +32,30 @@ class Peer:
 
     Attributes:
         socket: Bound, not blocking.
-        address: Of the other end of the tunnel, or of the relay before it.
+        address: Of the other end of the tunnel, or of the relay before it; None while the route
+            to it is unknown.
+        route: Says where the other end is, and may change its mind; None if it never moves.
+        unsent: How many datagrams could not be sent.
     """
 
     socket: socket.socket
-    address: tuple[str, int]
+    address: tuple[str, int] | None
+    route: Route | None = None
     unsent: int = field(default=0)
+    _followed_ns: int = field(default=0, init=False)
 
     @classmethod
-    def bind(cls, listen: tuple[str, int], address: tuple[str, int]) -> Peer:
-        """Bind a socket at `listen`."""
-        return cls(bind(listen), address)
+    def bind(cls, listen: tuple[str, int], where: tuple[str, int] | Route) -> Peer:
+        """Bind a socket at `listen`; send to an address, or to where a route leads."""
+        if isinstance(where, Route):
+            return cls(bind(listen), None, where)
+        return cls(bind(listen), where)
+
+    def follow(self, now_ns: int) -> None:
+        """Look where the route leads, if that is due at `now_ns` [ns]."""
+        if self.route is not None and now_ns >= self._followed_ns:
+            self._followed_ns = now_ns + ROUTE_PERIOD_NS
+            self.address = self.route.look()
 
     def receive(self) -> list[bytes]:
         """Everything that waits in the socket; one byte too many marks an oversized datagram."""
@@ -55,6 +71,9 @@ class Peer:
 
     def send(self, datagrams: list[bytes]) -> None:
         """Send; what the network refuses counts as lost, as UDP has it."""
+        if self.address is None:
+            self.unsent += len(datagrams)
+            return
         for data in datagrams:
             try:
                 self.socket.sendto(data, self.address)
@@ -106,6 +125,7 @@ def serve(
                 endpoint.receive_datagram(data, now_ns)
         if now_ns >= deadline_ns:
             endpoint.handle_deadline(now_ns)
+        peer.follow(now_ns)
         peer.send(endpoint.take_datagrams())
         done_ns = time.monotonic_ns()
         records = endpoint.take_records() if now_ns >= deadline_ns or now_ns >= sink_ns else []

@@ -20,10 +20,12 @@ OVERTAKES = -(1 << 62)
 
 Fate: TypeAlias = tuple[int, ...]
 
-_PARETO_CUT = 1e-3
+PARETO_CUT = 1e-3
+"""Share of the Pareto distribution that is cut off at its tail."""
+
 # Moments of s^(-1/3) for s uniform in (cut, 1).
-_PARETO_MEAN = 1.5 * (1.0 - _PARETO_CUT ** (2 / 3)) / (1.0 - _PARETO_CUT)
-_PARETO_SQUARE = 3.0 * (1.0 - _PARETO_CUT ** (1 / 3)) / (1.0 - _PARETO_CUT)
+_PARETO_MEAN = 1.5 * (1.0 - PARETO_CUT ** (2 / 3)) / (1.0 - PARETO_CUT)
+_PARETO_SQUARE = 3.0 * (1.0 - PARETO_CUT ** (1 / 3)) / (1.0 - PARETO_CUT)
 _PARETO_DEVIATION = sqrt(_PARETO_SQUARE - _PARETO_MEAN**2)
 _HALF_ROOT = sqrt(0.5)
 
@@ -105,9 +107,9 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
         survival = [0.5 * erfc(_HALF_ROOT * z) for z in correlated]
     else:
         survival = [1.0 - u for u in uniforms(key, purpose, block).tolist()]
-    kept = 1.0 - _PARETO_CUT
+    kept = 1.0 - PARETO_CUT
     return [
-        ((_PARETO_CUT + kept * s) ** (-1 / 3) - _PARETO_MEAN) / _PARETO_DEVIATION for s in survival
+        ((PARETO_CUT + kept * s) ** (-1 / 3) - _PARETO_MEAN) / _PARETO_DEVIATION for s in survival
     ]
 
 

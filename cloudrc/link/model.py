@@ -46,19 +46,27 @@ class LinkDirection:
             origin_ns: When the link came up [ns], on the clock of the `now_ns` given to `send`;
                 time line, trace and blackouts count from it.
         """
-        self._profile = profile
         self._seed = seed
         self._uplink = uplink
         self._origin_ns = origin_ns
+        self._departures: deque[int] = deque()
+        self._last_release_ns = 0
+        self._passed = self._lost = self._blackout = self._queue = self._duplicated = 0
+        self.replace_profile(profile)
+
+    def replace_profile(self, profile: DirectionProfile) -> None:
+        """Let other conditions hold from the next packet on.
+
+        Seed, origin, counts and what stands at the bottleneck stay: packet n meets the fate that
+        it would have met had the link had this profile from the start.
+        """
+        self._profile = profile
         self._timeline = Timeline(profile)
         only = self._timeline.only()
         shaped = only is None or only.blackout or only.rate is not None or profile.keep_order
         self._always = None if shaped else only
         self._delays: dict[tuple[int, int, int], list[Fate]] = {}
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
-        self._departures: deque[int] = deque()
-        self._last_release_ns = 0
-        self._passed = self._lost = self._blackout = self._queue = self._duplicated = 0
 
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
         """Put one packet on the link.

@@ -30,7 +30,11 @@ class Conditions(NamedTuple):
 
 
 class Timeline:
-    """The conditions of one direction over time."""
+    """The conditions of one direction over time.
+
+    Attributes:
+        starts_ns: When each piece of it begins, since the link came up, rising [ns].
+    """
 
     def __init__(self, profile: DirectionProfile) -> None:
         instants = {0.0}
@@ -39,12 +43,12 @@ class Timeline:
         for blackout in profile.blackouts:
             instants.update((blackout.start, blackout.start + blackout.duration))
         ordered = sorted(instants)
-        self._starts_ns = [round(instant * 1e9) for instant in ordered]
+        self.starts_ns = [round(instant * 1e9) for instant in ordered]
         self._pieces = [_conditions(profile, instant) for instant in ordered]
 
     def at(self, elapsed_ns: int) -> Conditions:
         """Say what holds `elapsed_ns` [ns] after the link came up."""
-        return self._pieces[max(bisect_right(self._starts_ns, elapsed_ns) - 1, 0)]
+        return self._pieces[max(bisect_right(self.starts_ns, elapsed_ns) - 1, 0)]
 
     def only(self) -> Conditions | None:
         """Say what always holds; None if that changes over time."""

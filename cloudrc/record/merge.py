@@ -12,12 +12,15 @@ from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 
+import numpy as np
+
 from cloudrc.errors import BadInputError
 from cloudrc.record.cdr import shifted
 from cloudrc.record.columns import Recording
 from cloudrc.record.offset import SAME_CLOCK, ClockOffset, clock_offset
 from cloudrc.record.order import merged
 from cloudrc.record.reader import MISSING, Contents, read_contents
+from cloudrc.record.slip import WorldTime
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
 
@@ -93,10 +96,15 @@ def merge(world: Path, cloud: Path) -> Mission:
 
 
 def _joined(world: Contents, cloud: Contents) -> Mission:
-    offset = clock_offset(Recording.from_contents(world), Recording.from_contents(cloud))
+    of_world = Recording.from_contents(world)
+    offset = clock_offset(of_world, Recording.from_contents(cloud))
+    logged_ns = np.array([message[1] for message in cloud.messages], dtype=np.int64)
+    moved_ns = logged_ns + offset.offset_ns
+    if offset == SAME_CLOCK:
+        moved_ns = WorldTime(of_world["/telemetry"]).at(logged_ns)
     moved = [
-        (topic, log_time_ns + offset.offset_ns, shifted(data, offset.offset_ns))
-        for topic, log_time_ns, data in cloud.messages
+        (topic, to_ns, shifted(data, to_ns - from_ns))
+        for (topic, from_ns, data), to_ns in zip(cloud.messages, moved_ns.tolist(), strict=True)
     ]
     joined = Contents(
         messages=list(heapq.merge(world.messages, moved, key=itemgetter(1))),

@@ -69,6 +69,8 @@ _TABLE = (
             Field("slip_ns", "int", "ns", _SLIP.text, "telemetry.slip_ns"),
             Field("mission", "int", "", "last mission request acted on", "telemetry.mission"),
             Field("guard", "int", "", _GUARD, "telemetry.guard"),
+            Field("pipe_contacts", "int", "", "begun in this mission", "telemetry.pipe_contacts"),
+            Field("touch_speed", "float", "m/s", "tip on the board", "telemetry.touch_speed"),
         ),
     ),
     Topic(

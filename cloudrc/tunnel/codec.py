@@ -69,7 +69,7 @@ class Accept(NamedTuple):
 
 
 _HEADER = struct.Struct("<BBBxIQ")
-_TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIB")
+_TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIdIB")
 _STAMP = struct.Struct("<q")
 _SLIP_OFFSET = struct.calcsize("<q3d4d3d3ddqq")
 _COMMAND = struct.Struct("<qqq3dd")
@@ -123,22 +123,24 @@ def peek(data: bytes) -> tuple[int, int, int]:
 
 
 def encode_telemetry(telemetry: Telemetry) -> bytes:
-    """Lay out the body of a TELEMETRY datagram."""
-    stamp_ns, odometry, tip_force, echo_ns, hold_ns, slip_ns, mission, guard = telemetry
+    """Lay out the body of a TELEMETRY datagram; the guard's state comes last."""
+    stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, guard, pipes, touch = telemetry
     _, position, orientation, velocity, rate = odometry
-    numbers = position + orientation + velocity + rate
-    return _TELEMETRY.pack(stamp_ns, *numbers, tip_force, echo_ns, hold_ns, slip_ns, mission, guard)
+    numbers = (*position, *orientation, *velocity, *rate, force, echo_ns, hold_ns, slip_ns)
+    return _TELEMETRY.pack(stamp_ns, *numbers, mission, touch, pipes, guard)
 
 
 def decode_telemetry(body: bytes) -> Telemetry:
     """Read the body of a TELEMETRY datagram; numbers may be anything, NaN included."""
     values = _TELEMETRY.unpack(body)
-    stamp_ns, (tip_force, echo_ns, hold_ns, slip_ns, mission, guard) = values[0], values[14:]
+    stamp_ns, (force, echo_ns, hold_ns, slip_ns) = values[0], values[14:18]
+    mission, touch, pipes, guard = values[18:]
     if guard >= len(_GUARD_STATES):
         raise DecodeError("malformed")
     odometry = Odometry(stamp_ns, values[1:4], values[4:8], values[8:11], values[11:14])
+    state = _GUARD_STATES[guard]
     return Telemetry(
-        stamp_ns, odometry, tip_force, echo_ns, hold_ns, slip_ns, mission, _GUARD_STATES[guard]
+        stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, state, pipes, touch
     )
 
 

@@ -37,6 +37,7 @@ from cloudrc.tunnel.session import Session
 from cloudrc.world.clock import CATCH_UP_NS, SimulationClock
 from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
+from cloudrc.world.touches import Touches
 
 ODOMETRY_PERIOD_NS = 10_000_000
 """Source: plant.md, 100 Hz."""
@@ -91,6 +92,7 @@ class WorldEndpoint:
         self._cloud = Hello(b"", b"")
         self._clock_is_shared = False
         self._mission = 0
+        self._touches = Touches()
         self._stalled_wake_ns = NEVER_NS
         self._odometry_ns = start_ns
         self._count_ns = start_ns + COUNT_PERIOD_NS
@@ -184,6 +186,7 @@ class WorldEndpoint:
         if simulator.touches:
             for touch in simulator.take_contacts():
                 records.append(Contact(now_ns, **touch._asdict()))
+                self._touches.note(touch)
         epoch = self._session.epoch
         if epoch:
             telemetry = Telemetry(
@@ -195,6 +198,8 @@ class WorldEndpoint:
                 self._clock.slip_ns,
                 self._mission,
                 guard.state,
+                self._touches.pipes,
+                self._touches.speed,
             )
             counter = self._session.next_counter(TELEMETRY)
             self._send(TELEMETRY, codec.encode_telemetry(telemetry))
@@ -210,6 +215,7 @@ class WorldEndpoint:
             self._cloud = hello
             self._clock_is_shared = hello.clock == self._identity.clock_id
             self._mission = 0
+            self._touches = Touches()
             self._open_epoch("cloud said hello")
         self._accept()
 
@@ -239,6 +245,7 @@ class WorldEndpoint:
         if request.request is Request.END:
             guard.end_mission(now_ns)
             return
+        self._touches = Touches()
         if request.start is Start.SPAWN:
             self.robot.put_on_ground(now_ns, "mission starts from spawn")
             self._open_epoch("mission starts from spawn")

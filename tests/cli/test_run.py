@@ -30,7 +30,6 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("line", "code", "words"),
     [
-        ("--mode cluster", 3, "Helm chart"),
         ("--mode local --seeds 3", 2, "virtual time"),
         ("--seeds 0", 2, "'0' is not a whole number from 1 to 100000"),
         ("--seed -1", 2, "--seed"),

@@ -20,6 +20,7 @@ class Flight:
         self.now_ns = 0
         self.position = (0.0, 0.0, 0.1)
         self.epoch = 1
+        self.world = "world 1"
         self.mission = 0
         self.guard = GuardState.GROUND
         self.uplink = self.downlink = True
@@ -38,7 +39,7 @@ class Flight:
             self._collect()
 
     def see(self):
-        seen = Seen(self.epoch, self.position, self.guard, self.mission)
+        seen = Seen(self.epoch, self.position, self.guard, self.mission, self.world)
         self.first_shown_ns.setdefault(self.mission, self.now_ns)
         self.teleop.see(seen, self.now_ns)
 
@@ -50,10 +51,17 @@ class Flight:
 
     def restart(self):
         """World loses everything it knew."""
+        self.world = f"world {self.epoch + 1}"
         self.epoch += 1
         self.mission = 0
         self.guard = GuardState.GROUND
         self.position = (0.0, 0.0, 0.1)
+
+    def restart_cloud(self):
+        """A new cloud opens a new epoch in the same world, and counts requests from 1 again."""
+        self.epoch += 1
+        self.mission = 0
+        self.guard = GuardState.HOLD
 
     @property
     def state(self):

@@ -12,7 +12,7 @@ from cloudrc.records import GuardChange, MissionEvent, TelemetrySent
 
 def sent(stamp_ns):
     odometry = Odometry(stamp_ns, (1.0, 2.0, 3.0), UPRIGHT, ZERO, ZERO)
-    telemetry = Telemetry(stamp_ns, odometry, 0.5, 1, 2, 3, 4, GuardState.TRACK)
+    telemetry = Telemetry(stamp_ns, odometry, 0.5, 1, 2, 3, 4, GuardState.TRACK, 2, 0.1)
     return TelemetrySent(stamp_ns, 1, 2, telemetry)
 
 
@@ -45,6 +45,15 @@ def test_events_are_all_told_and_samples_ten_times_a_second():
     assert (told.count(MissionEvent), told.count(TelemetrySent)) == (20, 5)
     os.close(reader)
     feed.tell([EVENT])  # nobody reads any more: not a word
+    os.close(writer)
+
+
+def test_where_nobody_watches_events_are_said_in_words():
+    reader, writer = os.pipe()
+    feed = Feed(writer, watched=False)
+    feed.tell([sent(0), EVENT])
+    assert os.read(reader, 1 << 20).decode().splitlines() == [EVENT.text]
+    os.close(reader)
     os.close(writer)
 
 

@@ -27,7 +27,7 @@ def start(folder: Path, *settings: str, dwell: float = 20.0) -> subprocess.Popen
 
 
 def children(parent: int) -> dict[str, int]:
-    """Process ids by what they are: relay, world, cloud."""
+    """Process ids by what they are: relay, world, teleop, cloud."""
     found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -63,7 +63,7 @@ def alive(pid: int) -> bool:
 def test_ctrl_c_ends_all_processes_within_two_seconds_and_leaves_a_report(tmp_path, how):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
-    assert set(pids) == {"relay", "world", "cloud"}
+    assert set(pids) == {"relay", "world", "teleop", "cloud"}
     os.kill(run.pid, how)
     asked = time.monotonic()
     while any(alive(pid) for pid in pids.values()):
@@ -72,11 +72,12 @@ def test_ctrl_c_ends_all_processes_within_two_seconds_and_leaves_a_report(tmp_pa
     run.communicate(timeout=60)
     assert run.returncode == 130
     assert report(tmp_path / "run")["verdict"] == "interrupted"
+    assert not (tmp_path / "run" / "api.json").exists()
     assert (tmp_path / "run" / "report.html").exists()
     assert (tmp_path / "run" / "mission.mcap").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("victim", ["world", "cloud", "relay"])
+@pytest.mark.parametrize("victim", ["world", "cloud", "teleop", "relay"])
 def test_a_process_that_dies_ends_the_run_and_is_named(tmp_path, victim):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
@@ -98,6 +99,47 @@ def test_the_processes_end_when_the_one_that_started_them_is_killed(tmp_path):
     while any(alive(pid) for pid in pids.values()):
         assert time.monotonic() < until
         time.sleep(0.05)
+
+
+def operate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    url = json.loads((folder / "api.json").read_text())["url"]
+    verb, *rest = words
+    command = [sys.executable, "-m", "cloudrc", "mission", verb, "--api", url, *rest]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
+    folder = tmp_path / "run"
+    run = start(folder)
+    wait_until_flying(run)
+    assert operate(folder, "run", "hover").returncode == 5  # one flies already
+    assert "held" in operate(folder, "hold").stdout
+    assert operate(folder, "goto", "0", "0", "99").returncode == 2
+    assert operate(folder, "goto", "0.3", "0", "0.8").returncode == 0
+    time.sleep(3.0)
+    status = json.loads(operate(folder, "status", "-o", "json").stdout)
+    assert status["mission"]["state"] == "held"
+    assert status["seen"]["position_m"] == pytest.approx([0.3, 0.0, 0.8], abs=0.1)
+    assert "flying" in operate(folder, "resume").stdout
+    assert "INTERRUPTED" in operate(folder, "cancel").stdout
+    run.communicate(timeout=60)
+    assert run.returncode == 1
+    assert report(folder)["failures"][0]["code"] == "cancelled"
+
+
+def test_without_fastapi_it_flies_without_an_api_and_says_so(tmp_path):
+    program = (
+        "import sys; from cloudrc.cli import extras; "
+        "extras.EXTRAS['api'] = ('fastapi_is_not_here',); "
+        "from cloudrc.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    )
+    words = ["run", *HOVER, "--out", str(tmp_path / "run")]
+    words[-3] = words[-3].format(dwell=0.1)
+    command = [sys.executable, "-c", program, *words]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=90)
+    assert run.returncode == 0
+    assert "no operator's API in this run" in run.stderr
+    assert "pip install 'cloudrc[api]'" in run.stderr
 
 
 PREDICTOR = '''

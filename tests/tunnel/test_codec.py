@@ -27,7 +27,12 @@ telemetries = st.builds(
     ),
     stamps,
     st.tuples(
-        floats, stamps, stamps, stamps, st.integers(0, 2**32 - 1), st.sampled_from(GuardState)
+        floats,
+        *[stamps] * 3,
+        st.integers(0, 2**32 - 1),
+        st.sampled_from(GuardState),
+        st.integers(0, 2**32 - 1),
+        floats,
     ),
     vectors,
     st.tuples(floats, floats, floats, floats),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from math import nan
 from typing import NamedTuple, TypeAlias
 
 from cloudrc.cloud.teleop.plan import Plan
@@ -23,12 +24,27 @@ class Seen(NamedTuple):
         position: Measured, of the base [m], world frame, shape (3,).
         guard: State of the guard.
         mission: Number of the last operator request that world has acted on; 0 if none.
+        world: Names world's process: a restarted world has another name, a restarted cloud opens
+            a new epoch in the same world.
+        pipe_contacts: How often the robot has begun to touch a pipe so far.
+        touch_speed: Speed of the arm's tip when it met the board [m/s]; NaN before that.
+        slip_ns: By how much world's clock lags its machine's [ns].
+        horizon: How far cloud looks ahead [s]; NaN before its first command.
+        rtt: Last round trip, hold excluded [s]; NaN likewise.
+        loop_delay: Last `now - echo_stamp`, hold included [s]; NaN likewise.
     """
 
     epoch: int
     position: Vector
     guard: GuardState
     mission: int
+    world: str = ""
+    pipe_contacts: int = 0
+    touch_speed: float = nan
+    slip_ns: int = 0
+    horizon: float = nan
+    rtt: float = nan
+    loop_delay: float = nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +52,25 @@ class StartMission:
     """Operator: fly this plan."""
 
     plan: Plan
+
+
+@dataclass(frozen=True, slots=True)
+class Continue:
+    """Teleop itself, after a restart: go on with a mission that was under way.
+
+    Attributes:
+        plan: As it was started.
+        leg: Index of the waypoint that was flown to.
+        elapsed: How long the mission had lasted [s].
+        world: The world that it was flown in; in another one it has failed.
+        held: Whether the operator had stopped it.
+    """
+
+    plan: Plan
+    leg: int
+    elapsed: float
+    world: str
+    held: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +101,8 @@ class GoTo:
     yaw: float = 0.0
 
 
-Verb: TypeAlias = StartMission | Hold | Resume | Cancel | GoTo
-"""What an operator can say."""
+Verb: TypeAlias = StartMission | Continue | Hold | Resume | Cancel | GoTo
+"""What an operator can say; `Continue` is for teleop alone."""
 
 Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 """What teleop says."""
@@ -101,11 +136,13 @@ class Outcome:
             "guard_stopped".
         text: The same in words.
         waypoint: Index of the waypoint that was flown to at the end.
+        reached: Number of waypoints reached.
     """
 
     code: str
     text: str
     waypoint: int
+    reached: int
 
     @property
     def success(self) -> bool:

@@ -27,6 +27,7 @@ from math import dist
 
 from cloudrc.cloud.teleop.messages import (
     Cancel,
+    Continue,
     GoTo,
     Hold,
     Outcome,
@@ -47,6 +48,8 @@ from cloudrc.records import MissionEvent
 FLYING, WORST_GUARD = State.FLYING, GuardState.HOLD
 UNDER_WAY = (FLYING, State.STARTING, State.HELD)
 NO_WAYPOINT = -1
+ANY_WORLD = ""
+"""Until the robot is seen to have started it does not matter which world it stands in."""
 NO_PLAN = Plan((Leg(ZERO),))
 """Stands in until the first mission starts; never flown."""
 
@@ -68,14 +71,25 @@ class Teleop:
         self._seen: Seen | None = None
         self._plan = NO_PLAN
         self._leg = 0
+        self._world = ANY_WORLD
+        self._continued: Continue | None = None
         self._yaw = 0.0
         self._began_ns = self._leg_began_ns = self._held_ns = 0
         self._within_since_ns: int | None = None
 
     @property
+    def leg(self) -> int:
+        """Index of the waypoint that is flown to; the number of waypoints once all are reached."""
+        return self._leg
+
+    @property
     def settled(self) -> bool:
         """Whether the robot is seen to have acted on the last request."""
         return self._requests.settled
+
+    def elapsed(self, now_ns: int) -> float:
+        """Time since the mission began [s]."""
+        return (now_ns - self._began_ns) * 1e-9
 
     def take_outputs(self) -> list[Output]:
         """Hand over what teleop has said since the last call, oldest first."""
@@ -96,6 +110,9 @@ class Teleop:
             case StartMission(plan):
                 self._refuse_unless("start", self.state not in UNDER_WAY, "cancel it first")
                 self._start(plan, now_ns)
+            case Continue():
+                self._refuse_unless("continue", self.state is State.IDLE, "it is not the first")
+                self._go_on(verb, now_ns)
             case Hold():
                 self._refuse_unless("hold", self.state is State.FLYING, "it has to be flying")
                 self._hold(now_ns)
@@ -114,12 +131,11 @@ class Teleop:
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry, at the instant [ns] at which it arrives."""
         before, self._seen = self._seen, seen
-        restarted = before is not None and seen.epoch != before.epoch
         started = self._requests.see(seen) and self.state is State.STARTING
         if self.state not in UNDER_WAY:
-            if before is None or restarted:
+            if before is None or seen.epoch != before.epoch:
                 self._aim(seen.position, self._yaw, NO_WAYPOINT)
-        elif restarted and not self._expects_restart():
+        elif self._world not in (ANY_WORLD, seen.world):
             self._fail("world_restarted", f"world restarted {self._where()}", now_ns)
         elif started:
             self._begin(now_ns)
@@ -138,18 +154,38 @@ class Teleop:
 
     def _start(self, plan: Plan, now_ns: int) -> None:
         self.state, self.outcome = State.STARTING, None
-        self._plan, self._leg = plan, 0
+        self._plan, self._leg, self._continued = plan, 0, None
         self._began_ns = now_ns
+        seen = self._seen
+        self._world = seen.world if seen and plan.start is Start.HERE else ANY_WORLD
         self._requests.ask(Request.START, plan.start)
         # Already now, so that the first command that the started robot gets leads the right way.
         self._aim_at_leg()
 
+    def _go_on(self, before: Continue, now_ns: int) -> None:
+        """Start again from here, at the waypoint that was flown to."""
+        self.state, self.outcome = State.STARTING, None
+        self._plan, self._leg, self._continued = before.plan, before.leg, before
+        self._began_ns = now_ns - round(before.elapsed * 1e9)
+        self._world = before.world
+        self._requests.ask(Request.START, Start.HERE)
+        if not before.held:
+            self._aim_at_leg()
+
     def _begin(self, now_ns: int) -> None:
         """The robot is seen to have started: the clocks of mission and leg begin."""
-        plan = self._plan
+        plan, before = self._plan, self._continued
         self.state = State.FLYING
-        self._began_ns = now_ns
         self._begin_leg(now_ns)
+        if self._seen is not None:
+            self._world = self._seen.world
+        if before is not None:
+            text = f"resumed after a restart of teleop {self._where()}"
+            self._tell("resumed", self._leg, text, now_ns)
+            if before.held:
+                self._hold(now_ns)
+            return
+        self._began_ns = now_ns
         where = "from the spawn" if plan.start is Start.SPAWN else "from here"
         self._tell("started", 0, f"mission started {where}, waypoints: {len(plan.legs)}", now_ns)
 
@@ -174,14 +210,14 @@ class Teleop:
     def _advance(self, now_ns: int) -> None:
         """The waypoint is reached: on to the next, or done."""
         index, count = self._leg, len(self._plan.legs)
-        text = f"{self._waypoint_text()} reached at {self._elapsed(now_ns):.2f} s"
+        text = f"{self._waypoint_text()} reached at {self.elapsed(now_ns):.2f} s"
         self._tell("reached", index, text, now_ns)
         self._leg += 1
         if self._leg < count:
             self._begin_leg(now_ns)
             self._aim_at_leg()
         else:
-            text = f"mission done at {self._elapsed(now_ns):.2f} s"
+            text = f"mission done at {self.elapsed(now_ns):.2f} s"
             self._end(State.DONE, "done", text, now_ns)
 
     def _hold(self, now_ns: int) -> None:
@@ -225,7 +261,7 @@ class Teleop:
         """However the mission ends, the robot is asked to hold where it is."""
         waypoint = min(self._leg, len(self._plan.legs) - 1)
         self.state = state
-        self.outcome = Outcome(code, text, waypoint)
+        self.outcome = Outcome(code, text, waypoint, reached=self._leg)
         self._requests.ask(Request.END)
         self._aim_here()
         self._tell(code, waypoint, text, now_ns)
@@ -244,13 +280,6 @@ class Teleop:
 
     def _tell(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
         self.outputs.append(MissionEvent(now_ns, event, waypoint, text))
-
-    def _expects_restart(self) -> bool:
-        return self.state is State.STARTING and self._plan.start is Start.SPAWN
-
-    def _elapsed(self, now_ns: int) -> float:
-        """Time since the mission began [s]."""
-        return (now_ns - self._began_ns) * 1e-9
 
     def _waypoint_text(self) -> str:
         return f"waypoint {self._leg + 1} of {len(self._plan.legs)}"

@@ -1,0 +1,51 @@
+{{/* Names, labels and images: what everything in the release is called. */}}
+
+{{- define "cloudrc.fullname" -}}
+{{- $name := .Values.fullnameOverride | default (contains "cloudrc" .Release.Name | ternary .Release.Name (printf "%s-cloudrc" .Release.Name)) -}}
+{{- $name | trunc 50 | trimSuffix "-" -}}
+{{- end }}
+
+{{/* Selector of a component's pods. Takes (dict "root" $ "component" NAME), as all below. */}}
+{{- define "cloudrc.selector" -}}
+app.kubernetes.io/name: cloudrc
+app.kubernetes.io/instance: {{ .root.Release.Name }}
+app.kubernetes.io/component: {{ .component }}
+{{- end }}
+
+{{- define "cloudrc.labels" -}}
+helm.sh/chart: {{ printf "cloudrc-%s" .root.Chart.Version | replace "+" "_" }}
+{{ include "cloudrc.selector" . }}
+app.kubernetes.io/version: {{ .root.Chart.AppVersion | quote }}
+app.kubernetes.io/part-of: cloudrc
+app.kubernetes.io/managed-by: {{ .root.Release.Service }}
+{{- end }}
+
+{{/* Labels of a pod: those that do not change with the chart's version, so that it alone rolls nothing. */}}
+{{- define "cloudrc.podLabels" -}}
+{{ include "cloudrc.selector" . }}
+app.kubernetes.io/part-of: cloudrc
+{{- end }}
+
+{{/* Image of a role, "world" or "cloud": its digest, else the tag. */}}
+{{- define "cloudrc.image" -}}
+{{- $image := .root.Values.image -}}
+{{- $of := index $image .role -}}
+{{- $name := $image.registry | empty | ternary $of.repository (printf "%s/%s" (trimSuffix "/" $image.registry) $of.repository) -}}
+{{- if $of.digest -}}
+{{ $name }}@{{ $of.digest }}
+{{- else -}}
+{{ $name }}:{{ $image.tag | default .root.Chart.AppVersion }}
+{{- end -}}
+{{- end }}
+
+{{- define "cloudrc.secretName" -}}
+{{ .Values.secret.existingSecret | default (printf "%s-tunnel" (include "cloudrc.fullname" .)) }}
+{{- end }}
+
+{{- define "cloudrc.serviceAccountName" -}}
+{{- if .root.Values.serviceAccount.create -}}
+{{ include "cloudrc.fullname" .root }}-{{ .component }}
+{{- else -}}
+{{ .root.Values.serviceAccount.name | default "default" }}
+{{- end -}}
+{{- end }}

@@ -1,0 +1,106 @@
+{{/* What the pods share: who they run as, their probes, their volumes. */}}
+
+{{/* The head of a pod's spec; it passes Pod Security "restricted". */}}
+{{- define "cloudrc.pod" -}}
+serviceAccountName: {{ include "cloudrc.serviceAccountName" . }}
+automountServiceAccountToken: false
+enableServiceLinks: false
+securityContext:
+  runAsNonRoot: true
+  runAsUser: 10001
+  runAsGroup: 10001
+  fsGroup: 10001
+  seccompProfile:
+    type: RuntimeDefault
+{{- with .root.Values.image.pullSecrets }}
+imagePullSecrets:
+  {{- range . }}
+  - name: {{ . }}
+  {{- end }}
+{{- end }}
+{{- end }}
+
+{{- define "cloudrc.containerSecurity" -}}
+allowPrivilegeEscalation: false
+readOnlyRootFilesystem: true
+capabilities:
+  drop: [ALL]
+{{- end }}
+
+{{/* Probes on the metrics port. Readiness waits for the peer, liveness never: losing the link is for
+     the guard to handle, in milliseconds. */}}
+{{- define "cloudrc.probes" -}}
+startupProbe:
+  httpGet: {path: /healthz, port: {{ . }}}
+  periodSeconds: 1
+  failureThreshold: 180
+readinessProbe:
+  httpGet: {path: /readyz, port: {{ . }}}
+  periodSeconds: 2
+  timeoutSeconds: 2
+livenessProbe:
+  httpGet: {path: /healthz, port: {{ . }}}
+  periodSeconds: 10
+  timeoutSeconds: 5
+  failureThreshold: 3
+{{- end }}
+
+{{- define "cloudrc.placement" -}}
+{{- with .nodeSelector }}
+nodeSelector:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- with .tolerations }}
+tolerations:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- with .affinity }}
+affinity:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- end }}
+
+{{/* Annotations of a pod. A change of the experiment rolls it; one of the link's profile does not. */}}
+{{- define "cloudrc.podAnnotations" -}}
+checksum/experiment: {{ toYaml .root.Values.experiment | sha256sum }}
+cloudrc/link-mode: {{ include "cloudrc.linkMode" .root }}
+kubectl.kubernetes.io/default-container: {{ .component }}
+{{- if .root.Values.metrics.annotations }}
+prometheus.io/scrape: "true"
+prometheus.io/path: /metrics
+prometheus.io/port: "9100"
+{{- end }}
+{{- with (index .root.Values .component).podAnnotations }}
+{{ toYaml . }}
+{{- end }}
+{{- end }}
+
+{{/* Volumes of both pods: the experiment, the link's profile, the key, the route between link and end. */}}
+{{- define "cloudrc.volumes" -}}
+{{- $name := include "cloudrc.fullname" .root -}}
+- name: experiment
+  configMap:
+    name: {{ $name }}-experiment
+- name: link
+  configMap:
+    name: {{ $name }}-link
+- name: secret
+  secret:
+    secretName: {{ include "cloudrc.secretName" .root }}
+    defaultMode: 0440
+- name: run
+  emptyDir:
+    medium: Memory
+    sizeLimit: 1Mi
+- name: data
+  emptyDir:
+    sizeLimit: {{ (index .root.Values .component).recordingSizeLimit }}
+{{- end }}
+
+{{/* Mounts of an end of the tunnel. */}}
+{{- define "cloudrc.endMounts" -}}
+- {name: experiment, mountPath: /etc/cloudrc, readOnly: true}
+- {name: secret, mountPath: /etc/cloudrc-secret, readOnly: true}
+- {name: run, mountPath: /run/cloudrc}
+- {name: data, mountPath: /var/lib/cloudrc}
+{{- end }}

@@ -1,0 +1,57 @@
+{{/* A mission as a file: takes (dict "root" $ "plan" NAME-OR-MAPPING). */}}
+{{- define "cloudrc.missionFile" -}}
+{{- if kindIs "map" .plan -}}
+{{ toYaml .plan }}
+{{- else -}}
+{{- $text := .root.Files.Get (printf "files/missions/%s.yaml" .plan) -}}
+{{- if not $text -}}
+{{- $known := list -}}
+{{- range $path, $_ := .root.Files.Glob "files/missions/*.yaml" -}}
+{{- $known = append $known (base $path | trimSuffix ".yaml") -}}
+{{- end -}}
+{{- fail (printf "mission: no mission '%s' ships with the chart; choose one of %s, or write it out under mission.plan" .plan (join ", " $known)) -}}
+{{- end -}}
+{{ $text | trimSuffix "\n" }}
+{{- end -}}
+{{- end }}
+
+{{/* The container that posts a mission, follows it and ends with its verdict:
+     takes (dict "root" $ "name" NAME "uid" FIELD "queue" BOOL). */}}
+{{- define "cloudrc.missionContainer" -}}
+- name: {{ .name }}
+  image: {{ include "cloudrc.image" (dict "root" .root "role" "cloud") }}
+  imagePullPolicy: {{ .root.Values.image.pullPolicy }}
+  args:
+    - mission
+    - fly
+    - --api=http://{{ include "cloudrc.fullname" .root }}-api:{{ .root.Values.teleop.service.port }}
+    - --mission=/etc/cloudrc-mission/mission.yaml
+    - --key=$(MISSION_KEY)
+    {{- if .queue }}
+    - --queue
+    {{- end }}
+  env:
+    # Posting twice under one key flies once.
+    - name: MISSION_KEY
+      valueFrom:
+        fieldRef:
+          fieldPath: {{ .uid }}
+  terminationMessagePolicy: FallbackToLogsOnError
+  securityContext:
+    {{- include "cloudrc.containerSecurity" . | nindent 4 }}
+  resources:
+    {{- toYaml .root.Values.mission.resources | nindent 4 }}
+  volumeMounts:
+    - {name: mission, mountPath: /etc/cloudrc-mission, readOnly: true}
+{{- end }}
+
+{{- define "cloudrc.missionPodTemplate" -}}
+metadata:
+  labels:
+    {{- include "cloudrc.podLabels" (dict "root" . "component" "mission") | nindent 4 }}
+spec:
+  restartPolicy: Never
+  {{- include "cloudrc.pod" (dict "root" . "component" "cloud") | nindent 2 }}
+  containers:
+    {{- include "cloudrc.missionContainer" (dict "root" . "name" "mission" "uid" "metadata.labels['batch.kubernetes.io/controller-uid']" "queue" .Values.mission.queue) | nindent 4 }}
+{{- end }}

@@ -1,0 +1,59 @@
+"""The flags that name a place in a cluster, for every command that goes there."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.extras import require
+
+if TYPE_CHECKING:
+    from cloudrc.cluster.access import Release
+
+READY_LIMIT = 300.0
+"""For the pods of a release to become ready, where the user does not say [s]."""
+
+
+def place_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags that name a release; kubectl's own names and defaults."""
+    group = parser.add_argument_group("in a cluster (KUBECONFIG is honoured)")
+    group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
+    group.add_argument(
+        "-n", "--namespace", metavar="NAME", help="namespace (default: the context's, or default)"
+    )
+    group.add_argument(
+        "--release", default="cloudrc", metavar="NAME", help="Helm release (default: cloudrc)"
+    )
+
+
+def timeout_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare how long to wait for a release."""
+    parser.add_argument(
+        "--timeout",
+        type=_seconds,
+        default=READY_LIMIT,
+        metavar="S",
+        help=f"seconds for the release to become ready (default: {READY_LIMIT:g})",
+    )
+
+
+def place(options: argparse.Namespace) -> Release:
+    """Find the release that the flags name.
+
+    Raises:
+        MissingPrerequisiteError: If the Kubernetes client or a kubeconfig is missing.
+    """
+    require("a cluster", ("kube",))
+    from cloudrc.cluster.access import connect
+
+    return connect(options.context, options.namespace, options.release)
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text.removesuffix("s"))
+    except ValueError:
+        value = 0.0
+    if not 0 < value <= 86_400:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds, above 0")
+    return value

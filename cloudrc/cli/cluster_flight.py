@@ -1,0 +1,197 @@
+"""One flight in a cluster: an experiment and a release come in; a folder and a report go out.
+
+Install or upgrade the release, wait until it can fly, fly the mission by a Job, fetch what both
+pods recorded, merge it, report.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cloudrc.errors import BadInputError, CloudrcError
+
+if TYPE_CHECKING:
+    from cloudrc.cluster.access import Release
+    from cloudrc.cluster.jobs import JobStatus
+    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.record.merge import Mission
+
+Tell = Callable[[str], None]
+
+GRACE = 120.0
+"""What a Job may last beyond its mission's limit: pods have to start [s]."""
+FLUSH = 1.0
+"""After which a recorder has handed its last half second to the operating system [s]."""
+FETCHES = 4
+"""How often to fetch until the mission's end is in both recordings."""
+FLOWN = (0, 1, 6, 130)
+"""Exit codes of a Job whose mission was flown, well, badly or not to its end."""
+COMPONENTS = ("world", "cloud")
+_SHAPER = re.compile(r'cloudrc_link_info\{[^}]*shaper="(\w+)"')
+
+
+def fly_in_cluster(
+    experiment: ResolvedExperiment, folder: Path, release: Release, timeout: float, tell: Tell
+) -> dict[str, Any]:
+    """Fly one experiment on a release and write everything that a run leaves.
+
+    Args:
+        experiment: Complete and checked.
+        folder: Empty; gets configuration, recordings, metrics, logs and report.
+        release: Where to fly; it is installed if it is not there, and stays.
+        timeout: For the release to become ready [s].
+        tell: Gets a line for people now and then.
+
+    Returns:
+        What report.json holds.
+
+    Raises:
+        CloudrcError: If the mission could not be flown.
+    """
+    from cloudrc.cluster.chart import chart_folder
+    from cloudrc.cluster.deploy import current_values, install
+    from cloudrc.config.load import dump
+
+    (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+    began = time.monotonic()
+    given = values(experiment, current_values(release))
+    install(release, chart_folder(), given, timeout=timeout, tell=tell)
+    tell(
+        f"release '{release.name}' {release.where} is ready after {time.monotonic() - began:.0f} s"
+    )
+    interrupted = False
+    try:
+        _fly(experiment, release, tell)
+    except KeyboardInterrupt:
+        interrupted = True
+    mission = fetch_all(release, folder, want_end=not interrupted)
+    return _report(experiment, folder, mission, interrupted)
+
+
+def values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
+    """Say to the chart what to fly; all else of the release stays as it is.
+
+    Args:
+        experiment: Complete; it becomes the chart's `experiment`, and its link the link.
+        before: What the release was installed with.
+    """
+    link = {**before.get("link", {}), "profile": ""}
+    return {**before, "link": link, "experiment": experiment.model_dump(mode="json")}
+
+
+def mission_document(experiment: ResolvedExperiment) -> dict[str, Any]:
+    """Say to the API what to fly."""
+    mission = experiment.mission.model_dump(mode="json")
+    return {
+        "name": experiment.name,
+        "start": mission["start"],
+        "time_limit_s": experiment.criteria.time_limit_s,
+        "waypoints": mission["waypoints"],
+    }
+
+
+def refuse_local_files(experiment: ResolvedExperiment) -> None:
+    """Refuse what only this machine has: files outside the package are not in the images.
+
+    Raises:
+        BadInputError: Names the key.
+    """
+    paths = {
+        f"cloud.{key}": getattr(experiment.cloud, key).name
+        for key in ("estimator", "predictor", "controller")
+    }
+    paths |= {
+        f"link.{key}.trace": getattr(experiment.link, key).trace for key in ("uplink", "downlink")
+    }
+    for key, name in paths.items():
+        if name is not None and ("/" in name or name.endswith(".py")):
+            raise BadInputError(
+                f"{key}: {name}: the pods do not have this file; build it into an image, "
+                "or fly with --mode local"
+            )
+    if experiment.mission.steps is not None:
+        raise BadInputError(
+            "mission.steps: a mission in a cluster has waypoints; fly steps with --mode local "
+            "or --mode virtual"
+        )
+
+
+def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
+    """Fly by a Job; interrupted, the mission is cancelled before this function ends."""
+    from cloudrc.cluster.errors import ClusterError
+    from cloudrc.cluster.jobs import follow, run_job
+
+    limit = experiment.criteria.time_limit_s
+    job = run_job(release, mission_document(experiment), limit=limit)
+    tell(f"Job {job.name} flies {experiment.name}")
+    try:
+        ended = follow(release, job.name, tell, timeout=limit + GRACE)
+    except KeyboardInterrupt:
+        _cancel(release, job, tell)
+        raise
+    if ended.exit_code not in FLOWN:
+        raise ClusterError(f"Job {job.name} did not fly its mission: {ended.message}")
+
+
+def _cancel(release: Release, job: JobStatus, tell: Tell) -> None:
+    from cloudrc.cluster.cancel import cancel
+
+    try:
+        tell(cancel(release, job.name))
+    except CloudrcError as error:
+        tell(f"not cancelled: {error}")
+
+
+def fetch_all(release: Release, folder: Path, *, want_end: bool) -> Mission:
+    """Fetch recordings, metrics and logs, and merge the recordings.
+
+    Args:
+        release: Where it flew.
+        folder: Of the run.
+        want_end: Whether to fetch again until the mission's end is in the recordings.
+    """
+    from cloudrc.cluster.fetch import fetch_logs, fetch_metrics, fetch_recording
+    from cloudrc.record.cut import cut_to_last_mission
+    from cloudrc.record.merge import merge
+
+    for _ in range(FETCHES):
+        time.sleep(FLUSH)
+        for component in COMPONENTS:
+            fetch_recording(release, component, folder / f"{component}.mcap")
+        mission, ended = cut_to_last_mission(merge(folder / "world.mcap", folder / "cloud.mcap"))
+        if ended or not want_end:
+            break
+    for component in COMPONENTS:
+        for container, text in fetch_metrics(release, component).items():
+            (folder / f"{component}-{container}.metrics").write_text(text, encoding="utf-8")
+        for container, text in fetch_logs(release, component).items():
+            (folder / f"{component}-{container}.log").write_text(text, encoding="utf-8")
+    return mission
+
+
+def shaper(folder: Path) -> str:
+    """Read what emulated the link from the metrics of its container."""
+    texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("*-link.metrics"))]
+    found = {name for text in texts for name in _SHAPER.findall(text)}
+    return "+".join(sorted(found)) or "unknown"
+
+
+def _report(
+    experiment: ResolvedExperiment, folder: Path, mission: Mission, interrupted: bool
+) -> dict[str, Any]:
+    from cloudrc.cli.flight import attachments
+    from cloudrc.record.hash import messages_sha256
+    from cloudrc.report.document import Run
+    from cloudrc.report.write import write_report
+
+    digest = messages_sha256(mission.contents.messages)
+    run = replace(Run("cluster", shaper(folder), digest), interrupted=interrupted)
+    try:
+        return write_report(folder, mission.recording(), experiment, run)
+    finally:
+        mission.write(folder / "mission.mcap", attachments(folder))

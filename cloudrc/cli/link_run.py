@@ -1,0 +1,176 @@
+"""What `cloudrc link run` does: it gives the sidecar its clock, sockets, programs and threads."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.ends import open_exporter, warn_if_exposed
+from cloudrc.drivers.process import StopSignal
+from cloudrc.records import Counted
+
+if TYPE_CHECKING:
+    from cloudrc.drivers.exporter import Exporter
+    from cloudrc.link.netem_tc import Run
+    from cloudrc.link.sidecar import Machine, Sidecar
+    from cloudrc.link.sidecar_follow import Load, ProfileFile
+
+TC_PATIENCE = 5.0
+"""How long tc and ip may take [s]."""
+NOT_FOUND = 127
+
+
+def run(options: argparse.Namespace) -> int:
+    """Shape one direction of the link until SIGTERM."""
+    stop = StopSignal()  # first: the first process of a container ignores SIGTERM until then
+    from cloudrc.link.netem_tables import write_tables
+    from cloudrc.link.sidecar import Settings, Sidecar
+    from cloudrc.link.sidecar_follow import ProfileFile
+
+    warn_if_exposed(options.listen)
+    exporter = open_exporter(options, "link")
+    watcher = Metrics(exporter, options.direction, options.mode) if exporter else None
+    file = ProfileFile(options.profile, loader(options.direction), log)
+    profile, state = file.first(), options.route.with_name("link.json")
+    settings = Settings(options.mode, options.direction, options.route, state)
+    with TemporaryDirectory(prefix="tc-", dir=options.route.parent) as tables:
+        write_tables(Path(tables))
+        sidecar = Sidecar(settings, _machine(options, runner(tables)), profile, watcher)
+        _follow(sidecar, file, options)
+        sidecar.run(stop)
+    return 0
+
+
+def log(line: str) -> None:
+    """Say one line to people."""
+    print(f"cloudrc link: {line}", file=sys.stderr, flush=True)
+
+
+def runner(tables: str) -> Run:
+    """Make what runs tc and ip; tc finds its distributions in the folder `tables`."""
+    from cloudrc.link.netem_tc import Answer
+
+    environment = {**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}
+
+    def answer(words: Sequence[str]) -> Answer:
+        try:
+            done = subprocess.run(
+                words,
+                capture_output=True,
+                text=True,
+                env=environment,
+                timeout=TC_PATIENCE,
+                check=False,
+            )
+        except FileNotFoundError:
+            return Answer(NOT_FOUND, "", "")
+        except subprocess.TimeoutExpired:
+            return Answer(1, "", f"no answer within {TC_PATIENCE:g} s")
+        return Answer(done.returncode, done.stdout, done.stderr)
+
+    return answer
+
+
+def loader(direction: str) -> Load:
+    """Make what reads a profile's file and takes one direction of it."""
+    from cloudrc.assembly import link_profile
+    from cloudrc.config.load import load_profile
+    from cloudrc.link.sidecar_follow import Loaded
+
+    def load(path: Path) -> Loaded:
+        profile = load_profile(path.absolute())  # with a slash: no shipped profile's name
+        values = profile.model_dump(mode="json", exclude_defaults=True)
+        return Loaded(link_profile(getattr(profile, direction)), values)
+
+    return load
+
+
+def resolve(name: str) -> list[str]:
+    """Give the IPv4 addresses of a name; raises an OSError if there is none."""
+    try:
+        found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_DGRAM)
+    except UnicodeError as error:  # a label that is empty or too long
+        raise OSError(f"not a name: {error}") from error
+    return [str(entry[4][0]) for entry in found]
+
+
+def _machine(options: argparse.Namespace, run: Run) -> Machine:
+    from cloudrc.config.load import load_experiment
+    from cloudrc.link.model import LinkDirection
+    from cloudrc.link.netem import Netem
+    from cloudrc.link.netem_tc import may_shape
+    from cloudrc.link.profile import DirectionProfile
+    from cloudrc.link.relay_shaper import RelayShaper
+    from cloudrc.link.sidecar import Machine
+    from cloudrc.tunnel.codec import peek
+
+    seed = load_experiment(str(options.config)).seed
+    clock, origin_ns = time.monotonic_ns, time.monotonic_ns()
+
+    def relay(profile: DirectionProfile) -> RelayShaper:
+        uplink = options.direction == "uplink"
+        return RelayShaper(options.listen, LinkDirection(profile, seed, uplink, origin_ns), peek)
+
+    def netem(profile: DirectionProfile) -> Netem:
+        return Netem(run, profile, origin_ns=origin_ns, clock=clock, wait=time.sleep)
+
+    return Machine(
+        relay=relay,
+        netem=netem,
+        may_shape=may_shape(Path("/proc/self/status").read_text(encoding="ascii")),
+        clock=clock,
+        today=lambda: datetime.now(UTC).isoformat(timespec="seconds"),
+        wait=time.sleep,
+        log=log,
+    )
+
+
+def _follow(sidecar: Sidecar, file: ProfileFile, options: argparse.Namespace) -> None:
+    """Let threads of their own look after the profile's file and the peer's name."""
+    from cloudrc.link.sidecar_follow import PEER_PERIOD, PROFILE_PERIOD, PeerName
+
+    name = PeerName(options.peer, resolve, log)
+
+    def look() -> None:
+        sidecar.profile = file.poll() or sidecar.profile
+
+    def ask() -> None:
+        sidecar.peer = name.poll() or sidecar.peer
+
+    for action, period in ((look, PROFILE_PERIOD), (ask, PEER_PERIOD)):
+        threading.Thread(target=_every, args=(period, action), daemon=True).start()
+
+
+def _every(period: float, action: Callable[[], None]) -> None:
+    """Act for ever, with so long a pause between [s]."""
+    while True:
+        action()
+        time.sleep(period)
+
+
+class Metrics:
+    """Keeps the metrics of a sidecar; a `Watcher`."""
+
+    def __init__(self, exporter: Exporter, direction: str, mode: str) -> None:
+        self._exporter = exporter
+        self._direction = direction
+        self._mode = mode
+
+    def shapes(self, shaper: str) -> None:
+        """Show who shapes, and be ready."""
+        self._exporter.shaped(shaper, self._direction, self._mode)
+        self._exporter.ready(True)
+
+    def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
+        """Show what became of the datagrams."""
+        self._exporter.see([Counted(stamp_ns, "link", name, n) for name, n in counts.items()])

@@ -1,0 +1,102 @@
+"""`cloudrc mission`: missions and the operator's hand, on a run here or a release in a cluster."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+
+from cloudrc.cli.cluster_flags import place_arguments
+
+EPILOG = """\
+where:
+  a run that flies here ('cloudrc run --mode local'): found by itself, or by
+  --api, whose URL is in the api.json of the run's folder
+  a release in a cluster: with --context, -n or --release, or if none flies here
+
+examples:
+  cloudrc mission run pipes
+  cloudrc mission hold
+  cloudrc mission goto 0.5 0 1.2
+  cloudrc mission run my.yaml --queue --context kind-cloudrc -n demo
+  cloudrc mission logs --follow
+
+A mission is a file with 'waypoints', such as those that 'cloudrc list missions'
+names. 'run' and 'fly' end with its verdict: 0 done, 1 failed, 6 not real time."""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+
+    def add(name: str, line: str) -> argparse.ArgumentParser:
+        verb = verbs.add_parser(
+            name,
+            help=line,
+            description=line[0].upper() + line[1:] + ".",
+            formatter_class=parser.formatter_class,
+            allow_abbrev=False,
+        )
+        verb.add_argument("--debug", action="store_true", default=argparse.SUPPRESS)
+        verb.add_argument("--api", metavar="URL", help="API of a run or release: http://HOST:PORT")
+        if name != "fly":
+            place_arguments(verb)
+        return verb
+
+    run = add("run", "fly a mission and follow it to its verdict")
+    run.add_argument("mission", metavar="FILE", help="a mission's file, or one that ships")
+    run.add_argument("--name", default="", help="for people (default: the file's name)")
+    for name in ("list", "status"):
+        line = {"list": "all missions", "status": "how things are, or how one mission is"}[name]
+        shown = add(name, line)
+        shown.add_argument(
+            "-o", "--output", choices=("table", "json"), default="table", help="default: table"
+        )
+    shown.add_argument("id", nargs="?", metavar="ID", help="of a mission (in a cluster: of a Job)")
+    cancel = add("cancel", "end a mission; the robot holds")
+    cancel.add_argument("id", nargs="?", metavar="ID", help="default: the one under way")
+    logs = add("logs", "what has happened")
+    logs.add_argument("id", nargs="?", metavar="ID", help="default: to all missions")
+    logs.add_argument("-f", "--follow", action="store_true", help="and what happens from now on")
+    goto = add("goto", "fly to a point, or hold a held mission there")
+    for axis in "XYZ":
+        goto.add_argument(axis.lower(), type=float, metavar=axis, help="[m], world frame")
+    add("hold", "stop the robot where it is")
+    add("resume", "go on with the mission that is held")
+    fly = add("fly", "what a mission's Job runs: post, follow, end with the verdict")
+    fly.add_argument("--mission", required=True, metavar="FILE", help="the mission")
+    fly.add_argument("--key", default="", help="posting twice under one key flies once")
+    for verb in (run, fly):
+        verb.add_argument("--queue", action="store_true", help="wait for the one under way")
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Do what the verb says."""
+    from cloudrc.cli import mission_cluster, mission_local
+
+    verb: str = options.verb
+    if verb == "fly":
+        return mission_local.fly(options)
+    url = options.api or _url_here(options)
+    if url is None and verb in mission_cluster.VERBS:
+        in_cluster: Callable[[argparse.Namespace], int] = mission_cluster.VERBS[verb]
+        return in_cluster(options)
+    if url is None:
+        with mission_cluster.api_url(options) as forwarded:
+            return mission_local.VERBS[verb](options, forwarded)
+    return mission_local.VERBS[verb](options, url)
+
+
+def _url_here(options: argparse.Namespace) -> str | None:
+    """Find the API of the run that flies here, unless the flags name a cluster."""
+    import json
+
+    from cloudrc.cli.folder import RUNS
+    from cloudrc.drivers.local import API_FILE
+
+    if options.context or options.namespace or options.release != "cloudrc":
+        return None
+    try:
+        url = json.loads((RUNS / "latest" / API_FILE).read_text(encoding="utf-8"))["url"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return str(url)

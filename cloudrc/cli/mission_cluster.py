@@ -1,0 +1,146 @@
+"""Verbs of `cloudrc mission` that speak with Kubernetes: missions are Jobs there."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.cluster_flags import place
+from cloudrc.cli.extras import require
+from cloudrc.cli.mission_local import read_mission
+from cloudrc.cli.output import table
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
+
+if TYPE_CHECKING:
+    from cloudrc.cluster.access import Release
+    from cloudrc.cluster.jobs import JobStatus
+
+GRACE = 180.0
+"""What a Job may last beyond its mission's limit: pods have to start [s]."""
+TIME_LIMIT = 60.0
+"""Of a mission that does not say its own, if the experiment does not either [s]."""
+
+
+@contextmanager
+def api_url(options: argparse.Namespace) -> Iterator[str]:
+    """Open the way to a release's API for as long as the block lasts."""
+    release = _place(options)
+    from cloudrc.cluster.forward import api_url as forwarded
+
+    with forwarded(release.context, release.namespace, release.name) as url:
+        yield url
+
+
+def _run(options: argparse.Namespace) -> int:
+    mission = read_mission(options.mission)
+    if options.name:
+        mission["name"] = options.name
+    release = _place(options)
+    from cloudrc.cluster.jobs import follow, run_job
+
+    limit = float(mission.get("time_limit_s") or TIME_LIMIT)
+    job = run_job(release, mission, limit=limit, queue=options.queue)
+    print(f"Job {job.name} in namespace '{release.namespace}'", flush=True)
+    ended = follow(release, job.name, _write, timeout=limit + GRACE)
+    if ended.exit_code is None:
+        print(ended.message)
+    return 1 if ended.exit_code is None else ended.exit_code
+
+
+def _list(options: argparse.Namespace) -> int:
+    release = _place(options)
+    from cloudrc.cluster.jobs import list_jobs
+
+    jobs = list_jobs(release)
+    if options.output == "json":
+        return _print_json([asdict(job) for job in jobs])
+    if not jobs:
+        print(f"no missions {release.where}; fly one: cloudrc mission run FILE")
+        return 0
+    print(table([("JOB", "STATE", "CREATED", "VERDICT"), *map(_row, jobs)]))
+    return 0
+
+
+def _status(options: argparse.Namespace) -> int:
+    if options.id is None:
+        from cloudrc.cli.mission_local import VERBS as OF_API
+
+        with api_url(options) as url:
+            return OF_API["status"](options, url)
+    release = _place(options)
+    from cloudrc.cluster.jobs import read_job
+
+    job = read_job(release, options.id)
+    if options.output == "json":
+        return _print_json([asdict(job)])
+    print(table([_row(job)]))
+    return 0
+
+
+def _cancel(options: argparse.Namespace) -> int:
+    if options.id is None:
+        from cloudrc.cli.mission_local import VERBS as OF_API
+
+        with api_url(options) as url:
+            return OF_API["cancel"](options, url)
+    release = _place(options)
+    from cloudrc.cluster.cancel import cancel
+
+    print(cancel(release, options.id))
+    return 0
+
+
+def _logs(options: argparse.Namespace) -> int:
+    release = _place(options)
+    from cloudrc.cluster.jobs import follow, list_jobs, logs
+
+    job = options.id
+    if job is None:
+        jobs = list_jobs(release)
+        if not jobs:
+            raise BadInputError(f"no missions {release.where}")
+        job = jobs[-1].name
+    if options.follow:
+        follow(release, job, _write, timeout=86_400.0)
+        return 0
+    for line in logs(release, job):
+        print(line)
+    return 0
+
+
+VERBS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "run": _run,
+    "list": _list,
+    "status": _status,
+    "cancel": _cancel,
+    "logs": _logs,
+}
+
+
+def _place(options: argparse.Namespace) -> Release:
+    require("a cluster", ("kube",))
+    try:
+        return place(options)
+    except MissingPrerequisiteError as error:
+        if options.context or options.namespace:
+            raise
+        raise MissingPrerequisiteError(
+            f"no run flies here (start one: cloudrc run), and {error}"
+        ) from None
+
+
+def _row(job: JobStatus) -> tuple[str, ...]:
+    return job.name, job.state, job.created, job.message
+
+
+def _print_json(jobs: list[dict[str, object]]) -> int:
+    print(json.dumps({"schemaVersion": 1, "jobs": jobs}, indent=2))
+    return 0
+
+
+def _write(line: str) -> None:
+    print(line, flush=True)

@@ -1,0 +1,205 @@
+"""Verbs of `cloudrc mission` that speak with teleop's API, wherever it is."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from cloudrc.cli.mission_follow import Follower, in_words, leave_message
+from cloudrc.cli.mission_http import Api
+from cloudrc.cli.output import table
+from cloudrc.errors import BadInputError, CloudrcError
+
+INTERRUPTED = 130
+
+
+def read_mission(name: str) -> dict[str, Any]:
+    """Read the file of a mission that ships, or any other; the API checks what is in it.
+
+    Raises:
+        BadInputError: If there is no such file, or it holds no mission.
+    """
+    from cloudrc.config import shipped
+
+    mission = dict(shipped.read("mission", name, Path()).tree)
+    if mission.get("steps") is not None:
+        raise BadInputError(
+            f"{name}: steps are for experiments; fly them by 'cloudrc run', or give waypoints"
+        )
+    mission.pop("steps", None)
+    return {"name": Path(name).stem, **mission}
+
+
+def fly(options: argparse.Namespace) -> int:
+    """Post a mission, follow it, end with its verdict; asked to stop, cancel it."""
+    if options.api is None:
+        raise BadInputError("fly needs --api; to fly by hand: cloudrc mission run FILE")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    api = Api(options.api)
+    follower, found = Follower(api, _write), ""
+    try:
+        mission = read_mission(options.mission)
+        order = {**mission, "key": options.key, "queue": options.queue}
+        found = follower.post(order)["id"]
+        verdict = follower.follow(found)
+    except KeyboardInterrupt:
+        if found:
+            with suppress(CloudrcError):
+                api.post(f"/v1/missions/{found}/cancel")
+        _end("INTERRUPTED: the Job was stopped, its mission is cancelled")
+        return INTERRUPTED
+    except CloudrcError as error:
+        leave_message(str(error))
+        raise
+    _end(in_words(verdict))
+    return int(verdict["exit_code"])
+
+
+def _run(options: argparse.Namespace, url: str) -> int:
+    api, mission = Api(url), read_mission(options.mission)
+    if options.name:
+        mission["name"] = options.name
+    follower = Follower(api, _write, patience=10.0)
+    mission_id = follower.post({**mission, "queue": options.queue})["id"]
+    try:
+        verdict = follower.follow(mission_id)
+    except KeyboardInterrupt:
+        print(f"mission {mission_id} flies on; end it: cloudrc mission cancel", file=sys.stderr)
+        raise
+    print(in_words(verdict))
+    return int(verdict["exit_code"])
+
+
+def _list(options: argparse.Namespace, url: str) -> int:
+    missions = Api(url).get("/v1/missions")["missions"]
+    if options.output == "json":
+        return _print_json({"missions": missions})
+    if not missions:
+        print("no missions yet")
+        return 0
+    heads = ("ID", "NAME", "STATE", "WAYPOINTS", "VERDICT")
+    print(table([heads, *map(_row, missions)]))
+    return 0
+
+
+def _row(mission: dict[str, Any]) -> tuple[str, ...]:
+    done = f"{len(mission['reached'])}/{mission['waypoints']}"
+    verdict = in_words(mission["verdict"]) if mission["verdict"] else ""
+    return mission["id"], mission["name"], mission["state"], done, verdict
+
+
+def _status(options: argparse.Namespace, url: str) -> int:
+    api = Api(url)
+    if options.id:
+        mission = api.get(f"/v1/missions/{options.id}")
+        if options.output == "json":
+            return _print_json(mission)
+        _say(mission)
+        _print_events(mission["events"])
+        return 0
+    state = api.get("/v1/state")
+    if options.output == "json":
+        return _print_json(state)
+    if state["mission"]:
+        _say(state["mission"])
+    else:
+        print("no mission is under way")
+    if state["queue"]:
+        print(f"waiting: {', '.join(state['queue'])}")
+    seen = state["seen"]
+    if seen is None:
+        print("the robot has not been seen yet; is the link up?")
+        return 0
+    where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
+    rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
+    print(f"robot at ({where}) m, guard {seen['guard']}, seen {seen['age_s']:.2f} s ago{rtt}")
+    return 0
+
+
+def _cancel(options: argparse.Namespace, url: str) -> int:
+    api = Api(url)
+    mission_id = options.id
+    if not mission_id:
+        mission = api.get("/v1/state")["mission"]
+        if mission is None:
+            raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
+        mission_id = mission["id"]
+    _say(api.post(f"/v1/missions/{mission_id}/cancel"))
+    return 0
+
+
+def _logs(options: argparse.Namespace, url: str) -> int:
+    api = Api(url)
+    if not options.follow and options.id:
+        _print_events(api.get(f"/v1/missions/{options.id}")["events"])
+        return 0
+    if not options.follow:
+        missions = [m["id"] for m in api.get("/v1/missions")["missions"]]
+        events = [e for m in missions for e in api.get(f"/v1/missions/{m}")["events"]]
+        _print_events(sorted(events, key=lambda event: int(event["id"])))
+        return 0
+    for event in api.events():
+        if not options.id or event["mission"] == options.id:
+            _print_events([event])
+    return 0
+
+
+def _goto(options: argparse.Namespace, url: str) -> int:
+    body = {"position_m": [options.x, options.y, options.z]}
+    _say(Api(url).post("/v1/goto", body))
+    return 0
+
+
+def _hold(options: argparse.Namespace, url: str) -> int:
+    _say(Api(url).post("/v1/hold"))
+    return 0
+
+
+def _resume(options: argparse.Namespace, url: str) -> int:
+    _say(Api(url).post("/v1/resume"))
+    return 0
+
+
+VERBS: dict[str, Callable[[argparse.Namespace, str], int]] = {
+    "run": _run,
+    "list": _list,
+    "status": _status,
+    "cancel": _cancel,
+    "logs": _logs,
+    "goto": _goto,
+    "hold": _hold,
+    "resume": _resume,
+}
+
+
+def _say(mission: dict[str, Any]) -> None:
+    """Say in one line where a mission is."""
+    where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
+    name = f" ({mission['name']})" if mission["name"] else ""
+    verdict = f"; {in_words(mission['verdict'])}" if mission["verdict"] else ""
+    print(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
+
+
+def _print_events(events: list[dict[str, Any]]) -> None:
+    for event in events:
+        print(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}", flush=True)
+
+
+def _print_json(document: dict[str, Any]) -> int:
+    print(json.dumps({"schemaVersion": 1, **document}, indent=2))
+    return 0
+
+
+def _write(line: str) -> None:
+    print(line, flush=True)
+
+
+def _end(text: str) -> None:
+    _write(text)
+    leave_message(text)

@@ -1,0 +1,199 @@
+"""The API of teleop: HTTP requests come in; verbs go to the mission service, JSON goes out.
+
+Handlers wait for the service on the bridge and touch nothing else of it. Errors are one line of
+`detail`; a mission that is in the way is named, and so is every value that cannot be used.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import radians
+from typing import Any
+
+from fastapi import APIRouter, Depends, FastAPI, Request
+from fastapi.responses import JSONResponse, StreamingResponse
+from pydantic import BaseModel
+from starlette.concurrency import run_in_threadpool
+
+from cloudrc import __version__
+from cloudrc.cloud.teleop import api_models as models
+from cloudrc.cloud.teleop.api_bridge import Bridge, Call
+from cloudrc.cloud.teleop.api_check import leads_to_board, read_goto, read_mission
+from cloudrc.cloud.teleop.api_errors import BODY_MAX, REFUSALS, TooLargeError, handle_errors
+from cloudrc.cloud.teleop.api_events import last_event_id, stream
+from cloudrc.cloud.teleop.plan import Plan
+from cloudrc.cloud.teleop.service import MissionService
+from cloudrc.cloud.teleop.service_mission import Mission, Order
+from cloudrc.config.schema import Mission as MissionSection
+from cloudrc.geometry.scene import Scene
+
+ABOUT = """\
+Fly missions, or steer by hand. One mission is flown at a time; a second one is refused with the
+id of the first, or waits if it says `queue`. A mission posted again under the same `key` is not
+made again. Positions are in metres, x forward, y left, z up.
+"""
+ANSWER_LIMIT = 2.0
+"""For the mission service to answer [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What the API needs to know of the experiment.
+
+    Attributes:
+        scene: That waypoints are checked against.
+        time_limit: Of missions that do not say theirs [s].
+        contact: Whether missions that do not say, and lead to the board, have to touch it.
+        plan: Turns a checked mission and its limit of time [s] into a plan.
+    """
+
+    scene: Scene
+    time_limit: float
+    contact: bool
+    plan: Callable[[MissionSection, float], Plan]
+
+
+def authorize(request: Request) -> None:
+    """Let everybody through: the place where a token will be asked for."""
+
+
+def create_app(bridge: Bridge, surroundings: Surroundings) -> FastAPI:
+    """Make the ASGI application."""
+    app = FastAPI(title="cloudrc teleop", version=__version__, description=ABOUT)
+    handle_errors(app)
+    router = APIRouter(prefix="/v1", dependencies=[Depends(authorize)], responses=REFUSALS)
+    _add_missions(router, bridge, surroundings)
+    _add_operator(router, bridge, surroundings)
+    _add_views(router, bridge)
+    app.include_router(router)
+    return app
+
+
+async def _ask(bridge: Bridge, call: Call) -> Any:
+    future = asyncio.wrap_future(bridge.submit(call))
+    return await asyncio.wait_for(future, ANSWER_LIMIT)
+
+
+async def _body(request: Request) -> bytes:
+    """Read a body that is not too long; a longer one is not read to its end."""
+    body = b""
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > BODY_MAX:
+            raise TooLargeError
+    return body
+
+
+def _takes(model: type[BaseModel], example: dict[str, Any]) -> dict[str, Any]:
+    """Describe a body that is read by `_body`."""
+    content = {"application/json": {"schema": models.inlined(model), "example": example}}
+    return {"requestBody": {"required": True, "content": content}}
+
+
+def _gives(model: type[BaseModel], text: str, code: int = 200) -> dict[str, Any]:
+    return {"response_model": None, "responses": {code: {"model": model, "description": text}}}
+
+
+def _add_missions(router: APIRouter, bridge: Bridge, surroundings: Surroundings) -> None:
+    @router.post(
+        "/missions",
+        status_code=201,
+        summary="Fly a mission",
+        openapi_extra=_takes(models.MissionRequest, models.MISSION_EXAMPLE),
+        response_model=None,
+        responses={
+            201: {"model": models.MissionView, "description": "It flies, or waits if queued"},
+            200: {"model": models.MissionView, "description": "The mission of this key"},
+        },
+    )
+    async def create(request: Request) -> JSONResponse:
+        body = await _body(request)
+        order = await run_in_threadpool(_order, body, surroundings)
+
+        def call(service: MissionService, now_ns: int) -> tuple[dict[str, Any], bool]:
+            mission, new = service.create(order, now_ns)
+            return mission.as_json(), new
+
+        view, new = await _ask(bridge, call)
+        return JSONResponse(view, 201 if new else 200)
+
+    @router.get("/missions", summary="All missions", **_gives(models.MissionList, "Oldest first"))
+    async def show_all() -> JSONResponse:
+        def call(service: MissionService, now_ns: int) -> list[dict[str, Any]]:
+            return [mission.summary() for mission in service.book.missions.values()]
+
+        return JSONResponse({"missions": await _ask(bridge, call)})
+
+    @router.get("/missions/{id}", summary="One mission", **_gives(models.MissionView, "As it is"))
+    async def show(id: str) -> JSONResponse:
+        return JSONResponse(await _ask(bridge, lambda s, now_ns: s.book.find(id).as_json()))
+
+    @router.post(
+        "/missions/{id}/cancel", summary="End a mission", **_gives(models.MissionView, "Ended")
+    )
+    async def cancel(id: str) -> JSONResponse:
+        return JSONResponse(await _ask(bridge, lambda s, now_ns: s.cancel(id, now_ns).as_json()))
+
+
+def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings) -> None:
+    @router.post("/hold", summary="Stop where you are", **_gives(models.MissionView, "Held"))
+    async def hold() -> JSONResponse:
+        return JSONResponse(await _ask(bridge, lambda s, now_ns: s.hold(now_ns).as_json()))
+
+    @router.post(
+        "/resume", summary="Go on with what is held", **_gives(models.MissionView, "It flies")
+    )
+    async def resume() -> JSONResponse:
+        return JSONResponse(await _ask(bridge, lambda s, now_ns: s.resume(now_ns).as_json()))
+
+    @router.post(
+        "/goto",
+        summary="Fly to a point",
+        description="A mission of its own, or another place for a mission that is held.",
+        openapi_extra=_takes(models.GoToRequest, {"position_m": [0.0, 0.0, 1.2], "yaw_deg": 0.0}),
+        **_gives(models.MissionView, "On its way"),
+    )
+    async def go_to(request: Request) -> JSONResponse:
+        body = await _body(request)
+        point = await run_in_threadpool(read_goto, body, surroundings.scene)
+
+        def call(service: MissionService, now_ns: int) -> Mission:
+            return service.go_to(point.position_m, radians(point.yaw_deg), now_ns)
+
+        return JSONResponse(await _ask(bridge, lambda s, now_ns: call(s, now_ns).as_json()))
+
+
+def _add_views(router: APIRouter, bridge: Bridge) -> None:
+    @router.get("/state", summary="How things are", **_gives(models.StateView, "Now"))
+    async def state() -> JSONResponse:
+        return JSONResponse(await _ask(bridge, lambda s, now_ns: s.state(now_ns)))
+
+    @router.get(
+        "/events",
+        summary="What happens, as it happens",
+        description="Server-sent events, one for each event of all missions, from the oldest that "
+        "is known. Resume with the header Last-Event-ID, or with `?after=ID`.",
+        response_class=StreamingResponse,
+        responses={200: {"content": {"text/event-stream": {}}, "description": "A stream"}},
+    )
+    async def events(request: Request, after: int = 0) -> StreamingResponse:
+        began = max(after, last_event_id(request))
+        await _ask(bridge, lambda s, now_ns: None)  # is it there?
+        ask = lambda call: _ask(bridge, call)  # noqa: E731
+        return StreamingResponse(
+            stream(request, ask, lambda: bool(bridge.closed), began),
+            media_type="text/event-stream",
+            headers={"Cache-Control": "no-store"},
+        )
+
+
+def _order(body: bytes, surroundings: Surroundings) -> Order:
+    request, mission = read_mission(body, surroundings.scene)
+    limit = surroundings.time_limit if request.time_limit_s is None else request.time_limit_s
+    contact = request.contact
+    if contact is None:
+        contact = surroundings.contact and leads_to_board(mission, surroundings.scene)
+    plan = surroundings.plan(mission, limit)
+    return Order(plan, request.name, request.key, contact, request.queue)

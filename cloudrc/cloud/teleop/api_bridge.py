@@ -1,0 +1,77 @@
+"""The bridge from the API's threads to teleop's loop: calls go over, their results come back.
+
+The machine belongs to one thread. Whoever else wants something of it leaves a call here, which the
+loop makes between two deadlines. The bridge is bounded: a flood is refused, it does not pile up.
+"""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+from cloudrc.cloud.teleop.service import MissionService
+from cloudrc.cloud.teleop.service_book import UnavailableError
+
+WAITING_MAX = 64
+"""Calls that wait at once."""
+
+Call = Callable[[MissionService, int], Any]
+"""Service and now [ns] come in; what is answered goes out."""
+
+
+class Bridge:
+    """Calls on their way.
+
+    Attributes:
+        closed: Why no call is taken, in words; "" if they are.
+    """
+
+    def __init__(self) -> None:
+        self.closed = "teleop is starting"
+        self._calls: queue.Queue[tuple[Call, Future[Any]]] = queue.Queue(WAITING_MAX)
+        self._service: MissionService | None = None
+
+    def open(self, service: MissionService) -> None:
+        """Take calls for this service from now on."""
+        self._service, self.closed = service, ""
+
+    def submit(self, call: Call) -> Future[Any]:
+        """Leave a call, from any thread.
+
+        Raises:
+            UnavailableError: If none is taken now.
+        """
+        if self.closed:
+            raise UnavailableError(self.closed)
+        future: Future[Any] = Future()
+        try:
+            self._calls.put_nowait((call, future))
+        except queue.Full:
+            raise UnavailableError(f"{WAITING_MAX} requests wait already; try again") from None
+        return future
+
+    def take(self) -> list[Callable[[int], None]]:
+        """Hand over the calls that wait, for the loop's thread to make."""
+        taken: list[Callable[[int], None]] = []
+        while len(taken) < WAITING_MAX:
+            try:
+                call, future = self._calls.get_nowait()
+            except queue.Empty:
+                break
+            taken.append(self._bound(call, future))
+        return taken
+
+    def _bound(self, call: Call, future: Future[Any]) -> Callable[[int], None]:
+        def make(now_ns: int) -> None:
+            service = self._service
+            assert service is not None, "nothing is taken before it is open"
+            if not future.set_running_or_notify_cancel():
+                return
+            try:
+                future.set_result(call(service, now_ns))
+            except Exception as error:  # whoever called has to hear of it
+                future.set_exception(error)
+
+        return make

@@ -1,0 +1,98 @@
+"""Checks what is posted to the API: bytes come in; a mission that can be flown, or problems go out.
+
+The same code that checks an experiment's file, so that the words are the same.
+"""
+
+from __future__ import annotations
+
+from math import cos, radians, sin
+from typing import TypeVar
+
+from pydantic import ValidationError
+
+from cloudrc.cloud.teleop.api_models import GoToRequest, MissionRequest
+from cloudrc.config.fields import Section
+from cloudrc.config.mission_check import check_mission
+from cloudrc.config.problems import Problem, from_pydantic
+from cloudrc.config.schema import Mission, Waypoint
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH
+from cloudrc.geometry.scene import Scene
+
+_Request = TypeVar("_Request", bound=Section)
+
+
+class RefusedError(BadInputError):
+    """A request that cannot be used; `problems` say why."""
+
+    def __init__(self, problems: list[Problem]) -> None:
+        super().__init__("; ".join(map(str, problems[:3])))
+        self.problems = problems
+
+
+def read_mission(body: bytes, scene: Scene) -> tuple[MissionRequest, Mission]:
+    """Read a mission and check it against the scene.
+
+    Raises:
+        RefusedError: With everything that is wrong.
+    """
+    request = _parse(body, MissionRequest)
+    mission = Mission(start=request.start, waypoints=request.waypoints)
+    _refuse(check_mission(mission, scene))
+    return request, mission
+
+
+def read_goto(body: bytes, scene: Scene) -> GoToRequest:
+    """Read a point and check it against the scene.
+
+    Raises:
+        RefusedError: With everything that is wrong.
+    """
+    request = _parse(body, GoToRequest)
+    waypoint = Waypoint(position_m=request.position_m, yaw_deg=request.yaw_deg)
+    problems = check_mission(Mission(start="here", waypoints=(waypoint,)), scene)
+    _refuse([Problem(problem.path[2:], problem.value, problem.reason) for problem in problems])
+    return request
+
+
+def leads_to_board(mission: Mission, scene: Scene) -> bool:
+    """Say whether the arm's tip is at the board or behind its face at some waypoint."""
+    board = scene.board
+    if board is None:
+        return False
+    for waypoint in mission.waypoints:
+        (x, y, z), yaw = waypoint.position_m, radians(waypoint.yaw_deg)
+        x, y, z = x + ARM_LENGTH * cos(yaw), y + ARM_LENGTH * sin(yaw), z + ARM_HEIGHT
+        if x >= board.x and board.y[0] <= y <= board.y[1] and board.z[0] <= z <= board.z[1]:
+            return True
+    return False
+
+
+def as_json(problem: Problem) -> dict[str, str | int | None]:
+    """Show a problem as the API does."""
+    index = next((int(key) for key in problem.path if key.isdigit()), None)
+    return {
+        "path": ".".join(problem.path),
+        "index": index if problem.path[:1] == ("waypoints",) else None,
+        "value": problem.value,
+        "reason": problem.reason,
+    }
+
+
+def _parse(body: bytes, model: type[_Request]) -> _Request:
+    try:
+        return model.model_validate_json(body)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        if first["type"] == "json_invalid":
+            problems = [Problem((), "", f"not JSON: {first['ctx']['error']}")]
+        elif not first["loc"]:
+            problems = [Problem((), "", "must be a mapping of keys")]
+        else:
+            problems = from_pydantic(error, model)
+        raise RefusedError(problems) from None
+
+
+def _refuse(problems: list[Problem]) -> None:
+    if problems:
+        raise RefusedError(problems)

@@ -1,0 +1,59 @@
+"""What the API answers when it does not do what was asked: an exception comes in, JSON goes out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.responses import JSONResponse
+
+from cloudrc.cloud.teleop.api_check import RefusedError, as_json
+from cloudrc.cloud.teleop.api_models import Refusal
+from cloudrc.cloud.teleop.service_book import (
+    ConflictError,
+    UnavailableError,
+    UnknownMissionError,
+)
+from cloudrc.errors import CloudrcError
+
+BODY_MAX = 256 * 1024
+"""Length of a request's body [bytes]."""
+
+REFUSALS: dict[int | str, dict[str, Any]] = {
+    code: {"model": Refusal, "description": text}
+    for code, text in {
+        404: "There is no such mission",
+        409: "The state does not allow it; `id` names the mission in the way",
+        413: f"The body is longer than {BODY_MAX // 1024} KiB",
+        422: "A value cannot be used; `problems` has every one",
+        503: "Not now: teleop is starting, or another one still holds the journal; try again",
+    }.items()
+}
+
+
+class TooLargeError(CloudrcError):
+    """The body of a request is too long."""
+
+
+def handle_errors(app: FastAPI) -> None:
+    """Let an application answer with `Refusal` for everything that cannot be done."""
+
+    @app.exception_handler(CloudrcError)
+    async def refuse(request: Request, error: CloudrcError) -> JSONResponse:
+        match error:
+            case RefusedError():
+                problems = [as_json(problem) for problem in error.problems]
+                return JSONResponse({"detail": str(error), "problems": problems}, 422)
+            case ConflictError():
+                return JSONResponse({"detail": str(error), "id": error.mission or None}, 409)
+            case UnknownMissionError():
+                return JSONResponse({"detail": str(error)}, 404)
+            case TooLargeError():
+                return JSONResponse({"detail": REFUSALS[413]["description"]}, 413)
+            case UnavailableError():
+                return JSONResponse({"detail": str(error)}, 503, {"Retry-After": "1"})
+        return JSONResponse({"detail": str(error)}, 500)
+
+    @app.exception_handler(TimeoutError)
+    async def too_late(request: Request, error: TimeoutError) -> JSONResponse:
+        return JSONResponse({"detail": "teleop did not answer in time; try again"}, 503)

@@ -1,0 +1,183 @@
+"""What the API takes and gives, with units, ranges and examples: the OpenAPI schema is made of it.
+
+Requests are sections like those of a configuration file, and are checked by the same code.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cloudrc.config.fields import Finite, Positive, Section
+from cloudrc.config.schema import MAX_WAYPOINTS, Waypoint
+
+Position = tuple[Finite, Finite, Finite]
+Text = Annotated[str, Field(max_length=200)]
+
+MISSION_EXAMPLE = {
+    "name": "to the board",
+    "start": "spawn",
+    "time_limit_s": 60.0,
+    "waypoints": [
+        {"position_m": [0.5, 0.0, 0.7], "tolerance_m": 0.15, "dwell_s": 0.2},
+        {"position_m": [0.5, 3.6, 0.7]},
+    ],
+}
+
+
+class MissionRequest(Section):
+    """A mission to fly."""
+
+    name: Text = Field("", description="For people")
+    description: str = Field("", description="One line, not kept")
+    start: Literal["spawn", "here"] = Field("spawn", description="Where the mission starts")
+    time_limit_s: Positive | None = Field(
+        None, description="For the whole mission, held time counted [s]; default: the experiment's"
+    )
+    waypoints: tuple[Waypoint, ...] = Field(
+        (), max_length=MAX_WAYPOINTS, description="Points, in order"
+    )
+    contact: bool | None = Field(
+        None,
+        description="Whether the arm has to touch the board; "
+        "default: if the experiment asks for it and the waypoints lead there",
+    )
+    key: Text = Field("", description="A second mission under the same key is not made")
+    queue: bool = Field(False, description="Wait for the mission under way, if there is one")
+
+
+class GoToRequest(Section):
+    """A point to fly to."""
+
+    position_m: Position = Field(description="Base position [m], world frame")
+    yaw_deg: Finite = Field(0.0, description="Heading [deg]")
+
+
+class _Answer(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Reached(_Answer):
+    """A waypoint that was reached."""
+
+    waypoint: int = Field(description="Its index, from 0")
+    time_s: float = Field(description="When, since the mission began [s]")
+
+
+class Failure(_Answer):
+    """A rule that was broken."""
+
+    code: str = Field(description="One word, for programs")
+    text: str = Field(description="The same for people")
+
+
+class Verdict(_Answer):
+    """What became of a mission that has ended."""
+
+    outcome: Literal["success", "failure", "invalid", "interrupted"] = Field(
+        description="As in report.json"
+    )
+    exit_code: int = Field(description="Of a Job that flew it: 0, 1, 6 or 130")
+    failures: list[Failure] = Field(description="Every rule that was broken")
+
+
+class Event(_Answer):
+    """Something that happened to a mission."""
+
+    id: int = Field(description="Rises with every event of all missions")
+    mission: str = Field(description="Whose")
+    event: str = Field(
+        description="queued, starting, started, reached, held, resumed, goto, restarted, "
+        "board_touched, pipe_touched; at the end done, cancelled, timed_out, leg_timed_out, "
+        "world_restarted or guard_stopped"
+    )
+    waypoint: int = Field(description="Index of the waypoint concerned")
+    text: str = Field(description="The same in words")
+    time_s: float = Field(description="Since the mission began [s]")
+
+
+class MissionSummary(_Answer):
+    """A mission, without its events."""
+
+    id: str = Field(description="Given by teleop")
+    name: str = Field(description="Given by its sender")
+    key: str = Field(description="Likewise")
+    state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"] = Field(
+        description="Where it is"
+    )
+    waypoint: int = Field(description="Index of the waypoint that is flown to, from 0")
+    waypoints: int = Field(description="How many it has")
+    reached: list[Reached] = Field(description="Those that were reached")
+    verdict: Verdict | None = Field(description="Once it has ended")
+
+
+class MissionView(MissionSummary):
+    """A mission with everything that has happened to it."""
+
+    events: list[Event] = Field(description="Oldest first")
+
+
+class MissionList(_Answer):
+    """All missions that are known."""
+
+    missions: list[MissionSummary] = Field(description="Oldest first")
+
+
+class Seen(_Answer):
+    """The newest telemetry."""
+
+    age_s: float = Field(description="Since it arrived [s]")
+    epoch: int = Field(description="Session that it belongs to")
+    world: str = Field(description="Names world's process")
+    position_m: list[float | None] = Field(description="Of the base, measured [m], world frame")
+    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = Field(
+        description="State of the guard on board"
+    )
+    pipe_contacts: int = Field(description="How often a pipe has been touched so far")
+    touch_speed_mps: float | None = Field(description="Of the tip at the board [m/s]")
+    horizon_s: float | None = Field(description="How far cloud looks ahead [s]")
+    rtt_s: float | None = Field(description="Last round trip, hold excluded [s]")
+    loop_delay_s: float | None = Field(description="The same, hold included [s]")
+
+
+class StateView(_Answer):
+    """How things are now."""
+
+    mission: MissionSummary | None = Field(description="The one under way")
+    queue: list[str] = Field(description="Ids of those that wait")
+    seen: Seen | None = Field(description="Null until the robot has been seen")
+
+
+class Problem(_Answer):
+    """One value that cannot be used."""
+
+    path: str = Field(description="Keys down to the value, joined by dots")
+    index: int | None = Field(description="Of the waypoint concerned; null if it is none")
+    value: str = Field(description="In words; empty if it is not there")
+    reason: str = Field(description="What it must be, and what to do")
+
+
+class Refusal(_Answer):
+    """Why something is not done."""
+
+    detail: str = Field(description="In words")
+    id: str | None = Field(None, description="The mission that is in the way")
+    problems: list[Problem] | None = Field(None, description="Every value that cannot be used")
+
+
+def inlined(model: type[BaseModel]) -> dict[str, Any]:
+    """Give a model's JSON schema without references, as the body of a request wants it."""
+    schema = model.model_json_schema()
+    parts = schema.pop("$defs", {})
+
+    def resolve(node: Any) -> Any:
+        if isinstance(node, list):
+            return [resolve(item) for item in node]
+        if not isinstance(node, dict):
+            return node
+        if "$ref" in node:
+            return resolve(parts[node["$ref"].rpartition("/")[2]])
+        return {key: resolve(value) for key, value in node.items()}
+
+    return dict(resolve(schema))

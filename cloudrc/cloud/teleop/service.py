@@ -1,0 +1,265 @@
+"""Missions as a service: orders, verbs and the robot as seen come in; answers and events go out.
+
+Pure, like the machine that it drives, and keeping a book of what it does. Missions have an id of
+ours and, if their sender wishes, a key of theirs: a second order under the same key is answered
+with the mission that the first one made. A mission that was under way when the book was closed
+goes on at the same waypoint, if the world is still the one in which it began.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from typing import Any
+
+from cloudrc.cloud.teleop import service_mission as missions
+from cloudrc.cloud.teleop.journal import Entry
+from cloudrc.cloud.teleop.messages import (
+    Cancel,
+    Continue,
+    GoTo,
+    Hold,
+    Output,
+    Resume,
+    Seen,
+    StartMission,
+    Verb,
+)
+from cloudrc.cloud.teleop.mission import Teleop
+from cloudrc.cloud.teleop.plan import Leg, Plan
+from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook
+from cloudrc.cloud.teleop.service_mission import Mission, Order, show_seen
+from cloudrc.cloud.teleop.verdict import Criteria, Failure, Verdict, Witness, judge
+from cloudrc.errors import BadInputError
+from cloudrc.messages import Setpoint, Start, Vector
+from cloudrc.records import Fault, MissionEvent
+
+SETPOINT_PERIOD_NS = 100_000_000
+"""Time between two copies of the setpoint [ns], so that either process may restart."""
+QUEUE_MAX = 16
+
+
+class MissionService:
+    """All missions of one robot, flown one after the other."""
+
+    def __init__(
+        self,
+        contact_speed_max: float,
+        write: Callable[[Entry], None] = lambda entry: None,
+        entries: Iterable[Entry] = (),
+    ) -> None:
+        """Remember what was before; nothing is flown until the first deadline.
+
+        Args:
+            contact_speed_max: Below which the arm's tip may meet the board [m/s].
+            write: Keeps an entry; raises OSError if it cannot.
+            entries: What was kept before, oldest first.
+        """
+        self._contact_speed_max = contact_speed_max
+        self._teleop = Teleop()
+        self._outputs: list[Output | Fault] = []
+        self._seen: Seen | None = None
+        self._seen_ns = 0
+        self._setpoint: Setpoint | None = None
+        self._setpoint_ns = 0
+        self._current: Mission | None = None
+        self._trouble = ""
+        self.book = MissionBook(write, entries)
+
+    @property
+    def over(self) -> bool:
+        """Whether there was something to fly, all of it has ended, and the robot holds."""
+        return bool(self.book.missions) and not self.book.open() and self._teleop.settled
+
+    @property
+    def seen(self) -> bool:
+        """Whether the robot has been in sight."""
+        return self._seen is not None
+
+    def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
+        """Take an order; it is started at once or waits.
+
+        Returns:
+            The mission, and whether it is new: the same key gives the same mission.
+
+        Raises:
+            ConflictError: If another one is under way and the order does not want to wait.
+            UnavailableError: If it cannot be kept.
+        """
+        known, waiting = self.book.with_key(order.key), self.book.open()
+        if known is not None:
+            return known, False
+        if waiting and not order.queue:
+            raise _busy(waiting[0], "cancel it first, or queue the new one")
+        if len(waiting) > QUEUE_MAX:
+            raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
+        mission = self.book.add(order)
+        if waiting:
+            self._note(mission, "queued", f"mission waits for {waiting[-1].id}", now_ns)
+        else:
+            self._launch(mission, StartMission(order.plan), now_ns)
+        return mission, True
+
+    def cancel(self, mission_id: str, now_ns: int) -> Mission:
+        """End a mission, or take it out of the queue.
+
+        Raises:
+            UnknownMissionError: If there is none of this id.
+            ConflictError: If it has ended.
+        """
+        mission = self.book.find(mission_id)
+        if mission.ended:
+            raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
+        if mission is self._current:
+            return self._operate(Cancel(), now_ns)
+        text = "mission cancelled before it began"
+        verdict = Verdict("interrupted", (Failure("cancelled", text),))
+        self._note(mission, "cancelled", text, now_ns, verdict=verdict.as_json())
+        return mission
+
+    def hold(self, now_ns: int) -> Mission:
+        """Stop the robot where it is; raises ConflictError unless it flies a mission."""
+        return self._operate(Hold(), now_ns)
+
+    def resume(self, now_ns: int) -> Mission:
+        """Go on with the mission that is held; raises ConflictError if none is."""
+        return self._operate(Resume(), now_ns)
+
+    def go_to(self, position: Vector, yaw: float, now_ns: int) -> Mission:
+        """Fly to a point: a mission of its own, or another place to be held at.
+
+        Args:
+            position: [m], world frame, shape (3,).
+            yaw: [rad].
+            now_ns: Own clock [ns].
+
+        Raises:
+            ConflictError: If a mission is under way that is not held.
+            UnavailableError: If it cannot be kept.
+        """
+        verb, waiting = GoTo(position, yaw), self.book.open()
+        if waiting and waiting[0].state != missions.HELD:
+            raise _busy(waiting[0], "hold or cancel it first")
+        if waiting:
+            return self._operate(verb, now_ns)
+        leg = Leg(position, yaw)
+        mission = self.book.add(Order(Plan((leg,), Start.HERE, leg.time_limit), "goto"))
+        self._launch(mission, verb, now_ns)
+        return mission
+
+    def see(self, seen: Seen, now_ns: int) -> None:
+        """Take note of the newest telemetry."""
+        self._seen, self._seen_ns = seen, now_ns
+        mission = self._current
+        if mission is not None and mission.world and mission.world == seen.world:
+            self._watch(mission, seen, now_ns)
+        self._teleop.see(seen, now_ns)
+        self._collect(now_ns)
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """Start what waits, keep the limits of time, repeat what has to be repeated."""
+        waiting = self.book.open()
+        if self._current is None and waiting:
+            self._launch(waiting[0], _first_verb(waiting[0]), now_ns)
+        self._teleop.handle_deadline(now_ns)
+        self._collect(now_ns)
+        if self._setpoint is not None and now_ns >= self._setpoint_ns:
+            self._setpoint_ns = now_ns + SETPOINT_PERIOD_NS
+            self._outputs.append(self._setpoint)
+
+    def take_outputs(self) -> list[Output | Fault]:
+        """Hand over what is to be told, oldest first; faults are for this process' own log."""
+        outputs, self._outputs = self._outputs, []
+        return outputs
+
+    def state(self, now_ns: int) -> dict[str, Any]:
+        """Say how things are, as the API shows it."""
+        seen, mission = self._seen, self._current
+        return {
+            "mission": mission.summary() if mission is not None else None,
+            "queue": [waits.id for waits in self.book.open() if waits is not mission],
+            "seen": None if seen is None else show_seen(seen, (now_ns - self._seen_ns) * 1e-9),
+        }
+
+    def _operate(self, verb: Verb, now_ns: int) -> Mission:
+        mission = self._current
+        if mission is None:
+            raise ConflictError("no mission is under way")
+        try:
+            self._teleop.operate(verb, now_ns)
+        except BadInputError as error:
+            raise ConflictError(str(error), mission.id) from None
+        self._collect(now_ns)
+        return mission
+
+    def _launch(self, mission: Mission, verb: Verb, now_ns: int) -> None:
+        self._current = mission
+        self._teleop.operate(verb, now_ns)
+        if isinstance(verb, Continue):
+            text = "teleop has restarted; the robot is asked to go on"
+            self._note(mission, "restarted", text, now_ns)
+        else:
+            self._note(mission, "starting", "the robot is asked to start", now_ns)
+        self._collect(now_ns)
+
+    def _watch(self, mission: Mission, seen: Seen, now_ns: int) -> None:
+        """Write down at once what the robot touches."""
+        before, after = mission.witness, mission.witness.see(seen)
+        mission.witness = after
+        elapsed = self._teleop.elapsed(now_ns)
+        if after.pipe_touches > before.pipe_touches:
+            text = f"the robot touched a pipe at {elapsed:.2f} s"
+            self._note(mission, "pipe_touched", text, now_ns)
+        if after.touch_speed != before.touch_speed:
+            text = f"board touched at {elapsed:.2f} s with {after.touch_speed:.2f} m/s"
+            self._note(mission, "board_touched", text, now_ns)
+
+    def _collect(self, now_ns: int) -> None:
+        for output in self._teleop.take_outputs():
+            if isinstance(output, Setpoint):
+                self._setpoint, self._setpoint_ns = output, now_ns + SETPOINT_PERIOD_NS
+            elif isinstance(output, MissionEvent):
+                self._follow(output, now_ns)
+            self._outputs.append(output)
+
+    def _follow(self, event: MissionEvent, now_ns: int) -> None:
+        mission, seen = self._current, self._seen
+        assert mission is not None, "events are of missions only"
+        changed: dict[str, Any] = {}
+        if event.waypoint >= 0:
+            changed["waypoint"] = event.waypoint
+        if event.event == "started" and seen is not None:
+            changed |= {"world": seen.world, "witness": asdict(Witness.begin(seen))}
+        outcome = self._teleop.outcome
+        if outcome is not None and event.event == outcome.code:
+            criteria = Criteria(mission.order.contact, self._contact_speed_max)
+            elapsed, waypoints = self._teleop.elapsed(now_ns), len(mission.order.plan.legs)
+            verdict = judge(
+                outcome, mission.witness, criteria, waypoints=waypoints, elapsed=elapsed
+            )
+            changed["verdict"] = verdict.as_json()
+        self._note(mission, event.event, event.text, now_ns, **changed)
+        if mission.ended:
+            self._current = None
+
+    def _note(self, mission: Mission, event: str, text: str, now_ns: int, **changed: Any) -> None:
+        if mission is self._current:
+            changed["time_s"] = round(self._teleop.elapsed(now_ns), 3)
+        self.book.note(mission, event, text, **changed)
+        if self.book.trouble != self._trouble:
+            self._trouble = self.book.trouble
+            if self._trouble:
+                self._outputs.append(Fault(now_ns, "journal", self._trouble))
+
+
+def _first_verb(mission: Mission) -> Verb:
+    """How to begin: anew, or where a teleop before this one left off."""
+    plan = mission.order.plan
+    if not mission.world:
+        return StartMission(plan)
+    held = mission.state == missions.HELD
+    return Continue(plan, mission.waypoint, mission.elapsed, mission.world, held)
+
+
+def _busy(mission: Mission, advice: str) -> ConflictError:
+    return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)

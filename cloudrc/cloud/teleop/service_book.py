@@ -1,0 +1,141 @@
+"""The book of missions: what happens is written down first, and only then counts.
+
+Everything that is known of a mission follows from its entries, so that what is known after a
+restart is what was known before. Entries go to `write`, which keeps them: the journal.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from itertools import islice, takewhile
+from typing import Any
+
+from cloudrc.cloud.teleop.journal import Entry
+from cloudrc.cloud.teleop.service_mission import Mission, Order, from_entry, order_entry
+from cloudrc.errors import CloudrcError
+
+KEPT = 100
+"""Missions that have ended and are still known."""
+LOGGED = 5_000
+"""Events, of all missions together, that can still be asked for."""
+
+
+class UnknownMissionError(CloudrcError):
+    """There is no mission of this id."""
+
+
+class UnavailableError(CloudrcError):
+    """Not now: the journal cannot be written, or another teleop holds it."""
+
+
+class ConflictError(CloudrcError):
+    """The state does not allow it; `mission` is the id of the mission in the way, "" if none."""
+
+    exit_code = 5
+
+    def __init__(self, text: str, mission: str = "") -> None:
+        super().__init__(text)
+        self.mission = mission
+
+
+class MissionBook:
+    """All missions, oldest first.
+
+    Attributes:
+        missions: By id.
+        trouble: Why the last entry could not be kept; "" if it was.
+    """
+
+    def __init__(self, write: Callable[[Entry], None], entries: Iterable[Entry]) -> None:
+        """Read what was written before.
+
+        Args:
+            write: Keeps an entry; raises OSError if it cannot.
+            entries: What was kept, oldest first.
+        """
+        self._write = write
+        self._numbered = self._events = 0
+        self.missions: dict[str, Mission] = {}
+        self.trouble = ""
+        self._log: deque[dict[str, Any]] = deque(maxlen=LOGGED)
+        for entry in entries:
+            self._apply(entry)
+
+    def knows(self, entry: Entry) -> bool:
+        """Whether an entry is of a mission that is still known."""
+        return entry["mission"] in self.missions
+
+    def open(self) -> list[Mission]:
+        """Missions that have not ended; the first is the one to fly."""
+        return [mission for mission in self.missions.values() if not mission.ended]
+
+    def find(self, mission_id: str) -> Mission:
+        """Give a mission.
+
+        Raises:
+            UnknownMissionError: If there is none of this id.
+        """
+        mission = self.missions.get(mission_id)
+        if mission is None:
+            raise UnknownMissionError(f"no mission '{mission_id}'; 'cloudrc mission list' has all")
+        return mission
+
+    def with_key(self, key: str) -> Mission | None:
+        """Give the mission that was ordered under a key, if any."""
+        found = (m for m in self.missions.values() if key and m.order.key == key)
+        return next(found, None)
+
+    def add(self, order: Order) -> Mission:
+        """Write a new mission down.
+
+        Raises:
+            UnavailableError: If it cannot be kept; it then does not exist.
+        """
+        entry = order_entry(Mission(f"m{self._numbered + 1}", order))
+        try:
+            self._write(entry)
+        except OSError as error:
+            raise UnavailableError(f"the journal cannot be written: {error.strerror}") from error
+        self._apply(entry)
+        return self.missions[entry["mission"]]
+
+    def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
+        """Write down what happens to a mission; a full disk does not stop a flight.
+
+        Args:
+            mission: Which.
+            event: One word.
+            text: The same in words.
+            changed: Values of the entry that are not as they were: waypoint, time_s, world,
+                witness, verdict.
+        """
+        entry = mission.entry(self._events + 1, event, text, **changed)
+        try:
+            self._write(entry)
+            self.trouble = ""
+        except OSError as error:
+            self.trouble = f"the journal cannot be written: {error.strerror}; free its volume"
+        self._apply(entry)
+
+    def events_after(self, number: int) -> list[dict[str, Any]]:
+        """Give the events of all missions that came after the one of this number."""
+        if number > self._events:  # of a journal that is gone
+            number = 0
+        return list(takewhile(lambda event: event["id"] > number, reversed(self._log)))[::-1]
+
+    def _apply(self, entry: Entry) -> None:
+        if entry["kind"] == "mission":
+            mission = from_entry(entry)
+            self.missions[mission.id] = mission
+            self._numbered = int(mission.id.removeprefix("m"))
+            self._forget_old()
+        elif (known := self.missions.get(entry["mission"])) is not None:
+            known.apply(entry)
+            self._log.append(known.events[-1])
+            self._events = entry["id"]
+
+    def _forget_old(self) -> None:
+        ended = [mission.id for mission in self.missions.values() if mission.ended]
+        for mission_id in islice(ended, max(0, len(ended) - KEPT)):
+            del self.missions[mission_id]

@@ -1,0 +1,178 @@
+"""One mission as teleop remembers it: journal entries come in; what the API shows goes out."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from math import isfinite
+from typing import Any
+
+from cloudrc.cloud.teleop.journal import Entry
+from cloudrc.cloud.teleop.messages import Seen
+from cloudrc.cloud.teleop.plan import Leg, Plan
+from cloudrc.cloud.teleop.verdict import Witness
+from cloudrc.messages import Start
+
+QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
+DONE, FAILED, CANCELLED = "done", "failed", "cancelled"
+ENDED = (DONE, FAILED, CANCELLED)
+
+STATES = {
+    "queued": QUEUED,
+    "starting": STARTING,
+    "started": FLYING,
+    "reached": FLYING,
+    "resumed": FLYING,
+    "held": HELD,
+    "done": DONE,
+    "cancelled": CANCELLED,
+    "timed_out": FAILED,
+    "leg_timed_out": FAILED,
+    "world_restarted": FAILED,
+    "guard_stopped": FAILED,
+}
+"""State of a mission after an event; one that is not named here changes nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What somebody asks to be flown.
+
+    Attributes:
+        plan: Checked.
+        name: For people.
+        key: The same key never makes a second mission; "" for none.
+        contact: Whether the arm has to touch the board.
+        queue: Whether to wait for the mission that is under way, in place of being refused.
+    """
+
+    plan: Plan
+    name: str = ""
+    key: str = ""
+    contact: bool = False
+    queue: bool = False
+
+
+@dataclass(slots=True)
+class Mission:
+    """Everything that is known of a mission; it follows from its journal entries alone.
+
+    Attributes:
+        id: Given by teleop.
+        order: What was asked for.
+        state: One of `STATES`.
+        world: Names the world in which it was started; "" before that.
+        elapsed: How long it had lasted at its last event [s].
+        reached: Index of each waypoint reached and when [s].
+        events: What has happened, as the API shows it.
+        witness: What the robot has touched.
+        verdict: As the API shows it; None until it has ended.
+    """
+
+    id: str
+    order: Order
+    state: str = QUEUED
+    world: str = ""
+    elapsed: float = 0.0
+    reached: list[dict[str, Any]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
+    witness: Witness = field(default_factory=Witness)
+    verdict: dict[str, Any] | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Whether it is over."""
+        return self.state in ENDED
+
+    @property
+    def waypoint(self) -> int:
+        """Index of the waypoint that is flown to, or was at the end."""
+        return min(len(self.reached), len(self.order.plan.legs) - 1)
+
+    def apply(self, entry: Entry) -> None:
+        """Take in an entry of kind "event"."""
+        event = {k: entry[k] for k in ("id", "mission", "event", "waypoint", "text", "time_s")}
+        self.events.append(event)
+        self.state = STATES.get(entry["event"], self.state)
+        self.elapsed, self.world = entry["time_s"], entry["world"]
+        self.witness = Witness(**entry["witness"])
+        self.verdict = entry.get("verdict", self.verdict)
+        if entry["event"] == "reached":
+            self.reached.append({"waypoint": entry["waypoint"], "time_s": entry["time_s"]})
+
+    def entry(self, number: int, event: str, text: str, **changed: Any) -> Entry:
+        """Make the entry of something that happens to the mission now."""
+        return {
+            "kind": "event",
+            "id": number,
+            "mission": self.id,
+            "event": event,
+            "text": text,
+            "waypoint": self.waypoint,
+            "time_s": round(self.elapsed, 3),
+            "world": self.world,
+            "witness": asdict(self.witness),
+            **changed,
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """What a list of missions shows."""
+        return {
+            "id": self.id,
+            "name": self.order.name,
+            "key": self.order.key,
+            "state": self.state,
+            "waypoint": self.waypoint,
+            "waypoints": len(self.order.plan.legs),
+            "reached": list(self.reached),
+            "verdict": self.verdict,
+        }
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything, as the API shows it."""
+        return {**self.summary(), "events": list(self.events)}
+
+
+def order_entry(mission: Mission) -> Entry:
+    """Make the entry that a mission begins with."""
+    order, plan = mission.order, mission.order.plan
+    return {
+        "kind": "mission",
+        "mission": mission.id,
+        "name": order.name,
+        "key": order.key,
+        "contact": order.contact,
+        "start": plan.start.name,
+        "time_limit": plan.time_limit,
+        "legs": [
+            [list(leg.position), leg.yaw, leg.tolerance, leg.dwell, leg.time_limit]
+            for leg in plan.legs
+        ],
+    }
+
+
+def from_entry(entry: Entry) -> Mission:
+    """Make the mission that an entry of kind "mission" began."""
+    legs = tuple(Leg(tuple(position), *rest) for position, *rest in entry["legs"])
+    plan = Plan(legs, Start[entry["start"]], entry["time_limit"])
+    return Mission(entry["mission"], Order(plan, entry["name"], entry["key"], entry["contact"]))
+
+
+def show_seen(seen: Seen, age: float) -> dict[str, Any]:
+    """What the API shows of telemetry of some `age` [s]."""
+    return {
+        "age_s": age,
+        "epoch": seen.epoch,
+        "world": seen.world,
+        "position_m": [_known(value) for value in seen.position],
+        "guard": seen.guard.name,
+        "pipe_contacts": seen.pipe_contacts,
+        "touch_speed_mps": _known(seen.touch_speed),
+        "horizon_s": _known(seen.horizon),
+        "rtt_s": _known(seen.rtt),
+        "loop_delay_s": _known(seen.loop_delay),
+    }
+
+
+def _known(value: float) -> float | None:
+    """JSON knows no NaN."""
+    return value if isfinite(value) else None

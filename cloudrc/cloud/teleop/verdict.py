@@ -1,0 +1,170 @@
+"""The verdict on one mission: how it ended and what teleop saw on its way; an exit code comes out.
+
+The same rules, codes and words as in a run's report, from what telemetry tells while it flies.
+Deviation: of the clock's slip only the real-time factor is judged, since teleop sees no lateness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from math import isfinite
+from typing import Any, Literal
+
+from cloudrc.cloud.teleop.messages import Outcome, Seen
+
+REAL_TIME_FACTOR_MIN = 0.95
+"""Below it the simulated robot was slower than its network. Source: DESIGN, section 9."""
+EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
+"""Source: DESIGN, section 9."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """One rule that was broken: one word for programs, a sentence for people."""
+
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a mission.
+
+    Attributes:
+        outcome: As in report.json.
+        failures: Every rule that was broken.
+    """
+
+    outcome: Literal["success", "failure", "invalid", "interrupted"]
+    failures: tuple[Failure, ...] = ()
+
+    @property
+    def exit_code(self) -> int:
+        """Of a Job that flew the mission."""
+        return EXIT_CODES[self.outcome]
+
+    def as_json(self) -> dict[str, Any]:
+        """For the API and the journal."""
+        failures = [asdict(failure) for failure in self.failures]
+        return {"outcome": self.outcome, "exit_code": self.exit_code, "failures": failures}
+
+
+@dataclass(frozen=True, slots=True)
+class Criteria:
+    """What a mission has to keep to besides reaching its waypoints.
+
+    Attributes:
+        contact: Whether the arm's tip has to touch the board.
+        contact_speed_max: Below which speed [m/s].
+    """
+
+    contact: bool
+    contact_speed_max: float
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """What has happened to the robot since its mission began; telemetry only counts and shows.
+
+    Attributes:
+        pipe_contacts: Telemetry's count when it was last seen.
+        pipe_touches: Of them since the mission began.
+        touch_before: Speed of an earlier mission's touch, still shown [m/s]; None if none.
+        touch_speed: Of this mission's touch [m/s]; None if the board was not touched.
+        slip_began_ns: World's slip when the mission began [ns].
+        slip_ns: The same when it was last seen [ns].
+    """
+
+    pipe_contacts: int = 0
+    pipe_touches: int = 0
+    touch_before: float | None = None
+    touch_speed: float | None = None
+    slip_began_ns: int = 0
+    slip_ns: int = 0
+
+    @classmethod
+    def begin(cls, seen: Seen) -> Witness:
+        """Begin with what is shown at the start of the mission."""
+        before = _known(seen.touch_speed)
+        return cls(seen.pipe_contacts, 0, before, None, seen.slip_ns, seen.slip_ns)
+
+    def see(self, seen: Seen) -> Witness:
+        """Take in what is shown now; the same object if nothing has happened."""
+        touch = _known(seen.touch_speed)
+        if self.touch_speed is not None or touch == self.touch_before:
+            touch = self.touch_speed
+        new = seen.pipe_contacts - self.pipe_contacts
+        if new < 0:  # the robot was put back to its spawn, and counts from 0
+            new = seen.pipe_contacts
+        if not new and touch == self.touch_speed and seen.slip_ns == self.slip_ns:
+            return self
+        return replace(
+            self,
+            pipe_contacts=seen.pipe_contacts,
+            pipe_touches=self.pipe_touches + new,
+            touch_speed=touch,
+            slip_ns=seen.slip_ns,
+        )
+
+
+def judge(
+    outcome: Outcome, witness: Witness, criteria: Criteria, *, waypoints: int, elapsed: float
+) -> Verdict:
+    """Judge a mission that has ended.
+
+    Args:
+        outcome: How it ended.
+        witness: What happened on the way.
+        criteria: What it had to keep to.
+        waypoints: How many it has.
+        elapsed: How long it took [s].
+    """
+    if outcome.code == "cancelled":  # what it did not reach is no news
+        harm = tuple(_harm(witness))
+        return Verdict("interrupted", (Failure(outcome.code, outcome.text), *harm))
+    broken = tuple(_broken(outcome, witness, criteria, waypoints))
+    slow = tuple(_not_real_time(witness, elapsed))
+    if slow:
+        return Verdict("invalid", slow + broken)
+    return Verdict("failure" if broken else "success", broken)
+
+
+def _broken(
+    outcome: Outcome, witness: Witness, criteria: Criteria, waypoints: int
+) -> Iterator[Failure]:
+    if not outcome.success:
+        yield Failure(outcome.code, outcome.text)
+    if outcome.reached < waypoints:
+        text = f"{outcome.reached} of {waypoints} waypoints reached"
+        yield Failure("waypoint_not_reached", text)
+    yield from _harm(witness)
+    if not criteria.contact:
+        return
+    speed, limit = witness.touch_speed, criteria.contact_speed_max
+    if speed is None:
+        yield Failure("board_not_touched", "the arm never touched the board")
+    elif speed >= limit:
+        text = f"the tip met the board at {speed:.2f} m/s, not below {limit:g} m/s"
+        yield Failure("contact_too_fast", text)
+
+
+def _harm(witness: Witness) -> Iterator[Failure]:
+    if witness.pipe_touches:
+        times = f" ({witness.pipe_touches} times)" if witness.pipe_touches > 1 else ""
+        yield Failure("pipe_touched", f"the robot touched a pipe{times}")
+
+
+def _not_real_time(witness: Witness, elapsed: float) -> Iterator[Failure]:
+    slipped = (witness.slip_ns - witness.slip_began_ns) * 1e-9
+    factor = 1.0 - slipped / elapsed if elapsed > 0 else 1.0
+    if factor < REAL_TIME_FACTOR_MIN:
+        text = (
+            f"real-time factor {factor:.3f} is below {REAL_TIME_FACTOR_MIN}: "
+            "give world more processor time"
+        )
+        yield Failure("not_real_time", text)
+
+
+def _known(speed: float) -> float | None:
+    return speed if isfinite(speed) else None

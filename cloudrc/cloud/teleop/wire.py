@@ -1,0 +1,43 @@
+"""Teleop's datagrams: messages between cloud's and teleop's process become JSON and come back.
+
+One message each: the name of its type, then its fields in order. Both processes are of one image
+and one pod; what arrives is checked all the same, since a file that both can write to is no proof
+of who wrote.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, TypeAlias
+
+from pydantic import TypeAdapter, ValidationError
+
+from cloudrc.cloud.teleop.messages import Output, Seen
+from cloudrc.messages import OperatorRequest, Setpoint
+from cloudrc.records import MissionEvent
+
+Message: TypeAlias = Seen | Output
+"""What goes through the sockets: `Seen` to teleop, the others to cloud."""
+
+_KINDS: dict[str, TypeAdapter[Any]] = {
+    kind.__name__: TypeAdapter(kind) for kind in (Seen, Setpoint, OperatorRequest, MissionEvent)
+}
+
+
+def encode(message: Message) -> bytes:
+    """Write a message as one datagram."""
+    return json.dumps([type(message).__name__, message]).encode()
+
+
+def decode(data: bytes) -> Message:
+    """Read a message from its datagram.
+
+    Raises:
+        ValueError: If it is not one.
+    """
+    try:
+        name, fields = json.loads(data)
+        message: Message = _KINDS[name].validate_python(fields)
+    except (ValidationError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError(f"not a message of teleop: {data[:60]!r}") from error
+    return message

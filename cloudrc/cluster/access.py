@@ -1,0 +1,123 @@
+"""Which cluster, which namespace, which release: flags come in, clients of that place go out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from cloudrc.cluster.errors import explained
+from cloudrc.errors import MissingPrerequisiteError
+
+DEFAULT_RELEASE = "cloudrc"
+REQUEST_TIMEOUT = 15.0
+"""For the API server to answer one request [s]."""
+
+
+@dataclass(frozen=True)
+class Release:
+    """One release of the chart: one robot and its cloud.
+
+    Attributes:
+        context: Of the kubeconfig; None for its current one.
+        namespace: Where the release is.
+        name: Of the release, as Helm knows it.
+    """
+
+    context: str | None
+    namespace: str
+    name: str
+
+    @property
+    def where(self) -> str:
+        """The place in words, for messages."""
+        context = f" of context '{self.context}'" if self.context else ""
+        return f"in namespace '{self.namespace}'{context}"
+
+    @property
+    def flags(self) -> list[str]:
+        """What kubectl has to be told to look at the same place."""
+        context = [f"--context={self.context}"] if self.context else []
+        return [*context, f"--namespace={self.namespace}"]
+
+    @property
+    def helm_flags(self) -> list[str]:
+        """Likewise for helm."""
+        context = [f"--kube-context={self.context}"] if self.context else []
+        return [*context, f"--namespace={self.namespace}"]
+
+    def selector(self, component: str) -> str:
+        """Select by label what belongs to a part of this release: "world", "cloud", "mission"."""
+        return (
+            f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={self.name},"
+            f"app.kubernetes.io/component={component}"
+        )
+
+    @cached_property
+    def _client(self) -> Any:
+        from kubernetes import client, config
+
+        configuration = client.Configuration()
+        with explained("read the kubeconfig", self.where):
+            load: Any = config.load_kube_config  # not annotated
+            load(context=self.context, client_configuration=configuration)
+        configuration.retries = False  # the caller repeats what is worth repeating, and says so
+        return client.ApiClient(configuration)
+
+    @cached_property
+    def core(self) -> Any:
+        """Client of pods, Services, ConfigMaps."""
+        from kubernetes import client
+
+        return client.CoreV1Api(self._client)
+
+    @cached_property
+    def batch(self) -> Any:
+        """Client of Jobs."""
+        from kubernetes import client
+
+        return client.BatchV1Api(self._client)
+
+    @cached_property
+    def apps(self) -> Any:
+        """Client of Deployments."""
+        from kubernetes import client
+
+        return client.AppsV1Api(self._client)
+
+
+def connect(
+    context: str | None = None, namespace: str | None = None, release: str = DEFAULT_RELEASE
+) -> Release:
+    """Find a place in the kubeconfig; nothing is sent to the cluster yet.
+
+    Args:
+        context: As the flag `--context`; None for the current one.
+        namespace: As the flag `-n`; None for the context's own, or "default".
+        release: Name of the Helm release.
+
+    Raises:
+        MissingPrerequisiteError: If there is no usable kubeconfig or no such context.
+    """
+    from kubernetes import config
+
+    try:
+        contexts: Any = config.list_kube_config_contexts  # not annotated
+        known, current = contexts()
+    except Exception as error:  # a kubeconfig can be broken in any way, and the client tells little
+        raise MissingPrerequisiteError(
+            f"no cluster is configured ({' '.join(str(error).split())}); set KUBECONFIG, or make "
+            "a cluster: kind create cluster --config kind-config.yaml"
+        ) from error
+    if context is not None:
+        current = next((c for c in known if c["name"] == context), None)
+        if current is None:
+            raise MissingPrerequisiteError(_unknown_context(context, [c["name"] for c in known]))
+    inherited = (current or {}).get("context", {}).get("namespace")
+    return Release(context, namespace or inherited or "default", release)
+
+
+def _unknown_context(context: str, known: Sequence[str]) -> str:
+    names = ", ".join(sorted(known)) or "none"
+    return f"no context '{context}' in the kubeconfig; there are: {names}; choose with --context"

@@ -1,0 +1,150 @@
+"""The metrics of a process: fed with its records like the recorder, scraped by Prometheus.
+
+    exporter = Exporter("world")
+    exporter.serve("127.0.0.1:9100")    /metrics, /healthz and /readyz, on threads of their own
+    exporter.see(records)               on the loop's thread: less than 1 us per record
+    exporter.ready(True)                a process that is no end of the tunnel says when it is
+
+What `see` takes in is kept in plain numbers; Prometheus' text is made of them when it is scraped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+from prometheus_client.metrics_core import Metric as Family
+
+from cloudrc import __version__
+from cloudrc.drivers.cgroup import read_throttling
+from cloudrc.drivers.probes import Answer, ProbeServer
+from cloudrc.exposition.histogram import Histogram
+from cloudrc.exposition.labels import Labels
+from cloudrc.exposition.live import Live
+from cloudrc.exposition.metric import Kind, Metric
+from cloudrc.exposition.part import Readings, plain
+from cloudrc.exposition.table import of_role
+from cloudrc.records import Record
+
+TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
+"""What `generate_latest` writes."""
+
+
+class Exporter:
+    """The metrics of one process."""
+
+    def __init__(self, role: str) -> None:
+        """Begin with nothing seen, served or ready.
+
+        Args:
+            role: "world", "cloud", "teleop" or "link".
+        """
+        self._role, self._metrics = role, of_role(role)
+        self._live = Live(role)
+        self._said_ready = False
+        self._server: ProbeServer | None = None
+        self._registry = CollectorRegistry()
+        self._registry.register(self)
+        ProcessCollector(registry=self._registry)
+
+    def see(self, records: Iterable[Record]) -> None:
+        """Take in records of this process, oldest first; never waits."""
+        self._live.see(records)
+
+    def ready(self, ready: bool) -> None:
+        """Say whether this process is ready; world and cloud need not, their records tell."""
+        self._said_ready = ready
+
+    def shaped(self, shaper: str, direction: str, mode: str) -> None:
+        """Say who shapes a direction of the link from now on; only with the role "link".
+
+        Args:
+            shaper: "relay" or "netem".
+            direction: "uplink" or "downlink".
+            mode: What was asked for: "auto", "relay" or "netem".
+        """
+        assert self._live.link is not None, "only a link is shaped"
+        self._live.link.shaped(shaper, direction, mode)
+
+    def asked(self, direction: str, delay: float) -> None:
+        """Say which mean delay [s] the profile in force asks for; only with the role "link"."""
+        assert self._live.link is not None, "only a link is shaped"
+        self._live.link.asked(direction, delay)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether this process has said so, or as an end of the tunnel hears the other end."""
+        return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
+
+    def serve(self, address: str | tuple[str, int]) -> int:
+        """Begin to answer on HOST:PORT.
+
+        Returns:
+            The port: the kernel's choice where 0 was asked for.
+
+        Raises:
+            MissingPrerequisiteError: If the address cannot be had.
+        """
+        if isinstance(address, str):
+            host, _, port = address.rpartition(":")
+            address = host, int(port)
+        pages = {"/metrics": self._page, "/healthz": _alive, "/readyz": self._readiness}
+        self._server = ProbeServer(address, pages)
+        return int(self._server.server_address[1])
+
+    def close(self) -> None:
+        """Stop answering."""
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+
+    def collect(self) -> Iterator[Family]:
+        """Give everything known now, as the registry asks for it."""
+        readings = self._live.read() | self._of_process()
+        for metric in self._metrics:
+            reading = readings.get(metric.name)
+            if reading:
+                yield _family(metric, reading)
+
+    def _of_process(self) -> Readings:
+        readings: Readings = {
+            "cloudrc_build_info": {(__version__, self._role): 1.0},
+            "cloudrc_ready": plain(self.is_ready),
+        }
+        throttling = read_throttling()
+        if throttling is not None:
+            readings["cloudrc_cpu_periods_total"] = plain(throttling.periods)
+            readings["cloudrc_cpu_throttled_periods_total"] = plain(throttling.throttled)
+            readings["cloudrc_cpu_throttled_seconds_total"] = plain(throttling.seconds)
+        return readings
+
+    def text(self) -> str:
+        """Write what Prometheus scrapes."""
+        return generate_latest(self._registry).decode()
+
+    def _page(self) -> Answer:
+        return Answer(200, self.text().encode(), TEXT_FORMAT)
+
+    def _readiness(self) -> Answer:
+        return Answer(200, b"ready\n") if self.is_ready else Answer(503, b"no peer yet\n")
+
+
+def _alive() -> Answer:
+    return Answer(200, b"alive\n")
+
+
+def _family(metric: Metric, reading: dict[Labels, float] | Histogram) -> Family:
+    """Put a reading into the library's words."""
+    name, names = metric.name, list(metric.labels)
+    if isinstance(reading, Histogram):
+        bounds = [*map(str, reading.bounds), "+Inf"]
+        buckets = list(zip(bounds, reading.cumulative(), strict=True))
+        return HistogramMetricFamily(name, metric.meaning, buckets, reading.total)
+    counts = metric.kind is Kind.COUNTER
+    family = (CounterMetricFamily if counts else GaugeMetricFamily)(
+        name, metric.meaning, labels=names
+    )
+    for labels, value in reading.items():
+        family.add_metric(labels, value)
+    return family

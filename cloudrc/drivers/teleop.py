@@ -1,0 +1,153 @@
+"""Teleop in a process of its own: its machine in real time, and what cloud has in its place.
+
+    cloud process: CloudEndpoint - RemoteTeleop  <- two Unix sockets ->  serve_teleop - machine
+
+Either process may restart: setpoint and requests are repeated, and what happened while cloud was
+away is told to it when it is there again.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol
+
+from cloudrc.drivers.unix import UnixPeer
+from cloudrc.records import Fault, MissionEvent
+
+PERIOD_NS = 20_000_000
+"""Between two deadlines of teleop's machine [ns]."""
+SILENCE_NS = 1_000_000_000
+"""Teleop speaks at 10 Hz; without a word for so long it is taken to be away [ns]."""
+EVENTS_KEPT = 256
+"""Events that wait for a cloud that is away."""
+
+Encode = Callable[[Any], bytes]
+Decode = Callable[[bytes], Any]
+"""Raises ValueError for what is no message."""
+
+
+class Machine(Protocol):
+    """What teleop's process runs."""
+
+    def see(self, seen: Any, now_ns: int) -> None:
+        """Take note of the newest telemetry."""
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """Do what is due."""
+
+    def take_outputs(self) -> Sequence[Any]:
+        """Hand over what it has said since the last call."""
+
+
+class RemoteTeleop:
+    """Stands for teleop in cloud's process.
+
+    Attributes:
+        outcome: Always None: cloud does not end with a mission.
+        settled: Always true.
+        outputs: What teleop has said since the last call of `take_outputs`.
+        malformed: How many datagrams were no messages.
+    """
+
+    outcome = None
+    settled = True
+
+    def __init__(self, peer: UnixPeer, encode: Encode, decode: Decode, start_ns: int) -> None:
+        """Join the socket; teleop has a second from `start_ns` [ns] to speak."""
+        self._peer, self._encode, self._decode = peer, encode, decode
+        self._heard_ns, self._silent = start_ns, False
+        self.outputs: list[Any] = []
+        self.malformed = 0
+
+    def see(self, seen: Any, now_ns: int) -> None:
+        """Tell teleop what is seen, if it listens."""
+        self._peer.send(self._encode(seen))
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """Take in what teleop has said; once it has been silent for a second, say so."""
+        for data in self._peer.receive():
+            try:
+                self.outputs.append(self._decode(data))
+            except ValueError:
+                self.malformed += 1
+                continue
+            self._heard_ns, self._silent = now_ns, False
+        if not self._silent and now_ns - self._heard_ns > SILENCE_NS:
+            self._silent = True
+            text = "teleop has been silent for 1 s: the last setpoint is kept; see teleop's log"
+            self.outputs.append(Fault(now_ns, "teleop_silent", text))
+
+    def take_outputs(self) -> list[Any]:
+        """Hand over what teleop has said since the last call."""
+        outputs, self.outputs = self.outputs, []
+        return outputs
+
+
+def serve_teleop(
+    machine: Machine,
+    peer: UnixPeer,
+    encode: Encode,
+    decode: Decode,
+    *,
+    calls: Callable[[], Iterable[Callable[[int], None]]],
+    tell: Callable[[list[MissionEvent | Fault]], None],
+    stop: Callable[[], bool],
+) -> None:
+    """Run teleop's machine in real time until `stop()` is true.
+
+    Args:
+        machine: Gets what is seen, and 50 deadlines a second.
+        peer: The socket to cloud.
+        encode: Writes a message for cloud.
+        decode: Reads one from cloud.
+        calls: What other threads want to be done, here and now [ns]; must not block.
+        tell: Gets events and faults, at every wake that has some; must not block.
+        stop: Asked at every wake.
+    """
+    unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
+    deadline_ns = time.monotonic_ns()
+    while not stop():
+        wait_ns = max(0, deadline_ns - time.monotonic_ns())
+        select.select([peer], [], [], wait_ns * 1e-9)
+        now_ns = time.monotonic_ns()
+        for data in peer.receive():
+            try:
+                machine.see(decode(data), now_ns)
+            except ValueError:
+                continue
+        for call in calls():
+            call(now_ns)
+        if now_ns >= deadline_ns:
+            machine.handle_deadline(now_ns)
+            deadline_ns += ((now_ns - deadline_ns) // PERIOD_NS + 1) * PERIOD_NS
+            _send_again(unsent, peer)
+        told = _send(machine.take_outputs(), unsent, peer, encode)
+        if told:
+            tell(told)
+
+
+def _send(
+    outputs: Sequence[Any], unsent: deque[bytes], peer: UnixPeer, encode: Encode
+) -> list[MissionEvent | Fault]:
+    """Send what is for cloud; return what is to be told elsewhere, too."""
+    told: list[MissionEvent | Fault] = []
+    for output in outputs:
+        if isinstance(output, MissionEvent | Fault):
+            told.append(output)
+        if isinstance(output, Fault):
+            continue
+        data = encode(output)
+        once = isinstance(output, MissionEvent)
+        # Events keep their order; everything else is repeated anyway.
+        if (once and unsent) or not peer.send(data):
+            if once:
+                unsent.append(data)
+    return told
+
+
+def _send_again(unsent: deque[bytes], peer: UnixPeer) -> None:
+    while unsent and peer.send(unsent[0]):
+        unsent.popleft()

@@ -1,0 +1,52 @@
+"""The closed sets that labels take their values from, and the buckets of the histograms."""
+
+from __future__ import annotations
+
+WORLD, CLOUD, TELEOP, LINK = "world", "cloud", "teleop", "link"
+ROLES = (WORLD, CLOUD, TELEOP, LINK)
+ENDS = (WORLD, CLOUD)
+MISSION = (CLOUD, TELEOP)
+
+AXES = ("x", "y", "z")
+TERMS = ("proportional", "integral", "derivative")
+DIRECTIONS = ("uplink", "downlink")
+OUTCOMES = (
+    "sent",
+    "used",
+    "late",
+    "stale",
+    "repeated",
+    "old_epoch",
+    "not_finite",
+    "malformed",
+    "version",
+    "direction",
+    "accept_ignored",
+)
+"""What becomes of a datagram; all but "sent" are told by its receiver."""
+PLUGINS = ("estimator", "predictor", "controller")
+GUARD_STATES = ("ground", "track", "hold", "land", "estop")
+"""In the order of `cloudrc.messages.GuardState`."""
+MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
+"""In the order of `cloudrc.cloud.teleop.messages.State`."""
+MISSION_OUTCOMES = (
+    "done",
+    "cancelled",
+    "timed_out",
+    "leg_timed_out",
+    "world_restarted",
+    "guard_stopped",
+    "other",
+)
+BODIES = ("pipe", "board", "floor", "other")
+"""Kinds of bodies: `pipe_2` is a "pipe", and what else a scene may have is "other"."""
+LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unsent")
+SHAPERS = ("relay", "netem")
+LINK_MODES = ("auto", "relay", "netem")
+
+DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.25, 0.5, 1.0)
+PERIOD_BUCKETS = (0.005, 0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
+"""Around the 10 ms of both loops."""
+LATENESS_BUCKETS = (0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
+
+Labels = tuple[str, ...]

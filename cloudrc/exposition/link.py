@@ -1,0 +1,50 @@
+"""What the emulated link exposes: who shapes which direction, and what became of the datagrams."""
+
+from __future__ import annotations
+
+from cloudrc.exposition.labels import DIRECTIONS, LINK_MODES, LINK_OUTCOMES, SHAPERS, Labels
+from cloudrc.exposition.part import Handlers, Readings, by, chosen
+from cloudrc.records import Counted
+
+
+class Link:
+    """One process that shapes one direction or both."""
+
+    def __init__(self) -> None:
+        """Begin before anything is shaped."""
+        self._shapers: dict[str, Labels] = {}
+        self._delays: dict[str, float] = {}
+        self._counts: dict[str, int] = {}
+
+    def handlers(self) -> Handlers:
+        """See `Part`."""
+        return {Counted: self._see_count}
+
+    def shaped(self, shaper: str, direction: str, mode: str) -> None:
+        """Say who shapes a direction from now on.
+
+        Args:
+            shaper: "relay" or "netem".
+            direction: "uplink" or "downlink".
+            mode: What was asked for: "auto", "relay" or "netem".
+        """
+        assert shaper in SHAPERS
+        assert direction in DIRECTIONS
+        assert mode in LINK_MODES
+        self._shapers[direction] = (shaper, direction, mode)
+
+    def asked(self, direction: str, delay: float) -> None:
+        """Say which mean delay [s] a direction is asked to have from now on."""
+        assert direction in DIRECTIONS
+        self._delays[direction] = delay
+
+    def _see_count(self, record: Counted) -> None:
+        self._counts[record.name] = record.total
+
+    def read(self) -> Readings:
+        """See `Part`."""
+        return {
+            "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
+            "cloudrc_link_delay_seconds": by(dict(self._delays)),
+            "cloudrc_link_datagrams_total": by(chosen(LINK_OUTCOMES, self._counts)),
+        }

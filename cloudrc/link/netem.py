@@ -1,0 +1,194 @@
+"""The kernel shapes the link: a profile goes in, `tc` puts it on the pod's egress.
+
+    interface > prio 7400: --+-- bands 1-3: everything else, as before
+                             +-- band 4 > netem 7401: what the filter sends there,
+                                          UDP to the peer's tunnel port and nothing else
+
+The set-up is found again after a restart by its handles, changed in flight by `tc qdisc change`,
+which keeps what is queued, and removed by `close`. A root qdisc of somebody else is left alone.
+
+Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.link.netem_tc import Iproute2, Run
+from cloudrc.link.netem_text import STEP_NS, check, options
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.relay_lane import Address
+from cloudrc.link.timeline import Timeline
+
+ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
+
+# The kernel's own default for three bands: nothing falls into the fourth by its type of service.
+_PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
+_UDP = "17"
+
+
+class Netem:
+    """One direction of the link in the kernel; a `Shaper`."""
+
+    name = "netem"
+
+    def __init__(
+        self,
+        run: Run,
+        profile: DirectionProfile,
+        *,
+        origin_ns: int,
+        clock: Callable[[], int],
+        wait: Callable[[float], None],
+    ) -> None:
+        """Set up, without touching the network yet.
+
+        Args:
+            run: Runs tc and ip; its environment's TC_LIB_DIR names the folder that
+                `netem_tables.write_tables` filled.
+            profile: Conditions.
+            origin_ns: When the link came up [ns]; the time line counts from it.
+            clock: Tells the time on the clock of `origin_ns` [ns].
+            wait: Sleeps for so long [s].
+        """
+        self._iproute2 = Iproute2(run)
+        self._profile = profile
+        self._timeline = Timeline(profile)
+        self._origin_ns = origin_ns
+        self._clock = clock
+        self._wait = wait
+        self._device = ""
+        self._applied: list[str] = []
+
+    def follow_peer(self, peer: Address) -> Address:
+        """Shape what goes to this peer from now on, on the interface that leads to it."""
+        device = self._iproute2.device(peer[0])
+        if device != self._device:
+            self.close()
+            self._device = device
+        try:
+            check(self._profile)
+            if not self._applied:
+                self._set_up()
+            self._select(peer)
+        except CloudrcError:
+            self.close()
+            raise
+        return peer
+
+    def follow_profile(self, profile: DirectionProfile) -> None:
+        """Shape by this profile from now on; what is queued leaves when it would have."""
+        check(profile)
+        before = self._profile, self._timeline
+        self._profile, self._timeline = profile, Timeline(profile)
+        try:
+            self._apply("change")
+        except MissingPrerequisiteError:
+            self._profile, self._timeline = before
+            raise
+
+    def step(self, timeout: float) -> None:
+        """Put into force what the time line says now, then wait, at most `timeout` [s]."""
+        self._apply("change")
+        steps = len(self._timeline.starts_ns) > 1
+        self._wait(min(timeout, STEP_NS * 1e-9) if steps else timeout)
+
+    def counts(self) -> dict[str, int]:
+        """Say how many datagrams netem sent on, dropped (losses included) and holds."""
+        return counters(self._qdiscs())
+
+    def close(self) -> None:
+        """Remove the qdiscs, if they are ours; what is queued in them is lost."""
+        if self._device and _is_ours(self._qdiscs()):
+            self._iproute2.tc("qdisc", "del", "dev", self._device, "root")
+        self._device, self._applied = "", []
+
+    def _set_up(self) -> None:
+        """Put the qdiscs in place, those included that an earlier process left."""
+        qdiscs, device = self._qdiscs(), self._device
+        root = next((one for one in qdiscs if one.get("root")), {"handle": "0:"})
+        if root["handle"] != "0:" and not _is_ours(qdiscs):
+            raise MissingPrerequisiteError(
+                f"{device} has a qdisc already ({root['kind']} {root['handle']}) that is not "
+                f"cloudrc's; remove it ('tc qdisc del dev {device} root'), or set link.mode=relay"
+            )
+        if not _is_ours(qdiscs):
+            self._add_root()
+        there = any(one.get("handle") == LEAF for one in qdiscs)
+        self._apply("change" if there else "add")
+
+    def _add_root(self) -> None:
+        place = ("dev", self._device, "root")
+        try:
+            self._iproute2.tc("qdisc", "add", *place, "handle", ROOT, *_PRIO)
+        except MissingPrerequisiteError:
+            # A kernel without sch_prio mostly lacks sch_netem, too, which is what people look for.
+            self._iproute2.tc("qdisc", "add", *place, "netem")
+            self._iproute2.tc("qdisc", "del", *place)
+            raise
+
+    def _apply(self, verb: str) -> None:
+        """Let what holds now be in force, unless it is."""
+        now = self._timeline.at(self._clock() - self._origin_ns)
+        wanted = options(self._profile, now)
+        if wanted != self._applied:
+            place = ("dev", self._device, "parent", BAND, "handle", LEAF)
+            self._iproute2.tc("qdisc", verb, *place, "netem", *wanted)
+            self._applied = wanted
+
+    def _select(self, peer: Address) -> None:
+        """Send the tunnel's flow to netem: first a new filter, then without the old ones."""
+        show = self._iproute2.show("filter", "show", "dev", self._device, "parent", ROOT)
+        old = sorted({int(one["pref"]) for one in show})
+        new = next(number for number in range(1, len(old) + 2) if number not in old)
+        try:
+            self._add_filter(new, _u32(peer))
+        except MissingPrerequisiteError:
+            self._add_filter(new, _flower(peer))
+        for number in old:
+            self._iproute2.tc("filter", "del", *self._filters(number))
+
+    def _add_filter(self, number: int, match: Sequence[str]) -> None:
+        self._iproute2.tc("filter", "add", *self._filters(number), "protocol", "ip", *match)
+
+    def _filters(self, number: int) -> tuple[str, ...]:
+        return ("dev", self._device, "parent", ROOT, "pref", str(number))
+
+    def _qdiscs(self) -> list[dict[str, Any]]:
+        return self._iproute2.show("qdisc", "show", "dev", self._device)
+
+
+def counters(qdiscs: list[dict[str, Any]]) -> dict[str, int]:
+    """Read what netem has counted from the objects of `tc -s -j qdisc show`.
+
+    Returns:
+        `forwarded`: sent on, copies included; `lost`: dropped, whether by chance or because the
+        queue was full; `held`: queued now. Empty if there is no such qdisc.
+    """
+    for one in qdiscs:
+        if one.get("handle") == LEAF and one.get("kind") == "netem":
+            return {"forwarded": one["packets"], "lost": one["drops"], "held": one["qlen"]}
+    return {}
+
+
+def _is_ours(qdiscs: list[dict[str, Any]]) -> bool:
+    """Say whether the root of an interface is what `Netem` puts there."""
+    return any(
+        one.get("root") and one.get("handle") == ROOT and one.get("kind") == "prio"
+        for one in qdiscs
+    )
+
+
+def _u32(peer: Address) -> list[str]:
+    host, port = peer
+    protocol = ["match", "ip", "protocol", _UDP, "0xff"]
+    address = ["match", "ip", "dst", f"{host}/32", "match", "ip", "dport", str(port), "0xffff"]
+    return ["u32", *protocol, *address, "flowid", BAND]
+
+
+def _flower(peer: Address) -> list[str]:
+    host, port = peer
+    address = ["dst_ip", host, "dst_port", str(port)]
+    return ["flower", "ip_proto", "udp", *address, "classid", BAND]

@@ -1,0 +1,63 @@
+"""The relay of a pod's sidecar: what the pod sends comes in, delayed as asked it goes to the peer.
+
+tunnel end > [listen]  RelayShaper  [any port] > the other pod's tunnel end
+"""
+
+from __future__ import annotations
+
+import socket
+
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.relay_lane import Address, Lane, Lanes, Peek, Side
+
+
+class RelayShaper:
+    """One direction of the link in userspace; a `Shaper`."""
+
+    name = "relay"
+
+    def __init__(self, listen: Address, direction: LinkDirection, peek: Peek) -> None:
+        """Open the two sockets.
+
+        Args:
+            listen: Where this pod's tunnel end sends to; port 0 lets the kernel choose.
+            direction: The link, its origin on the machine's monotonic clock.
+            peek: Reads kind, epoch and counter of a datagram.
+
+        Raises:
+            OSError: If `listen` is taken.
+        """
+        self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._inside.bind(listen)
+        except OSError:
+            self._inside.close()
+            raise
+        # The kernel refuses to send from a socket bound to 127.0.0.1 to another machine.
+        self._outside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._lane = Lane(Side(self._inside), Side(self._outside), direction, peek)
+        self._lanes = Lanes((self._lane,), origin_ns=0)
+
+    def follow_peer(self, peer: Address) -> Address:
+        """Send to this peer from now on; what is in flight goes there, too."""
+        self._lane.target.peer = peer
+        host, port = self._inside.getsockname()
+        return host, port
+
+    def follow_profile(self, profile: DirectionProfile) -> None:
+        """Shape by this profile from now on; what is in flight keeps the delay that it drew."""
+        self._lane.direction.replace_profile(profile)
+
+    def step(self, timeout: float) -> None:
+        """Forward for a moment, at most `timeout` [s]."""
+        self._lanes.step(timeout)
+
+    def counts(self) -> dict[str, int]:
+        """Say how many datagrams met which outcome, as `Lanes.outcomes` does."""
+        return self._lane.counts()
+
+    def close(self) -> None:
+        """Close the sockets; what is in flight is lost."""
+        self._inside.close()
+        self._outside.close()

@@ -1,0 +1,204 @@
+"""The `link` container of a pod: it chooses a shaper, tells the route, and follows what changes.
+
+Peer and profile come from other threads, which leave them here; the shaper is touched by the one
+thread that is in `run` and by no other.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol, TypeAlias
+
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.link.netem_text import notes
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.relay_lane import Address
+from cloudrc.link.route import publish, publish_route, withdraw
+from cloudrc.link.shaper import Shaper
+from cloudrc.link.sidecar_follow import Loaded
+
+Mode: TypeAlias = Literal["auto", "netem", "relay"]
+Make: TypeAlias = Callable[[DirectionProfile], Shaper]
+
+COUNT_PERIOD_NS = 1_000_000_000
+_WAIT = 0.05
+_STEP = 0.1
+"""Longest time in which a change that was left here is not seen [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How a sidecar is set up.
+
+    Attributes:
+        mode: `link.mode`: "relay" and "netem" are strict, "auto" takes netem where it can.
+        direction: "uplink" or "downlink", for reports.
+        route: File that tells this pod's tunnel end where it has to send.
+        state: File beside it that tells reports what shapes the link and why.
+    """
+
+    mode: Mode
+    direction: str
+    route: Path
+    state: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What a sidecar needs of the machine.
+
+    Attributes:
+        relay: Makes the relay.
+        netem: Makes netem, without touching the network yet.
+        may_shape: Whether this process is root with NET_ADMIN.
+        clock: Monotonic [ns].
+        today: Date and time in UTC as text, for reports.
+        wait: Sleeps for so long [s].
+        log: Gets lines for people.
+    """
+
+    relay: Make
+    netem: Make
+    may_shape: bool
+    clock: Callable[[], int]
+    today: Callable[[], str]
+    wait: Callable[[float], None]
+    log: Callable[[str], None]
+
+
+class Watcher(Protocol):
+    """Whoever keeps the metrics."""
+
+    def shapes(self, shaper: str) -> None:
+        """Learn that from now on this shaper is in force, and that the route is told."""
+        ...
+
+    def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
+        """Learn once a second how many datagrams met which outcome so far."""
+        ...
+
+
+class Sidecar:
+    """Shapes what one pod's tunnel end sends to the other's.
+
+    Attributes:
+        peer: Where the other pod's tunnel end is; another thread sets it.
+        profile: What is asked for; another thread sets it.
+    """
+
+    def __init__(
+        self, settings: Settings, machine: Machine, profile: Loaded, watcher: Watcher | None = None
+    ) -> None:
+        self.peer: Address | None = None
+        self.profile = profile
+        self._settings = settings
+        self._machine = machine
+        self._watcher = watcher
+        self._reason = ""
+
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Shape until `stop` says True.
+
+        Raises:
+            CloudrcError: If the mode is strict and its shaper cannot do what is asked.
+        """
+        withdraw(self._settings.route)  # an earlier process may have left one
+        if self._settings.mode == "netem" and not self._machine.may_shape:
+            raise MissingPrerequisiteError(
+                "link.mode=netem needs uid 0 and NET_ADMIN; give this container both, or set "
+                "link.mode=relay, which needs neither"
+            )
+        while self.peer is None:
+            if stop():
+                return
+            self._machine.wait(_WAIT)
+        try:
+            while not stop():
+                self._shape(self.peer, stop)
+        finally:
+            withdraw(self._settings.route)
+
+    def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
+        """Shape with one shaper, until `stop` or until a profile asks for another one."""
+        profile = self.profile
+        shaper, route = self._choose(profile, peer)
+        try:
+            self._announce(shaper, route, profile)
+            count_ns = self._machine.clock()
+            while not stop():
+                if self.peer is not None and self.peer != peer:
+                    peer = self.peer
+                    publish_route(self._settings.route, shaper.follow_peer(peer))
+                if self.profile is not profile:
+                    profile = self.profile
+                    if not self._replace(shaper, profile):
+                        return
+                shaper.step(_STEP)
+                if self._watcher and (now_ns := self._machine.clock()) >= count_ns:
+                    count_ns = now_ns + COUNT_PERIOD_NS
+                    self._watcher.counted(now_ns, shaper.counts())
+        finally:
+            shaper.close()
+
+    def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
+        """Take the shaper of the mode, or find out which one works; say why."""
+        machine, mode = self._machine, self._settings.mode
+        self._reason = f"link.mode={mode}"
+        if mode != "relay":
+            netem = machine.netem(profile.direction)
+            try:
+                if not machine.may_shape:
+                    raise MissingPrerequisiteError("no uid 0 with NET_ADMIN")
+                route = netem.follow_peer(peer)
+            except CloudrcError as error:
+                if mode == "netem":
+                    raise
+                self._reason = f"netem does not work here: {_cause(error)}"
+            else:
+                for note in notes(profile.direction):
+                    machine.log(note)
+                return netem, route
+        relay = machine.relay(profile.direction)
+        return relay, relay.follow_peer(peer)
+
+    def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
+        """Put a new profile in force; False if that takes another shaper."""
+        try:
+            shaper.follow_profile(profile.direction)
+        except CloudrcError as error:
+            if self._settings.mode == "auto":
+                self._machine.log(f"changes the shaper: {_cause(error)}")
+                return False
+            self._machine.log(f"the new profile is refused, the old one stays: {error}")
+            return True
+        self._machine.log("the new profile is in force")
+        self._tell(shaper, profile)
+        return True
+
+    def _announce(self, shaper: Shaper, route: Address, profile: Loaded) -> None:
+        settings = self._settings
+        self._machine.log(f"{shaper.name} shapes the {settings.direction} ({self._reason})")
+        self._tell(shaper, profile)
+        publish_route(settings.route, route)
+        if self._watcher:
+            self._watcher.shapes(shaper.name)
+
+    def _tell(self, shaper: Shaper, profile: Loaded) -> None:
+        """Write for reports what shapes the link."""
+        state = {
+            "shaper": shaper.name,
+            "reason": self._reason,
+            "mode": self._settings.mode,
+            "direction": self._settings.direction,
+            "profile": profile.values,
+            "since": self._machine.today(),
+        }
+        publish(self._settings.state, json.dumps(state, indent=2) + "\n")
+
+
+def _cause(error: CloudrcError) -> str:
+    """Take from an error what is wrong, without what to do about it."""
+    return str(error).partition("; ")[0]

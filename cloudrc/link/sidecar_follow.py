@@ -1,0 +1,120 @@
+"""What a pod's sidecar follows in flight: the file of its profile, and the address of its peer.
+
+Both are asked again and again by threads of their own, since a file has to be parsed and a name
+server may be slow. Here they are plain objects: file and names in, changes out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cloudrc.errors import BadInputError
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.relay_lane import Address
+
+PROFILE_PERIOD = 0.5
+"""How often the profile's file is looked at [s]."""
+PEER_PERIOD = 1.0
+"""How often the peer's name is resolved [s]."""
+
+
+class Loaded(NamedTuple):
+    """A profile as it was read: one direction in SI, and the file's values for people."""
+
+    direction: DirectionProfile
+    values: dict[str, Any]
+
+
+Load = Callable[[Path], Loaded]
+"""Reads and checks a profile's file; raises a BadInputError."""
+
+
+class ProfileFile:
+    """A profile's file that may change.
+
+    Kubernetes mounts a ConfigMap as a folder of links to `..data`, itself a link, which it swaps in
+    one step: the file's resolved path and inode change, not the path that it was given by.
+    """
+
+    def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
+        self._path = path
+        self._load = load
+        self._log = log
+        self._seen: object = None
+
+    def first(self) -> Loaded:
+        """Read the file; raises a BadInputError."""
+        self._seen = self._look()
+        return self._load(self._path)
+
+    def poll(self) -> Loaded | None:
+        """Read the file if it has changed; None if not, or if it is refused, which is logged."""
+        seen = self._look()
+        if seen == self._seen:
+            return None
+        self._seen = seen
+        try:
+            return self._load(self._path)
+        except (BadInputError, OSError) as error:
+            self._log(f"the new profile is refused, the old one stays: {error}")
+            return None
+
+    def _look(self) -> object:
+        """Tell versions of the file apart; None while there is none."""
+        try:
+            resolved = self._path.resolve(strict=True)
+            state = resolved.stat()
+        except OSError:
+            return None
+        return resolved, state.st_mtime_ns, state.st_ino, state.st_size
+
+
+class PeerName:
+    """The peer's name, whose address may change.
+
+    While an old and a new pod overlap a headless Service names both: the one that came later is the
+    one that flies on.
+    """
+
+    def __init__(
+        self,
+        peer: Address,
+        resolve: Callable[[str], Sequence[str]],
+        log: Callable[[str], None],
+    ) -> None:
+        """Set up.
+
+        Args:
+            peer: Name or address, and port.
+            resolve: Gives the addresses of a name; raises an OSError if there is none.
+            log: Gets one line for each change.
+        """
+        self._name, self._port = peer
+        self._resolve = resolve
+        self._log = log
+        self._known: list[str] = []
+        self._said = ""
+
+    def poll(self) -> Address | None:
+        """Resolve the name once; None if that fails and never succeeded before."""
+        before = self._known[-1:]
+        try:
+            addresses = sorted(self._resolve(self._name))
+        except OSError as error:
+            keeps = f"keeps {before[0]}" if before else "waits for it"
+            self._say(f"{self._name} cannot be resolved ({error.strerror or error}); {keeps}")
+        else:
+            kept = [address for address in self._known if address in addresses]
+            self._known = kept + [address for address in addresses if address not in kept]
+            was = f", was {before[0]}" if before and before != self._known[-1:] else ""
+            self._say(f"{self._name} is {self._known[-1]}{was}")
+        return (self._known[-1], self._port) if self._known else None
+
+    def _say(self, line: str) -> None:
+        """Log a line unless it says what the last one said."""
+        what = line.partition(", was")[0]
+        if what != self._said:
+            self._said = what
+            self._log(line)

@@ -1,0 +1,182 @@
+"""Renders the chart without helm: values go in, Kubernetes objects come out.
+
+gotpl plays the template engine; values are laid over the defaults and checked against the schema
+as helm does. A cluster is a function that answers `lookup`.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+gotpl_helm = pytest.importorskip("gotpl.exts.helm", reason="gotpl comes with the extra dev")
+
+ROOT = Path(__file__).resolve().parents[2]
+CHART = ROOT / "charts" / "cloudrc"
+METADATA = yaml.safe_load((CHART / "Chart.yaml").read_text())
+CI_VALUES = sorted((CHART / "ci").glob("*-values.yaml"))
+EXAMPLES = sorted((CHART / "examples").glob("values-*.yaml"))
+
+Object = dict[str, Any]
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+Lookup = Callable[[str, str, str, str], Any]
+
+
+class Files:
+    """Helm's `.Files`."""
+
+    def Get(self, name: str) -> str:  # noqa: N802
+        path = CHART / name
+        return path.read_text() if path.is_file() else ""
+
+    def Glob(self, pattern: str) -> dict[str, str]:  # noqa: N802
+        found = sorted(CHART.glob(pattern))
+        return {path.relative_to(CHART).as_posix(): path.read_text() for path in found}
+
+
+class Versions:
+    """Helm's `.Capabilities.APIVersions`."""
+
+    def __init__(self, known: Iterable[str]) -> None:
+        self.known = set(known)
+
+    def Has(self, version: str) -> bool:  # noqa: N802
+        return version in self.known
+
+
+def nothing(version: str, kind: str, namespace: str, name: str) -> Object:
+    """No cluster, as under `helm template`."""
+    return {}
+
+
+def a_namespace(level: str = "") -> Lookup:
+    """A cluster with nothing but the namespace, which may enforce Pod Security."""
+    labels = {"pod-security.kubernetes.io/enforce": level} if level else {}
+
+    def lookup(version: str, kind: str, namespace: str, name: str) -> Object:
+        return {"metadata": {"name": name, "labels": labels}} if kind == "Namespace" else {}
+
+    return lookup
+
+
+def holding(objects: Iterable[Object], otherwise: Lookup) -> Lookup:
+    """A cluster with these objects."""
+
+    def lookup(version: str, kind: str, namespace: str, name: str) -> Object:
+        for found in objects:
+            if (found["kind"], found["metadata"]["name"]) == (kind, name):
+                return found
+        return dict(otherwise(version, kind, namespace, name))
+
+    return lookup
+
+
+def laid_over(base: Any, values: Any) -> Any:
+    """Merge as helm does: mappings key by key, null takes away."""
+    if not isinstance(base, dict) or not isinstance(values, dict):
+        return values
+    merged = {key: laid_over(base.get(key), value) for key, value in values.items()}
+    return {k: v for k, v in {**base, **merged}.items() if v is not None}
+
+
+@cache
+def sources() -> Mapping[str, str]:
+    paths = (path for path in (CHART / "templates").rglob("*") if path.is_file())
+    return {path.relative_to(CHART).as_posix(): path.read_text() for path in sorted(paths)}
+
+
+cluster: list[Lookup] = []
+"""Who answers `lookup` now: templates are compiled once, clusters come and go."""
+
+
+@cache
+def engine() -> Any:
+    def lookup(version: str, kind: str, namespace: str, name: str) -> Any:
+        return cluster[-1](version, kind, namespace, name)
+
+    return gotpl_helm.HelmTemplateEngine(sources(), lookup=lookup)
+
+
+@cache
+def schema() -> Any:
+    return json.loads((CHART / "values.schema.json").read_text())
+
+
+def render_texts(
+    values: Object | None = None,
+    *,
+    release: str = "demo",
+    namespace: str = "lab",
+    lookup: Lookup = nothing,
+    apis: Iterable[str] = (),
+) -> dict[str, str]:
+    """Render every template: path -> text. Values that the schema refuses raise."""
+    import jsonschema
+
+    merged = laid_over(values_of(CHART / "values.yaml"), values or {})
+    jsonschema.Draft7Validator(schema()).validate(merged)
+    context = {
+        "Values": copy.deepcopy(merged),
+        "Release": {"Name": release, "Namespace": namespace, "Service": "Helm", "IsInstall": True},
+        "Chart": {"Version": METADATA["version"], "AppVersion": METADATA["appVersion"]},
+        "Capabilities": {"APIVersions": Versions(apis)},
+        "Files": Files(),
+    }
+    wanted = [name for name in sources() if not name.endswith(".tpl")]
+    cluster.append(lookup)
+    try:
+        return dict(engine().render(dict.fromkeys(wanted, context)))
+    finally:
+        cluster.pop()
+
+
+def render(values: Object | None = None, **where: Any) -> list[Object]:
+    """Render the objects of a release."""
+    texts = render_texts(values, **where)
+    objects = []
+    for name, text in sorted(texts.items()):
+        if not name.endswith("NOTES.txt"):
+            objects += [found for found in yaml.load_all(text, LOADER) if found]
+    return objects
+
+
+def notes(values: Object | None = None, **where: Any) -> str:
+    return render_texts(values, **where)["templates/NOTES.txt"]
+
+
+def of_kind(objects: Iterable[Object], kind: str) -> dict[str, Object]:
+    """Objects of a kind by the last part of their names: world, cloud, api..."""
+    found = [thing for thing in objects if thing["kind"] == kind]
+    return {thing["metadata"]["name"].removeprefix("demo-cloudrc-"): thing for thing in found}
+
+
+def pod_specs(objects: Iterable[Object]) -> dict[str, Object]:
+    """Pods of every object that makes one, by its component."""
+    specs = {}
+    for thing in objects:
+        if thing["kind"] in ("Deployment", "Job"):
+            specs[component(thing)] = thing["spec"]["template"]["spec"]
+        elif thing["kind"] == "Pod":
+            specs[component(thing)] = thing["spec"]
+    return specs
+
+
+def component(thing: Object) -> str:
+    return str(thing["metadata"]["labels"]["app.kubernetes.io/component"])
+
+
+def containers(spec: Object) -> dict[str, Object]:
+    return {
+        found["name"]: found for found in (*spec.get("initContainers", ()), *spec["containers"])
+    }
+
+
+def values_of(path: Path) -> Object:
+    return dict(yaml.load(path.read_text(), LOADER) or {})

@@ -1,0 +1,133 @@
+"""Experiment and link profile reach the pods as the package reads them, each in its own way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from rendering import Object, containers, of_kind, pod_specs, render
+
+from cloudrc.config.load import dump, load_experiment, load_profile
+from cloudrc.config.shipped import names
+
+
+def config(objects: list[Object], name: str, folder: Path) -> Path:
+    """Write a ConfigMap as the pod sees it."""
+    for file, text in of_kind(objects, "ConfigMap")[name]["data"].items():
+        (folder / file).write_text(text)
+    return folder
+
+
+def profile(values: Object, folder: Path) -> Any:
+    return load_profile(config(render(values), "link", folder) / "profile.yaml")
+
+
+def templates(values: Object) -> dict[str, Object]:
+    deployments = of_kind(render(values), "Deployment")
+    return {name: thing["spec"]["template"] for name, thing in deployments.items()}
+
+
+@pytest.mark.parametrize("name", names("experiment"))
+def test_the_values_hold_the_file_that_run_takes(name: str, tmp_path: Path) -> None:
+    """Also a resolved one, with everything spelled out."""
+    resolved = load_experiment(name)
+    values = {"experiment": yaml.safe_load(dump(resolved))}
+    written = config(render(values), "experiment", tmp_path) / "experiment.yaml"
+    assert load_experiment(written) == resolved
+    link = profile(values, tmp_path)
+    assert (link.uplink, link.downlink) == (resolved.uplink, resolved.downlink)
+
+
+def test_no_experiment_is_the_papers_scheme(tmp_path: Path) -> None:
+    written = config(render(), "experiment", tmp_path) / "experiment.yaml"
+    loaded, paper = load_experiment(written), load_experiment("paper")
+    for key in ("mission", "world", "guard", "tunnel", "link", "cloud", "criteria"):
+        assert getattr(loaded, key) == getattr(paper, key)
+
+
+def test_a_large_seed_stays_whole(tmp_path: Path) -> None:
+    written = config(render({"experiment": {"seed": 12_000_000}}), "experiment", tmp_path)
+    assert load_experiment(written / "experiment.yaml").seed == 12_000_000
+
+
+@pytest.mark.parametrize("name", names("profile"))
+def test_a_shipped_profile_by_name(name: str, tmp_path: Path) -> None:
+    assert profile({"link": {"profile": name}}, tmp_path) == load_profile(name)
+
+
+def test_without_a_profile_the_link_is_the_experiments(tmp_path: Path) -> None:
+    loss = {"bad_start": 0.1, "bad_end": 0.5}
+    given = {"profile": "wifi", "uplink": {"delay_ms": 80, "loss": loss}}
+    made, wifi = profile({"experiment": {"link": given}}, tmp_path), load_profile("wifi")
+    assert made.uplink.delay_ms == 80
+    assert made.uplink.loss.bad_start == 0.1
+    assert made.uplink.jitter_ms == wifi.uplink.jitter_ms
+    assert made.downlink == wifi.downlink
+
+
+def test_a_profile_stands_in_place_of_the_experiments_link(tmp_path: Path) -> None:
+    values = {
+        "experiment": {"link": {"uplink": {"delay_ms": 80}}},
+        "link": {"profile": {"downlink": {"delay_ms": 5}}},
+    }
+    made = profile(values, tmp_path)
+    assert (made.uplink.delay_ms, made.downlink.delay_ms) == (0, 5)
+
+
+def test_a_trace_lies_beside_its_profile(tmp_path: Path) -> None:
+    link = {
+        "profile": {"uplink": {"trace": "drive.csv"}},
+        "traces": {"drive.csv": "time_s,delay_ms\n0,30\n"},
+    }
+    assert profile({"link": link}, tmp_path).uplink.trace == str(tmp_path / "drive.csv")
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"link": {"profile": "wify"}}, "link.profile: no profile 'wify' ships.*choose one of 5g"),
+        (
+            {"experiment": {"link": {"profile": "./mine.yaml"}}},
+            "experiment.link.profile: no profile './mine.yaml'.*write it out under link.profile",
+        ),
+        ({"mission": {"enabled": True, "plan": "pipe"}}, "no mission 'pipe'.*one of hover, pipes"),
+    ],
+)
+def test_an_unknown_name_is_refused_with_the_known_ones(values: Object, said: str) -> None:
+    with pytest.raises(Exception, match=said):
+        render(values)
+
+
+def test_a_changed_experiment_rolls_both_pods() -> None:
+    before, after = templates({}), templates({"experiment": {"seed": 2}})
+    for name in ("world", "cloud"):
+        assert before[name] != after[name]
+        annotations = after[name]["metadata"]["annotations"]
+        changed = {
+            k for k, v in annotations.items() if before[name]["metadata"]["annotations"][k] != v
+        }
+        assert changed == {"checksum/experiment"}
+
+
+@pytest.mark.parametrize("link", [{"profile": "lossy"}, {"profile": {"uplink": {"delay_ms": 9}}}])
+def test_a_changed_profile_changes_one_configmap_and_nothing_else(link: Object) -> None:
+    before = {thing["metadata"]["name"]: thing for thing in render() if thing["kind"] != "Secret"}
+    after = {
+        thing["metadata"]["name"]: thing
+        for thing in render({"link": link})
+        if thing["kind"] != "Secret"
+    }
+    assert {name for name in before if before[name] != after[name]} == {"demo-cloudrc-link"}
+
+
+def test_the_profile_is_a_directory_of_its_own() -> None:
+    """So that the kubelet swaps it under a running container."""
+    for end in ("world", "cloud"):
+        (link,) = pod_specs(render())[end]["initContainers"]
+        mounts = {mount["mountPath"]: mount["name"] for mount in link["volumeMounts"]}
+        assert mounts["/etc/cloudrc-link"] == "link"
+        assert "--profile=/etc/cloudrc-link/profile.yaml" in link["args"]
+        others = [c for name, c in containers(pod_specs(render())[end]).items() if name != "link"]
+        assert not any("link" in {m["name"] for m in c["volumeMounts"]} for c in others)

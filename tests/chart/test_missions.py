@@ -1,0 +1,179 @@
+"""Missions as Jobs: in the chart, in the example, in `helm test`; each flies once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from rendering import CHART, Object, containers, of_kind, pod_specs, render
+
+import cloudrc
+from cloudrc.config.load import load_mission
+from cloudrc.config.mission_check import check_mission
+from cloudrc.geometry.scene import load_scene
+
+EXAMPLE = list(yaml.safe_load_all((CHART / "examples" / "mission-job.yaml").read_text()))
+ENABLED: Object = {"mission": {"enabled": True}}
+
+
+def jobs(values: Object | None = None) -> list[Object]:
+    return list(of_kind(render(values), "Job").values())
+
+
+def plan(values: Object, folder: Path) -> object:
+    """The mission in the ConfigMap that the Job mounts."""
+    objects = render(values)
+    (job,) = of_kind(objects, "Job").values()
+    name = job["spec"]["template"]["spec"]["volumes"][0]["configMap"]["name"]
+    (data,) = (
+        thing["data"] for thing in objects if thing["metadata"]["name"] == name and "data" in thing
+    )
+    (folder / "mission.yaml").write_text(data["mission.yaml"])
+    return load_mission(folder / "mission.yaml")
+
+
+def test_none_flies_unasked() -> None:
+    assert jobs() == []
+
+
+@pytest.mark.parametrize("job", [*jobs(ENABLED), EXAMPLE[1]], ids=["chart", "example"])
+def test_a_job_flies_once_ends_in_time_and_goes(job: Object) -> None:
+    spec = job["spec"]
+    assert spec["backoffLimit"] == 0
+    assert spec["activeDeadlineSeconds"] > 60
+    assert spec["ttlSecondsAfterFinished"] >= 3600
+    pod = spec["template"]["spec"]
+    assert pod["restartPolicy"] == "Never"
+    (container,) = pod["containers"]
+    assert container["terminationMessagePolicy"] == "FallbackToLogsOnError"
+    assert container["args"][:2] == ["mission", "fly"]
+
+
+@pytest.mark.parametrize("job", [*jobs(ENABLED), EXAMPLE[1]], ids=["chart", "example"])
+def test_its_uid_is_the_key(job: Object) -> None:
+    (container,) = job["spec"]["template"]["spec"]["containers"]
+    (variable,) = container["env"]
+    field = variable["valueFrom"]["fieldRef"]["fieldPath"]
+    assert field == "metadata.labels['batch.kubernetes.io/controller-uid']"
+    assert f"--key=$({variable['name']})" in container["args"]
+
+
+def test_it_calls_the_releases_api() -> None:
+    objects = render({**ENABLED, "teleop": {"service": {"port": 80}}})
+    (container,) = pod_specs(objects)["mission"]["containers"]
+    service = of_kind(objects, "Service")["api"]
+    assert service["spec"]["publishNotReadyAddresses"] is True
+    assert f"--api=http://{service['metadata']['name']}:80" in container["args"]
+
+
+@pytest.mark.parametrize(
+    ("values", "name"),
+    [
+        ({}, "pipes"),
+        ({"experiment": {"mission": "hover"}}, "hover"),
+        ({"mission": {"plan": "hover"}}, "hover"),
+    ],
+)
+def test_the_plan_is_the_experiments_unless_said(values: Object, name: str, tmp_path: Path) -> None:
+    values = {**values, "mission": {**values.get("mission", {}), "enabled": True}}
+    assert plan(values, tmp_path) == load_mission(name)
+
+
+def test_a_plan_may_be_written_out(tmp_path: Path) -> None:
+    point = {"position_m": [0.0, 0.0, 1.0], "dwell_s": 2.0}
+    values = {"mission": {"enabled": True, "plan": {"start": "here", "waypoints": [point]}}}
+    mission = plan(values, tmp_path)
+    assert mission.start == "here"  # type: ignore[attr-defined]
+
+
+def test_another_mission_is_another_job_and_the_same_the_same() -> None:
+    """A Job cannot be changed: an upgrade with a new plan would be refused."""
+    names = [
+        job["metadata"]["name"]
+        for values in (
+            ENABLED,
+            ENABLED,
+            {"mission": {"enabled": True, "plan": "hover"}},
+            {**ENABLED, "image": {"tag": "9"}},
+        )
+        for job in jobs(values)
+    ]
+    assert names[0] == names[1]
+    assert len(set(names)) == 3
+
+
+def test_queueing_is_a_flag() -> None:
+    (job,) = jobs({"mission": {"enabled": True, "queue": True}})
+    assert "--queue" in job["spec"]["template"]["spec"]["containers"][0]["args"]
+
+
+def test_the_example_is_for_the_release_of_the_readme(tmp_path: Path) -> None:
+    release = render(release="cloudrc")
+    service = next(t for t in release if t["metadata"]["name"] == "cloudrc-api")
+    config, job = EXAMPLE
+    pod = job["spec"]["template"]
+    (container,) = pod["spec"]["containers"]
+    assert f"--api=http://{service['metadata']['name']}:8080" in container["args"]
+    assert container["image"] == f"cloudrc/cloud:{cloudrc.__version__}"
+    assert pod["spec"]["volumes"][0]["configMap"]["name"] == config["metadata"]["name"]
+    policy = next(t for t in release if t["metadata"]["name"] == "cloudrc-mission")
+    selected = policy["spec"]["podSelector"]["matchLabels"]
+    assert selected.items() <= pod["metadata"]["labels"].items()
+    (tmp_path / "mission.yaml").write_text(config["data"]["mission.yaml"])
+    mission = load_mission(tmp_path / "mission.yaml")
+    assert check_mission(mission, load_scene("pipes")) == []
+    assert len(mission.waypoints) == 3
+
+
+def test_the_chart_makes_the_same_job_as_the_program() -> None:
+    """`cloudrc mission run` and the chart differ in names and times only."""
+    from cloudrc.cluster import manifest
+    from cloudrc.cluster.access import Release
+
+    follower = manifest.Follower(
+        "cloudrc/cloud:0.1.0", "IfNotPresent", (), "http://demo-cloudrc-api:8080"
+    )
+    made = manifest.job(Release(None, "lab", "demo"), "m", follower, limit=60.0, queue=False)
+    (job,) = jobs(ENABLED)
+    theirs, ours = (j["spec"]["template"] for j in (made, job))
+    same = ("app.kubernetes.io/name", "app.kubernetes.io/instance", "app.kubernetes.io/component")
+    assert [theirs["metadata"]["labels"][k] for k in same] == [
+        ours["metadata"]["labels"][k] for k in same
+    ]
+    (theirs,), (ours,) = (template["spec"]["containers"] for template in (theirs, ours))
+    assert theirs["env"] == ours["env"]
+    assert theirs["securityContext"] == ours["securityContext"]
+    assert theirs["volumeMounts"] == ours["volumeMounts"]
+    assert theirs["resources"] == ours["resources"]
+
+
+def test_helm_test_flies_and_leaves_nothing_behind() -> None:
+    pod = of_kind(render(), "Pod")["test"]
+    annotations = pod["metadata"]["annotations"]
+    assert annotations["helm.sh/hook"] == "test"
+    policy = annotations["helm.sh/hook-delete-policy"].split(",")
+    assert {"before-hook-creation", "hook-succeeded"} == set(policy)
+    (container,) = pod["spec"]["containers"]
+    assert container["args"][:2] == ["mission", "fly"]
+    assert pod["spec"]["activeDeadlineSeconds"] <= 180
+
+
+def test_its_mission_takes_seconds_and_can_be_flown(tmp_path: Path) -> None:
+    text = of_kind(render(), "ConfigMap")["test"]["data"]["mission.yaml"]
+    (tmp_path / "mission.yaml").write_text(text)
+    mission = load_mission(tmp_path / "mission.yaml")
+    assert check_mission(mission, load_scene("pipes")) == []
+    assert len(mission.waypoints) == 1
+    assert mission.waypoints[0].dwell_s <= 2
+
+
+def test_the_missions_pods_are_not_found_by_the_services() -> None:
+    objects = render(ENABLED)
+    for service in of_kind(objects, "Service").values():
+        for template in [
+            *(j["spec"]["template"] for j in jobs(ENABLED)),
+            of_kind(objects, "Pod")["test"],
+        ]:
+            assert not service["spec"]["selector"].items() <= template["metadata"]["labels"].items()
+    assert containers(pod_specs(objects)["mission"]).keys() == {"mission"}

@@ -1,0 +1,92 @@
+"""Metrics are found by annotation, or by the Prometheus operator where there is one."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+
+import pytest
+import yaml
+from rendering import CHART, Object, containers, of_kind, pod_specs, render
+
+from cloudrc.exposition.table import METRICS
+
+OPERATOR = "monitoring.coreos.com/v1"
+BOTH: Object = {"metrics": {"podMonitor": {"enabled": True}, "prometheusRule": {"enabled": True}}}
+KINDS = {"PodMonitor", "PrometheusRule"}
+RULES = CHART / "files" / "rules.yaml"
+
+
+def operated(objects: list[Object]) -> set[str]:
+    return {thing["kind"] for thing in objects} & KINDS
+
+
+def test_made_only_when_asked_for_and_known() -> None:
+    assert operated(render()) == set()
+    assert operated(render(apis=[OPERATOR])) == set()
+    assert operated(render(BOTH)) == set()
+    assert operated(render(BOTH, apis=[OPERATOR])) == KINDS
+
+
+def test_or_when_forced() -> None:
+    forced = {key: {"enabled": True, "force": True} for key in ("podMonitor", "prometheusRule")}
+    assert operated(render({"metrics": forced})) == KINDS
+
+
+def test_the_monitor_names_the_ports_of_the_pods() -> None:
+    (monitor,) = of_kind(render(BOTH, apis=[OPERATOR]), "PodMonitor").values()
+    asked = {endpoint["port"] for endpoint in monitor["spec"]["podMetricsEndpoints"]}
+    served = {
+        port["name"]
+        for end in ("world", "cloud")
+        for container in containers(pod_specs(render())[end]).values()
+        for port in container["ports"]
+        if port["name"].endswith("metrics")
+    }
+    assert asked == served
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_annotations_are_the_fallback(wanted: bool) -> None:
+    for thing in of_kind(render({"metrics": {"annotations": wanted}}), "Deployment").values():
+        template = thing["spec"]["template"]
+        found = {k: v for k, v in template["metadata"]["annotations"].items() if "prometheus" in k}
+        assert bool(found) is wanted
+        if wanted:
+            port = int(found["prometheus.io/port"])
+            assert found["prometheus.io/scrape"] == "true"
+            served = [
+                p["containerPort"] for c in template["spec"]["containers"] for p in c["ports"]
+            ]
+            assert port in served
+
+
+def rules() -> list[Object]:
+    groups = yaml.safe_load(RULES.read_text())["groups"]
+    return [rule for group in groups for rule in group["rules"]]
+
+
+def test_the_rules_ask_for_metrics_that_exist() -> None:
+    known = set(METRICS) | {rule["record"] for rule in rules() if "record" in rule}
+    for rule in rules():
+        asked = re.findall(r"(?:\w+:)?cloudrc_\w+(?::\w+)?", rule["expr"])
+        assert asked
+        assert set(asked) <= known
+
+
+def test_alerts_say_how_bad_what_and_what_to_do() -> None:
+    readme = (CHART / "README.md").read_text().lower()
+    for rule in rules():
+        if "record" in rule:
+            assert rule["record"].count(":") == 2  # level:metric:operation
+            continue
+        assert rule["labels"]["severity"] in {"info", "warning", "critical"}
+        assert rule["annotations"]["summary"].endswith(".")
+        assert f"### {rule['annotations']['runbook'].partition('#')[2]}\n" in readme
+
+
+def test_promtool_accepts_the_rules() -> None:
+    if shutil.which("promtool") is None:
+        pytest.skip("no promtool here (Debian package prometheus)")
+    subprocess.run(["promtool", "check", "rules", RULES], check=True, capture_output=True)

@@ -1,0 +1,89 @@
+"""The policies let through tunnel, names, API and scraping, and nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rendering import Object, containers, of_kind, pod_specs, render
+
+TUNNEL, DNS, API = {("UDP", 7400)}, {("UDP", 53), ("TCP", 53)}, {("TCP", 8080)}
+PROMETHEUS = {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "monitoring"}}}
+
+
+def policies(values: Object | None = None) -> dict[str, Object]:
+    return {name: found["spec"] for name, found in of_kind(render(values), "NetworkPolicy").items()}
+
+
+def ports(rule: Object) -> set[tuple[str, int]]:
+    return {(port["protocol"], port["port"]) for port in rule["ports"]}
+
+
+def peers(rule: Object) -> list[str]:
+    """Components of this release that a rule names; anything else as it stands."""
+    found = rule.get("from") or rule.get("to")
+    assert found, "a rule without peers admits everybody"
+    return sorted(map(_peer, found))
+
+
+def _peer(peer: Any) -> str:
+    labels = peer.get("podSelector", {}).get("matchLabels", {})
+    if labels.get("app.kubernetes.io/instance") == "demo" and len(peer) == 1:
+        return str(labels["app.kubernetes.io/component"])
+    return str(peer)
+
+
+def said(spec: Object, way: str) -> list[tuple[list[str], set[tuple[str, int]]]]:
+    return [(peers(rule), ports(rule)) for rule in spec.get(way, [])]
+
+
+def test_every_pod_is_selected_both_ways() -> None:
+    found = policies()
+    assert found.keys() == {"world", "cloud", "mission", "test"}
+    for name, spec in found.items():
+        assert spec["policyTypes"] == ["Ingress", "Egress"]
+        labels = spec["podSelector"]["matchLabels"]
+        assert labels["app.kubernetes.io/component"] == name
+        assert labels["app.kubernetes.io/instance"] == "demo"
+
+
+def test_only_the_tunnel_and_the_api_come_in() -> None:
+    found = policies()
+    assert said(found["world"], "ingress") == [(["cloud"], TUNNEL)]
+    assert said(found["cloud"], "ingress") == [(["world"], TUNNEL), (["mission", "test"], API)]
+    assert said(found["mission"], "ingress") == said(found["test"], "ingress") == []
+
+
+def test_only_the_tunnel_names_and_the_api_go_out() -> None:
+    found = policies()
+    kube_system = str(
+        {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "kube-system"}}}
+    )
+    names = ([kube_system], DNS)
+    assert said(found["world"], "egress") == [(["cloud"], TUNNEL), names]
+    assert said(found["cloud"], "egress") == [(["world"], TUNNEL), names]
+    assert said(found["mission"], "egress") == [(["cloud"], API), names]
+    assert said(found["test"], "egress") == [(["cloud"], API), names]
+
+
+def test_scraping_is_admitted_by_name_and_to_all_metrics_ports() -> None:
+    found = policies({"metrics": {"allowFrom": [PROMETHEUS]}})
+    for end in ("world", "cloud"):
+        rule = found[end]["ingress"][-1]
+        assert rule["from"] == [PROMETHEUS]
+        served = {
+            port["containerPort"]
+            for container in containers(pod_specs(render())[end]).values()
+            for port in container["ports"]
+            if port["name"].endswith("metrics")
+        }
+        assert ports(rule) == {("TCP", port) for port in served}
+
+
+def test_others_may_call_the_api_when_named() -> None:
+    found = policies({"teleop": {"allowFrom": [PROMETHEUS]}})
+    assert PROMETHEUS in found["cloud"]["ingress"][1]["from"]
+    assert len(found["world"]["ingress"]) == 1
+
+
+def test_they_can_be_left_out() -> None:
+    assert policies({"networkPolicy": {"enabled": False}}) == {}

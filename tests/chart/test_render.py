@@ -1,0 +1,131 @@
+"""Every values file renders, as helm would, into objects that Kubernetes knows."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from rendering import CHART, CI_VALUES, EXAMPLES, METADATA, Object, render, values_of
+
+kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="comes with the extra dev")
+
+OLDEST = re.fullmatch(r">=(\d+\.\d+)\.0-0", METADATA["kubeVersion"])[1]  # type: ignore[index]
+NEWEST = ".".join(kubernetes_validate.latest_version().split(".")[:2])
+FILES = [*CI_VALUES, *EXAMPLES]
+RANDOM = {"Secret"}
+OPERATOR = "monitoring.coreos.com/v1"
+
+each_file = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _quick() -> Any:
+    """The library reads two megabytes of definitions for each object anew."""
+    utils = kubernetes_validate.utils
+    slow = utils.schema_contents
+    utils.schema_contents = functools.cache(slow)
+    yield
+    utils.schema_contents = slow
+
+
+def test_there_is_something_to_render() -> None:
+    assert {path.stem for path in CI_VALUES} >= {"default-values", "netem-values", "relay-values"}
+    names = {"values-constrained-drone", "values-loaded-cloud", "values-invalid"}
+    assert {path.stem for path in EXAMPLES} == names
+
+
+@pytest.mark.parametrize("version", sorted({OLDEST, NEWEST}))
+@each_file
+def test_the_objects_are_valid(path: Path, version: str) -> None:
+    objects = [o for o in render(values_of(path)) if o["apiVersion"] != OPERATOR]
+    assert len(objects) > 10
+    for thing in objects:
+        kubernetes_validate.validate(thing, version, strict=True)
+
+
+@pytest.mark.parametrize("version", sorted({OLDEST, NEWEST}))
+def test_the_example_is_valid(version: str) -> None:
+    text = (CHART / "examples" / "mission-job.yaml").read_text()
+    for thing in yaml.safe_load_all(text):
+        kubernetes_validate.validate(thing, version, strict=True)
+
+
+@each_file
+def test_nothing_is_said_twice(path: Path) -> None:
+    """Server-side apply refuses ports, names and keys that occur twice."""
+    for thing in render(values_of(path)):
+        spec = thing.get("spec", {}).get("template", thing).get("spec", {})
+        for container in (*spec.get("initContainers", ()), *spec.get("containers", ())):
+            names = [port["name"] for port in container.get("ports", ())]
+            assert len(names) == len(set(names))
+            assert all(port["protocol"] for port in container.get("ports", ()))
+            assert all(len(name) <= 15 for name in names)
+        mounts = [volume["name"] for volume in spec.get("volumes", ())]
+        assert len(mounts) == len(set(mounts))
+
+
+def helm(*arguments: str) -> subprocess.CompletedProcess[str]:
+    if shutil.which("helm") is None:
+        pytest.skip("no helm here")
+    return subprocess.run(["helm", *arguments], capture_output=True, text=True)
+
+
+@each_file
+def test_helm_renders_the_same(path: Path) -> None:
+    flags = ("--namespace", "lab", "--kube-version", OLDEST, "--values", str(path))
+    done = helm("template", "demo", str(CHART), *flags)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    by_helm = _comparable(thing for thing in yaml.safe_load_all(done.stdout) if thing)
+    here = _comparable(render(values_of(path)))
+    assert by_helm.keys() == here.keys()
+    for key, thing in here.items():
+        assert key[0] in RANDOM or by_helm[key] == thing
+
+
+@each_file
+def test_helm_lint_has_nothing_to_say(path: Path) -> None:
+    done = helm("lint", "--strict", "--values", str(path), "--kube-version", OLDEST, str(CHART))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "WARNING" not in done.stdout
+
+
+def test_helm_refuses_an_older_cluster() -> None:
+    done = helm("template", "demo", str(CHART), "--kube-version", "1.28.0")
+    assert done.returncode != 0
+    assert f"requires kubeVersion: {METADATA['kubeVersion']}" in done.stderr
+
+
+def test_helm_refuses_an_unknown_value_and_names_it() -> None:
+    done = helm("template", "demo", str(CHART), "--kube-version", OLDEST, "--set", "link.mod=netem")
+    assert done.returncode != 0
+    assert "'mod'" in done.stderr or "mod is not allowed" in done.stderr, done.stderr
+
+
+def test_helm_keeps_a_large_seed() -> None:
+    """Numbers above a million are not written as powers of ten, which is no whole number."""
+    flags = ("--kube-version", OLDEST, "--set-json", 'experiment={"seed": 4503599627370495}')
+    done = helm(
+        "template", "demo", str(CHART), "--show-only", "templates/shared/experiment.yaml", *flags
+    )
+    assert "seed: 4503599627370495\n" in done.stdout + "\n"
+
+
+def _comparable(objects: Iterable[Object]) -> dict[tuple[str, str], Object]:
+    """Helm writes 1.0 as 1, and the mission's Job is named by the hash of its text."""
+    found = {}
+    for original in objects:
+        text = re.sub(r"-mission-[0-9a-f]{8}", "-mission", json.dumps(original))
+        thing = json.loads(text)
+        if thing["kind"] == "ConfigMap":
+            thing["data"] = {name: yaml.safe_load(text) for name, text in thing["data"].items()}
+        found[thing["kind"], thing["metadata"]["name"]] = thing
+    return found

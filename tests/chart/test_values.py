@@ -1,0 +1,116 @@
+"""Values, schema and tables come from the models; what is not in them is refused by name."""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from rendering import CHART, CI_VALUES, EXAMPLES, ROOT, Object, laid_over, render, schema, values_of
+
+from cloudrc.config.describe import leaves
+from cloudrc.config.schema import Experiment
+
+jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-validate, extra dev")
+
+DEFAULTS = values_of(CHART / "values.yaml")
+# Helm's own, and what Kubernetes or a plug-in defines and checks.
+OPEN = {"global", "affinity", "tolerations"}
+
+
+def parts(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Object]]:
+    """Every object of the schema that says something about values."""
+    if isinstance(node, dict):
+        yield path, node
+        for key, inner in node.items():
+            yield from parts(inner, (*path, key))
+    elif isinstance(node, list):
+        for inner in node:
+            yield from parts(inner, path)
+
+
+def test_nothing_is_stale() -> None:
+    """`make chart-docs` mends it."""
+    tool = runpy.run_path(str(ROOT / "tools" / "chart_docs.py"))
+    assert [path.name for path in tool["stale"]()] == []
+
+
+def test_the_schema_is_closed_at_every_level() -> None:
+    for path, part in parts(schema()):
+        if part.get("type") != "object" or OPEN & set(path):
+            continue
+        extra = part.get("additionalProperties", True)
+        # Closed, or a map of one kind of value: labels, annotations, parameters of a plug-in.
+        assert extra is False or (isinstance(extra, dict) and extra.get("type")), path
+
+
+def test_every_value_is_described() -> None:
+    definitions = schema()["$defs"]
+    for path, part in parts(schema()):
+        for name, value in part.get("properties", {}).items():
+            reference = value.get("$ref", "").rpartition("/")[2]
+            text = value.get("description") or definitions.get(reference, {}).get("description")
+            assert text, (*path, name)
+
+
+@pytest.mark.parametrize(
+    "key", sorted({p[-1] for p, _ in leaves(Experiment) if not p[-1].isdigit()})
+)
+def test_the_experiments_units_are_in_the_schema(key: str) -> None:
+    units = {"_m": "[m]", "_ms": "[ms]", "_s": "[s]", "_deg": "[deg]", "_kbit": "[kbit/s]"}
+    unit = next((units[end] for end in units if key.endswith(end)), None)
+    for _, part in parts(schema()):
+        if unit and key in part.get("properties", {}):
+            assert unit in part["properties"][key]["description"]
+
+
+def test_own_numbers_have_a_unit() -> None:
+    for path, part in parts(schema()):
+        for name, value in part.get("properties", {}).items():
+            if value.get("type") == "integer" and not path[:2] == ("$defs", "Experiment"):
+                words = ("[", "port", "Number of", "Packets", "random")
+                assert any(word in value["description"] for word in words), (*path, name)
+
+
+def test_the_defaults_are_valid_and_written_out() -> None:
+    jsonschema.Draft7Validator(schema()).validate(DEFAULTS)
+    assert DEFAULTS.keys() == schema()["properties"].keys() - {"global"}
+
+
+@pytest.mark.parametrize("path", [*CI_VALUES, *EXAMPLES], ids=lambda path: path.stem)
+def test_the_files_that_ship_are_valid(path: Any) -> None:
+    jsonschema.Draft7Validator(schema()).validate(laid_over(DEFAULTS, values_of(path)))
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({"lnk": {}}, "lnk"),
+        ({"link": {"mod": "netem"}}, "mod"),
+        ({"link": {"mode": "tc"}}, "tc"),
+        ({"link": {"profile": {"uplink": {"delay": 40}}}}, "delay"),
+        ({"experiment": {"seeds": 4}}, "seeds"),
+        ({"experiment": {"guard": {"command_age_max_ms": -1}}}, "-1"),
+        ({"experiment": {"world": {"low_level": {"gain_p": [1, 2]}}}}, "[1, 2]"),
+        ({"experiment": {"cloud": {"predictor": {"share": 1}}}}, "share"),
+        ({"world": {"resources": {"limits": {"cpus": 1}}}}, "cpus"),
+        ({"world": {"resources": {"limits": {"memory": "64MB"}}}}, "64MB"),
+        ({"metrics": {"allowFrom": [{"namespace": "x"}]}}, "namespace"),
+        ({"metrics": {"allowFrom": "all"}}, "all"),
+        ({"image": {"world": {"digest": "sha256:12"}}}, "sha256:12"),
+        ({"image": {"tag": "a b"}}, "a b"),
+        ({"secret": {"existingSecret": "Lab Key"}}, "Lab Key"),
+        ({"cloud": {"backgroundLoad": {"workers": 0}}}, "0"),
+        ({"teleop": {"service": {"port": 70_000}}}, "70000"),
+    ],
+)
+def test_a_wrong_value_is_refused_and_named(values: Object, named: str) -> None:
+    with pytest.raises(jsonschema.ValidationError) as caught:
+        render(values)
+    errors = [caught.value, *(caught.value.context or ())]
+    assert any(named in error.message for error in errors)
+
+
+def test_a_chart_that_contains_this_one_may_have_globals() -> None:
+    assert render({"global": {"anything": {"goes": True}}})

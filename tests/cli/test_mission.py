@@ -1,0 +1,225 @@
+"""`cloudrc mission` against the real API: what is printed, and what it ends with."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from api_harness import Running, running
+from teleop_harness import A, B
+
+from cloudrc.cli import mission_follow, mission_local
+from cloudrc.cli.main import main
+from cloudrc.cli.mission_http import Api
+
+FILE = """
+description: Two points
+start: here
+waypoints:
+  - {position_m: [1.0, 0.0, 1.0], dwell_s: 0.0}
+  - {position_m: [2.0, 0.0, 1.0], dwell_s: 0.0}
+"""
+
+
+@pytest.fixture
+def api() -> Iterator[Running]:
+    with running() as one:
+        yield one
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(mission_follow, "PERIOD", 0.02)
+    monkeypatch.setattr(mission_follow, "PATIENCE", 0.5)
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
+    (tmp_path / "two.yaml").write_text(FILE)
+    return tmp_path
+
+
+Command = Callable[..., int]
+
+
+@pytest.fixture
+def mission(api: Running) -> Command:
+    def run(*words: str) -> int:
+        verb, *rest = words
+        return main(["mission", verb, "--api", api.url, *rest])
+
+    return run
+
+
+def pilot(api: Running, *points: tuple[float, float, float]) -> threading.Thread:
+    """Fly the robot from point to point, each once the one before is reached."""
+
+    def fly() -> None:
+        api.until(lambda: api.get("/v1/state")["mission"] is not None)
+        mission_id = api.get("/v1/state")["mission"]["id"]
+        path = f"/v1/missions/{mission_id}"
+        api.until(lambda: api.get(path)["state"] == "flying")
+        for count, point in enumerate(points, 1):
+            api.flight.position = point
+            api.until(lambda count=count: len(api.get(path)["reached"]) >= count)
+
+    thread = threading.Thread(target=fly)
+    thread.start()
+    return thread
+
+
+def test_run_follows_to_the_verdict(
+    api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    thread = pilot(api, A, B)
+    assert mission("run", "two.yaml") == 0
+    thread.join()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "mission m1: starting, waypoints: 2"
+    assert [line for line in lines if "waypoint 1 of 2 reached" in line]
+    assert lines[-1] == "SUCCESS: every waypoint reached, every criterion met"
+
+
+def test_fly_under_one_key_flies_once_and_leaves_its_verdict(
+    api: Running,
+    mission: Command,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    log = folder / "termination-log"
+    log.touch()
+    monkeypatch.setattr(mission_follow.leave_message, "__defaults__", (log,))
+    thread = pilot(api, A)
+    end = threading.Thread(target=lambda: (thread.join(), api.post("/v1/missions/m1/cancel")))
+    end.start()
+    assert mission("fly", "--mission", "two.yaml", "--key", "uid") == 130
+    end.join()
+    assert log.read_text() == "INTERRUPTED: cancelled: mission cancelled\n"
+    assert mission("fly", "--mission", "two.yaml", "--key", "uid") == 130
+    assert capsys.readouterr().out.count("INTERRUPTED") == 2
+    assert len(api.get("/v1/missions")["missions"]) == 1
+
+
+def test_a_stopped_job_cancels_its_mission(
+    api: Running, mission: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(self: object, mission_id: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(mission_follow.Follower, "follow", stopped)
+    assert mission("fly", "--mission", "two.yaml") == 130
+    assert api.state_of("m1") == "cancelled"
+
+
+def test_a_second_one_is_refused_with_5_and_names_the_first(
+    api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    api.post("/v1/missions", {"waypoints": [{"position_m": B}]})
+    assert mission("fly", "--mission", "two.yaml") == 5
+    assert "mission m1 is" in capsys.readouterr().err
+
+
+def test_a_mission_that_cannot_be_flown_ends_with_2(
+    mission: Command, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "bad.yaml").write_text("waypoints: [{position_m: [99, 0, 1]}, {position: [0, 0, 1]}]")
+    assert mission("run", "bad.yaml") == 2
+    error = capsys.readouterr().err
+    assert "waypoints.1.position" in error
+    assert "Traceback" not in error
+    (folder / "steps.yaml").write_text("steps: {count: 3}")
+    assert mission("run", "steps.yaml") == 2
+    assert mission("run", "no-such-mission") == 2
+    assert "pipes" in capsys.readouterr().err
+
+
+def test_an_api_that_is_not_there_ends_with_4_or_5(capsys: pytest.CaptureFixture[str]) -> None:
+    away = ["--api", "http://127.0.0.1:9"]
+    assert main(["mission", "status", *away]) == 5
+    assert main(["mission", "fly", "--mission", "two.yaml", *away]) == 4
+    captured = capsys.readouterr()
+    assert captured.err.count("Connection refused") == 2
+    assert captured.out.count("waiting") == 1
+    assert main(["mission", "status", "--api", "here"]) == 2
+
+
+def test_the_operators_verbs(
+    api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert mission("status") == 0
+    assert "no mission is under way" in capsys.readouterr().out
+    assert mission("cancel") == 2
+    assert mission("hold") == 5
+    api.post("/v1/missions", {"name": "far", "waypoints": [{"position_m": [-1.0, -4.0, 1.0]}]})
+    api.until(lambda: api.state_of("m1") == "flying")
+    for verb, word in (("hold", "held"), ("goto", "held"), ("resume", "flying")):
+        points = ["-2.5", "0", "1.2"] if verb == "goto" else []
+        assert mission(verb, *points) == 0
+        assert f"mission m1 (far): {word}" in capsys.readouterr().out
+    assert mission("goto", "0.5", "0", "1") == 5  # it flies
+    assert mission("cancel") == 0
+    assert mission("goto", "0", "0", "99") == 2
+    assert "beyond the fence" in capsys.readouterr().err
+
+
+def test_list_status_and_logs(
+    api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert mission("list") == 0
+    assert capsys.readouterr().out == "no missions yet\n"
+    api.post("/v1/missions", {"name": "far", "waypoints": [{"position_m": [-1.0, -4.0, 1.0]}]})
+    api.until(lambda: api.state_of("m1") == "flying")
+    assert mission("list") == 0
+    assert capsys.readouterr().out.splitlines()[1].split() == ["m1", "far", "flying", "0/1"]
+    assert mission("list", "-o", "json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["schemaVersion"], document["missions"][0]["id"]) == (1, "m1")
+    assert mission("status") == 0
+    assert "robot at (0.00, 0.00, 0.10) m, guard TRACK" in capsys.readouterr().out
+    assert mission("status", "m1", "-o", "json") == 0
+    assert json.loads(capsys.readouterr().out)["events"][1]["event"] == "started"
+    for words in (["logs"], ["logs", "m1"]):
+        assert mission(*words) == 0
+        assert "mission started from the spawn" in capsys.readouterr().out
+    assert mission("status", "m9") == 5
+    assert "no mission 'm9'" in capsys.readouterr().err
+
+
+def test_the_run_that_flies_here_is_found_by_itself(
+    api: Running, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "runs" / "latest").mkdir(parents=True)
+    (folder / "runs" / "latest" / "api.json").write_text(json.dumps({"url": api.url}))
+    assert main(["mission", "status"]) == 0
+    assert "no mission is under way" in capsys.readouterr().out
+
+
+def test_without_run_and_cluster_both_ways_out_are_named(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["mission", "status"]) == 3
+    error = capsys.readouterr().err
+    assert "no run flies here" in error
+    assert "KUBECONFIG" in error
+    assert error.count("\n") == 1
+
+
+def test_a_missing_verb_or_point_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["mission"]) == 2
+    assert main(["mission", "goto", "1", "2"]) == 2
+    assert main(["mission", "holt"]) == 2
+    assert "hold" in capsys.readouterr().err
+
+
+def test_events_can_be_followed(api: Running) -> None:
+    api.post("/v1/missions", {"waypoints": [{"position_m": B}]})
+    stream = Api(api.url).events()
+    assert [next(stream)["event"] for _ in range(2)] == ["starting", "started"]
+    stream.close()
+
+
+def test_a_shipped_mission_is_read_by_its_name() -> None:
+    mission = mission_local.read_mission("pipes")
+    assert (mission["name"], len(mission["waypoints"])) == ("pipes", 7)

@@ -1,0 +1,73 @@
+"""A robot, a lossy link and a journal in memory for the mission service to fly with."""
+
+import json
+
+from teleop_harness import A, B, C, Flight
+
+from cloudrc.cloud.teleop.messages import Seen
+from cloudrc.cloud.teleop.plan import Leg, Plan
+from cloudrc.cloud.teleop.service import MissionService
+from cloudrc.cloud.teleop.service_mission import Order
+from cloudrc.records import Fault
+
+PLAN = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)))
+
+
+class ServiceFlight(Flight):
+    """The harness of the machine, with a service in its place that may be restarted."""
+
+    def __init__(self):
+        super().__init__()
+        self.kept = []
+        self.full = False
+        self.pipe_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
+        self.restart_teleop()
+
+    def restart_teleop(self):
+        """A new process, that has nothing but the journal."""
+        self.teleop = MissionService(0.25, self.write, json.loads(json.dumps(self.kept)))
+
+    def write(self, entry):
+        if self.full:
+            raise OSError(28, "No space left on device")
+        self.kept.append(json.loads(json.dumps(entry)))
+
+    def see(self):
+        seen = Seen(
+            self.epoch,
+            self.position,
+            self.guard,
+            self.mission,
+            self.world,
+            self.pipe_contacts,
+            self.touch_speed,
+            self.slip_ns,
+        )
+        self.teleop.see(seen, self.now_ns)
+
+    def create(self, plan=PLAN, **order):
+        mission, _ = self.teleop.create(Order(plan, **order), self.now_ns)
+        self._collect()
+        return mission.id
+
+    def view(self, mission_id):
+        return self.teleop.book.find(mission_id).as_json()
+
+    def names(self, mission_id):
+        return [event["event"] for event in self.view(mission_id)["events"]]
+
+    @property
+    def faults(self):
+        return [said for said in self.said if isinstance(said, Fault)]
+
+
+def flying(**order):
+    """A flight on its way to the second waypoint."""
+    flight = ServiceFlight()
+    flight.step()
+    mission_id = flight.create(**order)
+    flight.step(seconds=0.05)
+    flight.step(position=A)
+    assert flight.view(mission_id)["state"] == "flying"
+    assert flight.view(mission_id)["waypoint"] == 1
+    return flight, mission_id

@@ -1,0 +1,78 @@
+"""Datagrams between cloud and teleop: every message comes back as it was, nothing else does."""
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.cloud.teleop.messages import Seen
+from cloudrc.cloud.teleop.wire import decode, encode
+from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.records import Fault, MissionEvent
+
+numbers = st.floats(allow_nan=False)
+vectors = st.tuples(numbers, numbers, numbers)
+counts = st.integers(0, 2**62)
+messages = st.one_of(
+    st.builds(
+        Seen,
+        epoch=counts,
+        position=vectors,
+        guard=st.sampled_from(GuardState),
+        mission=counts,
+        world=st.text(max_size=40),
+        pipe_contacts=counts,
+        touch_speed=numbers,
+        slip_ns=counts,
+        horizon=numbers,
+        rtt=numbers,
+        loop_delay=numbers,
+    ),
+    st.builds(Setpoint, vectors, numbers, st.integers(-1, 9999)),
+    st.builds(OperatorRequest, counts, st.sampled_from(Request), st.sampled_from(Start)),
+    st.builds(MissionEvent, counts, st.text(max_size=20), st.integers(-1, 9999), st.text()),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(messages)
+def test_a_message_comes_back_as_it_was(message):
+    back = decode(encode(message))
+    assert back == message
+    assert type(back) is type(message)
+    assert [type(value) for value in back] == [type(value) for value in message]
+
+
+def test_what_is_not_known_comes_back_unknown():
+    back = decode(encode(Seen(1, (0.0, 0.0, 1.0), GuardState.TRACK, 1)))
+    assert math.isnan(back.touch_speed)
+    assert math.isnan(back.rtt)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"{}",
+        b'"Seen"',
+        b'["Nobody", []]',
+        b'["Seen", [1, [0, 0, 1], 7, 1]]',
+        b'["Setpoint", [["a", 0, 0], 0, 0]]',
+        b'["Setpoint", [[0, 0], 0, 0]]',
+        b'["OperatorRequest", [1, 9, 0]]',
+        b"[" * 5000,
+        b"\xff\xfe",
+        encode(Fault(0, "x", "y")),
+    ],
+)
+def test_what_is_no_message_is_refused(data):
+    with pytest.raises(ValueError, match="not a message"):
+        decode(data)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(max_size=80))
+def test_bytes_that_are_no_message_are_refused_in_one_way(data):
+    with pytest.raises(ValueError, match="not a message"):
+        decode(data)

@@ -1,0 +1,91 @@
+"""A mission is cancelled through its Job's name, in whatever state the Job is."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+from fake_api import FakeApi
+from test_jobs import MISSION, end
+
+from cloudrc.cluster.access import Release
+from cloudrc.cluster.cancel import cancel
+from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.jobs import run_job
+
+
+class FakeTeleop(ThreadingHTTPServer):
+    """Teleop's API: what it knows, and what was asked of it."""
+
+    def __init__(self) -> None:
+        self.missions: list[dict[str, str]] = []
+        self.posted: list[str] = []
+        self.refuses = False
+        teleop = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.answer(200, {"missions": teleop.missions})
+
+            def do_POST(self) -> None:
+                teleop.posted.append(self.path)
+                self.answer(409, {"detail": "it is over"}) if teleop.refuses else self.answer(
+                    200, {}
+                )
+
+            def answer(self, code: int, body: object) -> None:
+                self.send_response(code)
+                self.end_headers()
+                self.wfile.write(json.dumps(body).encode())
+
+            def log_message(self, *words: object) -> None:
+                pass
+
+        super().__init__(("127.0.0.1", 0), Handler)
+
+
+@pytest.fixture
+def teleop(running: FakeApi, pretend: Callable[[str, str], Path]) -> Iterator[FakeTeleop]:
+    server = FakeTeleop()
+    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    way = f"echo 'Forwarding from 127.0.0.1:{server.server_port} -> 8080'"
+    pretend("kubectl", f"{way}\nexec sleep 60")
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+def test_the_mission_of_a_job_is_found_by_its_key(teleop: FakeTeleop, release: Release) -> None:
+    job = run_job(release, MISSION, name="first")
+    teleop.missions = [{"id": "m1", "key": "another"}, {"id": "m2", "key": job.uid}]
+    assert "m2" in cancel(release, "first")
+    assert teleop.posted == ["/v1/missions/m2/cancel"]
+
+
+def test_a_job_that_has_not_posted_yet_is_deleted(
+    running: FakeApi, teleop: FakeTeleop, release: Release
+) -> None:
+    run_job(release, MISSION, name="first")
+    assert "deleted" in cancel(release, "first")
+    assert teleop.posted == []
+    assert ("jobs", "demo", "first") not in running.objects
+
+
+def test_a_job_that_has_ended_is_left_alone(
+    running: FakeApi, teleop: FakeTeleop, release: Release
+) -> None:
+    run_job(release, MISSION, name="first")
+    end(running, "first", "Complete")
+    assert "has ended already" in cancel(release, "first")
+    assert teleop.posted == []
+
+
+def test_what_the_api_refuses_is_told(teleop: FakeTeleop, release: Release) -> None:
+    job = run_job(release, MISSION, name="first")
+    teleop.missions, teleop.refuses = [{"id": "m1", "key": job.uid}], True
+    with pytest.raises(ClusterError, match="it is over"):
+        cancel(release, "first")

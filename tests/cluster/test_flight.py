@@ -1,0 +1,128 @@
+"""`cloudrc run --mode cluster` from the flags to the report, against what only pretends."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+from fake_api import FakeApi
+from test_cut import HOVER, SECOND, flown, later, merged
+from test_jobs import at_look, end, start_pod, terminated
+
+from cloudrc.cli import cluster_flight
+from cloudrc.cli.main import main
+
+NAME, (SETTING,) = HOVER
+LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cluster_flight, "FLUSH", 0.0)
+    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def metrics_port() -> Iterator[int]:
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(b'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n')
+
+        def log_message(self, *words: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    yield server.server_port
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture
+def pods(
+    running: FakeApi, pretend: Callable[[str, str], Path], tmp_path: Path, metrics_port: int
+) -> FakeApi:
+    """A release whose pods have recorded a flight, and whose Jobs fly it as soon as created."""
+    world, _ = flown()
+    merged(tmp_path, flown(), (later(world[-300:], SECOND), []), torn=True)
+    pretend("helm", f"echo $@ >> {tmp_path}/helm; test $1 = list && echo '[]' || cat > /dev/null")
+    opened = "\n".join(
+        f"echo 'Forwarding from 127.0.0.1:{metrics_port} -> {port}'" for port in (9100, 9101, 9102)
+    )
+    pretend(
+        "kubectl",
+        f'case "$*" in *exec*world*) cat {tmp_path}/world.mcap ;;'
+        f" *exec*cloud*) cat {tmp_path}/cloud.mcap ;; *) {opened}\nexec sleep 60 ;; esac",
+    )
+    return running
+
+
+def ending(api: FakeApi, kind: str, exit_code: int, message: str) -> Callable[[], None]:
+    def action() -> None:
+        (name,) = [key[2] for key in api.objects if key[0] == "jobs"]
+        start_pod(api, name, state=terminated(exit_code, message))
+        api.logs[f"{name}-x"] = "waypoint 1 of 1 reached at 3.00 s\n"
+        end(api, name, kind)
+
+    return action
+
+
+def test_a_flight_leaves_what_a_run_leaves(
+    pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    at_look(pods, 2, ending(pods, "Complete", 0, "mission done"))
+    code = main([*LINE, "--out", "out"])
+    captured = capsys.readouterr()
+    assert "waypoint 1 of 1 reached" in captured.err
+    report = json.loads(captured.out)
+    # What was recorded was flown in virtual time: nothing in it proves that it kept real time.
+    assert (code, report["verdict"]) == (6, "invalid")
+    assert (report["mode"], report["shaper"]) == ("cluster", "relay")
+    assert report["complete"]
+    assert report["numbers"]["waypoints_reached"]["value"] == 1
+    left = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"config.yaml", "mission.mcap", "report.json", "environment.json"} <= left
+    assert {"world.mcap", "cloud.mcap", "world-link.metrics", "cloud-teleop.log"} <= left
+    assert "upgrade --install cloudrc" in (tmp_path / "helm").read_text()
+
+
+def test_a_mission_that_was_refused_has_no_report(
+    pods: FakeApi, capsys: pytest.CaptureFixture[str]
+) -> None:
+    at_look(pods, 2, ending(pods, "Failed", 5, "mission m-1 is under way"))
+    assert main([*LINE, "--out", "out"]) == 5
+    assert "did not fly its mission: mission m-1 is under way" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["hover", "--set", "cloud.predictor=./mine.py"], "the pods do not have this file"),
+        (["steps"], "mission.steps"),
+    ],
+)
+def test_what_the_pods_cannot_have_is_refused_before_anything_is_done(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: list[str], words: str
+) -> None:
+    plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"
+    (tmp_path / "mine.py").write_text(plugin)
+    assert main(["run", *settings, "--mode", "cluster"]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
+
+
+def test_what_a_release_was_installed_with_is_kept() -> None:
+    from cloudrc.config.load import load_experiment
+
+    before = {"metrics": {"allowFrom": ["x"]}, "link": {"mode": "relay", "profile": "paper-p1"}}
+    given = cluster_flight.values(load_experiment("hover"), before)
+    assert given["metrics"] == before["metrics"]
+    assert given["link"] == {"mode": "relay", "profile": ""}
+    assert given["experiment"]["name"] == "hover"

@@ -1,0 +1,116 @@
+"""Why a pod does not run, in one sentence with the way out; and what is not trouble."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+from fake_api import FakeApi, deployment, pod
+
+from cloudrc.cluster.access import Release
+from cloudrc.cluster.deploy import wait_ready
+from cloudrc.cluster.errors import ClusterError, WaitedTooLongError
+from cloudrc.cluster.pods import list_pods, trouble
+
+
+def waiting(reason: str, message: str = "") -> dict[str, Any]:
+    return {"waiting": {"reason": reason, "message": message}}
+
+
+def unscheduled(message: str) -> list[dict[str, str]]:
+    return [{"type": "PodScheduled", "status": "False", "message": message}]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"state": waiting("ImagePullBackOff")}, "cloudrc/cloud:0.1.0.*make kind-load"),
+        ({"state": waiting("ErrImageNeverPull")}, "make kind-load"),
+        (
+            {"state": waiting("CreateContainerConfigError", 'secret "mine" not found')},
+            'cannot be made: secret "mine" not found',
+        ),
+        (
+            {
+                "state": waiting("CrashLoopBackOff"),
+                "last": {"terminated": {"exitCode": 3, "message": "port 9100 is\ntaken"}},
+            },
+            r"again and again \(exit code 3\): port 9100 is taken",
+        ),
+        ({"restarts": 5}, "again and again"),
+        ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
+    ],
+)
+def test_trouble_is_put_into_words(
+    api: FakeApi, release: Release, given: dict[str, Any], expected: str
+) -> None:
+    api.put("pods", "demo", pod("cloud-1", "cloud", ready=False, phase="Pending", **given))
+    said = trouble(list_pods(release, "cloud")[0])
+    assert said is not None
+    assert re.search(expected, said)
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"state": waiting("ContainerCreating")},
+        {"state": waiting("PodInitializing")},
+        {"conditions": unscheduled("pod has unbound immediate PersistentVolumeClaims: volume")},
+        {"restarts": 1},
+    ],
+)
+def test_what_passes_by_waiting_is_no_trouble(
+    api: FakeApi, release: Release, given: dict[str, Any]
+) -> None:
+    api.put("pods", "demo", pod("cloud-1", "cloud", ready=False, **given))
+    assert trouble(list_pods(release, "cloud")[0]) is None
+
+
+def test_a_release_that_is_ready_is_not_waited_for(running: FakeApi, release: Release) -> None:
+    wait_ready(release, timeout=0.0)
+
+
+@pytest.mark.parametrize(
+    "status",
+    [{"updatedReplicas": 0}, {"replicas": 2}, {"observedGeneration": 0}],
+    ids=["not updated", "old pod beside it", "not seen yet"],
+)
+def test_the_old_pods_readiness_is_not_the_new_ones(
+    running: FakeApi, release: Release, status: dict[str, int]
+) -> None:
+    running.put("deployments", "demo", deployment("cloud", **status))
+    with pytest.raises(WaitedTooLongError, match="its pod is being made"):
+        wait_ready(release, timeout=0.03)
+
+
+def test_what_is_not_ready_in_time_is_named(running: FakeApi, release: Release) -> None:
+    running.put("pods", "demo", pod("world-1", "world", ready=False))
+    with pytest.raises(WaitedTooLongError, match="container world is not ready") as caught:
+        wait_ready(release, timeout=0.03)
+    assert caught.value.exit_code == 4
+
+
+def test_a_pod_that_will_never_run_ends_the_waiting_at_once(
+    running: FakeApi, release: Release
+) -> None:
+    state = waiting("ImagePullBackOff")
+    running.put("pods", "demo", pod("world-1", "world", ready=False, state=state))
+    with pytest.raises(ClusterError, match="the world pod cannot run: the image"):
+        wait_ready(release, timeout=60.0)
+
+
+def test_a_pod_that_is_refused_ends_the_waiting_with_the_reason(
+    running: FakeApi, release: Release
+) -> None:
+    refused = {"type": "ReplicaFailure", "status": "True", "message": "violates PodSecurity"}
+    running.put("deployments", "demo", deployment("cloud", conditions=[refused]))
+    with pytest.raises(ClusterError, match="violates PodSecurity"):
+        wait_ready(release, timeout=60.0)
+
+
+def test_a_release_of_something_else_is_told(api: FakeApi, release: Release) -> None:
+    with pytest.raises(ClusterError, match="no Deployment 'world'"):
+        wait_ready(release, timeout=1.0)

@@ -1,0 +1,134 @@
+"""What Prometheus scrapes: valid, small, ours alone, and absent where nothing is known."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+
+import pytest
+from flying import records
+from prometheus_client.parser import text_string_to_metric_families
+
+from cloudrc import __version__
+from cloudrc.config.load import load_experiment
+from cloudrc.drivers.exporter import Exporter
+from cloudrc.exposition.labels import BODIES, ENDS, LINK_OUTCOMES, ROLES
+from cloudrc.exposition.metric import Kind
+from cloudrc.exposition.table import METRICS, of_role
+from cloudrc.messages import ZERO
+from cloudrc.records import (
+    Contact,
+    Control,
+    Counted,
+    Lateness,
+    MissionEvent,
+    Record,
+    TelemetrySent,
+)
+
+Flight = dict[str, list[Record]]
+PERIODS = (TelemetrySent, Control)
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """The records of a flight, with wakes as in real time; and what the other roles see."""
+    both = records(load_experiment("hover", ["link.profile=paper-p3"]))
+    seen: Flight = {}
+    for end, of_end in zip(ENDS, both, strict=True):
+        seen[end] = []
+        for record in of_end:
+            seen[end].append(record)
+            if isinstance(record, PERIODS):
+                seen[end].append(Lateness(record.stamp_ns, end, 80e-6, 300e-6, 0))
+    seen["world"] += [Contact(0, body, ZERO, ZERO, ZERO, True) for body in BODIES]
+    seen["teleop"] = [r for r in seen["cloud"] if isinstance(r, MissionEvent)]
+    seen["link"] = [Counted(0, "link", name, 5) for name in LINK_OUTCOMES]
+    return seen
+
+
+def exporter(role: str, flight: Flight) -> Exporter:
+    made = Exporter(role)
+    made.see(flight[role])
+    if role == "link":
+        made.shaped("relay", "uplink", "auto")
+        made.shaped("relay", "downlink", "auto")
+        made.asked("uplink", 0.045)
+    return made
+
+
+def series(text: str) -> list[str]:
+    return [line for line in text.splitlines() if not line.startswith("#")]
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_promtool_finds_nothing_to_say(role: str, flight: Flight) -> None:
+    if shutil.which("promtool") is None:
+        pytest.skip("promtool is missing: apt-get install prometheus")
+    command = ["promtool", "check", "metrics"]
+    done = subprocess.run(
+        command, input=exporter(role, flight).text(), capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_a_flight_shows_every_metric_of_its_role_and_no_other(role: str, flight: Flight) -> None:
+    families = text_string_to_metric_families(exporter(role, flight).text())
+    found = {family.name + "_total" * (family.type == "counter") for family in families}
+    optional = {name for name in METRICS if "_cpu_" in name}  # only where the kernel counts it
+    expected = {metric.name for metric in of_role(role)}
+    assert {
+        name for name in found if not name.startswith("process_")
+    } | optional == expected | optional
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_labels_keep_to_their_sets(role: str, flight: Flight) -> None:
+    for family in text_string_to_metric_families(exporter(role, flight).text()):
+        for sample in family.samples:
+            metric = METRICS.get(sample.name)
+            if metric is not None and metric.kind is not Kind.HISTOGRAM:
+                assert set(sample.labels) == set(metric.labels)
+                for name, value in sample.labels.items():
+                    assert value in (metric.labels[name] or (__version__,))
+
+
+@pytest.mark.parametrize("pod", [("world", "link"), ("cloud", "teleop", "link")])
+def test_a_pod_has_less_than_200_series(pod: tuple[str, ...], flight: Flight) -> None:
+    count = sum(len(series(exporter(role, flight).text())) for role in pod)
+    assert count < 200
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_nothing_says_when_it_was_created(role: str, flight: Flight) -> None:
+    assert "_created" not in exporter(role, flight).text()
+
+
+def test_the_build_is_named_once(flight: Flight) -> None:
+    lines = [line for line in series(exporter("world", flight).text()) if "build_info" in line]
+    assert lines == [f'cloudrc_build_info{{role="world",version="{__version__}"}} 1.0']
+
+
+def test_a_shaper_takes_the_place_of_the_one_before() -> None:
+    link = Exporter("link")
+    link.shaped("relay", "uplink", "auto")
+    link.shaped("netem", "uplink", "auto")
+    lines = [line for line in series(link.text()) if "link_info" in line]
+    assert lines == ['cloudrc_link_info{direction="uplink",mode="auto",shaper="netem"} 1.0']
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("end", ENDS)
+def test_a_record_costs_less_than_a_microsecond(end: str, flight: Flight) -> None:
+    """On the loop's thread; the least of some repeats, for the machine may be busy."""
+    chunks = [flight[end][i : i + 4] for i in range(0, len(flight[end]), 4)]
+    least = float("inf")
+    for _ in range(15):
+        made = Exporter(end)
+        began = time.perf_counter()
+        for chunk in chunks:
+            made.see(chunk)
+        least = min(least, time.perf_counter() - began)
+    assert least / len(flight[end]) < 1e-6

@@ -1,0 +1,98 @@
+"""The HTTP side of the exporter: probes, a port that is taken, clients that mean no good."""
+
+from __future__ import annotations
+
+import socket
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+
+import pytest
+
+from cloudrc.drivers import probes
+from cloudrc.drivers.exporter import Exporter
+from cloudrc.errors import MissingPrerequisiteError
+
+HOST = "127.0.0.1"
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[Exporter, int]]:
+    exporter = Exporter("link")
+    port = exporter.serve((HOST, 0))
+    yield exporter, port
+    exporter.close()
+
+
+def get(port: int, path: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(f"http://{HOST}:{port}{path}", timeout=10) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_metrics_and_probes_are_on_one_port(served: tuple[Exporter, int]) -> None:
+    exporter, port = served
+    assert get(port, "/healthz") == (200, "alive\n")
+    assert get(port, "/readyz") == (503, "no peer yet\n")
+    assert "cloudrc_ready 0.0" in get(port, "/metrics")[1]
+    exporter.ready(True)
+    assert get(port, "/readyz")[0] == 200
+    assert "cloudrc_ready 1.0" in get(port, "/metrics?name=any")[1]
+    exporter.ready(False)
+    assert get(port, "/readyz")[0] == 503
+
+
+def test_another_path_says_which_there_are(served: tuple[Exporter, int]) -> None:
+    assert get(served[1], "/") == (404, "there are /metrics, /healthz, /readyz\n")
+
+
+def test_the_text_is_what_it_says_it_is(served: tuple[Exporter, int]) -> None:
+    with urllib.request.urlopen(f"http://{HOST}:{served[1]}/metrics", timeout=10) as answer:
+        assert answer.headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
+        assert answer.read().endswith(b"\n")
+
+
+def test_a_port_that_is_taken_is_told_in_one_sentence(served: tuple[Exporter, int]) -> None:
+    with pytest.raises(MissingPrerequisiteError) as failure:
+        Exporter("world").serve(f"{HOST}:{served[1]}")
+    assert str(failure.value).startswith(f"metrics port {served[1]} is taken: ")
+    assert "\n" not in str(failure.value)
+    assert failure.value.exit_code == 3
+
+
+def test_an_address_of_another_machine_is_told_likewise() -> None:
+    with pytest.raises(MissingPrerequisiteError, match=r"cannot be served on 192\.0\.2\.1:9100: "):
+        Exporter("world").serve("192.0.2.1:9100")
+
+
+def test_it_answers_while_many_clients_hang(served: tuple[Exporter, int]) -> None:
+    hanging = [
+        socket.create_connection((HOST, served[1])) for _ in range(3 * probes.CONNECTIONS_MAX)
+    ]
+    for client in hanging[::2]:
+        client.sendall(b"GET /metr")
+    assert get(served[1], "/healthz")[0] == 200
+    assert hanging[0].recv(1) == b""  # the oldest had to go
+    for client in hanging:
+        client.close()
+
+
+def test_a_client_that_hangs_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probes, "LIFETIME", 0.0)
+    exporter = Exporter("link")
+    port = exporter.serve((HOST, 0))
+    with socket.create_connection((HOST, port), timeout=10) as client:
+        client.sendall(b"GET /metrics HT")
+        assert client.recv(100) == b""
+    exporter.close()
+
+
+def test_a_closed_exporter_frees_its_port(served: tuple[Exporter, int]) -> None:
+    exporter, port = served
+    exporter.close()
+    other = Exporter("link")
+    assert other.serve((HOST, port)) == port
+    other.close()

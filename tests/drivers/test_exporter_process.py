@@ -1,0 +1,145 @@
+"""Metrics and routes of the real processes: contradicting flags, ports taken, a flight watched."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.config.load import dump, load_experiment
+
+LISTEN = ["--listen", "127.0.0.1:7499"]
+
+
+@pytest.mark.parametrize("flags", [[], ["--peer", "127.0.0.1:1", "--route", "route"]])
+@pytest.mark.parametrize("end", ["world", "cloud"])
+def test_an_end_has_a_peer_or_a_route(
+    end: str, flags: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([end, "--config", "any.yaml", *LISTEN, *flags]) == 2
+    assert "--peer" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("end", ["world", "cloud"])
+def test_a_metrics_port_that_is_taken_ends_in_one_sentence(
+    end: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        flags = ["--peer", "127.0.0.1:1", "--metrics", f"127.0.0.1:{port}"]
+        assert main([end, "--config", "any.yaml", *LISTEN, *flags]) == 3
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 1
+    assert errors[0].startswith(f"cloudrc: error: metrics port {port} is taken: ")
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports that are free both for UDP and for TCP, on 127.0.0.1."""
+    held = []
+    while len(held) < 2 * count:
+        udp, tcp = socket.socket(type=socket.SOCK_DGRAM), socket.socket()
+        udp.bind(("127.0.0.1", 0))
+        tcp.bind(("127.0.0.1", udp.getsockname()[1]))
+        held += [udp, tcp]
+    ports = [each.getsockname()[1] for each in held[::2]]
+    for each in held:
+        each.close()
+    return ports
+
+
+class Pods:
+    """World and cloud, joined by two route files, each with its metrics."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        experiment = load_experiment("hover", ["mission.waypoints.0.dwell_s=60"])
+        (folder / "experiment.yaml").write_text(dump(experiment))
+        ports = free_ports(4)
+        self.tunnel = {"world": ports[0], "cloud": ports[1]}
+        self.metrics = {"world": ports[2], "cloud": ports[3]}
+        self.processes = {end: self.start(end) for end in ("world", "cloud")}
+
+    def start(self, end: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "cloudrc", end]
+        command += ["--config", str(self.folder / "experiment.yaml")]
+        command += ["--listen", f"127.0.0.1:{self.tunnel[end]}"]
+        command += ["--route", str(self.folder / f"{end}.route")]
+        command += ["--metrics", f"127.0.0.1:{self.metrics[end]}"]
+        with (self.folder / f"{end}.log").open("wb") as log:
+            return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
+
+    def route(self, end: str, port: int) -> None:
+        draft = self.folder / "draft"
+        draft.write_text(f"127.0.0.1:{port}\n")
+        draft.replace(self.folder / f"{end}.route")
+
+    def get(self, end: str, path: str) -> tuple[int, str]:
+        url = f"http://127.0.0.1:{self.metrics[end]}{path}"
+        try:
+            with urllib.request.urlopen(url, timeout=5) as answer:
+                return answer.status, answer.read().decode()
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, ""
+        except urllib.error.URLError:
+            return 0, ""
+
+    def wait(self, end: str, path: str, *wanted: str, status: int = 200, limit: float = 15) -> None:
+        until = time.monotonic() + limit
+        while True:
+            got, text = self.get(end, path)
+            if got == status and all(line in text for line in wanted):
+                return
+            assert time.monotonic() < until, (got, text, (self.folder / f"{end}.log").read_text())
+            time.sleep(0.05)
+
+    def stop(self) -> None:
+        for process in self.processes.values():
+            process.terminate()
+        for process in self.processes.values():
+            process.wait(5)
+
+
+@pytest.fixture
+def pods(tmp_path: Path) -> Iterator[Pods]:
+    made = Pods(tmp_path)
+    yield made
+    made.stop()
+
+
+@pytest.mark.process
+def test_ends_wait_for_their_route_follow_it_and_lose_readiness_without_a_peer(pods: Pods) -> None:
+    for end in pods.processes:
+        pods.wait(end, "/healthz")
+        assert pods.get(end, "/readyz")[0] == 503
+    pods.route("world", pods.tunnel["cloud"])
+    pods.route("cloud", pods.tunnel["world"])
+    for end in pods.processes:
+        pods.wait(end, "/readyz")
+    pods.wait("world", "/metrics", "cloudrc_guard_state 1.0", "cloudrc_real_time_factor ")
+    pods.wait("cloud", "/metrics", "cloudrc_mission_state 2.0", 'cloudrc_pid_output{axis="x"')
+    pods.route("world", 9)  # discard: cloud hears nothing any more, world still does
+    pods.wait("cloud", "/readyz", status=503)
+    assert pods.get("cloud", "/healthz")[0] == 200
+    pods.route("world", pods.tunnel["cloud"])
+    pods.wait("cloud", "/readyz")
+
+
+@pytest.mark.process
+def test_an_end_stops_in_order_within_two_seconds(pods: Pods) -> None:
+    for end, process in pods.processes.items():
+        pods.wait(end, "/healthz")
+        time.sleep(0.5)
+        process.send_signal(signal.SIGTERM)
+    asked = time.monotonic()
+    assert [process.wait(5) for process in pods.processes.values()] == [0, 0]
+    assert time.monotonic() - asked < 2.0

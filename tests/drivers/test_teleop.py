@@ -1,0 +1,177 @@
+"""Teleop beside cloud: Unix sockets that never block, and neighbours that come and go."""
+
+import threading
+import time
+
+import pytest
+
+from cloudrc.cloud.teleop.wire import decode, encode
+from cloudrc.drivers.teleop import EVENTS_KEPT, RemoteTeleop, serve_teleop
+from cloudrc.drivers.unix import UnixPeer
+from cloudrc.errors import BadInputError
+from cloudrc.messages import Setpoint
+from cloudrc.records import Fault, MissionEvent
+
+SECOND = 1_000_000_000
+POINT = Setpoint((1.0, 2.0, 3.0))
+
+
+def event(number):
+    return MissionEvent(number, "reached", number, "there")
+
+
+@pytest.fixture
+def peers(tmp_path):
+    paths = tmp_path / "a.sock", tmp_path / "b.sock"
+    pair = UnixPeer(*paths), UnixPeer(*reversed(paths))
+    yield pair
+    for peer in pair:
+        peer.close()
+
+
+def test_a_full_socket_drops_and_never_blocks(peers):
+    one, other = peers
+    for number in range(5000):
+        one.send(b"%d" % number)
+    assert one.unsent > 0
+    assert other.receive()[0] == b"0"
+
+
+def test_a_neighbour_that_is_away_or_new_is_no_error(peers, tmp_path):
+    one, other = peers
+    other.close()
+    assert not one.send(b"lost")
+    again = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
+    assert one.send(b"found")
+    assert again.receive() == [b"found"]
+    again.close()
+
+
+def test_a_path_that_is_too_long_is_named(tmp_path):
+    with pytest.raises(BadInputError, match="longer than 107 bytes"):
+        UnixPeer(tmp_path / ("x" * 120), tmp_path / "b")
+
+
+def remote(peer):
+    return RemoteTeleop(peer, encode, decode, 0)
+
+
+def test_cloud_says_once_that_teleop_is_silent_and_again_the_next_time(peers):
+    one, other = peers
+    teleop = remote(one)
+    for now_ns in range(0, 3 * SECOND, 10_000_000):
+        teleop.handle_deadline(now_ns)
+    (fault,) = teleop.take_outputs()
+    assert (type(fault), fault.code) == (Fault, "teleop_silent")
+    assert "last setpoint is kept" in fault.text
+    other.send(encode(POINT))
+    for now_ns in range(3 * SECOND, 6 * SECOND, 10_000_000):
+        teleop.handle_deadline(now_ns)
+    assert [type(output) for output in teleop.take_outputs()] == [Setpoint, Fault]
+
+
+def test_what_is_no_message_is_counted(peers):
+    one, other = peers
+    teleop = remote(one)
+    other.send(b"rubbish")
+    other.send(encode(POINT))
+    teleop.handle_deadline(0)
+    assert teleop.take_outputs() == [POINT]
+    assert teleop.malformed == 1
+
+
+class Machine:
+    """Says what it is given, and remembers what it sees."""
+
+    def __init__(self):
+        self.outputs, self.seen, self.deadlines = [], [], 0
+
+    def see(self, seen, now_ns):
+        self.seen.append(seen)
+
+    def handle_deadline(self, now_ns):
+        self.deadlines += 1
+
+    def take_outputs(self):
+        outputs, self.outputs = self.outputs, []
+        return outputs
+
+
+class Service:
+    """`serve_teleop` on a thread."""
+
+    def __init__(self, peer):
+        self.machine, self.told, self.calls = Machine(), [], []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(peer,))
+        self._thread.start()
+
+    def _run(self, peer):
+        serve_teleop(
+            self.machine,
+            peer,
+            encode,
+            decode,
+            calls=self._take,
+            tell=self.told.extend,
+            stop=self._stop.is_set,
+        )
+
+    def _take(self):
+        calls, self.calls = self.calls, []
+        return calls
+
+    def stop(self):
+        self._stop.set()
+        self._thread.join(1.0)
+        assert not self._thread.is_alive()
+
+
+def until(condition):
+    limit = time.monotonic() + 5.0
+    while not condition():
+        assert time.monotonic() < limit
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def service(peers):
+    running = Service(peers[0])
+    yield running
+    running.stop()
+
+
+def test_deadlines_calls_and_messages_meet_in_one_loop(peers, service):
+    instants = []
+    service.calls = [instants.append]
+    peers[1].send(b"rubbish")
+    peers[1].send(encode(POINT))
+    until(lambda: service.machine.deadlines > 3 and service.machine.seen and instants)
+    assert service.machine.seen == [POINT]
+
+
+def test_events_wait_for_a_cloud_that_is_away_and_keep_their_order(peers, service, tmp_path):
+    _, cloud = peers
+    cloud.close()
+    (tmp_path / "b.sock").unlink()
+    events = [event(number) for number in range(3)]
+    service.machine.outputs = [POINT, *events, Fault(0, "journal", "full")]
+    until(lambda: len(service.told) == 4)
+    back = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
+    received = []
+    until(lambda: received.extend(map(decode, back.receive())) or len(received) >= 3)
+    assert received == events  # a setpoint is repeated anyway, a fault is not cloud's
+    back.close()
+
+
+def test_what_waits_is_bounded(peers, service, tmp_path):
+    _, cloud = peers
+    cloud.close()
+    (tmp_path / "b.sock").unlink()
+    service.machine.outputs = [event(number) for number in range(EVENTS_KEPT + 50)]
+    until(lambda: len(service.told) == EVENTS_KEPT + 50)
+    back = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
+    received = []
+    until(lambda: received.extend(map(decode, back.receive())) or len(received) >= EVENTS_KEPT)
+    assert received[0] == event(50)
+    back.close()

@@ -1,0 +1,194 @@
+"""A release in a restricted namespace flies the paper's mission by a Job; who may look, may."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+from cost import Cost, cost_between, usage
+from kube import (
+    EXAMPLES,
+    TIMES,
+    JobEnd,
+    eventually,
+    fly,
+    job_end,
+    job_log,
+    kubectl,
+    metrics,
+    missions,
+    pod,
+    pods,
+    read,
+    value,
+)
+from neighbours import MONITORING, Prometheus, install_prometheus, stranger
+
+MISSION = "paper-mission"
+LIMIT_CPU = 0.200
+"""Of all containers of a release in flight [cores]. Source: issue "Numbers it must reach"."""
+LIMIT_MEMORY = 320 * 2**20
+"""Likewise [bytes]."""
+LIMIT_TIME = 360.0
+"""From `kind create cluster` to a Job that is Complete [s]."""
+
+
+@dataclass
+class FirstFlight:
+    """What was seen of the first mission and while it flew."""
+
+    paper: JobEnd
+    second: JobEnd
+    cost: Cost
+    opened: list[str]
+    knocks: float
+    own_knocks: float
+    seconds: float
+
+
+@pytest.fixture(scope="module")
+def prometheus(installed: None, prometheus_image: str) -> None:
+    install_prometheus(prometheus_image)
+    words = ["wait", "pod/prometheus", "--for=condition=Ready", "--timeout=60s"]
+    kubectl(f"--namespace={MONITORING}", *words)
+
+
+@pytest.fixture(scope="module")
+def first(prometheus: None) -> FirstFlight:
+    kubectl("apply", f"--filename={EXAMPLES / 'mission-paper.yaml'}")
+    eventually(lambda: "waypoint 1 of 7" in job_log(MISSION), "the mission flies", 60.0)
+    before = usage()
+    fly("second", [{"position_m": [0.5, 0.0, 0.7]}])
+    second = job_end("second", 30.0)
+    doors = {
+        "tcp": [(ip(component), port) for component, ports in DOORS.items() for port in ports],
+        "udp": [(ip("world"), 7400), (ip("cloud"), 7400)],
+    }
+    opened = stranger("stranger", doors)
+    knocks = malformed()
+    paper = job_end(MISSION)
+    seconds = time.monotonic() - TIMES["create"]
+    cost = cost_between(before, usage())
+    knock_from_the_cloud_pod()
+    return FirstFlight(paper, second, cost, opened, knocks, malformed(), seconds)
+
+
+DOORS = {"world": (9100, 9102), "cloud": (8080, 9100, 9101, 9102)}
+
+
+def ip(component: str) -> str:
+    return str(pod(component)["status"]["podIP"])
+
+
+def malformed() -> float:
+    """Datagrams that both ends could make nothing of."""
+    name, outcome = "cloudrc_datagrams_total", "malformed"
+    time.sleep(1.2)  # they are told once a second
+    return sum(value(metrics(end), name, outcome=outcome) for end in ("world", "cloud"))
+
+
+def knock_from_the_cloud_pod() -> None:
+    """Show that a knock would be heard: the cloud pod may send to the world's tunnel."""
+    code = (
+        "import socket; s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM);"
+        f" s.sendto(b'knock knock', ('{ip('world')}', 7400))"
+    )
+    kubectl("exec", pod("cloud")["metadata"]["name"], "-c", "cloud", "--", "python", "-c", code)
+
+
+def test_both_pods_run_as_restricted_as_the_namespace_asks(installed: None) -> None:
+    for component in ("world", "cloud"):
+        (one,) = pods(component)
+        spec = one["spec"]
+        assert spec["automountServiceAccountToken"] is False
+        for container in [*spec["initContainers"], *spec["containers"]]:
+            security = container["securityContext"]
+            assert security["readOnlyRootFilesystem"] is True
+            assert security["capabilities"] == {"drop": ["ALL"]}
+
+
+def test_the_papers_mission_ends_complete(first: FirstFlight, note: Callable[[str], None]) -> None:
+    note(f"from 'kind create cluster' to a Job that is Complete: {first.seconds:.0f} s")
+    assert (first.paper.condition, first.paper.exit_code) == ("Complete", 0), first.paper
+    assert first.seconds < LIMIT_TIME
+
+
+def test_every_waypoint_is_a_line_and_the_verdict_is_in_describe(first: FirstFlight) -> None:
+    for number in range(1, 8):
+        assert len(re.findall(rf"waypoint {number} of 7 reached", first.paper.log)) == 1
+    said = " ".join(first.paper.message.split())
+    assert "touched" in said or "success" in said.lower()
+    described = kubectl("describe", f"--selector=batch.kubernetes.io/job-name={MISSION}", "pod")
+    assert first.paper.message.splitlines()[0] in described
+
+
+def test_a_second_mission_is_refused_with_the_id_of_the_first(first: FirstFlight) -> None:
+    assert first.second.condition == "Failed"
+    assert first.second.exit_code != 0
+    assert re.search(rf"\b{missions()[0]['id']}\b", first.second.message), first.second.message
+
+
+def test_a_stranger_reaches_neither_tunnel_nor_metrics_nor_api(first: FirstFlight) -> None:
+    assert first.opened == []
+    assert first.knocks == 0
+    assert first.own_knocks >= 1, "a knock that gets through is counted"
+
+
+@pytest.fixture(scope="module")
+def asked(first: FirstFlight) -> Iterator[Callable[[str], list[dict[str, Any]]]]:
+    with Prometheus() as one:
+        yield one.ask
+
+
+Ask = Callable[[str], list[dict[str, Any]]]
+
+
+def test_prometheus_finds_both_pods(asked: Ask) -> None:
+    up = {
+        sample["metric"]["component"]: sample["value"][1]
+        for sample in asked("max by (component) (up)")
+    }
+    assert up == {"world": "1", "cloud": "1"}
+
+
+@pytest.mark.parametrize(
+    ("query", "series", "low", "high"),
+    [
+        ("max_over_time(max by (axis) (abs(cloudrc_prediction_error_meters))[2m:2s])", 3, 0, 0.5),
+        ("max_over_time(max by (axis, term) (abs(cloudrc_pid_output))[2m:2s])", 9, 0, 6.0),
+        (
+            "sum(cloudrc_uplink_delay_seconds_sum) / sum(cloudrc_uplink_delay_seconds_count)",
+            1,
+            0.04,
+            0.05,
+        ),
+        (
+            "sum(cloudrc_downlink_delay_seconds_sum) / sum(cloudrc_downlink_delay_seconds_count)",
+            1,
+            0.04,
+            0.05,
+        ),
+        ("sum(cloudrc_rtt_seconds_sum) / sum(cloudrc_rtt_seconds_count)", 1, 0.05, 0.1),
+        ("min(min_over_time(cloudrc_real_time_factor[1m]))", 1, 0.95, 1.05),
+    ],
+    ids=["prediction error", "PID terms", "uplink", "downlink", "rtt", "real time"],
+)
+def test_prometheus_answers(asked: Ask, query: str, series: int, low: float, high: float) -> None:
+    answers = [float(sample["value"][1]) for sample in asked(query)]
+    assert len(answers) == series
+    assert all(math.isfinite(a) and low <= a <= high for a in answers), answers
+
+
+def test_a_release_is_cheap(first: FirstFlight, note: Callable[[str], None]) -> None:
+    cost = first.cost
+    note(f"one release in flight: {cost.cpu * 1000:.0f}m CPU, {cost.memory / 2**20:.0f} MiB")
+    for name, (cpu, memory) in sorted(cost.containers.items()):
+        note(f"  {name:<14} {cpu * 1000:4.0f}m CPU  {memory / 2**20:4.0f} MiB")
+    assert cost.cpu <= LIMIT_CPU
+    assert cost.memory <= LIMIT_MEMORY
+    assert read("pods")["items"]

@@ -1,0 +1,122 @@
+"""The link is what its profile says, changes in flight, and changes nothing else."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from kube import (
+    CHART,
+    NAME,
+    NAMESPACE,
+    cloudrc,
+    eventually,
+    fly,
+    helm,
+    identity,
+    job_end,
+    job_log,
+    kubectl,
+    metrics,
+    pod,
+    read,
+    value,
+)
+
+TOLERANCE = 0.002
+"""Of a mean one-way delay [s]. Source: issue, "Numbers it must reach"."""
+MEANS = {"paper-p1": 0.020, "paper-p3": 0.070, "paper-p2": 0.045}
+"""Profile -> mean delay of each direction [s]; the last one is what the release began with."""
+MEASURED = {"paper-p1": 8.0, "paper-p2": 10.0, "paper-p3": 20.0}
+"""Profile -> time over which its delay is measured [s]: jitter alone lets a mean of 100 datagrams a
+second stray by 0.2, 0.5 and 0.5 ms."""
+SETTLE = 1.0
+"""What was sent under the old profile has arrived after it [s]."""
+INTERRUPTED = 130
+"""Exit code of a mission that was cancelled."""
+DIRECTIONS = {"uplink": ("cloud", "world"), "downlink": ("world", "cloud")}
+"""Direction -> who measures it, whose link container shapes it."""
+LONG = [
+    {"position_m": [0.5, 0.0, 0.7]},
+    {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
+]
+"""Up, and then waiting for longer than anything here takes."""
+
+
+@pytest.fixture(scope="module")
+def flight(installed: None) -> Iterator[None]:
+    """A mission that is in the air while the profiles change, and is cancelled after them."""
+    before = identity()
+    fly("long", LONG, limit=300.0)
+    eventually(lambda: "waypoint 1 of" in job_log("long"), "the robot is in the air", 60.0)
+    yield
+    assert read("job", "long")["status"].get("active") == 1, "it flies still"
+    assert identity() == before, "a profile's change must not restart anything"
+    done = cloudrc("mission", "cancel", "long", "-n", NAMESPACE, "--release", NAME)
+    assert done.returncode == 0, done.stderr
+    end = job_end("long", 30.0)
+    assert (end.condition, end.exit_code) == ("Failed", INTERRUPTED), end
+
+
+def counts(direction: str) -> tuple[float, float]:
+    """Sum [s] and number of the one-way delays that were measured so far."""
+    samples = metrics(DIRECTIONS[direction][0])
+    name = f"cloudrc_{direction}_delay_seconds"
+    return value(samples, f"{name}_sum"), value(samples, f"{name}_count")
+
+
+def change_profile(name: str) -> None:
+    before = {component: changes(component) for component in ("world", "cloud")}
+    helm("upgrade", NAME, str(CHART), "--reuse-values", f"--set=link.profile={name}")
+    # The kubelet looks at its volumes about once a minute; a change of the pod makes it look now.
+    for component in ("world", "cloud"):
+        one = pod(component)["metadata"]["name"]
+        kubectl("annotate", "pod", one, "--overwrite", f"cloudrc-e2e/profile={name}")
+    for component, number in before.items():
+        eventually(
+            lambda c=component, n=number: changes(c) > n, f"{component}'s link follows", 90.0
+        )
+
+
+def changes(component: str) -> int:
+    """How often a pod's link has taken a new profile over."""
+    return kubectl("logs", pod(component)["metadata"]["name"], "-c", "link").count("in force")
+
+
+@pytest.mark.parametrize("profile", MEANS)
+def test_both_delays_are_the_profiles_within_two_milliseconds(
+    flight: None, profile: str, note: Callable[[str], None]
+) -> None:
+    change_profile(profile)
+    time.sleep(SETTLE)
+    before = {direction: counts(direction) for direction in DIRECTIONS}
+    time.sleep(MEASURED[profile])
+    for direction, (total, number) in before.items():
+        later_total, later_number = counts(direction)
+        assert later_number - number > 50 * MEASURED[profile], "datagrams arrive all the time"
+        mean = (later_total - total) / (later_number - number)
+        note(f"{profile} {direction}: {mean * 1e3:.2f} ms, wanted {MEANS[profile] * 1e3:.0f} ms")
+        assert abs(mean - MEANS[profile]) < TOLERANCE
+
+
+def objects() -> dict[str, int]:
+    """Every object of the release with the generation or version that a change would raise."""
+    kinds = "deployment,service,configmap,networkpolicy,secret,serviceaccount,pvc"
+    found = read(kinds, f"--selector=app.kubernetes.io/instance={NAME}")["items"]
+    return {
+        f"{one['kind']}/{one['metadata']['name']}": one["metadata"].get("generation")
+        or one["metadata"]["resourceVersion"]
+        for one in found
+    }
+
+
+def test_an_upgrade_with_the_same_values_changes_nothing(installed: None, values: Path) -> None:
+    line = ["upgrade", NAME, str(CHART), f"--values={values}"]
+    helm(*line)
+    before, pods = objects(), identity()
+    helm(*line)
+    assert objects() == before
+    time.sleep(2.0)
+    assert identity() == pods

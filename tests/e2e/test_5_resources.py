@@ -1,0 +1,67 @@
+"""Limits as emulation: they constrain, it shows, and a run not in real time says so."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from kube import CHART, EXAMPLES, NAME, NAMESPACE, cloudrc, helm, metrics, value
+
+PLACE = ["-n", NAMESPACE, "--release", NAME]
+SHORT = ["--set", "mission.waypoints.0.dwell_s=6"]
+"""Over `hover`: long enough to be throttled, short enough for a suite."""
+
+
+@pytest.fixture
+def with_values(installed: None, values: Path) -> Iterator[Callable[[str], None]]:
+    def upgrade(name: str) -> None:
+        file = EXAMPLES / f"values-{name}.yaml"
+        helm("upgrade", NAME, str(CHART), f"--values={values}", f"--values={file}")
+        # Not waited for: 'cloudrc run' keeps these values, lays its experiment over them and waits.
+
+    yield upgrade
+    helm("upgrade", NAME, str(CHART), f"--values={values}")
+
+
+def flown(folder: Path) -> tuple[int, dict]:
+    done = cloudrc("run", "hover", *SHORT, "--mode", "cluster", *PLACE, "--out", str(folder))
+    assert (folder / "report.json").is_file(), done.stdout + done.stderr
+    return done.returncode, json.loads((folder / "report.json").read_text())
+
+
+def throttled(component: str) -> float:
+    return value(metrics(component), "cloudrc_cpu_throttled_seconds_total")
+
+
+@pytest.mark.parametrize(
+    ("name", "component"), [("constrained-drone", "world"), ("loaded-cloud", "cloud")]
+)
+def test_a_constrained_part_is_throttled_and_still_keeps_real_time(
+    with_values: Callable[[str], None],
+    tmp_path: Path,
+    note: Callable[[str], None],
+    name: str,
+    component: str,
+) -> None:
+    with_values(name)
+    code, report = flown(tmp_path / name)
+    assert (code, report["verdict"]) == (0, "success"), report
+    numbers = {key: entry["value"] for key, entry in report["numbers"].items()}
+    note(
+        f"{name}: throttled {throttled(component):.2f} s,"
+        f" lateness p99 {numbers[f'{component}_lateness_p99'] * 1e3:.1f} ms,"
+        f" prediction error {numbers['prediction_error_rms'] * 1e3:.1f} mm,"
+        f" real-time factor {numbers['real_time_factor']:.3f}"
+    )
+    assert throttled(component) > 0
+    assert numbers["real_time_factor"] >= 0.95
+
+
+def test_a_world_that_cannot_keep_up_says_invalid(
+    with_values: Callable[[str], None], tmp_path: Path
+) -> None:
+    with_values("invalid")
+    code, report = flown(tmp_path / "invalid")
+    assert (code, report["verdict"]) == (6, "invalid")

@@ -1,0 +1,104 @@
+"""What can be wrong with a cluster ends in one sentence, with the code that belongs to it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from kube import CHART, NAMESPACE, ROOT, cloudrc, command
+from neighbours import apply_anywhere
+
+ELSEWHERE = f"{NAMESPACE}-bad"
+
+
+@pytest.fixture(scope="module")
+def namespace(cluster: None) -> Iterator[str]:
+    """A namespace that allows everything, for releases that are not meant to work."""
+    apply_anywhere([{"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": ELSEWHERE}}])
+    yield ELSEWHERE
+    command("kubectl", "delete", "namespace", ELSEWHERE, "--wait=false")
+
+
+def refusal(release: str, *settings: str) -> tuple[int, str]:
+    """Install with helm, then let our own command say what is wrong."""
+    command("helm", "install", release, CHART, f"-n={ELSEWHERE}", *settings)
+    line = ["run", "hover", "--mode", "cluster", "-n", ELSEWHERE, "--release", release]
+    try:
+        done = cloudrc(*line, "--timeout", "60")
+    finally:
+        command("helm", "uninstall", release, f"-n={ELSEWHERE}")
+    (said,) = [each for each in done.stderr.splitlines() if each.startswith("cloudrc: error:")]
+    assert "Traceback" not in done.stderr
+    return done.returncode, said
+
+
+def test_an_image_that_is_not_loaded_is_named(namespace: str) -> None:
+    code, line = refusal("no-image", "--set=image.tag=0.0.0-missing")
+    assert code == 5
+    assert "cloudrc/world:0.0.0-missing" in line or "cloudrc/cloud:0.0.0-missing" in line
+    assert "make kind-load" in line
+
+
+def test_strict_netem_without_the_kernels_is_refused_with_both_ways_out(namespace: str) -> None:
+    if has_netem():
+        pytest.skip("this kernel has sch_netem")
+    code, line = refusal("no-netem", "--set=link.mode=netem")
+    assert code == 5
+    assert "sch_netem" in line
+    assert "relay" in line
+
+
+def has_netem() -> bool:
+    nodes = command("kubectl", "get", "nodes", "--output=jsonpath={.items[0].metadata.name}")
+    probe = "ip link add probe0 type dummy && tc qdisc add dev probe0 root netem delay 1ms"
+    done = subprocess.run(["docker", "exec", nodes, "sh", "-c", probe], capture_output=True)
+    subprocess.run(["docker", "exec", nodes, "ip", "link", "delete", "probe0"], capture_output=True)
+    return done.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["--set=secret.existingSecret=mine"], "no Secret 'mine'"),
+        (["--set=link.mdoe=relay"], "mdoe"),
+        (["--set=link.profile=no-such"], "no-such"),
+    ],
+    ids=["missing Secret", "unknown value", "unknown profile"],
+)
+def test_helm_itself_refuses_what_cannot_work(
+    namespace: str, settings: list[str], words: str
+) -> None:
+    with pytest.raises(AssertionError, match=words):
+        command("helm", "install", "refused", CHART, f"-n={ELSEWHERE}", *settings)
+
+
+def test_without_permission_one_sentence_says_so(namespace: str, tmp_path: Path) -> None:
+    environ = {**os.environ, "KUBECONFIG": str(powerless(tmp_path))}
+    words = ["mission", "list", "-n", ELSEWHERE, "--release", "bad"]
+    done = subprocess.run(
+        [sys.executable, "-m", "cloudrc", *words],
+        env=environ,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert done.returncode == 5
+    assert "forbidden" in done.stderr
+    assert "kubectl auth can-i" in done.stderr
+
+
+def powerless(folder: Path) -> Path:
+    """A kubeconfig of a service account that may do nothing."""
+    account = {"name": "powerless", "namespace": ELSEWHERE}
+    apply_anywhere([{"apiVersion": "v1", "kind": "ServiceAccount", "metadata": account}])
+    token = command("kubectl", "create", "token", "powerless", f"-n={ELSEWHERE}").strip()
+    config = yaml.safe_load(command("kubectl", "config", "view", "--raw", "--minify"))
+    config["users"][0]["user"] = {"token": token}
+    path = folder / "kubeconfig"
+    path.write_text(yaml.safe_dump(config))
+    return path

@@ -1,0 +1,104 @@
+"""Errors of predictions and delay estimates: worked by hand, and against the truth of a flight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import pytest
+from control_periods import MS, period
+from flying import records
+
+from cloudrc.config.load import load_experiment
+from cloudrc.exposition.judge import DelayJudge, PredictionJudge
+from cloudrc.exposition.live import Live
+from cloudrc.records import CommandApplied, Control
+
+
+def flying_along_x(predicted_lead: float, *, every_ms: int = 10) -> Iterator[Control]:
+    """1 m/s along x, seen every 10 ms, predicted 25 ms ahead with an error of `predicted_lead`."""
+    for at in range(0, 400, every_ms):
+        x = at * 1e-3
+        predicted = (x + 0.025 + predicted_lead, 0.0, 0.0)
+        yield period(7000 + at, at, measured=(x, 0.0, 0.0), position=predicted, horizon=0.025)
+
+
+def test_a_prediction_is_held_to_the_measurement_of_its_instant() -> None:
+    judge = PredictionJudge()
+    for control in flying_along_x(0.01):
+        judge.take(control)
+    assert judge.error == pytest.approx((0.01, 0.0, 0.0))
+    assert judge.judged == 37  # the last three wait for what is measured 25 ms later
+    assert judge.square == pytest.approx(37 * 0.01**2)
+
+
+def test_a_right_prediction_has_no_error_between_two_measurements() -> None:
+    judge = PredictionJudge()
+    for control in flying_along_x(0.0):
+        judge.take(control)
+    assert judge.square == pytest.approx(0.0, abs=1e-18)
+
+
+def test_nothing_is_judged_across_a_gap() -> None:
+    judge = PredictionJudge()
+    for control in flying_along_x(0.01, every_ms=60):
+        judge.take(control)
+    assert judge.judged == 0
+    assert math.isnan(judge.error[0])
+
+
+def test_nothing_is_judged_across_sessions() -> None:
+    judge = PredictionJudge()
+    judge.take(period(0, 0, horizon=0.01, position=(9.0, 9.0, 9.0)))
+    judge.reset()
+    judge.take(period(10, 5))
+    judge.take(period(20, 15))
+    assert judge.square == 0.0
+
+
+def test_odometry_that_goes_back_is_not_measured() -> None:
+    judge = PredictionJudge()
+    for basis in (0, 10, 5, 20, 15, 30):
+        x = basis * 1e-3
+        judge.take(
+            period(basis, basis, measured=(x, 0, 0), position=(x + 0.01, 0, 0), horizon=0.01)
+        )
+    assert judge.square == pytest.approx(0.0, abs=1e-18)
+    assert judge.judged >= 3
+
+
+def test_a_delay_estimate_is_held_to_the_time_that_passed() -> None:
+    judge = DelayJudge()
+    judge.sent(period(1000, 500, horizon=0.08))  # odometry of 500 ms becomes a command
+    # Applied at 600 ms of world's clock: 100 ms after that odometry. Echoed 3 ms later.
+    judge.echoed(period(1150, 603, loop_delay=0.145, rtt=0.142), 1145 * MS)
+    assert judge.error == pytest.approx(-0.02)
+
+
+def test_an_echo_of_nobody_knows_what_is_not_judged() -> None:
+    judge = DelayJudge()
+    judge.sent(period(1000, 500, horizon=0.08))
+    judge.echoed(period(1150, 603, loop_delay=0.144, rtt=0.141), 1145 * MS)
+    assert math.isnan(judge.error)
+
+
+@pytest.mark.parametrize("offset_ns", [0, 5_000_000_000])
+def test_errors_of_a_flight_are_those_that_the_truth_gives(offset_ns: int) -> None:
+    experiment = load_experiment("hover", ["link.profile=paper-p2"])
+    world, cloud = records(experiment, offset_ns=offset_ns)
+    controls = {(c.epoch, c.counter): c for c in cloud if isinstance(c, Control)}
+    truth = set()
+    for applied in world:
+        if isinstance(applied, CommandApplied):
+            passed_ns = applied.stamp_ns - applied.basis_stamp_ns
+            control = controls[applied.epoch, applied.counter]
+            truth.add(round((control.horizon - passed_ns * 1e-9) * 1e6))
+    live, seen = Live("cloud"), set()
+    for record in cloud:
+        live.see([record])
+        error = live.read().get("cloudrc_delay_estimate_error_seconds")
+        if isinstance(record, Control) and error:
+            assert isinstance(error, dict)
+            seen.add(round(error[()] * 1e6))
+    assert len(seen) > 100
+    assert len(seen - truth) <= 0.01 * len(seen), "to the microsecond, but for rounding"

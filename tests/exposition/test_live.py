@@ -1,0 +1,221 @@
+"""What a process exposes: histograms and counts of a flight, readiness, mission, absent values."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from control_periods import MS, period
+from flying import records
+
+from cloudrc.config.load import load_experiment
+from cloudrc.exposition import labels
+from cloudrc.exposition.histogram import Histogram
+from cloudrc.exposition.live import Live
+from cloudrc.messages import ZERO, GuardState
+from cloudrc.records import (
+    Arrival,
+    Contact,
+    Counted,
+    GuardChange,
+    Lateness,
+    MissionEvent,
+    Record,
+    SessionOpened,
+)
+
+Flight = tuple[list[Record], list[Record]]
+
+
+def value(live: Live, name: str, *label_values: str) -> float:
+    reading = live.read()[name]
+    assert isinstance(reading, dict)
+    return reading[label_values]
+
+
+def histogram(live: Live, name: str) -> Histogram:
+    reading = live.read()[name]
+    assert isinstance(reading, Histogram)
+    return reading
+
+
+def wake(at_ms: float, *, slip_ms: float = 0.0, lateness: float = 1e-4) -> Lateness:
+    return Lateness(round((at_ms - slip_ms) * MS), "world", lateness, 2e-4, round(slip_ms * MS))
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return records(load_experiment("hover", ["link.profile=paper-p2"]))
+
+
+def test_a_value_is_counted_up_to_its_bound_and_no_further() -> None:
+    values = Histogram((0.01, 0.1))
+    for each in (0.005, 0.01, 0.0101, 5.0):
+        values.observe(each)
+    assert values.cumulative() == [2, 3, 4]
+    assert values.total == pytest.approx(5.0251)
+
+
+@pytest.mark.parametrize(("role", "index"), [("world", 0), ("cloud", 1)])
+def test_one_way_delays_are_those_that_arrived(flight: Flight, role: str, index: int) -> None:
+    live = Live(role)
+    live.see(flight[index])
+    delays = [r.delay for r in flight[index] if isinstance(r, Arrival)]
+    name = "cloudrc_downlink_delay_seconds" if role == "world" else "cloudrc_uplink_delay_seconds"
+    assert histogram(live, name).cumulative()[-1] == len(delays)
+    assert histogram(live, name).total == pytest.approx(sum(delays))
+    age = histogram(live, "cloudrc_age_of_information_seconds")
+    assert min(delays) < age.total / age.cumulative()[-1] < 2 * max(delays)
+
+
+def test_without_a_shared_clock_one_way_delays_are_absent() -> None:
+    experiment = load_experiment("hover", ["link.profile=paper-p1"])
+    both = records(experiment, offset_ns=7_000_000_000)
+    for role, of_end in zip(labels.ENDS, both, strict=True):
+        live = Live(role)
+        live.see(of_end)
+        assert not any("_age_" in name or "link_delay" in name for name in live.read())
+    assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] > 100  # needs no shared clock
+
+
+def test_a_round_trip_is_counted_once_per_echo() -> None:
+    live = Live("cloud")
+    for k, rtt in enumerate((math.nan, 0.04, 0.04, 0.04, 0.05)):
+        live.see([period(10 * k, 10 * k, rtt=rtt, loop_delay=rtt + 0.005)])
+    assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] == 2
+    assert histogram(live, "cloudrc_loop_delay_seconds").total == pytest.approx(0.1)
+
+
+def test_errors_and_terms_are_signed_and_by_axis() -> None:
+    live = Live("cloud")
+    live.see(
+        [
+            period(
+                0,
+                0,
+                setpoint=(1.0, 2.0, 3.0),
+                measured=(0.0, 2.5, 3.0),
+                derivative=(0.0, 0.0, -0.7),
+            )
+        ]
+    )
+    assert value(live, "cloudrc_tracking_error_meters", "x") == 1.0
+    assert value(live, "cloudrc_tracking_error_meters", "y") == -0.5
+    assert value(live, "cloudrc_pid_output", "z", "derivative") == -0.7
+    assert live.read()["cloudrc_prediction_error_meters"] == {}  # nothing judged yet
+
+
+def test_counts_become_datagrams_of_their_direction() -> None:
+    live = Live("world")
+    for name, total in (("sent", 7), ("late", 2), ("late", 3), ("stalls", 1), ("unheard_of", 9)):
+        live.see([Counted(0, "world", name, total)])
+    assert value(live, "cloudrc_datagrams_total", "uplink", "sent") == 7
+    assert value(live, "cloudrc_datagrams_total", "downlink", "late") == 3
+    assert value(live, "cloudrc_datagrams_total", "downlink", "used") == 0
+    assert value(live, "cloudrc_world_stalls_total") == 1
+
+
+def test_guard_and_contacts_are_counted() -> None:
+    live = Live("world")
+    assert value(live, "cloudrc_guard_state") == GuardState.GROUND
+    live.see(
+        [GuardChange(0, GuardState.TRACK, "mission started"), GuardChange(1, GuardState.HOLD, "")]
+    )
+    live.see(
+        [
+            Contact(0, body, ZERO, ZERO, ZERO, True)
+            for body in ("board", "pipe_1", "pipe_3", "chair")
+        ]
+    )
+    assert value(live, "cloudrc_guard_state") == GuardState.HOLD
+    assert value(live, "cloudrc_guard_transitions_total", "hold") == 1
+    contacts = live.read()["cloudrc_contacts_total"]
+    assert isinstance(contacts, dict)
+    assert {name for (name,), count in contacts.items() if count} == {"board", "pipe", "other"}
+    assert contacts["pipe",] == 2
+
+
+def test_the_real_time_factor_is_that_of_the_last_ten_seconds() -> None:
+    live = Live("world")
+    live.see([wake(0)])
+    assert "cloudrc_real_time_factor" not in live.read()
+    live.see([wake(10 * k) for k in range(1, 500)])
+    assert value(live, "cloudrc_real_time_factor") == pytest.approx(1.0)
+    # From 5 s on it loses 1 ms in 10 ms: after 20 s everything before is forgotten.
+    live.see([wake(10 * k, slip_ms=k - 500) for k in range(500, 2000)])
+    assert value(live, "cloudrc_real_time_factor") == pytest.approx(0.9)
+    assert value(live, "cloudrc_world_slip_seconds_total") == pytest.approx(1.499)
+
+
+def test_period_and_lateness_of_the_loop() -> None:
+    live = Live("world")
+    live.see([wake(0), wake(10), wake(30, slip_ms=5, lateness=0.01)])
+    period_ = histogram(live, "cloudrc_loop_period_seconds")
+    assert (period_.total, period_.cumulative()[-1]) == (pytest.approx(0.03), 2)
+    assert histogram(live, "cloudrc_loop_lateness_seconds").total == pytest.approx(0.0102)
+    assert value(live, "cloudrc_loop_busy_seconds_total") == pytest.approx(6e-4)
+
+
+def heard(role: str, *seen: Record) -> bool:
+    live = Live(role)
+    live.see(seen)
+    assert live.end is not None
+    return live.end.has_peer
+
+
+@pytest.mark.parametrize("role", labels.ENDS)
+def test_an_end_has_a_peer_while_it_hears_it(role: str) -> None:
+    opened = SessionOpened(0, role, 1, "")
+    arrival = Arrival(1000 * MS, role == "cloud", 1, 0, math.nan, True)
+    assert not heard(role)
+    assert not heard(role, wake(0))
+    assert heard(role, opened, wake(10))
+    assert heard(role, opened, arrival, wake(2900))
+    assert not heard(role, opened, arrival, wake(3100))
+    again = SessionOpened(5000 * MS, role, 2, "")
+    assert heard(role, opened, arrival, again, wake(5010))
+
+
+def test_world_waits_for_the_first_command_of_a_cloud_that_has_none_yet() -> None:
+    assert heard("world", SessionOpened(0, "world", 1, ""), wake(60_000))
+    assert not heard("cloud", SessionOpened(0, "cloud", 1, ""), wake(60_000))
+
+
+def test_the_mission_is_told_by_its_events() -> None:
+    live = Live("teleop")
+    seen = []
+    for event, waypoint in (
+        ("started", 0),
+        ("reached", 0),
+        ("held", 1),
+        ("goto", -1),
+        ("resumed", 1),
+        ("reached", 1),
+        ("done", 1),
+        ("goto", -1),
+        ("started", 0),
+        ("leg_timed_out", 0),
+    ):
+        live.see([MissionEvent(0, event, waypoint, "")])
+        state = labels.MISSION_STATES[int(value(live, "cloudrc_mission_state"))]
+        seen.append((state, value(live, "cloudrc_mission_waypoint")))
+    assert seen == [
+        ("flying", 0),
+        ("flying", 1),
+        ("held", 1),
+        ("held", 1),
+        ("flying", 1),
+        ("flying", 2),
+        ("done", -1),
+        ("starting", -1),
+        ("flying", 0),
+        ("failed", -1),
+    ]
+    assert value(live, "cloudrc_waypoints_reached_total") == 2
+    assert value(live, "cloudrc_missions_total", "done") == 1
+    assert value(live, "cloudrc_missions_total", "leg_timed_out") == 1
+
+
+def test_a_cloud_whose_mission_is_elsewhere_exposes_none() -> None:
+    assert not any("mission" in name for name in Live("cloud").read())
+    assert "cloudrc_mission_state" in Live("teleop").read()

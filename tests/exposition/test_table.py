@@ -1,0 +1,96 @@
+"""The table of metrics: names by the rules, closed labels, everything counted is in it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cloud.teleop.messages import State
+from cloudrc.exposition import labels
+from cloudrc.exposition.document import QUERIES, page
+from cloudrc.exposition.metric import Kind, Metric
+from cloudrc.exposition.table import METRICS, of_role
+from cloudrc.messages import GuardState
+
+ROOT = Path(__file__).resolve().parents[2]
+UNITS = ("seconds", "meters", "newtons", "meters_per_second", "radians_per_second")
+NOT_DATAGRAMS = {"stalls", "missed_periods", "horizon_clamped"}
+
+
+@pytest.mark.parametrize("metric", METRICS.values(), ids=lambda metric: metric.name)
+def test_a_metric_keeps_the_rules(metric: Metric) -> None:
+    assert re.fullmatch(r"cloudrc(_[a-z]+)+", metric.name)
+    assert metric.name.endswith("_total") == (metric.kind is Kind.COUNTER)
+    assert metric.meaning.endswith(".")
+    assert set(metric.roles) <= set(labels.ROLES)
+    assert bool(metric.buckets) == (metric.kind is Kind.HISTOGRAM)
+    assert list(metric.buckets) == sorted(metric.buckets)
+    for name, values in metric.labels.items():
+        assert values or name == "version", "a label has a closed set of values"
+
+
+def test_delays_are_resolved_from_5_ms_to_1_s() -> None:
+    assert (labels.DELAY_BUCKETS[0], labels.DELAY_BUCKETS[-1]) == (0.005, 1.0)
+
+
+def test_the_names_that_others_build_on_are_there() -> None:
+    wanted = {
+        "cloudrc_rtt_seconds": (),
+        "cloudrc_uplink_delay_seconds": (),
+        "cloudrc_downlink_delay_seconds": (),
+        "cloudrc_delay_estimate_seconds": (),
+        "cloudrc_prediction_error_meters": ("axis",),
+        "cloudrc_pid_output": ("axis", "term"),
+        "cloudrc_guard_state": (),
+        "cloudrc_datagrams_total": ("direction", "outcome"),
+        "cloudrc_real_time_factor": (),
+        "cloudrc_link_info": ("shaper", "direction", "mode"),
+        "cloudrc_build_info": ("version", "role"),
+    }
+    assert {name: tuple(METRICS[name].labels) for name in wanted} == wanted
+
+
+def test_states_are_numbered_as_their_enumerations() -> None:
+    assert tuple(state.name.lower() for state in GuardState) == labels.GUARD_STATES
+    assert tuple(state.name.lower() for state in State) == labels.MISSION_STATES
+
+
+def test_the_shipped_bodies_are_known() -> None:
+    scenes = (ROOT / "cloudrc" / "world" / "scenes").glob("*.xml")
+    bodies = {
+        name for scene in scenes for name in re.findall(r'<body name="(\w+)"', scene.read_text())
+    }
+    assert bodies
+    assert {body.rstrip("_0123456789") for body in bodies} <= set(labels.BODIES)
+
+
+def test_whatever_the_ends_count_is_a_metric() -> None:
+    found: set[str] = set()
+    for part in ("world", "cloud", "tunnel"):
+        for path in (ROOT / "cloudrc" / part).rglob("*.py"):
+            text = path.read_text()
+            found.update(re.findall(r'counts\["(\w+)"\]', text))
+            found.update(re.findall(r'DecodeError\("(\w+)"\)', text))
+            if path.name == "guard.py":
+                found.update(re.findall(r'return "(\w+)"', text))
+    assert {"sent", "malformed", "old_epoch", "stale", "missed_periods"} <= found
+    assert found - set(labels.OUTCOMES) - NOT_DATAGRAMS == set()
+
+
+def test_every_role_has_the_metrics_of_a_process() -> None:
+    for role in labels.ROLES:
+        names = {metric.name for metric in of_role(role)}
+        assert {"cloudrc_build_info", "cloudrc_cpu_throttled_seconds_total"} <= names
+
+
+def test_the_page_is_what_make_docs_writes() -> None:
+    assert (ROOT / "docs" / "metrics.md").read_text() == page(), "run: make docs"
+
+
+def test_the_page_names_every_metric_and_its_queries_name_no_other() -> None:
+    assert all(f"`{name}`" in page() for name in METRICS)
+    for query in QUERIES.values():
+        for name in re.findall(r"cloudrc_\w+", query):
+            assert re.sub(r"(?<!_total)_(bucket|sum|count)$", "", name) in METRICS

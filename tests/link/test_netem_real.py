@@ -1,0 +1,232 @@
+"""netem in the kernel: asked, applied and measured between two network namespaces."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import netem_laboratory as lab
+import numpy as np
+import pytest
+from netem_laboratory import Flow
+
+from cloudrc.assembly import link_profile
+from cloudrc.config.load import load_profile
+from cloudrc.config.shipped import names
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.link.netem import Netem
+from cloudrc.link.netem_tables import STRETCH, table, write_tables
+from cloudrc.link.netem_text import check
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
+
+LATE = 0.4
+"""How late a step may be where starting `tc` takes a tenth of a second [s]."""
+Distribution = Literal["uniform", "normal", "pareto"]
+pytestmark = pytest.mark.netem
+WITHIN = 0.002
+"""Of medians: a slow virtual machine now and then stands still, which means would show [s]."""
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    folder = tmp_path_factory.mktemp("tc")
+    write_tables(folder)
+    try:
+        with lab.laboratory():
+            yield folder
+    except lab.UnableError as error:
+        pytest.exit(f"netem cannot be tested here: {error}", MissingPrerequisiteError.exit_code)
+
+
+@pytest.fixture
+def shaped(tables: Path) -> Iterator[Netem]:
+    """netem without conditions, in force."""
+    netem = lab.netem(tables, DirectionProfile())
+    assert netem.follow_peer(lab.PEER) == lab.PEER
+    yield netem
+    netem.close()
+
+
+def measure(count: int, period: float = 0.01) -> Flow:
+    flow = Flow()
+    flow.send(count, period)
+    return flow.settle()
+
+
+def told(words: str, **values: float) -> None:
+    """Print a number for those who watch with -s."""
+    print(words, {name: round(value, 5) for name, value in values.items()})
+
+
+def least(error: Callable[[], float], enough: float) -> float:
+    """The least of up to three errors: a machine that stands still for a while spoils one."""
+    found = error()
+    for _ in range(2):
+        found = found if found < enough else min(found, error())
+    return found
+
+
+def test_the_delay_is_applied_to_the_tunnels_flow_alone(shaped: Netem) -> None:
+    shaped.follow_profile(DirectionProfile(delay=0.060))
+
+    def off() -> float:
+        tunnel, stranger = Flow(), Flow(port=7402)
+        tunnel.send(200, meanwhile=lambda: stranger.send(1, 0.0))
+        delay, other = np.median(tunnel.settle().delays()), np.median(stranger.settle().delays())
+        told("60 ms asked", tunnel=delay, other_port=other)
+        assert other < 0.020
+        return float(abs(delay - other - 0.060))
+
+    assert least(off, WITHIN) < WITHIN
+    assert min(lab.ping() for _ in range(10)) < 0.020
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "normal", "pareto"])
+def test_jitter_is_distributed_as_asked(shaped: Netem, distribution: Distribution) -> None:
+    profile = DirectionProfile(delay=0.080, jitter=0.020)
+    shaped.follow_profile(replace(profile, distribution="normal"))
+    shaped.follow_profile(replace(profile, distribution=distribution))
+    shares = [0.05, 0.25, 0.5, 0.75, 0.95]
+    unit = 0.020 * STRETCH[distribution] / 8192
+    asked = 0.080 + unit * np.quantile(table(distribution), shares)
+
+    def off() -> float:
+        delays = measure(800, 0.004).delays()
+        error = np.abs(np.quantile(delays, shares) - asked).max()
+        told(distribution, mean=delays.mean(), deviation=delays.std(), quantile_off=error)
+        return float(error)
+
+    assert least(off, 0.006) < 0.006
+
+
+def test_losses_are_as_many_as_asked_and_counted(shaped: Netem) -> None:
+    shaped.follow_profile(DirectionProfile(loss=0.2))
+    flow = measure(1500, 0.002)
+    counts = shaped.counts()
+    told("loss 0.2 asked", measured=1 - len(flow.arrived) / 1500)
+    assert counts["forwarded"] == len(flow.arrived)
+    assert counts["forwarded"] + counts["lost"] == 1500
+    assert counts["lost"] / 1500 == pytest.approx(0.2, abs=5 * (0.2 * 0.8 / 1500) ** 0.5)
+
+
+def test_losses_come_in_bursts(shaped: Netem) -> None:
+    shaped.follow_profile(DirectionProfile(loss=GilbertElliott(0.05, 0.25)))
+    flow = measure(2000, 0.002)
+    lost = sorted(set(range(2000)) - set(flow.numbers()))
+    bursts = 1 + sum(after - before > 1 for before, after in pairwise(lost))
+    told("gemodel", loss=len(lost) / 2000, burst=len(lost) / bursts)
+    assert len(lost) / 2000 == pytest.approx(1 / 6, abs=0.07)
+    assert 2.5 < len(lost) / bursts < 6.5
+
+
+def test_a_change_in_flight_loses_nothing(shaped: Netem) -> None:
+    asked = [DirectionProfile(delay) for delay in (0.3, 0.02, 0.15, 0.05, 0.2)]
+    asked[2] = replace(asked[2], jitter=0.02, distribution="normal")
+    asked[3] = replace(asked[3], rate=2e6)
+    flow = Flow()
+    for profile in asked:
+        flow.send(60, 0.005)
+        shaped.follow_profile(profile)
+    flow.send(60, 0.005)
+    assert sorted(flow.settle().numbers()) == list(range(360))
+    assert flow.delays()[:30].max() < 0.050
+    assert np.median(flow.delays()[-30:]) == pytest.approx(0.2, abs=0.010)
+    assert shaped.counts()["lost"] == 0
+
+
+def test_the_order_is_kept_where_asked(shaped: Netem) -> None:
+    profile = DirectionProfile(delay=0.040, jitter=0.030)
+    for keep_order in (False, True, False):
+        shaped.follow_profile(replace(profile, keep_order=keep_order))
+        numbers = measure(300, 0.003).numbers()
+        assert (numbers == sorted(numbers)) is keep_order
+        assert len(numbers) == 300
+
+
+def test_a_bottleneck_has_its_rate(shaped: Netem) -> None:
+    shaped.follow_profile(DirectionProfile(rate=400e3, queue_packets=1000))
+    flow = Flow()
+    flow.send(100, 0.0)
+    flow.settle()
+    took = (flow.arrived[-1][1] - flow.arrived[0][1]) * 1e-9
+    told("400 kbit/s asked", measured=99 * 200 * 8 / took)  # 172 bytes and 28 of headers
+    assert 99 * 200 * 8 / took == pytest.approx(400e3, rel=0.03)
+
+
+def test_duplicates_and_packets_that_overtake(shaped: Netem) -> None:
+    shaped.follow_profile(DirectionProfile(delay=0.050, duplicate=0.3))
+    numbers = measure(500, 0.003).numbers()
+    assert (len(numbers) - 500) / 500 == pytest.approx(0.3, abs=0.11)
+    shaped.follow_profile(DirectionProfile(delay=0.050, reorder=0.3))
+    early = (measure(500, 0.003).delays() < 0.030).mean()
+    assert early == pytest.approx(0.3, abs=0.11)
+
+
+def test_a_time_line_is_stepped(tables: Path) -> None:
+    profile = DirectionProfile(
+        delay=0.02, changes=(Change(2.5, delay=0.1),), blackouts=(Blackout(3.5, 0.3),)
+    )
+    origin_ns = time.monotonic_ns() + 5_000_000_000  # by then it is set up
+    begun_ns = origin_ns + time.time_ns() - time.monotonic_ns()
+    netem, flow = lab.netem(tables, profile, origin_ns), Flow()
+    netem.follow_peer(lab.PEER)
+    while time.monotonic_ns() < origin_ns + 4_500_000_000:
+        flow.send(1, 0.01, meanwhile=lambda: netem.step(0.0))
+    netem.close()
+    flow.settle()
+    since = {n: (at_ns - begun_ns) * 1e-9 for n, at_ns in enumerate(flow.sent_ns)}
+    delays = dict(zip(flow.numbers(), flow.delays(), strict=True))
+    before = [delays[n] for n in delays if since[n] < 2.45]
+    after = [delays[n] for n in delays if since[n] > 2.5 + LATE]
+    lost = [since[n] for n in since if n not in delays and since[n] < 4.2]
+    told("step", before=np.median(before), after=np.median(after), dark=max(lost) - min(lost))
+    assert np.median(before) == pytest.approx(0.02, abs=0.005)
+    assert np.median(after) == pytest.approx(0.1, abs=0.005)
+    assert min(lost) == pytest.approx(3.5, abs=LATE)
+    assert max(lost) == pytest.approx(3.8, abs=LATE)
+
+
+def test_it_is_set_up_once_and_removed_without_a_trace(tables: Path) -> None:
+    before = lab.qdiscs()
+    first = lab.netem(tables, DirectionProfile(0.02))
+    first.follow_peer(("10.79.0.9", 7400))  # killed here: its qdiscs stay
+    left = lab.qdiscs()
+    second = lab.netem(tables, DirectionProfile(0.05))
+    for peer in (lab.PEER, lab.PEER, ("10.79.0.7", 7400), lab.PEER):
+        second.follow_peer(peer)
+    assert lab.qdiscs().count("netem") == left.count("netem") == 1
+    filters = lab.sh("tc", "-n", lab.NEAR, "filter", "show", "dev", lab.DEVICE, "parent", "7400:")
+    assert filters.count("flowid 7400:4") == 1
+    assert np.median(measure(50).delays()) == pytest.approx(0.05, abs=0.01)
+    second.close()
+    second.close()
+    assert lab.qdiscs() == before
+
+
+def test_a_qdisc_of_somebody_else_is_left_alone(tables: Path) -> None:
+    place = ("tc", "-n", lab.NEAR, "qdisc")
+    lab.sh(*place, "add", "dev", lab.DEVICE, "root", "handle", "1:", "prio")
+    before = lab.qdiscs()
+    with pytest.raises(MissingPrerequisiteError, match=r"wire has a qdisc already \(prio 1:\)"):
+        lab.netem(tables, DirectionProfile(0.02)).follow_peer(lab.PEER)
+    assert lab.qdiscs() == before
+    lab.sh(*place, "del", "dev", lab.DEVICE, "root")
+
+
+@pytest.mark.parametrize("name", names("profile"))
+def test_tc_takes_every_shipped_profile_that_is_not_refused(shaped: Netem, name: str) -> None:
+    profile = link_profile(load_profile(name).uplink)
+    try:
+        check(profile)
+    except BadInputError:
+        assert name == "lossy"
+        return
+    shaped.follow_profile(profile)
+    listed = json.loads(lab.sh("tc", "-n", lab.NEAR, "-j", "qdisc", "show", "dev", lab.DEVICE))
+    options = next(one["options"] for one in listed if one["kind"] == "netem")
+    assert options.get("delay", {"delay": 0})["delay"] == pytest.approx(profile.delay)

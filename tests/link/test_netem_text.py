@@ -1,0 +1,144 @@
+"""What netem is asked for: a profile in tc's words, its tables, and what is refused by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cloudrc.assembly import link_profile
+from cloudrc.config.load import load_profile
+from cloudrc.config.shipped import names
+from cloudrc.errors import BadInputError
+from cloudrc.link.draws import Purpose, stream_key
+from cloudrc.link.fates import shape
+from cloudrc.link.netem_tables import ENTRIES, STRETCH, table, write_tables
+from cloudrc.link.netem_text import check, notes, options
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
+from cloudrc.link.timeline import Timeline
+
+
+def text(profile: DirectionProfile, at: float = 0.0) -> str:
+    check(profile)
+    return " ".join(options(profile, Timeline(profile).at(round(at * 1e9))))
+
+
+def test_nothing_asked_takes_everything_back() -> None:
+    assert text(DirectionProfile()) == (
+        "limit 10000 delay 0.000us loss random 0% duplicate 0% rate 0bit"
+    )
+
+
+def test_everything_that_netem_has_is_named() -> None:
+    profile = DirectionProfile(
+        delay=0.045, jitter=0.0255, distribution="normal", correlation=0.25, loss=0.015,
+        duplicate=0.02, reorder=0.1,
+    )  # fmt: skip
+    assert text(profile) == (
+        "limit 10000 delay 45000.000us 25500.000us 25% distribution normal "
+        "loss random 1.5% duplicate 2% reorder 10% rate 0bit"
+    )
+
+
+def test_a_pareto_jitter_is_stretched_as_its_table_is_squeezed() -> None:
+    words = text(DirectionProfile(delay=0.045, jitter=0.002, distribution="pareto"))
+    assert "delay 45000.000us 8000.000us 0% distribution pareto" in words
+
+
+def test_bursts_are_tcs_gemodel() -> None:
+    profile = DirectionProfile(loss=GilbertElliott(0.01, 0.1, 0.6, 0.005))
+    assert "loss gemodel 1% 10% 60% 0.5%" in text(profile)
+
+
+def test_the_limit_holds_the_queue_and_what_is_under_way() -> None:
+    profile = DirectionProfile(delay=0.3, rate=2e6, queue_packets=100)
+    assert text(profile).startswith("limit 475 ")  # 100 + 0.3 s * 2 Mbit/s / 1600 bit
+    assert text(profile).endswith("rate 2000000bit -14")
+
+
+def test_a_rate_keeps_the_order_and_reorder_is_undone() -> None:
+    words = text(DirectionProfile(delay=0.04, jitter=0.03, reorder=0.2, keep_order=True))
+    assert words.endswith("rate 100gbit")
+    assert "reorder" not in words
+
+
+def test_reorder_without_a_delay_is_left_out_since_tc_refuses_it() -> None:
+    assert "reorder" not in text(DirectionProfile(reorder=0.2))
+
+
+def test_changes_and_blackouts_are_steps() -> None:
+    profile = DirectionProfile(
+        delay=0.02, changes=(Change(1.0, delay=0.1, loss=0.5),), blackouts=(Blackout(2.0, 0.3),)
+    )
+    assert "delay 20000.000us loss random 0%" in text(profile, 0.99)
+    assert "delay 100000.000us loss random 50%" in text(profile, 1.0)
+    assert "delay 100000.000us loss random 100%" in text(profile, 2.1)
+    assert "delay 100000.000us loss random 50%" in text(profile, 2.3)
+
+
+BURSTS = GilbertElliott(0.1, 0.5, delay_bad=0.04)
+
+
+@pytest.mark.parametrize(
+    ("profile", "key"),
+    [
+        (DirectionProfile(trace=Trace((0.0,), (0.1,))), "trace"),
+        (DirectionProfile(loss=BURSTS), "loss.delay_bad_ms"),
+        (DirectionProfile(changes=(Change(1.0, loss=BURSTS),)), "loss.delay_bad_ms"),
+        (DirectionProfile(jitter=0.01, rate=1e6), "without keep_order"),
+        (DirectionProfile(rate=1e6, changes=(Change(1.0, jitter=0.1),)), "without keep_order"),
+        (DirectionProfile(blackouts=(Blackout(1.0, 0.01),)), "10 ms at 1 s"),
+        (DirectionProfile(changes=(Change(1.0), Change(1.005))), "less than 20 ms apart"),
+    ],
+)
+def test_what_netem_cannot_do_is_refused_by_its_name(profile: DirectionProfile, key: str) -> None:
+    with pytest.raises(BadInputError, match=r"netem cannot do .*; set link\.mode=relay") as refused:
+        check(profile)
+    assert key in str(refused.value)
+
+
+def test_what_netem_does_otherwise_is_said() -> None:
+    profile = DirectionProfile(0.1, 0.01, correlation=0.3)
+    assert notes(profile) == ["netem realises next to nothing of correlation 0.3"]
+    assert notes(replace(profile, correlation=0.0)) == []
+
+
+@pytest.mark.parametrize("name", names("profile"))
+def test_of_the_shipped_profiles_only_lossy_needs_the_relay(name: str) -> None:
+    profile = link_profile(load_profile(name).downlink)
+    if name == "lossy":
+        with pytest.raises(BadInputError, match="delay_bad_ms"):
+            check(profile)
+    else:
+        assert text(profile)
+
+
+@pytest.mark.parametrize("distribution", sorted(STRETCH))
+def test_tables_are_the_models_distributions(distribution: str) -> None:
+    entries = np.array(table(distribution))
+    assert len(entries) == ENTRIES <= 16_384
+    assert np.abs(entries).max() < 2**15
+    profile = DirectionProfile(jitter=1.0, distribution=distribution)  # type: ignore[arg-type]
+    key = stream_key(1, True, 1, 3)
+    drawn = np.concatenate([shape(key, Purpose.DELAY, block, profile) for block in range(80)])
+    unit = STRETCH[distribution] / 8192
+    assert entries.mean() * unit == pytest.approx(0.0, abs=0.001)
+    assert entries.std() * unit == pytest.approx(
+        3**-0.5 if distribution == "uniform" else 1.0, rel=1e-3
+    )
+    shares = np.linspace(0.02, 0.9, 25)
+    assert np.quantile(entries * unit, shares) == pytest.approx(
+        np.quantile(drawn, shares), abs=0.06
+    )
+
+
+def test_tables_are_written_as_tc_reads_them(tmp_path: Path) -> None:
+    write_tables(tmp_path)
+    assert sorted(file.name for file in tmp_path.iterdir()) == [
+        "normal.dist", "pareto.dist", "uniform.dist",
+    ]  # fmt: skip
+    first, *rows = (tmp_path / "normal.dist").read_text().splitlines()
+    assert first.startswith("#")
+    assert [int(word) for row in rows for word in row.split()] == table("normal")
