@@ -10,6 +10,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -44,15 +45,16 @@ def test_a_metrics_port_that_is_taken_ends_in_one_sentence(
 
 def free_ports(count: int) -> list[int]:
     """Ports that are free both for UDP and for TCP, on 127.0.0.1."""
-    held = []
-    while len(held) < 2 * count:
-        udp, tcp = socket.socket(type=socket.SOCK_DGRAM), socket.socket()
-        udp.bind(("127.0.0.1", 0))
-        tcp.bind(("127.0.0.1", udp.getsockname()[1]))
-        held += [udp, tcp]
-    ports = [each.getsockname()[1] for each in held[::2]]
-    for each in held:
-        each.close()
+    ports: list[int] = []
+    with ExitStack() as held:
+        while len(ports) < count:
+            udp, tcp = socket.socket(type=socket.SOCK_DGRAM), socket.socket()
+            held.callback(udp.close)
+            held.callback(tcp.close)
+            udp.bind(("127.0.0.1", 0))
+            with suppress(OSError):  # free for UDP, but somebody's TCP connection has just used it
+                tcp.bind(udp.getsockname())
+                ports.append(udp.getsockname()[1])
     return ports
 
 
