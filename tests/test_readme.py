@@ -43,7 +43,9 @@ def execute(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     if words[0] == "cloudrc":
         words = [sys.executable, "-m", *words]
     where = ROOT if words[0] == "make" else folder
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
+    # A make inside make says which folder it enters and leaves.
+    plain = {key: value for key, value in os.environ.items() if not key.startswith("MAKE")}
+    environment = {**plain, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
     return subprocess.run(words, cwd=where, capture_output=True, text=True, env=environment)
 
 
