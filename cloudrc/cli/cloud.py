@@ -26,6 +26,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Control."""
+    from cloudrc.drivers.process import StopSignal, run_end
+
+    stop = StopSignal()
     import os
     import time
 
@@ -33,7 +36,6 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.cloud.endpoint import CloudIdentity
     from cloudrc.config.load import load_experiment
     from cloudrc.drivers.machine import clock_id
-    from cloudrc.drivers.process import run_end
 
     exporter = open_exporter(options, "cloud")
     experiment, clock = load_experiment(str(options.config)), clock_id()
@@ -47,6 +49,7 @@ def execute(options: argparse.Namespace) -> int:
         peer,
         recorder,
         end="cloud",
+        stop=stop,
         over=lambda: cloud.mission_over,
         exporter=exporter,
         watched=options.feed,

@@ -15,13 +15,15 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Fly."""
+    from cloudrc.drivers.process import StopSignal, run_end
+
+    stop = StopSignal()
     import os
     import time
 
     from cloudrc import assembly
     from cloudrc.config.load import load_experiment
     from cloudrc.drivers.machine import clock_id
-    from cloudrc.drivers.process import run_end
     from cloudrc.world.endpoint import WorldIdentity
 
     exporter = open_exporter(options, "world")
@@ -35,6 +37,7 @@ def execute(options: argparse.Namespace) -> int:
         peer,
         recorder,
         end="world",
+        stop=stop,
         slip_ns=lambda: world.slip_ns,
         exporter=exporter,
         watched=options.feed,

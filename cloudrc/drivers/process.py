@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
 
 class StopSignal:
-    """True once the process shall end."""
+    """True once the process shall end.
+
+    To be made first of all: the first process of a container ignores SIGTERM until then.
+    """
 
     def __init__(self) -> None:
         """Take over SIGTERM and SIGINT, and remember who started this process."""
@@ -64,6 +67,7 @@ def run_end(
     recorder: Takes,
     *,
     end: str,
+    stop: StopSignal,
     over: Callable[[], bool] = lambda: False,
     slip_ns: Callable[[], int] = lambda: 0,
     exporter: Exporter | None = None,
@@ -76,6 +80,7 @@ def run_end(
         peer: Its socket.
         recorder: Where its records go.
         end: "world" or "cloud".
+        stop: Made before anything that takes its time, so that nobody asks in vain.
         over: Whether this end is done by itself.
         slip_ns: By how much world's clock lags [ns].
         exporter: Gets the records too, if they are to become metrics.
@@ -84,7 +89,7 @@ def run_end(
     Returns:
         True if it was done by itself, False if it was stopped.
     """
-    stop, feed, thread = StopSignal(), Feed.on_stdout(watched=watched), RecordingThread(recorder)
+    feed, thread = Feed.on_stdout(watched=watched), RecordingThread(recorder)
     trouble, dropped = "", 0
 
     def sink(records: list[Record]) -> None:

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import gc
+import os
+import signal
 import socket
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from cloudrc import assembly
 from cloudrc.cli.main import main
 from cloudrc.config.shipped import FOLDERS
 
 CONFIG = ["--config", str(FOLDERS["experiment"] / "hover.yaml")]
 FREE = "127.0.0.1:9"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+
+
+def free_port() -> str:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{probe.getsockname()[1]}"
 
 
 @pytest.fixture
@@ -38,3 +51,34 @@ def test_an_address_in_use_is_named_with_its_flag(
     said = capsys.readouterr().err
     assert said.startswith(f"cloudrc: error: {flag} {taken}: cannot receive there: Address already")
     assert said.endswith("; name an address of this machine and a port that is free\n")
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Give the signals back that a process of its own would keep."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    gc.unfreeze()
+
+
+# Here too a socket outlives the command.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.usefixtures("handlers")
+@pytest.mark.parametrize("end", ["world", "cloud"])
+def test_whoever_is_stopped_while_it_starts_leaves_a_whole_recording(
+    end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first process of a container ignores a signal that it does not handle yet."""
+    build = getattr(assembly, f"build_{end}")
+
+    def stopped(*arguments: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return build(*arguments)
+
+    monkeypatch.setattr(assembly, f"build_{end}", stopped)
+    record = tmp_path / "end.mcap"
+    free = [free_port(), "--peer", FREE, "--record", str(record)]
+    assert main([end, *CONFIG, "--listen", *free]) == 0
+    assert record.read_bytes().endswith(MCAP_MAGIC)
