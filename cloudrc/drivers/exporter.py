@@ -10,6 +10,7 @@ What `see` takes in is kept in plain numbers; Prometheus' text is made of them w
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
@@ -29,6 +30,8 @@ from cloudrc.records import Record
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 """What `generate_latest` writes."""
+STILL_MAX = 5.0
+"""A loop that has said nothing for so long stands still [s]; each says something every second."""
 
 
 class Exporter:
@@ -43,6 +46,7 @@ class Exporter:
         self._role, self._metrics = role, of_role(role)
         self._live = Live(role)
         self._said_ready = False
+        self._seen_at: float | None = None  # no loop is alive or dead before it has begun
         self._server: ProbeServer | None = None
         self._registry = CollectorRegistry()
         self._registry.register(self)
@@ -50,10 +54,12 @@ class Exporter:
 
     def see(self, records: Iterable[Record]) -> None:
         """Take in records of this process, oldest first; never waits."""
+        self._seen_at = time.monotonic()
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
         """Say whether this process is ready; world and cloud need not, their records tell."""
+        self._seen_at = time.monotonic()
         self._said_ready = ready
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
@@ -89,7 +95,7 @@ class Exporter:
         if isinstance(address, str):
             host, _, port = address.rpartition(":")
             address = host, int(port)
-        pages = {"/metrics": self._page, "/healthz": _alive, "/readyz": self._readiness}
+        pages = {"/metrics": self._page, "/healthz": self._liveness, "/readyz": self._readiness}
         self._server = ProbeServer(address, pages)
         return int(self._server.server_address[1])
 
@@ -129,9 +135,12 @@ class Exporter:
     def _readiness(self) -> Answer:
         return Answer(200, b"ready\n") if self.is_ready else Answer(503, b"no peer yet\n")
 
-
-def _alive() -> Answer:
-    return Answer(200, b"alive\n")
+    def _liveness(self) -> Answer:
+        """Whether this process' own loop moves; the link and the other end are no part of it."""
+        still = None if self._seen_at is None else time.monotonic() - self._seen_at
+        if still is None or still <= STILL_MAX:
+            return Answer(200, b"alive\n")
+        return Answer(503, f"the loop has stood still for {still:.0f} s\n".encode())
 
 
 def _family(metric: Metric, reading: dict[Labels, float] | Histogram) -> Family:

@@ -45,6 +45,19 @@ def test_metrics_and_probes_are_on_one_port(served: tuple[Exporter, int]) -> Non
     assert get(port, "/readyz")[0] == 503
 
 
+def test_a_loop_that_stands_still_is_not_alive(
+    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is not asked for while it starts, and what the other end does is no part of it."""
+    exporter, port = served
+    monkeypatch.setattr("cloudrc.drivers.exporter.STILL_MAX", -1.0)
+    assert get(port, "/healthz") == (200, "alive\n")
+    exporter.see([])
+    assert get(port, "/healthz") == (503, "the loop has stood still for 0 s\n")
+    monkeypatch.setattr("cloudrc.drivers.exporter.STILL_MAX", 60.0)
+    assert get(port, "/healthz") == (200, "alive\n")
+
+
 def test_another_path_says_which_there_are(served: tuple[Exporter, int]) -> None:
     assert get(served[1], "/") == (404, "there are /metrics, /healthz, /readyz\n")
 
