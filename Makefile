@@ -7,7 +7,7 @@ VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' cloudrc/__init__.py)
 # Put before the images' names, with a slash at its end: make images REGISTRY=ghcr.io/me/
 REGISTRY ?=
 CLUSTER ?= cloudrc
-IMAGES := world cloud prometheus
+IMAGES := world cloud
 SCRIPTS := .ci/run
 BUILD_ARGS := --build-arg VERSION=$(VERSION) \
 	--build-arg SOURCE=$(or $(filter https://%,$(shell git config remote.origin.url)),unpublished) \
@@ -33,7 +33,8 @@ test: $(VENV)/dev ## run the default tests on all cores
 process: $(VENV)/dev ## run the tests that start processes and take real time
 	$(bin)/pytest -m 'process and not full'
 
-e2e: $(VENV)/dev ## fly on a kind cluster (KEEP=1 leaves it); needs Docker, kind, helm, kubectl
+# With KUBECONFIG set, the release goes into that cluster, and nothing is made or removed but ours.
+e2e: $(VENV)/dev ## fly on a kind cluster of its own, or that of KUBECONFIG (KEEP=1 leaves it)
 	$(bin)/pytest -m e2e tests/e2e $(if $(KEEP),--keep)
 
 test-netem: $(VENV)/dev ## run the tests of the kernel's netem; needs root and sch_netem

@@ -1,10 +1,21 @@
-"""What all tests share: the signals of a terminal, however the tests themselves were started."""
+"""What all tests share: the signals of a terminal, and that nothing is skipped in silence."""
 
 from __future__ import annotations
 
+import os
 import signal
+
+import pytest
 
 # A shell that starts the tests in the background lets them ignore Ctrl-C, and so would all the
 # processes that they start, though to end on Ctrl-C is what some of these are tested for.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Where REQUIRE_ALL is set, as in CI, a test that was skipped has failed."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if os.environ.get("REQUIRE_ALL") and reporter and reporter.stats.get("skipped"):
+        reporter.write_line("REQUIRE_ALL: tests were skipped; see -rs", red=True)
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED

@@ -19,6 +19,7 @@ from pydantic import BaseModel
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
+import chart_values  # noqa: E402
 from chart_kubernetes import Quantities, Resources  # noqa: E402
 from chart_values import ChartValues  # noqa: E402
 
@@ -79,12 +80,26 @@ def schema() -> dict[str, Any]:
     made = ChartValues.model_json_schema(by_alias=True)
     made = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc", **made}
     made["$defs"] = {name: _adapt(part) for name, part in made.pop("$defs").items()}
+    own = [name for name in made["$defs"] if _is_own(name)]
+    for part in (made, *(made["$defs"][name] for name in own)):
+        part["required"] = sorted({*part.get("required", ()), *_subparts(part)})
     plug_in = made["$defs"]["PlugIn"]
     plug_in["additionalProperties"] = {
         "description": "A parameter of the plug-in, in the unit that its `build` documents",
         "type": ["number", "string", "boolean", "array", "null"],
     }
     return dict(_adapt(made))
+
+
+def _is_own(name: str) -> bool:
+    """Whether a definition is a part of the values, neither Kubernetes' nor the experiment's."""
+    kind = getattr(chart_values, name, None)
+    return getattr(kind, "__module__", "") == chart_values.__name__
+
+
+def _subparts(part: dict[str, Any]) -> list[str]:
+    """Name what templates look into: whoever sets it to null is told so, not shown a template."""
+    return [key for key, value in part["properties"].items() if "$ref" in value]
 
 
 def _adapt(part: Any) -> Any:

@@ -14,6 +14,7 @@ from pydantic import Field
 from cloudrc.config.schema import Experiment, Mission, Profile
 
 Seconds = Annotated[int, Field(ge=0)]
+ObjectName = Annotated[str, Field(pattern=r"^$|^[a-z]([-a-z0-9]*[a-z0-9])?$")]
 Name = Annotated[str, Field(pattern=r"^$|^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")]
 
 
@@ -62,7 +63,11 @@ class LinkContainer(Values):
         "followed in flight, nothing restarts. null: the experiment's own link",
     )
     traces: Texts = Field(
-        {}, description="CSV files (name: text) that a profile written here names as its trace"
+        {},
+        description="CSV files (name: text) that a profile written here names as its trace",
+        json_schema_extra={
+            "propertyNames": {"pattern": r"^[-._a-zA-Z0-9]+$", "not": {"const": "profile.yaml"}}
+        },
     )
     resources: Resources = resources("20m", "40Mi", "1", "96Mi")
 
@@ -74,7 +79,11 @@ class Placement(Values):
     tolerations: tuple[dict[str, Any], ...] = Field((), description="Kubernetes' tolerations")
     affinity: dict[str, Any] = Field({}, description="Kubernetes' affinity")
     pod_annotations: Texts = Field({}, description="More annotations of the pod")
-    pod_labels: Texts = Field({}, description="More labels of the pod")
+    pod_labels: Texts = Field(
+        {},
+        description="More labels of the pod; those of app.kubernetes.io are the chart's",
+        json_schema_extra={"propertyNames": {"not": {"pattern": r"^app\.kubernetes\.io/"}}},
+    )
 
 
 class WorldPod(Placement):
@@ -82,7 +91,7 @@ class WorldPod(Placement):
 
     resources: Resources = resources("60m", "96Mi", "1", "256Mi")
     recording_size_limit: Quantity = Field(
-        "1Gi", description="Room for the recording; the pod is evicted beyond it [bytes]"
+        "1Gi", description="Room for the recording, which ends at nine tenths of it [bytes]"
     )
 
 
@@ -101,7 +110,7 @@ class CloudPod(Placement):
 
     resources: Resources = resources("60m", "64Mi", "1", "192Mi")
     recording_size_limit: Quantity = Field(
-        "1Gi", description="Room for the recording; the pod is evicted beyond it [bytes]"
+        "1Gi", description="Room for the recording, which ends at nine tenths of it [bytes]"
     )
     background_load: BackgroundLoad = Field(BackgroundLoad(), description="CPU load beside it")
 
@@ -215,7 +224,9 @@ class ServiceAccount(Values):
 class ChartValues(Values):
     """Values of the chart cloudrc."""
 
-    fullname_override: Name = Field("", description="Put in place of RELEASE-cloudrc in all names")
+    fullname_override: ObjectName = Field(
+        "", description="Put in place of RELEASE-cloudrc in all names"
+    )
     image: Image = Field(Image(), description="Which images the pods run")
     experiment: Experiment = Field(
         Experiment(),

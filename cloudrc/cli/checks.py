@@ -6,20 +6,17 @@ import ctypes.util
 import importlib.metadata
 import os
 import platform
-import shutil
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from cloudrc.cli import checks_cluster
+from cloudrc.cli.check import CLUSTER, FLYING, Check
 from cloudrc.cli.extras import EXTRAS, missing
-
-FLYING = ("virtual", "local")
-CLUSTER = ("cluster",)
 
 # What a control loop of 10 ms can bear; a quiet desktop stays far below [s].
 LATE_SLEEP = 2e-3
@@ -28,35 +25,15 @@ STEP = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
     "mujoco.mj_step(m, mujoco.MjData(m)); print(mujoco.__version__)"
 )
-WHERE_TO_GET = {
-    "docker": "https://docs.docker.com/engine/install",
-    "kind": "https://kind.sigs.k8s.io",
-    "kubectl": "https://kubernetes.io/docs/tasks/tools",
-    "helm": "https://helm.sh/docs/intro/install",
-}
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One line of the doctor.
+def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Check]:
+    """Run every check, in the order in which they are shown.
 
-    Attributes:
-        name: What was looked at.
-        state: "ok"; "warn": it will fly, but see `fix`; "missing".
-        found: What is there, in words.
-        fix: What to do about it; empty if nothing.
-        modes: Modes that cannot run without it.
+    Args:
+        mode: That is wanted; a cluster is asked only if it is "cluster".
+        context: Of the kubeconfig; None for the current one.
     """
-
-    name: str
-    state: Literal["ok", "warn", "missing"]
-    found: str
-    fix: str = ""
-    modes: tuple[str, ...] = ()
-
-
-def all_checks() -> Iterator[Check]:
-    """Run every check, in the order in which they are shown."""
     yield python()
     for extra in EXTRAS:
         yield packages(extra)
@@ -65,8 +42,9 @@ def all_checks() -> Iterator[Check]:
     yield timer()
     yield cores()
     yield graphics()
-    for program in WHERE_TO_GET:
-        yield executable(program)
+    yield from checks_cluster.programs()
+    if mode in CLUSTER:
+        yield from checks_cluster.cluster(context)
     yield netem()
     yield cgroup()
 
@@ -81,7 +59,9 @@ def python() -> Check:
 
 def packages(extra: str) -> Check:
     """Check the packages of one extra."""
-    modes = {"world": FLYING, "record": FLYING, "report": FLYING, "kube": CLUSTER}.get(extra, ())
+    everywhere = (*FLYING, *CLUSTER)
+    wanted = {"world": FLYING, "record": everywhere, "report": everywhere, "kube": CLUSTER}
+    modes = wanted.get(extra, ())
     absent = missing(extra)
     if absent:
         fix = f"pip install 'cloudrc[{extra}]'"
@@ -154,14 +134,6 @@ def graphics() -> Check:
     return Check("graphics", "ok", ", ".join(found) if found else "no GL, and none is needed")
 
 
-def executable(program: str) -> Check:
-    """Look for a program that the cluster mode uses."""
-    path = shutil.which(program)
-    if path is None:
-        return Check(program, "missing", "not in PATH", WHERE_TO_GET[program], CLUSTER)
-    return Check(program, "ok", path, "", CLUSTER)
-
-
 def netem() -> Check:
     """Look for the kernel's network emulator; the userspace relay stands in for it."""
     release = platform.release()
@@ -175,11 +147,12 @@ def netem() -> Check:
 
 
 def cgroup() -> Check:
-    """Look for cgroup v2, which resource limits in a cluster rest on."""
+    """Look for control groups: what a CPU limit holds back is read from v1 and v2 alike."""
     if Path("/sys/fs/cgroup/cgroup.controllers").exists():
         return Check("cgroup", "ok", "v2")
-    old = Path("/sys/fs/cgroup").is_dir()
-    return Check("cgroup", "warn", "v1" if old else "none", "limits in a cluster want cgroup v2")
+    if Path("/sys/fs/cgroup").is_dir():
+        return Check("cgroup", "ok", "v1")
+    return Check("cgroup", "warn", "none", "the metrics of CPU limits stay empty on this machine")
 
 
 def _text(path: Path) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import end_arguments, open_exporter, open_peer, open_recorder
+from cloudrc.cli.ends import chosen, end_arguments, open_exporter, open_peer, open_recorder
 
 if TYPE_CHECKING:
     from cloudrc.cloud.endpoint import Operator
@@ -36,10 +36,11 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.cloud.endpoint import CloudIdentity
     from cloudrc.config.load import load_experiment
     from cloudrc.drivers.machine import clock_id
+    from cloudrc.messages import GuardState
 
     exporter = open_exporter(options, "cloud")
     experiment, clock = load_experiment(str(options.config)), clock_id()
-    recorder = open_recorder(options.record, "cloud", clock)
+    recorder = open_recorder(options, "cloud", clock)
     peer = open_peer(options)
     identity = CloudIdentity(clock, os.urandom(16))
     teleop = _join(options.teleop) if options.teleop else None
@@ -53,6 +54,7 @@ def execute(options: argparse.Namespace) -> int:
         over=lambda: cloud.mission_over,
         exporter=exporter,
         watched=options.feed,
+        choose=chosen(options, lambda: cloud.guard is GuardState.TRACK),
     )
     return 0
 

@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
+from cloudrc.cluster.access import DEFAULT_RELEASE
 
 if TYPE_CHECKING:
     from cloudrc.cluster.access import Release
@@ -22,7 +23,7 @@ def place_arguments(parser: argparse.ArgumentParser) -> None:
         "-n", "--namespace", metavar="NAME", help="namespace (default: the context's, or default)"
     )
     group.add_argument(
-        "--release", default="cloudrc", metavar="NAME", help="Helm release (default: cloudrc)"
+        "--release", metavar="NAME", help=f"Helm release (default: {DEFAULT_RELEASE})"
     )
 
 
@@ -46,7 +47,7 @@ def place(options: argparse.Namespace) -> Release:
     require("a cluster", ("kube",))
     from cloudrc.cluster.access import connect
 
-    return connect(options.context, options.namespace, options.release)
+    return connect(options.context, options.namespace, options.release or DEFAULT_RELEASE)
 
 
 def _seconds(text: str) -> float:

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 Tell = Callable[[str], None]
 
-GRACE = 120.0
-"""What a Job may last beyond its mission's limit: pods have to start [s]."""
 FLUSH = 1.0
 """After which a recorder has handed its last half second to the operating system [s]."""
 FETCHES = 4
@@ -42,7 +40,8 @@ def fly_in_cluster(
 
     Args:
         experiment: Complete and checked.
-        folder: Empty; gets configuration, recordings, metrics, logs and report.
+        folder: Empty, and so until the mission has flown; then it gets configuration, recordings,
+            metrics, logs and report.
         release: Where to fly; it is installed if it is not there, and stays.
         timeout: For the release to become ready [s].
         tell: Gets a line for people now and then.
@@ -51,13 +50,13 @@ def fly_in_cluster(
         What report.json holds.
 
     Raises:
-        CloudrcError: If the mission could not be flown.
+        CloudrcError: If the mission could not be flown, or another one is under way there.
     """
     from cloudrc.cluster.chart import chart_folder
     from cloudrc.cluster.deploy import current_values, install
     from cloudrc.config.load import dump
 
-    (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+    _refuse_busy(release)
     began = time.monotonic()
     given = values(experiment, current_values(release))
     install(release, chart_folder(), given, timeout=timeout, tell=tell)
@@ -69,7 +68,8 @@ def fly_in_cluster(
         _fly(experiment, release, tell)
     except KeyboardInterrupt:
         interrupted = True
-    mission = fetch_all(release, folder, want_end=not interrupted)
+    (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+    mission = fetch_all(release, folder, tell, want_end=not interrupted)
     return _report(experiment, folder, mission, interrupted)
 
 
@@ -81,7 +81,24 @@ def values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[st
         before: What the release was installed with.
     """
     link = {**before.get("link", {}), "profile": ""}
-    return {**before, "link": link, "experiment": experiment.model_dump(mode="json")}
+    # The chart's own Job would fly its mission in the way of ours.
+    mission = {**before.get("mission", {}), "enabled": False}
+    flown = experiment.model_dump(mode="json")
+    return {**before, "link": link, "mission": mission, "experiment": flown}
+
+
+def _refuse_busy(release: Release) -> None:
+    """Refuse to end somebody's flight: installing another experiment replaces both pods."""
+    from cloudrc.cluster.cancel import under_way
+    from cloudrc.cluster.errors import ClusterError
+
+    found, job = under_way(release)
+    if found:
+        end = " ".join(["cloudrc mission cancel", *filter(None, [job]), *release.cloudrc_flags])
+        raise ClusterError(
+            f"{found} is under way on release '{release.name}' {release.where}; wait for it, "
+            f"end it: {end}, or fly on a release of your own: --release NAME"
+        )
 
 
 def mission_document(experiment: ResolvedExperiment) -> dict[str, Any]:
@@ -124,13 +141,14 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
     """Fly by a Job; interrupted, the mission is cancelled before this function ends."""
     from cloudrc.cluster.errors import ClusterError
-    from cloudrc.cluster.jobs import follow, run_job
+    from cloudrc.cluster.follow import follow, patience
+    from cloudrc.cluster.jobs import run_job
 
     limit = experiment.criteria.time_limit_s
     job = run_job(release, mission_document(experiment), limit=limit)
     tell(f"Job {job.name} flies {experiment.name}")
     try:
-        ended = follow(release, job.name, tell, timeout=limit + GRACE)
+        ended = follow(release, job.name, tell, timeout=patience(limit, False))
     except KeyboardInterrupt:
         _cancel(release, job, tell)
         raise
@@ -147,31 +165,55 @@ def _cancel(release: Release, job: JobStatus, tell: Tell) -> None:
         tell(f"not cancelled: {error}")
 
 
-def fetch_all(release: Release, folder: Path, *, want_end: bool) -> Mission:
+def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Mission:
     """Fetch recordings, metrics and logs, and merge the recordings.
 
     Args:
         release: Where it flew.
         folder: Of the run.
+        tell: Gets a line for what could not be fetched.
         want_end: Whether to fetch again until the mission's end is in the recordings.
+
+    Raises:
+        CloudrcError: If the recordings cannot be fetched; without the rest there is a report.
     """
-    from cloudrc.cluster.fetch import fetch_logs, fetch_metrics, fetch_recording
+    from cloudrc.cluster.fetch import fetch_logs, fetch_metrics
     from cloudrc.record.cut import cut_to_last_mission
     from cloudrc.record.merge import merge
 
     for _ in range(FETCHES):
         time.sleep(FLUSH)
-        for component in COMPONENTS:
-            fetch_recording(release, component, folder / f"{component}.mcap")
+        _fetch_recordings(release, folder, tell)
         mission, ended = cut_to_last_mission(merge(folder / "world.mcap", folder / "cloud.mcap"))
         if ended or not want_end:
             break
     for component in COMPONENTS:
-        for container, text in fetch_metrics(release, component).items():
-            (folder / f"{component}-{container}.metrics").write_text(text, encoding="utf-8")
-        for container, text in fetch_logs(release, component).items():
-            (folder / f"{component}-{container}.log").write_text(text, encoding="utf-8")
+        for fetch, suffix in ((fetch_metrics, "metrics"), (fetch_logs, "log")):
+            try:
+                texts = fetch(release, component)
+            except CloudrcError as error:
+                tell(f"the report goes without the {component} pod's {suffix}: {error}")
+                continue
+            for container, text in texts.items():
+                path = folder / f"{component}-{container}.{suffix}"
+                path.write_text(text, encoding="utf-8")
     return mission
+
+
+def _fetch_recordings(release: Release, folder: Path, tell: Tell) -> None:
+    """Copy both recordings; a way that breaks off is tried again."""
+    from cloudrc.cluster.fetch import fetch_recording
+
+    for component in COMPONENTS:
+        for left in reversed(range(FETCHES)):
+            try:
+                fetch_recording(release, component, folder / f"{component}.mcap")
+                break
+            except CloudrcError as error:
+                if not left:
+                    raise
+                tell(f"{error}; trying again")
+                time.sleep(FLUSH)
 
 
 def shaper(folder: Path) -> str:

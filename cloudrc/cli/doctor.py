@@ -6,7 +6,8 @@ import argparse
 import json
 from dataclasses import asdict
 
-from cloudrc.cli.checks import Check, all_checks
+from cloudrc.cli.check import Check
+from cloudrc.cli.checks import all_checks
 from cloudrc.cli.output import paint, table
 from cloudrc.errors import MissingPrerequisiteError
 
@@ -21,6 +22,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         default="local",
         help="the mode that you want to fly in (default: local)",
     )
+    parser.add_argument("--context", metavar="NAME", help="of the cluster (default: current)")
     parser.add_argument(
         "-o", "--output", choices=("table", "json"), default="table", help="default: table"
     )
@@ -28,7 +30,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Print all checks; exit 3 if the wanted mode cannot run."""
-    checks = list(all_checks())
+    checks = list(all_checks(options.mode, options.context))
     blocking = [c.name for c in checks if c.state == "missing" and options.mode in c.modes]
     if options.output == "json":
         print(_json(options.mode, checks, blocking))

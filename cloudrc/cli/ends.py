@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.drivers.realtime import Peer
     from cloudrc.record.recorder import Recorder
+    from cloudrc.records import Record
 
 Address = tuple[str, int]
 EPILOG = """\
@@ -42,6 +44,17 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
     process_arguments(parser)
     parser.add_argument("--record", type=Path, metavar="FILE", help="MCAP file to write")
     parser.add_argument(
+        "--record-flights",
+        action="store_true",
+        help="leave out what comes periodically while nothing flies",
+    )
+    parser.add_argument(
+        "--record-max",
+        type=size,
+        metavar="SIZE",
+        help="end the recording at nine tenths of this: 500M, 1Gi (default: no limit)",
+    )
+    parser.add_argument(
         "--listen", type=address, required=True, metavar="HOST:PORT", help="where to receive"
     )
     target = parser.add_mutually_exclusive_group(required=True)
@@ -61,6 +74,19 @@ def address(text: str) -> Address:
     if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
         raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT")
     return host, int(port)
+
+
+def size(text: str) -> float:
+    """Read an amount of bytes as Kubernetes writes it, as argparse calls it."""
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti)?", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 500M or 1Gi")
+    number, unit = found.groups(default="")
+    factor = {"": 1.0, "m": 1e-3}.get(unit)
+    if factor is None:
+        base = 1024.0 if unit.endswith("i") else 1000.0
+        factor = base ** ("kMGT".index(unit[0].replace("K", "k")) + 1)
+    return float(number) * factor
 
 
 def warn_if_exposed(listen: Address) -> None:
@@ -107,12 +133,22 @@ def listening(flag: str, listen: Address) -> Iterator[None]:
         ) from error
 
 
-def open_recorder(path: Path | None, clock: str, clock_id: bytes) -> Recorder:
+def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:
     """Make the recorder of a process; without a file it writes into nothing."""
     from cloudrc.record.recorder import Recorder
     from cloudrc.record.writer import McapWriter
 
     return Recorder(
-        path or Path(os.devnull),
+        options.record or Path(os.devnull),
         lambda file: McapWriter(file, clock=clock, clock_id=clock_id.hex()),
+        size_max=round(0.9 * options.record_max) if options.record_max else None,
     )
+
+
+def chosen(
+    options: argparse.Namespace, flies: Callable[[], bool]
+) -> Callable[[list[Record]], list[Record]]:
+    """What chooses the records for the recording."""
+    from cloudrc.drivers.recording import FlightsOnly
+
+    return FlightsOnly(flies) if options.record_flights else list

@@ -10,22 +10,37 @@ from cloudrc.errors import BadInputError
 RUNS = Path("runs")
 
 
-def new_folder(out: Path | None, name: str) -> Path:
+def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
     """Make the folder of a run.
 
     Args:
         out: As the user asked; None for the next free `runs/<name>-<n>`.
         name: Experiment, mode and seed in one word.
+        latest: Whether `runs/latest` leads to it from now on.
 
     Raises:
         BadInputError: If `out` exists and is not an empty folder, or if it cannot be made.
     """
     try:
-        return _new_folder(out, name)
+        folder = _new_folder(out, name)
     except OSError as error:
         where = f"--out {out}" if out else f"{RUNS}/ in the working folder"
         remedy = "name another folder" if out else "name a folder that you may write in with --out"
         raise BadInputError(f"{where}: cannot be made: {error.strerror}; {remedy}") from error
+    if latest and out is None:
+        point_latest_to(folder)
+    return folder
+
+
+def discard(folder: Path) -> bool:
+    """Remove the folder of a run that has recorded nothing; say whether it is gone."""
+    if any(path.stat().st_size for path in folder.glob("*.mcap")):
+        return False
+    for path in (*folder.glob("*.mcap"), folder / "config.yaml"):
+        path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # there is something else in it
+        folder.rmdir()
+    return not folder.exists()
 
 
 def _new_folder(out: Path | None, name: str) -> Path:
@@ -45,11 +60,10 @@ def _new_folder(out: Path | None, name: str) -> Path:
         except FileExistsError:
             n += 1
             continue
-        _point_latest_to(folder)
         return folder
 
 
-def _point_latest_to(folder: Path) -> None:
+def point_latest_to(folder: Path) -> None:
     """Let `runs/latest` lead to the newest run; a file system without links goes without."""
     latest = folder.parent / "latest"
     with contextlib.suppress(OSError):

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
-from cloudrc.cli.cluster_flags import place_arguments
+from cloudrc.cli.cluster_flags import place_arguments, timeout_argument
 
+KUBECTL_PLUGIN = "kubectl-cloudrc"
+"""What this program is called when kubectl starts it."""
+CONNECT_LIMIT = 1.0
+"""For the API of a run on this machine to take a connection [s]."""
 EPILOG = """\
 where:
   a run that flies here ('cloudrc run --mode local'): found by itself, or by
   --api, whose URL is in the api.json of the run's folder
-  a release in a cluster: with --context, -n or --release, or if none flies here
+  a release in a cluster: with --context, -n or --release, if none flies here,
+  and always as 'kubectl cloudrc mission'
 
 examples:
   cloudrc mission run pipes
@@ -44,6 +51,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
     run = add("run", "fly a mission and follow it to its verdict")
     run.add_argument("mission", metavar="FILE", help="a mission's file, or one that ships")
+    timeout_argument(run)
     run.add_argument("--name", default="", help="for people (default: the file's name)")
     for name in ("list", "status"):
         line = {"list": "all missions", "status": "how things are, or how one mission is"}[name]
@@ -87,16 +95,32 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _url_here(options: argparse.Namespace) -> str | None:
-    """Find the API of the run that flies here, unless the flags name a cluster."""
+    """Find the API of the run that flies here, unless a cluster is meant."""
     import json
 
     from cloudrc.cli.folder import RUNS
     from cloudrc.drivers.local import API_FILE
 
-    if options.context or options.namespace or options.release != "cloudrc":
+    plugin = Path(sys.argv[0]).name.startswith(KUBECTL_PLUGIN)
+    if plugin or options.context or options.namespace or options.release:
         return None
     try:
-        url = json.loads((RUNS / "latest" / API_FILE).read_text(encoding="utf-8"))["url"]
+        url = str(json.loads((RUNS / "latest" / API_FILE).read_text(encoding="utf-8"))["url"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return str(url)
+    return None if _is_gone(url) else url
+
+
+def _is_gone(url: str) -> bool:
+    """Say whether nobody listens: a run that was killed leaves its file behind."""
+    import socket
+    from urllib.parse import urlsplit
+
+    try:
+        parts = urlsplit(url)
+        socket.create_connection((parts.hostname or "", parts.port or 0), CONNECT_LIMIT).close()
+    except ConnectionRefusedError:
+        return True
+    except (OSError, ValueError):
+        return False  # whatever it is, the verb itself says it better
+    return False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import place
 from cloudrc.cli.extras import require
+from cloudrc.cli.mission_check import check_on, parse
 from cloudrc.cli.mission_local import read_mission
 from cloudrc.cli.output import table
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
@@ -18,11 +20,6 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 if TYPE_CHECKING:
     from cloudrc.cluster.access import Release
     from cloudrc.cluster.jobs import JobStatus
-
-GRACE = 180.0
-"""What a Job may last beyond its mission's limit: pods have to start [s]."""
-TIME_LIMIT = 60.0
-"""Of a mission that does not say its own, if the experiment does not either [s]."""
 
 
 @contextmanager
@@ -39,13 +36,25 @@ def _run(options: argparse.Namespace) -> int:
     mission = read_mission(options.mission)
     if options.name:
         mission["name"] = options.name
+    request = parse(options.mission, mission)
     release = _place(options)
-    from cloudrc.cluster.jobs import follow, run_job
+    from cloudrc.cluster.deploy import wait_ready
+    from cloudrc.cluster.follow import follow, patience
+    from cloudrc.cluster.jobs import run_job
+    from cloudrc.cluster.pods import require_release
 
-    limit = float(mission.get("time_limit_s") or TIME_LIMIT)
+    require_release(release)
+    limit = check_on(release, options.mission, request)
+    # An install that was not waited for is a matter of seconds: the link is up last.
+    wait_ready(release, timeout=options.timeout, tell=_write)
     job = run_job(release, mission, limit=limit, queue=options.queue)
     print(f"Job {job.name} in namespace '{release.namespace}'", flush=True)
-    ended = follow(release, job.name, _write, timeout=limit + GRACE)
+    try:
+        ended = follow(release, job.name, _write, timeout=patience(limit, options.queue))
+    except KeyboardInterrupt:
+        end = f"cloudrc mission cancel {job.name} {' '.join(release.cloudrc_flags)}"
+        print(f"Job {job.name} flies on; end it: {end}", file=sys.stderr)
+        raise
     if ended.exit_code is None:
         print(ended.message)
     return 1 if ended.exit_code is None else ended.exit_code
@@ -96,7 +105,8 @@ def _cancel(options: argparse.Namespace) -> int:
 
 def _logs(options: argparse.Namespace) -> int:
     release = _place(options)
-    from cloudrc.cluster.jobs import follow, list_jobs, logs
+    from cloudrc.cluster.follow import follow, logs
+    from cloudrc.cluster.jobs import list_jobs
 
     job = options.id
     if job is None:

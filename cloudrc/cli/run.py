@@ -104,7 +104,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> int:
     from cloudrc.cli.closing import exit_code, show
-    from cloudrc.cli.folder import new_folder
+    from cloudrc.cli.folder import discard, new_folder, point_latest_to
     from cloudrc.cli.output import unread_is_fine
     from cloudrc.config.load import load_experiment
 
@@ -112,7 +112,9 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
     # What is wrong with the place is said before a folder is made for the run.
     flight = _in_cluster(experiment, options) if mode == "cluster" else _here(experiment, mode)
     name = experiment.name
-    folder = new_folder(options.out, f"{name}-{mode}-seed{experiment.seed}")
+    # In a cluster much can go wrong before anything is recorded: nothing is left of that.
+    late = mode == "cluster"
+    folder = new_folder(options.out, f"{name}-{mode}-seed{experiment.seed}", latest=not late)
     as_json = options.output == "json"
     stream = sys.stderr if as_json else sys.stdout
     mission = experiment.mission
@@ -126,9 +128,13 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
             )
     try:
         report = flight(folder, stream, waypoints)
-    except CloudrcError:
-        print(f"what was recorded is in {folder}", file=sys.stderr)
+    except (CloudrcError, KeyboardInterrupt):
+        if not (late and discard(folder)):
+            print(f"what was recorded is in {folder}", file=sys.stderr)
         raise
+    finally:
+        if late and options.out is None and folder.exists():
+            point_latest_to(folder)
     text = (folder / "report.json").read_text()
     with unread_is_fine(sys.stdout):
         if as_json:

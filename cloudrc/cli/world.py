@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import end_arguments, open_exporter, open_peer, open_recorder
+from cloudrc.cli.ends import chosen, end_arguments, open_exporter, open_peer, open_recorder
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +28,7 @@ def execute(options: argparse.Namespace) -> int:
 
     exporter = open_exporter(options, "world")
     experiment, clock = load_experiment(str(options.config)), clock_id()
-    recorder = open_recorder(options.record, "world", clock)
+    recorder = open_recorder(options, "world", clock)
     peer = open_peer(options)
     identity = WorldIdentity(clock, os.urandom(16))
     world = assembly.build_world(experiment, identity, time.monotonic_ns)
@@ -41,5 +41,6 @@ def execute(options: argparse.Namespace) -> int:
         slip_ns=lambda: world.slip_ns,
         exporter=exporter,
         watched=options.feed,
+        choose=chosen(options, lambda: world.robot.guard.armed),
     )
     return 0

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.teleop.messages import Outcome, Output, Seen
-from cloudrc.messages import NEVER_NS, OperatorRequest, Setpoint, Telemetry
+from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Setpoint, Telemetry
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import USED, Channel
@@ -93,6 +93,7 @@ class CloudEndpoint:
         self._clock_is_shared = False
         self._setpoint: Setpoint | None = None
         self._world = ""
+        self.guard = GuardState.GROUND  # as telemetry last told
         self._delays = (nan, nan, nan)
         self._tick_ns = self._hello_ns = self._heard_ns = start_ns
         self._count_ns = start_ns + COUNT_PERIOD_NS
@@ -204,6 +205,7 @@ class CloudEndpoint:
         self._records.append(Arrival(now_ns, True, epoch, counter, delay, used))
         if used:
             telemetry = codec.decode_telemetry(body)
+            self.guard = telemetry.guard
             self._loop.observe(telemetry, now_ns)
             self.teleop.see(self._seen(telemetry, epoch), now_ns)
             if self.teleop.outputs:

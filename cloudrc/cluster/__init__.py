@@ -1,5 +1,6 @@
 """Kubernetes: a release of the chart is found, installed, flown by Jobs, and read out.
 
 The entry points: `access.connect` names a release, `jobs.run_job` flies a mission on it,
-`deploy.install` puts it there, `fetch` brings back what it recorded.
+`follow.follow` tells how it goes, `deploy.install` puts it there, `fetch` brings back what it
+recorded.
 """

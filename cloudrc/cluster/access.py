@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -47,6 +49,11 @@ class Release:
         context = [f"--kube-context={self.context}"] if self.context else []
         return [*context, f"--namespace={self.namespace}"]
 
+    @property
+    def cloudrc_flags(self) -> list[str]:
+        """Likewise for cloudrc."""
+        return [*self.flags, f"--release={self.name}"]
+
     def selector(self, component: str) -> str:
         """Select by label what belongs to a part of this release: "world", "cloud", "mission"."""
         return (
@@ -59,7 +66,7 @@ class Release:
         from kubernetes import client, config
 
         configuration = client.Configuration()
-        with explained("read the kubeconfig", self.where):
+        with explained("read the kubeconfig", self.where), _logging_in(self.where):
             load: Any = config.load_kube_config  # not annotated
             load(context=self.context, client_configuration=configuration)
         configuration.retries = False  # the caller repeats what is worth repeating, and says so
@@ -80,11 +87,48 @@ class Release:
         return client.BatchV1Api(self._client)
 
     @cached_property
+    def version(self) -> Any:
+        """Client of the API server's own version."""
+        from kubernetes import client
+
+        return client.VersionApi(self._client)
+
+    @cached_property
     def apps(self) -> Any:
         """Client of Deployments."""
         from kubernetes import client
 
         return client.AppsV1Api(self._client)
+
+
+@contextmanager
+def _logging_in(where: str) -> Iterator[None]:
+    """Raise what the client only logs: that a login program did not run or gave nothing.
+
+    Raises:
+        MissingPrerequisiteError: With the client's words, which name the program.
+    """
+    heard: list[str] = []
+
+    class Listener(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            heard.append(" ".join(record.getMessage().split()))
+
+    # It logs to the root logger, which prints by itself once it is used without a handler; and
+    # again when a token has expired, so that one handler stays.
+    root, listener = logging.getLogger(), Listener(logging.ERROR)
+    if not any(isinstance(handler, logging.NullHandler) for handler in root.handlers):
+        root.addHandler(logging.NullHandler())
+    root.addHandler(listener)
+    try:
+        yield
+    finally:
+        root.removeHandler(listener)
+    if heard:
+        raise MissingPrerequisiteError(
+            f"cannot log in to the cluster {where}: the kubeconfig's login program failed: "
+            f"{heard[0]}; install it, or run it by hand to see why"
+        )
 
 
 def connect(

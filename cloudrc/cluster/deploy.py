@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cluster.access import REQUEST_TIMEOUT, Release
-from cloudrc.cluster.errors import ClusterError, WaitedTooLongError, explained
+from cloudrc.cluster.errors import ClusterError, WaitedTooLongError, explained, insist
 from cloudrc.cluster.pods import is_ready, list_pods, trouble
 from cloudrc.cluster.tools import run
 
@@ -98,7 +98,7 @@ def wait_ready(
     """
     until, hopeless_since, said = time.monotonic() + timeout, None, ""
     while True:
-        states = {component: _state(release, component) for component in COMPONENTS}
+        states = insist(lambda: {each: _state(release, each) for each in COMPONENTS}, tell)
         waiting = {component: why for component, (why, _) in states.items() if why}
         if not waiting:
             return

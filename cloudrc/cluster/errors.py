@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 from cloudrc.errors import CloudrcError
+
+OUTAGE_MAX = 30.0
+"""How long the API server may be away while something is waited for: it may choose a leader [s]."""
+OUTAGE_PERIOD = 1.0
+"""Between two tries [s]."""
+TOO_MANY_REQUESTS = 429
+SERVER_ERROR = 500
+"""This HTTP status and all above it."""
+
+_Answer = TypeVar("_Answer")
 
 
 class ClusterError(CloudrcError):
     """The cluster, or something in it, refused or failed."""
 
     exit_code = 5
+
+
+class AwayError(ClusterError):
+    """The API server does not answer, or has no time: it may a moment later."""
 
 
 class WaitedTooLongError(CloudrcError):
@@ -30,7 +46,8 @@ def explained(doing: str, where: str) -> Iterator[None]:
         where: Cluster and namespace, as `Release.where` says it.
 
     Raises:
-        ClusterError: In place of what the client raises; other exceptions pass.
+        ClusterError: In place of what the client raises; other exceptions pass. It is an
+            `AwayError` where it may pass by waiting.
     """
     from kubernetes.client.exceptions import ApiException
     from kubernetes.config.config_exception import ConfigException
@@ -39,14 +56,40 @@ def explained(doing: str, where: str) -> Iterator[None]:
     try:
         yield
     except ApiException as error:
-        raise ClusterError(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
+        status = int(error.status or 0)
+        away = status == TOO_MANY_REQUESTS or status >= SERVER_ERROR
+        kind = AwayError if away else ClusterError
+        raise kind(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
     except (HTTPError, OSError) as error:
-        raise ClusterError(
+        raise AwayError(
             f"cannot {doing} {where}: the API server does not answer ({_root(error)}); "
             "is the cluster up? ask it: kubectl cluster-info"
         ) from error
     except ConfigException as error:  # such as a login program that fails
         raise ClusterError(f"cannot {doing} {where}: {_first_line(str(error))}") from error
+
+
+def insist(ask: Callable[[], _Answer], tell: Callable[[str], None]) -> _Answer:
+    """Ask again while the API server is away, for `OUTAGE_MAX` at most.
+
+    Args:
+        ask: Reads something, and changes nothing.
+        tell: Gets a line when the API server is away.
+
+    Raises:
+        ClusterError: What `ask` raises, if it does not pass.
+    """
+    until = None
+    while True:
+        try:
+            return ask()
+        except AwayError as error:
+            if until is None:
+                until = time.monotonic() + OUTAGE_MAX
+                tell(f"{error}; trying again for {OUTAGE_MAX:g} s")
+            elif time.monotonic() > until:
+                raise
+        time.sleep(OUTAGE_PERIOD)
 
 
 def _refusal(error: Exception, doing: str) -> str:

@@ -1,22 +1,18 @@
-"""Missions as Jobs: a mission comes in; a Job posts it, and its lines and its verdict go out."""
+"""Missions as Jobs: a mission comes in; a Job posts it, and how it stands goes out."""
 
 from __future__ import annotations
 
 import secrets
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from cloudrc.cluster import manifest
 from cloudrc.cluster.access import REQUEST_TIMEOUT, Release
-from cloudrc.cluster.errors import ClusterError, WaitedTooLongError, explained
-from cloudrc.cluster.pods import find_pod, list_pods, refusal, trouble
+from cloudrc.cluster.errors import ClusterError, explained
+from cloudrc.cluster.pods import find_pod, list_pods
 
-LOOK_PERIOD = 0.5
-"""Between two looks at a Job [s]."""
-READ_LIMIT = 30.0
-"""For a log to say anything before the Job itself is looked at again [s]."""
 API_CONTAINER = "teleop"
 API_PORT_NAME = "api"
 
@@ -65,7 +61,8 @@ def run_job(
     Raises:
         ClusterError: If the cluster refuses, or there is no such release.
     """
-    name = name or f"{release.name}-mission-{secrets.token_hex(3)}"
+    # A pod is named for its Job, and no name is longer than 63 characters.
+    name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
     follower = find_follower(release)
     body = manifest.job(release, name, follower, limit=limit, queue=queue)
     with explained("create jobs", release.where):
@@ -75,11 +72,21 @@ def run_job(
     owner = {"apiVersion": "batch/v1", "kind": "Job", "name": name, "uid": created.metadata.uid}
     plan = manifest.config_map(release, name, mission)
     plan["metadata"]["ownerReferences"] = [owner]  # the plan goes when the Job goes
-    with explained("create configmaps", release.where):
-        release.core.create_namespaced_config_map(
-            release.namespace, plan, _request_timeout=REQUEST_TIMEOUT
-        )
+    _create_plan(release, plan)
     return _status(created, None)
+
+
+def _create_plan(release: Release, plan: Mapping[str, Any]) -> None:
+    """Create the ConfigMap; without it the Job would wait for it in vain, and goes too."""
+    try:
+        with explained("create configmaps", release.where):
+            release.core.create_namespaced_config_map(
+                release.namespace, plan, _request_timeout=REQUEST_TIMEOUT
+            )
+    except BaseException:  # Ctrl-C too
+        with suppress(ClusterError):
+            delete_job(release, plan["metadata"]["name"])
+        raise
 
 
 def find_follower(release: Release) -> manifest.Follower:
@@ -93,7 +100,46 @@ def find_follower(release: Release) -> manifest.Follower:
         )
     pull_secrets = tuple(secret.name for secret in spec.image_pull_secrets or [])
     policy = teleop.image_pull_policy or "IfNotPresent"
-    return manifest.Follower(teleop.image, policy, pull_secrets, _api_url(release))
+    home = _home(release)
+    return manifest.Follower(
+        teleop.image,
+        policy,
+        pull_secrets,
+        _api_url(release),
+        _placement(release, home),
+        _reference(home),
+    )
+
+
+def _home(release: Release) -> Any:
+    """The release's cloud Deployment; None if what runs is of nobody."""
+    with explained("list deployments", release.where):
+        found = release.apps.list_namespaced_deployment(
+            release.namespace,
+            label_selector=release.selector("cloud"),
+            _request_timeout=REQUEST_TIMEOUT,
+        ).items
+    return found[0] if found else None
+
+
+def _reference(home: Any) -> dict[str, Any] | None:
+    if home is None:
+        return None
+    metadata = home.metadata
+    return {
+        "apiVersion": "apps/v1",
+        "kind": "Deployment",
+        "name": metadata.name,
+        "uid": metadata.uid,
+    }
+
+
+def _placement(release: Release, home: Any) -> dict[str, Any]:
+    """Where the release may run, as it was written."""
+    if home is None:
+        return {}
+    spec = release.apps.api_client.sanitize_for_serialization(home.spec.template.spec) or {}
+    return {key: spec[key] for key in ("nodeSelector", "tolerations", "affinity") if key in spec}
 
 
 def _api_url(release: Release) -> str:
@@ -136,7 +182,7 @@ def read_job(release: Release, name: str) -> JobStatus:
         job = release.batch.read_namespaced_job(
             name, release.namespace, _request_timeout=REQUEST_TIMEOUT
         )
-    return _status(job, _pod_of(release, job.metadata.uid))
+    return _status(job, pod_of(release, job.metadata.uid))
 
 
 def delete_job(release: Release, name: str) -> None:
@@ -150,79 +196,14 @@ def delete_job(release: Release, name: str) -> None:
         )
 
 
-def follow(
-    release: Release, name: str, write: Callable[[str], None], *, timeout: float
-) -> JobStatus:
-    """Pass on what a Job says, line by line, until it has ended.
-
-    Args:
-        release: Where the Job is.
-        name: Of the Job.
-        write: Gets each line of its log once.
-        timeout: How long to follow at most [s].
-
-    Returns:
-        The Job's end.
-
-    Raises:
-        ClusterError: If the Job's pod cannot run; says why.
-        WaitedTooLongError: If it has not ended in time.
-    """
-    until, told = time.monotonic() + timeout, 0
-    while True:
-        status = read_job(release, name)
-        lines = _log(release, status.uid)
-        for line in lines[told:]:
-            write(line)
-        told = max(told, len(lines))
-        if status.state in ("complete", "failed"):
-            return status
-        if status.state == "pending":
-            _refuse_hopeless(release, status)
-        if time.monotonic() > until:
-            raise WaitedTooLongError(
-                f"Job '{name}' has not ended within {timeout:g} s, it goes on; "
-                f"look: cloudrc mission status {name}"
-            )
-        time.sleep(LOOK_PERIOD)
-
-
-def logs(release: Release, name: str) -> list[str]:
-    """Read what a Job has said so far.
-
-    Raises:
-        ClusterError: If there is no such Job.
-    """
-    return _log(release, read_job(release, name).uid)
-
-
-def _log(release: Release, uid: str) -> list[str]:
-    pod = _pod_of(release, uid)
-    if pod is None or not _has_started(pod):
-        return []
-    with explained("get pods/log", release.where):
-        text: str = release.core.read_namespaced_pod_log(
-            pod.metadata.name, release.namespace, _request_timeout=READ_LIMIT
-        )
-    return text.splitlines()
-
-
-def _has_started(pod: Any) -> bool:
+def has_started(pod: Any) -> bool:
+    """Say whether a container of a pod runs or has run."""
     statuses = pod.status.container_statuses or []
     return any(status.state.running or status.state.terminated for status in statuses)
 
 
-def _refuse_hopeless(release: Release, status: JobStatus) -> None:
-    pod = _pod_of(release, status.uid)
-    why = trouble(pod) if pod is not None else refusal(release, "Job", status.name)
-    if why:
-        raise ClusterError(
-            f"Job '{status.name}' cannot start: {why}; then delete it: "
-            f"kubectl {' '.join(release.flags)} delete job {status.name}"
-        )
-
-
-def _pod_of(release: Release, uid: str) -> Any:
+def pod_of(release: Release, uid: str) -> Any:
+    """Find the pod of the Job of this UID; None if there is none."""
     pods = list_pods(release, manifest.COMPONENT)
     return next((pod for pod in pods if _owner(pod) == uid), None)
 
@@ -239,7 +220,7 @@ def _status(job: Any, pod: Any) -> JobStatus:
     elif "Failed" in ends:
         state, message = "failed", message or _failure(ends["Failed"])
     else:
-        state = "flying" if pod is not None and _has_started(pod) else "pending"
+        state = "flying" if pod is not None and has_started(pod) else "pending"
     created = job.metadata.creation_timestamp
     return JobStatus(
         job.metadata.name,

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from math import ceil
 from typing import Any
 
 from cloudrc.cluster.access import Release
@@ -20,6 +21,10 @@ UID_LABEL = "batch.kubernetes.io/controller-uid"
 """Kubernetes puts the Job's UID under it on the Job's pod."""
 START_ALLOWANCE = 120
 """Beyond the mission's own limit, for the pod to start and the robot to be seen [s]."""
+QUEUE_ALLOWANCE = 3600
+"""Beyond that, for the missions before it to end, where it waits in the queue [s]."""
+DEADLINE_MAX = 2**31 - 1
+"""What Kubernetes takes [s]."""
 KEEP = 3600
 """How long a finished Job stays to be looked at [s]."""
 USER = 10001
@@ -34,12 +39,16 @@ class Follower:
         pull_policy: Of that image.
         pull_secrets: Names of Secrets for the image's registry.
         api: URL of the release's API inside the cluster.
+        placement: `nodeSelector`, `tolerations` and `affinity` of the release's cloud pod.
+        owner: Reference to the release's cloud Deployment: missions go when the release goes.
     """
 
     image: str
     pull_policy: str
     pull_secrets: tuple[str, ...]
     api: str
+    placement: Mapping[str, Any] = field(default_factory=dict)
+    owner: Mapping[str, Any] | None = None
 
 
 def labels(release: Release) -> dict[str, str]:
@@ -69,6 +78,16 @@ def config_map(release: Release, name: str, mission: Mapping[str, Any]) -> dict[
     }
 
 
+def deadline(limit: float, queue: bool) -> int:
+    """Say how long a Job may last [s].
+
+    Args:
+        limit: The mission's own limit of time [s].
+        queue: Whether it may have to wait for others.
+    """
+    return min(ceil(limit) + START_ALLOWANCE + queue * QUEUE_ALLOWANCE, DEADLINE_MAX)
+
+
 def job(
     release: Release, name: str, follower: Follower, *, limit: float, queue: bool
 ) -> dict[str, Any]:
@@ -81,14 +100,15 @@ def job(
         limit: The mission's own limit of time [s].
         queue: Whether to wait where another mission flies, in place of being refused.
     """
+    owners = [dict(follower.owner)] if follower.owner else []
     return {
         "apiVersion": "batch/v1",
         "kind": "Job",
-        "metadata": {"name": name, "labels": labels(release)},
+        "metadata": {"name": name, "labels": labels(release), "ownerReferences": owners},
         "spec": {
             # The mission is posted under the Job's UID: a second try would only read its verdict.
             "backoffLimit": 0,
-            "activeDeadlineSeconds": int(limit) + START_ALLOWANCE,
+            "activeDeadlineSeconds": deadline(limit, queue),
             "ttlSecondsAfterFinished": KEEP,
             "template": {
                 "metadata": {"labels": labels(release)},
@@ -100,6 +120,7 @@ def job(
 
 def _pod(name: str, follower: Follower, queue: bool) -> dict[str, Any]:
     return {
+        **follower.placement,
         "restartPolicy": "Never",
         "automountServiceAccountToken": False,
         "enableServiceLinks": False,

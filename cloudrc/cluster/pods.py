@@ -51,7 +51,27 @@ def find_pod(release: Release, component: str) -> Any:
             f"the {component} pod of release '{release.name}' does not run: {why}; "
             f"see: kubectl {' '.join(release.flags)} describe pod {pods[0].metadata.name}"
         )
-    raise ClusterError(
+    raise _no_release(release)
+
+
+def require_release(release: Release) -> None:
+    """Make sure that there is a release, whether or not its pods run.
+
+    Raises:
+        ClusterError: If there is none; says how to install it.
+    """
+    with explained("list deployments", release.where):
+        found = release.apps.list_namespaced_deployment(
+            release.namespace,
+            label_selector=release.selector("cloud"),
+            _request_timeout=REQUEST_TIMEOUT,
+        ).items
+    if not found:
+        raise _no_release(release)
+
+
+def _no_release(release: Release) -> ClusterError:
+    return ClusterError(
         f"no release '{release.name}' {release.where}; install it: "
         f"helm install {release.name} charts/cloudrc {' '.join(release.helm_flags)}, "
         "or name another: --release NAME -n NAMESPACE"

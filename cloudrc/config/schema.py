@@ -186,7 +186,7 @@ class Experiment(Section):
         "", description="Label in reports, without slashes; default: the file's name"
     )
     description: str = Field("", description="One line for lists and reports")
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(1, description="Of everything random")
+    seed: Annotated[int, Field(ge=0, lt=2**53)] = Field(1, description="Of everything random")
     mission: Annotated[
         Annotated[str, Tag("<name>")] | Annotated[Mission, Tag("<inline>")], Discriminator(_form)
     ] = Field("pipes", description="A shipped mission, a file, or inline")

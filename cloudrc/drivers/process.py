@@ -72,6 +72,7 @@ def run_end(
     slip_ns: Callable[[], int] = lambda: 0,
     exporter: Exporter | None = None,
     watched: bool = True,
+    choose: Callable[[list[Record]], list[Record]] = list,
 ) -> bool:
     """Fly one end until it is asked to stop or `over()`; its recording is whole afterwards.
 
@@ -85,35 +86,55 @@ def run_end(
         slip_ns: By how much world's clock lags [ns].
         exporter: Gets the records too, if they are to become metrics.
         watched: Whether a supervisor reads the feed.
+        choose: Says what of its records is recorded.
 
     Returns:
         True if it was done by itself, False if it was stopped.
     """
     feed, thread = Feed.on_stdout(watched=watched), RecordingThread(recorder)
-    trouble, dropped = "", 0
-
-    def sink(records: list[Record]) -> None:
-        nonlocal trouble, dropped
-        recorder.put(records)
-        feed.tell(records)
-        if exporter is not None:
-            exporter.see(records)
-            if records and recorder.dropped != dropped:
-                dropped = recorder.dropped
-                exporter.see([_lost(records[-1].stamp_ns, end, recorder)])
-        if records and recorder.error != trouble:
-            trouble = recorder.error
-            feed.tell([Fault(records[-1].stamp_ns, "recorder", trouble)])
-
+    taps = _Taps(end, recorder, feed, exporter, choose)
     thread.start()
     feed.ready()
     try:
-        serve(endpoint, peer, end=end, sink=sink, stop=lambda: stop() or over(), slip_ns=slip_ns)
+        serve(endpoint, peer, end=end, sink=taps, stop=lambda: stop() or over(), slip_ns=slip_ns)
     finally:
-        recorder.put([_lost(time.monotonic_ns() - slip_ns(), end, recorder)])
+        taps.record_losses(time.monotonic_ns() - slip_ns())
         thread.stop()
     return over()
 
 
-def _lost(stamp_ns: int, end: str, recorder: Takes) -> Counted:
-    return Counted(stamp_ns, end, "recorder_dropped", recorder.dropped)
+class _Taps:
+    """Where an end's records go: into its recording, to who watches, into its metrics."""
+
+    def __init__(
+        self,
+        end: str,
+        recorder: Takes,
+        feed: Feed,
+        exporter: Exporter | None,
+        choose: Callable[[list[Record]], list[Record]],
+    ) -> None:
+        self._end, self._recorder, self._feed = end, recorder, feed
+        self._exporter, self._choose = exporter, choose
+        self._trouble, self._dropped = "", 0
+
+    def __call__(self, records: list[Record]) -> None:
+        """Take records in; never waits."""
+        recorder, exporter = self._recorder, self._exporter
+        recorder.put(self._choose(records))
+        self._feed.tell(records)
+        if exporter is not None:
+            exporter.see(records)
+            if records and recorder.dropped != self._dropped:
+                self._dropped = recorder.dropped
+                exporter.see([self._losses(records[-1].stamp_ns)])
+        if records and recorder.error != self._trouble:
+            self._trouble = recorder.error
+            self._feed.tell([Fault(records[-1].stamp_ns, "recorder", self._trouble)])
+
+    def record_losses(self, stamp_ns: int) -> None:
+        """Note in the recording what did not reach it."""
+        self._recorder.put([self._losses(stamp_ns)])
+
+    def _losses(self, stamp_ns: int) -> Counted:
+        return Counted(stamp_ns, self._end, "recorder_dropped", self._recorder.dropped)

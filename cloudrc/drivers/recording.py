@@ -8,8 +8,23 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Protocol
 
+from cloudrc.records import (
+    Arrival,
+    CommandApplied,
+    Control,
+    GroundTruth,
+    Lateness,
+    Record,
+    TelemetrySent,
+)
+
+AFTERWARDS_NS = 90_000_000_000
+"""For so long after the robot has last followed the cloud, all is recorded still [ns]: until it has
+landed after a loss of the link."""
+PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
 BATCH = 16
 """Records written at a time."""
 IDLE = 0.02
@@ -31,6 +46,34 @@ class Recorder(Protocol):
 
     def close(self) -> None:
         """Write out the rest and end the file."""
+
+
+class FlightsOnly:
+    """Lets through what happens while the robot flies, and of the rest what is an event.
+
+    A pod outlives its missions: 100 samples a second of a robot that keeps its place would fill
+    its volume within hours.
+    """
+
+    def __init__(self, flies: Callable[[], bool]) -> None:
+        """Begin with a robot that does not fly.
+
+        Args:
+            flies: Whether the robot follows the cloud.
+        """
+        self._flies = flies
+        self._until_ns = 0
+
+    def __call__(self, records: list[Record]) -> list[Record]:
+        """Choose what is to be recorded."""
+        if not records:
+            return records
+        stamp_ns = records[-1].stamp_ns
+        if self._flies():
+            self._until_ns = stamp_ns + AFTERWARDS_NS
+        if stamp_ns <= self._until_ns:
+            return records
+        return [record for record in records if not isinstance(record, PERIODIC)]
 
 
 class RecordingThread:

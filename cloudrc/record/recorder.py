@@ -8,6 +8,7 @@ with the file, the flight goes on.
 from __future__ import annotations
 
 import contextlib
+import errno
 from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -40,7 +41,11 @@ class Recorder:
     """
 
     def __init__(
-        self, path: Path, open_sink: Callable[[Path], Sink], capacity: int = CAPACITY
+        self,
+        path: Path,
+        open_sink: Callable[[Path], Sink],
+        capacity: int = CAPACITY,
+        size_max: int | None = None,
     ) -> None:
         """Set the queue up; the file is opened by the first drain.
 
@@ -48,8 +53,10 @@ class Recorder:
             path: Of the file.
             open_sink: Opens it: `lambda path: McapWriter(path, clock="world")`.
             capacity: Records that the queue holds.
+            size_max: The file is ended when it has grown to this [bytes]; None: never.
         """
         self.error = ""
+        self._size_max = size_max
         self._path = path
         self._open_sink = open_sink
         self._capacity = capacity
@@ -101,6 +108,8 @@ class Recorder:
         if self._sink and not self._ended:
             try:
                 self._sink.flush()
+                if self._size_max is not None and self._path.stat().st_size >= self._size_max:
+                    raise OSError(errno.EFBIG, "it has grown to its limit")
             except OSError as error:
                 self._stop(error)
 

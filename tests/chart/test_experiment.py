@@ -131,3 +131,32 @@ def test_the_profile_is_a_directory_of_its_own() -> None:
         assert "--profile=/etc/cloudrc-link/profile.yaml" in link["args"]
         others = [c for name, c in containers(pod_specs(render())[end]).items() if name != "link"]
         assert not any("link" in {m["name"] for m in c["volumeMounts"]} for c in others)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (
+            {"experiment": {"mission": "nonsense"}},
+            "experiment.mission: no mission 'nonsense' .*pipe",
+        ),
+        ({"experiment": {"mission": "./mine.yaml"}}, "experiment.mission: .*write it out there"),
+        ({"experiment": {"cloud": {"predictor": "./my.py"}}}, r"cloud.predictor: '\./my.py' is a"),
+        (
+            {"experiment": {"cloud": {"controller": {"name": "a/b.py"}}}},
+            "cloud.controller: 'a/b.py'",
+        ),
+        ({"link": {"profile": {"downlink": {"trace": "t.csv"}}}}, "downlink.trace names 't.csv'"),
+    ],
+)
+def test_what_the_pods_could_not_find_is_refused_at_once(values: Object, said: str) -> None:
+    with pytest.raises(Exception, match=said):
+        render(values)
+
+
+def test_a_trace_that_is_written_out_is_found() -> None:
+    link = {
+        "profile": {"uplink": {"trace": "t.csv"}},
+        "traces": {"t.csv": "time_s,delay_ms\n0,1\n"},
+    }
+    assert "t.csv" in of_kind(render({"link": link}), "ConfigMap")["link"]["data"]

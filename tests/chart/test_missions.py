@@ -13,7 +13,10 @@ from cloudrc.config.load import load_mission
 from cloudrc.config.mission_check import check_mission
 from cloudrc.geometry.scene import load_scene
 
-EXAMPLE = list(yaml.safe_load_all((CHART / "examples" / "mission-job.yaml").read_text()))
+EXAMPLES = {
+    name: list(yaml.safe_load_all((CHART / "examples" / f"{name}.yaml").read_text()))
+    for name in ("mission-job", "mission-paper")
+}
 ENABLED: Object = {"mission": {"enabled": True}}
 
 
@@ -33,11 +36,16 @@ def plan(values: Object, folder: Path) -> object:
     return load_mission(folder / "mission.yaml")
 
 
+each_job = pytest.mark.parametrize(
+    "job", [*jobs(ENABLED), *(job for _, job in EXAMPLES.values())], ids=["chart", *EXAMPLES]
+)
+
+
 def test_none_flies_unasked() -> None:
     assert jobs() == []
 
 
-@pytest.mark.parametrize("job", [*jobs(ENABLED), EXAMPLE[1]], ids=["chart", "example"])
+@each_job
 def test_a_job_flies_once_ends_in_time_and_goes(job: Object) -> None:
     spec = job["spec"]
     assert spec["backoffLimit"] == 0
@@ -50,7 +58,7 @@ def test_a_job_flies_once_ends_in_time_and_goes(job: Object) -> None:
     assert container["args"][:2] == ["mission", "fly"]
 
 
-@pytest.mark.parametrize("job", [*jobs(ENABLED), EXAMPLE[1]], ids=["chart", "example"])
+@each_job
 def test_its_uid_is_the_key(job: Object) -> None:
     (container,) = job["spec"]["template"]["spec"]["containers"]
     (variable,) = container["env"]
@@ -108,10 +116,11 @@ def test_queueing_is_a_flag() -> None:
     assert "--queue" in job["spec"]["template"]["spec"]["containers"][0]["args"]
 
 
-def test_the_example_is_for_the_release_of_the_readme(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example_is_for_the_release_of_the_readme(name: str, tmp_path: Path) -> None:
     release = render(release="cloudrc")
     service = next(t for t in release if t["metadata"]["name"] == "cloudrc-api")
-    config, job = EXAMPLE
+    config, job = EXAMPLES[name]
     pod = job["spec"]["template"]
     (container,) = pod["spec"]["containers"]
     assert f"--api=http://{service['metadata']['name']}:8080" in container["args"]
@@ -123,7 +132,12 @@ def test_the_example_is_for_the_release_of_the_readme(tmp_path: Path) -> None:
     (tmp_path / "mission.yaml").write_text(config["data"]["mission.yaml"])
     mission = load_mission(tmp_path / "mission.yaml")
     assert check_mission(mission, load_scene("pipes")) == []
-    assert len(mission.waypoints) == 3
+    assert len(mission.waypoints) == {"mission-job": 3, "mission-paper": 7}[name]
+
+
+def test_the_papers_mission_is_the_one_that_ships(tmp_path: Path) -> None:
+    (tmp_path / "mission.yaml").write_text(EXAMPLES["mission-paper"][0]["data"]["mission.yaml"])
+    assert load_mission(tmp_path / "mission.yaml").waypoints == load_mission("pipes").waypoints
 
 
 def test_the_chart_makes_the_same_job_as_the_program() -> None:

@@ -51,13 +51,40 @@ def test_a_new_chart_version_alone_rolls_no_pod() -> None:
         ("cloudrc", {}, "cloudrc-world"),
         ("my-cloudrc", {}, "my-cloudrc-world"),
         ("demo", {"fullnameOverride": "robot"}, "robot-world"),
-        ("d" * 53, {}, "d" * 50 + "-world"),
+        ("d" * 53, {}, "d" * 46 + "-world"),
     ],
 )
 def test_names(release: str, values: dict[str, str], name: str) -> None:
-    objects = render(values, release=release)
+    objects = render({**values, "mission": {"enabled": True}}, release=release)
     assert name in {thing["metadata"]["name"] for thing in objects}
     assert max(len(thing["metadata"]["name"]) for thing in objects) <= 63
+
+
+@pytest.mark.parametrize("release", ["1rel", "my.rel"])
+def test_a_release_whose_services_could_have_no_name_is_refused(release: str) -> None:
+    with pytest.raises(Exception, match=f"the name '{release}-cloudrc' .* set fullnameOverride"):
+        render(release=release)
+    assert render({"fullnameOverride": "robot"}, release=release)
+
+
+def test_what_is_written_on_a_pod_wins_over_the_charts_own() -> None:
+    mine = {"prometheus.io/scrape": "false", "example.org/owner": "me"}
+    pods = of_kind(render({"cloud": {"podAnnotations": mine}}), "Deployment")
+    found = pods["cloud"]["spec"]["template"]["metadata"]["annotations"]
+    assert mine.items() <= found.items()
+    assert found["prometheus.io/port"] == "9100"
+
+
+def test_missions_run_where_the_cloud_does() -> None:
+    where = {
+        "nodeSelector": {"disk": "fast"},
+        "tolerations": [{"key": "lab", "operator": "Exists"}],
+        "affinity": {"nodeAffinity": {}},
+    }
+    pods = pod_specs(render({"cloud": where, "mission": {"enabled": True}}))
+    for name in ("cloud", "mission", "test"):
+        assert where.items() <= pods[name].items()
+    assert not where.keys() & pods["world"].keys()
 
 
 def images(values: dict[str, object]) -> dict[str, str]:

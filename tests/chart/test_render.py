@@ -13,7 +13,17 @@ from typing import Any
 
 import pytest
 import yaml
-from rendering import CHART, CI_VALUES, EXAMPLES, METADATA, Object, render, values_of
+from rendering import (
+    CHART,
+    CI_VALUES,
+    EXAMPLES,
+    METADATA,
+    Object,
+    laid_over,
+    render,
+    render_texts,
+    values_of,
+)
 
 kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="comes with the extra dev")
 
@@ -51,16 +61,30 @@ def test_the_objects_are_valid(path: Path, version: str) -> None:
         kubernetes_validate.validate(thing, version, strict=True)
 
 
+@pytest.mark.parametrize("name", ["mission-job", "mission-paper"])
 @pytest.mark.parametrize("version", sorted({OLDEST, NEWEST}))
-def test_the_example_is_valid(version: str) -> None:
-    text = (CHART / "examples" / "mission-job.yaml").read_text()
+def test_an_example_is_valid(name: str, version: str) -> None:
+    text = (CHART / "examples" / f"{name}.yaml").read_text()
     for thing in yaml.safe_load_all(text):
         kubernetes_validate.validate(thing, version, strict=True)
+
+
+class Once(yaml.SafeLoader):
+    """Reads YAML in which no mapping has a key twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        mapping = super().construct_mapping(node, deep)
+        assert len(mapping) == len(node.value), [key.value for key, _ in node.value]
+        return mapping
 
 
 @each_file
 def test_nothing_is_said_twice(path: Path) -> None:
     """Server-side apply refuses ports, names and keys that occur twice."""
+    annotations = {"podAnnotations": {"prometheus.io/scrape": "false"}}
+    for name, text in render_texts(laid_over(values_of(path), {"cloud": annotations})).items():
+        if not name.endswith("NOTES.txt"):
+            list(yaml.load_all(text, Once))
     for thing in render(values_of(path)):
         spec = thing.get("spec", {}).get("template", thing).get("spec", {})
         for container in (*spec.get("initContainers", ()), *spec.get("containers", ())):

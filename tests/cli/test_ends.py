@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import gc
 import os
 import signal
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 
 from cloudrc import assembly
+from cloudrc.cli.ends import size
 from cloudrc.cli.main import main
 from cloudrc.config.shipped import FOLDERS
 
@@ -82,3 +84,17 @@ def test_whoever_is_stopped_while_it_starts_leaves_a_whole_recording(
     free = [free_port(), "--peer", FREE, "--record", str(record)]
     assert main([end, *CONFIG, "--listen", *free]) == 0
     assert record.read_bytes().endswith(MCAP_MAGIC)
+
+
+@pytest.mark.parametrize(
+    ("text", "bytes_"),
+    [("1Gi", 2**30), ("500M", 5e8), ("1.5Ki", 1536), ("4096", 4096), ("2k", 2e3)],
+)
+def test_a_size_is_written_as_in_kubernetes(text: str, bytes_: float) -> None:
+    assert size(text) == bytes_
+
+
+@pytest.mark.parametrize("text", ["", "1GB", "-1", "1 Gi", "nan"])
+def test_another_size_is_refused(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="such as 500M or 1Gi"):
+        size(text)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from fake_api import FakeApi, deployment, kubeconfig, pod
 
-from cloudrc.cluster import deploy, jobs
+from cloudrc.cluster import deploy, errors, follow
 from cloudrc.cluster.access import Release, connect
 
 
@@ -19,7 +19,8 @@ def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeApi]:
     path = tmp_path / "kubeconfig"
     path.write_text(kubeconfig(server.url))
     monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", str(path))
-    monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
+    monkeypatch.setattr(follow, "LOOK_PERIOD", 0.01)
+    monkeypatch.setattr(errors, "OUTAGE_PERIOD", 0.01)
     monkeypatch.setattr(deploy, "LOOK_PERIOD", 0.01)
     monkeypatch.setattr(deploy, "PATIENCE", 0.0)
     yield server

@@ -16,6 +16,10 @@ from urllib.parse import parse_qs, urlsplit
 
 import yaml
 
+VERSION_KEYS = (
+    "buildDate compiler gitCommit gitTreeState gitVersion goVersion major minor platform".split()
+)
+
 
 class FakeApi:
     """Holds objects by (plural, namespace, name); `refuse` answers a verb with a code."""
@@ -25,6 +29,7 @@ class FakeApi:
         self.logs: dict[str, str] = {}
         self.refuse: dict[tuple[str, str], tuple[int, str]] = {}
         self.seen: list[str] = []
+        self.version = {"major": "1", "minor": "33"}
         self.lock = threading.RLock()
         self._clock = itertools.count()
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), self._handler())
@@ -53,6 +58,8 @@ class FakeApi:
 
     def answer(self, method: str, path: str, body: Any) -> tuple[int, Any]:
         address = urlsplit(path)
+        if address.path == "/version/":
+            return 200, {**dict.fromkeys(VERSION_KEYS, ""), **self.version}
         parts = address.path.strip("/").split("/")
         namespace, plural, *rest = parts[parts.index("namespaces") + 1 :]
         name, subresource = (*rest, "", "")[:2]

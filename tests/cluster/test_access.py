@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from fake_api import FakeApi, kubeconfig, pod
 
 from cloudrc.cluster.access import Release, connect
 from cloudrc.cluster.errors import ClusterError
 from cloudrc.cluster.pods import find_pod, list_pods
 from cloudrc.errors import MissingPrerequisiteError
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_current_context_gives_the_namespace(api: FakeApi) -> None:
@@ -45,6 +52,41 @@ def test_without_a_kubeconfig_one_sentence_says_what_to_do(
         connect()
     assert caught.value.exit_code == 3
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        (None, "No such file or directory: .*login-to-nowhere"),
+        ("echo no token >&2; exit 7", "returned 7"),
+        ("echo '{}'", "exec"),
+    ],
+    ids=["missing", "failing", "giving nothing"],
+)
+def test_a_login_program_that_fails_is_named_and_nothing_else_is_printed(
+    tmp_path: Path, script: str | None, words: str
+) -> None:
+    """In a process of its own: here pytest listens to what is logged."""
+    program = tmp_path / "login-to-nowhere"
+    if script is not None:
+        program.write_text(f"#!/bin/sh\n{script}\n")
+        program.chmod(0o755)
+    config = yaml.safe_load(kubeconfig("http://127.0.0.1:9"))
+    version = "client.authentication.k8s.io/v1"
+    login = {"apiVersion": version, "command": str(program), "interactiveMode": "Never"}
+    config["users"][0]["user"] = {"exec": login}
+    (tmp_path / "config").write_text(yaml.safe_dump(config))
+    done = subprocess.run(
+        [sys.executable, "-m", "cloudrc", "mission", "list", "-n", "demo"],
+        env={**os.environ, "KUBECONFIG": str(tmp_path / "config"), "PYTHONPATH": str(ROOT)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 3, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("cloudrc: error: cannot log in to the cluster in namespace 'demo'")
+    assert re.search(words, line)
 
 
 def test_a_cluster_that_does_not_answer_is_said_in_one_sentence(

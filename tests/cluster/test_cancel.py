@@ -61,8 +61,8 @@ def teleop(running: FakeApi, pretend: Callable[[str, str], Path]) -> Iterator[Fa
 
 def test_the_mission_of_a_job_is_found_by_its_key(teleop: FakeTeleop, release: Release) -> None:
     job = run_job(release, MISSION, name="first")
-    teleop.missions = [{"id": "m1", "key": "another"}, {"id": "m2", "key": job.uid}]
-    assert "m2" in cancel(release, "first")
+    teleop.missions = [{"id": "m1", "key": "another"}, {"id": "m2", "key": job.uid, "name": "up"}]
+    assert cancel(release, "first") == "mission m2 (up) of Job 'first' is cancelled"
     assert teleop.posted == ["/v1/missions/m2/cancel"]
 
 
@@ -73,6 +73,19 @@ def test_a_job_that_has_not_posted_yet_is_deleted(
     assert "deleted" in cancel(release, "first")
     assert teleop.posted == []
     assert ("jobs", "demo", "first") not in running.objects
+
+
+def test_without_a_cloud_pod_the_job_is_deleted(
+    running: FakeApi, teleop: FakeTeleop, release: Release
+) -> None:
+    """Nobody could be asked to cancel its mission, and the Job would wait for its deadline."""
+    run_job(release, MISSION, name="first")
+    running.get("pods", "cloud-1")["status"]["phase"] = "Pending"
+    said = cancel(release, "first")
+    assert "'first' is deleted" in said
+    assert "cloudrc mission cancel --namespace=demo --release=cloudrc" in said
+    assert ("jobs", "demo", "first") not in running.objects
+    assert teleop.posted == []
 
 
 def test_a_job_that_has_ended_is_left_alone(
@@ -86,6 +99,6 @@ def test_a_job_that_has_ended_is_left_alone(
 
 def test_what_the_api_refuses_is_told(teleop: FakeTeleop, release: Release) -> None:
     job = run_job(release, MISSION, name="first")
-    teleop.missions, teleop.refuses = [{"id": "m1", "key": job.uid}], True
+    teleop.missions, teleop.refuses = [{"id": "m1", "key": job.uid, "name": ""}], True
     with pytest.raises(ClusterError, match="it is over"):
         cancel(release, "first")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -15,8 +16,16 @@ from test_jobs import at_look, end, start_pod, terminated
 
 from cloudrc.cli import cluster_flight
 from cloudrc.cli.main import main
+from cloudrc.cluster import fetch
+from cloudrc.cluster.access import Release, connect
+from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.jobs import run_job
+from cloudrc.config.load import load_experiment
 
+Patch = pytest.MonkeyPatch
 NAME, (SETTING,) = HOVER
+MISSIONS: list[dict[str, str]] = []
+"""What teleop knows of."""
 LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]
 
 
@@ -33,7 +42,10 @@ def metrics_port() -> Iterator[int]:
         def do_GET(self) -> None:
             self.send_response(200)
             self.end_headers()
-            self.wfile.write(b'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n')
+            if self.path == "/v1/missions":
+                self.wfile.write(json.dumps({"missions": MISSIONS}).encode())
+            else:
+                self.wfile.write(b'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n')
 
         def log_message(self, *words: object) -> None:
             pass
@@ -54,7 +66,8 @@ def pods(
     merged(tmp_path, flown(), (later(world[-300:], SECOND), []), torn=True)
     pretend("helm", f"echo $@ >> {tmp_path}/helm; test $1 = list && echo '[]' || cat > /dev/null")
     opened = "\n".join(
-        f"echo 'Forwarding from 127.0.0.1:{metrics_port} -> {port}'" for port in (9100, 9101, 9102)
+        f"echo 'Forwarding from 127.0.0.1:{metrics_port} -> {port}'"
+        for port in (8080, 9100, 9101, 9102)
     )
     pretend(
         "kubectl",
@@ -90,15 +103,71 @@ def test_a_flight_leaves_what_a_run_leaves(
     left = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"config.yaml", "mission.mcap", "report.json", "environment.json"} <= left
     assert {"world.mcap", "cloud.mcap", "world-link.metrics", "cloud-teleop.log"} <= left
+    assert not (tmp_path / "runs").exists()
     assert "upgrade --install cloudrc" in (tmp_path / "helm").read_text()
 
 
-def test_a_mission_that_was_refused_has_no_report(
-    pods: FakeApi, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("out", [[], ["--out", "out"]], ids=["runs", "out"])
+def test_a_mission_that_was_refused_leaves_nothing_and_claims_nothing(
+    pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: list[str]
 ) -> None:
     at_look(pods, 2, ending(pods, "Failed", 5, "mission m-1 is under way"))
+    assert main([*LINE, *out]) == 5
+    said = capsys.readouterr().err
+    assert "did not fly its mission: mission m-1 is under way" in said
+    assert "what was recorded" not in said
+    assert not (tmp_path / "out").exists()
+    assert list((tmp_path / "runs").glob("*")) == []
+
+
+def test_a_run_in_runs_is_the_latest_one(pods: FakeApi, tmp_path: Path) -> None:
+    at_look(pods, 2, ending(pods, "Complete", 0, "mission done"))
+    assert main(LINE) == 6
+    assert (tmp_path / "runs" / "latest" / "report.json").is_file()
+
+
+def test_a_way_that_breaks_off_costs_the_metrics_and_not_the_report(
+    pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Patch
+) -> None:
+    calls: list[str] = []
+
+    def broken(release: object, component: str) -> dict[str, str]:
+        raise ClusterError("no way to the pod")
+
+    def hiccup(release: Release, component: str, target: Path) -> None:
+        calls.append(component)
+        if len(calls) == 1:
+            raise ClusterError("kubectl exec failed")
+        fetch_recording(release, component, target)
+
+    fetch_recording = fetch.fetch_recording
+    monkeypatch.setattr(fetch, "fetch_metrics", broken)
+    monkeypatch.setattr(fetch, "fetch_recording", hiccup)
+    at_look(pods, 2, ending(pods, "Complete", 0, "mission done"))
+    assert main([*LINE, "--out", "out"]) == 6
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["shaper"] == "unknown"
+    assert "without the world pod's metrics: no way to the pod" in captured.err
+    assert "kubectl exec failed; trying again" in captured.err
+    assert (tmp_path / "out" / "cloud-teleop.log").is_file()
+
+
+def test_a_flight_that_is_under_way_is_not_ended_by_another(
+    pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Patch
+) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "MISSIONS", [{"id": "m7", "state": "held"}])
     assert main([*LINE, "--out", "out"]) == 5
-    assert "did not fly its mission: mission m-1 is under way" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "mission m7 is under way on release 'cloudrc'" in said
+    assert "end it: cloudrc mission cancel --namespace=demo --release=cloudrc, or" in said
+    monkeypatch.setattr(sys.modules[__name__], "MISSIONS", [{"id": "m7", "state": "done"}])
+    run_job(connect(), {}, name="first")
+    assert main([*LINE, "--out", "out"]) == 5
+    said = capsys.readouterr().err
+    assert "Job 'first' is under way" in said
+    assert "cloudrc mission cancel first --namespace=demo --release=cloudrc" in said
+    assert not (tmp_path / "helm").exists()
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -119,10 +188,14 @@ def test_what_the_pods_cannot_have_is_refused_before_anything_is_done(
 
 
 def test_what_a_release_was_installed_with_is_kept() -> None:
-    from cloudrc.config.load import load_experiment
-
     before = {"metrics": {"allowFrom": ["x"]}, "link": {"mode": "relay", "profile": "paper-p1"}}
     given = cluster_flight.values(load_experiment("hover"), before)
     assert given["metrics"] == before["metrics"]
     assert given["link"] == {"mode": "relay", "profile": ""}
     assert given["experiment"]["name"] == "hover"
+
+
+def test_the_charts_own_mission_does_not_fly_in_the_way() -> None:
+    before = {"mission": {"enabled": True, "queue": True}}
+    given = cluster_flight.values(load_experiment("hover"), before)
+    assert given["mission"] == {"enabled": False, "queue": True}

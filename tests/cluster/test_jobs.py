@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -13,7 +14,8 @@ from fake_api import FakeApi, pod
 from cloudrc.cluster import manifest
 from cloudrc.cluster.access import Release
 from cloudrc.cluster.errors import ClusterError, WaitedTooLongError
-from cloudrc.cluster.jobs import delete_job, follow, list_jobs, logs, read_job, run_job
+from cloudrc.cluster.follow import follow, logs
+from cloudrc.cluster.jobs import delete_job, list_jobs, read_job, run_job
 
 MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
 
@@ -56,6 +58,26 @@ def test_a_job_is_made_from_the_release_itself(running: FakeApi, release: Releas
     assert "--api=http://cloudrc-api:8080" in container["args"]
     assert json.loads(plan["data"]["mission.yaml"]) == MISSION
     assert plan["metadata"]["ownerReferences"][0]["uid"] == status.uid
+
+
+def test_a_job_goes_with_its_release_and_runs_where_that_does(
+    running: FakeApi, release: Release
+) -> None:
+    cloud = running.get("deployments", "cloudrc-cloud")
+    where = {"nodeSelector": {"disk": "fast"}, "tolerations": [{"key": "lab"}]}
+    cloud["spec"]["template"] = {"spec": {**where, "containers": []}}
+    run_job(release, MISSION, name="first")
+    job = running.get("jobs", "first")
+    (owner,) = job["metadata"]["ownerReferences"]
+    assert (owner["kind"], owner["uid"]) == ("Deployment", cloud["metadata"]["uid"])
+    assert where.items() <= job["spec"]["template"]["spec"].items()
+
+
+def test_a_long_release_has_missions_too(running: FakeApi, release: Release) -> None:
+    for body in list(running.objects.values()):
+        body["metadata"]["labels"]["app.kubernetes.io/instance"] = "r" * 53
+    status = run_job(replace(release, name="r" * 53), MISSION)
+    assert len(status.name) <= 63 - len("-xxxxx")
 
 
 def test_a_job_without_a_name_gets_one_that_is_free(running: FakeApi, release: Release) -> None:

@@ -29,6 +29,7 @@ from kube import (
 )
 
 CLUSTER = "cloudrc-e2e"
+IMAGES = "world cloud prometheus"  # a real Prometheus is for these tests alone
 BUILD = ROOT / "build" / "e2e"
 TOOLS = {
     "docker": "https://docs.docker.com/engine/install/",
@@ -70,7 +71,7 @@ def cluster(request: pytest.FixtureRequest) -> Iterator[None]:
     for folder in BUILD.iterdir():
         if folder.is_dir():  # of an earlier session; the kubeconfig beside them may be in use
             shutil.rmtree(folder)
-    command("make", "images", timeout=1800)
+    command("make", "images", f"IMAGES={IMAGES}", timeout=1800)
     TIMES["create"] = time.monotonic()
     if own:
         os.environ["KUBECONFIG"] = str(BUILD / "kubeconfig")
@@ -102,7 +103,8 @@ def _load() -> None:
     """Load the images where the cluster is one of kind; another has to be able to pull them."""
     context = command("kubectl", "config", "current-context").strip()
     if context.startswith("kind-"):
-        command("make", "kind-load", f"CLUSTER={context.removeprefix('kind-')}", timeout=300)
+        name = f"CLUSTER={context.removeprefix('kind-')}"
+        command("make", "kind-load", name, f"IMAGES={IMAGES}", timeout=300)
 
 
 def _make_namespace() -> None:
@@ -157,6 +159,6 @@ def installed(cluster: None, values: Path) -> None:
 
 @pytest.fixture(scope="session")
 def prometheus_image(cluster: None) -> str:
-    """The image that `make images` builds beside ours."""
+    """A real Prometheus, and promtool with it."""
     found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
     return found.split()[0]

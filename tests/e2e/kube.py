@@ -125,9 +125,14 @@ def identity() -> dict[str, tuple[str, list[int]]]:
 Sample = tuple[str, tuple[tuple[str, str], ...]]
 
 
+def scrapes(component: str) -> dict[str, str]:
+    """What each container of a pod answers to a scrape."""
+    return fetch_metrics(place(), component)
+
+
 def metrics(component: str, container: str = "") -> dict[Sample, float]:
     """Every sample of a container: by name and sorted labels."""
-    text = fetch_metrics(place(), component)[container or component]
+    text = scrapes(component)[container or component]
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(text)

@@ -168,6 +168,12 @@ def apply_anywhere(documents: list[dict[str, Any]]) -> None:
     command("kubectl", "apply", "--filename=-", given=yaml.safe_dump_all(documents))
 
 
+def promtool(*words: str, given: str) -> str:
+    """What the tool of Prometheus says, and of what it is given on its standard input."""
+    where = ("exec", f"--namespace={MONITORING}", "--stdin", "prometheus", "--container=prometheus")
+    return kubectl(*where, "--", "promtool", *words, given=given)
+
+
 class Prometheus:
     """The Prometheus of the tests, asked by HTTP while the block lasts."""
 

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from cost import Cost, cost_between, usage
 from kube import (
+    CHART,
     EXAMPLES,
     TIMES,
     JobEnd,
@@ -25,9 +26,10 @@ from kube import (
     pod,
     pods,
     read,
+    scrapes,
     value,
 )
-from neighbours import MONITORING, Prometheus, install_prometheus, stranger
+from neighbours import MONITORING, Prometheus, install_prometheus, promtool, stranger
 
 MISSION = "paper-mission"
 LIMIT_CPU = 0.200
@@ -143,6 +145,20 @@ def test_a_stranger_reaches_neither_tunnel_nor_metrics_nor_api(first: FirstFligh
 def asked(first: FirstFlight) -> Iterator[Callable[[str], list[dict[str, Any]]]]:
     with Prometheus() as one:
         yield one.ask
+
+
+@pytest.mark.parametrize("component", ["world", "cloud"])
+def test_promtool_has_nothing_to_say_about_the_metrics(first: FirstFlight, component: str) -> None:
+    found = scrapes(component)
+    assert found.keys() >= {component, "link"}
+    for container, text in found.items():
+        assert "cloudrc_build_info" in text, container
+        assert promtool("check", "metrics", given=text) == "", container
+
+
+def test_promtool_accepts_the_alerts(prometheus: None) -> None:
+    said = promtool("check", "rules", "/dev/stdin", given=(CHART / "files/rules.yaml").read_text())
+    assert "SUCCESS" in said
 
 
 Ask = Callable[[str], list[dict[str, Any]]]

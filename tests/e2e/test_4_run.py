@@ -28,6 +28,13 @@ def report(installed: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_the_doctor_finds_what_a_run_needs(installed: None) -> None:
+    done = cloudrc("doctor", "--mode", "cluster", "-o", "json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = {check["name"]: check["state"] for check in json.loads(done.stdout)["checks"]}
+    assert (found["kubeconfig"], found["cluster"]) == ("ok", "ok")
+
+
 def test_everything_that_a_run_leaves_is_there(report: Path) -> None:
     wanted = ["report.html", "report.json", "mission.mcap", "config.yaml", "environment.json"]
     wanted += [f"figures/{name}.png" for name in ("delay", "odom", "error")]

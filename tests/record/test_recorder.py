@@ -175,3 +175,18 @@ def test_a_disk_without_room_for_the_head_raises_nothing(room: int) -> None:
     recorder.close()
     assert recorder.dropped == 5
     assert "No space left on device" in recorder.error
+
+
+def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> None:
+    path = tmp_path / "world.mcap"
+    recorder = Recorder(path, open_mcap, size_max=20_000)
+    for start in range(0, 3000, 100):
+        recorder.put(world_records(100, start * MS))
+        while recorder.drain():
+            pass
+        recorder.flush()
+    recorder.close()
+    assert "recording stopped: it has grown to its limit" in recorder.error
+    assert recorder.dropped > 0
+    assert 20_000 <= path.stat().st_size < 100_000
+    assert Recording.read(path).note == ""

@@ -1,8 +1,13 @@
 {{/* Names, labels and images: what everything in the release is called. */}}
 
+{{/* Begins the names of all objects; the longest goes on with "-mission-" and 8 digits, up to 63. */}}
 {{- define "cloudrc.fullname" -}}
 {{- $name := .Values.fullnameOverride | default (contains "cloudrc" .Release.Name | ternary .Release.Name (printf "%s-cloudrc" .Release.Name)) -}}
-{{- $name | trunc 50 | trimSuffix "-" -}}
+{{- $name = $name | trunc 46 | trimSuffix "-" -}}
+{{- if not (regexMatch "^[a-z]([-a-z0-9]*[a-z0-9])?$" $name) -}}
+{{- fail (printf "the name '%s' begins with no letter, or has others than a-z, 0-9 and '-': choose another release name, or set fullnameOverride" $name) -}}
+{{- end -}}
+{{- $name -}}
 {{- end }}
 
 {{/* Selector of a component's pods. Takes (dict "root" $ "component" NAME), as all below. */}}

@@ -62,17 +62,15 @@ affinity:
 
 {{/* Annotations of a pod. A change of the experiment rolls it; one of the link's profile does not. */}}
 {{- define "cloudrc.podAnnotations" -}}
-checksum/experiment: {{ toYaml .root.Values.experiment | sha256sum }}
-cloudrc/link-mode: {{ include "cloudrc.linkMode" .root }}
-kubectl.kubernetes.io/default-container: {{ .component }}
-{{- if .root.Values.metrics.annotations }}
-prometheus.io/scrape: "true"
-prometheus.io/path: /metrics
-prometheus.io/port: "9100"
-{{- end }}
-{{- with (index .root.Values .component).podAnnotations }}
-{{ toYaml . }}
-{{- end }}
+{{- $made := dict "checksum/experiment" (toYaml .root.Values.experiment | sha256sum) -}}
+{{- $_ := set $made "cloudrc/link-mode" (include "cloudrc.linkMode" .root) -}}
+{{- $_ := set $made "kubectl.kubernetes.io/default-container" .component -}}
+{{- if .root.Values.metrics.annotations -}}
+{{- $scrape := dict "prometheus.io/scrape" "true" "prometheus.io/path" "/metrics" "prometheus.io/port" "9100" -}}
+{{- $made = merge $made $scrape -}}
+{{- end -}}
+{{- /* Whoever writes an annotation of these names means it. */ -}}
+{{ toYaml (merge (deepCopy (index .root.Values .component).podAnnotations) $made) }}
 {{- end }}
 
 {{/* Volumes of both pods: the experiment, the link's profile, the key, the route between link and end. */}}

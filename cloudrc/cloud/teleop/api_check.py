@@ -37,6 +37,8 @@ def read_mission(body: bytes, scene: Scene) -> tuple[MissionRequest, Mission]:
         RefusedError: With everything that is wrong.
     """
     request = _parse(body, MissionRequest)
+    if not request.waypoints:  # an experiment's mission may have steps in their place
+        _refuse([Problem(("waypoints",), "", "none given; give at least one")])
     mission = Mission(start=request.start, waypoints=request.waypoints)
     _refuse(check_mission(mission, scene))
     return request, mission

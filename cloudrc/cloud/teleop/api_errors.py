@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 
 from cloudrc.cloud.teleop.api_check import RefusedError, as_json
@@ -14,6 +15,7 @@ from cloudrc.cloud.teleop.service_book import (
     UnavailableError,
     UnknownMissionError,
 )
+from cloudrc.config.problems import Problem, in_words
 from cloudrc.errors import CloudrcError
 
 BODY_MAX = 256 * 1024
@@ -53,6 +55,14 @@ def handle_errors(app: FastAPI) -> None:
             case UnavailableError():
                 return JSONResponse({"detail": str(error)}, 503, {"Retry-After": "1"})
         return JSONResponse({"detail": str(error)}, 500)
+
+    @app.exception_handler(RequestValidationError)
+    async def refuse_query(request: Request, error: RequestValidationError) -> JSONResponse:
+        found = [
+            Problem(tuple(map(str, each["loc"][1:])), in_words(each["input"]), each["msg"])
+            for each in error.errors()
+        ]
+        return await refuse(request, RefusedError(found))
 
     @app.exception_handler(TimeoutError)
     async def too_late(request: Request, error: TimeoutError) -> JSONResponse:

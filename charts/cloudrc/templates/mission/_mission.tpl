@@ -1,4 +1,4 @@
-{{/* A mission as a file: takes (dict "root" $ "plan" NAME-OR-MAPPING). */}}
+{{/* A mission as a file: takes (dict "root" $ "plan" NAME-OR-MAPPING "key" WHERE-IT-STANDS). */}}
 {{- define "cloudrc.missionFile" -}}
 {{- if kindIs "map" .plan -}}
 {{ toYaml .plan }}
@@ -9,7 +9,7 @@
 {{- range $path, $_ := .root.Files.Glob "files/missions/*.yaml" -}}
 {{- $known = append $known (base $path | trimSuffix ".yaml") -}}
 {{- end -}}
-{{- fail (printf "mission: no mission '%s' ships with the chart; choose one of %s, or write it out under mission.plan" .plan (join ", " $known)) -}}
+{{- fail (printf "%s: no mission '%s' ships with the chart; choose one of %s, or write it out there" .key .plan (join ", " $known)) -}}
 {{- end -}}
 {{ $text | trimSuffix "\n" }}
 {{- end -}}
@@ -52,6 +52,9 @@ metadata:
 spec:
   restartPolicy: Never
   {{- include "cloudrc.pod" (dict "root" . "component" "cloud") | nindent 2 }}
+  {{- with include "cloudrc.placement" .Values.cloud }}
+  {{- . | nindent 2 }}
+  {{- end }}
   containers:
     {{- include "cloudrc.missionContainer" (dict "root" . "name" "mission" "uid" "metadata.labels['batch.kubernetes.io/controller-uid']" "queue" .Values.mission.queue) | nindent 4 }}
 {{- end }}

@@ -1,0 +1,41 @@
+"""What the API says of a wrong query or an empty mission: the words that fit, in one shape."""
+
+from __future__ import annotations
+
+import json
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+
+import pytest
+from api_harness import Running, running
+
+from cloudrc.cloud.teleop import api_models as models
+
+
+@pytest.fixture(scope="module")
+def idle() -> Iterator[Running]:
+    with running() as one:
+        yield one
+
+
+@pytest.mark.parametrize("value", ["x", "1.5", ""])
+def test_a_query_that_cannot_be_used_is_refused_like_a_body(idle: Running, value: str) -> None:
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        urllib.request.urlopen(f"{idle.url}/v1/events?after={value}", timeout=5.0)
+    refusal = json.loads(caught.value.read())
+    models.Refusal.model_validate(refusal)
+    assert caught.value.code == 422
+    (problem,) = refusal["problems"]
+    assert (problem["path"], problem["value"], problem["index"]) == ("after", repr(value), None)
+    assert "integer" in problem["reason"]
+    assert refusal["detail"].startswith("after: ")
+
+
+@pytest.mark.parametrize("body", [{}, {"waypoints": []}, {"name": "nothing"}])
+def test_nothing_is_offered_that_the_api_does_not_take(
+    idle: Running, body: dict[str, object]
+) -> None:
+    status, refusal = idle.post("/v1/missions", body)
+    assert status == 422
+    assert refusal["detail"] == "waypoints: none given; give at least one"

@@ -1,0 +1,153 @@
+"""`cloudrc doctor --mode cluster` says "can run" exactly where `cloudrc run` can."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from fake_api import FakeApi, kubeconfig
+
+from cloudrc.cli import checks, extras, run
+from cloudrc.cli.main import main
+from cloudrc.cluster.version import OLDEST
+
+Printed = pytest.CaptureFixture[str]
+CHART = Path(__file__).resolve().parents[2] / "charts" / "cloudrc" / "Chart.yaml"
+LINE = ["doctor", "--mode", "cluster", "-o", "json"]
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without what has nothing to do with a cluster and takes its time."""
+    for name in ("mujoco_steps", "udp_loopback", "timer", "graphics"):
+        monkeypatch.setattr(checks, name, lambda name=name: checks.Check(name, "ok", ""))
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Let only some programs be there."""
+
+    def install(*names: str) -> None:
+        found = {name: f"/nowhere/{name}" for name in names}
+        monkeypatch.setattr(shutil, "which", found.get)
+
+    return install
+
+
+def doctor(capsys: Printed, code: int, *more: str) -> dict[str, dict[str, Any]]:
+    assert main([*LINE, *more]) == code
+    report = json.loads(capsys.readouterr().out)
+    assert report["ready"] is (code == 0)
+    return {check["name"]: check for check in report["checks"]}
+
+
+def test_a_cluster_elsewhere_needs_neither_docker_nor_kind(
+    api: FakeApi, installed: Callable[..., None], capsys: Printed
+) -> None:
+    installed("helm", "kubectl")
+    found = doctor(capsys, 0)
+    assert found["cluster"]["found"] == "Kubernetes 1.33 answers"
+    for name in ("docker", "kind"):
+        assert found[name]["state"] == "warn"
+        assert "to make a cluster here" in found[name]["fix"]
+
+
+@pytest.mark.parametrize("program", ["helm", "kubectl"])
+def test_what_the_run_calls_is_needed(
+    api: FakeApi, installed: Callable[..., None], capsys: Printed, program: str
+) -> None:
+    installed(*{"helm", "kubectl"} - {program})
+    assert doctor(capsys, 3)[program]["state"] == "missing"
+
+
+def test_docker_without_its_daemon_is_not_ok(
+    api: FakeApi, pretend: Callable[[str, str], Path], capsys: Printed
+) -> None:
+    for name in ("helm", "kubectl", "kind"):
+        pretend(name, "true")
+    pretend("docker", "echo 'Cannot connect to the Docker daemon' >&2; exit 1")
+    found = doctor(capsys, 0)
+    assert found["docker"]["state"] == "warn"
+    assert "daemon does not answer" in found["docker"]["found"]
+    pretend("docker", "echo 28.0.0")
+    assert doctor(capsys, 0)["docker"]["state"] == "ok"
+
+
+def test_without_a_kubeconfig_it_cannot_run(
+    tmp_path: Path,
+    installed: Callable[..., None],
+    capsys: Printed,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    installed("helm", "kubectl")
+    nowhere = str(tmp_path / "none")
+    monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", nowhere)
+    found = doctor(capsys, 3)
+    assert found["kubeconfig"]["state"] == "missing"
+    assert "kind create cluster" in found["kubeconfig"]["fix"]
+    assert "cluster" not in found
+
+
+def test_a_cluster_that_does_not_answer_cannot_be_flown_on(
+    tmp_path: Path,
+    installed: Callable[..., None],
+    capsys: Printed,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    installed("helm", "kubectl")
+    path = tmp_path / "config"
+    path.write_text(kubeconfig("http://127.0.0.1:9"))
+    monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", str(path))
+    cluster = doctor(capsys, 3)["cluster"]
+    assert "does not answer" in cluster["found"]
+    assert "kubectl cluster-info" in cluster["fix"]
+
+
+@pytest.mark.parametrize(
+    ("minor", "code"), [("28", 3), ("28+", 3), ("29", 0), ("30+", 0), ("100", 0)]
+)
+def test_a_cluster_that_is_too_old_is_said_to_be(
+    api: FakeApi, installed: Callable[..., None], capsys: Printed, minor: str, code: int
+) -> None:
+    installed("helm", "kubectl")
+    api.version["minor"] = minor
+    cluster = doctor(capsys, code)["cluster"]
+    assert cluster["state"] == ("missing" if code else "ok")
+    assert not code or "needs 1.29" in cluster["fix"]
+
+
+def test_another_context_can_be_asked_for(
+    api: FakeApi, installed: Callable[..., None], capsys: Printed
+) -> None:
+    installed("helm", "kubectl")
+    assert "elsewhere" in doctor(capsys, 0, "--context", "elsewhere")["kubeconfig"]["found"]
+    assert doctor(capsys, 3, "--context", "x")["kubeconfig"]["state"] == "missing"
+
+
+@pytest.mark.parametrize("mode", run.MODES)
+def test_the_extras_that_block_a_mode_are_those_that_its_run_asks_for(mode: str) -> None:
+    blocking = {extra for extra in extras.EXTRAS if mode in checks.packages(extra).modes}
+    assert blocking == set(run.EXTRAS[mode])
+
+
+def test_other_modes_leave_the_cluster_alone(api: FakeApi) -> None:
+    names = [check.name for check in checks.all_checks("local")]
+    assert "cluster" not in names
+    assert "kubeconfig" not in names
+
+
+def test_either_version_of_cgroups_is_read_and_none_is_wanted() -> None:
+    assert "want" not in checks.cgroup().fix
+
+
+def test_the_oldest_version_is_that_of_the_chart() -> None:
+    wanted = yaml.safe_load(CHART.read_text())["kubeVersion"]
+    found = re.fullmatch(r">=(\d+)\.(\d+)\.0-0", wanted)
+    assert found is not None
+    assert tuple(map(int, found.groups())) == OLDEST

@@ -1,0 +1,92 @@
+"""Whether `cloudrc mission` means the run that flies here or a release in the cluster."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fake_api import FakeApi
+
+from cloudrc.cli.main import main
+
+Printed = pytest.CaptureFixture[str]
+IN_CLUSTER = "no missions in namespace 'demo'"
+
+
+@pytest.fixture(autouse=True)
+def api_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "latest").mkdir(parents=True)
+    return tmp_path / "runs" / "latest" / "api.json"
+
+
+@pytest.fixture
+def flies_here(api_file: Path) -> Iterator[None]:
+    """Somebody listens where the run's file says, and never answers."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"http://127.0.0.1:{server.getsockname()[1]}"
+        api_file.write_text(json.dumps({"url": url}))
+        yield
+
+
+@pytest.fixture
+def was_killed(api_file: Path) -> str:
+    """A run that could not clean up after itself."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    api_file.write_text(json.dumps({"url": f"http://127.0.0.1:{port}"}))
+    return str(port)
+
+
+@pytest.fixture
+def no_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cloudrc.cli.mission_http.ANSWER_LIMIT", 0.05)
+
+
+@pytest.mark.usefixtures("flies_here", "no_patience")
+def test_the_run_here_is_meant_unless_something_says_otherwise(
+    running: FakeApi, capsys: Printed
+) -> None:
+    assert main(["mission", "list"]) == 5
+    assert "127.0.0.1" in capsys.readouterr().err
+    assert running.seen == []
+
+
+@pytest.mark.usefixtures("flies_here", "no_patience")
+@pytest.mark.parametrize("flags", [["--release", "cloudrc"], ["-n", "demo"], ["--context", "here"]])
+def test_a_flag_of_the_cluster_means_the_cluster(
+    running: FakeApi, capsys: Printed, flags: list[str]
+) -> None:
+    assert main(["mission", "list", *flags]) == 0
+    assert IN_CLUSTER in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("flies_here", "no_patience")
+def test_the_plugin_of_kubectl_means_the_cluster(
+    running: FakeApi, capsys: Printed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc", "mission", "list"])
+    assert main() == 0
+    assert IN_CLUSTER in capsys.readouterr().out
+
+
+def test_a_run_that_was_killed_is_not_in_the_way(
+    running: FakeApi, was_killed: str, capsys: Printed
+) -> None:
+    assert main(["mission", "list"]) == 0
+    assert IN_CLUSTER in capsys.readouterr().out
+
+
+def test_without_a_cluster_a_run_that_was_killed_is_no_run(
+    was_killed: str, capsys: Printed, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    nowhere = str(tmp_path / "none")
+    monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", nowhere)
+    assert main(["mission", "status"]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no run flies here" in line
+    assert "KUBECONFIG" in line
