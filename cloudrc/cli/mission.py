@@ -6,8 +6,13 @@ import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import place_arguments, timeout_argument
+from cloudrc.cli.token import reader, token_argument, token_file
+
+if TYPE_CHECKING:
+    from cloudrc.cli.mission_http import Api
 
 KUBECTL_PLUGIN = "kubectl-cloudrc"
 """What this program is called when kubectl starts it."""
@@ -24,11 +29,16 @@ examples:
   cloudrc mission run pipes
   cloudrc mission hold
   cloudrc mission goto 0.5 0 1.2
+  cloudrc mission estop
   cloudrc mission run my.yaml --queue --context kind-cloudrc -n demo
   cloudrc mission logs --follow
 
 A mission is a file with 'waypoints', such as those that 'cloudrc list missions'
-names. 'run' and 'fly' end with its verdict: 0 done, 1 failed, 6 not real time."""
+names. 'run' and 'fly' end with its verdict: 0 done, 1 failed, 6 not real time.
+'estop' stops the rotors at once, whatever flies, and lets the robot fall; that
+and a landing after a lost link are left by 'acknowledge'. An API that is called
+over a network asks for a token: --token-file, CLOUDRC_TOKEN_FILE, or for a
+release of the chart its Secret, read with your own rights in the cluster."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +54,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
             allow_abbrev=False,
         )
         verb.add_argument("--debug", action="store_true", default=argparse.SUPPRESS)
-        verb.add_argument("--api", metavar="URL", help="API of a run or release: http://HOST:PORT")
+        verb.add_argument(
+            "--api", metavar="URL", help="http://HOST:PORT or unix:PATH of a run or release"
+        )
+        token_argument(verb)
         if name != "fly":
             place_arguments(verb)
         return verb
@@ -70,6 +83,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         goto.add_argument(axis.lower(), type=float, metavar=axis, help="[m], world frame")
     add("hold", "stop the robot where it is")
     add("resume", "go on with the mission that is held")
+    add("estop", "stop the rotors at once: the robot falls, and its mission has failed")
+    add("acknowledge", "release a robot that was stopped or has landed; arms nothing")
     fly = add("fly", "what a mission's Job runs: post, follow, end with the verdict")
     fly.add_argument("--mission", required=True, metavar="FILE", help="the mission")
     fly.add_argument("--key", default="", help="posting twice under one key flies once")
@@ -80,6 +95,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Do what the verb says."""
     from cloudrc.cli import mission_cluster, mission_local
+    from cloudrc.cli.mission_http import Api
 
     verb: str = options.verb
     if verb == "fly":
@@ -88,10 +104,11 @@ def execute(options: argparse.Namespace) -> int:
     if url is None and verb in mission_cluster.VERBS:
         in_cluster: Callable[[argparse.Namespace], int] = mission_cluster.VERBS[verb]
         return in_cluster(options)
+    of_api: Callable[[argparse.Namespace, Api], int] = mission_local.VERBS[verb]
     if url is None:
-        with mission_cluster.api_url(options) as forwarded:
-            return mission_local.VERBS[verb](options, forwarded)
-    return mission_local.VERBS[verb](options, url)
+        with mission_cluster.api(options) as forwarded:
+            return of_api(options, forwarded)
+    return of_api(options, Api(url, reader(token_file(options))))
 
 
 def _url_here(options: argparse.Namespace) -> str | None:

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.cluster_flags import place
 from cloudrc.cli.extras import require
 from cloudrc.cli.mission_check import check_on, parse
+from cloudrc.cli.mission_http import Api
 from cloudrc.cli.mission_local import read_mission
 from cloudrc.cli.output import table
+from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 if TYPE_CHECKING:
@@ -23,13 +25,15 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def api_url(options: argparse.Namespace) -> Iterator[str]:
+def api(options: argparse.Namespace) -> Iterator[Api]:
     """Open the way to a release's API for as long as the block lasts."""
-    release = _place(options)
-    from cloudrc.cluster.forward import api_url as forwarded
+    release, path = _place(options), token_file(options)
+    from cloudrc.cluster.forward import api_url
+    from cloudrc.cluster.tokens import operator_token
 
-    with forwarded(release.context, release.namespace, release.name) as url:
-        yield url
+    token = operator_token(release) if path is None else ""
+    with api_url(release.context, release.namespace, release.name) as url:
+        yield Api(url, reader(path) if path else lambda: token)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -78,8 +82,8 @@ def _status(options: argparse.Namespace) -> int:
     if options.id is None:
         from cloudrc.cli.mission_local import VERBS as OF_API
 
-        with api_url(options) as url:
-            return OF_API["status"](options, url)
+        with api(options) as of_release:
+            return OF_API["status"](options, of_release)
     release = _place(options)
     from cloudrc.cluster.jobs import read_job
 
@@ -94,12 +98,13 @@ def _cancel(options: argparse.Namespace) -> int:
     if options.id is None:
         from cloudrc.cli.mission_local import VERBS as OF_API
 
-        with api_url(options) as url:
-            return OF_API["cancel"](options, url)
+        with api(options) as of_release:
+            return OF_API["cancel"](options, of_release)
     release = _place(options)
     from cloudrc.cluster.cancel import cancel
 
-    print(cancel(release, options.id))
+    path = token_file(options)
+    print(cancel(release, options.id, reader(path)() if path else None))
     return 0
 
 

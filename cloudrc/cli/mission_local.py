@@ -14,6 +14,7 @@ from typing import Any
 from cloudrc.cli.mission_follow import Follower, in_words, leave_message
 from cloudrc.cli.mission_http import Api
 from cloudrc.cli.output import table
+from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, CloudrcError
 
 INTERRUPTED = 130
@@ -41,7 +42,7 @@ def fly(options: argparse.Namespace) -> int:
     if options.api is None:
         raise BadInputError("fly needs --api; to fly by hand: cloudrc mission run FILE")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    api = Api(options.api)
+    api = Api(options.api, reader(token_file(options)))
     follower, found = Follower(api, _write), ""
     try:
         mission = read_mission(options.mission)
@@ -61,8 +62,8 @@ def fly(options: argparse.Namespace) -> int:
     return int(verdict["exit_code"])
 
 
-def _run(options: argparse.Namespace, url: str) -> int:
-    api, mission = Api(url), read_mission(options.mission)
+def _run(options: argparse.Namespace, api: Api) -> int:
+    mission = read_mission(options.mission)
     if options.name:
         mission["name"] = options.name
     follower = Follower(api, _write, patience=10.0)
@@ -76,8 +77,8 @@ def _run(options: argparse.Namespace, url: str) -> int:
     return int(verdict["exit_code"])
 
 
-def _list(options: argparse.Namespace, url: str) -> int:
-    missions = Api(url).get("/v1/missions")["missions"]
+def _list(options: argparse.Namespace, api: Api) -> int:
+    missions = api.get("/v1/missions")["missions"]
     if options.output == "json":
         return _print_json({"missions": missions})
     if not missions:
@@ -94,8 +95,7 @@ def _row(mission: dict[str, Any]) -> tuple[str, ...]:
     return mission["id"], mission["name"], mission["state"], done, verdict
 
 
-def _status(options: argparse.Namespace, url: str) -> int:
-    api = Api(url)
+def _status(options: argparse.Namespace, api: Api) -> int:
     if options.id:
         mission = api.get(f"/v1/missions/{options.id}")
         if options.output == "json":
@@ -122,8 +122,7 @@ def _status(options: argparse.Namespace, url: str) -> int:
     return 0
 
 
-def _cancel(options: argparse.Namespace, url: str) -> int:
-    api = Api(url)
+def _cancel(options: argparse.Namespace, api: Api) -> int:
     mission_id = options.id
     if not mission_id:
         mission = api.get("/v1/state")["mission"]
@@ -134,8 +133,7 @@ def _cancel(options: argparse.Namespace, url: str) -> int:
     return 0
 
 
-def _logs(options: argparse.Namespace, url: str) -> int:
-    api = Api(url)
+def _logs(options: argparse.Namespace, api: Api) -> int:
     if not options.follow and options.id:
         _print_events(api.get(f"/v1/missions/{options.id}")["events"])
         return 0
@@ -150,23 +148,37 @@ def _logs(options: argparse.Namespace, url: str) -> int:
     return 0
 
 
-def _goto(options: argparse.Namespace, url: str) -> int:
+def _goto(options: argparse.Namespace, api: Api) -> int:
     body = {"position_m": [options.x, options.y, options.z]}
-    _say(Api(url).post("/v1/goto", body))
+    _say(api.post("/v1/goto", body))
     return 0
 
 
-def _hold(options: argparse.Namespace, url: str) -> int:
-    _say(Api(url).post("/v1/hold"))
+def _hold(options: argparse.Namespace, api: Api) -> int:
+    _say(api.post("/v1/hold"))
     return 0
 
 
-def _resume(options: argparse.Namespace, url: str) -> int:
-    _say(Api(url).post("/v1/resume"))
+def _resume(options: argparse.Namespace, api: Api) -> int:
+    _say(api.post("/v1/resume"))
     return 0
 
 
-VERBS: dict[str, Callable[[argparse.Namespace, str], int]] = {
+def _estop(options: argparse.Namespace, api: Api) -> int:
+    mission = api.post("/v1/estop")["id"]
+    print("emergency stop: the robot is told to stop its rotors until it has", flush=True)
+    if mission:
+        print(f"mission {mission} has failed")
+    return 0
+
+
+def _acknowledge(options: argparse.Namespace, api: Api) -> int:
+    api.post("/v1/acknowledge")
+    print("acknowledged: the next mission may fly")
+    return 0
+
+
+VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
     "run": _run,
     "list": _list,
     "status": _status,
@@ -175,6 +187,8 @@ VERBS: dict[str, Callable[[argparse.Namespace, str], int]] = {
     "goto": _goto,
     "hold": _hold,
     "resume": _resume,
+    "estop": _estop,
+    "acknowledge": _acknowledge,
 }
 
 

@@ -9,7 +9,7 @@ is said at once, each with the line it stands in.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,10 +23,11 @@ from cloudrc.config.resolved import COMMAND_AGE_MAX_MS, ResolvedExperiment, spee
 from cloudrc.config.schema import Experiment, Mission, Profile
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
-from cloudrc.link.trace import read_trace
+from cloudrc.link.trace import read_table, read_trace
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _DIRECTIONS = ("uplink", "downlink")
+_FILES: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
 
 
 def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
@@ -72,6 +73,11 @@ def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
     return _load_profile(str(name), folder or Path())[1]
 
 
+def check_profile(document: Document, name: str) -> Profile:
+    """Check a link profile that was put together in memory; raises BadInputError."""
+    return _validate(document, Profile, name, _resolve_traces(document, ()))
+
+
 def load_mission(name: str | Path, folder: Path | None = None) -> Mission:
     """Load a mission by its name or path (relative to `folder`); raises BadInputError.
 
@@ -92,8 +98,7 @@ def dump(experiment: ResolvedExperiment) -> str:
 
 def _load_profile(name: str, folder: Path) -> tuple[Document, Profile]:
     document = shipped.read("profile", name, folder)
-    wrong = _resolve_traces(document, ())
-    return document, _validate(document, Profile, name, wrong)
+    return document, check_profile(document, name)
 
 
 def _validate(document: Document, model: type[_Model], name: str, found: list[Problem]) -> _Model:
@@ -201,18 +206,17 @@ def _forget_profile(document: Document) -> None:
 
 
 def _resolve_traces(document: Document, above: yaml_text.Path) -> list[Problem]:
-    """Make the paths of traces absolute."""
+    """Make the paths of traces and tables absolute, and read them to see whether they can be."""
     found = []
-    for key in _DIRECTIONS:
-        path = (*above, key, "trace")
-        trace = document.get(*path)
-        if not isinstance(trace, str):
+    for path in ((*above, key, name) for key in _DIRECTIONS for name in _FILES):
+        given = document.get(*path)
+        if not isinstance(given, str):
             continue
         source = document.source(path)
-        absolute = (source.folder / Path(trace).expanduser()).resolve()
+        absolute = (source.folder / Path(given).expanduser()).resolve()
         document.graft(path, str(absolute), source)
         try:
-            read_trace(absolute)
+            _FILES[path[-1]](absolute)
         except BadInputError as error:
             found.append(Problem(path, "", str(error)))
     return found

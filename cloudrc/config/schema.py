@@ -56,7 +56,11 @@ class Waypoint(Section):
     yaw_deg: Finite = Field(0.0, description="Heading [deg]")
     tolerance_m: Positive = Field(0.10, description="Distance that counts as there [m]")
     dwell_s: NotNegative = Field(0.5, description="How long to stay within the tolerance [s]")
-    time_limit_s: Positive = Field(60.0, description="Time allowed for this leg [s]")
+    time_limit_s: Positive | None = Field(
+        None,
+        description="Time allowed for this leg, in which the robot is seen to fly on commands [s]; "
+        "default: 3 times what it is expected to take",
+    )
 
 
 class Steps(Section):
@@ -118,7 +122,7 @@ class World(Section):
 class Guard(Section):
     """What the onboard guard allows; configured on world's side only."""
 
-    command_age_max_ms: Positive | None = Field(
+    command_age_max_ms: Annotated[Positive, Field(le=10_000)] | None = Field(
         None,
         description="A command whose basis is older is not flown [ms]; "
         "default: the link profile's own, else 250",
@@ -130,6 +134,9 @@ class Guard(Section):
     )
     acceleration_max_mps2: Positive = Field(12.0, description="Cap on its change [m/s^2]")
     yaw_rate_max_radps: Positive = Field(1.0, description="Cap on the yaw rate [rad/s]")
+    hold_max_s: Positive = Field(
+        60.0, description="HOLD for so long during a mission ends in LAND [s]"
+    )
 
 
 class Tunnel(Section):

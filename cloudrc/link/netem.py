@@ -12,12 +12,17 @@ Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8).
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
+from cloudrc.link.netem_check import differences
+from cloudrc.link.netem_steps import Steps, pause_ns
+from cloudrc.link.netem_tables import write_measured
 from cloudrc.link.netem_tc import Iproute2, Run
-from cloudrc.link.netem_text import STEP_NS, check, options
+from cloudrc.link.netem_text import check, limit, options
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay_lane import Address
 from cloudrc.link.timeline import Timeline
@@ -30,7 +35,11 @@ _UDP = "17"
 
 
 class Netem:
-    """One direction of the link in the kernel; a `Shaper`."""
+    """One direction of the link in the kernel; a `Shaper`.
+
+    Attributes:
+        steps: How well the time line has been followed so far.
+    """
 
     name = "netem"
 
@@ -42,6 +51,8 @@ class Netem:
         origin_ns: int,
         clock: Callable[[], int],
         wait: Callable[[float], None],
+        tables: Path | None = None,
+        log: Callable[[str], None] = lambda line: None,
     ) -> None:
         """Set up, without touching the network yet.
 
@@ -52,15 +63,23 @@ class Netem:
             origin_ns: When the link came up [ns]; the time line counts from it.
             clock: Tells the time on the clock of `origin_ns` [ns].
             wait: Sleeps for so long [s].
+            tables: That folder, where a profile's measured distribution is added.
+            log: Gets lines for people.
         """
         self._iproute2 = Iproute2(run)
-        self._profile = profile
-        self._timeline = Timeline(profile)
-        self._origin_ns = origin_ns
-        self._clock = clock
-        self._wait = wait
+        self._clock, self._wait = clock, wait
+        self._tables, self._log = tables, log
         self._device = ""
         self._applied: list[str] = []
+        self._stepped_ns = origin_ns
+        self.steps = Steps()
+        self._follow(profile, origin_ns)
+
+    def _follow(self, profile: DirectionProfile, origin_ns: int) -> None:
+        self._profile, self._timeline = profile, Timeline(profile)
+        self._origin_ns, self._room, self._piece = origin_ns, limit(profile), -1
+        if self._tables is not None:
+            write_measured(self._tables, profile)
 
     def follow_peer(self, peer: Address) -> Address:
         """Shape what goes to this peer from now on, on the interface that leads to it."""
@@ -72,32 +91,45 @@ class Netem:
             check(self._profile)
             if not self._applied:
                 self._set_up()
+                self._confirm()
             self._select(peer)
         except CloudrcError:
             self.close()
             raise
         return peer
 
-    def follow_profile(self, profile: DirectionProfile) -> None:
-        """Shape by this profile from now on; what is queued leaves when it would have."""
+    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+        """Shape by this profile from now on; what is queued leaves when it would have.
+
+        Args:
+            profile: Conditions.
+            restart: Whether their time line counts from now; else from when the old one did.
+        """
         check(profile)
-        before = self._profile, self._timeline
-        self._profile, self._timeline = profile, Timeline(profile)
+        before = self._profile, self._origin_ns
+        self._follow(profile, self._clock() if restart else self._origin_ns)
         try:
             self._apply("change")
-        except MissingPrerequisiteError:
-            self._profile, self._timeline = before
+            self._confirm()
+        except CloudrcError:
+            self._follow(*before)
+            self._apply("change")
             raise
 
     def step(self, timeout: float) -> None:
-        """Put into force what the time line says now, then wait, at most `timeout` [s]."""
-        self._apply("change")
-        steps = len(self._timeline.starts_ns) > 1
-        self._wait(min(timeout, STEP_NS * 1e-9) if steps else timeout)
+        """Put into force what the time line says, as it says it, for `timeout` [s]."""
+        until_ns = self._clock() + round(timeout * 1e9)
+        while True:
+            self._apply("change")
+            due_ns = self._next_ns()
+            wake_ns = until_ns if due_ns is None else min(due_ns, until_ns)
+            self._wait(max(0, wake_ns - self._clock()) * 1e-9)
+            if wake_ns >= until_ns:
+                return
 
     def counts(self) -> dict[str, int]:
         """Say how many datagrams netem sent on, dropped (losses included) and holds."""
-        return counters(self._qdiscs())
+        return counters(self._qdiscs()) | self.steps.counts()
 
     def close(self) -> None:
         """Remove the qdiscs, if they are ours; what is queued in them is lost."""
@@ -131,12 +163,41 @@ class Netem:
 
     def _apply(self, verb: str) -> None:
         """Let what holds now be in force, unless it is."""
-        now = self._timeline.at(self._clock() - self._origin_ns)
-        wanted = options(self._profile, now)
+        elapsed_ns = self._clock() - self._origin_ns
+        starts_ns = self._timeline.starts_ns
+        piece = max(bisect_right(starts_ns, elapsed_ns) - 1, 0)
+        if piece == self._piece and self._applied:
+            return
+        wanted = options(self._profile, self._timeline.at(elapsed_ns), self._room)
         if wanted != self._applied:
             place = ("dev", self._device, "parent", BAND, "handle", LEAF)
             self._iproute2.tc("qdisc", verb, *place, "netem", *wanted)
             self._applied = wanted
+        # The first piece was not stepped to, and neither was one that is as the one before.
+        if 0 <= self._piece < piece:
+            done_ns, due_ns = self._clock(), self._origin_ns + starts_ns[piece]
+            self._stepped_ns = done_ns
+            self.steps.note(done_ns - due_ns, piece - self._piece - 1)
+            if piece == len(starts_ns) - 1:
+                self._log(self.steps.in_words())
+        self._piece = piece
+
+    def _next_ns(self) -> int | None:
+        """Say when to look at the time line again [ns]; None if nothing more will happen."""
+        following = self._piece + 1
+        if following >= len(self._timeline.starts_ns):
+            return None
+        return pause_ns(self._origin_ns + self._timeline.starts_ns[following], self._stepped_ns)
+
+    def _confirm(self) -> None:
+        """Read back what is in force, and refuse what is not as it was asked for."""
+        listed = next(one for one in self._qdiscs() if one.get("handle") == LEAF)
+        found = differences(self._applied, listed.get("options", {}))
+        if found:
+            raise BadInputError(
+                f"netem cannot do what is asked ({'; '.join(found)}); set link.mode=relay, which "
+                "can, or ask for other values"
+            )
 
     def _select(self, peer: Address) -> None:
         """Send the tunnel's flow to netem: first a new filter, then without the old ones."""

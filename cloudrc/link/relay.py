@@ -11,7 +11,9 @@ import socket
 from collections.abc import Callable
 
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.relay_lane import IN_FLIGHT_MAX, Address, Lane, Lanes, Peek, Side
+from cloudrc.link.relay_lane import IN_FLIGHT_MAX, Address, Lane, Peek, Side
+from cloudrc.link.relay_lanes import Lanes
+from cloudrc.link.relay_wait import tighten_slack
 
 LOOPBACK = "127.0.0.1"
 
@@ -66,13 +68,21 @@ class Relay:
         )
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Forward until `stop` says True; it is asked at least every 0.1 s."""
-        while not stop():
-            self._lanes.step(_STOP_PERIOD)
+        """Forward, once, until `stop` says True; it is asked at least every 0.1 s."""
+        tighten_slack()
+        try:
+            while not stop():
+                self._lanes.step(_STOP_PERIOD)
+        finally:
+            self._lanes.close()
 
     def outcomes(self) -> dict[str, int]:
         """Count datagrams by what became of them, both ways together, as `Lanes.outcomes` does."""
         return self._lanes.outcomes()
+
+    def recent(self) -> dict[str, int]:
+        """Say how late datagrams left of late, both ways together, as `Lanes.recent` does."""
+        return self._lanes.recent()
 
     def counts(self) -> dict[str, float]:
         """Say what has happened so far, both ways together, as `Lanes.counts` does."""

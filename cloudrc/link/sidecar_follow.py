@@ -13,18 +13,26 @@ from typing import Any, NamedTuple
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay_lane import Address
+from cloudrc.link.state import CHANGE_FILE, Change, read_change
 
-PROFILE_PERIOD = 0.5
+PROFILE_PERIOD = 0.1
 """How often the profile's file is looked at [s]."""
 PEER_PERIOD = 1.0
 """How often the peer's name is resolved [s]."""
 
 
 class Loaded(NamedTuple):
-    """A profile as it was read: one direction in SI, and the file's values for people."""
+    """A profile as it was read: one direction in SI, and the file's values for people.
+
+    Attributes:
+        direction: The one that is shaped here.
+        values: Both, as in the file, defaults left out.
+        change: Who changed it last, and why.
+    """
 
     direction: DirectionProfile
     values: dict[str, Any]
+    change: Change = Change()
 
 
 Load = Callable[[Path], Loaded]
@@ -47,7 +55,7 @@ class ProfileFile:
     def first(self) -> Loaded:
         """Read the file; raises a BadInputError."""
         self._seen = self._look()
-        return self._load(self._path)
+        return self._read()
 
     def poll(self) -> Loaded | None:
         """Read the file if it has changed; None if not, or if it is refused, which is logged."""
@@ -56,10 +64,18 @@ class ProfileFile:
             return None
         self._seen = seen
         try:
-            return self._load(self._path)
+            return self._read()
         except (BadInputError, OSError) as error:
             self._log(f"the new profile is refused, the old one stays: {error}")
             return None
+
+    def _read(self) -> Loaded:
+        loaded = self._load(self._path)
+        try:
+            told = self._path.with_name(CHANGE_FILE).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError):
+            return loaded
+        return loaded._replace(change=read_change(told))
 
     def _look(self) -> object:
         """Tell versions of the file apart; None while there is none."""

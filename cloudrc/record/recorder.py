@@ -16,6 +16,11 @@ from typing import Protocol
 
 from cloudrc.records import Record
 
+TROUBLE = {
+    errno.ENOSPC: "disk full",
+    errno.EDQUOT: "disk quota used up",
+    errno.EROFS: "disk is read-only",
+}
 CAPACITY = 20_000
 """Records that the queue holds: some 30 s of either end."""
 
@@ -28,6 +33,12 @@ class Sink(Protocol):
 
     def flush(self) -> None:
         """Hand everything to the operating system."""
+
+    def sync(self) -> None:
+        """Have what was flushed survive the machine."""
+
+    def abandon(self, reason: str) -> None:
+        """After an error: cut off what is torn and note why; never raises."""
 
     def close(self) -> None:
         """End the file."""
@@ -104,10 +115,11 @@ class Recorder:
         return taken
 
     def flush(self) -> None:
-        """Hand what was written to the operating system; never raises."""
+        """Hand what was written to the disk, however long that takes; never raises."""
         if self._sink and not self._ended:
             try:
                 self._sink.flush()
+                self._sink.sync()
                 if self._size_max is not None and self._path.stat().st_size >= self._size_max:
                     raise OSError(errno.EFBIG, "it has grown to its limit")
             except OSError as error:
@@ -149,10 +161,9 @@ class Recorder:
     def _stop(self, error: OSError) -> None:
         """Give the file up: what is in it stays readable, what comes now is counted."""
         self._ended = True
+        reason = f"recording stopped: {TROUBLE.get(error.errno or 0, error.strerror or error)}"
         self.error = (
-            f"{self._path}: recording stopped: {error.strerror or error};"
-            " make room or choose another folder; the flight goes on"
+            f"{self._path}: {reason}; make room or choose another folder; the flight goes on"
         )
         if self._sink:
-            with contextlib.suppress(OSError):
-                self._sink.close()
+            self._sink.abandon(reason)

@@ -8,6 +8,16 @@ import sys
 
 import pytest
 
+from cloudrc.cli.bench_wire import measure_wire
+
+
+@pytest.mark.process
+def test_a_sealed_odometry_costs_an_eighth_of_the_papers_pickled_one() -> None:
+    wire = measure_wire()
+    print(f"{wire.ratio:.3f} of {wire.pickled * 1e6:.1f} us")
+    assert 1000 <= wire.pickled_size <= 1100  # as large as the paper's
+    assert wire.ratio <= 0.12
+
 
 @pytest.mark.process  # by itself: what runs beside it takes its caches away
 @pytest.mark.full

@@ -42,6 +42,7 @@ class ServiceFlight(Flight):
             self.pipe_contacts,
             self.touch_speed,
             self.slip_ns,
+            **self.progress(),
         )
         self.teleop.see(seen, self.now_ns)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from kube import (
@@ -99,6 +101,34 @@ def test_both_delays_are_the_profiles_within_two_milliseconds(
         mean = (later_total - total) / (later_number - number)
         note(f"{profile} {direction}: {mean * 1e3:.2f} ms, wanted {MEANS[profile] * 1e3:.0f} ms")
         assert abs(mean - MEANS[profile]) < TOLERANCE
+
+
+def set_link(*words: str) -> dict[str, Any]:
+    """Set the link of the flight by hand; gives what is in force then."""
+    done = cloudrc("link", "set", *words, "-n", NAMESPACE, "--release", NAME, "-o", "json")
+    assert done.returncode == 0, done.stderr
+    document: dict[str, Any] = json.loads(done.stdout)
+    return document
+
+
+def test_the_link_is_set_by_hand_and_read_back(flight: None, note: Callable[[str], None]) -> None:
+    try:
+        told = set_link("downlink.delay_ms=120", "downlink.jitter_ms=0")
+        note(f"link set: in force after {told['seconds']:.1f} s")
+        assert told["links"]["downlink"]["asked"]["delay"] == 0.12
+        time.sleep(SETTLE)
+        total, number = counts("downlink")
+        time.sleep(5.0)
+        later_total, later_number = counts("downlink")
+        mean = (later_total - total) / (later_number - number)
+        note(f"set by hand downlink: {mean * 1e3:.2f} ms, wanted 120 ms")
+        assert abs(mean - 0.12) < TOLERANCE
+    finally:
+        told = set_link("--profile", "paper-p2")
+    assert told["links"]["downlink"]["asked"]["delay"] == 0.045
+    said = "link: uplink 45 ± 25 ms (profile paper-p2)"
+    log = ("logs", pod("world")["metadata"]["name"], "-c", "world")
+    eventually(lambda: said in kubectl(*log), "world has noted it for its recording", 5.0)
 
 
 def objects() -> dict[str, int]:

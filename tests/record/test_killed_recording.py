@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.record.columns import Recording
+from cloudrc.record.recover import recover
 
 FLIGHT = """
 import sys, time
@@ -30,9 +31,26 @@ for n in range(10_000):
 """
 
 
+@pytest.mark.promise("P-RECORD-1")
 @pytest.mark.process
 @pytest.mark.parametrize("after", [0.9, 1.3])
 def test_sigkill_loses_at_most_half_a_second(tmp_path: Path, after: float) -> None:
+    kill_after(tmp_path, after)
+
+
+@pytest.mark.process
+@pytest.mark.full
+@pytest.mark.parametrize("part", range(10))
+def test_sigkill_at_any_of_fifty_instants_loses_at_most_half_a_second(
+    tmp_path: Path, part: int
+) -> None:
+    for n in range(5):
+        folder = tmp_path / f"{n}"
+        folder.mkdir()
+        kill_after(folder, 0.6 + 0.031 * (5 * part + n))
+
+
+def kill_after(tmp_path: Path, after: float) -> None:
     path = tmp_path / "world.mcap"
     command = [sys.executable, "-c", FLIGHT, str(path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -44,8 +62,12 @@ def test_sigkill_loses_at_most_half_a_second(tmp_path: Path, after: float) -> No
         process.send_signal(signal.SIGKILL)
         rest = process.stdout.read().split()
     last_ns = int(rest[-1]) if rest else last_ns
-    recording = Recording.read(path)
-    assert recording.note.startswith("cut short")
+    clean = tmp_path / "clean.mcap"
+    recovery = recover(path, clean)
+    assert not recovery.complete
+    assert "chunks" not in recovery.dropped
+    recording = Recording.read(clean)
+    assert "cut short" in recording.note
     stamps = recording["/count"]["stamp_ns"]
     assert (last_ns - stamps[-1]) * 1e-9 <= 0.5
     counts = recording["/count"]["total"]

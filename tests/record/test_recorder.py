@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import os
 import threading
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from cloudrc.drivers.recording import RecordingThread
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
+from cloudrc.record.recover import recover
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted, Record
 from tests.record.samples import MS, assert_equal, world_records
@@ -54,6 +56,12 @@ class Shelf:
 
     def flush(self) -> None:
         pass
+
+    def sync(self) -> None:
+        pass
+
+    def abandon(self, reason: str) -> None:
+        self.closed = True
 
     def close(self) -> None:
         self.closed = True
@@ -100,7 +108,7 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> Non
         recorder.flush()
     recorder.close()
     assert recorder.error == (
-        "world.mcap: recording stopped: No space left on device;"
+        "world.mcap: recording stopped: disk full;"
         " make room or choose another folder; the flight goes on"
     )
     assert 0 < recorder.dropped < len(records)
@@ -109,11 +117,93 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> Non
     assert len(Recording.read(path)["/odometry"]) > 50
 
 
+@pytest.mark.parametrize("room", range(60_000, 60_800, 80))
+def test_on_a_full_disk_the_file_ends_with_a_whole_chunk(tmp_path: Path, room: int) -> None:
+    disk = Disk(room)
+    recorder = Recorder(Path("world.mcap"), lambda path: McapWriter(disk, clock="world"))
+    for record in world_records(400):
+        recorder.put([record])
+        recorder.drain()
+        recorder.flush()
+    recorder.close()
+    path = tmp_path / "kept.mcap"
+    path.write_bytes(disk.getvalue())
+    recovery = recover(path, tmp_path / "clean.mcap")
+    assert (recovery.bytes_lost, recovery.dropped) == (0, {})
+    note = Recording.read(path).note
+    assert "disk full" in note or room - len(disk.getvalue()) < 200, "told, if there is room"
+
+
+@pytest.mark.promise("P-RECORD-3")
+@pytest.mark.parametrize("step", ["flush", "sync", "close"])
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (errno.ENOSPC, "disk full"),
+        (errno.EROFS, "disk is read-only"),
+        (errno.EDQUOT, "disk quota used up"),
+        (errno.EIO, "Input/output error"),
+    ],
+)
+def test_whatever_the_disk_refuses_the_user_is_told_and_nothing_raised(
+    step: str, code: int, words: str
+) -> None:
+    class Refusing(Shelf):
+        pass
+
+    def refuse(*_: object) -> None:
+        raise OSError(code, "Input/output error")
+
+    shelf = Refusing()
+    setattr(shelf, step, refuse)
+    recorder = Recorder(Path("w.mcap"), lambda path: shelf)
+    recorder.put(counted(3))
+    recorder.drain()
+    recorder.flush()
+    recorder.put(counted(2))
+    recorder.close()
+    assert f"w.mcap: recording stopped: {words};" in recorder.error
+    assert recorder.dropped == (0 if step == "close" else 2)
+
+
+def test_a_recording_without_a_file_needs_no_disk() -> None:
+    recorder = Recorder(Path(os.devnull), open_mcap)
+    recorder.put(counted(3))
+    recorder.drain()
+    recorder.flush()
+    recorder.close()
+    assert (recorder.error, recorder.dropped) == ("", 0)
+
+
+def test_an_fsync_that_takes_long_keeps_nobody_waiting() -> None:
+    syncing, release = threading.Event(), threading.Event()
+
+    class Slow(Shelf):
+        def sync(self) -> None:
+            syncing.set()
+            release.wait(10.0)
+
+    shelf = Slow()
+    recorder = Recorder(Path("x"), lambda path: shelf)
+    recorder.put(counted(1))
+    recorder.drain()
+    flushing = threading.Thread(target=recorder.flush)
+    flushing.start()
+    assert syncing.wait(10.0)
+    for record in counted(500):  # five seconds of a loop at 100 Hz
+        recorder.put([record])
+    assert recorder.dropped == 0
+    release.set()
+    flushing.join(10.0)
+    recorder.close()
+    assert len(shelf.records) == 501
+
+
 def test_a_disk_that_fills_up_at_the_very_end_raises_nothing() -> None:
     recorder = Recorder(Path("w.mcap"), lambda path: McapWriter(Disk(1500), clock="world"))
     recorder.put(counted(20))
     recorder.close()
-    assert "No space left on device" in recorder.error
+    assert "disk full" in recorder.error
 
 
 def test_a_folder_that_is_not_there_stops_the_recording_only(tmp_path: Path) -> None:
@@ -174,7 +264,7 @@ def test_a_disk_without_room_for_the_head_raises_nothing(room: int) -> None:
     recorder.put(counted(5))
     recorder.close()
     assert recorder.dropped == 5
-    assert "No space left on device" in recorder.error
+    assert "disk full" in recorder.error
 
 
 def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> None:
@@ -189,4 +279,4 @@ def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> N
     assert "recording stopped: it has grown to its limit" in recorder.error
     assert recorder.dropped > 0
     assert 20_000 <= path.stat().st_size < 100_000
-    assert Recording.read(path).note == ""
+    assert "cut short" not in Recording.read(path).note

@@ -2,11 +2,13 @@
 
 The machine belongs to one thread. Whoever else wants something of it leaves a call here, which the
 loop makes between two deadlines. The bridge is bounded: a flood is refused, it does not pile up.
+Beside it is a lane for the emergency stop, which waits for nobody.
 """
 
 from __future__ import annotations
 
 import queue
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
@@ -26,10 +28,14 @@ class Bridge:
 
     Attributes:
         closed: Why no call is taken, in words; "" if they are.
+        alarm: Tells the robot to stop its rotors past everything else, teleop's loop included; may
+            be called from any thread.
     """
 
     def __init__(self) -> None:
         self.closed = "teleop is starting"
+        self.alarm: Callable[[], object] = lambda: None
+        self._urgent: deque[tuple[Call, Future[Any]]] = deque(maxlen=WAITING_MAX)
         self._calls: queue.Queue[tuple[Call, Future[Any]]] = queue.Queue(WAITING_MAX)
         self._service: MissionService | None = None
 
@@ -37,8 +43,8 @@ class Bridge:
         """Take calls for this service from now on."""
         self._service, self.closed = service, ""
 
-    def submit(self, call: Call) -> Future[Any]:
-        """Leave a call, from any thread.
+    def submit(self, call: Call, *, urgent: bool = False) -> Future[Any]:
+        """Leave a call, from any thread; an urgent one is made before all others.
 
         Raises:
             UnavailableError: If none is taken now.
@@ -46,6 +52,9 @@ class Bridge:
         if self.closed:
             raise UnavailableError(self.closed)
         future: Future[Any] = Future()
+        if urgent:
+            self._urgent.append((call, future))
+            return future
         try:
             self._calls.put_nowait((call, future))
         except queue.Full:
@@ -55,6 +64,8 @@ class Bridge:
     def take(self) -> list[Callable[[int], None]]:
         """Hand over the calls that wait, for the loop's thread to make."""
         taken: list[Callable[[int], None]] = []
+        while self._urgent:
+            taken.append(self._bound(*self._urgent.popleft()))
         while len(taken) < WAITING_MAX:
             try:
                 call, future = self._calls.get_nowait()

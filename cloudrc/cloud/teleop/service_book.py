@@ -12,7 +12,13 @@ from itertools import islice, takewhile
 from typing import Any
 
 from cloudrc.cloud.teleop.journal import Entry
-from cloudrc.cloud.teleop.service_mission import Mission, Order, from_entry, order_entry
+from cloudrc.cloud.teleop.service_mission import (
+    Mission,
+    Order,
+    from_entry,
+    number_of,
+    order_entry,
+)
 from cloudrc.errors import CloudrcError
 
 KEPT = 100
@@ -47,14 +53,17 @@ class MissionBook:
         trouble: Why the last entry could not be kept; "" if it was.
     """
 
-    def __init__(self, write: Callable[[Entry], None], entries: Iterable[Entry]) -> None:
+    def __init__(
+        self, write: Callable[[Entry], None], entries: Iterable[Entry], salt: bytes = b""
+    ) -> None:
         """Read what was written before.
 
         Args:
             write: Keeps an entry; raises OSError if it cannot.
             entries: What was kept, oldest first.
+            salt: Makes numbers of missions that no other book has.
         """
-        self._write = write
+        self._write, self._salt = write, salt
         self._numbered = self._events = 0
         self.missions: dict[str, Mission] = {}
         self.trouble = ""
@@ -92,11 +101,15 @@ class MissionBook:
         Raises:
             UnavailableError: If it cannot be kept; it then does not exist.
         """
-        entry = order_entry(Mission(f"m{self._numbered + 1}", order))
+        mission_id = f"m{self._numbered + 1}"
+        entry = order_entry(Mission(mission_id, order, number_of(mission_id, self._salt)))
         try:
             self._write(entry)
         except OSError as error:
-            raise UnavailableError(f"the journal cannot be written: {error.strerror}") from error
+            raise UnavailableError(
+                f"no mission can start: the journal cannot be written: {error.strerror}; "
+                "free or mend its volume"
+            ) from error
         self._apply(entry)
         return self.missions[entry["mission"]]
 
