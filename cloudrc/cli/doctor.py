@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import asdict
 
 from cloudrc.cli.check import Check
 from cloudrc.cli.checks import all_checks
-from cloudrc.cli.output import paint, table
+from cloudrc.cli.output import output_argument, paint, table, written
 from cloudrc.errors import MissingPrerequisiteError
 
 COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
@@ -23,30 +22,27 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="the mode that you want to fly in (default: local)",
     )
     parser.add_argument("--context", metavar="NAME", help="of the cluster (default: current)")
-    parser.add_argument(
-        "-o", "--output", choices=("table", "json"), default="table", help="default: table"
-    )
+    output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Print all checks; exit 3 if the wanted mode cannot run."""
     checks = list(all_checks(options.mode, options.context))
     blocking = [c.name for c in checks if c.state == "missing" and options.mode in c.modes]
-    if options.output == "json":
-        print(_json(options.mode, checks, blocking))
+    if options.output != "table":
+        print(written(_document(options.mode, checks, blocking), options.output))
     else:
         print(_text(options.mode, checks, blocking))
     return MissingPrerequisiteError.exit_code if blocking else 0
 
 
-def _json(mode: str, checks: list[Check], blocking: list[str]) -> str:
-    report = {
+def _document(mode: str, checks: list[Check], blocking: list[str]) -> dict[str, object]:
+    return {
         "schemaVersion": 1,
         "mode": mode,
         "ready": not blocking,
         "checks": [asdict(check) for check in checks],
     }
-    return json.dumps(report, indent=2)
 
 
 def _text(mode: str, checks: list[Check], blocking: list[str]) -> str:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import shutil
 import sys
 import textwrap
 
-from cloudrc.cli.output import paint
+from cloudrc.cli.output import output_argument, paint, written
 
 PLUGINS = ("estimators", "predictors", "controllers", "metrics")
 YAML = ("experiments", "missions", "profiles")
@@ -27,21 +26,19 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "what", nargs="?", choices=KINDS, metavar="WHAT", help=f"one of {', '.join(KINDS)}"
     )
-    parser.add_argument(
-        "-o", "--output", choices=("table", "json"), default="table", help="default: table"
-    )
+    output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Print every kind that was asked for."""
     kinds = [options.what] if options.what else list(KINDS)
     found = {kind: describe_all(kind) for kind in kinds}
-    if options.output == "json":
+    if options.output != "table":
         entries = {
             kind: [{"name": name, "description": text} for name, text in lines.items()]
             for kind, lines in found.items()
         }
-        print(json.dumps({"schemaVersion": 1, **entries}, indent=2))
+        print(written({"schemaVersion": 1, **entries}, options.output))
         return 0
     print("\n\n".join(f"{paint(kind, 'bold')}\n{_block(lines)}" for kind, lines in found.items()))
     return 0

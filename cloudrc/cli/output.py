@@ -1,14 +1,33 @@
-"""Text for people: tables in plain columns, colour on a terminal only."""
+"""What commands print: tables and colour for people, JSON and YAML for programs."""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import json
 import os
 import sys
 from collections.abc import Iterator, Sequence
 from typing import TextIO
 
+FORMATS = ("table", "json", "yaml")
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1", "dim": "2"}
+
+
+def output_argument(parser: argparse.ArgumentParser, what: str = "") -> None:
+    """Declare how a command prints; `what` says what else the form changes."""
+    text = f"{what} (default: table)" if what else "default: table"
+    parser.add_argument("-o", "--output", choices=FORMATS, default="table", help=text)
+
+
+def written(document: object, form: str) -> str:
+    """Write plain values for programs, as "json" or "yaml"."""
+    text = json.dumps(document, indent=2, ensure_ascii=False)
+    if form == "json":
+        return text
+    from cloudrc.config import yaml_text
+
+    return yaml_text.write(json.loads(text)).rstrip("\n")
 
 
 def is_live(stream: TextIO) -> bool:

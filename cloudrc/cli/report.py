@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from cloudrc.cli.extras import require
+from cloudrc.cli.output import output_argument, written
 from cloudrc.errors import BadInputError
 
 EPILOG = """\
@@ -17,9 +18,7 @@ examples:
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
-    parser.add_argument(
-        "-o", "--output", choices=("table", "json"), default="table", help="default: table"
-    )
+    output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -31,8 +30,8 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.report.write import read_run, write_report
 
     document = write_report(options.run, *read_run(options.run))
-    if options.output == "json":
-        print((options.run / "report.json").read_text(), end="")
+    if options.output != "table":
+        print(written(document, options.output))
     else:
         show(document, options.run)
     return exit_code(document)

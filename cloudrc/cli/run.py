@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import signal
 import sys
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.cli.cluster_flags import place, place_arguments, timeout_argument
 from cloudrc.cli.extras import require
+from cloudrc.cli.output import is_live, output_argument, unread_is_fine, written
 from cloudrc.cli.parser import count
 from cloudrc.errors import BadInputError, CloudrcError
 
@@ -73,13 +75,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder to write (default: the next in runs/)"
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        choices=("table", "json"),
-        default="table",
-        help="json: report.json on stdout and nothing else (default: table)",
-    )
+    output_argument(parser, "json, yaml: the report on stdout and nothing else")
     place_arguments(parser)
     timeout_argument(parser)
 
@@ -105,7 +101,6 @@ def execute(options: argparse.Namespace) -> int:
 def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> int:
     from cloudrc.cli.closing import exit_code, show
     from cloudrc.cli.folder import discard, new_folder, point_latest_to
-    from cloudrc.cli.output import unread_is_fine
     from cloudrc.config.load import load_experiment
 
     experiment = load_experiment(options.experiment, overrides)
@@ -115,11 +110,11 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
     # In a cluster much can go wrong before anything is recorded: nothing is left of that.
     late = mode == "cluster"
     folder = new_folder(options.out, f"{name}-{mode}-seed{experiment.seed}", latest=not late)
-    as_json = options.output == "json"
-    stream = sys.stderr if as_json else sys.stdout
+    for_programs = options.output != "table"
+    stream = sys.stderr if for_programs else sys.stdout
     mission = experiment.mission
     waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
-    if not as_json:
+    if not for_programs:
         with unread_is_fine(stream):
             print(
                 f"{name}: mode {mode}, seed {experiment.seed}, link {experiment.link.profile},"
@@ -135,10 +130,10 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
     finally:
         if late and options.out is None and folder.exists():
             point_latest_to(folder)
-    text = (folder / "report.json").read_text()
     with unread_is_fine(sys.stdout):
-        if as_json:
-            print(text, end="")
+        if for_programs:
+            document = json.loads((folder / "report.json").read_text())
+            print(written(document, options.output))
         else:
             show(report, folder)
         sys.stdout.flush()
@@ -151,7 +146,6 @@ def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
     def flight(folder: Path, stream: TextIO, waypoints: int) -> dict[str, Any]:
         from cloudrc.cli.flight import fly
         from cloudrc.cli.live import FlightView
-        from cloudrc.cli.output import is_live
 
         quiet = stream is sys.stderr and not is_live(stream)
         view = None if quiet else FlightView(stream, waypoints)

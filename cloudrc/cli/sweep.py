@@ -16,7 +16,7 @@ from typing import Any
 
 from cloudrc.cli.closing import EXIT_CODES
 from cloudrc.cli.folder import new_folder
-from cloudrc.cli.output import unread_is_fine
+from cloudrc.cli.output import unread_is_fine, written
 from cloudrc.cli.statistics import as_csv, as_table, summarise
 
 
@@ -46,8 +46,9 @@ def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
     reports.sort(key=lambda report: int(report["seed"]))
     summary = _write(folder, name, reports, interrupted)
     with unread_is_fine(sys.stdout):
-        if options.output == "json":
-            print((folder / "sweep.json").read_text(), end="", flush=True)
+        if options.output != "table":
+            document = json.loads((folder / "sweep.json").read_text())
+            print(written(document, options.output), flush=True)
         else:
             print(f"\n{as_table(summary)}\n\n{folder / 'sweep.json'}", flush=True)
     if interrupted:
@@ -56,7 +57,7 @@ def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
 
 
 def _tell(options: argparse.Namespace, report: dict[str, Any], count: str) -> None:
-    stream = sys.stderr if options.output == "json" else sys.stdout
+    stream = sys.stdout if options.output == "table" else sys.stderr
     if options.output == "table" or stream.isatty():
         failures = "".join(f": {f['text']}" for f in report["failures"][:1])
         with unread_is_fine(stream):

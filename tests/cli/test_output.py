@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import json
 
 import pytest
+import yaml
 
+from cloudrc.cli.main import main
 from cloudrc.cli.output import is_live, number, paint, table
 
 
@@ -47,3 +50,13 @@ def test_a_dumb_terminal_and_a_file_get_no_living_line(monkeypatch: pytest.Monke
     assert not is_live(io.StringIO())
     monkeypatch.setenv("TERM", "dumb")
     assert not is_live(Terminal())
+
+
+@pytest.mark.parametrize("line", [["list"], ["faults", "list"]])
+def test_yaml_says_what_json_says(line: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    documents = []
+    for form, read in (("json", json.loads), ("yaml", yaml.safe_load)):
+        main([*line, "-o", form])
+        documents.append(read(capsys.readouterr().out))
+    assert documents[0] == documents[1]
+    assert documents[0]["schemaVersion"] == 1
