@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from cloudrc.exposition.end import End
-from cloudrc.exposition.labels import BODIES, DIRECTIONS, GUARD_STATES
+from cloudrc.exposition.labels import BODIES, DIRECTIONS, GUARD_STATES, LIMITS
 from cloudrc.exposition.part import Handlers, Readings, by, per_axis, plain
 from cloudrc.messages import NEVER_NS, GuardState
 from cloudrc.records import Contact, GroundTruth, GuardChange, Lateness, TelemetrySent
@@ -53,8 +53,9 @@ class WorldEnd(End):
         self._see_age(record.stamp_ns)
 
     def _see_guard(self, record: GuardChange) -> None:
+        if record.state != self._guard or record.state is GuardState.GROUND:
+            self._changes[GUARD_STATES[record.state]] += 1  # touch-down is told, but stays LAND
         self._guard = record.state
-        self._changes[GUARD_STATES[record.state]] += 1
 
     def _see_contact(self, record: Contact) -> None:
         kind = record.body.rstrip("_0123456789")
@@ -72,8 +73,14 @@ class WorldEnd(End):
         """See `Part`."""
         readings = super().read()
         readings |= {
+            "cloudrc_sessions_refused_total": plain(self._counts.get("busy", 0)),
             "cloudrc_guard_state": plain(self._guard),
             "cloudrc_guard_transitions_total": by(self._changes),
+            "cloudrc_guard_limited_total": by(
+                {limit: self._counts.get(f"limited_{limit}", 0) for limit in LIMITS}
+            ),
+            "cloudrc_guard_held_seconds_total": plain(self._counts.get("held_seconds", 0)),
+            "cloudrc_guard_starts_refused_total": plain(self._counts.get("start_refused", 0)),
             "cloudrc_contacts_total": by(self._contacts),
             "cloudrc_world_slip_seconds_total": plain(self._slip_ns * 1e-9),
             "cloudrc_world_stalls_total": plain(self._counts.get("stalls", 0)),

@@ -107,12 +107,14 @@ def test_errors_and_terms_are_signed_and_by_axis() -> None:
 
 def test_counts_become_datagrams_of_their_direction() -> None:
     live = Live("world")
-    for name, total in (("sent", 7), ("late", 2), ("late", 3), ("stalls", 1), ("unheard_of", 9)):
+    totals = {"sent": 7, "late": 3, "stalls": 1, "held_seconds": 4, "unheard_of": 9}
+    for name, total in totals.items():
         live.see([Counted(0, "world", name, total)])
     assert value(live, "cloudrc_datagrams_total", "uplink", "sent") == 7
     assert value(live, "cloudrc_datagrams_total", "downlink", "late") == 3
     assert value(live, "cloudrc_datagrams_total", "downlink", "used") == 0
     assert value(live, "cloudrc_world_stalls_total") == 1
+    assert value(live, "cloudrc_guard_held_seconds_total") == 4
 
 
 def test_guard_and_contacts_are_counted() -> None:

@@ -16,7 +16,14 @@ from cloudrc.messages import GuardState
 
 ROOT = Path(__file__).resolve().parents[2]
 UNITS = ("seconds", "meters", "newtons", "meters_per_second", "radians_per_second")
-NOT_DATAGRAMS = {"stalls", "missed_periods", "horizon_clamped"}
+NOT_DATAGRAMS = {
+    "stalls",
+    "missed_periods",
+    "horizon_clamped",
+    "frozen",
+    "start_refused",
+    "held_seconds",
+} | {f"limited_{limit}" for limit in labels.LIMITS}
 
 
 @pytest.mark.parametrize("metric", METRICS.values(), ids=lambda metric: metric.name)
@@ -94,3 +101,9 @@ def test_the_page_names_every_metric_and_its_queries_name_no_other() -> None:
     for query in QUERIES.values():
         for name in re.findall(r"cloudrc_\w+", query):
             assert re.sub(r"(?<!_total)_(bucket|sum|count)$", "", name) in METRICS
+
+
+def test_no_label_is_one_that_prometheus_keeps_for_itself() -> None:
+    """promtool refuses them outside of histograms and summaries."""
+    labels = {label for metric in METRICS.values() for label in metric.labels}
+    assert not labels & {"le", "quantile", "job", "instance", "namespace", "pod"}
