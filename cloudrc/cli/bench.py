@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import argparse
 import gc
-import json
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from cloudrc.cli.bench_wire import measure_wire
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import table
+from cloudrc.cli.output import output_argument, table, written
 from cloudrc.cli.parser import count
 from cloudrc.errors import CloudrcError
 
@@ -40,9 +40,7 @@ Keep = Callable[["list[Record]"], object]
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument(
-        "-o", "--output", choices=("table", "json"), default="table", help="default: table"
-    )
+    output_argument(parser)
     parser.add_argument(
         "--repeats", type=count, default=7, metavar="N", help="of each part (default: 7)"
     )
@@ -59,8 +57,10 @@ def execute(options: argparse.Namespace) -> int:
         name: {"us_per_step": cost * 1e6, "ratio": raw / cost, "real_time_factor": STEP / cost}
         for name, cost in costs.items()
     }
-    if options.output == "json":
-        print(json.dumps(figures, indent=2))
+    wire = measure_wire()
+    if options.output != "table":
+        document = {**figures, "wire": {**wire._asdict(), "ratio": wire.ratio}}
+        print(written({"schemaVersion": 1, **document}, options.output))
         return 0
     rows = [("experiment paper, mode virtual", "us a step", "ratio to raw", "x real time")]
     for name, figure in figures.items():
@@ -68,6 +68,12 @@ def execute(options: argparse.Namespace) -> int:
         rows.append((name, f"{cost:.2f}", f"{ratio:.3f}", f"{factor:.0f}"))
     print(table(rows, right=(1, 2, 3)))
     print("\nraw replayed the same controls and ended in the same bits")
+    print(
+        f"\none odometry, both ends: laid out, sealed, opened and read {wire.sealed * 1e6:.2f} us"
+        f" ({wire.size} bytes), without the seal {wire.unsealed * 1e6:.2f} us;\n"
+        f"pickled as in the paper {wire.pickled * 1e6:.1f} us ({wire.pickled_size} bytes):"
+        f" {wire.ratio:.3f} of it"
+    )
     return 0
 
 

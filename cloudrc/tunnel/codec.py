@@ -1,8 +1,12 @@
 """Messages to bytes and back: a fixed layout per kind, little-endian, nothing executable.
 
-A datagram is a 16-byte header (version, kind, direction, epoch, counter) and a body of exactly the
-length that its kind has. Whatever does not fit raises DecodeError, which names the outcome that it
-is counted under; no other exception leaves `decode` or the decoders.
+A datagram is a 16-byte header (version, direction, epoch, generation, kind, counter), a body of
+exactly the length that its kind has, and a 16-byte tag. Here is only the layout: `session` seals
+and opens. Whatever does not fit raises DecodeError, which names the outcome that it is counted
+under; no other exception leaves `check` or the decoders.
+
+The header is in the clear, since a link decides by it, and authenticated. Its last 12 bytes are the
+nonce of the seal: no two datagrams of one direction of an epoch have the same kind and counter.
 
 Deviation: the paper's tunnel sends pickled ROS messages, which execute code and weigh 1 kB.
 """
@@ -10,6 +14,7 @@ Deviation: the paper's tunnel sends pickled ROS messages, which execute code and
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
@@ -23,19 +28,27 @@ from cloudrc.messages import (
     Telemetry,
 )
 
-VERSION = 1
+VERSION = 2
+"""Of the wire, one per build; 1 had no tags. Another one is refused, never spoken."""
 DATAGRAM_MAX = 512
 """Longer than any datagram of ours [bytes]; a longer one is refused unread."""
 
 
 class Kind(IntEnum):
-    """What a datagram carries; each kind of each direction counts its datagrams on its own."""
+    """What a datagram carries; each kind of each direction counts its datagrams on its own.
+
+    Up to LAST_GREETING they make a session and are authenticated by the pre-shared key; the others
+    belong to one and are sealed with its keys.
+    """
 
     HELLO = 1
     ACCEPT = 2
-    TELEMETRY = 3
-    COMMAND = 4
-    OPERATOR = 5
+    CHALLENGE = 3
+    BUSY = 4
+    TELEMETRY = 5
+    COMMAND = 6
+    OPERATOR = 7
+    ALIVE = 8
 
 
 class Direction(IntEnum):
@@ -49,65 +62,110 @@ class DecodeError(ValueError):
     """Bytes that are not one of our datagrams; the text is the outcome that is counted."""
 
 
+Header: TypeAlias = tuple[int, int, int, int, int, int]
+"""Version, direction, epoch, generation of the keys, kind and counter."""
 Datagram: TypeAlias = tuple[int, int, int, int, bytes]
 """Kind, direction, epoch and counter, which are in the clear in its header, and its body."""
 
 
 class Hello(NamedTuple):
-    """Cloud asks for a session. `nonce` names the cloud process, `clock` its monotonic clock."""
+    """Cloud asks for a session.
+
+    Attributes:
+        nonce: 16 bytes that name the session asked for.
+        clock: 16 bytes that name cloud's monotonic clock.
+        cookie: From world's challenge; zeros at first.
+        suite: Cipher that cloud would like.
+    """
 
     nonce: bytes
     clock: bytes
+    cookie: bytes
+    suite: int
 
 
 class Accept(NamedTuple):
-    """World opens one, under the epoch in the header; `nonce` is the one of the hello answered."""
+    """World opens a session, under the epoch in the header.
+
+    Attributes:
+        nonce: Of the hello answered.
+        world_nonce: 16 bytes that name world's process.
+        clock: 16 bytes that name world's monotonic clock.
+        suite: Cipher of the session.
+    """
 
     nonce: bytes
     world_nonce: bytes
     clock: bytes
+    suite: int
 
 
-_HEADER = struct.Struct("<BBBxIQ")
-_TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIdIB")
+class Busy(NamedTuple):
+    """World refuses one, and says why.
+
+    Attributes:
+        nonce: Of the hello answered.
+        used: Whether this nonce has had its session; else another cloud has authority.
+    """
+
+    nonce: bytes
+    used: bool
+
+
+_HEADER = struct.Struct("<BBIBBQ")
+_TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIdIQHB")
 _STAMP = struct.Struct("<q")
 _SLIP_OFFSET = struct.calcsize("<q3d4d3d3ddqq")
 _COMMAND = struct.Struct("<qqq3dd")
-_OPERATOR = struct.Struct("<IBB")
-_HELLO = struct.Struct("<16s16s")
-_ACCEPT = struct.Struct("<16s16s16s")
+_OPERATOR = struct.Struct("<IBBQH")
+_HELLO = struct.Struct("<16s16s16sB")
+_ACCEPT = struct.Struct("<16s16s16sB")
+_COOKIE = struct.Struct("<16s")
+_BUSY = struct.Struct("<16s?")
 
-_unpack_header = _HEADER.unpack_from
+_new = tuple.__new__  # of a named tuple: four times as fast as calling it
+_unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
 HEADER_SIZE = _HEADER.size
 BODY_SIZES = {
     Kind.HELLO: _HELLO.size,
     Kind.ACCEPT: _ACCEPT.size,
+    Kind.CHALLENGE: _COOKIE.size,
+    Kind.BUSY: _BUSY.size,
     Kind.TELEMETRY: _TELEMETRY.size,
     Kind.COMMAND: _COMMAND.size,
     Kind.OPERATOR: _OPERATOR.size,
+    Kind.ALIVE: 0,
 }
-_SIZES = {int(kind): HEADER_SIZE + size for kind, size in BODY_SIZES.items()}
+LAST_GREETING = int(Kind.BUSY)
+TAG_SIZE = 16
+SIZES = {int(kind): HEADER_SIZE + size + TAG_SIZE for kind, size in BODY_SIZES.items()}
+_size_of = SIZES.get
 
 
-def encode_header(kind: int, direction: int, epoch: int, counter: int) -> bytes:
-    """Lay out the header; epoch < 2^32, counter < 2^64."""
-    return _HEADER.pack(VERSION, kind, direction, epoch, counter)
+def encode_header(
+    kind: int, direction: int, epoch: int, counter: int, generation: int = 0
+) -> bytes:
+    """Lay out the header; epoch < 2^32, generation < 2^8, counter < 2^64."""
+    return _HEADER.pack(VERSION, direction, epoch, generation, kind, counter)
 
 
-def decode(data: bytes) -> Datagram:
-    """Take a datagram apart, and check version, kind and the length that follows from it.
+def check(data: bytes) -> Header:
+    """Read a datagram's header, and check version, kind and the length that follows from it.
+
+    Nothing in it is authenticated yet.
 
     Raises:
         DecodeError: "malformed" (too short, too long, unknown kind) or "version".
     """
-    if len(data) < HEADER_SIZE:
+    size = len(data)
+    if size < HEADER_SIZE:
         raise DecodeError("malformed")
-    version, kind, direction, epoch, counter = _unpack_header(data)
-    if version != VERSION:
+    header = _unpack_header(data)
+    if header[0] != VERSION:
         raise DecodeError("version")
-    if _SIZES.get(kind) != len(data) or direction > 1:
+    if _size_of(header[4]) != size or header[1] > 1:
         raise DecodeError("malformed")
-    return kind, direction, epoch, counter, data[HEADER_SIZE:]
+    return header
 
 
 def peek(data: bytes) -> tuple[int, int, int]:
@@ -118,30 +176,45 @@ def peek(data: bytes) -> tuple[int, int, int]:
     """
     if len(data) < HEADER_SIZE:
         raise DecodeError("malformed")
-    _, kind, _, epoch, counter = _unpack_header(data)
+    _, _, epoch, _, kind, counter = _unpack_header(data)
     return kind, epoch, counter
+
+
+# Spelled out number by number: that takes half the time of slices and stars.
 
 
 def encode_telemetry(telemetry: Telemetry) -> bytes:
     """Lay out the body of a TELEMETRY datagram; the guard's state comes last."""
-    stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, guard, pipes, touch = telemetry
-    _, position, orientation, velocity, rate = odometry
-    numbers = (*position, *orientation, *velocity, *rate, force, echo_ns, hold_ns, slip_ns)
-    return _TELEMETRY.pack(stamp_ns, *numbers, mission, touch, pipes, guard)
+    # fmt: off
+    (
+        stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, guard, pipes, touch,
+        mission_id, reached,
+    ) = telemetry
+    _, (px, py, pz), (qw, qx, qy, qz), (vx, vy, vz), (rx, ry, rz) = odometry
+    return _TELEMETRY.pack(
+        stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, force, echo_ns, hold_ns,
+        slip_ns, mission, touch, pipes, mission_id, reached, guard,
+    )
+    # fmt: on
 
 
 def decode_telemetry(body: bytes) -> Telemetry:
     """Read the body of a TELEMETRY datagram; numbers may be anything, NaN included."""
-    values = _TELEMETRY.unpack(body)
-    stamp_ns, (force, echo_ns, hold_ns, slip_ns) = values[0], values[14:18]
-    mission, touch, pipes, guard = values[18:]
+    # fmt: off
+    (
+        stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, force, echo_ns, hold_ns,
+        slip_ns, mission, touch, pipes, mission_id, reached, guard,
+    ) = _TELEMETRY.unpack(body)
     if guard >= len(_GUARD_STATES):
         raise DecodeError("malformed")
-    odometry = Odometry(stamp_ns, values[1:4], values[4:8], values[8:11], values[11:14])
-    state = _GUARD_STATES[guard]
-    return Telemetry(
-        stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, state, pipes, touch
+    odometry = _new(
+        Odometry, (stamp_ns, (px, py, pz), (qw, qx, qy, qz), (vx, vy, vz), (rx, ry, rz))
     )
+    return _new(Telemetry, (
+        stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, _GUARD_STATES[guard], pipes,
+        touch, mission_id, reached,
+    ))
+    # fmt: on
 
 
 def decode_stamps(body: bytes) -> tuple[int, int]:
@@ -165,14 +238,14 @@ def decode_command(body: bytes) -> Command:
 
 def encode_operator(request: OperatorRequest) -> bytes:
     """Lay out the body of an OPERATOR datagram."""
-    return _OPERATOR.pack(request.number, request.request, request.start)
+    return _OPERATOR.pack(*request)
 
 
 def decode_operator(body: bytes) -> OperatorRequest:
     """Read the body of an OPERATOR datagram."""
-    number, request, start = _OPERATOR.unpack(body)
+    number, request, start, mission_id, reached = _OPERATOR.unpack(body)
     try:
-        return OperatorRequest(number, Request(request), Start(start))
+        return OperatorRequest(number, Request(request), Start(start), mission_id, reached)
     except ValueError:
         raise DecodeError("malformed") from None
 
@@ -195,6 +268,16 @@ def encode_accept(accept: Accept) -> bytes:
 def decode_accept(body: bytes) -> Accept:
     """Read the body of an ACCEPT datagram."""
     return Accept(*_ACCEPT.unpack(body))
+
+
+def encode_busy(busy: Busy) -> bytes:
+    """Lay out the body of a BUSY datagram; that of a CHALLENGE is the cookie itself."""
+    return _BUSY.pack(*busy)
+
+
+def decode_busy(body: bytes) -> Busy:
+    """Read the body of a BUSY datagram."""
+    return Busy(*_BUSY.unpack(body))
 
 
 _GUARD_STATES = tuple(GuardState)

@@ -16,7 +16,7 @@ from cloudrc.messages import (
     Telemetry,
 )
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.codec import DecodeError, Kind
+from cloudrc.tunnel.codec import Accept, Busy, DecodeError, Hello, Kind
 
 stamps = st.integers(-(2**63), 2**63 - 1)
 floats = st.floats(allow_nan=False)
@@ -33,6 +33,8 @@ telemetries = st.builds(
         st.sampled_from(GuardState),
         st.integers(0, 2**32 - 1),
         floats,
+        st.integers(0, 2**64 - 1),
+        st.integers(0, 2**16 - 1),
     ),
     vectors,
     st.tuples(floats, floats, floats, floats),
@@ -41,18 +43,30 @@ telemetries = st.builds(
 )
 commands = st.builds(Command, stamps, stamps, stamps, vectors, floats)
 requests = st.builds(
-    OperatorRequest, st.integers(0, 2**32 - 1), st.sampled_from(Request), st.sampled_from(Start)
+    OperatorRequest,
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(Request),
+    st.sampled_from(Start),
+    st.integers(0, 2**64 - 1),
+    st.integers(0, 2**16 - 1),
 )
 
 
 def datagram(kind: Kind, body: bytes) -> bytes:
-    return codec.encode_header(kind, 0, 1, 2) + body
+    return codec.encode_header(kind, 0, 1, 2) + body + bytes(codec.TAG_SIZE)
 
 
 @given(telemetries)
 @settings(max_examples=50, deadline=None)
 def test_telemetry_comes_back_as_it_was(telemetry):
     assert codec.decode_telemetry(codec.encode_telemetry(telemetry)) == telemetry
+
+
+@given(telemetries)
+@settings(max_examples=20, deadline=None)
+def test_the_stamps_of_telemetry_can_be_read_alone(telemetry):
+    stamps_ns = codec.decode_stamps(codec.encode_telemetry(telemetry))
+    assert stamps_ns == (telemetry.stamp_ns, telemetry.slip_ns)
 
 
 @given(commands)
@@ -68,8 +82,39 @@ def test_a_request_comes_back_as_it_was(request_):
 
 
 def test_the_header_lies_where_the_design_puts_it():
-    data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788)
-    assert data == bytes([1, 4, 1, 0]) + bytes([4, 3, 2, 1]) + bytes.fromhex("8877665544332211")
+    data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788, generation=9)
+    assert data == bytes([2, 1, 4, 3, 2, 1, 9, 6]) + bytes.fromhex("8877665544332211")
+    assert codec.peek(data) == (Kind.COMMAND, 0x01020304, 0x1122334455667788)
+
+
+def test_a_direction_that_does_not_exist_is_refused():
+    data = bytearray(datagram(Kind.ALIVE, b""))
+    data[1] = 2
+    with pytest.raises(DecodeError, match=r"^malformed$"):
+        codec.check(bytes(data))
+
+
+def test_no_answer_to_a_hello_is_longer_than_it_and_nothing_is_longer_than_the_most():
+    answers = (Kind.CHALLENGE, Kind.ACCEPT, Kind.BUSY)
+    assert all(codec.SIZES[kind] <= codec.SIZES[Kind.HELLO] for kind in answers)
+    assert max(codec.SIZES.values()) <= codec.DATAGRAM_MAX
+
+
+@given(st.builds(Hello, *[st.binary(min_size=16, max_size=16)] * 3, st.integers(0, 255)))
+@settings(max_examples=20, deadline=None)
+def test_a_hello_comes_back_as_it_was(hello):
+    assert codec.decode_hello(codec.encode_hello(hello)) == hello
+
+
+@given(st.builds(Accept, *[st.binary(min_size=16, max_size=16)] * 3, st.integers(0, 255)))
+@settings(max_examples=20, deadline=None)
+def test_an_accept_comes_back_as_it_was(accept):
+    assert codec.decode_accept(codec.encode_accept(accept)) == accept
+
+
+@pytest.mark.parametrize("used", [False, True])
+def test_a_refusal_comes_back_as_it_was(used):
+    assert codec.decode_busy(codec.encode_busy(Busy(b"n" * 16, used))) == Busy(b"n" * 16, used)
 
 
 def test_a_command_is_laid_out_as_documented():
@@ -80,23 +125,23 @@ def test_a_command_is_laid_out_as_documented():
 @pytest.mark.parametrize("kind", list(Kind))
 def test_every_wrong_length_is_refused(kind):
     whole = datagram(kind, bytes(codec.BODY_SIZES[kind]))
-    codec.decode(whole)
+    codec.check(whole)
     for length in (*range(len(whole)), len(whole) + 1, 2048):
-        with pytest.raises(DecodeError, match="malformed"):
-            codec.decode(whole[:length].ljust(length, b"\0"))
+        with pytest.raises(DecodeError, match=r"^malformed$"):
+            codec.check(whole[:length].ljust(length, b"\0"))
 
 
 def test_another_version_is_refused_by_name():
     data = bytearray(datagram(Kind.COMMAND, bytes(codec.BODY_SIZES[Kind.COMMAND])))
     data[0] = codec.VERSION + 1
-    with pytest.raises(DecodeError, match="version"):
-        codec.decode(bytes(data))
+    with pytest.raises(DecodeError, match=r"^version$"):
+        codec.check(bytes(data))
 
 
 @given(st.binary(max_size=400))
 @settings(max_examples=100, deadline=None)
 def test_garbage_raises_nothing_but_decode_errors(data):
-    for read in (codec.decode, codec.peek):
+    for read in (codec.check, codec.peek):
         try:
             read(data)
         except DecodeError:
@@ -107,12 +152,21 @@ def test_garbage_raises_nothing_but_decode_errors(data):
 def test_a_request_that_does_not_exist_is_refused(offset, value):
     body = bytearray(codec.encode_operator(OperatorRequest(1, Request.START, Start.HERE)))
     body[offset] = value
-    with pytest.raises(DecodeError):
+    with pytest.raises(DecodeError, match=r"^malformed$"):
         codec.decode_operator(bytes(body))
 
 
 def test_a_guard_state_that_does_not_exist_is_refused():
     body = bytearray(codec.BODY_SIZES[Kind.TELEMETRY])
-    body[-1] = 200
-    with pytest.raises(DecodeError):
-        codec.decode_telemetry(bytes(body))
+    body[-1] = max(GuardState)
+    assert codec.decode_telemetry(bytes(body)).guard is max(GuardState)
+    for wrong in (max(GuardState) + 1, 200):
+        body[-1] = wrong
+        with pytest.raises(DecodeError, match=r"^malformed$"):
+            codec.decode_telemetry(bytes(body))
+
+
+@pytest.mark.parametrize("size", range(codec.HEADER_SIZE))
+def test_a_link_is_told_what_is_too_short_for_a_header(size):
+    with pytest.raises(DecodeError, match=r"^malformed$"):
+        codec.peek(bytes(size))

@@ -1,39 +1,149 @@
-"""Sessions and channels: which datagram belongs to us, and which one counts."""
+"""Sessions: whose datagrams are opened, and that nothing changes before a tag is right."""
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import LATE, REPEATED, USED, WINDOW, Channel
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
-from cloudrc.tunnel.session import NO_EPOCH, Session
+from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from cloudrc.tunnel.session import (
+    AES_256_GCM,
+    CHACHA20_POLY1305,
+    NO_EPOCH,
+    Agreement,
+    Session,
+    pair,
+)
+from cloudrc.tunnel.unsealed import UnsealedSession, make_session
 
-BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
+BODY = bytes(range(codec.BODY_SIZES[Kind.COMMAND]))
+AGREEMENT = Agreement(b"cloud".ljust(16), b"world".ljust(16))
+HELLO = bytes(codec.BODY_SIZES[Kind.HELLO])
 
 
-def test_the_other_end_opens_what_one_end_seals():
-    cloud, world = Session(Direction.DOWNLINK), Session(Direction.UPLINK)
-    cloud.begin(7)
+def a_session(sends=Direction.DOWNLINK, secret=bytes(32)):
+    return Session(sends, KeyRing(KeySet(Key(secret))))
+
+
+def state(session):
+    """All that a datagram could change; ciphers by where they are."""
+    return {name: repr(value) for name, value in vars(session).items() if name != "_tried"}
+
+
+def unsealed():
+    ends = UnsealedSession(Direction.UPLINK), UnsealedSession(Direction.DOWNLINK)
+    for end in ends:
+        end.begin(1, AGREEMENT)
+    return ends
+
+
+@pytest.mark.parametrize("ends", [pair, unsealed, lambda: pair(suite=CHACHA20_POLY1305)])
+def test_the_other_end_opens_what_one_end_seals(ends):
+    world, cloud = ends()
     cloud.seal(Kind.COMMAND, BODY)
-    assert world.open(cloud.seal(Kind.COMMAND, BODY)) == (
-        Kind.COMMAND,
-        Direction.DOWNLINK,
-        7,
-        1,
-        BODY,
-    )
+    datagram = world.open(cloud.seal(Kind.COMMAND, BODY))
+    assert datagram == (Kind.COMMAND, Direction.DOWNLINK, 1, 1, BODY)
 
 
-def test_an_end_does_not_open_its_own_datagrams():
-    cloud = Session(Direction.DOWNLINK)
-    with pytest.raises(DecodeError, match="direction"):
+def test_a_sealed_datagram_shows_its_header_and_nothing_of_its_body():
+    _, cloud = pair(epoch=7)
+    data = cloud.seal(Kind.COMMAND, BODY)
+    assert codec.peek(data) == (Kind.COMMAND, 7, 0)
+    assert len(data) == codec.SIZES[Kind.COMMAND]
+    assert all(BODY[i : i + 4] not in data for i in range(len(BODY) - 3))
+
+
+def test_an_unsealed_one_is_as_long_and_is_opened_by_no_sealed_end():
+    world, _ = pair()
+    data = unsealed()[1].seal(Kind.COMMAND, BODY)
+    assert len(data) == codec.SIZES[Kind.COMMAND]
+    with pytest.raises(DecodeError, match=r"^tag$"):
+        world.open(data)
+
+
+def test_an_end_without_keys_is_not_sealed():
+    assert not make_session(Direction.UPLINK, None).sealed
+    assert make_session(Direction.UPLINK, KeyRing(KeySet(Key(bytes(32))))).sealed
+    assert unsealed()[0].tend(10**12) == []
+
+
+@pytest.mark.parametrize("ends", [pair, unsealed])
+def test_an_end_does_not_open_its_own_datagrams(ends):
+    _, cloud = ends()
+    with pytest.raises(DecodeError, match=r"^direction$"):
         cloud.open(cloud.seal(Kind.COMMAND, BODY))
 
 
+@pytest.mark.parametrize("ends", [pair, unsealed])
+def test_another_epoch_is_refused(ends):
+    world, cloud = ends()
+    old = cloud.seal(Kind.COMMAND, BODY)
+    world.begin(2)
+    with pytest.raises(DecodeError, match=r"^old_epoch$"):
+        world.open(old)
+
+
+@pytest.mark.parametrize("make", [a_session, lambda: UnsealedSession(Direction.DOWNLINK)])
+def test_without_a_session_nothing_is_opened_but_greetings(make):
+    cloud, (world, _) = make(), pair(epoch=NO_EPOCH)
+    with pytest.raises(DecodeError, match=r"^old_epoch$"):
+        cloud.open(world.seal(Kind.TELEMETRY, bytes(codec.BODY_SIZES[Kind.TELEMETRY])))
+    assert cloud.tend(0) == []
+    cookie = b"c" * 16
+    assert cloud.open(world.greet(Kind.CHALLENGE, cookie))[4] == cookie
+
+
+FLAWS = {
+    "key": {"secret": b"x" * 32},
+    "epoch": {"epoch": 2},
+    "suite": {"suite": CHACHA20_POLY1305},
+}
+
+
+@pytest.mark.parametrize("flaw", FLAWS)
+def test_keys_depend_on_key_epoch_and_suite(flaw):
+    world, _ = pair()
+    _, cloud = pair(**FLAWS[flaw])
+    cloud.epoch = 1  # as a forger would write it
+    with pytest.raises(DecodeError, match=r"^tag$"):
+        world.open(cloud.seal(Kind.COMMAND, BODY))
+
+
+@pytest.mark.parametrize("nonces", [(b"x" * 16, b"w" * 16), (b"c" * 16, b"x" * 16)])
+def test_keys_depend_on_both_nonces(nonces):
+    world, cloud = a_session(Direction.UPLINK), a_session()
+    world.begin(1, Agreement(b"c" * 16, b"w" * 16))
+    cloud.begin(1, Agreement(*nonces))
+    with pytest.raises(DecodeError, match=r"^tag$"):
+        world.open(cloud.seal(Kind.COMMAND, BODY))
+
+
+def test_each_direction_has_its_own_key():
+    world, cloud = pair()
+    data = bytearray(world.seal(Kind.ALIVE, b""))
+    data[1] = Direction.DOWNLINK
+    with pytest.raises(DecodeError, match=r"^tag$"):
+        world.open(bytes(data))
+    assert cloud.seal(Kind.ALIVE, b"")[16:] != world.seal(Kind.ALIVE, b"")[16:]
+
+
+def test_no_nonce_is_used_twice_in_an_epoch():
+    _, cloud = pair()
+    kinds = [Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE]
+    nonces = [
+        cloud.seal(kind, bytes(codec.BODY_SIZES[kind]))[4:16] for kind in kinds for _ in range(50)
+    ]
+    assert len(set(nonces)) == 150
+
+
+def test_an_end_cannot_begin_without_greetings():
+    with pytest.raises(AssertionError, match=r"^greetings come first$"):
+        a_session().begin(1)
+
+
 def test_kinds_count_on_their_own_and_an_epoch_begins_them_anew():
-    session = Session(Direction.DOWNLINK)
-    session.begin(1)
+    _, session = pair()
     session.seal(Kind.COMMAND, BODY)
     assert session.next_counter(Kind.COMMAND) == 1
     assert session.next_counter(Kind.OPERATOR) == 0
@@ -41,55 +151,112 @@ def test_kinds_count_on_their_own_and_an_epoch_begins_them_anew():
     assert session.next_counter(Kind.COMMAND) == 0
 
 
-def test_hellos_belong_to_no_epoch_and_count_on():
-    session = Session(Direction.DOWNLINK)
-    hello = bytes(codec.BODY_SIZES[Kind.HELLO])
-    session.seal(Kind.HELLO, hello)
+@pytest.mark.parametrize("kind", [Kind.HELLO, Kind.CHALLENGE, Kind.BUSY])
+def test_greetings_belong_to_no_epoch_and_count_on(kind):
+    _, session = pair()
+    session.greet(kind, b"")
     session.begin(5)
-    _, _, epoch, counter, _ = codec.decode(session.seal(Kind.HELLO, hello))
-    assert (epoch, counter) == (NO_EPOCH, 1)
+    assert codec.peek(session.greet(kind, b"")) == (kind, NO_EPOCH, 1)
 
 
-def test_newest_wins_and_the_last_to_arrive_wins():
-    newest, arrival = Channel(newest_wins=True), Channel(newest_wins=False)
-    order = [0, 2, 1, 2, 3]
-    used, late, repeated = USED, LATE, REPEATED
-    assert [newest.take(n) for n in order] == [used, used, late, repeated, used]
-    assert [arrival.take(n) for n in order] == [used, used, used, repeated, used]
+@pytest.mark.parametrize("ends", [pair, unsealed])
+def test_greetings_of_both_kinds_of_session_need_their_tag(ends):
+    world, cloud = ends()
+    for kind in (Kind.HELLO, Kind.BUSY):
+        end, other = (world, cloud) if kind == Kind.BUSY else (cloud, world)
+        data = end.greet(kind, bytes(codec.BODY_SIZES[kind]))
+        other.open(data)
+        with pytest.raises(DecodeError, match=r"^tag$"):
+            other.open(data[:-1] + bytes([data[-1] ^ 1]))
 
 
-def test_what_is_too_old_to_remember_counts_as_repeated():
-    channel = Channel(newest_wins=True)
-    channel.take(WINDOW)
-    assert channel.take(1) == LATE
-    assert channel.take(0) == REPEATED
-    assert channel.take(1) == REPEATED
+def test_a_session_is_made_at_a_moment_of_its_clock():
+    ring = KeyRing(KeySet(Key(b"a" * 32), Key(b"b" * 32), 10.0))
+    late = make_session(Direction.UPLINK, ring, 10_000_000_000)
+    assert (len(late.accepted), late._sends) == (1, Direction.UPLINK)
+    assert len(make_session(Direction.UPLINK, ring, 9_999_999_999).accepted) == 2
 
 
-def test_a_jump_over_the_window_forgets_what_was_before():
-    channel = Channel(newest_wins=True)
-    channel.take(3)
-    assert channel.take(2**64 - 1) == USED
-    assert channel.take(4) == REPEATED
+def test_an_acceptance_belongs_to_the_epoch_that_it_opens():
+    session, _ = pair(epoch=4)
+    session.greet(Kind.ACCEPT, b"")
+    session.begin(5)
+    assert codec.peek(session.greet(Kind.ACCEPT, b"")) == (Kind.ACCEPT, 5, 0)
 
 
-@given(st.lists(st.integers(0, 40), max_size=60), st.booleans())
-@settings(max_examples=80, deadline=None)
-def test_the_window_agrees_with_a_set(counters, newest_wins):
-    channel, seen = Channel(newest_wins), set()
-    for counter in counters:
-        if counter in seen:
-            expected = REPEATED
-        elif newest_wins and seen and counter < max(seen):
-            expected = LATE
-        else:
-            expected = USED
-        seen.add(counter)
-        assert channel.take(counter) == expected
+def test_a_greeting_of_another_key_is_refused_and_of_the_same_is_named():
+    world, stranger = a_session(Direction.UPLINK), a_session(secret=b"x" * 32)
+    with pytest.raises(DecodeError, match=r"^tag$"):
+        world.open(stranger.greet(Kind.HELLO, HELLO))
+    ours = a_session()
+    assert world.open(ours.greet(Kind.HELLO, HELLO))[4] == HELLO
+    assert world.greeting_key == ours.ring.current
 
 
-def test_a_new_epoch_forgets_all_counters():
-    channel = Channel(newest_wins=True)
-    channel.take(9)
-    channel.reset()
-    assert channel.take(0) == USED
+def datagrams(count):
+    """Sealed datagrams of every kind, both directions, and greetings; with who opens them."""
+    world, cloud = pair()
+    made = []
+    for number in range(count):
+        for end, other, kinds in (
+            (world, cloud, (Kind.TELEMETRY, Kind.ALIVE, Kind.ACCEPT, Kind.CHALLENGE, Kind.BUSY)),
+            (cloud, world, (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE, Kind.HELLO)),
+        ):
+            kind = kinds[number % len(kinds)]
+            make = end.greet if kind <= codec.LAST_GREETING else end.seal
+            made.append((make(kind, bytes([number % 256]) * codec.BODY_SIZES[kind]), other))
+    return made
+
+
+def flip_every_bit(made):
+    """How many of all copies with one bit flipped were opened."""
+    accepted = flips = 0
+    for data, opener in made:
+        opener.open(data)
+        before = state(opener)
+        for position in range(8 * len(data)):
+            flipped = bytearray(data)
+            flipped[position // 8] ^= 1 << position % 8
+            flips += 1
+            try:
+                opener.open(bytes(flipped))
+                accepted += 1
+            except DecodeError:
+                pass
+        assert state(opener) == before
+    return accepted, flips
+
+
+@pytest.mark.promise("P-LINK-1")
+def test_no_datagram_with_a_flipped_bit_is_accepted_or_changes_anything(figure):
+    accepted, flips = flip_every_bit(datagrams(20))
+    figure("bit flips of 40 datagrams: accepted", accepted, "==", 0, count=flips)
+    assert accepted == 0
+    assert flips > 20_000
+
+
+@pytest.mark.full
+def test_no_bit_of_a_thousand_datagrams_can_be_flipped(figure):
+    accepted, flips = flip_every_bit(datagrams(500))
+    figure("bit flips of 1,000 datagrams: accepted", accepted, "==", 0, count=flips)
+    assert accepted == 0
+    assert flips > 500_000
+
+
+@given(st.sampled_from(datagrams(5)), st.data())
+@settings(max_examples=200, deadline=None)
+def test_what_is_refused_changes_nothing(made, data):
+    good, opener = made
+    cut = data.draw(st.integers(0, len(good)))
+    spoiled = good[:cut] + data.draw(st.binary(max_size=len(good) - cut + 3))
+    before = state(opener)
+    try:
+        opener.open(spoiled)
+    except DecodeError:
+        assert state(opener) == before
+    else:
+        assert spoiled == good
+
+
+def test_the_suite_that_ends_agree_on_is_aes_unless_they_say_else():
+    assert AGREEMENT.suite == AES_256_GCM

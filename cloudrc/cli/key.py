@@ -1,0 +1,66 @@
+"""`cloudrc key`: make the tunnel's pre-shared key, and rotate it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from cloudrc.errors import BadInputError
+
+EPILOG = """\
+Both ends of the tunnel read the same key file ('--key FILE', in the cluster
+a Secret) and follow it while they fly. 'new' on a file that is there already
+rotates: the old key stays valid beside the new one for the overlap, counted
+by each process from the moment it reads the file, so that nothing is lost
+while the file is on its way. In the cluster:
+  kubectl create secret generic NAME --from-file=key=FILE \\
+    --dry-run=client -o yaml | kubectl apply -f -"""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    new = verbs.add_parser("new", help="make a key file, or rotate the key in one")
+    new.add_argument("file", type=Path, metavar="FILE", help="gets mode 0600")
+    new.add_argument(
+        "--overlap",
+        type=_seconds,
+        default=None,
+        metavar="SECONDS",
+        help="how long the old key stays valid after a rotation (default: 300)",
+    )
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Make the key."""
+    import os
+
+    from cloudrc.drivers.epochs import replace_durably
+    from cloudrc.drivers.keyfile import read_keys
+    from cloudrc.tunnel.keys import KEY_SIZE, OVERLAP, Key, KeySet, write
+
+    path: Path = options.file
+    previous = read_keys(path).current if path.exists() else None
+    if previous is None and options.overlap is not None:
+        raise BadInputError(f"--overlap: {path} is not there, so there is no old key to keep")
+    keys = KeySet(Key(os.urandom(KEY_SIZE)), previous, options.overlap or OVERLAP)
+    try:
+        replace_durably(path, write(keys).encode("ascii"))
+    except OSError as error:
+        remedy = "name a file in a folder that is there and that you may write in"
+        raise BadInputError(f"{path}: {error.strerror or error}; {remedy}") from None
+    before = f", beside {previous.name} for {keys.overlap:g} s" if previous else ""
+    print(f"key {keys.current.name}{before}: {path}")
+    return 0
+
+
+def _seconds(text: str) -> float:
+    from cloudrc.tunnel.keys import OVERLAP_MAX
+
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = -1.0
+    if not 0 < seconds <= OVERLAP_MAX:
+        raise argparse.ArgumentTypeError(f"'{text}' is not above 0 and at most {OVERLAP_MAX:g} s")
+    return seconds

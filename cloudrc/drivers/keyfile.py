@@ -1,0 +1,87 @@
+"""The key file: read at the start, and followed in flight, since a Secret may be rotated.
+
+The loop looks at it twice a second, as at the route: one system call as long as nothing changes.
+"""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+from cloudrc.errors import BadInputError
+from cloudrc.records import Fault
+from cloudrc.tunnel.keys import KeyRing, KeySet, parse
+
+PERIOD_NS = 500_000_000
+"""How often it is asked whether the file has changed [ns]."""
+SIZE_MAX = 4096
+"""Of a key file [bytes]."""
+MAKE = "make one: cloudrc key new FILE"
+
+
+class KeyFile:
+    """The keys of one end; `ring` always holds those that are valid."""
+
+    def __init__(self, path: Path, now_ns: int) -> None:
+        """Read the file for the first time [ns, monotonic clock].
+
+        Raises:
+            BadInputError: If it is not there or holds no key.
+        """
+        self._path = path
+        self._seen = _identity(path)
+        self._keys = read_keys(path)
+        self._due_ns = now_ns
+        self.ring = KeyRing(self._keys, now_ns)
+
+    def follow(self, now_ns: int) -> list[Fault]:
+        """Look whether the file has changed, if that is due [ns, monotonic clock].
+
+        Returns:
+            What is to be told: a new key, or why the old ones stay.
+        """
+        if now_ns < self._due_ns:
+            return []
+        self._due_ns = now_ns + PERIOD_NS
+        seen = _identity(self._path)
+        if seen == self._seen or seen is None:  # a file that is gone for a moment changes nothing
+            return []
+        self._seen = seen
+        try:
+            keys = read_keys(self._path)
+        except BadInputError as error:
+            return [Fault(now_ns, "key", f"the keys stay as they were: {error}")]
+        if keys == self._keys:
+            return []
+        self._keys = keys
+        self.ring.replace(keys, now_ns)
+        text = f"new key {keys.current.name}; the one before is valid for {keys.overlap:g} s more"
+        return [Fault(now_ns, "key", text)]
+
+
+def read_keys(path: Path) -> KeySet:
+    """Read a key file.
+
+    Raises:
+        BadInputError: What is wrong with it and what to do, without a word of it.
+    """
+    try:
+        with path.open("rb") as file:
+            return parse(file.read(SIZE_MAX))
+    except OSError as error:
+        raise BadInputError(f"--key {path}: {error.strerror or error}; {MAKE}") from None
+    except ValueError as error:
+        raise BadInputError(f"--key {path}: {error}; {MAKE}") from None
+
+
+def is_exposed(path: Path) -> bool:
+    """Whether every user of this machine can read a key file."""
+    return bool(path.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH))
+
+
+def _identity(path: Path) -> tuple[int, int, int] | None:
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_ino, status.st_size

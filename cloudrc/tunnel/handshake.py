@@ -1,0 +1,234 @@
+"""Greetings, world's side: how a cloud gets a session, and why nobody else does.
+
+    cloud                                      world
+      HELLO (nonce, clock, no cookie)   -->
+                                        <--    CHALLENGE (cookie)
+      HELLO (nonce, clock, cookie)      -->
+                                        <--    ACCEPT (nonce, world's nonce, clock), a new epoch
+                                            or BUSY (nonce)
+
+All of them carry a tag by the pre-shared key: who does not have it is not answered at all. The
+cookie is a MAC over the current two seconds, so world keeps nothing for a hello without it, and a
+captured hello is worth nothing four seconds later. No answer is longer than a hello, and there are
+at most 20 of them in any second: ten challenges, ten other answers. A captured hello that somebody
+repeats can use up the challenges alone, and these, which name nobody, lead the honest cloud on all
+the same; a hello with a cookie is answered once per counter.
+
+The cloud that has the session keeps it while it is heard: one datagram, new and sealed with the
+session's keys, in `command_age_max`. Only after that another one gets it, under the next epoch. A
+nonce that has had its session never gets another: a captured hello cannot bring back an old one.
+
+Deviation: WireGuard derives session keys by Diffie-Hellman too; here the pre-shared key is all, as
+both ends are one owner's, and whoever has that key can command the robot anyway.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, Protocol
+
+from cloudrc.tunnel.channel import REPEATED, Channel
+from cloudrc.tunnel.codec import (
+    Accept,
+    Busy,
+    DecodeError,
+    Hello,
+    Kind,
+    encode_accept,
+    encode_busy,
+)
+from cloudrc.tunnel.keys import Key
+from cloudrc.tunnel.session import (
+    ACCEPT,
+    AES_256_GCM,
+    ALIVE,
+    CHACHA20_POLY1305,
+    Agreement,
+    Session,
+)
+
+BUSY, CHALLENGE, OPERATOR = int(Kind.BUSY), int(Kind.CHALLENGE), int(Kind.OPERATOR)
+
+EPOCH_MAX = 2**32 - 1
+ANSWERS_MAX = 10
+"""Answers in any second to hellos with a cookie; as many challenges. Source: 20 together, as
+WireGuard's handshakes per second and address."""
+SECOND_NS = 1_000_000_000
+CHALLENGE_NS = SECOND_NS // 10
+"""Between two challenges [ns]; spread over the second, so that none waits long for the next."""
+COOKIE_NS = 2_000_000_000
+"""A cookie is valid in its slot of this length and in the next one [ns]."""
+GRACE_NS = 1_000_000_000
+"""Authority of a cloud whose session is new, until it is heard for the first time [ns]."""
+USED_MAX = 64
+"""Old nonces remembered; at ten answers a second none is forgotten while its cookie is valid."""
+
+
+def epochs_after(last: int) -> Iterator[int]:
+    """Count epochs on; after the last that the header can hold comes 1: nonces are fresh then."""
+    while True:
+        last = last % EPOCH_MAX + 1
+        yield last
+
+
+class Answer(NamedTuple):
+    """What world does about a hello.
+
+    Attributes:
+        outcome: What it is counted under.
+        datagrams: To be sent, none or one.
+        opened: Whether a new session has been opened.
+    """
+
+    outcome: str
+    datagrams: list[bytes]
+    opened: bool = False
+
+
+class Identity(Protocol):
+    """What the door asks of world's identity; `cloudrc.world.identity` explains it."""
+
+    @property
+    def clock_id(self) -> bytes:
+        """Names this machine's monotonic clock."""
+
+    @property
+    def nonce(self) -> bytes:
+        """Names this process."""
+
+    @property
+    def suite(self) -> int:
+        """Cipher that world would like."""
+
+    @property
+    def last_epoch(self) -> int:
+        """The last one before this process."""
+
+    @property
+    def next_epoch(self) -> Callable[[], int] | None:
+        """Gives persisted epochs."""
+
+
+class Door:
+    """World's side: who has authority, who gets it next, and under which epoch."""
+
+    def __init__(self, session: Session, identity: Identity, *, age_max_ns: int) -> None:
+        """Begin without a session.
+
+        Args:
+            session: World's; from here on its epochs are opened here.
+            identity: World's.
+            age_max_ns: How long an incumbent may be silent [ns].
+        """
+        self._session = session
+        self._nonce, self._clock, self._suite = identity.nonce, identity.clock_id, identity.suite
+        self._next_epoch = identity.next_epoch or epochs_after(identity.last_epoch).__next__
+        self._cookies = session.ring.current.derive(identity.nonce, b"cookies")
+        self._age_max_ns = age_max_ns
+        self._fresh_until_ns = -1
+        self._incumbent = Hello(b"", b"", b"", AES_256_GCM)
+        self._key = session.ring.current  # that the incumbent's session began with
+        self._used: deque[bytes] = deque(maxlen=USED_MAX)
+        self._challenged_ns = -CHALLENGE_NS
+        self._answered_ns: deque[int] = deque(maxlen=ANSWERS_MAX)
+        self._counters: dict[bytes, int] = {}  # newest counter answered, by nonce
+        self._windows = {int(kind): Channel(newest_wins=True) for kind in (ALIVE, OPERATOR)}
+
+    @property
+    def shares_clock(self) -> bool:
+        """Whether the cloud that has the session reads the same clock as world."""
+        return self._incumbent.clock == self._clock
+
+    def hear(self, now_ns: int) -> None:
+        """Note that the incumbent is alive: a new datagram of its session has come [ns]."""
+        self._fresh_until_ns = now_ns + self._age_max_ns
+
+    def admit(self, kind: int, counter: int, now_ns: int) -> None:
+        """Let an ALIVE or OPERATOR datagram of the session in, once [ns, monotonic clock].
+
+        Raises:
+            DecodeError: "malformed" if it is neither, "repeated".
+        """
+        window = self._windows.get(kind)
+        if window is None:
+            raise DecodeError("malformed")
+        if window.take(counter) == REPEATED:
+            raise DecodeError(REPEATED)
+        self.hear(now_ns)
+
+    def knock(self, hello: Hello, counter: int, now_ns: int) -> Answer:
+        """Decide about the hello that the session has just opened.
+
+        Args:
+            hello: Its body.
+            counter: From its header.
+            now_ns: Monotonic clock [ns].
+        """
+        if not self._has_cookie(hello, now_ns):
+            if now_ns - self._challenged_ns < CHALLENGE_NS:
+                return Answer("unanswered", [])
+            self._challenged_ns = now_ns
+            return self._answer("hello", CHALLENGE, self._cookie(now_ns))
+        if counter <= self._counters.get(hello.nonce, -1):
+            return Answer(REPEATED, [])
+        answered = self._answered_ns
+        if len(answered) == ANSWERS_MAX and now_ns - answered[0] < SECOND_NS:
+            return Answer("unanswered", [])
+        answered.append(now_ns)
+        self._remember(hello.nonce, counter)
+        if hello.nonce == self._incumbent.nonce:
+            # Whichever key this hello has: cloud takes the answer's for the key of the session.
+            return Answer("hello", [self._session.greet(ACCEPT, self._accept(), self._key)])
+        if hello.nonce in self._used:
+            return self._answer("hello", BUSY, encode_busy(Busy(hello.nonce, used=True)))
+        if now_ns <= self._fresh_until_ns:
+            return self._answer("busy", BUSY, encode_busy(Busy(hello.nonce, used=False)))
+        self._used.append(self._incumbent.nonce)
+        self._incumbent = hello
+        self._fresh_until_ns = now_ns + max(GRACE_NS, self._age_max_ns)
+        agreement = Agreement(hello.nonce, self._nonce, self._agreed())
+        self._key = self._session.greeting_key
+        self._begin(agreement, self._key)
+        return self._answer("hello", ACCEPT, self._accept(), opened=True)
+
+    def move_on(self) -> bytes:
+        """Open the next epoch of the same session; the datagram that tells cloud."""
+        self._begin()
+        return self._session.greet(ACCEPT, self._accept())
+
+    def _remember(self, nonce: bytes, counter: int) -> None:
+        counters = self._counters
+        counters.pop(nonce, None)  # the one that is answered last is forgotten last
+        counters[nonce] = counter
+        if len(counters) > USED_MAX:
+            del counters[next(iter(counters))]
+
+    def _begin(self, agreement: Agreement | None = None, key: Key | None = None) -> None:
+        self._session.begin(self._next_epoch(), agreement, key)
+        for window in self._windows.values():
+            window.reset()
+
+    def _accept(self) -> bytes:
+        accept = Accept(self._incumbent.nonce, self._nonce, self._clock, self._agreed())
+        return encode_accept(accept)
+
+    def _agreed(self) -> int:
+        wishes = (self._incumbent.suite, self._suite)
+        return CHACHA20_POLY1305 if CHACHA20_POLY1305 in wishes else AES_256_GCM
+
+    def _answer(self, outcome: str, kind: int, body: bytes, *, opened: bool = False) -> Answer:
+        session = self._session
+        return Answer(outcome, [session.greet(kind, body, session.greeting_key)], opened)
+
+    def _cookie(self, now_ns: int, slots_ago: int = 0) -> bytes:
+        slot = now_ns // COOKIE_NS - slots_ago
+        return hmac.digest(self._cookies, b"%d" % slot, hashlib.sha256)[:16]
+
+    def _has_cookie(self, hello: Hello, now_ns: int) -> bool:
+        return any(
+            hmac.compare_digest(hello.cookie, self._cookie(now_ns, slots_ago))
+            for slots_ago in (0, 1)
+        )

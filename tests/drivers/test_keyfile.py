@@ -1,0 +1,176 @@
+"""The key file: made by a command, read at the start, followed in flight, shown to nobody."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile, is_exposed, read_keys
+from cloudrc.errors import BadInputError
+from cloudrc.tunnel.keys import Key, KeySet, parse, write
+
+CONFIG = Path(__file__).parents[2] / "cloudrc" / "experiments" / "hover.yaml"
+FIRST, SECOND = b"1" * 32, b"2" * 32
+
+
+def put(path: Path, data: bytes) -> None:
+    """Replace a file as kubelet does: at once, by another one."""
+    draft = path.with_name("draft")
+    draft.write_bytes(data)
+    draft.replace(path)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    (tmp_path / "key").write_bytes(FIRST)
+    return tmp_path / "key"
+
+
+def test_a_file_that_stays_changes_nothing(path: Path) -> None:
+    keys = KeyFile(path, 0)
+    assert [keys.follow(n * PERIOD_NS) for n in range(5)] == [[]] * 5
+    assert keys.ring.accepted(0) == (Key(FIRST),)
+
+
+def test_a_new_key_is_taken_and_the_old_one_is_valid_beside_it(path: Path) -> None:
+    keys = KeyFile(path, 0)
+    keys.follow(0)
+    put(path, SECOND)
+    assert keys.follow(PERIOD_NS - 1) == []  # it is not time to look yet
+    (said,) = keys.follow(PERIOD_NS)
+    assert said.code == "key"
+    assert keys.ring.accepted(PERIOD_NS) == (Key(SECOND), Key(FIRST))
+
+
+def test_the_overlap_is_that_of_the_file_and_counts_from_reading_it(path: Path) -> None:
+    keys = KeyFile(path, 0)
+    put(path, write(KeySet(Key(SECOND), Key(FIRST), 10.0)).encode())
+    read_ns = 77_000_000_000
+    keys.follow(read_ns)
+    assert len(keys.ring.accepted(read_ns + 9_999_999_999)) == 2
+    assert keys.ring.accepted(read_ns + 10_000_000_000) == (Key(SECOND),)
+
+
+def test_the_same_key_in_another_file_is_no_news(path: Path) -> None:
+    keys = KeyFile(path, 0)
+    put(path, FIRST)
+    assert keys.follow(PERIOD_NS) == []
+
+
+@pytest.mark.parametrize("wrong", [b"", b"no key", b"3" * 31])
+def test_a_file_that_is_wrong_leaves_the_keys_and_is_told_once(path: Path, wrong: bytes) -> None:
+    keys = KeyFile(path, 0)
+    put(path, wrong)
+    (said,) = keys.follow(PERIOD_NS)
+    assert said.text.startswith("the keys stay as they were: ")
+    assert keys.follow(2 * PERIOD_NS) == []
+    assert keys.ring.current == Key(FIRST)
+    put(path, SECOND)
+    keys.follow(3 * PERIOD_NS)
+    assert keys.ring.current == Key(SECOND)
+
+
+def test_a_file_that_is_gone_leaves_the_keys(path: Path) -> None:
+    keys = KeyFile(path, 0)
+    path.unlink()
+    assert keys.follow(PERIOD_NS) == []
+    assert keys.ring.current == Key(FIRST)
+
+
+@pytest.mark.parametrize("end", ["world", "cloud"])
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [(None, "No such file"), (b"short", "neither 32 bytes nor lines"), (b"", "its lines are")],
+)
+def test_an_end_without_a_key_does_not_start(
+    end: str,
+    data: bytes | None,
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    key = tmp_path / "key"
+    if data is not None:
+        key.write_bytes(data)
+    words = ["--config", str(CONFIG), "--listen", "127.0.0.1:7499", "--peer", "127.0.0.1:9"]
+    assert main([end, *words, "--key", str(key)]) == 2
+    error = capsys.readouterr().err
+    assert f"--key {key}: {said}" in error
+    assert "cloudrc key new FILE" in error
+    assert main([end, *words]) == 2
+    assert "--key" in capsys.readouterr().err
+
+
+def test_a_file_that_everybody_can_read_is_noticed(path: Path) -> None:
+    path.chmod(0o600)
+    assert not is_exposed(path)
+    path.chmod(0o644)
+    assert is_exposed(path)
+
+
+def test_the_command_makes_a_key_that_only_its_owner_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "key"
+    os.umask(0o022)
+    assert main(["key", "new", str(path)]) == 0
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    keys = parse(path.read_bytes())
+    assert keys.previous is None
+    said = capsys.readouterr().out
+    assert keys.current.name in said
+    assert keys.current.text() not in said
+
+
+def test_the_command_rotates_a_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "key"
+    path.write_bytes(FIRST)
+    assert main(["key", "new", str(path), "--overlap", "60"]) == 0
+    keys = parse(path.read_bytes())
+    assert (keys.previous, keys.overlap) == (Key(FIRST), 60.0)
+    assert main(["key", "new", str(path)]) == 0
+    again = parse(path.read_bytes())
+    assert (again.previous, again.overlap) == (keys.current, 300.0)
+    assert keys.current.text() not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["new", "{}/none", "--overlap", "5"], "there is no old key to keep"),
+        (["new", "{}/key", "--overlap", "0"], "not above 0"),
+        (["new", "{}/key", "--overlap", "nan"], "not above 0"),
+        (["new", "{}/key", "--overlap", "soon"], "not above 0"),
+        (["new", "{}/wrong"], "neither 32 bytes"),
+        (["new", "{}/no/key"], "No such file"),
+    ],
+)
+def test_what_the_command_cannot_do_it_says_in_a_line(
+    words: list[str], said: str, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (path.parent / "wrong").write_bytes(b"what is this")
+    assert main(["key", *(word.format(path.parent) for word in words)]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.splitlines()) == 1
+    assert path.read_bytes() == FIRST
+    assert sorted(p.name for p in path.parent.iterdir()) == ["key", "wrong"]
+
+
+def test_a_huge_file_is_not_read_whole(tmp_path: Path) -> None:
+    (tmp_path / "key").write_bytes(b"#" * 10_000_000)
+    with pytest.raises(BadInputError):
+        read_keys(tmp_path / "key")
+
+
+def test_a_key_that_cannot_be_written_names_the_file_that_was_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "no" / "folder" / "k"
+    assert main(["key", "new", str(path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"cloudrc: error: {path}: No such file or directory; name a file in")

@@ -1,0 +1,167 @@
+"""Hostile datagrams for both ends, and the oracle: none is accepted, none raises, none is kept.
+
+Run by itself it is a coverage-guided fuzzer (libFuzzer's flags):
+
+    python tests/tunnel/hostile.py -atheris_runs=10000000 [CORPUS]
+
+Four ways to be hostile, in turns: bytes as they come; a sealed frame of the session with some bytes
+changed; one cut short or made longer; one sealed properly, with a key that is not ours.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+from pathlib import Path
+
+sys.path += [str(Path(__file__).parents[1] / "missions"), str(Path(__file__).parents[2])]
+
+from types import SimpleNamespace
+
+from bare_world import Bare, BareCloud, ring
+
+from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.codec import Kind
+from cloudrc.tunnel.session import pair
+
+LONGEST = 2048
+DOWNLINK = (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE)
+
+
+class Target:
+    """A world and a cloud in a session, with every frame that was ever valid between them."""
+
+    def __init__(self) -> None:
+        self.bare = Bare(ring())
+        self.world = self.bare.world
+        self.cloud = a_cloud()
+        self.frames: list[bytes] = []
+        for _ in range(40):  # until both are in one session
+            self.cloud.handle_deadline(self.cloud.next_deadline_ns())
+            for data in self.cloud.take_datagrams():
+                self.give(data, self.world)
+            for data in self.world.take_datagrams():
+                self.give(data, self.cloud)
+        assert self.cloud._session.epoch == self.world._session.epoch == 1
+        talker = BareCloud(b"other", None)
+        talker.session = self.cloud._session
+        self.frames += [talker.command(), talker.start(1), talker.session.seal(Kind.ALIVE, b"")]
+        telemetry = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
+        self.frames += [self.world._session.seal(Kind.TELEMETRY, telemetry) for _ in range(3)]
+        self.known = frozenset(self.frames)
+        self.strangers = pair(1, b"s" * 32)
+        for end in (self.world, self.cloud):
+            end.take_records()
+            end.take_datagrams()
+        self.before = self.state()
+        self.tried = 0
+
+    def give(self, data: bytes, end: object) -> None:
+        self.frames.append(data)
+        end.receive_datagram(data, 0)
+
+    def state(self) -> tuple:
+        """All that a datagram that is let through would change."""
+        accepted = ("used", "late", "repeated", "hello", "busy", "accept_ignored", "unanswered")
+        ends = (self.world, self.cloud)
+        return (
+            [[end._counts[name] for name in accepted] for end in ends],
+            [
+                (end._session.epoch, end._session._newest, len(end._session._openers))
+                for end in ends
+            ],
+            self.world._door._fresh_until_ns,
+            self.cloud._heard_ns,
+            self.world._mission,
+            self.world._waiting,
+        )
+
+    def try_one(self, program: bytes) -> None:
+        """Make a hostile datagram of a fuzzer's bytes, and give it to both ends."""
+        data = self.make(program)
+        if data in self.known:
+            return
+        self.tried += 1
+        self.world.receive_datagram(data, 0)
+        self.cloud.receive_datagram(data, 0)
+        if self.tried % 1000 == 0:
+            self.check()
+
+    def check(self) -> None:
+        assert self.state() == self.before, "a hostile datagram was let through"
+        assert self.world.take_datagrams() == self.cloud.take_datagrams() == []
+        assert self.world.take_records() == self.cloud.take_records() == []
+
+    def make(self, program: bytes) -> bytes:
+        if len(program) < 4:
+            return program
+        way, which, rest = program[0] % 4, program[1] | program[2] << 8, program[3:]
+        frame = self.frames[which % len(self.frames)]
+        if way == 0:
+            return rest[:LONGEST]
+        if way == 1:
+            spoiled = bytearray(frame)
+            for at, change in zip(rest[::2], rest[1::2], strict=False):
+                spoiled[at % len(spoiled)] ^= change
+            return bytes(spoiled)
+        if way == 2:
+            length = (rest[0] | which & 0x700) % LONGEST
+            return (frame + rest * (1 + length // len(rest)))[:length]
+        kind = DOWNLINK[which % 3] if which & 1 else Kind.TELEMETRY
+        size = codec.BODY_SIZES[kind]
+        session = self.strangers[kind != Kind.TELEMETRY]
+        return session.seal(kind, (rest * (1 + size // len(rest)))[:size])
+
+
+def a_cloud() -> CloudEndpoint:
+    """Cloud's end without anything behind it."""
+    nothing = SimpleNamespace(
+        faults=[], counts={}, ready=False, outputs=[], outcome=None, settled=True,
+        reset=lambda: None, observe=lambda telemetry, now_ns: None, see=lambda seen, now_ns: None,
+        handle_deadline=lambda now_ns: None,
+    )  # fmt: skip
+    return CloudEndpoint(
+        nothing, nothing, CloudIdentity(bytes(16), b"c" * 16, ring()), newest_wins=True
+    )
+
+
+def memory() -> float:
+    """Most memory that this process has had [MiB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def main() -> None:
+    import atheris
+
+    with atheris.instrument_imports(include=["cloudrc.tunnel", "cloudrc.world.endpoint",
+                                             "cloudrc.cloud.endpoint"]):  # fmt: skip
+        for name in [name for name in sys.modules if name.startswith("cloudrc.")]:
+            del sys.modules[name]
+        del sys.modules["bare_world"]
+        import hostile
+
+    target = hostile.Target()
+    begin: list[float] = []
+
+    def one(data: bytes) -> None:
+        target.try_one(data)
+        if target.tried == 100_000 and not begin:
+            begin.append(memory())
+
+    import atexit
+
+    def report() -> None:
+        target.check()
+        grown = memory() - begin[0] if begin else 0.0
+        print(f"hostile {target.tried} accepted 0 memory {grown:+.1f} MiB", flush=True)
+
+    atexit.register(report)
+    sys.path.append(str(Path(__file__).parent))
+    atheris.Setup(sys.argv, one)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parent))
+    main()

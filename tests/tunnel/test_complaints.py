@@ -1,0 +1,63 @@
+"""What keeps two ends from talking is said once, in words, and only while they do not talk."""
+
+import pytest
+from bare_world import Bare, BareCloud, ring
+
+from cloudrc.records import Fault
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.codec import Kind
+from cloudrc.tunnel.complaints import Complaints
+from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+
+OTHER = KeyRing(KeySet(Key(b"x" * 32)))
+
+
+def faults(bare):
+    return [record for record in bare.world.take_records() if isinstance(record, Fault)]
+
+
+def test_another_version_is_told_once():
+    bare = Bare(ring())
+    hello = bytes([3]) + bare.cloud("a").hello()[1:]
+    for _ in range(3):
+        bare.world.receive_datagram(hello, 0)
+    (fault,) = faults(bare)
+    assert fault.code == "version"
+    assert fault.text.startswith("peer speaks v3, we speak v2: ")
+    assert bare.world._counts["version"] == 3
+
+
+@pytest.mark.promise("P-LINK-4")
+def test_another_key_is_told_once():
+    bare = Bare(ring())
+    for _ in range(3):
+        bare.world.receive_datagram(BareCloud(b"a", OTHER).hello(), 0)
+    (fault,) = faults(bare)
+    assert (fault.code, "same key file" in fault.text) == ("key", True)
+    assert bare.world.take_datagrams() == []
+
+
+def test_within_a_session_garbage_is_only_counted():
+    bare = Bare(ring())
+    bare.send(bare.cloud("a").hello())
+    bare.world.receive_datagram(BareCloud(b"b", OTHER).hello(), 0)
+    assert faults(bare) == []
+    assert bare.world._counts["tag"] == 1
+
+
+@pytest.mark.parametrize("outcome", ["malformed", "direction", "old_epoch"])
+def test_what_anybody_may_send_is_not_worth_a_word(outcome):
+    assert Complaints().about(outcome, bytes(16), 0) == []
+
+
+def test_a_tag_of_no_greeting_is_not_worth_a_word():
+    data = codec.encode_header(Kind.COMMAND, 1, 1, 1)
+    assert Complaints().about("tag", data, 0) == []
+
+
+def test_after_a_session_it_is_said_again():
+    complaints = Complaints()
+    assert complaints.say("x", "text", 7) == [Fault(7, "x", "text")]
+    assert complaints.say("x", "text", 8) == []
+    complaints.forget()
+    assert complaints.say("x", "text", 9) == [Fault(9, "x", "text")]

@@ -1,0 +1,214 @@
+"""World's side of the greetings: cookies, names, and who has authority."""
+
+from types import SimpleNamespace
+
+import pytest
+from doorstep import CLOCK, KEY, MS, NONCE, SECOND_NS, WORLD, Doorstep
+
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.codec import Accept, Busy, DecodeError, Direction, Kind
+from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, EPOCH_MAX, Door, epochs_after
+from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from cloudrc.tunnel.knocker import NO_COOKIE
+from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, Agreement, Session
+
+
+@pytest.fixture
+def step():
+    return Doorstep()
+
+
+def test_a_hello_without_a_cookie_gets_one_and_changes_nothing(step):
+    before = dict(vars(step.door))
+    assert step.knock().outcome == "hello"
+    del before["_challenged_ns"]
+    assert {name: vars(step.door)[name] for name in before} == before
+    assert step.world.epoch == 0
+
+
+def test_with_the_cookie_it_gets_a_session(step):
+    answer = step.knock(cookie=step.cookie())
+    assert (answer.outcome, answer.opened) == ("hello", True)
+    assert step.world.epoch == 1
+    kind, _, epoch, _, body = step.cloud.open(answer.datagrams[0])
+    assert (kind, epoch) == (Kind.ACCEPT, 1)
+    assert codec.decode_accept(body) == Accept(NONCE, WORLD, CLOCK, AES_256_GCM)
+
+
+@pytest.mark.parametrize("spoil", [lambda c: bytes(16), lambda c: c[:-1] + bytes([c[-1] ^ 1])])
+def test_a_wrong_cookie_is_as_good_as_none(step, spoil):
+    cookie = step.cookie()
+    step.now_ns += CHALLENGE_NS
+    assert step.answer(cookie=spoil(cookie))[0] == Kind.CHALLENGE
+    assert step.world.epoch == 0
+
+
+@pytest.mark.parametrize(("slots", "opened"), [(0, True), (1, True), (2, False)])
+def test_a_cookie_lasts_its_slot_and_the_next(step, slots, opened):
+    cookie = step.cookie()
+    step.now_ns += slots * COOKIE_NS
+    assert step.knock(cookie=cookie).opened == opened
+
+
+def test_a_cookie_of_the_process_before_is_worth_nothing(step):
+    other = Doorstep(nonce=b"v" * 16)
+    assert not other.knock(cookie=step.cookie()).opened
+
+
+def test_a_cookie_cannot_be_made_without_the_key(step):
+    assert step.cookie() != Doorstep().cookie()[::-1]
+    strange = Doorstep()
+    strange.door = Door(
+        Session(Direction.UPLINK, KeyRing(KeySet(Key(b"x" * 32)))),
+        SimpleNamespace(
+            nonce=WORLD, clock_id=CLOCK, suite=1, last_epoch=0, next_epoch=None
+        ),
+        age_max_ns=1,
+    )  # fmt: skip
+    assert strange.door._cookie(step.now_ns) != step.cookie()
+
+
+def test_a_repeated_hello_gets_the_same_acceptance(step):
+    cookie = step.cookie()
+    assert step.knock(cookie=cookie).opened
+    again = step.knock(cookie=cookie)
+    assert (again.outcome, again.opened) == ("hello", False)
+    assert codec.peek(again.datagrams[0])[:2] == (Kind.ACCEPT, 1)
+
+
+def test_another_cloud_is_refused_while_the_incumbent_is_fresh(step):
+    step.knock(cookie=step.cookie())
+    step.door.hear(step.now_ns)
+    step.now_ns += 250 * MS
+    answer = step.knock(b"m" * 16, step.cookie())
+    assert (answer.outcome, answer.opened) == ("busy", False)
+    body = step.cloud.open(answer.datagrams[0])[4]
+    assert codec.decode_busy(body) == Busy(b"m" * 16, used=False)
+    step.now_ns += 1
+    assert step.knock(b"m" * 16, step.cookie()).opened
+    assert step.world.epoch == 2
+
+
+def test_a_nonce_that_had_its_session_gets_no_other(step):
+    step.knock(cookie=step.cookie())
+    step.now_ns += 2 * SECOND_NS
+    step.knock(b"m" * 16, step.cookie())
+    step.now_ns += 2 * SECOND_NS
+    answer = step.knock(cookie=step.cookie())
+    assert answer.outcome == "hello"
+    kind, _, _, _, body = step.cloud.open(answer.datagrams[0])
+    assert kind == Kind.BUSY
+    assert codec.decode_busy(body) == Busy(NONCE, used=True)
+    assert step.world.epoch == 2
+
+
+@pytest.mark.parametrize(
+    ("wishes", "agreed"),
+    [
+        ((AES_256_GCM, AES_256_GCM), AES_256_GCM),
+        ((CHACHA20_POLY1305, AES_256_GCM), CHACHA20_POLY1305),
+        ((AES_256_GCM, CHACHA20_POLY1305), CHACHA20_POLY1305),
+        ((77, AES_256_GCM), AES_256_GCM),
+    ],
+)
+def test_the_suite_is_chacha_if_one_end_is_slow_at_aes(wishes, agreed):
+    step = Doorstep(suite=wishes[1])
+    _, _, body = step.answer(cookie=step.cookie(), suite=wishes[0])
+    assert codec.decode_accept(body).suite == agreed
+    assert step.world._agreement == Agreement(NONCE, WORLD, agreed)
+
+
+def test_a_door_opens_from_the_first_moment_of_its_clock(step):
+    step.now_ns = 0
+    assert step.knock(cookie=step.cookie()).opened
+
+
+def test_a_session_rests_on_the_key_of_its_hello():
+    step = Doorstep()
+    old, new = KEY, Key(b"n" * 32)
+    step.world.ring.replace(KeySet(new), step.now_ns)
+    step.world.tend(step.now_ns)
+    for key in (old, new):
+        step.world.open(step.cloud.greet(Kind.HELLO, bytes(codec.BODY_SIZES[Kind.HELLO]), key))
+        for cookie in (NO_COOKIE, step.door._cookie(step.now_ns)):
+            step.now_ns += CHALLENGE_NS
+            (data,) = step.knock(key.name.encode().ljust(16), cookie).datagrams
+            assert key.verifies(data[:-16], data[-16:])
+        assert step.world._key == key
+        assert step.world._openers[0][1] == key
+        assert key.verifies(*(lambda told: (told[:-16], told[-16:]))(step.door.move_on()))
+        step.now_ns += 2 * SECOND_NS
+
+
+def test_whichever_acceptance_comes_first_names_the_key_of_the_session():
+    step = Doorstep()
+    old, new = KEY, Key(b"n" * 32)
+    step.world.ring.replace(KeySet(new), step.now_ns)
+    step.world.tend(step.now_ns)
+    for key in (old, new):  # while two are valid, a cloud says hello with each in turn
+        step.world.open(step.cloud.greet(Kind.HELLO, bytes(codec.BODY_SIZES[Kind.HELLO]), key))
+        (data,) = step.knock(cookie=step.door._cookie(step.now_ns)).datagrams
+        assert old.verifies(data[:-16], data[-16:])
+    assert step.world._key == old
+
+
+def test_answers_are_never_longer_than_the_hello(step):
+    hello = codec.SIZES[Kind.HELLO]
+    answers = [step.knock(), step.knock(cookie=step.cookie()), step.knock(b"m" * 16, step.cookie())]
+    kinds = [codec.peek(answer.datagrams[0])[0] for answer in answers]
+    assert kinds == [Kind.CHALLENGE, Kind.ACCEPT, Kind.BUSY]
+    assert all(len(answer.datagrams[0]) <= hello for answer in answers)
+
+
+def test_the_door_knows_whether_the_clock_is_shared(step):
+    step.knock(cookie=step.cookie())
+    assert step.door.shares_clock
+    step.now_ns += 2 * SECOND_NS
+    step.knock(b"m" * 16, step.cookie(), clock=b"d" * 16)
+    assert not step.door.shares_clock
+
+
+def test_operator_and_alive_are_let_in_once(step):
+    for kind in (Kind.OPERATOR, Kind.ALIVE):
+        step.door.admit(kind, 5, step.now_ns)
+        step.door.admit(kind, 4, step.now_ns)  # late, but new
+        with pytest.raises(DecodeError, match=r"^repeated$"):
+            step.door.admit(kind, 5, step.now_ns)
+    with pytest.raises(DecodeError, match=r"^malformed$"):
+        step.door.admit(Kind.TELEMETRY, 0, step.now_ns)
+
+
+def test_a_repeat_does_not_count_as_a_sign_of_life(step):
+    step.knock(cookie=step.cookie())
+    step.door.admit(Kind.ALIVE, 0, step.now_ns)
+    step.now_ns += 200 * MS
+    with pytest.raises(DecodeError):
+        step.door.admit(Kind.ALIVE, 0, step.now_ns)
+    step.now_ns += 100 * MS
+    assert step.knock(b"m" * 16, step.cookie()).opened
+
+
+def test_a_new_epoch_of_the_same_session_keeps_who_has_it(step):
+    step.knock(cookie=step.cookie())
+    step.door.admit(Kind.OPERATOR, 0, step.now_ns)
+    kind, epoch, _ = codec.peek(step.door.move_on())[0], step.world.epoch, None
+    assert (kind, epoch) == (Kind.ACCEPT, 2)
+    step.door.admit(Kind.OPERATOR, 0, step.now_ns)  # counters begin again
+
+
+def test_epochs_rise_from_the_last_one():
+    step = Doorstep(last_epoch=41)
+    step.knock(cookie=step.cookie())
+    assert step.world.epoch == 42
+
+
+def test_epochs_may_come_from_a_file():
+    step = Doorstep(next_epoch=iter([100]).__next__)
+    step.knock(cookie=step.cookie())
+    assert step.world.epoch == 100
+
+
+def test_after_the_last_epoch_comes_the_first():
+    counting = epochs_after(EPOCH_MAX - 1)
+    assert [next(counting) for _ in range(3)] == [EPOCH_MAX, 1, 2]
+    codec.encode_header(Kind.ALIVE, 0, EPOCH_MAX, 0)

@@ -1,0 +1,91 @@
+"""How many hellos world answers, and that nobody can use up another one's answers."""
+
+import pytest
+from doorstep import MS, NONCE, SECOND_NS, Doorstep
+
+from cloudrc.tunnel.handshake import ANSWERS_MAX, CHALLENGE_NS, COOKIE_NS, USED_MAX
+from cloudrc.tunnel.knocker import NO_COOKIE
+
+
+@pytest.fixture
+def step():
+    return Doorstep()
+
+
+def test_used_names_are_remembered_for_longer_than_a_cookie_lasts():
+    assert USED_MAX * SECOND_NS // ANSWERS_MAX * 2 > 2 * COOKIE_NS
+
+
+@pytest.mark.promise("P-LINK-4")
+def test_no_more_than_twenty_answers_in_any_second(step):
+    answered_ns = []
+    for _ in range(3000):
+        for cookie in (NO_COOKIE, step.door._cookie(step.now_ns)):
+            if step.knock(cookie=cookie).datagrams:
+                answered_ns.append(step.now_ns)
+        step.now_ns += MS
+    assert len(answered_ns) == 3 * 20
+    for first, later in zip(answered_ns, answered_ns[20:], strict=False):
+        assert later - first >= SECOND_NS
+
+
+@pytest.mark.promise("P-LINK-4")
+def test_hellos_without_a_cookie_cannot_use_up_the_answers_to_those_with_one(step):
+    cookie = step.cookie()
+    for _ in range(1000):
+        assert step.knock(b"m" * 16).outcome == "unanswered"
+    assert step.knock(cookie=cookie).opened
+
+
+def test_a_challenge_is_never_further_than_a_tenth_of_a_second(step):
+    for _ in range(50):
+        assert step.knock().datagrams
+        step.now_ns += CHALLENGE_NS - 1
+        assert step.knock().outcome == "unanswered"
+        step.now_ns += 1  # to the nanosecond
+
+
+def test_a_hello_that_cannot_be_answered_opens_nothing(step):
+    cookie = step.cookie()
+    while step.knock(b"m" * 16, cookie).datagrams:
+        pass
+    step.now_ns += step.door._age_max_ns + SECOND_NS - 1
+    step.door._answered_ns.extend([step.now_ns] * ANSWERS_MAX)
+    answer = step.knock(cookie=cookie)
+    assert (answer.outcome, answer.opened, step.world.epoch) == ("unanswered", False, 1)
+    assert answer.datagrams == []
+    step.now_ns += SECOND_NS - 1
+    assert not step.knock(cookie=step.door._cookie(step.now_ns)).opened
+    step.now_ns += 1  # to the nanosecond
+    assert step.knock(cookie=step.door._cookie(step.now_ns)).opened
+    answers = [step.knock(cookie=step.door._cookie(step.now_ns)) for _ in range(ANSWERS_MAX)]
+    assert [bool(one.datagrams) for one in answers] == (ANSWERS_MAX - 1) * [True] + [False]
+
+
+def test_a_hello_with_a_cookie_is_answered_once(step):
+    cookie = step.cookie()
+    assert step.knock(cookie=cookie, counter=7).opened
+    for _ in range(1000):  # captured while its cookie is valid, and repeated
+        for counter in (7, 6, 0):
+            answer = step.knock(cookie=cookie, counter=counter)
+            assert (answer.outcome, answer.datagrams) == ("repeated", [])
+    assert step.knock(cookie=cookie, counter=8).datagrams
+    step.now_ns += 2 * SECOND_NS
+    assert step.knock(b"m" * 16, step.cookie(), counter=0).opened
+
+
+def test_what_is_remembered_is_bounded(step):
+    for number in range(3 * USED_MAX):
+        step.now_ns += 2 * SECOND_NS
+        step.knock(b"%016d" % number, step.door._cookie(step.now_ns))
+    assert len(step.door._used) == USED_MAX
+    assert len(step.door._answered_ns) == ANSWERS_MAX
+    assert len(step.door._counters) == USED_MAX
+
+
+def test_the_counter_that_was_answered_last_is_forgotten_last(step):
+    for number in range(USED_MAX + 1):
+        step.now_ns += 2 * SECOND_NS
+        for nonce in (NONCE, b"%016d" % number):
+            step.knock(nonce, step.door._cookie(step.now_ns))
+    assert NONCE in step.door._counters

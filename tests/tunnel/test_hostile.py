@@ -1,0 +1,86 @@
+"""Hostile datagrams: no exception escapes, none is accepted, memory stays flat."""
+
+from __future__ import annotations
+
+import platform
+import random
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).parent))
+from hostile import LONGEST, Target, memory
+
+
+@pytest.fixture(scope="module")
+def target() -> Target:
+    return Target()
+
+
+def flood(target: Target, count: int, seed: int) -> None:
+    """So many datagrams, made by chance alone."""
+    rng = random.Random(seed)
+    for _ in range(count):
+        target.try_one(rng.randbytes(rng.choice((6, 8, 12, 40, 200))))
+    target.check()
+
+
+def test_hostile_datagrams_are_not_accepted(target: Target) -> None:
+    flood(target, 30_000, seed=1)
+    assert target.tried > 25_000
+
+
+def test_every_truncation_and_every_longer_version_is_refused(target: Target) -> None:
+    for frame in {frame[6:8]: frame for frame in target.frames}.values():
+        for length in range(LONGEST + 1):
+            if length != len(frame):
+                data = frame[:length].ljust(length, b"\0")
+                target.world.receive_datagram(data, 0)
+                target.cloud.receive_datagram(data, 0)
+    target.check()
+
+
+def test_the_check_notices_what_is_let_through() -> None:
+    target = Target()
+    fresh = target.frames[-6]
+    target.world.receive_datagram(fresh, 0)
+    with pytest.raises(AssertionError, match="let through"):
+        target.check()
+
+
+@pytest.mark.process
+def test_a_million_hostile_datagrams(target: Target, figure: Callable[..., None]) -> None:
+    flood(target, 100_000, seed=2)
+    before = memory()
+    flood(target, 900_000, seed=3)
+    grown = memory() - before
+    figure("hostile datagrams by chance: accepted", 0, "==", 0, count=target.tried)
+    figure("hostile datagrams by chance: memory grown", grown, "<=", 2.0, "MiB")
+    assert grown < 2.0
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "runs",
+    [pytest.param(200_000), pytest.param(10_000_000, marks=pytest.mark.full)],
+)
+def test_coverage_guided_ones(runs: int, tmp_path: Path, figure: Callable[..., None]) -> None:
+    if (sys.platform, platform.machine()) != ("linux", "x86_64"):
+        pytest.skip("atheris has wheels for Linux on x86_64 alone")
+    command = [sys.executable, str(Path(__file__).with_name("hostile.py"))]
+    command += [f"-atheris_runs={runs}", "-seed=1", "-max_len=256", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    said = re.search(
+        r"hostile (\d+) accepted 0 memory \+?(-?[\d.]+) MiB", done.stdout + done.stderr
+    )
+    assert said, done.stderr[-3000:]
+    figure("hostile datagrams by coverage: accepted", 0, "==", 0, count=int(said.group(1)))
+    grown = float(said.group(2))
+    figure("hostile datagrams by coverage: memory grown", grown, "<=", 20.0, "MiB")
+    assert int(said.group(1)) > 0.7 * runs
+    assert float(said.group(2)) < 20.0

@@ -1,0 +1,143 @@
+"""Keys: read, rotated, and never shown."""
+
+import copy
+import logging
+import traceback
+
+import pytest
+
+from cloudrc.tunnel.keys import OVERLAP, Key, KeyRing, KeySet, parse, write
+
+SECRET = bytes(range(32))
+A, B, C = (Key(letter * 32) for letter in (b"a", b"b", b"c"))
+SECOND_NS = 1_000_000_000
+
+
+@pytest.mark.parametrize("size", [0, 31, 33, 64])
+def test_a_key_has_32_bytes(size):
+    with pytest.raises(ValueError, match=f"32 bytes, not {size}"):
+        Key(b"s" * size)
+
+
+@pytest.mark.parametrize(
+    "show",
+    [repr, str, "{}".format, "{!r}".format, lambda key: repr(KeySet(key)), lambda k: repr([k])],
+)
+def test_a_key_shows_nothing_of_itself(show):
+    text = show(Key(SECRET))
+    assert SECRET.hex()[:8] not in text
+    assert repr(SECRET)[2:10] not in text
+
+
+def test_a_key_is_not_pickled_and_not_copied():
+    for spread in (copy.copy, copy.deepcopy, lambda key: key.__reduce_ex__(4)):
+        with pytest.raises(TypeError, match=r"^a key is not pickled$"):
+            spread(Key(SECRET))
+
+
+def test_a_log_and_a_traceback_hold_no_key(caplog):
+    logging.getLogger().warning("keys: %s %r", Key(SECRET), KeyRing(KeySet(Key(SECRET))))
+    try:
+        parse(SECRET.hex().encode() + b"\ncurrent x")
+    except ValueError as error:
+        text = "".join(traceback.format_exception(error)) + caplog.text
+    assert SECRET.hex()[:16] not in text
+
+
+def test_keys_are_equal_by_what_they_hold():
+    assert Key(SECRET) == Key(SECRET)
+    assert hash(Key(SECRET)) == hash(Key(SECRET))
+    assert A != B
+    assert A != "a" * 32
+    assert A.name != B.name
+    assert hash(A) != hash(B)
+
+
+def test_a_tag_fits_only_its_key_and_its_data():
+    tag = A.tag(b"data")
+    assert len(tag) == 16
+    assert A.verifies(b"data", tag)
+    assert not A.verifies(b"date", tag)
+    assert not B.verifies(b"data", tag)
+
+
+def test_what_is_derived_depends_on_salt_and_use():
+    derived = {A.derive(salt, use) for salt in (b"", b"s") for use in (b"u", b"v")}
+    assert len(derived) == 4
+
+
+@pytest.mark.parametrize(
+    "keys", [KeySet(A), KeySet(A, B, 60.0), KeySet(A, B, 0.5), KeySet(A, B, 86_400.0)]
+)
+def test_a_file_holds_what_was_written(keys):
+    assert parse(write(keys).encode()) == keys
+
+
+def test_a_file_says_what_it_is():
+    assert write(KeySet(A)).startswith(
+        "# A key of cloudrc's tunnel: keep it secret. Made by 'cloudrc key new'.\ncurrent "
+    )
+
+
+def test_a_file_of_32_bytes_is_a_key():
+    assert parse(SECRET) == KeySet(Key(SECRET), None, OVERLAP)
+
+
+HEX = SECRET.hex()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "^its lines are 'current', and perhaps 'previous' and 'overlap_s'$"),
+        ("# only a comment", "its lines are"),
+        (f"previous {HEX}", "its lines are"),
+        (f"current {HEX}\nnext {HEX}", "its lines are"),
+        (f"current {HEX}\ncurrent {HEX}", "its lines are"),
+        (HEX, "neither 32 bytes nor lines"),
+        (f"current {HEX} {HEX}", "neither 32 bytes nor lines"),
+        (f"current {HEX[:-2]}", "64 hexadecimal digits"),
+        (f"current {HEX[:-1]}x", "64 hexadecimal digits"),
+        (f"current {HEX}\nprevious x", "64 hexadecimal digits"),
+        *(
+            (f"current {HEX}\noverlap_s {wrong}", "overlap_s is above 0")
+            for wrong in ("0", "-1", "nan", "inf", "86401", "soon")
+        ),
+    ],
+)
+def test_a_wrong_file_is_refused_in_words_without_the_key(text, said):
+    with pytest.raises(ValueError, match=said) as caught:
+        parse(text.encode())
+    assert HEX[:8] not in str(caught.value)
+    assert caught.value.__suppress_context__ or caught.value.__context__ is None
+
+
+def test_bytes_that_are_no_text_are_refused():
+    with pytest.raises(ValueError, match="neither 32 bytes"):
+        parse(b"\xff" * 40)
+
+
+def test_the_previous_key_is_valid_for_the_overlap_from_reading_on():
+    ring = KeyRing(KeySet(A, B, 10.0), now_ns=5 * SECOND_NS)
+    assert ring.accepted(15 * SECOND_NS - 1) == (A, B)
+    assert ring.accepted(15 * SECOND_NS) == (A,)
+
+
+def test_a_new_key_leaves_the_one_until_now_valid_for_the_overlap():
+    ring = KeyRing(KeySet(A))
+    ring.replace(KeySet(B, None, 10.0), 100 * SECOND_NS)
+    assert ring.current == B
+    assert ring.accepted(110 * SECOND_NS - 1) == (B, A)
+    assert ring.accepted(110 * SECOND_NS) == (B,)
+
+
+def test_the_file_says_which_key_is_previous():
+    ring = KeyRing(KeySet(A))
+    ring.replace(KeySet(B, C, 10.0), 0)
+    assert ring.accepted(1) == (B, C)
+
+
+def test_the_same_key_again_makes_no_previous_one():
+    ring = KeyRing(KeySet(A))
+    ring.replace(KeySet(A), 0)
+    assert ring.accepted(0) == (A,)

@@ -1,0 +1,235 @@
+"""New keys in flight: every 120 s, after 2^32 datagrams, and when the key file is rotated."""
+
+import pytest
+
+from cloudrc.tunnel import codec, session
+from cloudrc.tunnel.codec import DecodeError, Direction, Kind
+from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from cloudrc.tunnel.session import KEPT, REKEY_NS, Agreement, Session, pair
+
+BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
+SECOND_NS = 1_000_000_000
+OLD, NEW = Key(b"o" * 32), Key(b"n" * 32)
+GENERATION = 6  # where it stands in the header
+
+
+class Ends:
+    """World and cloud of one session, each with its own key file."""
+
+    def __init__(self, overlap=300.0):
+        self.rings = {end: KeyRing(KeySet(OLD)) for end in ("world", "cloud")}
+        self.overlap, self.now_ns = overlap, 0
+        self.world = Session(Direction.UPLINK, self.rings["world"])
+        self.cloud = Session(Direction.DOWNLINK, self.rings["cloud"])
+        for end in (self.world, self.cloud):
+            end.begin(1, Agreement(b"c" * 16, b"w" * 16))
+            end.tend(0)
+
+    def rotate(self, end, key=NEW):
+        self.rings[end].replace(KeySet(key, None, self.overlap), self.now_ns)
+
+    def pass_time(self, seconds, *, deliver=True):
+        """Every second both ends tend to themselves and send one datagram; what is refused."""
+        refused = 0
+        for _ in range(seconds):
+            self.now_ns += SECOND_NS
+            for end, other in ((self.world, self.cloud), (self.cloud, self.world)):
+                for data in [*end.tend(self.now_ns), end.seal(Kind.ALIVE, b"")]:
+                    if deliver:
+                        try:
+                            other.open(data)
+                        except DecodeError:
+                            refused += 1
+        return refused
+
+
+def generation(data):
+    return data[GENERATION]
+
+
+def test_after_two_minutes_the_keys_are_new_and_every_datagram_is_opened():
+    ends = Ends()
+    assert ends.pass_time(119) == 0
+    assert generation(ends.cloud.seal(Kind.COMMAND, BODY)) == 0
+    assert ends.pass_time(2) == 0
+    assert generation(ends.cloud.seal(Kind.COMMAND, BODY)) == 1
+    assert ends.pass_time(500) == 0
+    assert generation(ends.world.seal(Kind.ALIVE, b"")) == 5
+
+
+def test_counters_go_on_through_a_rekey():
+    world, cloud = pair()
+    cloud.tend(0)
+    world.open(cloud.seal(Kind.COMMAND, BODY))
+    cloud.tend(REKEY_NS)
+    assert world.open(cloud.seal(Kind.COMMAND, BODY))[3] == 1
+
+
+def test_the_keys_of_two_generations_differ():
+    _, cloud = pair()
+    first = cloud.seal(Kind.ALIVE, b"")
+    cloud.tend(0)
+    cloud.tend(REKEY_NS)
+    cloud._counters[int(Kind.ALIVE)] = 0
+    assert cloud.seal(Kind.ALIVE, b"")[16:] != first[16:]
+
+
+@pytest.mark.parametrize(("sent", "moved"), [(9, 0), (10, 1)])
+def test_so_many_datagrams_make_new_keys(monkeypatch, sent, moved):
+    assert session.REKEY_DATAGRAMS == 2**32
+    monkeypatch.setattr(session, "REKEY_DATAGRAMS", 10)
+    _, cloud = pair()
+    for _ in range(sent):
+        cloud.seal(Kind.COMMAND, BODY)
+    cloud.tend(1)
+    assert generation(cloud.seal(Kind.COMMAND, BODY)) == moved
+    for _ in range(8):
+        cloud.seal(Kind.COMMAND, BODY)
+    cloud.tend(2)
+    assert generation(cloud.seal(Kind.COMMAND, BODY)) == 1  # the count begins anew
+
+
+def test_late_datagrams_of_the_generation_before_are_opened():
+    world, cloud = pair()
+    cloud.tend(0)
+    late = cloud.seal(Kind.COMMAND, BODY)
+    cloud.tend(REKEY_NS)
+    world.open(cloud.seal(Kind.COMMAND, BODY))
+    assert world.open(late)[3] == 0
+
+
+def test_generations_long_gone_are_forgotten():
+    world, cloud = pair()
+    cloud.tend(0)
+    late = cloud.seal(Kind.COMMAND, BODY)
+    for number in range(1, KEPT + 1):
+        assert len(world._openers) <= KEPT
+        cloud.tend(number * REKEY_NS)
+        world.open(cloud.seal(Kind.COMMAND, BODY))
+    with pytest.raises(DecodeError, match=r"^tag$"):
+        world.open(late)
+
+
+@pytest.mark.parametrize(("ahead", "opened"), [(127, True), (128, False)])
+def test_a_peer_may_be_far_ahead_after_a_long_silence(ahead, opened):
+    world, cloud = pair()
+    for number in range(ahead + 1):
+        cloud.tend(number * REKEY_NS)
+    data = cloud.seal(Kind.COMMAND, BODY)
+    if opened:
+        assert world.open(data)[4] == BODY
+    else:
+        with pytest.raises(DecodeError, match=r"^tag$"):
+            world.open(data)
+
+
+def test_generations_go_on_beyond_the_byte_of_the_header():
+    world, cloud = pair()
+    for number in range(600):
+        cloud.tend(number * REKEY_NS)
+        assert world.open(cloud.seal(Kind.ALIVE, b""))[3] == number
+
+
+def test_a_forged_generation_opens_nothing_and_keeps_little():
+    world, cloud = pair()
+    data = bytearray(cloud.seal(Kind.COMMAND, BODY))
+    for byte in range(1, 256):
+        data[GENERATION] = byte
+        with pytest.raises(DecodeError, match=r"^tag$"):
+            world.open(bytes(data))
+    assert len(world._tried) <= session.AHEAD_MAX
+    world.tend(1)
+    assert world._tried == {}
+
+
+@pytest.mark.promise("P-LINK-5")
+@pytest.mark.parametrize("order", [("world", "cloud"), ("cloud", "world")])
+@pytest.mark.parametrize("apart", [0, 1, 90])
+def test_a_rotation_goes_through_without_losing_a_datagram(order, apart):
+    ends = Ends()
+    ends.pass_time(50)
+    ends.rotate(order[0])
+    announced = ends.pass_time(apart)
+    assert announced <= apart  # the other end cannot open what says that there is a new key
+    ends.rotate(order[1])
+    assert ends.pass_time(2) <= 1
+    assert ends.world._key == ends.cloud._key == NEW
+    assert ends.pass_time(700) == 0  # beyond the overlap, and through rekeys
+
+
+def test_a_rotation_and_a_rekey_at_once():
+    ends = Ends()
+    ends.pass_time(119)
+    ends.rotate("world")
+    ends.pass_time(125)
+    ends.rotate("cloud")
+    ends.pass_time(2)
+    assert ends.pass_time(400) == 0
+    assert ends.world._key == ends.cloud._key == NEW
+
+
+def test_an_announced_generation_is_used_for_nothing_else():
+    world, cloud = pair()
+    world.tend(0)
+    world.ring.replace(KeySet(NEW), 0)
+    announced = [world.tend(second * SECOND_NS) for second in (1, 2)]
+    assert [(generation(d), codec.peek(d)[2]) for (d,) in announced] == [(1, 0), (1, 1)]
+    (again,) = world.tend(REKEY_NS)  # the old key moves on, beyond what was announced
+    assert generation(world.seal(Kind.ALIVE, b"")) == 2
+    assert generation(again) == 3
+    assert world.next_counter(Kind.ALIVE) == 4
+    assert cloud.open(world.seal(Kind.ALIVE, b""))[3] == 4
+
+
+def test_datagrams_of_the_generation_before_the_last_are_still_opened():
+    world, cloud = pair()
+    cloud.tend(0)
+    late = cloud.seal(Kind.COMMAND, BODY)
+    for number in range(1, KEPT):
+        cloud.tend(number * REKEY_NS)
+        world.open(cloud.seal(Kind.COMMAND, BODY))
+    assert world.open(late)[3] == 0
+
+
+def test_a_flood_of_forged_generations_derives_each_key_once(monkeypatch):
+    world, cloud = pair()
+    data = bytearray(cloud.seal(Kind.COMMAND, BODY))
+    data[GENERATION] = 5
+    derived, derive = [], Session._derive
+    monkeypatch.setattr(Session, "_derive", lambda *how: (derived.append(how), derive(*how))[1])
+    for _ in range(10):
+        with pytest.raises(DecodeError):
+            world.open(bytes(data))
+    assert len(derived) == 1
+
+
+def test_after_the_overlap_the_old_key_opens_nothing():
+    ends = Ends(overlap=10.0)
+    ends.rotate("world")
+    ends.pass_time(9)
+    ends.world.open(ends.cloud.seal(Kind.COMMAND, BODY))
+    ends.pass_time(2)
+    with pytest.raises(DecodeError, match=r"^tag$"):
+        ends.world.open(ends.cloud.seal(Kind.COMMAND, BODY))
+    assert ends.world._key == NEW
+    assert ends.pass_time(3) == 6
+
+
+def test_a_second_rotation_replaces_the_first():
+    ends = Ends()
+    for key in (NEW, Key(b"m" * 32)):
+        for end in ("world", "cloud"):
+            ends.rotate(end, key)
+        ends.pass_time(3)
+    assert ends.pass_time(3) == 0
+    assert ends.world._key == ends.cloud._key == Key(b"m" * 32)
+
+
+def test_while_two_keys_are_valid_greetings_of_both_are_taken():
+    ends = Ends()
+    ends.rotate("world")
+    ends.pass_time(1)
+    hello = bytes(codec.BODY_SIZES[Kind.HELLO])
+    for key in (OLD, NEW):
+        ends.world.open(ends.cloud.greet(Kind.HELLO, hello, key))
+        assert ends.world.greeting_key == key
