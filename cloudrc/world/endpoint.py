@@ -1,19 +1,19 @@
 """World's end of the tunnel: commands come in, the robot flies, telemetry leaves.
 
 Time only moves in `_advance`: before anything that comes in has an effect, the ticks before it are
-run, so the result does not depend on when a driver wakes up. World alone hands out epochs: a new
-cloud process gets a new one, and so does a mission that starts from the spawn.
+run, so the result does not depend on when a driver wakes up. World alone hands out epochs: a cloud
+that gets authority gets a new one, and so does a mission that starts from the spawn.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
 from math import nan
 
 from cloudrc.messages import (
     NEVER_NS,
     Command,
+    GuardState,
     Odometry,
     OperatorRequest,
     Request,
@@ -31,10 +31,13 @@ from cloudrc.records import (
     TelemetrySent,
 )
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import USED, Channel
-from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Hello, Kind
-from cloudrc.tunnel.session import Session
+from cloudrc.tunnel.channel import REPEATED, USED, Channel
+from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
+from cloudrc.tunnel.complaints import Complaints
+from cloudrc.tunnel.handshake import Door
+from cloudrc.tunnel.unsealed import make_session
 from cloudrc.world.clock import CATCH_UP_NS, SimulationClock
+from cloudrc.world.identity import WorldIdentity as WorldIdentity
 from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 from cloudrc.world.touches import Touches
@@ -42,22 +45,8 @@ from cloudrc.world.touches import Touches
 ODOMETRY_PERIOD_NS = 10_000_000
 """Source: plant.md, 100 Hz."""
 COUNT_PERIOD_NS = 1_000_000_000
+TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # an enum's member is slow to look up
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
-
-
-@dataclass(frozen=True, slots=True)
-class WorldIdentity:
-    """Who this end is, and what it must not forget.
-
-    Attributes:
-        clock_id: 16 bytes that name this machine's monotonic clock.
-        nonce: 16 bytes that name this process.
-        last_epoch: The last epoch handed out before this process began.
-    """
-
-    clock_id: bytes
-    nonce: bytes
-    last_epoch: int = 0
 
 
 class WorldEndpoint:
@@ -85,13 +74,14 @@ class WorldEndpoint:
         """
         self.robot, self._sensors, self._identity = robot, sensors, identity
         self._clock = SimulationClock(start_ns)
-        self._session = Session(Direction.UPLINK)
+        self._session = make_session(Direction.UPLINK, identity.ring, start_ns)
+        self._door = Door(self._session, identity, age_max_ns=command_age_max_ns)
         self._channel = Channel(newest_wins)
+        self._complaints = Complaints()
         self._command_age_max_ns = command_age_max_ns
-        self._last_epoch = identity.last_epoch
-        self._cloud = Hello(b"", b"")
         self._clock_is_shared = False
         self._mission = 0
+        self._progress = (0, 0)  # mission and waypoints reached: kept through every epoch
         self._touches = Touches()
         self._stalled_wake_ns = NEVER_NS
         self._odometry_ns = start_ns
@@ -106,6 +96,11 @@ class WorldEndpoint:
     def slip_ns(self) -> int:
         """By how much world's clock lags the monotonic one [ns]."""
         return self._clock.slip_ns
+
+    @property
+    def sealed(self) -> bool:
+        """See `Endpoint`."""
+        return self._session.sealed
 
     def next_deadline_ns(self) -> int:
         """When the next odometry is due [ns], monotonic clock."""
@@ -132,16 +127,18 @@ class WorldEndpoint:
             kind, _, epoch, counter, body = self._session.open(data)
             if kind == COMMAND:
                 self._receive_command(epoch, counter, body, now_ns, world_ns)
-            elif kind == Kind.OPERATOR:
-                self._advance(world_ns)
-                self._receive_operator(epoch, codec.decode_operator(body))
             elif kind == Kind.HELLO:
                 self._advance(world_ns)
-                self._receive_hello(codec.decode_hello(body))
+                self._receive_hello(codec.decode_hello(body), counter, now_ns)
             else:
-                raise DecodeError("malformed")
+                self._door.admit(kind, counter, now_ns)
+                if kind == Kind.OPERATOR:
+                    self._advance(world_ns)
+                    self._receive_operator(codec.decode_operator(body))
         except DecodeError as error:
             self._counts[str(error)] += 1
+            if not self._session.epoch:
+                self._records += self._complaints.about(str(error), data, world_ns)
 
     def _follow(self, now_ns: int) -> int:
         """World time at a wake; remembers a wake after a stall, whose datagrams have waited."""
@@ -200,67 +197,89 @@ class WorldEndpoint:
                 guard.state,
                 self._touches.pipes,
                 self._touches.speed,
+                *self._progress,
             )
             counter = self._session.next_counter(TELEMETRY)
             self._send(TELEMETRY, codec.encode_telemetry(telemetry))
             records.append(TelemetrySent(now_ns, epoch, counter, telemetry))
         if now_ns >= self._count_ns:
             self._count_ns += COUNT_PERIOD_NS
-            for name, count in sorted(self._counts.items()):
+            self._counts["held_seconds"] += guard.armed and guard.state is HOLD
+            self._greet(self._session.tend(now_ns + self._clock.slip_ns))
+            for name, count in sorted((self._counts | guard.counts).items()):
                 records.append(Counted(now_ns, "world", name, count))
         self._odometry_ns += ODOMETRY_PERIOD_NS
 
-    def _receive_hello(self, hello: Hello) -> None:
-        if hello.nonce != self._cloud.nonce:
-            self._cloud = hello
-            self._clock_is_shared = hello.clock == self._identity.clock_id
+    def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:
+        """Answer as the door says; what waited through a stall is too old to decide by."""
+        if now_ns == self._stalled_wake_ns:
+            raise DecodeError("stale")
+        answer = self._door.knock(hello, counter, now_ns)
+        self._counts[answer.outcome] += 1
+        if answer.opened:
+            self._clock_is_shared = self._door.shares_clock
             self._mission = 0
             self._touches = Touches()
-            self._open_epoch("cloud said hello")
-        self._accept()
+            self._begin_epoch("cloud said hello")
+        self._greet(answer.datagrams)
 
-    def _open_epoch(self, cause: str) -> None:
-        """Everything that belongs to the old session is forgotten."""
-        self._last_epoch += 1
-        self._session.begin(self._last_epoch)
+    def _begin_epoch(self, cause: str) -> None:
+        """Everything that belongs to the old epoch is forgotten."""
         self._channel.reset()
         self.robot.guard.forget_commands()
         self._waiting = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
-        self._records.append(SessionOpened(self._clock.tick_ns, "world", self._last_epoch, cause))
+        self._complaints.forget()
+        epoch, now_ns = self._session.epoch, self._clock.tick_ns
+        self._records.append(SessionOpened(now_ns, "world", epoch, cause))
 
-    def _accept(self) -> None:
-        identity = self._identity
-        accept = Accept(self._cloud.nonce, identity.nonce, identity.clock_id)
-        self._send(Kind.ACCEPT, codec.encode_accept(accept))
-
-    def _receive_operator(self, epoch: int, request: OperatorRequest) -> None:
-        if epoch != self._session.epoch:
-            self._counts["old_epoch"] += 1
+    def _receive_operator(self, request: OperatorRequest) -> None:
+        if request.request is Request.PROGRESS:
+            self._keep_progress(request)
             return
         if request.number <= self._mission:
             return
-        self._mission = request.number
         guard, now_ns = self.robot.guard, self._clock.tick_ns
-        if request.request is Request.END:
-            guard.end_mission(now_ns)
+        if request.request is Request.START and guard.latched:
+            # Not acted on, so not confirmed either: the operator has to acknowledge first.
+            self._counts["start_refused"] += 1
             return
+        self._mission = request.number
+        self._keep_progress(request)
+        if request.request is Request.START:
+            self._start_mission(request, now_ns)
+        elif request.request is Request.END:
+            guard.end_mission(now_ns)
+        elif request.request is Request.ESTOP:
+            guard.stop(now_ns)
+        else:
+            guard.acknowledge(now_ns)
+
+    def _start_mission(self, request: OperatorRequest, now_ns: int) -> None:
+        if request.mission_id != self._progress[0] or request.start is Start.SPAWN:
+            self._progress = (request.mission_id, 0)  # from the spawn nothing is reached yet
+        self._keep_progress(request)
         self._touches = Touches()
         if request.start is Start.SPAWN:
             self.robot.put_on_ground(now_ns, "mission starts from spawn")
-            self._open_epoch("mission starts from spawn")
-            self._accept()
-        guard.start_mission(now_ns)
+            self._greet([self._door.move_on()])
+            self._begin_epoch("mission starts from spawn")
+        self.robot.guard.start_mission(now_ns)
+
+    def _keep_progress(self, request: OperatorRequest) -> None:
+        """The onboard witness of how far a mission is; it only ever rises."""
+        mission_id, reached = self._progress
+        if request.mission_id == mission_id:
+            self._progress = (mission_id, max(reached, request.reached))
 
     def _receive_command(
         self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
     ) -> None:
         """Whatever arrives for this epoch is noted; the newest is offered to the guard."""
-        if epoch != self._session.epoch:
-            self._counts["old_epoch"] += 1
-            return
         command, guard = codec.decode_command(body), self.robot.guard
         outcome = self._channel.take(counter)
+        if outcome != REPEATED:
+            self._door.hear(now_ns)
         if outcome == USED:
             self._advance(world_ns)
             stalled = now_ns == self._stalled_wake_ns
@@ -268,10 +287,14 @@ class WorldEndpoint:
         used = outcome == USED
         delay = (now_ns - command.stamp_ns) * 1e-9 if self._clock_is_shared else nan
         self._records.append(Arrival(world_ns, False, epoch, counter, delay, used))
-        if used and guard.armed:
+        if used and guard.state is TRACK:
             self._waiting = (epoch, counter, command)
         self._counts[outcome] += 1
 
     def _send(self, kind: int, body: bytes) -> None:
         self._datagrams.append(self._session.seal(kind, body))
         self._counts["sent"] += 1
+
+    def _greet(self, datagrams: list[bytes]) -> None:
+        self._datagrams += datagrams
+        self._counts["sent"] += len(datagrams)

@@ -1,85 +1,152 @@
 """The guard: between the tunnel and the low-level controller, it decides what may be flown.
 
 Commands and operator requests come in; a velocity reference comes out, every 2 ms. It trusts its
-own clock and its own sensors only, and assumes that the cloud may say anything. Here without
-latches: HOLD ends as soon as a fresh command arrives. A command is fresh while its *basis*, the
-odometry that it was computed from, is at most `command_age_max` old.
+own clock and its own sensors only, and assumes that the cloud may say anything.
+
+                 fresh command of a         command too old, mission over,
+                  started mission                   new session
+        GROUND -------------------> TRACK ------------------------------> HOLD
+          ^                          | ^                                  | |
+          |                          | +----------------------------------+ |
+          | acknowledged             |     10 fresh commands within 500 ms  | after 60 s, if a
+          | after touch-down         |                                      | mission is on
+          |                          |   5 impossible commands within 1 s   |
+          +------------------------ LAND <----------------------------------+
+
+ESTOP is reached from everywhere by the operator's word, and by a hit: what has flown into something
+at speed, or turned over, is thrown about by its rotors. It is left for GROUND by the
+acknowledgement. LAND acknowledged in the air becomes HOLD. Both end the mission: only a start arms
+again. HOLD before the robot has left the ground is GROUND: its rotors stop, the mission goes on.
+
+A command is fresh while its *basis*, the odometry it was computed from, is at most
+`command_age_max` old. HOLD after a mission's end lasts as long as the operator likes: there a robot
+waits for the next one. HOLD within a mission does not: who should end it may be gone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import isfinite, sqrt
+from collections import Counter, deque
+from math import inf, isfinite
 
 from cloudrc.messages import NEVER_NS, ZERO, Command, GuardState, Vector
 from cloudrc.records import GuardChange
+from cloudrc.world import guard_rules as rules
+from cloudrc.world.guard_hits import Hits
+from cloudrc.world.guard_limits import Limits
+from cloudrc.world.guard_rest import STILL, Rest, TakeOff
 from cloudrc.world.readings import Readings
 
-TRACK = GuardState.TRACK  # looked up in every tick
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # an enum's member is slow to look up
 
-BRAKE = 3.0
-"""Deceleration in HOLD [m/s^2]; the stop rule of the design assumes it."""
-HOLD_GAIN = 1.0
-"""Of the local position hold [1/s]."""
-HOLD_SPEED_MAX = 0.5
-"""Of the local position hold [m/s]."""
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What the guard allows.
-
-    Attributes:
-        command_age_max_ns: Age of the basis beyond which a command is not flown [ns].
-        speed_max: Largest speed [m/s].
-        acceleration_max: Largest change of the reference [m/s^2].
-        yaw_rate_max: Largest yaw rate [rad/s].
-    """
-
-    command_age_max_ns: int = 250_000_000
-    speed_max: float = 6.0
-    acceleration_max: float = 12.0
-    yaw_rate_max: float = 1.0
+RESUME_COMMANDS = 10
+RESUME_NS = 500_000_000
+"""So many fresh commands within so long end a HOLD [ns]. Source: DESIGN, section 5."""
+SETTLE_NS = 1_000_000_000
+"""Least time from one HOLD to the next, and from one TRACK to the next [ns]. Source: fault F5."""
+LAND_SPEED = 0.5
+"""Of the descent [m/s]. Source: DESIGN, section 5."""
+TOUCH_DOWN_NS = 400_000_000
+"""A descent that has stood still for so long has touched down [ns]."""
+INVALID_COMMANDS = 5
+INVALID_NS = 1_000_000_000
+"""So many impossible commands within so long end in LAND [ns]. Source: fault F23."""
 
 
 class Guard:
-    """A state machine on world's clock; starts in GROUND, where no command is flown."""
+    """A state machine on world's clock; starts in GROUND, where no command is flown.
+
+    Attributes:
+        state: Where it is.
+        armed: Whether a mission is on: from the operator's start to its end, LAND or ESTOP.
+        reference: What the low-level controller was last told to follow [m/s], shape (3,).
+        yaw_rate: Capped [rad/s]; the published low-level controller holds yaw at 0 regardless.
+        changes: Of the state, since the last `take_changes`.
+        counts: How often a limit changed what was commanded: "limited_speed", "limited_yaw_rate"
+            (commands), "limited_fence" (ticks).
+    """
 
     def __init__(self, limits: Limits) -> None:
+        """Begin on the ground."""
         self._limits = limits
-        self.changes: list[GuardChange] = []  # since the last `take_changes`
-        self.state = GuardState.GROUND
-        self.armed = False  # true from the operator's start of a mission to its end
-        self._fresh_until_ns = NEVER_NS
-        self._wanted = ZERO
+        self._speed_max = limits.speed_max * rules.JUST_BELOW
+        self._land_speed = min(LAND_SPEED, 0.5 * limits.speed_max)
+        self._low, self._high = limits.inside()
+        self._floor = self._low[2]
+        self._rest = Rest(self._low, self._high, 0.5 * limits.speed_max)
+        self._hits, self._take_off = Hits(), TakeOff()
+        self.changes: list[GuardChange] = []
+        self.counts: Counter[str] = Counter()
+        self.state = GROUND
+        self.armed = self._flies = False
         self.reference: Vector = ZERO
-        self.yaw_rate = 0.0  # capped; the published low-level controller holds yaw at 0 regardless
-        self._anchor: Vector | None = None
+        self.yaw_rate = 0.0
+        self._wanted: Vector = ZERO
+        self._acceleration = limits.acceleration_max
+        self._track_until_ns = self._steady_until_ns = NEVER_NS
+        self._tracked_ns = self._held_ns = -SETTLE_NS
+        self._alone_ns = self._moved_ns = 0
+        self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
+        self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
+
+    @property
+    def brakes(self) -> bool:
+        """Whether the robot is coming to rest, and has no position to hold yet."""
+        return self._rest.brakes
+
+    @property
+    def latched(self) -> bool:
+        """Whether nothing goes on without the operator's acknowledgement."""
+        return self.state is LAND or self.state is ESTOP
+
+    def take_changes(self) -> list[GuardChange]:
+        """Hand over the changes of state since the last call."""
+        changes, self.changes = self.changes, []
+        return changes
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
         """The robot stands at its spawn: rotors off, nothing is remembered."""
-        self.armed = False
         self.forget_commands()
-        self.reference = ZERO
-        self._enter(GuardState.GROUND, now_ns, cause)
+        self._tracked_ns = self._held_ns = -SETTLE_NS
+        self._enter(GROUND, now_ns, cause)
 
-    def start_mission(self, now_ns: int) -> None:
-        """The operator starts a mission: from here on fresh commands are flown."""
-        self.armed = True
-        if self.state is not GuardState.GROUND:
+    def start_mission(self, now_ns: int) -> bool:
+        """The operator starts a mission: from here on fresh commands are flown.
+
+        Returns:
+            False if the operator first has to acknowledge why the robot landed or was stopped.
+        """
+        if self.latched:
+            return False
+        if not self.armed:
             self.forget_commands()  # only what is computed for this mission counts
+        self.armed = True
+        self._alone_ns = now_ns
+        return True
 
     def end_mission(self, now_ns: int) -> None:
         """The mission is over: hold here until the operator starts the next one."""
         self.armed = False
         if self.state is TRACK:
-            self._enter(GuardState.HOLD, now_ns, "mission ended")
+            self._enter(HOLD, now_ns, "mission ended")
+
+    def stop(self, now_ns: int) -> None:
+        """Stop the rotors at once, whatever the robot does."""
+        if self.state is not ESTOP:
+            self._enter(ESTOP, now_ns, "emergency stop")
+
+    def acknowledge(self, now_ns: int) -> None:
+        """The operator knows why the robot lands or was stopped; no mission is on."""
+        if self.latched and not self._flies:
+            self._enter(GROUND, now_ns, "acknowledged")
+        elif self.state is LAND:
+            self._enter(HOLD, now_ns, "acknowledged before touch-down")
 
     def forget_commands(self) -> None:
-        """A new session begins: what came in the old one is no longer fresh."""
-        self._fresh_until_ns = NEVER_NS
-        self._wanted = ZERO
-        self.yaw_rate = 0.0
+        """A new session or mission begins: what came before is no longer fresh."""
+        self._track_until_ns = self._steady_until_ns = NEVER_NS
+        self._fresh_ns.clear()
+        self._invalid_ns.clear()
+        self._wanted, self.yaw_rate = ZERO, 0.0
 
     def offer(self, command: Command, now_ns: int) -> str | None:
         """Take a command that the tunnel lets through.
@@ -89,25 +156,61 @@ class Guard:
             now_ns: World's clock [ns].
 
         Returns:
-            None if it may be flown, else why it is refused: "not_finite" or "stale".
+            None if it may be flown, else why it is refused: "not_finite"; "future", if it names
+            odometry that has yet to be measured; "stale".
         """
-        x, y, z = command.velocity
-        if not (isfinite(x) and isfinite(y) and isfinite(z) and isfinite(command.yaw_rate)):
+        velocity, yaw_rate = command.velocity, command.yaw_rate
+        x, y, z = velocity
+        if not (isfinite(x) and isfinite(y) and isfinite(z) and isfinite(yaw_rate)):
+            self._note_invalid(now_ns)
             return "not_finite"
+        limits = self._limits
         age_ns = now_ns - command.basis_stamp_ns
-        if not 0 <= age_ns <= self._limits.command_age_max_ns:
+        if age_ns < 0:
+            self._note_invalid(now_ns)
+            return "future"
+        if age_ns > limits.command_age_max_ns:
             return "stale"
         if self.armed:
-            self._fresh_until_ns = command.basis_stamp_ns + self._limits.command_age_max_ns
-            self._wanted = _shortened(command.velocity, self._limits.speed_max)
-            yaw_rate_max = self._limits.yaw_rate_max
-            self.yaw_rate = min(max(command.yaw_rate, -yaw_rate_max), yaw_rate_max)
-            if self.state is not TRACK:
+            fresh_until_ns = command.basis_stamp_ns + limits.command_age_max_ns
+            self._wanted = rules.shortened(velocity, self._speed_max)
+            self.yaw_rate = rules.within(yaw_rate, -limits.yaw_rate_max, limits.yaw_rate_max)
+            if self._wanted is not velocity:
+                self.counts["limited_speed"] += 1
+            if self.yaw_rate != yaw_rate:
+                self.counts["limited_yaw_rate"] += 1
+            if self.state is GROUND and self._settled(now_ns, fresh_until_ns):
                 self._enter(TRACK, now_ns, "fresh command")
+            elif self.state is HOLD:
+                self._leave_hold(now_ns, fresh_until_ns)
+            if self.state is TRACK:
+                self._track_until_ns = fresh_until_ns
         return None
 
-    def tick(self, now_ns: int, readings: Readings, dt: float) -> Vector:
-        """Say what the low-level controller shall follow now; not to be called in GROUND.
+    def _leave_hold(self, now_ns: int, fresh_until_ns: int) -> None:
+        """One more fresh command has come: fly again once the link has proven itself."""
+        self._fresh_ns.append(now_ns)
+        took_ns = now_ns - self._fresh_ns[0]
+        enough = len(self._fresh_ns) == RESUME_COMMANDS and took_ns <= RESUME_NS
+        if enough and self._settled(now_ns, fresh_until_ns):
+            cause = f"{RESUME_COMMANDS} fresh commands within {took_ns * 1e-9:.3f} s"
+            self._enter(TRACK, now_ns, cause)
+            self._acceleration = min(rules.BRAKE, self._acceleration)
+
+    def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
+        """Whether TRACK, and the HOLD that may follow, keep their distance from the last ones."""
+        return min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns) >= SETTLE_NS
+
+    def _note_invalid(self, now_ns: int) -> None:
+        """An honest cloud never says that: one that goes on saying it is not flown any more."""
+        self._invalid_ns.append(now_ns)
+        if len(self._invalid_ns) < INVALID_COMMANDS or now_ns - self._invalid_ns[0] > INVALID_NS:
+            return
+        if self.armed and self.state is not GROUND:
+            self._enter(LAND, now_ns, f"{INVALID_COMMANDS} impossible commands within 1 s")
+
+    def tick(self, now_ns: int, readings: Readings, dt: float) -> Vector | None:
+        """Say what the low-level controller shall follow now.
 
         Args:
             now_ns: World's clock [ns].
@@ -115,73 +218,83 @@ class Guard:
             dt: Time since the last tick [s].
 
         Returns:
-            Velocity reference [m/s], shape (3,).
+            Velocity reference [m/s], shape (3,); None while the rotors stand still.
         """
-        if self.state is TRACK:
-            if now_ns <= self._fresh_until_ns:
-                if self.reference is not self._wanted:
-                    step = self._limits.acceleration_max * dt
-                    self.reference = _towards(self.reference, self._wanted, step)
-                return self.reference
-            self._lose_link(now_ns)
-        return self._hold(readings.position, readings.velocity, dt)
-
-    def take_changes(self) -> list[GuardChange]:
-        """Hand over the changes of state since the last call."""
-        changes, self.changes = self.changes, []
-        return changes
-
-    def _lose_link(self, now_ns: int) -> None:
-        limit_ns = self._limits.command_age_max_ns
-        age, limit = (now_ns - self._fresh_until_ns + limit_ns) * 1e-9, limit_ns * 1e-9
-        self._enter(GuardState.HOLD, now_ns, f"command age {age:.3f} s above {limit:.3f} s")
-
-    def _hold(self, position: Vector, velocity: Vector, dt: float) -> Vector:
-        """Brake until the reference stands still, then hold the position reached by then."""
-        if self._anchor is None:
-            self.reference = _towards(self.reference, ZERO, BRAKE * dt)
-            if self.reference == ZERO and _norm(velocity) < 0.1:
-                self._anchor = position
+        # The usual case: the same command as in the last tick, and far from the fence.
+        if now_ns <= self._steady_until_ns and self.reference is self._wanted:
             return self.reference
-        pull = _scaled(_minus(self._anchor, position), HOLD_GAIN)
-        self.reference = _shortened(pull, HOLD_SPEED_MAX)
+        if self._flies and (hit := self._hits.felt(now_ns, readings)):
+            self._enter(ESTOP, now_ns, hit)
+        elif not self._take_off.over:
+            self._take_off.look(readings, self._flies)
+        if now_ns <= self._track_until_ns:
+            reference = rules.towards(self.reference, self._wanted, self._acceleration * dt)
+            if reference is self._wanted:
+                self._acceleration = self._limits.acceleration_max
+        else:
+            self._look_after_itself(now_ns, readings)
+            if not self._flies:
+                return None
+            sink = self._land_speed if self.state is LAND else 0.0
+            reference = self._rest.follow(self.reference, readings, sink, dt)
+        self._follow(reference, now_ns, readings, dt)
         return self.reference
 
-    def _enter(self, state: GuardState, now_ns: int, cause: str) -> None:
-        self.state = state
-        self._anchor = None
+    def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
+        """Take a reference as far as the robot stays upright, and inside the fence."""
+        climb, position = readings.velocity[2], readings.position
+        if reference[2] < climb - rules.SINK_LAG:
+            reference = rules.upright(reference, self.reference, climb, self._speed_max)
+        if rules.is_far(reference, position, self._low, self._high):
+            self._steady_until_ns = min(self._track_until_ns, now_ns + rules.GLIMPSE_NS)
+        else:
+            self._steady_until_ns = NEVER_NS
+            inside = rules.fenced(reference, position, self._low, self._high)
+            if inside != reference:
+                self.counts["limited_fence"] += 1
+                inside = rules.held_back(self.reference, inside, self._limits.acceleration_max * dt)
+                reference = rules.shortened(inside, self._speed_max)
+        self.reference = reference
+
+    def _look_after_itself(self, now_ns: int, readings: Readings) -> None:
+        """Change the state where no fresh command leads."""
+        state, limits = self.state, self._limits
+        if state is TRACK:
+            age = (now_ns - self._track_until_ns + limits.command_age_max_ns) * 1e-9
+            cause = f"command age {age:.3f} s above {limits.command_age_max_ns * 1e-9:.3f} s"
+            new = self._track_until_ns == NEVER_NS
+            self._enter(HOLD, now_ns, "new session" if new else cause)
+        elif state is HOLD and self.armed and now_ns - self._alone_ns > limits.hold_max_ns:
+            self._enter(LAND, now_ns, f"held for {limits.hold_max_ns * 1e-9:g} s without the cloud")
+        elif state is LAND and self._flies:
+            sinking = self.reference[2] <= -self._land_speed
+            if not (sinking and abs(readings.velocity[2]) < STILL):
+                self._moved_ns = now_ns
+            elif now_ns - self._moved_ns >= TOUCH_DOWN_NS:
+                self._enter(LAND, now_ns, "touched down, rotors stopped")
+                self._flies, self.reference = False, ZERO
+        if self.state is HOLD and self._take_off.may_end(readings):
+            self._enter(GROUND, now_ns, "not off the ground yet, rotors stopped", self.armed)
+
+    def _enter(self, state: GuardState, now_ns: int, cause: str, armed: bool = False) -> None:
+        """Change the state; every change is noted with its cause."""
+        if self.state is not HOLD or state is not LAND:  # goes down where it has held
+            self._rest.forget()
+        self.state, self._flies = state, state is not GROUND and state is not ESTOP
+        self._track_until_ns = self._steady_until_ns = NEVER_NS
+        x, y, _ = self._low
+        self._low = (x, y, -inf if state is LAND else self._floor)
+        if state is TRACK:
+            self._tracked_ns = now_ns
+            self._acceleration = self._limits.acceleration_max
+        elif state is HOLD:
+            self._held_ns = self._alone_ns = now_ns
+            self._fresh_ns.clear()
+        else:
+            self.armed = armed
+            self._moved_ns = now_ns
+            if state is not LAND:
+                self.reference = ZERO
+                self._hits.forget()
+                self._take_off.forget()
         self.changes.append(GuardChange(now_ns, state, cause))
-
-
-def _norm(a: Vector) -> float:
-    return sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
-
-
-def _minus(a: Vector, b: Vector) -> Vector:
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
-
-
-def _scaled(a: Vector, factor: float) -> Vector:
-    return (a[0] * factor, a[1] * factor, a[2] * factor)
-
-
-def _shortened(a: Vector, length_max: float) -> Vector:
-    """`a`, or the vector of its direction that is `length_max` long if `a` is longer."""
-    # Scaled down first: the square of a huge but finite number overflows to infinity.
-    largest = max(abs(a[0]), abs(a[1]), abs(a[2]))
-    if largest > length_max:
-        a = _scaled(a, length_max / largest)
-        return _scaled(a, min(1.0, length_max / _norm(a)))
-    length = _norm(a)
-    return a if length <= length_max else _scaled(a, length_max / length)
-
-
-def _towards(start: Vector, end: Vector, step: float) -> Vector:
-    """The point on the way from `start` to `end` that is at most `step` away from `start`."""
-    (ax, ay, az), (bx, by, bz) = start, end
-    x, y, z = bx - ax, by - ay, bz - az
-    length = sqrt(x * x + y * y + z * z)
-    if length <= step:
-        return end
-    share = step / length
-    return (ax + share * x, ay + share * y, az + share * z)

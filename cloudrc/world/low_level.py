@@ -37,6 +37,10 @@ _WEIGHT = MASS * GRAVITY
 _HALF_TILT_GAIN, _HALF_YAW_GAIN = 0.5 * TILT_GAIN, 0.5 * YAW_GAIN
 _TWO_ARMS, _FOUR_RATIOS = 2.0 * ARM, 4.0 * TORQUE_RATIO
 
+TURNED_AWAY, ASKEW = 0.5, 0.3
+"""Cosine of the error about the nose below which, and sine of the yaw error beyond which the axes
+of the published error do not fit any more [1]."""
+
 
 class LowLevel:
     """Makes the robot follow a velocity; yaw is held at 0, as in the published controller."""
@@ -84,6 +88,21 @@ class LowLevel:
         force = self.force(readings.velocity, velocity_reference)
         return allocate(attitude(force, readings))
 
+    def brake(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
+        """As `update`, while the robot comes to rest: the integral, which would wind up, stays.
+
+        Deviation: the published controller integrates always; after a braking its integral pushes
+        the robot back for a second.
+
+        Args:
+            readings: State of the base.
+            velocity_reference: Wanted velocity [m/s], world frame, shape (3,).
+        """
+        integral = self._integral
+        speeds = self.update(readings, velocity_reference)
+        self._integral = integral
+        return speeds
+
     def force(self, velocity: Vector, reference: Vector) -> Vector:
         """Compute the force that the robot needs, and move the integral on by one `dt`.
 
@@ -130,6 +149,9 @@ def attitude(force: Vector, readings: Readings) -> Effort:
     e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R e_R + k_w w); thrust = F . (R z).
     Worked out in the body frame, where the vectors wanted are the rows of Q.
     Source: plant.md, "LLC", with yaw and yaw rate reference 0.
+    Deviation: where a hit has turned the robot by more than 17 degrees, the tilt is corrected about
+    the axes that it has now: e_R steers it half the yaw error aside, and beyond 90 degrees the
+    wrong way.
 
     Args:
         force: Wanted [N], world frame, shape (3,).
@@ -153,10 +175,14 @@ def attitude(force: Vector, readings: Readings) -> Effort:
     y1 = scale * (fz * yy - fy * yz)
     y2 = scale * (fz * zy - fy * zz)
 
+    if y1 < TURNED_AWAY or xy > ASKEW or xy < -ASKEW:
+        roll, pitch = -z1 - z1, z0 + z0
+    else:
+        roll, pitch = y2 - z1, z0 + y1 * z0 - y0 * z1
     return (
         thrust,
-        _HALF_TILT_GAIN * (y2 - z1) - TILT_RATE_GAIN * p,
-        _HALF_TILT_GAIN * (z0 + y1 * z0 - y0 * z1) - TILT_RATE_GAIN * q,
+        _HALF_TILT_GAIN * roll - TILT_RATE_GAIN * p,
+        _HALF_TILT_GAIN * pitch - TILT_RATE_GAIN * q,
         _HALF_YAW_GAIN * (y2 * z0 - y0 * z2 - y0) - YAW_RATE_GAIN * r,
     )
 

@@ -13,7 +13,7 @@ from cloudrc.world.low_level import LowLevel
 from cloudrc.world.rotors import STOPPED
 from cloudrc.world.simulator import Simulator
 
-GROUND = GuardState.GROUND  # an enum's member is slow to look up
+TRACK = GuardState.TRACK  # an enum's member is slow to look up
 
 
 class Robot:
@@ -38,13 +38,14 @@ class Robot:
         """
         simulator, guard, low_level = self.simulator, self.guard, self._low_level
         ticks = range(tick_ns, until_ns, STEP_NS)
-        # Only commands and requests lead off the ground and back to it, and none comes in here.
-        if guard.state is GROUND:
-            for _ in ticks:
+        for now_ns in ticks:
+            readings = simulator.readings
+            reference = guard.tick(now_ns, readings, STEP)
+            if reference is None:
+                low_level.reset()
                 simulator.step(STOPPED)
-        else:
-            for now_ns in ticks:
-                readings = simulator.readings
-                reference = guard.tick(now_ns, readings, STEP)
+            elif guard.state is TRACK or not guard.brakes:
                 simulator.step(low_level.update(readings, reference))
+            else:
+                simulator.step(low_level.brake(readings, reference))
         return tick_ns + len(ticks) * STEP_NS

@@ -6,11 +6,12 @@ import pytest
 from flying import CLOCK, join, records
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from talking import MS, Talk, talking
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudIdentity
 from cloudrc.config.load import load_experiment
-from cloudrc.messages import Command, GuardState
+from cloudrc.messages import GuardState
 from cloudrc.records import (
     Arrival,
     CommandApplied,
@@ -23,68 +24,14 @@ from cloudrc.records import (
     TelemetrySent,
 )
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.codec import Direction, Hello, Kind
-from cloudrc.tunnel.session import Session
 from cloudrc.world.endpoint import WorldIdentity
 
-MS = 1_000_000
 EXPERIMENT = load_experiment("hover", ["link.profile=ideal"])
-
-
-class Talk:
-    """A world, and a cloud of which we write every datagram ourselves."""
-
-    def __init__(self, last_epoch=0):
-        identity = WorldIdentity(CLOCK, b"world".ljust(16), last_epoch)
-        self.world = assembly.build_world(EXPERIMENT, identity)
-        self.session = Session(Direction.DOWNLINK)
-        self.now_ns = 0
-        self.records = []
-
-    def wait(self, until_ns):
-        while self.world.next_deadline_ns() <= until_ns:
-            self.world.handle_deadline(self.world.next_deadline_ns())
-        self.now_ns = until_ns
-
-    def send(self, data):
-        self.world.receive_datagram(data, self.now_ns)
-
-    def hello(self, nonce):
-        self.send(self.session.seal(Kind.HELLO, codec.encode_hello(Hello(nonce.ljust(16), CLOCK))))
-        datagrams = map(codec.decode, self.world.take_datagrams())
-        epoch = [epoch for kind, _, epoch, _, _ in datagrams if kind == Kind.ACCEPT][-1]
-        self.session.begin(epoch)
-        return epoch
-
-    def request(self, number, request, start):
-        from cloudrc.messages import OperatorRequest
-
-        body = codec.encode_operator(OperatorRequest(number, request, start))
-        self.send(self.session.seal(Kind.OPERATOR, body))
-
-    def command(self, velocity=(0.0, 0.0, 1.0), basis_ns=None, stamp_ns=None):
-        basis_ns = self.now_ns if basis_ns is None else basis_ns
-        command = Command(self.now_ns, basis_ns, 0, velocity, 0.0)
-        return self.session.seal(Kind.COMMAND, codec.encode_command(command))
-
-    def take(self, kind):
-        self.records += self.world.take_records()
-        return [record for record in self.records if isinstance(record, kind)]
-
-    def counts(self):
-        self.wait(self.now_ns + 1000 * MS)
-        return {record.name: record.total for record in self.take(Counted)}
 
 
 @pytest.fixture
 def talk():
-    from cloudrc.messages import Request, Start
-
-    talk = Talk()
-    talk.hello(b"cloud")
-    talk.wait(20 * MS)
-    talk.request(1, Request.START, Start.HERE)
-    return talk
+    return talking()
 
 
 def test_without_a_session_world_is_silent():
@@ -94,8 +41,11 @@ def test_without_a_session_world_is_silent():
 
 
 def test_every_new_cloud_process_gets_a_rising_epoch_and_a_repeated_hello_the_same():
-    talk = Talk(last_epoch=41)
-    assert [talk.hello(n) for n in (b"one", b"one", b"two", b"two", b"one")] == [42, 42, 43, 43, 44]
+    talk, epochs = Talk(last_epoch=41), []
+    for nonce in (b"one", b"one", b"two", b"two", b"three"):
+        talk.wait(talk.now_ns + 1_100 * MS)  # the one before has fallen silent
+        epochs.append(talk.hello(nonce))
+    assert epochs == [42, 42, 43, 43, 44]
 
 
 def test_a_command_is_applied_at_the_first_tick_after_its_arrival(talk):
@@ -124,12 +74,7 @@ def test_the_flight_does_not_depend_on_when_the_driver_wakes(talk, wakes):
     talk.send(talk.command(basis_ns=20 * MS))
     talk.wait(200 * MS)
     last = talk.take(GroundTruth)[-1]
-    other = Talk()
-    other.hello(b"cloud")
-    other.wait(20 * MS)
-    from cloudrc.messages import Request, Start
-
-    other.request(1, Request.START, Start.HERE)
+    other = talking()
     other.now_ns = 21_300_000
     other.send(other.command(basis_ns=20 * MS))
     other.wait(200 * MS)
@@ -155,8 +100,12 @@ def test_late_and_repeated_commands_are_counted_and_not_flown(talk):
         (lambda data: data + b"x", "malformed"),
         (lambda data: data.ljust(65_000, b"x"), "malformed"),
         (lambda data: bytes([codec.VERSION + 1]) + data[1:], "version"),
-        (lambda data: data[:2] + b"\0" + data[3:], "direction"),
-        (lambda data: data[:4] + b"\x09" + data[5:], "old_epoch"),
+        (lambda data: data[:1] + b"\0" + data[2:], "direction"),
+        (lambda data: data[:2] + b"\x09" + data[3:], "old_epoch"),
+        (lambda data: data[:6] + b"\x01" + data[7:], "tag"),
+        (lambda data: data[:8] + b"\x09" + data[9:], "tag"),
+        (lambda data: data[:30] + b"\x09" + data[31:], "tag"),
+        (lambda data: data[:-1] + bytes([data[-1] ^ 1]), "tag"),
     ],
 )
 def test_a_bad_datagram_is_dropped_and_counted(talk, spoil, outcome):

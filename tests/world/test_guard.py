@@ -1,179 +1,254 @@
-"""The guard: what may be flown, for how long, and what happens then."""
+"""The guard: who arms it, what it takes of a command, and when it falls into HOLD."""
 
+from itertools import pairwise
 from math import hypot, inf, nan
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from guard_play import (
+    HERE,
+    LIMITS,
+    MS,
+    SECOND,
+    armed,
+    command,
+    feed,
+    holding,
+    run,
+    sensed,
+    states,
+    tracking,
+)
 
-from cloudrc.messages import UPRIGHT, Command, GuardState
-from cloudrc.world.guard import BRAKE, HOLD_SPEED_MAX, Guard, Limits
-from cloudrc.world.readings import Readings
+from cloudrc.messages import ZERO, GuardState
+from cloudrc.world.guard import Guard
+from cloudrc.world.guard_limits import Limits
+from cloudrc.world.guard_rest import HARDEST, PULL_MAX
 
-MS = 1_000_000
-TICK = 2 * MS
-HERE = (1.0, 2.0, 3.0)
-STILL = (0.0, 0.0, 0.0)
-LIMITS = Limits(command_age_max_ns=250 * MS, speed_max=6.0, acceleration_max=12.0)
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
 
-def command(velocity=(1.0, 0.0, 0.0), basis_ns=0, yaw_rate=0.0):
-    return Command(0, basis_ns, 0, velocity, yaw_rate)
+# Arming
 
 
-def sensed(position, velocity):
-    return Readings.of((*position, *UPRIGHT), (*velocity, *STILL))
-
-
-@pytest.fixture
-def guard():
+def test_at_first_nothing_is_armed_and_nothing_flown():
     guard = Guard(LIMITS)
-    guard.start_mission(0)
-    return guard
-
-
-def tracking(velocity, now_ns=0):
-    guard = Guard(LIMITS)
-    guard.start_mission(now_ns)
-    guard.offer(command(velocity, basis_ns=now_ns), now_ns)
-    return guard
-
-
-def run(guard, start_ns, end_ns, position=HERE, velocity=STILL):
-    """Tick through a time; returns the references."""
-    return [
-        guard.tick(now_ns, sensed(position, velocity), 0.002)
-        for now_ns in range(start_ns, end_ns, TICK)
-    ]
+    assert (guard.state, guard.armed, guard.reference, guard.yaw_rate) == (GROUND, False, ZERO, 0.0)
+    assert guard.changes == []
 
 
 def test_fresh_commands_alone_never_arm():
     guard = Guard(LIMITS)
     assert guard.offer(command(), 0) is None
-    assert guard.state is GuardState.GROUND
+    assert guard.state is GROUND
+    assert run(guard, 0, 10 * MS) == [None] * 5  # the rotors stand still
 
 
-def test_a_started_mission_waits_on_the_ground_for_its_first_command(guard):
-    assert guard.state is GuardState.GROUND
+def test_a_started_mission_waits_on_the_ground_for_its_first_command():
+    guard = armed()
+    assert run(guard, 0, 10 * MS) == [None] * 5
+    guard.offer(command(basis_ns=10 * MS), 10 * MS)
+    assert guard.state is TRACK
+    assert [change.cause for change in guard.take_changes()] == ["fresh command"]
+
+
+def test_what_came_before_the_start_of_a_mission_is_not_flown():
+    guard = Guard(LIMITS)
     guard.offer(command(), 0)
-    assert guard.state is GuardState.TRACK
+    guard.start_mission(1 * MS)
+    assert run(guard, 1 * MS, 3 * MS) == [None]
+
+
+def test_a_second_start_within_a_mission_forgets_nothing():
+    guard = tracking()
+    assert guard.start_mission(10 * MS)
+    run(guard, 10 * MS, 20 * MS)
+    assert guard.state is TRACK
+
+
+def test_what_the_fence_changes_is_within_the_acceleration_cap():
+    """Beyond a margin it comes back in one axis while another axis speeds up."""
+    guard = tracking((0.0, 6.0, 0.0))
+    before = ZERO
+    for k in range(40):
+        now_ns, x = 2 * MS * k, -2.8 - 0.01 * k
+        after = guard.tick(now_ns, sensed((x, -3.0, 1.3), (-5.0, 0.0, 0.0)), 0.002)
+        assert hypot(*(b - a for a, b in zip(before, after, strict=True))) <= 0.024 + 1e-15
+        before = after
+    assert before[0] > 0.2
+    assert before[1] > 0.5
+
+
+def test_put_on_the_ground_nothing_is_armed_or_remembered():
+    guard = tracking()
+    run(guard, 0, 10 * MS)
+    guard.put_on_ground(10 * MS, "mission starts from spawn")
+    assert guard.take_changes()[-1] == (10 * MS, GROUND, "mission starts from spawn")
+    assert (guard.state, guard.armed, guard.reference) == (GROUND, False, ZERO)
+    guard.offer(command(basis_ns=10 * MS), 10 * MS)
+    assert guard.state is GROUND
+
+
+# What is taken of a command
 
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
 @pytest.mark.parametrize("axis", range(4))
-def test_what_is_not_finite_is_refused_whole(guard, bad, axis):
-    values = [1.0, 1.0, 1.0, 0.0]
+def test_what_is_not_finite_is_refused_whole(bad, axis):
+    guard = tracking((0.5, 0.0, 0.0))
+    before = run(guard, 0, 100 * MS)[-1]
+    values = [1.0, 1.0, 1.0, 0.1]
     values[axis] = bad
-    assert guard.offer(command(tuple(values[:3]), 0, values[3]), 0) == "not_finite"
-    assert guard.state is GuardState.GROUND
+    assert guard.offer(command(tuple(values[:3]), 100 * MS, values[3]), 100 * MS) == "not_finite"
+    assert run(guard, 100 * MS, 102 * MS) == [before]
+    assert guard.yaw_rate == 0.0
 
 
 @pytest.mark.parametrize(
-    ("age_ms", "answer"), [(0, None), (250, None), (251, "stale"), (-1, "stale")]
+    ("age_ns", "answer"),
+    [(0, None), (250 * MS, None), (250 * MS + 1, "stale"), (-1, "future"), (1 << 62, "stale")],
 )
-def test_a_command_is_fresh_while_its_basis_is(guard, age_ms, answer):
-    now_ns = 10_000 * MS
-    assert guard.offer(command(basis_ns=now_ns - age_ms * MS), now_ns) == answer
+def test_a_command_is_fresh_while_its_basis_is(age_ns, answer):
+    now_ns = 10 * SECOND
+    assert armed().offer(command(basis_ns=now_ns - age_ns), now_ns) == answer
+
+
+def test_the_speed_is_capped_and_keeps_its_direction():
+    guard = tracking((30.0, 40.0, 0.0))
+    feed(guard, 10 * MS, 60, (30.0, 40.0, 0.0), position=(1.0, -3.0, 1.3))
+    assert guard.reference[1] / guard.reference[0] == pytest.approx(4 / 3)
+    assert 5.99 < hypot(*guard.reference) <= 6.0
+    assert guard.counts["limited_speed"] == 61
+
+
+@pytest.mark.parametrize(("asked", "allowed"), [(0.4, 0.4), (7.0, 1.0), (-7.0, -1.0)])
+def test_the_yaw_rate_is_capped(asked, allowed):
+    guard = armed()
+    for _ in range(2):
+        guard.offer(command(yaw_rate=asked), 0)
+    assert guard.yaw_rate == allowed
+    assert guard.counts["limited_yaw_rate"] == 2 * (asked != allowed)
+    guard.forget_commands()
+    assert guard.yaw_rate == 0.0
 
 
 def test_the_reference_follows_no_faster_than_the_acceleration_cap():
-    references = run(tracking((3.0, 4.0, 0.0)), 0, 200 * MS)
+    references = run(tracking((3.0, 4.0, 0.0)), 0, 200 * MS, position=(1.0, -3.0, 1.3))
     assert references[0] == pytest.approx((12 * 0.002 * 0.6, 12 * 0.002 * 0.8, 0.0))
     assert references[-1] == pytest.approx((1.44, 1.92, 0.0))  # 12 m/s^2 for 0.2 s
 
 
-def test_the_speed_is_capped_and_keeps_its_direction():
-    reference = run(tracking((30.0, 40.0, 0.0)), 0, 240 * MS)[-1]
-    assert reference[1] / reference[0] == pytest.approx(4 / 3)
-    guard = tracking((30.0, 40.0, 0.0))
-    guard.reference = (3.6, 4.8, 0.0)
-    assert guard.tick(0, sensed(HERE, STILL), 0.002) == pytest.approx((3.6, 4.8, 0.0))
+def test_one_command_is_slowed_all_the_more_the_nearer_the_fence_is():
+    guard = tracking((0.0, 2.0, 0.0))
+    feed(guard, 0, 30, (0.0, 2.0, 0.0), position=(1.0, 0.0, 1.3))
+    assert guard.reference == (0.0, 2.0, 0.0)
+    assert guard.counts == {}
+    flown = []
+    for k, y in enumerate((3.0, 4.0, 4.5, 5.0, 5.4)):  # not faster than a robot gets there
+        start_ns = (300 + 40 * k) * MS
+        flown.append(run(guard, start_ns, start_ns + 2 * MS, (1.0, y, 1.3))[0][1])
+    assert flown[0] == 2.0
+    assert flown[1:] == sorted(flown[1:], reverse=True)
+    assert flown[-1] <= 0.0
+    assert guard.counts == {"limited_fence": 4}
 
 
+# From TRACK to HOLD
+
+
+@pytest.mark.promise("P-GUARD-1")
 def test_hold_begins_with_the_first_tick_after_the_age_limit():
-    guard = tracking((1.0, 0.0, 0.0))
+    guard = tracking()
     run(guard, 0, 252 * MS)
-    assert guard.state is GuardState.TRACK
+    assert guard.state is TRACK
     run(guard, 252 * MS, 254 * MS)
-    assert guard.state is GuardState.HOLD
+    assert guard.state is HOLD
     assert guard.take_changes()[-1].cause == "command age 0.252 s above 0.250 s"
 
 
-def test_hold_brakes_and_then_pulls_back_to_where_it_came_to_rest():
+def test_a_new_session_holds_at_once_and_says_why():
+    guard = tracking()
+    run(guard, 0, 10 * MS)
+    guard.forget_commands()
+    run(guard, 10 * MS, 12 * MS)
+    assert guard.take_changes()[-1][1:] == (HOLD, "new session")
+
+
+def test_hold_brakes_at_once_and_then_holds_where_the_robot_came_to_rest():
     guard = tracking((1.5, 0.0, 0.0))
-    run(guard, 0, 252 * MS)
-    speed = hypot(*guard.reference)
-    references = run(guard, 252 * MS, 1252 * MS)
-    assert references[0][0] == pytest.approx(speed - BRAKE * 0.002)
-    assert references[-1] == STILL
-    assert run(guard, 1252 * MS, 1254 * MS, (1.2, 2.0, 3.0))[0] == pytest.approx((-0.2, 0.0, 0.0))
-    far = run(guard, 1254 * MS, 1256 * MS, (9.0, 2.0, 3.0))[0]
-    assert hypot(*far) == pytest.approx(HOLD_SPEED_MAX)
+    run(guard, 0, 252 * MS, velocity=(1.5, 0.0, 0.0))
+    first, *rest = run(guard, 252 * MS, 900 * MS, velocity=(1.5, 0.0, 0.0))
+    assert hypot(*first) < 1.0  # the reference starts ahead of the robot, which follows late
+    assert rest[-1] == ZERO
+    assert guard.brakes
+    run(guard, 900 * MS, 902 * MS, velocity=(0.75, 0.0, 0.0))
+    run(guard, 902 * MS, 904 * MS)
+    assert not guard.brakes
+    assert run(guard, 904 * MS, 906 * MS, (1.02, 2.0, 1.3))[0][0] < 0.0
+    far = run(guard, 906 * MS, 2 * SECOND, (3.0, 2.0, 1.3))[-1]
+    assert far == pytest.approx((-PULL_MAX, 0.0, 0.0))
 
 
-def test_hold_waits_for_the_robot_to_come_to_rest_before_it_drops_anchor():
-    guard = tracking((1.0, 0.0, 0.0))
-    run(guard, 0, 1000 * MS, velocity=(0.5, 0.0, 0.0))
-    assert run(guard, 1000 * MS, 1002 * MS, (5.0, 2.0, 3.0), (0.5, 0.0, 0.0)) == [STILL]
-    run(guard, 1002 * MS, 1004 * MS, (6.0, 2.0, 3.0), STILL)
-    assert run(guard, 1004 * MS, 1006 * MS, (6.0, 2.0, 3.0), STILL) == [STILL]
+def test_a_robot_that_lags_its_reference_brakes_from_where_it_is():
+    guard = tracking((5.0, 0.0, 0.0))
+    run(guard, 0, 252 * MS, velocity=(0.2, 0.0, 0.0))
+    assert guard.reference[0] > 2.5
+    run(guard, 252 * MS, 254 * MS, velocity=(0.2, 0.0, 0.0))
+    assert hypot(*guard.reference) <= 0.2
 
 
-def test_a_fresh_command_ends_the_hold():
-    guard = tracking((1.0, 0.0, 0.0))
-    run(guard, 0, 500 * MS)
-    guard.offer(command((2.0, 0.0, 0.0), basis_ns=490 * MS), 500 * MS)
-    assert guard.state is GuardState.TRACK
+def test_the_reference_brakes_no_harder_than_is_said():
+    guard = tracking((3.0, 0.0, 0.0))
+    run(guard, 0, 252 * MS, velocity=(3.0, 0.0, 0.0))
+    references = run(guard, 252 * MS, 1200 * MS, velocity=(3.0, 0.0, 0.0))
+    steps = [a[0] - b[0] for a, b in pairwise(references)]
+    assert max(steps) <= HARDEST * 0.002 * (1 + 1e-9)
+
+
+def test_the_next_hold_is_another_place():
+    guard = holding()
+    now_ns = feed(guard, 2 * SECOND, 20, (0.0, 0.0, 0.0))
+    assert guard.state is TRACK
+    elsewhere = run(guard, now_ns, now_ns + 2 * SECOND, (3.0, 2.0, 1.3))
+    assert guard.state is HOLD
+    assert set(elsewhere) == {ZERO}
+
+
+def test_a_command_into_the_floor_ends_above_it():
+    guard = tracking((0.0, 0.0, -2.0))
+    lower = run(guard, 0, 200 * MS, (1.0, 2.0, 0.40))[-1][2]
+    assert 0.2 * -lower + lower * lower / 6 == pytest.approx(0.05)
+    assert run(guard, 200 * MS, 210 * MS, (1.0, 2.0, 0.34))[-1][2] == 0.0
+
+
+def test_position_hold_is_damped():
+    guard = holding()
+    assert run(guard, 2 * SECOND, 3 * SECOND, HERE, (0.0, 0.2, 0.0))[-1][1] < -0.2
 
 
 def test_the_end_of_a_mission_holds_whatever_the_cloud_says():
-    guard = tracking((1.0, 0.0, 0.0))
+    guard = tracking()
     guard.end_mission(10 * MS)
-    assert guard.state is GuardState.HOLD
-    guard.offer(command((2.0, 0.0, 0.0), basis_ns=20 * MS), 20 * MS)
-    assert guard.state is GuardState.HOLD
-    guard.start_mission(30 * MS)
-    guard.offer(command((2.0, 0.0, 0.0), basis_ns=30 * MS), 30 * MS)
-    assert guard.state is GuardState.TRACK
+    assert guard.take_changes()[-1] == (10 * MS, HOLD, "mission ended")
+    assert guard.armed is False
+    feed(guard, 20 * MS, 300)
+    assert guard.state is HOLD
+    assert states(guard) == []
 
 
-def test_a_mission_from_here_forgets_what_came_before_it():
-    guard = tracking((1.0, 0.0, 0.0))
-    guard.end_mission(10 * MS)
-    guard.start_mission(20 * MS)
-    assert run(guard, 20 * MS, 22 * MS)
-    assert guard.state is GuardState.HOLD
+# Slow robots
 
 
-def test_back_on_the_ground_nothing_is_armed():
-    guard = tracking((1.0, 0.0, 0.0))
-    guard.put_on_ground(10 * MS, "mission starts from spawn")
-    guard.offer(command(basis_ns=10 * MS), 10 * MS)
-    assert guard.state is GuardState.GROUND
-    assert guard.reference == STILL
+def test_a_low_speed_cap_holds_for_hold_and_land_too():
+    guard = tracking(limits=Limits(LIMITS.fence_low, LIMITS.fence_high, speed_max=0.2))
+    run(guard, 0, 2 * SECOND)
+    fastest = max(hypot(*r) for r in run(guard, 2 * SECOND, 4 * SECOND, (5.0, -2.0, 0.4)))
+    assert fastest <= 0.2
+    for _ in range(5):
+        guard.offer(command((nan, 0.0, 0.0)), 4 * SECOND)
+    down = run(guard, 4 * SECOND, 6 * SECOND, (5.0, -2.0, 0.4), (0.0, 0.0, -0.1))
+    assert max(hypot(*r) for r in down) <= 0.2
 
 
-@given(
-    st.lists(st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3), max_size=20),
-    st.floats(0.5, 20.0),
-)
-@settings(max_examples=60, deadline=None)
-def test_whatever_is_commanded_the_reference_stays_inside_the_caps(velocities, speed_max):
-    guard = Guard(Limits(speed_max=speed_max))
-    guard.start_mission(0)
-    before = STILL
-    for number, velocity in enumerate(velocities):
-        guard.offer(command(velocity, basis_ns=number * TICK), number * TICK)
-        if guard.state is GuardState.GROUND:
-            continue
-        after = guard.tick(number * TICK, sensed(HERE, STILL), 0.002)
-        assert hypot(*after) <= speed_max * (1 + 1e-12)
-        step = hypot(*(b - a for a, b in zip(before, after, strict=True)))
-        assert step <= 12.0 * 0.002 * (1 + 1e-9)
-        before = after
-
-
-@pytest.mark.parametrize(("asked", "allowed"), [(0.4, 0.4), (7.0, 1.0), (-7.0, -1.0)])
-def test_the_yaw_rate_is_capped(guard, asked, allowed):
-    guard.offer(command(yaw_rate=asked), 0)
-    assert guard.yaw_rate == allowed
+def test_the_first_reading_may_be_anything():
+    guard = tracking()
+    assert guard.tick(0, sensed((nan, nan, nan), (nan, inf, -inf)), 0.002) is not None

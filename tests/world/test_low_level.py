@@ -4,11 +4,11 @@ from math import cos, isfinite, radians, sin
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import UPRIGHT, ZERO
-from cloudrc.world.low_level import LowLevel, allocate, attitude
+from cloudrc.world.low_level import ASKEW, TURNED_AWAY, LowLevel, allocate, attitude
 from cloudrc.world.readings import Readings
 
 WEIGHT = 10.3005  # 1.05 kg * 9.81 m/s^2
@@ -92,7 +92,7 @@ def test_rates_are_damped():
 unit = st.floats(-1.0, 1.0)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 @given(
     force=st.tuples(unit, unit, st.floats(0.2, 2.0)),
     quaternion=st.tuples(*[unit] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
@@ -105,10 +105,32 @@ def test_attitude_is_the_matrix_formula(force, quaternion):
     y_d = np.cross(z_d, (1.0, 0.0, 0.0))
     y_d /= np.linalg.norm(y_d)
     error = np.column_stack([np.cross(y_d, z_d), y_d, z_d]).T @ rotation
+    assume(error[1, 1] > TURNED_AWAY and abs(rotation[1, 0]) < ASKEW)
     error = 0.5 * (error - error.T)
     thrust, *torque = attitude(force, turned((w, *q)))
     assert thrust == pytest.approx(np.dot(force, rotation[:, 2]), abs=1e-9)
     assert torque == pytest.approx([-error[2, 1], -error[0, 2], -0.035 * error[1, 0]], abs=1e-9)
+
+
+@pytest.mark.parametrize("yaw", [18.0, -18.0, 60.0, 90.0, 135.0, 180.0, -100.0])
+def test_a_robot_that_was_turned_by_a_hit_still_tilts_the_right_way(yaw):
+    """The torque, seen from the world, turns the thrust towards the force: e_z x z_d."""
+    half = radians(yaw) / 2
+    readings = turned((cos(half), 0.0, 0.0, sin(half)))
+    _, roll, pitch, _ = attitude((3.0, 0.0, 4.0), readings)
+    turn = np.array(readings.axes[:3]) * roll + np.array(readings.axes[3:6]) * pitch
+    assert turn[:2] == pytest.approx([0.0, 0.6], abs=1e-9)
+
+
+def test_while_the_robot_brakes_the_integral_stands_still():
+    law = LowLevel()
+    moving = AT_REST._replace(velocity=(1.0, 0.0, 0.0))
+    for _ in range(50):
+        law.brake(moving, ZERO)
+    for _ in range(50):
+        fresh = LowLevel()
+        fresh.brake(moving, ZERO)
+    assert law.brake(moving, ZERO) == fresh.brake(moving, ZERO)
 
 
 @pytest.mark.parametrize("force", [ZERO, (5.0, 0.0, 0.0), (0.0, 0.0, -5.0)])

@@ -1,0 +1,73 @@
+"""What the guard allows: set on world's side only, checked once, never zero and never infinite.
+
+A limit that is switched off is the fault that nobody sees, so there is no value that does it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+
+from cloudrc.messages import Vector
+from cloudrc.world.guard_rules import (
+    FLOOR_MARGIN,
+    MARGIN,
+    REACTION,
+    STOPPING_DISTANCE,
+    stopping_distance,
+)
+
+AGE_MAX_NS = 10_000_000_000
+"""Commands that are older are never flown [ns], whatever an experiment says."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the guard allows.
+
+    Attributes:
+        fence_low: Corner of the box that the base may not leave [m], world frame, shape (3,).
+        fence_high: The opposite corner [m], shape (3,).
+        command_age_max_ns: Age of the basis beyond which a command is not flown [ns].
+        speed_max: Largest speed [m/s].
+        acceleration_max: Largest change of the reference [m/s^2].
+        yaw_rate_max: Largest yaw rate [rad/s].
+        hold_max_ns: HOLD for so long in a mission ends in LAND [ns].
+    """
+
+    fence_low: Vector
+    fence_high: Vector
+    command_age_max_ns: int = 250_000_000
+    speed_max: float = 6.0
+    acceleration_max: float = 12.0
+    yaw_rate_max: float = 1.0
+    hold_max_ns: int = 60_000_000_000
+
+    def __post_init__(self) -> None:
+        """Refuse what would switch a limit off.
+
+        Raises:
+            ValueError: If a limit is not finite, not above 0 or, for the speed and the age, beyond
+                what can be stopped in time; the message names it.
+        """
+        for name in self.__slots__[2:]:
+            value = getattr(self, name)
+            if not (isfinite(value) and value > 0):
+                raise ValueError(f"guard: {name} is {value}; it has to be finite and above 0")
+        if self.command_age_max_ns > AGE_MAX_NS:
+            raise ValueError(f"guard: command_age_max_ns is {self.command_age_max_ns}, above 10 s")
+        way = stopping_distance(self.speed_max, self.command_age_max_ns * 1e-9 + REACTION)
+        if way > STOPPING_DISTANCE + 1e-4:
+            raise ValueError(
+                f"guard: speed_max is {self.speed_max:g} m/s, from which stopping takes {way:.2f} m"
+                f" with commands that old; at most {STOPPING_DISTANCE:g} m are allowed"
+            )
+        for low, high in zip(self.fence_low, self.fence_high, strict=True):
+            if not (isfinite(low) and isfinite(high) and high - low > FLOOR_MARGIN + MARGIN):
+                raise ValueError(f"guard: a fence from {low:g} to {high:g} m leaves no room")
+
+    def inside(self) -> tuple[Vector, Vector]:
+        """Give the fence's corners with the margins taken off [m], shape (3,) each."""
+        (ax, ay, az), (bx, by, bz) = self.fence_low, self.fence_high
+        low = (ax + MARGIN, ay + MARGIN, az + FLOOR_MARGIN)
+        return low, (bx - MARGIN, by - MARGIN, bz - MARGIN)

@@ -1,0 +1,145 @@
+"""How the guard comes to rest and stays there: readings in, a velocity reference out.
+
+Position and velocity of the sensors on board are all that is used. Braking starts hard and ends
+gently, because the low-level controller follows late and swings back; the promise that the stop
+rule builds on, BRAKE after REACTION, is kept with room to spare.
+"""
+
+from __future__ import annotations
+
+from math import hypot, nan
+
+from cloudrc.messages import Vector
+from cloudrc.world.guard_rules import BRAKE, shortened, towards, within
+from cloudrc.world.readings import Readings
+
+HARDEST, GENTLEST = 5.5, 1.0
+"""Range of what is flown in place of the 3 m/s^2 that are promised [m/s^2]."""
+EASE = 0.25
+"""In the end the reference falls exponentially, with this time constant [s]."""
+LEAD, LEAST_SHARE = 1.0, 0.2
+"""By so much [m/s] the reference begins ahead of the robot, but not below this share of it."""
+STILL = 0.1
+"""Slower than this the robot counts as come to rest [m/s]."""
+PULL = 0.8
+"""Of the position hold: velocity per distance [1/s]."""
+DAMPING = 1.6
+"""Of the position hold: velocity taken back per velocity [1]."""
+PULL_MAX = 0.5
+"""Of the position hold [m/s]."""
+HOP, HOP_SPEED = 0.02, 0.2
+"""A robot that has not been this far [m] above or below where it stood stands there still, if it is
+slower than this [m/s]: it drops from no higher, and hits nothing at speed."""
+
+
+class Rest:
+    """Brakes, holds the position where the robot came to rest, or goes down from there.
+
+    Attributes:
+        brakes: Whether the robot is coming to rest, and has no position to hold yet.
+    """
+
+    def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
+        """Begin without a position.
+
+        Args:
+            low: Corner of where a position may be held [m], world frame, shape (3,).
+            high: The opposite corner [m], shape (3,).
+            speed_max: Of the position hold, if it is below PULL_MAX [m/s].
+        """
+        self._low, self._high = low, high
+        self._pull_max = min(PULL_MAX, speed_max)
+        self._anchor: Vector | None = None
+        self.brakes = False
+
+    def forget(self) -> None:
+        """The robot moves on; the next rest is another one."""
+        self._anchor, self.brakes = None, False
+
+    def follow(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
+        """Go on with braking, with holding the position, and with going down.
+
+        Args:
+            reference: As followed so far [m/s], world frame, shape (3,).
+            readings: Of the sensors on board.
+            sink: How fast to go down [m/s], 0 to stay.
+            dt: Time since the last call [s].
+        """
+        if self._anchor is None:
+            return self._brake(reference, readings, sink, dt)
+        (ax, ay, az), (x, y, z), (vx, vy, vz) = self._anchor, readings.position, readings.velocity
+        up = 0.0 if sink else PULL * (az - z) - DAMPING * vz
+        back = (PULL * (ax - x) - DAMPING * vx, PULL * (ay - y) - DAMPING * vy, up)
+        x, y, z = shortened(back, self._pull_max)
+        return towards(reference, (x, y, z - sink), BRAKE * dt)
+
+    def _brake(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
+        """Slow down; at rest, drop anchor."""
+        if not self.brakes:
+            reference, self.brakes = brake_start(reference, readings.velocity), True
+        x, y, z = reference
+        rest = (0.0, 0.0, -sink)
+        reference = towards(reference, rest, brake_rate(hypot(x, y, z + sink)) * dt)
+        vx, vy, vz = readings.velocity
+        if reference is rest and hypot(vx, vy, vz + sink) < STILL:
+            x, y, z = map(within, readings.position, self._low, self._high)
+            self._anchor, self.brakes = (x, y, z), False
+        return reference
+
+
+def brake_start(reference: Vector, velocity: Vector) -> Vector:
+    """Say where the reference begins to brake: ahead of the robot, which follows it late.
+
+    A robot that is slower than its reference would else go on speeding up for a while.
+
+    Args:
+        reference: So far, finite [m/s], shape (3,).
+        velocity: Of the robot [m/s], world frame, shape (3,).
+    """
+    start = velocity if hypot(*velocity) < hypot(*reference) else reference
+    speed = hypot(*start)
+    if speed == 0.0:
+        return start
+    share = max(LEAST_SHARE, 1.0 - LEAD / speed)
+    x, y, z = start
+    return (share * x, share * y, share * z)
+
+
+def brake_rate(speed: float) -> float:
+    """Say how fast the reference falls at a `speed` [m/s]: hard first, gently in the end."""
+    return min(HARDEST, max(GENTLEST, speed / EASE))
+
+
+class TakeOff:
+    """Tells a robot that has not left the ground yet from one that flies.
+
+    Held in the air so near to the ground it would scrape along.
+
+    Attributes:
+        over: Whether the robot has left the ground.
+    """
+
+    def __init__(self) -> None:
+        """Begin on the ground."""
+        self.forget()
+
+    def forget(self) -> None:
+        """The robot stands, or will; the next take-off is another one."""
+        self.over, self._height = False, nan
+
+    def look(self, readings: Readings, flies: bool) -> None:
+        """Note where the robot stands, or see whether it has left.
+
+        Args:
+            readings: Of the sensors on board.
+            flies: Whether its rotors turn.
+        """
+        height = readings.position[2]
+        if flies:
+            self.over = not abs(height - self._height) < HOP
+        else:
+            self._height = height
+
+    def may_end(self, readings: Readings) -> bool:
+        """Say whether the rotors may stop here."""
+        return not self.over and hypot(*readings.velocity) < HOP_SPEED

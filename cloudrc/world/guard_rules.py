@@ -1,0 +1,211 @@
+"""The guard's arithmetic: pure functions on floats, of which each answers to any numbers at all.
+
+Whatever comes in, NaN and infinities included, a finite answer inside its bound goes out. So every
+comparison is written so that NaN fails it. `tests/world/test_guard_proof.py` proves the scalar
+ones for all 64-bit floats.
+"""
+
+from __future__ import annotations
+
+from math import copysign, inf, sqrt
+
+from cloudrc.messages import ZERO, Vector
+
+BRAKE = 3.0
+"""Deceleration that the robot is sure to reach [m/s^2]. Source: DESIGN, section 5."""
+REACTION = 0.2
+"""Time until it does [s]. Source: likewise."""
+STOPPING_DISTANCE = 8.7
+"""Within which the fastest allowed speed has to be stopped [m]. Source: likewise."""
+SIXTH = 1.0 / (2.0 * BRAKE)
+CAUTION, MARGIN = 0.6, 0.2
+"""At the fence v has to keep CAUTION v + v^2/6 <= distance - MARGIN [s], [m].
+Deviation: DESIGN, section 5 has 0.2 s and 0.1 m. So late follows the low-level controller that a
+cloud which does its worst gets the robot 0.3 m beyond the fence with these."""
+FAR = 1e6
+"""Farther than this [m] a face limits nothing."""
+GLIMPSE, GLIMPSE_NS = 0.25, 10_000_000
+"""The robot moves by less than this [m] in so long [ns]: it is never faster than 25 m/s."""
+COME_BACK, COME_BACK_MAX = 1.0, 0.5
+"""Beyond the margin the robot has to fly back: velocity per distance [1/s], at most [m/s]."""
+ASIDE, ASIDE_MARGIN = 0.5, 0.5
+"""With this share of the speed [1] the robot has to stop so far [m] from a wall, whichever way it
+flies: what it hits turns it aside. Off the board's edge at 2.7 m/s it goes on across at 1.2."""
+FLOOR_MARGIN = 0.35
+"""Takes the place of MARGIN at the floor, which parts of a tilted robot reach first [m]; there
+REACTION is enough, since the robot climbs readily."""
+LOW, LOW_SPEED = 0.25, 1.0
+"""Lower than this [m] the robot flies sideways no faster than this [m/s]."""
+SINK_LAG = 0.5
+"""The reference goes down ahead of the robot by at most this [m/s]: asked for more than gravity
+gives, the low-level controller would turn the robot over, and then brake nothing."""
+JUST_BELOW = 1.0 - 2.0**-45
+"""Times this, a cap is not exceeded by what is rounded on the way to the reference."""
+
+
+def stopping_distance(speed: float, reaction: float) -> float:
+    """Give the way [m] from a `speed` [m/s] to rest: `reaction` [s], then braking at BRAKE."""
+    return speed * (reaction + speed * SIXTH)
+
+
+def within(value: float, low: float, high: float) -> float:
+    """Give `value`, or the end nearest to it of what lies between `low` and `high`.
+
+    `low` if it is not a number; all three are in one unit, [m], [m/s] or [rad/s].
+    """
+    if value >= high:
+        return high
+    return value if value > low else low
+
+
+def approach(reach: float, caution: float = CAUTION) -> float:
+    """Say how fast the robot may be told to fly towards a face of the fence.
+
+    The largest v with t v + v^2/6 <= d is 2 d / (t + sqrt(t^2 + 2 d/3)): solved so that no
+    difference cancels. Beyond the face v is negative: the robot has to come back.
+
+    Args:
+        reach: Distance to the face [m], margin taken off.
+        caution: t of the formula [s].
+    """
+    if reach > FAR:
+        return inf
+    if reach > 0.0:
+        return 2.0 * reach / (caution + sqrt(caution * caution + 4.0 * SIXTH * reach))
+    return max(COME_BACK * reach, -COME_BACK_MAX) if reach < 0.0 else 0.0
+
+
+def is_far(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
+    """Say whether `fenced` leaves a velocity as it is, here and up to GLIMPSE from here.
+
+    Args:
+        velocity: [m/s], world frame, shape (3,).
+        position: Of the base [m], world frame, shape (3,).
+        low: Corner of the fence [m], margins taken off, shape (3,).
+        high: The opposite corner [m], shape (3,).
+    """
+    (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
+    speed = sqrt(vx * vx + vy * vy + vz * vz)
+    if speed > LOW_SPEED:
+        aside = ASIDE * speed
+        side = GLIMPSE - MARGIN + ASIDE_MARGIN + aside * (REACTION + aside * SIXTH)
+        if not (ax + side <= x <= bx - side and ay + side <= y <= by - side):
+            return False
+    if vx > 0.0:
+        bx -= vx * (CAUTION + vx * SIXTH)
+    else:
+        ax -= vx * (CAUTION - vx * SIXTH)
+    if vy > 0.0:
+        by -= vy * (CAUTION + vy * SIXTH)
+    else:
+        ay -= vy * (CAUTION - vy * SIXTH)
+    if vz > 0.0:
+        bz -= vz * (CAUTION + vz * SIXTH)
+    else:
+        az -= vz * (REACTION - vz * SIXTH)
+    return (
+        ax + GLIMPSE <= x <= bx - GLIMPSE
+        and ay + GLIMPSE <= y <= by - GLIMPSE
+        and az + GLIMPSE <= z <= bz - GLIMPSE
+    )
+
+
+def fenced(velocity: Vector, position: Vector, low: Vector, high: Vector) -> Vector:
+    """Slow a reference, axis by axis, until the robot can stop before the faces of the fence.
+
+    Near the floor it is slowed sideways, too: a rotor that touches at speed turns the robot over.
+    And near the walls in every direction: what it hits there may throw it against them.
+
+    Args:
+        velocity: Finite [m/s], world frame, shape (3,).
+        position: Of the base [m], world frame, shape (3,).
+        low: Corner of the fence [m], margins taken off, shape (3,).
+        high: The opposite corner [m], shape (3,).
+    """
+    (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
+    if not z >= az - FLOOR_MARGIN + LOW:
+        vx, vy, _ = shortened((vx, vy, 0.0), LOW_SPEED)
+    inside = (
+        within(vx, -approach(x - ax), approach(bx - x)),
+        within(vy, -approach(y - ay), approach(by - y)),
+        # Whoever stands on the floor is not asked to take off.
+        within(vz, min(0.0, -approach(z - az, REACTION)), approach(bz - z)),
+    )
+    reach = min(x - ax, bx - x, y - ay, by - y) + MARGIN - ASIDE_MARGIN
+    return shortened(inside, max(approach(reach, REACTION) / ASIDE, LOW_SPEED))
+
+
+def shortened(a: Vector, length_max: float) -> Vector:
+    """Give `a` [m/s] if it is at most `length_max` [m/s] long, else its direction with that length.
+
+    Zero if a component is not a number, or infinite.
+    """
+    x, y, z = a
+    largest = max(abs(x), abs(y), abs(z))
+    if largest > length_max:
+        # Scaled down first: the square of a huge but finite number overflows to infinity.
+        scale = length_max / largest
+        x, y, z = x * scale, y * scale, z * scale
+    square = x * x + y * y + z * z
+    if square <= length_max * length_max:
+        return a if largest <= length_max else (x, y, z)
+    scale = length_max / sqrt(square)
+    if not scale <= 1.0:
+        return ZERO
+    return (x * scale, y * scale, z * scale)
+
+
+def towards(start: Vector, end: Vector, step: float) -> Vector:
+    """Give the point from `start` to `end` at most `step` away from `start`, all in [m/s]."""
+    (ax, ay, az), (bx, by, bz) = start, end
+    x, y, z = bx - ax, by - ay, bz - az
+    square = x * x + y * y + z * z
+    if square <= step * step:
+        return end
+    share = step / sqrt(square)
+    return (ax + share * x, ay + share * y, az + share * z)
+
+
+def held_back(before: Vector, after: Vector, step: float) -> Vector:
+    """Give `after`, but no more than `step` of what leads away from rest, all in [m/s].
+
+    Where the fence has the robot come back in one axis while another speeds up, each axis alone may
+    be within the cap and their sum beyond it. Slowing down is never held back.
+
+    Args:
+        before: Finite [m/s], shape (3,).
+        after: Finite [m/s], shape (3,).
+        step: Longest way from `before` that speeds up [m/s].
+    """
+    (ax, ay, az), (bx, by, bz) = before, after
+    x, y, z = growth(ax, bx), growth(ay, by), growth(az, bz)
+    square = x * x + y * y + z * z
+    if square <= step * step:
+        return after
+    excess = 1.0 - step / sqrt(square)
+    return (
+        bx - copysign(excess * x, bx),
+        by - copysign(excess * y, by),
+        bz - copysign(excess * z, bz),
+    )
+
+
+def growth(before: float, after: float) -> float:
+    """Say by how much `after` is farther from rest than `before` on the same side, in [m/s]."""
+    if after < 0.0:
+        before, after = -before, -after
+    return max(after - max(before, 0.0), 0.0)
+
+
+def upright(reference: Vector, before: Vector, climb: float, speed_max: float) -> Vector:
+    """Keep the reference from going down so far ahead of the robot that it would turn over.
+
+    Args:
+        reference: Wanted [m/s], world frame, shape (3,).
+        before: What it was a tick ago [m/s], at most `speed_max` long, shape (3,).
+        climb: Vertical velocity of the robot [m/s].
+        speed_max: Of the result [m/s].
+    """
+    x, y, z = reference
+    lowest = min(before[2], climb - SINK_LAG)
+    return shortened((x, y, lowest), speed_max) if z < lowest else reference

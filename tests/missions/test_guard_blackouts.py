@@ -1,0 +1,140 @@
+"""A silent link anywhere in the paper's mission: hold, touch nothing, go on, finish."""
+
+import pytest
+from flying import fly, join, numbers
+from silence import BOTH, PATIENCE, fly_through
+
+from cloudrc.config.load import load_experiment
+from cloudrc.messages import GuardState
+from cloudrc.records import Control, GuardChange, MissionEvent
+
+SLOW = ("cloud.controller.speed_max=1.5",)
+LONG = ("guard.hold_max_s=100",)
+FLIGHT_S = 27.0
+"""Until shortly before the board is touched; there the robot presses on it."""
+INSTANTS = [round(1.5 + k * (FLIGHT_S - 1.5) / 199, 3) for k in range(200)]
+
+
+def check_kill(figure, start_s, calm_within, *settings):
+    """Both directions fall silent, as when the cloud is killed, for a minute."""
+    silence = fly_through(start_s, 60.5, *LONG, *settings)
+    speed = "1.5 m/s" if settings else "uncapped"
+    for name, measured, asked, unit in (
+        ("HOLD after, age of the basis", silence.basis_age, 0.252, "s"),
+        ("below 0.05 m/s after", silence.calm_after, calm_within, "s"),
+        ("drift in 60 s", silence.drift, 0.10, "m"),
+        ("in TRACK after the link's return", silence.resumed_after, 1.0, "s"),
+        ("pipes and floor touched", len(silence.touched), 0, ""),
+    ):
+        figure(f"cloud killed, {speed}: {name}", measured, "<=", asked, unit)
+    assert silence.outcome == "done"
+    assert silence.touched == []
+    # Of the newest command that was applied: not before the limit, and within a tick after it.
+    assert 0.250 < silence.basis_age <= 0.252 + 1e-9
+    assert silence.held_after <= 0.252
+    assert silence.calm_after <= calm_within
+    assert silence.drift <= 0.10
+    assert silence.resumed_after <= 1.0
+
+
+@pytest.mark.promise("P-GUARD-1")
+@pytest.mark.parametrize("start_s", INSTANTS[13::40])
+def test_without_its_cloud_the_robot_stops_within_a_second_and_stays(start_s, figure):
+    check_kill(figure, start_s, 1.0, *SLOW)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("start_s", INSTANTS)
+def test_without_its_cloud_the_robot_stops_at_any_instant(start_s, figure):
+    check_kill(figure, start_s, 1.0, *SLOW)
+
+
+@pytest.mark.parametrize("start_s", [10.6, 16.3])
+def test_uncapped_it_takes_a_little_longer(start_s, figure):
+    check_kill(figure, start_s, 1.4)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("start_s", INSTANTS)
+def test_uncapped_it_takes_a_little_longer_at_any_instant(start_s, figure):
+    check_kill(figure, start_s, 1.4)
+
+
+def check_blackout(figure, start_s, duration_s, ways, *settings, clearance=0.0):
+    blackouts = [
+        f"link.{way}.blackouts=[{{start_s: {start_s}, duration_s: {duration_s}}}]" for way in ways
+    ]
+    flight = fly("paper", *PATIENCE, *blackouts, *settings)
+    assert flight.verdict.failures == ()
+    least = numbers(flight)["min_clearance"]
+    speed = "2 m/s" if settings else "uncapped"
+    figure(f"blackout, {speed}: least clearance", least, ">=", clearance, "m")
+    assert least >= clearance
+
+
+WAYS = (BOTH, ("uplink",), ("downlink",))
+STARTS = [round(0.5 + 1.3 * k, 2) for k in range(24)]
+FAST = "cloud.controller.speed_max=2"
+
+
+@pytest.mark.parametrize("ways", WAYS)
+@pytest.mark.parametrize(("start_s", "duration_s"), [(11.3, 0.3), (22.1, 5.0)])
+def test_a_silence_in_a_pipe_touches_nothing(start_s, duration_s, ways, figure):
+    check_blackout(figure, start_s, duration_s, ways, FAST, clearance=0.12)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("ways", WAYS)
+@pytest.mark.parametrize("duration_s", [0.3, 1.0, 5.0, 20.0])
+@pytest.mark.parametrize("start_s", STARTS)
+def test_a_silence_anywhere_touches_nothing(start_s, duration_s, ways, figure):
+    check_blackout(figure, start_s, duration_s, ways, FAST, clearance=0.12)
+    check_blackout(figure, start_s, duration_s, ways)
+
+
+def fly_records(*settings, until_s=None):
+    ends = join(load_experiment("paper", settings))
+    of_world, of_cloud = [], []
+
+    def sink(w, c):
+        of_world.extend(w)
+        of_cloud.extend(c)
+
+    limit_ns = round((until_s or 150) * 1e9)
+    over = (lambda: False) if until_s else (lambda: ends.cloud.mission_over)
+    ends.run.fly(over, limit_ns, sink)
+    return ends, of_world, of_cloud
+
+
+def test_a_silent_downlink_freezes_the_reference_until_the_echo_is_back():
+    """With an integral and `commanded_velocity`, which would both drift off."""
+    _, _, of_cloud = fly_records(
+        *PATIENCE,
+        "cloud.predictor=commanded_velocity",
+        "cloud.controller={name: pid, gain_i: [0.1, 0.1, 0.1], speed_max: 2}",
+        "link.downlink.blackouts=[{start_s: 11.3, duration_s: 20}]",
+    )
+    control = [r for r in of_cloud if isinstance(r, Control)]
+    silent = [r for r in control if 12.5e9 < r.stamp_ns < 31.3e9]
+    assert len(silent) > 1800
+    assert {r.command for r in silent} == {(0.0, 0.0, 0.0)}
+    before = [r for r in control if 11.0e9 < r.stamp_ns < 11.3e9][-1]
+    after = next(r for r in control if r.stamp_ns > 31.3e9 and any(r.command))
+    assert max(abs(a - b) for a, b in zip(after.integral, before.integral, strict=True)) < 0.1
+    assert [r for r in of_cloud if isinstance(r, MissionEvent)][-1].event == "done"
+
+
+def test_a_downlink_that_never_comes_back_lands_and_the_run_still_ends():
+    ends, of_world, _ = fly_records(
+        "link.downlink.blackouts=[{start_s: 11.3, duration_s: 1000}]", "guard.hold_max_s=20"
+    )
+    changes = [r for r in of_world if isinstance(r, GuardChange)]
+    assert [r.state for r in changes[-3:]] == [GuardState.HOLD, GuardState.LAND, GuardState.LAND]
+    assert changes[-1].cause == "touched down, rotors stopped"
+    assert ends.cloud.teleop.outcome.code == "guard_stopped"
+    assert ends.run.now_ns < 100e9
+
+
+def test_a_flight_without_faults_never_meets_the_fence():
+    ends, _, _ = fly_records()
+    assert dict(ends.world.robot.guard.counts) == {}

@@ -1,0 +1,82 @@
+"""What the operator says reaches the guard on board, and only what it acts on is confirmed."""
+
+import pytest
+from talking import MS, talking
+
+from cloudrc.messages import GuardState, Request, Start
+from cloudrc.records import CommandApplied, GuardChange, SessionOpened, TelemetrySent
+
+
+@pytest.fixture
+def talk():
+    """Flying; the request to start was number 1."""
+    talk = talking()
+    fly(talk, 10)
+    return talk
+
+
+def fly(talk, count):
+    for _ in range(count):
+        talk.send(talk.command())
+        talk.wait(talk.now_ns + 10 * MS)
+
+
+def ask(talk, number, request, start=Start.HERE):
+    talk.request(number, request, start)
+    talk.wait(talk.now_ns + 20 * MS)
+    telemetry = talk.take(TelemetrySent)[-1].telemetry
+    return telemetry.guard, telemetry.mission
+
+
+def test_an_emergency_stop_acts_at_the_next_tick(talk):
+    assert ask(talk, 2, Request.ESTOP) == (GuardState.ESTOP, 2)
+    assert talk.take(GuardChange)[-1].cause == "emergency stop"
+
+
+@pytest.mark.promise("P-GUARD-4")
+@pytest.mark.parametrize("start", Start)
+def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
+    ask(talk, 2, Request.ESTOP)
+    sessions = len(talk.take(SessionOpened))
+    assert ask(talk, 3, Request.START, start) == (GuardState.ESTOP, 2)
+    assert len(talk.take(SessionOpened)) == sessions
+    assert talk.counts()["start_refused"] == 1
+    assert ask(talk, 4, Request.ACKNOWLEDGE) == (GuardState.GROUND, 4)
+    assert ask(talk, 3, Request.START, start) == (GuardState.GROUND, 4)  # a late copy
+    fly(talk, 5)
+    assert talk.take(GuardChange)[-1].state is GuardState.GROUND
+    assert ask(talk, 5, Request.START)[1] == 5
+    fly(talk, 5)
+    assert talk.take(GuardChange)[-1].state is GuardState.TRACK
+
+
+def test_the_end_of_a_mission_is_confirmed_even_while_latched(talk):
+    ask(talk, 2, Request.ESTOP)
+    assert ask(talk, 3, Request.END) == (GuardState.ESTOP, 3)
+
+
+def test_in_hold_commands_are_heard_but_neither_flown_nor_echoed(talk):
+    talk.wait(talk.now_ns + 2_000 * MS)
+    applied = len(talk.take(CommandApplied))
+    echo_ns = talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns
+    fly(talk, 9)
+    assert talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns == echo_ns
+    fly(talk, 1)
+    assert len(talk.take(CommandApplied)) == applied + 1
+    assert talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns > echo_ns
+
+
+def test_what_was_limited_is_counted(talk):
+    for _ in range(10):
+        talk.send(talk.command((0.0, 0.0, 9.0)))
+        talk.wait(talk.now_ns + 10 * MS)
+    assert talk.counts()["limited_speed"] == 10
+
+
+def test_only_a_hold_within_a_mission_is_counted_as_held(talk):
+    talk.wait(talk.now_ns + 4_000 * MS)
+    held = talk.counts()["held_seconds"]
+    assert 4 <= held <= 5
+    ask(talk, 2, Request.END)
+    talk.wait(talk.now_ns + 4_000 * MS)
+    assert talk.counts()["held_seconds"] == held

@@ -1,0 +1,132 @@
+"""Runs plain Python on all 64-bit floats at once: branches are explored, z3 answers.
+
+A `Symbol` stands for any float. Where the code under test compares, the run forks: each run takes
+one way, and what was found true on it is its path. Comparisons, sums, products and negation are
+those of IEEE 754, bit for bit. Division and square root take z3 minutes; they are replaced by what
+correct rounding promises of them, which is enough for bounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import z3
+
+DOUBLE, ROUND = z3.Float64(), z3.RNE()
+
+
+class Symbol:
+    """Any float that fulfils the path so far."""
+
+    def __init__(self, run: Run, term: z3.FPRef) -> None:
+        self.run, self.term = run, term
+
+    def _with(self, other: Symbol | float) -> z3.FPRef:
+        return other.term if isinstance(other, Symbol) else z3.FPVal(other, DOUBLE)
+
+    def _new(self, term: z3.FPRef) -> Symbol:
+        return Symbol(self.run, term)
+
+    def __neg__(self):
+        return self._new(z3.fpNeg(self.term))
+
+    def __add__(self, other):
+        return self._new(z3.fpAdd(ROUND, self.term, self._with(other)))
+
+    __radd__ = __add__
+
+    def __sub__(self, other):
+        return self._new(z3.fpSub(ROUND, self.term, self._with(other)))
+
+    def __rsub__(self, other):
+        return self._new(z3.fpSub(ROUND, self._with(other), self.term))
+
+    def __mul__(self, other):
+        return self._new(z3.fpMul(ROUND, self.term, self._with(other)))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other):
+        """Of n >= 0 by d > 0: a float >= 0, not NaN; finite if n is finite and d at least 0.1."""
+        n, d, q = self.term, self._with(other), self.run.fresh("quotient").term
+        self.run.prove(z3.And(n >= 0.0, d >= 0.1, z3.Not(z3.fpIsInf(n)), z3.Not(z3.fpIsInf(d))))
+        bound = z3.FPVal(1e300, DOUBLE)
+        self.run.prove(n <= 1e299)
+        self.run.learn(z3.And(q >= 0.0, q <= bound))
+        return self._new(q)
+
+    def __lt__(self, other):
+        return self.run.take(z3.fpLT(self.term, self._with(other)))
+
+    def __le__(self, other):
+        return self.run.take(z3.fpLEQ(self.term, self._with(other)))
+
+    def __gt__(self, other):
+        return self.run.take(z3.fpGT(self.term, self._with(other)))
+
+    def __ge__(self, other):
+        return self.run.take(z3.fpGEQ(self.term, self._with(other)))
+
+
+class Run:
+    """One way through the code."""
+
+    def __init__(self, decisions: list[bool]) -> None:
+        self.decisions, self.taken = decisions, 0
+        self.path: list[z3.BoolRef] = []
+        self.names = 0
+
+    def fresh(self, name: str) -> Symbol:
+        """A float of which nothing is known."""
+        self.names += 1
+        return Symbol(self, z3.FP(f"{name}_{self.names}", DOUBLE))
+
+    def learn(self, fact: z3.BoolRef) -> None:
+        """From here on it is so."""
+        self.path.append(fact)
+
+    def take(self, condition: z3.BoolRef) -> bool:
+        """Which way this run goes; the other one is for another run."""
+        if self.taken == len(self.decisions):
+            self.decisions.append(True)
+        decision = self.decisions[self.taken]
+        self.taken += 1
+        self.learn(condition if decision else z3.Not(condition))
+        return decision
+
+    def prove(self, claim: z3.BoolRef) -> None:
+        """Fail with a counterexample, if there is one on this path."""
+        solver = z3.Solver()
+        solver.add(*self.path, z3.Not(claim))
+        answer = solver.check()
+        assert answer == z3.unsat, f"{answer}: {solver.model() if answer == z3.sat else claim}"
+
+    def is_possible(self) -> bool:
+        """Whether any float goes this way."""
+        solver = z3.Solver()
+        solver.add(*self.path)
+        return solver.check() != z3.unsat
+
+
+def root(x: Symbol) -> Symbol:
+    """Of x >= 0, finite: a float >= 0, finite."""
+    x.run.prove(z3.And(x.term >= 0.0, z3.Not(z3.fpIsInf(x.term))))
+    r = x.run.fresh("root")
+    x.run.learn(z3.And(r.term >= 0.0, r.term <= 1.5e154))
+    return r
+
+
+def everywhere(check: Callable[[Run], None]) -> int:
+    """Run `check` on every path; returns how many are possible."""
+    decisions: list[bool] = []
+    paths = 0
+    while True:
+        run = Run(decisions)
+        check(run)
+        paths += run.is_possible()
+        del decisions[run.taken :]
+        while decisions and not decisions[-1]:
+            decisions.pop()
+        if not decisions:
+            return paths
+        decisions[-1] = False

@@ -1,0 +1,171 @@
+"""The guard with a robot under it: it brakes, holds, lands, stops, and meets a hostile cloud."""
+
+from math import dist, hypot, nan
+from random import Random
+
+import pytest
+from guard_play import LIMITS, MS, SECOND
+
+from cloudrc.geometry import fence
+from cloudrc.messages import Command, GuardState
+from cloudrc.world.guard import Guard
+from cloudrc.world.low_level import LowLevel
+from cloudrc.world.robot import Robot
+from cloudrc.world.simulator import Simulator
+
+PERIOD_NS = 10 * MS
+UP = (0.0, 0.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    return Simulator("pelican", "empty")
+
+
+class Flight:
+    """A robot in free air, commanded at 100 Hz."""
+
+    def __init__(self, simulator):
+        self.guard = Guard(LIMITS)
+        self.robot = Robot(simulator, LowLevel(), self.guard)
+        self.robot.put_on_ground(0, "test")
+        self.guard.start_mission(0)
+        self.now_ns = 0
+        self.room = 9.0  # smallest distance to a wall or the ceiling [m]
+
+    @property
+    def readings(self):
+        return self.robot.simulator.readings
+
+    @property
+    def speed(self):
+        return hypot(*self.readings.velocity)
+
+    def fly(self, seconds, policy=None):
+        """Go on; a policy gives the command, None is silence."""
+        for _ in range(round(seconds * SECOND / PERIOD_NS)):
+            if policy is not None:
+                velocity = policy(self) if callable(policy) else policy
+                self.guard.offer(Command(0, self.now_ns, 0, velocity, 0.0), self.now_ns)
+            self.robot.run(self.now_ns, self.now_ns + PERIOD_NS)
+            self.now_ns += PERIOD_NS
+            x, y, z = self.readings.position
+            (ax, ay, _), (bx, by, bz) = fence.LOW, fence.HIGH
+            self.room = min(self.room, x - ax, bx - x, y - ay, by - y, bz - z)
+        return self
+
+
+@pytest.fixture
+def flight(simulator):
+    """At 1.5 m, at rest."""
+    flight = Flight(simulator)
+    flight.fly(1.5, UP)
+    return flight.fly(2.0, (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "velocity", [(1.5, 0.0, 0.0), (-1.5, 0.0, 0.0), (0.0, 1.5, 0.0), (0.0, -1.0, 0.3)]
+)
+def test_a_robot_that_is_left_alone_stops_and_stays(flight, velocity):
+    flight.fly(1.2, velocity)
+    flight.fly(0.26)
+    assert flight.guard.state is GuardState.HOLD
+    flight.fly(1.0)
+    still = flight.readings.position
+    for _ in range(58):
+        flight.fly(1.0)
+        assert flight.speed < 0.05
+        assert dist(flight.readings.position, still) < 0.10
+
+
+def test_a_minute_later_it_goes_down_slowly_and_stops_its_rotors(flight):
+    flight.fly(60.5)
+    assert flight.guard.state is GuardState.LAND
+    start = flight.readings.position
+    speeds = []
+    while flight.guard.tick(flight.now_ns, flight.readings, 0.0) is not None:
+        flight.fly(0.1)
+        speeds.append(-flight.readings.velocity[2])
+        assert len(speeds) < 80
+    assert max(speeds) < 0.65
+    x, y, z = flight.readings.position
+    assert z == pytest.approx(0.1, abs=0.01)
+    assert hypot(x - start[0], y - start[1]) < 0.10
+    flight.fly(1.0)
+    assert set(flight.robot.simulator._rotors.speeds) < {0.0} or flight.speed < 0.01
+
+
+def test_five_impossible_commands_bring_it_down_from_full_speed(flight):
+    flight.fly(0.6, (0.0, -3.0, 0.0))
+    flight.fly(0.05, (nan, 0.0, 0.0))
+    assert flight.guard.state is GuardState.LAND
+    flight.fly(6.0, (3.0, 0.0, 3.0))
+    assert flight.readings.position[2] == pytest.approx(0.1, abs=0.01)
+    assert flight.speed < 0.01
+
+
+def test_an_emergency_stop_lets_it_fall(flight):
+    flight.guard.stop(flight.now_ns)
+    flight.fly(0.3, UP)
+    assert flight.readings.velocity[2] < -2.0
+    flight.fly(3.0, UP)
+    assert flight.readings.position[2] < 0.3
+
+
+def test_after_an_acknowledged_stop_it_takes_off_again_from_where_it_is(flight):
+    flight.fly(1.5, (0.0, 0.0, -0.8))
+    flight.guard.stop(flight.now_ns)
+    flight.fly(2.0)
+    flight.guard.acknowledge(flight.now_ns)
+    flight.guard.start_mission(flight.now_ns)
+    flight.fly(1.5, UP)
+    assert flight.readings.position[2] > 0.8
+    assert flight.guard.state is GuardState.TRACK
+
+
+# A cloud that does its worst. The robot is at most 6 m/s fast, and its base stays in the box.
+
+FACES = [(9.0, 0.0, 0.0), (-9.0, 0.0, 0.0), (0.0, 9.0, 0.0), (0.0, -9.0, 0.0), (0.0, 0.0, 9.0)]
+
+
+@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.parametrize("velocity", [*FACES, (0.0, 0.0, -9.0), (5.0, -5.0, 5.0), (-5.0,) * 3])
+def test_full_speed_at_a_face_ends_before_it(flight, velocity):
+    flight.fly(8.0, velocity)
+    assert flight.room > 0.1
+    assert flight.readings.position[2] > 0.25
+    assert flight.guard.counts["limited_fence"] > 0
+
+
+def hostile(seed):
+    """Jumps between extremes, at random instants."""
+    rng, until_ns, velocity = Random(seed), 0, UP
+
+    def policy(flight):
+        nonlocal until_ns, velocity
+        if flight.now_ns >= until_ns:
+            until_ns = flight.now_ns + rng.choice((20, 50, 200, 500, 1000, 3000)) * MS
+            velocity = tuple(rng.choice((-9.0, -3.0, 0.0, 3.0, 9.0)) for _ in range(3))
+        return velocity
+
+    return policy
+
+
+def check_hostile(simulator, seed):
+    flight = Flight(simulator)
+    flight.fly(1.0, UP)
+    flight.fly(59.0, hostile(seed))
+    assert flight.room > 0.0
+    assert flight.readings.position[2] > 0.2
+
+
+@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.parametrize("seed", range(3))
+def test_a_hostile_cloud_does_not_get_it_out_of_the_fence(simulator, seed):
+    check_hostile(simulator, seed)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(3, 203))
+def test_two_hundred_hostile_clouds_do_not_get_it_out_of_the_fence(simulator, seed):
+    check_hostile(simulator, seed)

@@ -1,0 +1,90 @@
+"""The limits of the guard: none can be switched off, in the file or in code."""
+
+from dataclasses import fields
+from math import inf, nan
+
+import pytest
+from guard_play import LIMITS
+
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.world.guard_limits import Limits
+from cloudrc.world.guard_rules import FLOOR_MARGIN, MARGIN
+
+NUMBERS = [field.name for field in fields(Limits) if not field.name.startswith("fence")]
+
+
+def limits(**values):
+    return Limits(LIMITS.fence_low, LIMITS.fence_high, **values)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("value", [0, 0.0, -1, inf, -inf, nan])
+def test_a_limit_that_limits_nothing_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"guard: {name} is"):
+        limits(**{name: value})
+
+
+def test_a_command_may_not_be_older_than_ten_seconds():
+    with pytest.raises(ValueError, match="above 10 s"):
+        limits(command_age_max_ns=10_000_000_001, speed_max=0.5)
+    limits(command_age_max_ns=10_000_000_000, speed_max=0.5)
+
+
+@pytest.mark.parametrize(("age_ms", "fastest"), [(250, 6.0), (400, 5.645805), (800, 4.823043)])
+def test_a_speed_that_cannot_be_stopped_from_in_time_is_refused(age_ms, fastest):
+    # v (T + 0.2) + v^2 / 6 = 8.7 m, solved by hand.
+    limits(command_age_max_ns=age_ms * 1_000_000, speed_max=fastest)
+    with pytest.raises(ValueError, match="speed_max"):
+        limits(command_age_max_ns=age_ms * 1_000_000, speed_max=fastest + 1e-3)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("high", [-inf, inf, nan, -9.0, -8.5])
+def test_a_fence_without_room_is_refused(axis, high):
+    low, corner = [-9.0] * 3, [9.0] * 3
+    corner[axis] = high
+    with pytest.raises(ValueError, match="leaves no room"):
+        Limits(tuple(low), tuple(corner))
+
+
+def test_a_fence_as_thick_as_its_margins_has_no_room():
+    thin = FLOOR_MARGIN + MARGIN
+    with pytest.raises(ValueError, match="leaves no room"):
+        Limits((0.0, 0.0, 0.0), (5.0, 5.0, thin))
+    Limits((0.0, 0.0, 0.0), (5.0, 5.0, thin + 0.01))
+
+
+@pytest.mark.parametrize("low", [(0.0, 0.0), (0.0, 0.0, 0.0, 0.0)])
+def test_a_fence_has_three_axes(low):
+    with pytest.raises(ValueError, match="zip"):
+        Limits(low, (5.0, 5.0, 5.0))
+
+
+def test_inside_the_fence_are_its_margins():
+    low, high = Limits((0.0, 10.0, 20.0), (5.0, 15.0, 25.0)).inside()
+    assert low == pytest.approx((0.2, 10.2, 20.35))
+    assert high == pytest.approx((4.8, 14.8, 24.8))
+
+
+KEYS = (
+    "command_age_max_ms",
+    "speed_max_mps",
+    "acceleration_max_mps2",
+    "yaw_rate_max_radps",
+    "hold_max_s",
+)
+
+
+@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("value", ["0", "-1", ".inf", ".nan"])
+def test_the_file_refuses_it_too_and_names_the_key(key, value):
+    with pytest.raises(BadInputError, match=rf"guard\.{key}"):
+        load_experiment("paper", [f"guard.{key}={value}"])
+
+
+def test_the_file_refuses_a_speed_or_an_age_beyond_the_stop_rule():
+    with pytest.raises(BadInputError, match=r"guard\.speed_max_mps: at most 6 m/s can be stopped"):
+        load_experiment("paper", ["guard.speed_max_mps=6.5"])
+    with pytest.raises(BadInputError, match="command_age_max_ms"):
+        load_experiment("paper", ["guard.command_age_max_ms=10001"])

@@ -1,0 +1,95 @@
+"""The guard's comparisons and clamps, proven for all 64-bit floats, NaN and infinities included."""
+
+import pytest
+import z3
+from symbolic import everywhere, root
+
+from cloudrc.world import guard_rest
+from cloudrc.world import guard_rules as rules
+
+
+@pytest.fixture(autouse=True)
+def abstract_root(monkeypatch):
+    monkeypatch.setattr(rules, "sqrt", root)
+
+
+def is_finite(term):
+    return z3.Not(z3.Or(z3.fpIsNaN(term), z3.fpIsInf(term)))
+
+
+def test_within_answers_from_its_interval_whatever_comes_in():
+    def check(run):
+        value, low, high = (run.fresh(name) for name in ("value", "low", "high"))
+        run.learn(z3.And(is_finite(low.term), is_finite(high.term), low.term <= high.term))
+        answer = rules.within(value, low, high)
+        run.prove(z3.And(answer.term >= low.term, answer.term <= high.term))
+
+    assert everywhere(check) == 3
+
+
+def test_within_changes_nothing_inside_its_interval():
+    def check(run):
+        value = run.fresh("value")
+        run.learn(z3.And(value.term > -1.0, value.term < 1.0))
+        run.prove(z3.fpEQ(lift(run, rules.within(value, -1.0, 1.0)).term, value.term))
+
+    everywhere(check)
+
+
+@pytest.mark.parametrize("caution", [rules.CAUTION, rules.REACTION])
+def test_an_approach_is_never_below_the_way_back_and_never_not_a_number(caution):
+    def check(run):
+        reach = run.fresh("reach")
+        answer = rules.approach(reach, caution)
+        term = answer.term if hasattr(answer, "term") else z3.FPVal(answer, z3.Float64())
+        run.prove(term >= -rules.COME_BACK_MAX)
+        # Outside or at the face never outwards; inside never back.
+        run.prove(z3.Implies(reach.term <= 0.0, term <= 0.0))
+        run.prove(z3.Implies(reach.term > 0.0, term >= 0.0))
+
+    assert everywhere(check) >= 4
+
+
+def test_an_axis_at_the_fence_is_finite_and_no_faster_than_commanded():
+    """One axis of `fenced`, any finite command; of `approach` only what is proven above is used."""
+
+    def check(run):
+        v, up, down = (run.fresh(name) for name in ("v", "up", "down"))
+        run.learn(is_finite(v.term))
+        run.learn(z3.And(up.term >= -rules.COME_BACK_MAX, down.term >= -rules.COME_BACK_MAX))
+        term = rules.within(v, -down, up).term
+        bound = z3.fpMax(z3.fpAbs(v.term), z3.FPVal(rules.COME_BACK_MAX, z3.Float64()))
+        run.prove(z3.And(is_finite(term), z3.fpAbs(term) <= bound))
+
+    assert everywhere(check) == 3
+
+
+def test_what_grows_is_no_more_than_what_there_is():
+    """So what is held back keeps its sign, and is never faster than what was asked for."""
+
+    def check(run):
+        before, after = run.fresh("before"), run.fresh("after")
+        run.learn(z3.And(is_finite(before.term), is_finite(after.term)))
+        grown = lift(run, rules.growth(before, after)).term
+        run.prove(z3.And(grown >= 0.0, grown <= z3.fpAbs(after.term)))
+
+    assert everywhere(check) >= 6
+
+
+def test_the_rate_of_braking_is_inside_its_range_whatever_comes_in():
+    def check(run):
+        speed = run.fresh("speed")
+        run.learn(z3.And(speed.term >= 0.0, speed.term <= 1e200))
+        rate = lift(run, guard_rest.brake_rate(speed)).term
+        run.prove(z3.And(rate >= guard_rest.GENTLEST, rate <= guard_rest.HARDEST))
+
+    everywhere(check)
+
+
+def lift(run, value):
+    """A number as a symbol."""
+    if isinstance(value, float | int):
+        symbol = run.fresh("constant")
+        run.learn(z3.fpEQ(symbol.term, z3.FPVal(value, z3.Float64())))
+        return symbol
+    return value
