@@ -33,9 +33,9 @@ class GuardState(IntEnum):
     HOLD = 2
     """No fresh command: brake, then hold the position with onboard sensing alone."""
     LAND = 3
-    """Reserved: slow descent after a long HOLD."""
+    """Slow descent, rotors stopped once it has touched down; latched until acknowledged."""
     ESTOP = 4
-    """Reserved: rotors stopped at once, latched."""
+    """Rotors stopped at once; latched until acknowledged."""
 
 
 class Start(IntEnum):
@@ -54,6 +54,12 @@ class Request(IntEnum):
     """Begin the mission: arm."""
     END = 1
     """The mission is over: hold locally until the next one starts."""
+    ESTOP = 2
+    """Stop the rotors at once, whatever the robot does; latched until acknowledged."""
+    ACKNOWLEDGE = 3
+    """The operator has seen why the robot lands or was stopped, and releases it; arms nothing."""
+    PROGRESS = 4
+    """Keep in mind how far the mission is, for a cloud that forgets: no number, no effect else."""
 
 
 class Odometry(NamedTuple):
@@ -89,6 +95,8 @@ class Telemetry(NamedTuple):
         pipe_contacts: How often the robot has begun to touch a pipe in this mission.
         touch_speed: Of the tip when it first touched the board in this mission [m/s]; NaN if it has
             not yet.
+        mission_id: The mission started last, as OperatorRequest named it; 0 if none.
+        reached: How many of its waypoints world has been told are reached, or `MISSION_OVER`.
     """
 
     stamp_ns: int
@@ -101,6 +109,8 @@ class Telemetry(NamedTuple):
     guard: GuardState
     pipe_contacts: int = 0
     touch_speed: float = nan
+    mission_id: int = 0
+    reached: int = 0
 
 
 class Command(NamedTuple):
@@ -121,6 +131,10 @@ class Command(NamedTuple):
     yaw_rate: float
 
 
+MISSION_OVER = 0xFFFF
+"""In place of a number of waypoints reached: more than any mission has."""
+
+
 class OperatorRequest(NamedTuple):
     """What the operator asks of the robot itself; repeated until telemetry shows its number.
 
@@ -128,11 +142,15 @@ class OperatorRequest(NamedTuple):
         number: Rises by one with every request of a session's operator, from 1.
         request: What is asked.
         start: Where the mission starts from; only read with Request.START.
+        mission_id: Names the mission, below 2^63.
+        reached: How many of its waypoints are reached; `MISSION_OVER` if it has ended before that.
     """
 
     number: int
     request: Request
     start: Start = Start.SPAWN
+    mission_id: int = 0
+    reached: int = 0
 
 
 class Setpoint(NamedTuple):

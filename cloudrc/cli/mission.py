@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import place_arguments, timeout_argument
+from cloudrc.cli.mission_here import run_argument, url_here
+from cloudrc.cli.output import output_argument
+from cloudrc.cli.token import reader, token_argument, token_file
 
-KUBECTL_PLUGIN = "kubectl-cloudrc"
-"""What this program is called when kubectl starts it."""
-CONNECT_LIMIT = 1.0
-"""For the API of a run on this machine to take a connection [s]."""
+if TYPE_CHECKING:
+    from cloudrc.cli.mission_http import Api
+
 EPILOG = """\
 where:
-  a run that flies here ('cloudrc run --mode local'): found by itself, or by
-  --api, whose URL is in the api.json of the run's folder
+  a run that flies here ('cloudrc run --mode local'): found by itself, that of
+  ./runs/latest first, or by --run, its folder, or by --api
   a release in a cluster: with --context, -n or --release, if none flies here,
   and always as 'kubectl cloudrc mission'
 
@@ -24,11 +25,16 @@ examples:
   cloudrc mission run pipes
   cloudrc mission hold
   cloudrc mission goto 0.5 0 1.2
+  cloudrc mission estop
   cloudrc mission run my.yaml --queue --context kind-cloudrc -n demo
   cloudrc mission logs --follow
 
 A mission is a file with 'waypoints', such as those that 'cloudrc list missions'
-names. 'run' and 'fly' end with its verdict: 0 done, 1 failed, 6 not real time."""
+names. 'run' and 'fly' end with its verdict: 0 done, 1 failed, 6 not real time.
+'estop' stops the rotors at once, whatever flies, and lets the robot fall; that
+and a landing after a lost link are left by 'acknowledge'. An API that is called
+over a network asks for a token: --token-file, CLOUDRC_TOKEN_FILE, or for a
+release of the chart its Secret, read with your own rights in the cluster."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,8 +50,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
             allow_abbrev=False,
         )
         verb.add_argument("--debug", action="store_true", default=argparse.SUPPRESS)
-        verb.add_argument("--api", metavar="URL", help="API of a run or release: http://HOST:PORT")
+        verb.add_argument(
+            "--api", metavar="URL", help="http://HOST:PORT or unix:PATH of a run or release"
+        )
+        token_argument(verb)
         if name != "fly":
+            run_argument(verb)
             place_arguments(verb)
         return verb
 
@@ -56,9 +66,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     for name in ("list", "status"):
         line = {"list": "all missions", "status": "how things are, or how one mission is"}[name]
         shown = add(name, line)
-        shown.add_argument(
-            "-o", "--output", choices=("table", "json"), default="table", help="default: table"
-        )
+        output_argument(shown)
     shown.add_argument("id", nargs="?", metavar="ID", help="of a mission (in a cluster: of a Job)")
     cancel = add("cancel", "end a mission; the robot holds")
     cancel.add_argument("id", nargs="?", metavar="ID", help="default: the one under way")
@@ -70,6 +78,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         goto.add_argument(axis.lower(), type=float, metavar=axis, help="[m], world frame")
     add("hold", "stop the robot where it is")
     add("resume", "go on with the mission that is held")
+    add("estop", "stop the rotors at once: the robot falls, and its mission has failed")
+    add("acknowledge", "release a robot that was stopped or has landed; arms nothing")
     fly = add("fly", "what a mission's Job runs: post, follow, end with the verdict")
     fly.add_argument("--mission", required=True, metavar="FILE", help="the mission")
     fly.add_argument("--key", default="", help="posting twice under one key flies once")
@@ -80,47 +90,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Do what the verb says."""
     from cloudrc.cli import mission_cluster, mission_local
+    from cloudrc.cli.mission_http import Api
 
     verb: str = options.verb
     if verb == "fly":
         return mission_local.fly(options)
-    url = options.api or _url_here(options)
+    url = options.api or url_here(options)
     if url is None and verb in mission_cluster.VERBS:
         in_cluster: Callable[[argparse.Namespace], int] = mission_cluster.VERBS[verb]
         return in_cluster(options)
+    of_api: Callable[[argparse.Namespace, Api], int] = mission_local.VERBS[verb]
     if url is None:
-        with mission_cluster.api_url(options) as forwarded:
-            return mission_local.VERBS[verb](options, forwarded)
-    return mission_local.VERBS[verb](options, url)
-
-
-def _url_here(options: argparse.Namespace) -> str | None:
-    """Find the API of the run that flies here, unless a cluster is meant."""
-    import json
-
-    from cloudrc.cli.folder import RUNS
-    from cloudrc.drivers.local import API_FILE
-
-    plugin = Path(sys.argv[0]).name.startswith(KUBECTL_PLUGIN)
-    if plugin or options.context or options.namespace or options.release:
-        return None
-    try:
-        url = str(json.loads((RUNS / "latest" / API_FILE).read_text(encoding="utf-8"))["url"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return None if _is_gone(url) else url
-
-
-def _is_gone(url: str) -> bool:
-    """Say whether nobody listens: a run that was killed leaves its file behind."""
-    import socket
-    from urllib.parse import urlsplit
-
-    try:
-        parts = urlsplit(url)
-        socket.create_connection((parts.hostname or "", parts.port or 0), CONNECT_LIMIT).close()
-    except ConnectionRefusedError:
-        return True
-    except (OSError, ValueError):
-        return False  # whatever it is, the verb itself says it better
-    return False
+        with mission_cluster.api(options) as forwarded:
+            return of_api(options, forwarded)
+    return of_api(options, Api(url, reader(token_file(options))))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,8 +12,10 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.cluster_flags import place
 from cloudrc.cli.extras import require
 from cloudrc.cli.mission_check import check_on, parse
+from cloudrc.cli.mission_http import Api
 from cloudrc.cli.mission_local import read_mission
-from cloudrc.cli.output import table
+from cloudrc.cli.output import table, written
+from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 if TYPE_CHECKING:
@@ -23,13 +24,15 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def api_url(options: argparse.Namespace) -> Iterator[str]:
+def api(options: argparse.Namespace) -> Iterator[Api]:
     """Open the way to a release's API for as long as the block lasts."""
-    release = _place(options)
-    from cloudrc.cluster.forward import api_url as forwarded
+    release, path = _place(options), token_file(options)
+    from cloudrc.cluster.forward import api_url
+    from cloudrc.cluster.tokens import operator_token
 
-    with forwarded(release.context, release.namespace, release.name) as url:
-        yield url
+    token = operator_token(release) if path is None else ""
+    with api_url(release.context, release.namespace, release.name) as url:
+        yield Api(url, reader(path) if path else lambda: token)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -65,8 +68,8 @@ def _list(options: argparse.Namespace) -> int:
     from cloudrc.cluster.jobs import list_jobs
 
     jobs = list_jobs(release)
-    if options.output == "json":
-        return _print_json([asdict(job) for job in jobs])
+    if options.output != "table":
+        return _print([asdict(job) for job in jobs], options.output)
     if not jobs:
         print(f"no missions {release.where}; fly one: cloudrc mission run FILE")
         return 0
@@ -78,14 +81,14 @@ def _status(options: argparse.Namespace) -> int:
     if options.id is None:
         from cloudrc.cli.mission_local import VERBS as OF_API
 
-        with api_url(options) as url:
-            return OF_API["status"](options, url)
+        with api(options) as of_release:
+            return OF_API["status"](options, of_release)
     release = _place(options)
     from cloudrc.cluster.jobs import read_job
 
     job = read_job(release, options.id)
-    if options.output == "json":
-        return _print_json([asdict(job)])
+    if options.output != "table":
+        return _print([asdict(job)], options.output)
     print(table([_row(job)]))
     return 0
 
@@ -94,12 +97,13 @@ def _cancel(options: argparse.Namespace) -> int:
     if options.id is None:
         from cloudrc.cli.mission_local import VERBS as OF_API
 
-        with api_url(options) as url:
-            return OF_API["cancel"](options, url)
+        with api(options) as of_release:
+            return OF_API["cancel"](options, of_release)
     release = _place(options)
     from cloudrc.cluster.cancel import cancel
 
-    print(cancel(release, options.id))
+    path = token_file(options)
+    print(cancel(release, options.id, reader(path)() if path else None))
     return 0
 
 
@@ -139,7 +143,7 @@ def _place(options: argparse.Namespace) -> Release:
         if options.context or options.namespace:
             raise
         raise MissingPrerequisiteError(
-            f"no run flies here (start one: cloudrc run), and {error}"
+            f"no run flies here (start one: cloudrc run; or name one: --run, --api), and {error}"
         ) from None
 
 
@@ -147,8 +151,8 @@ def _row(job: JobStatus) -> tuple[str, ...]:
     return job.name, job.state, job.created, job.message
 
 
-def _print_json(jobs: list[dict[str, object]]) -> int:
-    print(json.dumps({"schemaVersion": 1, "jobs": jobs}, indent=2))
+def _print(jobs: list[dict[str, object]], form: str) -> int:
+    print(written({"schemaVersion": 1, "jobs": jobs}, form))
     return 0
 
 

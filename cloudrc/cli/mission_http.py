@@ -1,12 +1,18 @@
-"""The client of teleop's API: paths come in, JSON goes out, and errors become one sentence."""
+"""The client of teleop's API: paths come in, JSON goes out, and errors become one sentence.
+
+The API is at http://HOST:PORT, where every request carries a token, or at unix:PATH, a socket file
+that its owner alone can open.
+"""
 
 from __future__ import annotations
 
+import http.client
 import json
-import urllib.error
-import urllib.request
-from collections.abc import Iterator, Mapping
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from cloudrc.errors import BadInputError, CloudrcError
 
@@ -14,6 +20,9 @@ ANSWER_LIMIT = 10.0
 """For the API to answer one request [s]."""
 STREAM_LIMIT = 30.0
 """Without a word from a stream it is dead [s]; alive it says something every 10 s."""
+LATER = (408, 429, 502, 503, 504)
+"""What is worth another try."""
+UNIX = "unix:"
 
 
 class ApiError(CloudrcError):
@@ -29,36 +38,35 @@ class UnreachableError(ApiError):
 class Api:
     """Teleop's API at one address."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, token: Callable[[], str] = lambda: "") -> None:
         """Ask nothing yet.
 
         Args:
-            url: "http://HOST:PORT".
+            url: "http://HOST:PORT" or "unix:PATH".
+            token: Asked with every request, since a token may change; "" for none.
 
         Raises:
             BadInputError: If it is no such address.
         """
-        if not url.startswith(("http://", "https://")):
-            raise BadInputError(f"--api {url}: give http://HOST:PORT")
-        self.url = url.rstrip("/")
-        # The API is next door or in the cluster: no proxy leads there.
-        self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+        self.url, self._token = url.rstrip("/"), token
+        parts = urlsplit(self.url)
+        valid = parts.scheme in ("http", "https") and parts.hostname and not parts.username
+        if not (valid or (url.startswith(UNIX) and len(url) > len(UNIX))):
+            raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH")
 
     def get(self, path: str) -> Any:
         """Ask for something; raises as `post`."""
-        return self._ask(urllib.request.Request(self.url + path))
+        return self._ask("GET", path)
 
     def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
         """Ask for something to be done.
 
         Raises:
-            UnreachableError: If nobody answers, or teleop is not ready.
+            UnreachableError: If nobody answers, or teleop is not ready or busy.
             BadInputError: If a value cannot be used.
             ApiError: If it is refused.
         """
-        data = b"" if body is None else json.dumps(body).encode()
-        headers = {"Content-Type": "application/json"}
-        return self._ask(urllib.request.Request(self.url + path, data, headers, method="POST"))
+        return self._ask("POST", path, b"" if body is None else json.dumps(body).encode())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
         """Give events as they happen, from the one after this number; ends when teleop ends.
@@ -66,44 +74,80 @@ class Api:
         Raises:
             UnreachableError: If the stream breaks off.
         """
-        request = urllib.request.Request(f"{self.url}/v1/events?after={after}")
-        with self._open(request, STREAM_LIMIT) as stream:
-            try:
-                for line in stream:
-                    if line.startswith(b"data: "):
-                        yield json.loads(line.removeprefix(b"data: "))
-            except OSError as error:
-                raise UnreachableError(f"the API at {self.url} broke off: {error}") from error
-
-    def _ask(self, request: urllib.request.Request) -> Any:
-        with self._open(request, ANSWER_LIMIT) as answer:
-            try:
-                return json.loads(answer.read())
-            except (OSError, ValueError) as error:
-                raise UnreachableError(f"no answer from the API at {self.url}: {error}") from error
-
-    def _open(self, request: urllib.request.Request, timeout: float) -> Any:
+        connection, stream = self._open("GET", f"/v1/events?after={after}", None, STREAM_LIMIT)
         try:
-            return self._opener.open(request, timeout=timeout)
-        except urllib.error.HTTPError as error:
-            raise _refusal(error) from None
-        except (urllib.error.URLError, OSError) as error:
-            why = getattr(error, "reason", error)
-            raise UnreachableError(
-                f"the API at {self.url} does not answer ({getattr(why, 'strerror', why) or why})"
-            ) from None
+            for line in stream:
+                if line.startswith(b"data: "):
+                    yield json.loads(line.removeprefix(b"data: "))
+        except (OSError, http.client.HTTPException) as error:
+            raise UnreachableError(f"the API at {self.url} broke off: {error}") from error
+        finally:
+            connection.close()
+
+    def _ask(self, method: str, path: str, body: bytes | None = None) -> Any:
+        connection, answer = self._open(method, path, body, ANSWER_LIMIT)
+        try:
+            return json.loads(answer.read())
+        except (OSError, ValueError, http.client.HTTPException) as error:
+            raise UnreachableError(f"no answer from the API at {self.url}: {error}") from error
+        finally:
+            connection.close()
+
+    def _open(
+        self, method: str, path: str, body: bytes | None, limit: float
+    ) -> tuple[http.client.HTTPConnection, http.client.HTTPResponse]:
+        connection = self._connection(limit)
+        headers = {"Content-Type": "application/json"}
+        token = self._token()
+        if token:
+            headers["Authorization"] = f"Bearer {token}"
+        try:
+            connection.request(method, path, body, headers)
+            answer = connection.getresponse()
+        except (OSError, http.client.HTTPException) as error:
+            connection.close()
+            why = getattr(error, "strerror", None) or error
+            raise UnreachableError(f"the API at {self.url} does not answer ({why})") from None
+        if answer.status >= 400:
+            refusal = _refusal(answer, with_token=bool(token))
+            connection.close()
+            raise refusal
+        return connection, answer
+
+    def _connection(self, limit: float) -> http.client.HTTPConnection:
+        """Not yet open; straight to the API: it is next door or in the cluster, no proxy is."""
+        if self.url.startswith(UNIX):
+            return _UnixConnection(Path(self.url.removeprefix(UNIX)), limit)
+        parts = urlsplit(self.url)
+        secure = parts.scheme == "https"
+        kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
+        return kind(parts.hostname or "", parts.port, timeout=limit)
 
 
-def _refusal(error: urllib.error.HTTPError) -> CloudrcError:
+class _UnixConnection(http.client.HTTPConnection):
+    def __init__(self, path: Path, limit: float) -> None:
+        super().__init__("localhost", timeout=limit)
+        self._path = path
+
+    def connect(self) -> None:
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.sock.settimeout(self.timeout)
+        self.sock.connect(str(self._path))
+
+
+def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcError:
     try:
-        said = json.loads(error.read())
-    except (OSError, ValueError):
+        said = json.loads(answer.read())
+    except (OSError, ValueError, http.client.HTTPException):
         said = {}
-    detail = str(said.get("detail") or f"the API answered {error.code} {error.reason}")
+    detail = str(said.get("detail") or f"the API answered {answer.status} {answer.reason}")
     problems = said.get("problems") or []
     if len(problems) > 1:
         lines = [": ".join(p[k] for k in ("path", "value", "reason") if p[k]) for p in problems]
         detail = "\n  ".join([f"the mission has {len(lines)} problems:", *lines])
-    if error.code in (400, 413, 422):
+    if answer.status in (400, 413, 422):
         return BadInputError(detail)
-    return UnreachableError(detail) if error.code in (502, 503, 504) else ApiError(detail)
+    if answer.status == 401:
+        which = "does not know this token" if with_token else "wants a token"
+        detail = f"the API {which}; name its file: --token-file FILE or CLOUDRC_TOKEN_FILE"
+    return UnreachableError(detail) if answer.status in LATER else ApiError(detail)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import signal
 import sys
 from collections.abc import Callable
@@ -13,7 +12,8 @@ from typing import Any
 
 from cloudrc.cli.mission_follow import Follower, in_words, leave_message
 from cloudrc.cli.mission_http import Api
-from cloudrc.cli.output import table
+from cloudrc.cli.output import table, written
+from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, CloudrcError
 
 INTERRUPTED = 130
@@ -41,7 +41,7 @@ def fly(options: argparse.Namespace) -> int:
     if options.api is None:
         raise BadInputError("fly needs --api; to fly by hand: cloudrc mission run FILE")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    api = Api(options.api)
+    api = Api(options.api, reader(token_file(options)))
     follower, found = Follower(api, _write), ""
     try:
         mission = read_mission(options.mission)
@@ -61,8 +61,8 @@ def fly(options: argparse.Namespace) -> int:
     return int(verdict["exit_code"])
 
 
-def _run(options: argparse.Namespace, url: str) -> int:
-    api, mission = Api(url), read_mission(options.mission)
+def _run(options: argparse.Namespace, api: Api) -> int:
+    mission = read_mission(options.mission)
     if options.name:
         mission["name"] = options.name
     follower = Follower(api, _write, patience=10.0)
@@ -76,10 +76,10 @@ def _run(options: argparse.Namespace, url: str) -> int:
     return int(verdict["exit_code"])
 
 
-def _list(options: argparse.Namespace, url: str) -> int:
-    missions = Api(url).get("/v1/missions")["missions"]
-    if options.output == "json":
-        return _print_json({"missions": missions})
+def _list(options: argparse.Namespace, api: Api) -> int:
+    missions = api.get("/v1/missions")["missions"]
+    if options.output != "table":
+        return _print({"missions": missions}, options.output)
     if not missions:
         print("no missions yet")
         return 0
@@ -94,18 +94,17 @@ def _row(mission: dict[str, Any]) -> tuple[str, ...]:
     return mission["id"], mission["name"], mission["state"], done, verdict
 
 
-def _status(options: argparse.Namespace, url: str) -> int:
-    api = Api(url)
+def _status(options: argparse.Namespace, api: Api) -> int:
     if options.id:
         mission = api.get(f"/v1/missions/{options.id}")
-        if options.output == "json":
-            return _print_json(mission)
+        if options.output != "table":
+            return _print(mission, options.output)
         _say(mission)
         _print_events(mission["events"])
         return 0
     state = api.get("/v1/state")
-    if options.output == "json":
-        return _print_json(state)
+    if options.output != "table":
+        return _print(state, options.output)
     if state["mission"]:
         _say(state["mission"])
     else:
@@ -122,8 +121,7 @@ def _status(options: argparse.Namespace, url: str) -> int:
     return 0
 
 
-def _cancel(options: argparse.Namespace, url: str) -> int:
-    api = Api(url)
+def _cancel(options: argparse.Namespace, api: Api) -> int:
     mission_id = options.id
     if not mission_id:
         mission = api.get("/v1/state")["mission"]
@@ -134,8 +132,7 @@ def _cancel(options: argparse.Namespace, url: str) -> int:
     return 0
 
 
-def _logs(options: argparse.Namespace, url: str) -> int:
-    api = Api(url)
+def _logs(options: argparse.Namespace, api: Api) -> int:
     if not options.follow and options.id:
         _print_events(api.get(f"/v1/missions/{options.id}")["events"])
         return 0
@@ -150,23 +147,37 @@ def _logs(options: argparse.Namespace, url: str) -> int:
     return 0
 
 
-def _goto(options: argparse.Namespace, url: str) -> int:
+def _goto(options: argparse.Namespace, api: Api) -> int:
     body = {"position_m": [options.x, options.y, options.z]}
-    _say(Api(url).post("/v1/goto", body))
+    _say(api.post("/v1/goto", body))
     return 0
 
 
-def _hold(options: argparse.Namespace, url: str) -> int:
-    _say(Api(url).post("/v1/hold"))
+def _hold(options: argparse.Namespace, api: Api) -> int:
+    _say(api.post("/v1/hold"))
     return 0
 
 
-def _resume(options: argparse.Namespace, url: str) -> int:
-    _say(Api(url).post("/v1/resume"))
+def _resume(options: argparse.Namespace, api: Api) -> int:
+    _say(api.post("/v1/resume"))
     return 0
 
 
-VERBS: dict[str, Callable[[argparse.Namespace, str], int]] = {
+def _estop(options: argparse.Namespace, api: Api) -> int:
+    mission = api.post("/v1/estop")["id"]
+    print("emergency stop: the robot is told to stop its rotors until it has", flush=True)
+    if mission:
+        print(f"mission {mission} has failed")
+    return 0
+
+
+def _acknowledge(options: argparse.Namespace, api: Api) -> int:
+    api.post("/v1/acknowledge")
+    print("acknowledged: the next mission may fly")
+    return 0
+
+
+VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
     "run": _run,
     "list": _list,
     "status": _status,
@@ -175,6 +186,8 @@ VERBS: dict[str, Callable[[argparse.Namespace, str], int]] = {
     "goto": _goto,
     "hold": _hold,
     "resume": _resume,
+    "estop": _estop,
+    "acknowledge": _acknowledge,
 }
 
 
@@ -191,8 +204,8 @@ def _print_events(events: list[dict[str, Any]]) -> None:
         print(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}", flush=True)
 
 
-def _print_json(document: dict[str, Any]) -> int:
-    print(json.dumps({"schemaVersion": 1, **document}, indent=2))
+def _print(document: dict[str, Any], form: str) -> int:
+    print(written({"schemaVersion": 1, **document}, form))
     return 0
 
 

@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.ends import Address, open_exporter, process_arguments, warn_if_exposed
+from cloudrc.cli.ends import open_exporter, process_arguments
 from cloudrc.cli.extras import require
+from cloudrc.cli.teleop_api import ServedApi, api_address, serve_api
 
 if TYPE_CHECKING:
     from cloudrc.cloud.teleop.api_bridge import Bridge
-    from cloudrc.cloud.teleop.api_server import ApiServer
     from cloudrc.cloud.teleop.journal import Journal
     from cloudrc.cloud.teleop.service import MissionService
     from cloudrc.config.resolved import ResolvedExperiment
@@ -22,9 +22,16 @@ if TYPE_CHECKING:
 EPILOG = """\
 It talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
 --start or --mission it ends once that is flown; else on SIGTERM, on Ctrl-C,
-and when the process that started it is gone. The API describes itself: /docs."""
+and when the process that started it is gone; what flies then holds, and a
+successor with the same journal goes on. The API describes itself:
+/openapi.json. It asks for a token, except on a socket file, which only its
+owner can open. A token: openssl rand -hex 32 > DIR/operator; one in DIR/reader
+may look, not command."""
 LOCK_PERIOD = 0.2
 """Between two tries to get the journal [s]."""
+PAUSE_LIMIT_NS = 500_000_000
+"""For the robot to be seen to hold before teleop ends [ns]."""
+SALT_SIZE = 16
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,9 +42,16 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--api",
-        type=_api_address,
-        metavar="HOST:PORT",
-        help="serve the API here; port 0: any (default: not at all)",
+        type=api_address,
+        metavar="WHERE",
+        help="serve the API here: [HOST:]PORT, HOST being 127.0.0.1 unless you say, port 0: any; "
+        "or unix:PATH, for you alone (default: not at all)",
+    )
+    parser.add_argument(
+        "--tokens", type=Path, metavar="DIR", help="token files, 'operator' and 'reader'"
+    )
+    parser.add_argument(
+        "--audit", type=Path, metavar="FILE", help="write here who commanded what (JSON lines)"
     )
     parser.add_argument("--api-file", type=Path, metavar="FILE", help="write the API's URL here")
     parser.add_argument(
@@ -54,33 +68,60 @@ def execute(options: argparse.Namespace) -> int:
     """Fly missions."""
     from cloudrc.config.load import load_experiment
     from cloudrc.drivers.process import StopSignal
+    from cloudrc.records import Counted
 
     if options.api:
         require("the API of teleop", ("api",))
     stop, exporter = StopSignal(), open_exporter(options, "teleop")
     experiment = load_experiment(str(options.config))
-    bridge, server = _serve_api(options, experiment) if options.api else (None, None)
-    journal = _open_journal(options.journal, stop, bridge) if options.journal else None
-    if options.journal and journal is None:
-        return 0  # stopped while another one had it
+    served = serve_api(options, experiment) if options.api else None
+    journal = None
     try:
+        if options.journal:
+            journal = _open_journal(options.journal, stop, served.bridge if served else None)
+            if journal is None:
+                return 0  # stopped while another one had it
         service = _open_service(experiment, journal)
         ends = _start(options, experiment, service)
-        _fly(options, service, bridge, exporter, lambda: stop() or (ends and service.over))
+        ending = _Ending(service, stop)
+        over = lambda: ending() or (ends and service.over)  # noqa: E731
+        if exporter is not None and journal is not None and journal.repaired:
+            exporter.see([Counted(0, "teleop", "journal_repaired", 1)])
+        _fly(options, service, served, exporter, over, journal.trouble if journal else "")
     finally:
-        if server is not None:
-            server.stop()
+        if served is not None:
+            served.stop()
         if journal is not None:
             journal.close()
     return 0
 
 
+class _Ending:
+    """Lets teleop end: what flies is paused first, and the robot is given the time to hold."""
+
+    def __init__(self, service: MissionService, asked: Callable[[], bool]) -> None:
+        self._service, self._asked = service, asked
+        self._since_ns: int | None = None
+
+    def __call__(self) -> bool:
+        import time
+
+        if not self._asked():
+            return False
+        now_ns = time.monotonic_ns()
+        if self._since_ns is None:
+            self._since_ns = now_ns
+            self._service.pause(now_ns)
+        return self._service.settled or now_ns - self._since_ns > PAUSE_LIMIT_NS
+
+
 def _fly(
     options: argparse.Namespace,
     service: MissionService,
-    bridge: Bridge | None,
+    served: ServedApi | None,
     exporter: Exporter | None,
     stop: Callable[[], bool],
+    trouble: str,
 ) -> None:
     """Run the service until `stop()`."""
     from cloudrc.cloud.teleop import wire
@@ -92,9 +133,9 @@ def _fly(
     feed = Feed.on_stdout(watched=options.feed)
     peer = UnixPeer(options.socket / "teleop.sock", options.socket / "cloud.sock")
     calls: Callable[[], Iterable[Callable[[int], None]]] = list
-    if bridge is not None:
-        bridge.open(service)
-        calls = bridge.take
+    if served is not None:
+        served.open(service, lambda: peer.send(wire.encode(wire.ALARM)))
+        calls = served.bridge.take
     feed.ready()
 
     def tell(told: list[Any]) -> None:
@@ -105,41 +146,13 @@ def _fly(
     def ask() -> bool:
         if exporter is not None:
             exporter.ready(service.seen)
+            if served is not None:
+                exporter.see(served.counted())
         return stop()
 
+    if trouble:
+        tell([Fault(0, "journal", trouble)])
     serve_teleop(service, peer, wire.encode, wire.decode, calls=calls, tell=tell, stop=ask)
-
-
-def _serve_api(
-    options: argparse.Namespace, experiment: ResolvedExperiment
-) -> tuple[Bridge, ApiServer]:
-    """Answer from now on, if only that teleop is not ready yet."""
-    from cloudrc import assembly
-    from cloudrc.cloud.teleop.api import Surroundings, create_app
-    from cloudrc.cloud.teleop.api_bridge import Bridge
-    from cloudrc.cloud.teleop.api_server import ApiServer
-    from cloudrc.geometry.scene import load_scene
-
-    warn_if_exposed(options.api)
-    criteria, bridge = experiment.criteria, Bridge()
-    scene = load_scene(experiment.world.scene)
-    surroundings = Surroundings(
-        scene, criteria.time_limit_s, criteria.contact, assembly.mission_plan
-    )
-    server = ApiServer(create_app(bridge, surroundings), bridge, options.api)
-    server.start()
-    if options.api_file is not None:
-        _write_url(options.api_file, server.url)
-    return bridge, server
-
-
-def _write_url(path: Path, url: str) -> None:
-    """Write it in one step: who waits for the file finds it whole."""
-    import json
-
-    new = path.with_name(f"{path.name}.new")
-    new.write_text(json.dumps({"schemaVersion": 1, "url": url}) + "\n", encoding="utf-8")
-    new.replace(path)
 
 
 def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge | None) -> Journal | None:
@@ -168,15 +181,19 @@ def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge | None) -
 
 def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> MissionService:
     """Remember what the journal has; what is too old to be known is taken out of it."""
+    import os
+    from contextlib import suppress
+
     from cloudrc.cloud.teleop.service import MissionService
 
-    limit = experiment.criteria.contact_speed_max_mps
+    limit, salt = experiment.criteria.contact_speed_max_mps, os.urandom(SALT_SIZE)
     if journal is None:
-        return MissionService(limit)
-    service = MissionService(limit, journal.append, journal.entries)
+        return MissionService(limit, salt=salt)
+    service = MissionService(limit, journal.append, journal.entries, salt)
     known = [entry for entry in journal.entries if service.book.knows(entry)]
     if len(known) < len(journal.entries):
-        journal.rewrite(known)
+        with suppress(OSError):  # a full disk: it is done at the next start
+            journal.rewrite(known)
     return service
 
 
@@ -210,11 +227,3 @@ def _load(name: str, experiment: ResolvedExperiment) -> Any:
     if problems:
         raise BadInputError("\n  ".join([f"{name} cannot be flown:", *map(str, problems)]))
     return mission
-
-
-def _api_address(text: str) -> Address:
-    """Read HOST:PORT; the port may be 0."""
-    from cloudrc.cli.ends import address
-
-    host, colon, port = text.rpartition(":")
-    return (host, 0) if host and colon and port == "0" else address(text)

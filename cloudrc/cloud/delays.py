@@ -17,12 +17,18 @@ HORIZON_MAX = 1.0
 
 
 class DelayMeter:
-    """Feeds a delay estimator and asks it how far to look ahead."""
+    """Feeds a delay estimator and asks it how far to look ahead.
+
+    Attributes:
+        rtt: Last round trip, hold excluded [s]; NaN before the first.
+        loop_delay: Last `now - echo_stamp`, hold included [s]; NaN likewise.
+        newest_echo_ns: Stamp of the newest command that is seen to be flown [ns], cloud's clock.
+    """
 
     def __init__(self, estimator: Estimator, counts: Counter[str]) -> None:
         """Ask `estimator`; what is clamped is counted in `counts`."""
         self._estimator, self._counts = estimator, counts
-        self._newest_echo_ns = NEVER_NS
+        self.newest_echo_ns = NEVER_NS
         self._stamp_ns = 0
         self.rtt = nan
         self.loop_delay = nan
@@ -34,9 +40,9 @@ class DelayMeter:
         and over, and its growing age would poison the estimate.
         """
         self._stamp_ns = telemetry.stamp_ns
-        if telemetry.echo_stamp_ns <= self._newest_echo_ns:
+        if telemetry.echo_stamp_ns <= self.newest_echo_ns:
             return
-        self._newest_echo_ns = telemetry.echo_stamp_ns
+        self.newest_echo_ns = telemetry.echo_stamp_ns
         loop_ns = now_ns - telemetry.echo_stamp_ns
         applied_ns = telemetry.stamp_ns - telemetry.echo_hold_ns
         self.loop_delay = loop_ns * 1e-9

@@ -1,69 +1,53 @@
 """Cloud's end of the tunnel: telemetry comes in, a command leaves every 10 ms.
 
-It asks for a session with a hello that names its process, and takes the epoch that world hands
-out. Teleoperation is joined to it by messages only: what is seen goes there, setpoints and
-operator requests come back.
+It asks for a session with hellos, and takes the epoch that world hands out; while it has nothing
+to command it says that it is alive, for its authority lasts as long as it is heard. Teleoperation
+is joined to it by messages only: what is seen goes there, setpoints and operator requests come
+back.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass
 from math import nan
-from typing import Protocol
 
+from cloudrc.cloud.identity import CloudIdentity as CloudIdentity
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.cloud.teleop.messages import Outcome, Output, Seen
-from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Setpoint, Telemetry
+from cloudrc.cloud.operator import Alarm
+from cloudrc.cloud.operator import Operator as Operator
+from cloudrc.cloud.teleop.messages import Seen
+from cloudrc.messages import (
+    NEVER_NS,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Setpoint,
+    Telemetry,
+)
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import USED, Channel
-from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Hello, Kind
-from cloudrc.tunnel.session import NO_EPOCH, Session
+from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
+from cloudrc.tunnel.complaints import BUSY, SILENCE, Complaints
+from cloudrc.tunnel.knocker import Knocker
+from cloudrc.tunnel.session import NO_EPOCH
+from cloudrc.tunnel.unsealed import make_session
 
 PERIOD_NS = 10_000_000
 """Source: control.md, commands at 100 Hz."""
 HELLO_PERIOD_NS = 100_000_000
+GIVE_UP_NS = 5_000_000_000
+"""A robot that has not been told in so long that its mission is over will not be told."""
 SILENCE_NS = 500_000_000
 """Without telemetry for so long, cloud says hello again: world may have restarted."""
+ALIVE_PERIOD_NS = 100_000_000
+"""A cloud that has nothing to command says so often that it is there."""
+PATIENCE_NS = 5_000_000_000
+"""So long without a session is worth telling [ns]."""
 COUNT_PERIOD_NS = 1_000_000_000
 MISSED_MAX = 50
 """So many missed periods are a fault worth telling; a few happen on any machine."""
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
-
-
-@dataclass(frozen=True, slots=True)
-class CloudIdentity:
-    """Who this end is: 16 bytes for its monotonic clock, 16 for this process."""
-
-    clock_id: bytes
-    nonce: bytes
-
-
-class Operator(Protocol):
-    """Teleop as cloud knows it: the machine itself, or the socket behind which it lives."""
-
-    @property
-    def outputs(self) -> Sequence[Output | Fault]:
-        """What it has said since the last call of `take_outputs`."""
-
-    @property
-    def outcome(self) -> Outcome | None:
-        """How the mission ended; None while there is none, or cloud has to go on anyway."""
-
-    @property
-    def settled(self) -> bool:
-        """Whether the robot is seen to have acted on the last request."""
-
-    def see(self, seen: Seen, now_ns: int) -> None:
-        """Take note of the newest telemetry."""
-
-    def handle_deadline(self, now_ns: int) -> None:
-        """Do what is due."""
-
-    def take_outputs(self) -> Sequence[Output | Fault]:
-        """Hand over what it has said since the last call."""
 
 
 class CloudEndpoint:
@@ -88,14 +72,20 @@ class CloudEndpoint:
             start_ns: Cloud's monotonic clock now [ns].
         """
         self._loop, self.teleop, self._identity = loop, teleop, identity
-        self._session = Session(Direction.DOWNLINK)
+        self._session = make_session(Direction.DOWNLINK, identity.ring, start_ns)
+        self._knocker = Knocker(identity.nonce, identity.clock_id, identity.suite)
+        self._complaints = Complaints()
+        self._hellos = 0
         self._channel = Channel(newest_wins)
         self._clock_is_shared = False
         self._setpoint: Setpoint | None = None
         self._world = ""
         self.guard = GuardState.GROUND  # as telemetry last told
         self._delays = (nan, nan, nan)
-        self._tick_ns = self._hello_ns = self._heard_ns = start_ns
+        self._alarm = Alarm()
+        self._asked = 0  # the highest number of an operator's request
+        self._tick_ns = self._hello_ns = self._heard_ns = self._alive_ns = start_ns
+        self._flying_ns = start_ns
         self._count_ns = start_ns + COUNT_PERIOD_NS
         self._commanded_ns = NEVER_NS
         self._datagrams: list[bytes] = []
@@ -104,8 +94,14 @@ class CloudEndpoint:
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended and the robot is seen to hold, or cannot be seen to."""
-        return self.teleop.outcome is not None and self.teleop.settled
+        """Whether the mission has ended and the robot is seen to hold, or cannot be told to."""
+        told = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
+        return told and self.teleop.outcome is not None
+
+    @property
+    def sealed(self) -> bool:
+        """See `Endpoint`."""
+        return self._session.sealed
 
     def next_deadline_ns(self) -> int:
         """When the next command is due [ns]."""
@@ -129,13 +125,22 @@ class CloudEndpoint:
         if missed:
             self._count_missed(missed, now_ns)
         self._tick_ns += (missed + 1) * PERIOD_NS
-        if self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS:
+        if self._asks(now_ns):
             self._say_hello_if_due(now_ns)
+            if now_ns - self._heard_ns > PATIENCE_NS:
+                self._records += self._complaints.say("no_session", SILENCE, now_ns)
         self.teleop.handle_deadline(now_ns)
         if self.teleop.outputs:
             self._take_from_teleop()
+        if self._session.epoch and (alarm := self._alarm.due(self._asked, now_ns)) is not None:
+            self._relay(alarm)
+        if self.teleop.outcome is None:
+            self._flying_ns = now_ns
         if self._session.epoch and self._loop.ready and self._setpoint is not None:
             self._send_command(self._setpoint, now_ns)
+        elif self._session.epoch and now_ns >= self._alive_ns:
+            self._alive_ns = now_ns + ALIVE_PERIOD_NS
+            self._send(Kind.ALIVE, b"")
         if now_ns >= self._count_ns:
             self._note_counts(now_ns)
         if self._loop.faults:
@@ -149,10 +154,25 @@ class CloudEndpoint:
                 self._receive_telemetry(epoch, counter, body, now_ns)
             elif kind == Kind.ACCEPT:
                 self._receive_accept(epoch, codec.decode_accept(body), now_ns)
-            else:
+            elif kind == Kind.CHALLENGE:
+                hello = self._knocker.challenged(body)
+                if hello is not None and self._asks(now_ns):
+                    self._greet(hello)
+            elif kind == Kind.BUSY:
+                if self._knocker.refused(codec.decode_busy(body)) and self._asks(now_ns):
+                    self._counts["busy"] += 1
+                    self._records += self._complaints.say("busy", BUSY, now_ns)
+            elif kind != Kind.ALIVE:
                 raise DecodeError("malformed")
         except DecodeError as error:
-            self._counts[str(error)] += 1
+            self._refuse(str(error), data, now_ns)
+
+    def _refuse(self, outcome: str, data: bytes, now_ns: int) -> None:
+        self._counts[outcome] += 1
+        if outcome == "old_epoch" and codec.peek(data)[1] > self._session.epoch:
+            self._say_hello_if_due(now_ns)  # world may have moved on, its accept lost
+        elif self._asks(now_ns):
+            self._records += self._complaints.about(outcome, data, now_ns)
 
     def _count_missed(self, missed: int, now_ns: int) -> None:
         before = self._counts["missed_periods"]
@@ -168,21 +188,31 @@ class CloudEndpoint:
         if now_ns < self._hello_ns:
             return
         self._hello_ns = now_ns + HELLO_PERIOD_NS
-        hello = Hello(self._identity.nonce, self._identity.clock_id)
-        self._send(Kind.HELLO, codec.encode_hello(hello))
+        self._greet(self._knocker.hello())
+
+    def _asks(self, now_ns: int) -> bool:
+        """Whether cloud wants a session: it has none, or does not hear world in it."""
+        return self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
+
+    def _greet(self, hello: bytes) -> None:
+        """Send a hello; while two keys are valid, with each in turn."""
+        keys = self._session.accepted
+        key = keys[self._hellos % len(keys)]
+        self._hellos += 1
+        self._datagrams.append(self._session.greet(Kind.HELLO, hello, key))
+        self._counts["sent"] += 1
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
         """Take the epoch that world hands out to this very process, if it is a new one."""
-        world = accept.world_nonce.hex()
-        # A restarted world may count its epochs from 1 again.
-        is_old = epoch <= self._session.epoch and world == self._world
-        if accept.nonce != self._identity.nonce or is_old:
+        agreement = self._knocker.accepted(epoch, accept, self._session.epoch)
+        if agreement is None:
             self._counts["accept_ignored"] += 1
             return
-        self._session.begin(epoch)
+        self._session.begin(epoch, agreement, self._session.greeting_key)
+        self._complaints.forget()
         self._channel.reset()
         self._loop.reset()
-        self._world = world
+        self._world = accept.world_nonce.hex()
         self._clock_is_shared = accept.clock == self._identity.clock_id
         self._heard_ns = now_ns
         self._commanded_ns = NEVER_NS
@@ -190,11 +220,6 @@ class CloudEndpoint:
 
     def _receive_telemetry(self, epoch: int, counter: int, body: bytes, now_ns: int) -> None:
         """Whatever arrives for this epoch is noted; loop and teleop get the newest."""
-        if epoch != self._session.epoch:
-            self._counts["old_epoch"] += 1
-            if epoch > self._session.epoch:
-                self._say_hello_if_due(now_ns)  # world moved on and its accept was lost
-            return
         self._heard_ns = now_ns
         outcome = self._channel.take(counter)
         self._counts[outcome] += 1
@@ -206,7 +231,9 @@ class CloudEndpoint:
         if used:
             telemetry = codec.decode_telemetry(body)
             self.guard = telemetry.guard
+            self._alarm.see(telemetry.guard, telemetry.mission)
             self._loop.observe(telemetry, now_ns)
+            self._asked = max(self._asked, telemetry.mission)
             self.teleop.see(self._seen(telemetry, epoch), now_ns)
             if self.teleop.outputs:
                 self._take_from_teleop()
@@ -222,6 +249,8 @@ class CloudEndpoint:
             telemetry.touch_speed,
             telemetry.slip_ns,
             *self._delays,
+            telemetry.mission_id,
+            telemetry.reached,
         )
 
     def _take_from_teleop(self) -> None:
@@ -229,11 +258,22 @@ class CloudEndpoint:
             if isinstance(message, Setpoint):
                 self._setpoint = message
             elif isinstance(message, OperatorRequest):
-                self._send(Kind.OPERATOR, codec.encode_operator(message))
+                self._relay(message)
             else:
                 self._records.append(message)
                 if isinstance(message, MissionEvent) and message.event == "started":
                     self._loop.start_mission()
+
+    def _relay(self, request: OperatorRequest) -> None:
+        """Pass a request on; one without a number is an alarm, before which nothing starts.
+
+        Without a session nothing can be sealed: the request is dropped, for teleop repeats it.
+        """
+        if request.number == 0 and request.request is Request.ESTOP:
+            self._alarm.sound()
+        elif self._session.epoch and not (self._alarm.sounds and request.request is Request.START):
+            self._asked = max(self._asked, request.number)
+            self._send(Kind.OPERATOR, codec.encode_operator(request))
 
     def _send_command(self, setpoint: Setpoint, now_ns: int) -> None:
         elapsed_ns = now_ns - self._commanded_ns if self._commanded_ns >= 0 else PERIOD_NS
@@ -246,6 +286,7 @@ class CloudEndpoint:
 
     def _note_counts(self, now_ns: int) -> None:
         self._count_ns += COUNT_PERIOD_NS
+        self._datagrams += self._session.tend(now_ns)
         for name, count in sorted((self._counts | self._loop.counts).items()):
             self._records.append(Counted(now_ns, "cloud", name, count))
 

@@ -3,6 +3,10 @@
 A plug-in may be wrong: it raises, or returns something that is not finite. Then the loop does the
 careful thing (looks ahead by the last good horizon, uses the last sample, commands zero), counts
 it, and says once what happened; it never stops.
+
+While no echo shows that commands are flown, the reference is frozen: the command is to stand still
+and the controller is not asked, so that no integral winds up and no predictor believes in motion
+that was commanded and never flown. Commands go on, since only they can end the silence.
 """
 
 from __future__ import annotations
@@ -15,11 +19,15 @@ from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.delays import DelayMeter
 from cloudrc.cloud.estimators import Estimator
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.messages import ZERO, Command, Odometry, Setpoint, Telemetry
+from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry
 from cloudrc.records import Control, Fault
 
+FREEZE_NS = 400_000_000
+"""An echo that is silent for longer than horizon and this freezes the reference [ns].
+Source: DESIGN, section 5."""
 PLUG_IN_ERRORS = (Exception, SystemExit)
 """A plug-in is foreign code: anything may come out of it; a person's Ctrl-C is not its own."""
+STAND_STILL = ControlOutput(ZERO, 0.0)
 
 
 class ControlLoop:
@@ -47,10 +55,12 @@ class ControlLoop:
         self._basis: Odometry | None = None
         self._basis_arrival_ns = 0
         self._horizon = 0.0
+        self._trusted_ns = NEVER_NS
 
     def start_mission(self) -> None:
         """A mission begins within the session: the controller starts anew."""
         self._controller.reset()
+        self._trusted_ns = NEVER_NS
 
     @property
     def ready(self) -> bool:
@@ -85,7 +95,11 @@ class ControlLoop:
         assert basis is not None, "ask `ready` first"
         horizon = self._look_ahead(now_ns)
         estimate = self._predict(basis, horizon, now_ns)
-        output = self._steer(estimate, setpoint, dt, now_ns)
+        if self._is_unheard(now_ns, horizon):
+            self.counts["frozen"] += 1
+            output = STAND_STILL
+        else:
+            output = self._steer(estimate, setpoint, dt, now_ns)
         hold_ns = now_ns - self._basis_arrival_ns
         command = Command(now_ns, basis.stamp_ns, hold_ns, output.velocity, output.yaw_rate)
         try:
@@ -148,8 +162,16 @@ class ControlLoop:
                 raise ValueError(f"it returned {output}")
         except PLUG_IN_ERRORS as error:
             self._note("controller", error, now_ns)
-            return ControlOutput(ZERO, 0.0)
+            return STAND_STILL
         return output
+
+    def _is_unheard(self, now_ns: int, horizon: float) -> bool:
+        """Whether the echo has been silent for too long; before the first it has time, too."""
+        if self._trusted_ns < self._delays.newest_echo_ns:
+            self._trusted_ns = self._delays.newest_echo_ns
+        elif self._trusted_ns == NEVER_NS:
+            self._trusted_ns = now_ns
+        return now_ns - self._trusted_ns > horizon * 1e9 + FREEZE_NS
 
     def _note(self, kind: str, error: BaseException, now_ns: int) -> None:
         """Count what a plug-in did wrong; report it the first time."""

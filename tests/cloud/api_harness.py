@@ -1,32 +1,51 @@
 """The real API on a free port, over a service whose robot is flown by a thread of the test."""
 
 import json
+import socket
 import threading
 import time
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from service_harness import ServiceFlight
 
 from cloudrc import assembly
+from cloudrc.cli.mission_http import Api
 from cloudrc.cloud.teleop.api import Surroundings, create_app
+from cloudrc.cloud.teleop.api_audit import Audit
 from cloudrc.cloud.teleop.api_bridge import Bridge
+from cloudrc.cloud.teleop.api_gate import Gate, Limits
 from cloudrc.cloud.teleop.api_server import ApiServer
+from cloudrc.cloud.teleop.api_tokens import Tokens
 from cloudrc.geometry.scene import load_scene
 
 LIMIT = 5.0
+OPERATOR, READER = "operator-token-of-the-tests", "reader-token-of-the-tests"
+NO_LIMITS = Limits(1e6, 10**6, 10**6, 10**6)
 
 
 class Running:
     """API, service and robot; `flight.position` is where the robot is."""
 
-    def __init__(self, *, ready=True):
+    def __init__(self, *, ready=True, limits=NO_LIMITS, unix=False):
+        self.folder = TemporaryDirectory(prefix="cloudrc-")
+        folder = Path(self.folder.name)
+        (folder / "operator").write_text(OPERATOR + "\n")
+        (folder / "reader").write_text(READER + "\n")
         self.flight, self.bridge = ServiceFlight(), Bridge()
+        self.alarms, self.complaints = [], []
+        self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
         surroundings = Surroundings(load_scene("pipes"), 60.0, True, assembly.mission_plan)
-        self.server = ApiServer(
-            create_app(self.bridge, surroundings), self.bridge, ("127.0.0.1", 0)
-        )
+        app, tokens = create_app(self.bridge, surroundings), Tokens(folder)
+        self.audit = Audit(folder / "audit.jsonl", self.complaints.append)
+        self.gate = Gate(app, None if unix else tokens, self.audit, limits, self.complaints.append)
+        self.address = folder / "api.sock" if unix else ("127.0.0.1", 0)
+        self.server = ApiServer(self.gate, self.bridge, self.address)
+        self.token_file = folder / "operator"
+        self.audit_file = folder / "audit.jsonl"
         self.url = self.server.url
         self.server.start()
         self._stopping = threading.Event()
@@ -34,7 +53,8 @@ class Running:
         if ready:
             self.bridge.open(self.flight.teleop)
         self._thread.start()
-        self.until(self.answers)
+        if not unix:
+            self.until(self.answers)
 
     def _fly(self):
         while not self._stopping.wait(0.002):
@@ -53,24 +73,44 @@ class Running:
 
     def stop(self):
         self.server.stop()
+        self.audit.close()
         self._stopping.set()
         self._thread.join(LIMIT)
+        self.folder.cleanup()
 
     def get(self, path):
-        with urllib.request.urlopen(self.url + path, timeout=LIMIT) as answer:
+        with urllib.request.urlopen(self.request(path), timeout=LIMIT) as answer:
             return json.loads(answer.read())
 
-    def post(self, path, body=None):
+    def request(self, path, data=None, token=OPERATOR, method=None, headers=None):
+        headers = dict(headers or {})
+        if token is not None:
+            headers["Authorization"] = f"Bearer {token}"
+        return urllib.request.Request(self.url + path, data, headers, method=method)
+
+    def post(self, path, body=None, token=OPERATOR):
         """Status and answer, whatever it is; `body` may be bytes."""
         data = (
             body if isinstance(body, bytes) else b"" if body is None else json.dumps(body).encode()
         )
-        request = urllib.request.Request(self.url + path, data, method="POST")
+        return self.send(self.request(path, data, token, "POST"))
+
+    def post_local(self, path, body=None):
+        """Over the socket file."""
+        return Api(self.url).post(path, body)
+
+    def send(self, request):
         try:
             with urllib.request.urlopen(request, timeout=LIMIT) as answer:
                 return answer.status, json.loads(answer.read())
         except urllib.error.HTTPError as error:
             return error.code, json.loads(error.read())
+
+    def audited(self):
+        """What the audit log has, once it is written."""
+        self.audit.close()
+        lines = self.audit_file.read_text().splitlines() if self.audit_file.exists() else []
+        return [json.loads(line) for line in lines]
 
     def until(self, condition):
         limit = time.monotonic() + LIMIT
@@ -80,6 +120,18 @@ class Running:
 
     def state_of(self, mission_id):
         return self.get(f"/v1/missions/{mission_id}")["state"]
+
+
+def connect(one):
+    """A connection on which a test writes every byte itself."""
+    host, _, port = one.url.removeprefix("http://").partition(":")
+    return socket.create_connection((host, int(port)), timeout=10.0)
+
+
+def head(method, path, *lines, token=OPERATOR):
+    """The head of a request."""
+    lines = (f"{method} {path} HTTP/1.1", "Host: x", f"Authorization: Bearer {token}", *lines)
+    return ("\r\n".join(lines) + "\r\n\r\n").encode()
 
 
 @contextmanager

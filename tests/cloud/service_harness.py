@@ -19,7 +19,7 @@ class ServiceFlight(Flight):
     def __init__(self):
         super().__init__()
         self.kept = []
-        self.full = False
+        self.full, self.tries = False, 0
         self.pipe_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
         self.restart_teleop()
 
@@ -28,6 +28,7 @@ class ServiceFlight(Flight):
         self.teleop = MissionService(0.25, self.write, json.loads(json.dumps(self.kept)))
 
     def write(self, entry):
+        self.tries += 1
         if self.full:
             raise OSError(28, "No space left on device")
         self.kept.append(json.loads(json.dumps(entry)))
@@ -42,6 +43,7 @@ class ServiceFlight(Flight):
             self.pipe_contacts,
             self.touch_speed,
             self.slip_ns,
+            **self.progress(),
         )
         self.teleop.see(seen, self.now_ns)
 

@@ -22,6 +22,7 @@ class Flight:
         self.epoch = 1
         self.world = "world 1"
         self.mission = 0
+        self.onboard = (0, 0)  # mission's number and waypoints reached, as world keeps them
         self.guard = GuardState.GROUND
         self.uplink = self.downlink = True
         self.first_shown_ns = {}  # number of a request -> when telemetry first showed it
@@ -39,9 +40,14 @@ class Flight:
             self._collect()
 
     def see(self):
-        seen = Seen(self.epoch, self.position, self.guard, self.mission, self.world)
+        seen = Seen(
+            self.epoch, self.position, self.guard, self.mission, self.world, **self.progress()
+        )
         self.first_shown_ns.setdefault(self.mission, self.now_ns)
         self.teleop.see(seen, self.now_ns)
+
+    def progress(self):
+        return dict(zip(("mission_id", "reached"), self.onboard, strict=True))
 
     def operate(self, verb):
         try:
@@ -54,6 +60,7 @@ class Flight:
         self.world = f"world {self.epoch + 1}"
         self.epoch += 1
         self.mission = 0
+        self.onboard = (0, 0)
         self.guard = GuardState.GROUND
         self.position = (0.0, 0.0, 0.1)
 
@@ -88,16 +95,33 @@ class Flight:
 
     def _obey(self, request):
         """Act on it as world does: rising numbers only; a start from the spawn restarts."""
+        if request.request is Request.PROGRESS:
+            self._keep(request)
         if request.number <= self.mission:
             return
         self.mission = request.number
-        if request.request is Request.END:
-            self.guard = GuardState.HOLD
+        if request.request is not Request.START:
+            stopped = self.guard in (GuardState.LAND, GuardState.ESTOP)
+            if request.request is Request.ESTOP:
+                self.guard = GuardState.ESTOP
+            elif request.request is Request.ACKNOWLEDGE:
+                self.guard = GuardState.GROUND if stopped else self.guard
+            elif not stopped:
+                self.guard = GuardState.HOLD
             return
+        if request.mission_id != self.onboard[0] or request.start is Start.SPAWN:
+            self.onboard = (request.mission_id, 0)
+        self._keep(request)
         if request.start is Start.SPAWN:
             self.epoch += 1
             self.position = (0.0, 0.0, 0.1)
-        self.guard = GuardState.TRACK
+        if self.guard not in (GuardState.LAND, GuardState.ESTOP):
+            self.guard = GuardState.TRACK
+
+    def _keep(self, request):
+        number, reached = self.onboard
+        if request.mission_id == number:
+            self.onboard = (number, max(reached, request.reached))
 
 
 def flying(plan=PLAN):

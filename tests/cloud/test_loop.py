@@ -4,7 +4,7 @@ from math import inf, nan
 
 import pytest
 
-from cloudrc.cloud.controllers import Controller
+from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.controllers.pid import build as pid
 from cloudrc.cloud.estimators import Estimator
 from cloudrc.cloud.estimators.running_mean import build as running_mean
@@ -82,6 +82,59 @@ def test_a_horizon_out_of_range_is_clamped_and_counted(horizon, clamped):
     _, control = command(a_loop, 1094)
     assert control.horizon == clamped
     assert a_loop.counts["horizon_clamped"] == 1
+
+
+class Integrating(Controller):
+    """Says how often it was asked."""
+
+    def __init__(self):
+        self.asked = 0
+
+    def update(self, estimate, setpoint, dt):
+        self.asked += 1
+        return ControlOutput((1.0, 0.0, 0.0), 0.5)
+
+
+def test_a_silent_echo_freezes_the_reference_after_horizon_and_400_ms():
+    controller = Integrating()
+    a_loop = loop(controller=controller)
+    a_loop.observe(telemetry(100, echo_ms=1000), 1100 * MS)  # a horizon of 100 ms
+    assert command(a_loop, 1500)[0].velocity == (1.0, 0.0, 0.0)
+    assert command(a_loop, 1501)[0][3:] == (ZERO, 0.0)
+    assert a_loop.counts["frozen"] == 1
+    assert controller.asked == 1
+    # Telemetry alone does not help, an echo does.
+    a_loop.observe(telemetry(500, echo_ms=1000, hold_ms=400), 1510 * MS)
+    assert command(a_loop, 1510)[0].velocity == ZERO
+    a_loop.observe(telemetry(510, echo_ms=1420), 1520 * MS)
+    assert command(a_loop, 1520)[0].velocity == (1.0, 0.0, 0.0)
+
+
+def test_before_the_first_echo_there_is_as_much_time():
+    a_loop = loop(controller=Integrating())
+    a_loop.observe(telemetry(100), 1100 * MS)
+    assert command(a_loop, 2000)[0].velocity == (1.0, 0.0, 0.0)
+    assert command(a_loop, 2400)[0].velocity == (1.0, 0.0, 0.0)
+    assert command(a_loop, 2401)[0].velocity == ZERO
+    a_loop.start_mission()
+    assert command(a_loop, 2410)[0].velocity == (1.0, 0.0, 0.0)
+
+
+def test_while_frozen_the_predictor_is_told_to_expect_no_motion():
+    told = []
+
+    class Listening(Predictor):
+        def predict(self, odometry, horizon):
+            return odometry
+
+        def commanded(self, command):
+            told.append(command.velocity)
+
+    a_loop = loop(predictor=Listening(), controller=Integrating())
+    a_loop.observe(telemetry(100, echo_ms=1000), 1100 * MS)
+    command(a_loop, 1200)
+    command(a_loop, 1600)
+    assert told == [(1.0, 0.0, 0.0), ZERO]
 
 
 class Raising(Estimator, Predictor, Controller):

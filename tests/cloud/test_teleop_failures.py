@@ -29,7 +29,7 @@ def test_a_leg_that_takes_too_long_fails_the_mission():
     flight.step(position=AWAY, seconds=1.98)
     assert flight.state == "FLYING"
     flight.step(seconds=0.02)
-    assert_failed(flight, "leg_timed_out", "waypoint 2 of 2 not reached within 2 s")
+    assert_failed(flight, "leg_timed_out", "waypoint 2 of 2 not reached in 2 s")
     assert flight.teleop.outcome.waypoint == 1
     assert flight.setpoints[-1] == Setpoint(AWAY, 0.0, -1)
 

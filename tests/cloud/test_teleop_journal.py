@@ -1,41 +1,14 @@
-"""The journal: exact, whole after a crash at any byte, and one process at a time."""
+"""The journal on a real disk: exact, whole after a crash at any byte, one process at a time."""
 
 import os
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from journal_disks import SOME, records, whole
 
-from cloudrc.cloud.teleop.journal import Journal, JournalLockedError, parse, to_line
-
-values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
-    max_leaves=8,
-)
-entries = st.lists(st.dictionaries(st.text(), values, max_size=4), max_size=6)
-
-SOME = [{"kind": "event", "n": n, "text": f"é\n{n}", "limit": float("inf")} for n in range(4)]
-
-
-@settings(max_examples=100, deadline=None)
-@given(entries)
-def test_entries_are_read_back_exactly(some):
-    data = b"".join(map(to_line, some))
-    assert parse(data) == (some, len(data), 0)
-
-
-@settings(max_examples=200, deadline=None)
-@given(entries, st.data())
-def test_cut_at_any_byte_all_whole_entries_are_there(some, data):
-    lines = [to_line(entry) for entry in some]
-    whole = b"".join(lines)
-    cut = data.draw(st.integers(0, len(whole)))
-    found, good, damaged = parse(whole[:cut])
-    assert found == some[: len(found)]
-    assert good == sum(map(len, lines[: len(found)])) <= cut
-    assert len(found) == len(some) or cut < good + len(lines[len(found)])
-    assert damaged == 0
+from cloudrc.cloud.teleop.journal import Journal, JournalLockedError
+from cloudrc.cloud.teleop.journal_disk import Disk
+from cloudrc.cloud.teleop.journal_format import HEAD, MAGIC
+from cloudrc.errors import BadInputError
 
 
 def write(path, some):
@@ -45,43 +18,85 @@ def write(path, some):
 
 
 def test_it_is_there_when_it_is_opened_again(tmp_path):
-    path = tmp_path / "new" / "journal.jsonl"
+    path = tmp_path / "new" / "journal"
     write(path, SOME[:2])
     write(path, SOME[2:])
     with Journal(path) as journal:
-        assert (journal.entries, journal.trouble) == (SOME, "")
+        assert (journal.entries, journal.trouble, journal.repaired) == (SOME, "", False)
+    assert path.read_bytes() == whole(SOME)
+    assert path.stat().st_mode & 0o777 == 0o600
 
 
+@pytest.mark.promise("P-JOURNAL-2")
 def test_a_torn_end_is_cut_and_reported(tmp_path):
-    path = tmp_path / "journal.jsonl"
+    path = tmp_path / "journal"
     write(path, SOME)
-    torn = len(to_line(SOME[-1])) - 3
+    torn = len(records(SOME)[-1]) - 3
     path.write_bytes(path.read_bytes()[:-3])
     with Journal(path) as journal:
-        assert journal.entries == SOME[:3]
-        assert f"{torn} bytes of a torn entry were cut off" in journal.trouble
+        assert (journal.entries, journal.repaired) == (SOME[:3], True)
+        said = f"journal repaired: {path}: {torn} bytes of a torn entry were cut off"
+        assert journal.trouble == said
+        assert path.read_bytes() == whole(SOME[:3])
         journal.append(SOME[3])
     with Journal(path) as journal:
         assert (journal.entries, journal.trouble) == (SOME, "")
 
 
 def test_damage_in_the_middle_is_left_out_and_a_copy_kept(tmp_path):
-    path = tmp_path / "journal.jsonl"
+    path = tmp_path / "journal"
     write(path, SOME)
     data = bytearray(path.read_bytes())
-    data[len(to_line(SOME[0])) + 20] ^= 1
+    data[len(whole(SOME[:1])) + HEAD + 2] ^= 1
     path.write_bytes(data)
     with Journal(path) as journal:
         assert journal.entries == [SOME[0], *SOME[2:]]
-        assert "1 damaged entries" in journal.trouble
-    assert (tmp_path / "journal.jsonl.damaged").read_bytes() == data
+        copy = tmp_path / "journal.damaged"
+        assert journal.trouble == (
+            f"journal repaired: {path}: 1 damaged entries were left out; see {copy}"
+        )
+        assert journal.repaired
+        journal.append(SOME[1])
+    assert copy.read_bytes() == data
+    with Journal(path) as journal:
+        assert (journal.entries, journal.trouble) == ([SOME[0], *SOME[2:], SOME[1]], "")
+    assert not (tmp_path / "journal.new").exists()
 
 
+def test_a_damaged_head_is_mended(tmp_path):
+    path = tmp_path / "journal"
+    path.write_bytes(b"?" + whole(SOME)[1:])
+    with Journal(path) as journal:
+        assert journal.entries == SOME
+        assert "its head was damaged; see" in journal.trouble
+    assert path.read_bytes() == whole(SOME)
+
+
+@pytest.mark.parametrize("cut", range(len(MAGIC)))
+def test_a_crash_at_its_very_beginning_leaves_an_empty_one(tmp_path, cut):
+    path = tmp_path / "journal"
+    path.write_bytes(MAGIC[:cut])
+    with Journal(path) as journal:
+        assert (journal.entries, journal.repaired) == ([], cut > 0)
+        journal.append(SOME[0])
+    assert path.read_bytes() == whole(SOME[:1])
+
+
+def test_another_file_is_not_touched(tmp_path):
+    path = tmp_path / "precious"
+    path.write_bytes(b"my thesis")
+    for _ in range(2):  # the lock is let go
+        with pytest.raises(BadInputError, match=r"--journal .*precious: is no journal; name an"):
+            Journal(path)
+    assert path.read_bytes() == b"my thesis"
+
+
+@pytest.mark.promise("P-JOURNAL-3")
 def test_a_second_one_is_kept_out_until_the_first_ends(tmp_path):
-    path = tmp_path / "journal.jsonl"
+    path = tmp_path / "journal"
     with Journal(path) as first:
         first.append(SOME[0])
-        with pytest.raises(JournalLockedError, match="another teleop"):
+        with pytest.raises(JournalLockedError, match="another teleop has this journal open; wait"):
             Journal(path)
         first.rewrite([SOME[1]])  # a new file of the same name is locked likewise
         with pytest.raises(JournalLockedError):
@@ -90,29 +105,83 @@ def test_a_second_one_is_kept_out_until_the_first_ends(tmp_path):
         assert second.entries == [SOME[1]]
 
 
-def test_every_entry_is_synced_before_it_counts(tmp_path, monkeypatch):
-    with Journal(tmp_path / "journal.jsonl") as journal:
-        synced, fsync = [], os.fsync
-        monkeypatch.setattr(os, "fsync", lambda file: (synced.append(file), fsync(file)))
-        for count, entry in enumerate(SOME, 1):
+def test_without_a_lock_file_the_folder_is_locked(tmp_path):
+    (tmp_path / "journal.lock").mkdir()  # cannot be opened as a file
+    with Journal(tmp_path / "journal"):
+        with pytest.raises(JournalLockedError):
+            Journal(tmp_path / "journal")
+    Journal(tmp_path / "journal").close()
+
+
+def test_a_rewritten_one_goes_on(tmp_path):
+    path = tmp_path / "journal"
+    with Journal(path) as journal:
+        for entry in SOME:
             journal.append(entry)
-            assert len(synced) == count
-
-
-def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch):
-    path, real = tmp_path / "journal.jsonl", os.write
-
-    def write_half(file, data):
-        if len(data) < 20:
-            raise OSError(28, "No space left on device")
-        return real(file, data[:20])
-
-    with Journal(path) as journal:
+        journal.rewrite(SOME[2:])
         journal.append(SOME[0])
-        monkeypatch.setattr(os, "write", write_half)
-        with pytest.raises(OSError, match="No space"):
-            journal.append(SOME[1])
-        monkeypatch.undo()
-        journal.append(SOME[2])
+    assert path.read_bytes() == whole([*SOME[2:], SOME[0]])
+
+
+def test_nothing_is_left_open(tmp_path):
+    def handles():
+        return len(os.listdir("/proc/self/fd"))
+
+    path = tmp_path / "journal"
+    write(path, SOME)
+    before = handles()
+    for _ in range(3):
+        path.write_bytes(path.read_bytes().replace(b"event", b"tneve", 1))
+        write(path, SOME)
+        with pytest.raises(OSError, match="Is a directory"):
+            Journal(tmp_path)
+    assert handles() == before
+
+
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"):
+        Journal(tmp_path / "file" / "journal")
+
+
+def test_folder_and_lock_are_made_and_the_lock_is_private(tmp_path):
+    path = tmp_path / "a" / "b" / "journal"
+    before = os.umask(0)
+    try:
+        Journal(path).close()
+    finally:
+        os.umask(before)
+    assert path.with_name("journal.lock").stat().st_mode & 0o777 == 0o600
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_what_an_earlier_crash_left_is_written_over(tmp_path):
+    path = tmp_path / "journal"
+    rubbish = b"rubbish" * 1000
+    (tmp_path / "journal.new").write_bytes(rubbish)
+    (tmp_path / "journal.damaged").write_bytes(rubbish)
+    damaged = b"?" + whole(SOME)[1:]
+    path.write_bytes(damaged)
     with Journal(path) as journal:
-        assert (journal.entries, journal.trouble) == ([SOME[0], SOME[2]], "")
+        assert journal.entries == SOME
+    assert path.read_bytes() == whole(SOME)
+    assert (tmp_path / "journal.damaged").read_bytes() == damaged
+
+
+def test_a_rewrite_that_fails_leaves_no_file_behind(tmp_path):
+    class Refusing(Disk):
+        def replace(self, new, path):
+            raise OSError(5, "Input/output error")
+
+    path = tmp_path / "journal"
+    with Journal(path, Refusing()) as journal:
+        journal.append(SOME[0])
+        with pytest.raises(OSError, match="Input/output"):
+            journal.rewrite(SOME)
+        assert not (tmp_path / "journal.new").exists()
+        journal.append(SOME[1])
+    assert path.read_bytes() == whole(SOME[:2])
+
+
+def test_removing_what_is_not_there_is_done(tmp_path):
+    Disk().remove(tmp_path / "none")

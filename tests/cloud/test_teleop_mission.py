@@ -197,6 +197,55 @@ def test_another_mission_can_follow():
     assert flight.setpoints[-1] == Setpoint(A, 0.3, 0)
 
 
+@pytest.fixture
+def ended():
+    """A mission is done, but its end has not reached the robot, which tracks on."""
+    flight = flying(Plan((Leg(A, dwell=0.0),)))
+    flight.downlink = False
+    flight.step(position=A)
+    assert (flight.state, flight.guard) == ("DONE", GuardState.TRACK)
+    return flight
+
+
+@pytest.mark.promise("P-MISSION-8")
+def test_a_robot_that_may_still_fly_is_led_nowhere_before_it_is_seen_to_start_anew(ended):
+    """It would fly past the spawn, through whatever stands between."""
+    ended.operate(StartMission(PLAN))
+    ended.step(seconds=0.5)
+    assert ended.setpoints[-1] == Setpoint(A, 0.0, -1)
+    ended.downlink = True
+    ended.step(seconds=0.15)
+    assert ended.state == "FLYING"
+    assert ended.setpoints[-1] == Setpoint(A, 0.3, 0)
+
+
+def test_a_robot_that_holds_after_the_end_finds_the_first_waypoint_aimed_at(ended):
+    ended.downlink = True
+    ended.step(seconds=0.15)
+    assert ended.guard is GuardState.HOLD
+    ended.downlink = False
+    ended.operate(StartMission(PLAN))
+    assert ended.setpoints[-1] == Setpoint(A, 0.3, 0)
+
+
+@pytest.mark.parametrize("acted_on", [False, True])
+def test_what_was_asked_between_an_end_and_a_start_may_have_been_acted_on(ended, acted_on):
+    ended.downlink = True
+    ended.step(seconds=0.15)
+    ended.operate(StartMission(Plan((Leg(B),), Start.HERE)))
+    ended.uplink = False
+    ended.downlink = acted_on
+    ended.step(seconds=0.15)
+    ended.downlink = False
+    ended.operate(Cancel())
+    ended.uplink = True
+    ended.step(seconds=0.15)
+    before = len(ended.setpoints)
+    ended.operate(StartMission(PLAN))
+    ended.step(seconds=0.15)
+    assert ended.setpoints[before:] == []
+
+
 VERBS = {
     "start": StartMission(PLAN),
     "hold": Hold(),

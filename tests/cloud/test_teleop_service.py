@@ -60,6 +60,23 @@ def test_a_queued_mission_starts_when_the_first_has_ended():
     assert flight.names(second) == ["queued", "starting", "started", "reached", "done"]
 
 
+def test_between_two_missions_the_robot_is_seen_to_hold():
+    """Still on its way, it would be led past the spawn to the second one's first waypoint."""
+    flight, first = flying()
+    second = flight.create(queue=True)
+    flight.downlink = False
+    finish(flight)
+    flight.step(seconds=1.0)
+    assert (flight.view(first)["state"], flight.view(second)["state"]) == ("done", "starting")
+    assert flight.requests[-1].request is Request.END
+    assert flight.setpoints[-1].waypoint == -1
+    flight.downlink = True
+    flight.step(seconds=0.12)
+    assert flight.requests[-1].request is Request.START
+    assert flight.setpoints[-1] == Setpoint(A, 0.0, 0)
+    assert flight.view(second)["state"] == "flying"
+
+
 def test_the_queue_is_bounded():
     flight, _ = flying()
     for _ in range(QUEUE_MAX):

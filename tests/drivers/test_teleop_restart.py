@@ -1,110 +1,18 @@
 """World, cloud and teleop as processes, each of which may be killed in flight."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
-import urllib.error
-import urllib.request
-from pathlib import Path
 
 import pytest
+from release import LIMIT, TOKEN, Release
 
-from cloudrc.config.load import dump, load_experiment
-from cloudrc.drivers.local import _free_addresses
+from cloudrc.cli.mission_http import Api, UnreachableError
+from cloudrc.cloud.teleop.journal_format import parse
+from cloudrc.cloud.teleop.wire import ALARM, encode
+from cloudrc.drivers.unix import UnixPeer
 
 pytestmark = pytest.mark.process
-
-LIMIT = 30.0
-MISSION = """
-waypoints:
-  - {position_m: [0.5, 0.0, 0.7], tolerance_m: 0.2, dwell_s: 0.0}
-  - {position_m: [0.5, 3.6, 0.7], tolerance_m: 0.2, dwell_s: 0.0}
-  - {position_m: [0.5, 0.0, 0.7], tolerance_m: 0.2, dwell_s: 0.0}
-"""
-
-
-class Release:
-    """What a release has, without its link: three processes, a journal, an API."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.running, self.all = folder, {}, []
-        self.world, self.cloud = _free_addresses(2)
-        (folder / "config.yaml").write_text(dump(load_experiment("paper")))
-        (folder / "mission.yaml").write_text(MISSION)
-        for name in ("world", "cloud", "teleop"):
-            self.start(name)
-        self.until(lambda: self.ask("/v1/state")["seen"] is not None)
-
-    def start(self, name: str) -> None:
-        flags = {
-            "world": ["--listen", self.world, "--peer", self.cloud],
-            "cloud": ["--listen", self.cloud, "--peer", self.world, "--teleop", "."],
-            "teleop": ["--socket", ".", "--api", "127.0.0.1:0", "--api-file", "api.json",
-                       "--journal", "journal/journal.jsonl"],
-        }  # fmt: skip
-        (self.folder / "api.json").unlink(missing_ok=True) if name == "teleop" else None
-        self.running[name] = self.run(name, "--config", "config.yaml", *flags[name])
-
-    def run(self, *words: str) -> "subprocess.Popen[str]":
-        command = [sys.executable, "-m", "cloudrc", *words]
-        environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-        pipe = subprocess.PIPE
-        process = subprocess.Popen(
-            command, cwd=self.folder, stdout=pipe, stderr=pipe, text=True, env=environ
-        )
-        self.all.append(process)
-        return process
-
-    def kill(self, *names: str) -> None:
-        for name in names:
-            self.running[name].kill()
-            self.running[name].communicate()
-
-    def end(self) -> None:
-        for process in self.all:
-            process.kill()
-            process.communicate()
-
-    def ask(self, path: str):
-        try:
-            url = json.loads((self.folder / "api.json").read_text())["url"]
-            with urllib.request.urlopen(url + path, timeout=2.0) as answer:
-                return json.loads(answer.read())
-        except urllib.error.HTTPError as error:
-            error.close()
-        except (OSError, ValueError):
-            pass
-        return {"seen": None, "missions": []}
-
-    def mission(self):
-        """The newest one, if there is any."""
-        missions = self.ask("/v1/missions")["missions"]
-        return missions[-1] if missions else {"state": "away", "reached": []}
-
-    def until(self, condition) -> None:
-        limit = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < limit, "not in time"
-            time.sleep(0.05)
-
-    def fly(self) -> "subprocess.Popen[str]":
-        """What a Job runs, once it has reached its first waypoint."""
-        url = json.loads((self.folder / "api.json").read_text())["url"]
-        job = self.run("mission", "fly", "--api", url, "--mission", "mission.yaml", "--key", "u")
-        self.until(lambda: len(self.mission()["reached"]) == 1)
-        return job
-
-    def stop(self) -> dict[str, float]:
-        took = {}
-        for name, process in self.running.items():
-            began = time.monotonic()
-            process.send_signal(signal.SIGTERM)
-            process.communicate(timeout=10)
-            took[name] = time.monotonic() - began
-        return took
 
 
 @pytest.fixture
@@ -147,12 +55,60 @@ def test_a_second_teleop_waits_for_the_journal_and_takes_over(release):
     release.until(lambda: (release.folder / "api.json").exists())
     url = json.loads((release.folder / "api.json").read_text())["url"]
     assert url != json.loads(old)["url"]
-    with pytest.raises(urllib.error.HTTPError, match="503") as refused:
-        urllib.request.urlopen(f"{url}/v1/state", timeout=2.0)
-    refused.value.close()
+    with pytest.raises(UnreachableError, match="another teleop has this journal open"):
+        Api(url, lambda: TOKEN).get("/v1/state")
     first.send_signal(signal.SIGTERM)
     first.communicate(timeout=2.0)
     release.until(lambda: release.mission()["state"] == "done")
+
+
+@pytest.mark.promise("P-MISSION-4")
+def test_asked_to_end_in_flight_teleop_pauses_the_mission_and_a_successor_goes_on(release):
+    release.fly()
+    teleop = release.running["teleop"]
+    began = time.monotonic()
+    teleop.send_signal(signal.SIGTERM)
+    teleop.communicate(timeout=10)
+    assert time.monotonic() - began < 2.0
+    assert teleop.returncode == 0
+    entries = parse((release.folder / "journal" / "missions").read_bytes()).entries
+    assert (entries[-1]["event"], "paused by shutdown" in entries[-1]["text"]) == ("paused", True)
+    release.start("teleop")
+    release.until(lambda: release.mission()["state"] == "done")
+    assert [reached["waypoint"] for reached in release.mission()["reached"]] == [0, 1, 2]
+
+
+@pytest.mark.promise("P-API-8")
+def test_an_emergency_stop_stops_the_rotors_and_is_audited(release):
+    job = release.fly()
+    release.post("/v1/estop")
+    release.until(lambda: release.ask("/v1/state")["seen"]["guard"] == "ESTOP")
+    out, _ = job.communicate(timeout=LIMIT)
+    assert (job.returncode, "emergency_stopped" in out) == (1, True)
+    release.post("/v1/acknowledge")
+    release.until(lambda: release.ask("/v1/state")["seen"]["guard"] != "ESTOP")
+    release.stop()
+    lines = (release.folder / "audit.jsonl").read_text().splitlines()
+    actions = [json.loads(line)["action"] for line in lines]
+    assert actions[-2:] == ["POST /v1/estop", "POST /v1/acknowledge"]
+    everything = b"".join(path.read_bytes() for path in release.folder.rglob("*")
+                          if path.is_file() and path.name != "operator")  # fmt: skip
+    assert TOKEN.encode() not in everything
+
+
+def test_an_emergency_stop_comes_through_while_teleop_waits_for_its_disk(release):
+    """Its loop hangs in a write: the alarm goes past it to cloud, which gives it its number."""
+    release.fly()
+    alarm = UnixPeer(release.folder / "mine.sock", release.folder / "cloud.sock")
+    release.running["teleop"].send_signal(signal.SIGSTOP)
+    assert alarm.send(encode(ALARM))
+    time.sleep(0.3)
+    release.running["teleop"].send_signal(signal.SIGCONT)
+    alarm.close()
+    release.until(lambda: release.mission()["state"] == "failed")
+    assert release.ask("/v1/state")["seen"]["guard"] == "ESTOP"
+    failures = release.mission()["verdict"]["failures"]
+    assert failures[0]["code"] == "guard_stopped"  # teleop itself was never asked
 
 
 def test_all_end_within_two_seconds_of_sigterm(release):

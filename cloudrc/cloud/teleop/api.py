@@ -14,6 +14,7 @@ from typing import Any
 
 from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.security import HTTPBearer
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
@@ -21,7 +22,14 @@ from cloudrc import __version__
 from cloudrc.cloud.teleop import api_models as models
 from cloudrc.cloud.teleop.api_bridge import Bridge, Call
 from cloudrc.cloud.teleop.api_check import leads_to_board, read_goto, read_mission
-from cloudrc.cloud.teleop.api_errors import BODY_MAX, REFUSALS, TooLargeError, handle_errors
+from cloudrc.cloud.teleop.api_errors import (
+    BODY_LIMIT,
+    BODY_MAX,
+    REFUSALS,
+    TooLargeError,
+    TooSlowError,
+    handle_errors,
+)
 from cloudrc.cloud.teleop.api_events import last_event_id, stream
 from cloudrc.cloud.teleop.plan import Plan
 from cloudrc.cloud.teleop.service import MissionService
@@ -33,6 +41,9 @@ ABOUT = """\
 Fly missions, or steer by hand. One mission is flown at a time; a second one is refused with the
 id of the first, or waits if it says `queue`. A mission posted again under the same `key` is not
 made again. Positions are in metres, x forward, y left, z up.
+
+Every request needs a token: `Authorization: Bearer TOKEN`. A reader's may look, an operator's may
+command. `POST /v1/estop` stops the rotors at once and is served even while a flood is refused.
 """
 ANSWER_LIMIT = 2.0
 """For the mission service to answer [s]."""
@@ -55,15 +66,21 @@ class Surroundings:
     plan: Callable[[MissionSection, float], Plan]
 
 
-def authorize(request: Request) -> None:
-    """Let everybody through: the place where a token will be asked for."""
+BEARER = HTTPBearer(auto_error=False, description="An operator's token, or a reader's for GET")
+"""For the description alone: the gate before the application checks every token."""
 
 
 def create_app(bridge: Bridge, surroundings: Surroundings) -> FastAPI:
-    """Make the ASGI application."""
-    app = FastAPI(title="cloudrc teleop", version=__version__, description=ABOUT)
+    """Make the ASGI application; it belongs behind a gate."""
+    app = FastAPI(
+        title="cloudrc teleop",
+        version=__version__,
+        description=ABOUT,
+        docs_url=None,  # their pages load scripts from elsewhere
+        redoc_url=None,
+    )
     handle_errors(app)
-    router = APIRouter(prefix="/v1", dependencies=[Depends(authorize)], responses=REFUSALS)
+    router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUSALS)
     _add_missions(router, bridge, surroundings)
     _add_operator(router, bridge, surroundings)
     _add_views(router, bridge)
@@ -71,18 +88,25 @@ def create_app(bridge: Bridge, surroundings: Surroundings) -> FastAPI:
     return app
 
 
-async def _ask(bridge: Bridge, call: Call) -> Any:
-    future = asyncio.wrap_future(bridge.submit(call))
+async def _ask(bridge: Bridge, call: Call, *, urgent: bool = False) -> Any:
+    future = asyncio.wrap_future(bridge.submit(call, urgent=urgent))
     return await asyncio.wait_for(future, ANSWER_LIMIT)
 
 
 async def _body(request: Request) -> bytes:
-    """Read a body that is not too long; a longer one is not read to its end."""
+    """Read a body that is neither too long nor too slow; another one is not read to its end."""
+    said = request.headers.get("content-length", "0")
+    if said.isdecimal() and int(said[:12]) > BODY_MAX:
+        raise TooLargeError
     body = b""
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > BODY_MAX:
-            raise TooLargeError
+    try:
+        async with asyncio.timeout(BODY_LIMIT):
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > BODY_MAX:
+                    raise TooLargeError
+    except TimeoutError:
+        raise TooSlowError from None
     return body
 
 
@@ -147,6 +171,27 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
     )
     async def resume() -> JSONResponse:
         return JSONResponse(await _ask(bridge, lambda s, now_ns: s.resume(now_ns).as_json()))
+
+    @router.post(
+        "/estop",
+        summary="Stop the rotors at once",
+        description="Whatever the robot does. It falls, and stays off until acknowledged.",
+        **_gives(models.Stopped, "The robot is told until it obeys"),
+    )
+    async def stop() -> JSONResponse:
+        bridge.alarm()
+        mission = await _ask(bridge, lambda s, now_ns: s.stop_rotors(now_ns), urgent=True)
+        return JSONResponse({"id": mission.id if mission else None, "state": "stopping"})
+
+    @router.post(
+        "/acknowledge",
+        summary="Release a robot that was stopped or has landed",
+        description="It arms nothing: the next mission does.",
+        **_gives(models.Acknowledged, "The robot is told until it obeys"),
+    )
+    async def acknowledge() -> JSONResponse:
+        await _ask(bridge, lambda s, now_ns: s.acknowledge(now_ns))
+        return JSONResponse({"state": "acknowledged"})
 
     @router.post(
         "/goto",

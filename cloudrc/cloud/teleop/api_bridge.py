@@ -2,20 +2,27 @@
 
 The machine belongs to one thread. Whoever else wants something of it leaves a call here, which the
 loop makes between two deadlines. The bridge is bounded: a flood is refused, it does not pile up.
+Each role has a lane of its own, so that readers cannot take an operator's place. Beside them is one
+for the emergency stop, which waits for nobody.
 """
 
 from __future__ import annotations
 
-import queue
+import threading
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextvars import ContextVar
 from typing import Any
 
+from cloudrc.cloud.teleop.api_tokens import OPERATOR, ROLES, Role
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.service_book import UnavailableError
 
 WAITING_MAX = 64
-"""Calls that wait at once."""
+"""Calls of each role that wait at once."""
+LANE: ContextVar[Role] = ContextVar("lane", default=OPERATOR)
+"""Whose request is being served; set by the gate."""
 
 Call = Callable[[MissionService, int], Any]
 """Service and now [ns] come in; what is answered goes out."""
@@ -26,19 +33,24 @@ class Bridge:
 
     Attributes:
         closed: Why no call is taken, in words; "" if they are.
+        alarm: Tells the robot to stop its rotors past everything else, teleop's loop included; may
+            be called from any thread.
     """
 
     def __init__(self) -> None:
         self.closed = "teleop is starting"
-        self._calls: queue.Queue[tuple[Call, Future[Any]]] = queue.Queue(WAITING_MAX)
+        self.alarm: Callable[[], object] = lambda: None
+        self._urgent: deque[tuple[Call, Future[Any]]] = deque(maxlen=WAITING_MAX)
+        self._lanes: dict[Role, deque[tuple[Call, Future[Any]]]] = {r: deque() for r in ROLES}
+        self._lock = threading.Lock()
         self._service: MissionService | None = None
 
     def open(self, service: MissionService) -> None:
         """Take calls for this service from now on."""
         self._service, self.closed = service, ""
 
-    def submit(self, call: Call) -> Future[Any]:
-        """Leave a call, from any thread.
+    def submit(self, call: Call, *, urgent: bool = False) -> Future[Any]:
+        """Leave a call in its lane, from any thread; an urgent one is made before all others.
 
         Raises:
             UnavailableError: If none is taken now.
@@ -46,21 +58,29 @@ class Bridge:
         if self.closed:
             raise UnavailableError(self.closed)
         future: Future[Any] = Future()
-        try:
-            self._calls.put_nowait((call, future))
-        except queue.Full:
-            raise UnavailableError(f"{WAITING_MAX} requests wait already; try again") from None
+        if urgent:
+            self._urgent.append((call, future))
+            return future
+        with self._lock:
+            lane = self._lanes[LANE.get()]
+            if len(lane) >= WAITING_MAX:  # those that nobody waits for any more make room
+                still = [waiting for waiting in lane if not waiting[1].cancelled()]
+                lane.clear()
+                lane.extend(still)
+            if len(lane) >= WAITING_MAX:
+                raise UnavailableError(f"{WAITING_MAX} requests wait already; try again")
+            lane.append((call, future))
         return future
 
     def take(self) -> list[Callable[[int], None]]:
-        """Hand over the calls that wait, for the loop's thread to make."""
+        """Hand over the calls that wait, operators' first, for the loop's thread to make."""
         taken: list[Callable[[int], None]] = []
-        while len(taken) < WAITING_MAX:
-            try:
-                call, future = self._calls.get_nowait()
-            except queue.Empty:
-                break
-            taken.append(self._bound(call, future))
+        while self._urgent:
+            taken.append(self._bound(*self._urgent.popleft()))
+        with self._lock:
+            for lane in self._lanes.values():
+                while lane and len(taken) < WAITING_MAX:
+                    taken.append(self._bound(*lane.popleft()))
         return taken
 
     def _bound(self, call: Call, future: Future[Any]) -> Callable[[int], None]:

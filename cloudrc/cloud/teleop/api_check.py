@@ -9,15 +9,19 @@ from math import cos, radians, sin
 from typing import TypeVar
 
 from pydantic import ValidationError
+from pydantic_core import from_json
 
 from cloudrc.cloud.teleop.api_models import GoToRequest, MissionRequest
 from cloudrc.config.fields import Section
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem, from_pydantic
-from cloudrc.config.schema import Mission, Waypoint
+from cloudrc.config.schema import MAX_WAYPOINTS, Mission, Waypoint
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
+
+PROBLEMS_MAX = 50
+"""Of one request, that are put into words."""
 
 _Request = TypeVar("_Request", bound=Section)
 
@@ -36,6 +40,7 @@ def read_mission(body: bytes, scene: Scene) -> tuple[MissionRequest, Mission]:
     Raises:
         RefusedError: With everything that is wrong.
     """
+    _refuse_too_many(body)
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # an experiment's mission may have steps in their place
         _refuse([Problem(("waypoints",), "", "none given; give at least one")])
@@ -81,6 +86,17 @@ def as_json(problem: Problem) -> dict[str, str | int | None]:
     }
 
 
+def _refuse_too_many(body: bytes) -> None:
+    """Count before anything is checked: what is wrong with each of too many would take long."""
+    try:
+        points = from_json(body)["waypoints"]
+    except (ValueError, TypeError, KeyError):
+        return  # whatever it is, the model says it in words
+    if isinstance(points, list) and len(points) > MAX_WAYPOINTS:
+        reason = f"at most {MAX_WAYPOINTS}; split the mission"
+        _refuse([Problem(("waypoints",), str(len(points)), reason)])
+
+
 def _parse(body: bytes, model: type[_Request]) -> _Request:
     try:
         return model.model_validate_json(body)
@@ -90,8 +106,8 @@ def _parse(body: bytes, model: type[_Request]) -> _Request:
             problems = [Problem((), "", f"not JSON: {first['ctx']['error']}")]
         elif not first["loc"]:
             problems = [Problem((), "", "must be a mapping of keys")]
-        else:
-            problems = from_pydantic(error, model)
+        else:  # words take time: a hostile mission must not cost more of it than an honest one
+            problems = from_pydantic(error, model, limit=PROBLEMS_MAX)
         raise RefusedError(problems) from None
 
 

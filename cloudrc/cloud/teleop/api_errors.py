@@ -20,14 +20,20 @@ from cloudrc.errors import CloudrcError
 
 BODY_MAX = 256 * 1024
 """Length of a request's body [bytes]."""
+BODY_LIMIT = 5.0
+"""For a request's body to arrive [s]."""
 
 REFUSALS: dict[int | str, dict[str, Any]] = {
     code: {"model": Refusal, "description": text}
     for code, text in {
+        401: "There is no valid token in the request",
+        403: "The token is a reader's",
         404: "There is no such mission",
+        408: f"The body did not arrive within {BODY_LIMIT:g} s",
         409: "The state does not allow it; `id` names the mission in the way",
         413: f"The body is longer than {BODY_MAX // 1024} KiB",
         422: "A value cannot be used; `problems` has every one",
+        429: "Too many requests; try again in a second",
         503: "Not now: teleop is starting, or another one still holds the journal; try again",
     }.items()
 }
@@ -35,6 +41,10 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
 
 class TooLargeError(CloudrcError):
     """The body of a request is too long."""
+
+
+class TooSlowError(CloudrcError):
+    """The body of a request does not arrive."""
 
 
 def handle_errors(app: FastAPI) -> None:
@@ -52,6 +62,8 @@ def handle_errors(app: FastAPI) -> None:
                 return JSONResponse({"detail": str(error)}, 404)
             case TooLargeError():
                 return JSONResponse({"detail": REFUSALS[413]["description"]}, 413)
+            case TooSlowError():
+                return JSONResponse({"detail": REFUSALS[408]["description"]}, 408)
             case UnavailableError():
                 return JSONResponse({"detail": str(error)}, 503, {"Retry-After": "1"})
         return JSONResponse({"detail": str(error)}, 500)
@@ -63,6 +75,10 @@ def handle_errors(app: FastAPI) -> None:
             for each in error.errors()
         ]
         return await refuse(request, RefusedError(found))
+
+    @app.exception_handler(Exception)
+    async def fail(request: Request, error: Exception) -> JSONResponse:
+        return JSONResponse({"detail": "the API failed; see teleop's log"}, 500)
 
     @app.exception_handler(TimeoutError)
     async def too_late(request: Request, error: TimeoutError) -> JSONResponse:

@@ -89,8 +89,9 @@ class Event(_Answer):
     mission: str = Field(description="Whose")
     event: str = Field(
         description="queued, starting, started, reached, held, resumed, goto, restarted, "
-        "board_touched, pipe_touched; at the end done, cancelled, timed_out, leg_timed_out, "
-        "world_restarted or guard_stopped"
+        "board_touched, pipe_touched, paused; at the end done, cancelled, timed_out, "
+        "leg_timed_out, world_restarted, guard_stopped, emergency_stopped, taken_over or "
+        "end_lost"
     )
     waypoint: int = Field(description="Index of the waypoint concerned")
     text: str = Field(description="The same in words")
@@ -147,6 +148,19 @@ class StateView(_Answer):
     mission: MissionSummary | None = Field(description="The one under way")
     queue: list[str] = Field(description="Ids of those that wait")
     seen: Seen | None = Field(description="Null until the robot has been seen")
+
+
+class Stopped(_Answer):
+    """An emergency stop on its way."""
+
+    id: str | None = Field(description="The mission that was under way and has failed")
+    state: Literal["stopping"] = Field(description="Until the guard on board is in ESTOP")
+
+
+class Acknowledged(_Answer):
+    """An acknowledgement on its way."""
+
+    state: Literal["acknowledged"] = Field(description="The robot may fly again")
 
 
 class Problem(_Answer):

@@ -1,28 +1,27 @@
 """The journal of missions: entries come in and are on the disk when `append` returns.
 
-Append-only text, one entry per line: CRC-32 of the JSON (8 hex digits), its length in bytes, the
-JSON. What a crash has torn off at the end is cut when the journal is opened again, and reported.
-A lock keeps a second process out: during a change of pods an old and a new teleop can overlap.
+Append-only, see `journal_format`. What a crash has torn off at the end is cut when the journal is
+opened again, damage in the middle is left out, and both are reported. A lock keeps a second process
+out: during a change of pods an old and a new teleop can overlap. A disk that is full or read-only
+refuses entries, and takes them again once it can.
 """
 
 from __future__ import annotations
 
-import fcntl
-import json
-import os
-import re
-import zlib
+import errno
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeAlias
 
-from cloudrc.errors import CloudrcError
+from cloudrc.cloud.teleop.journal_disk import Disk
+from cloudrc.cloud.teleop.journal_format import MAGIC, Parsed, parse, to_record
+from cloudrc.cloud.teleop.journal_format import Entry as Entry
+from cloudrc.errors import BadInputError, CloudrcError
 
-Entry: TypeAlias = dict[str, Any]
-"""What JSON can hold; numbers may also be infinite."""
-
-_LINE = re.compile(rb"([0-9a-f]{8}) (\d{1,9}) (.*)", re.DOTALL)
+REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EDQUOT)
+"""A disk that can only be read, or is full: what is there still counts."""
+NO_FILE = -1
 
 
 class JournalLockedError(CloudrcError):
@@ -35,32 +34,36 @@ class Journal:
     Attributes:
         entries: Those that were there when it was opened, oldest first.
         trouble: What was wrong with the file and what has been done about it; "" if nothing.
+        repaired: Whether something was cut off or left out.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, disk: Disk | None = None) -> None:
         """Open, lock, read, and cut off what cannot be read.
+
+        Args:
+            path: Of the file; its folder is made.
+            disk: Where it is; None for the machine's own.
 
         Raises:
             JournalLockedError: If another process has it.
-            OSError: If the file cannot be opened or written.
+            BadInputError: If the file is something else.
+            OSError: If there is no journal and none can be made.
         """
-        self._path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._lock = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        self._path, self._disk = path, disk or Disk()
+        self._file, self._named = NO_FILE, False
+        self.trouble = ""
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lock = self._disk.lock(path)
         except BlockingIOError:
-            os.close(self._lock)
             raise JournalLockedError(
                 f"{path}: another teleop has this journal open; waiting until it ends"
             ) from None
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
-        _sync_folder(path.parent)
-        data = path.read_bytes()
-        self.entries, good, lost = parse(data)
-        self.trouble = ""
-        if good < len(data):
-            self._mend(data, good, lost)
+        try:
+            found = self._read()
+            self._mend(found)
+        except BaseException:
+            self.close()
+            raise
 
     def append(self, entry: Entry) -> None:
         """Write an entry; it survives the process and the machine from here on.
@@ -68,27 +71,51 @@ class Journal:
         Raises:
             OSError: If the disk refuses; the journal is then as before.
         """
-        size = os.fstat(self._file).st_size
+        disk, file = self._disk, self._opened()
+        record = to_record(self._number + 1, entry)
+        if not self._size:
+            record = MAGIC + record
         try:
-            _write(self._file, to_line(entry))
+            if disk.size(file) != self._size:  # an attempt before this one could not be undone
+                disk.truncate(file, self._size)
+            self._write(file, record)
         except OSError:
-            os.ftruncate(self._file, size)
+            with suppress(OSError):
+                disk.truncate(file, self._size)
+                disk.sync(file)
             raise
+        self._size += len(record)
+        self._number += 1
 
     def rewrite(self, entries: Iterable[Entry]) -> None:
-        """Replace all entries, in one step: a crash leaves the old or the new ones."""
-        new = self._path.with_name(f"{self._path.name}.new")
-        file = os.open(new, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
-        _write(file, b"".join(map(to_line, entries)))
-        new.replace(self._path)
-        _sync_folder(self._path.parent)
-        os.close(self._file)
-        self._file = file
+        """Replace all entries, in one step: a crash leaves the old or the new ones.
+
+        Raises:
+            OSError: If the disk refuses; the journal is then as before.
+        """
+        disk, new = self._disk, self._path.with_name(f"{self._path.name}.new")
+        records = [to_record(number, entry) for number, entry in enumerate(entries, 1)]
+        data = b"".join((MAGIC, *records))
+        file = disk.open(new, new=True)
+        try:
+            self._write(file, data)
+            disk.replace(new, self._path)
+        except OSError:
+            disk.close(file)
+            with suppress(OSError):
+                disk.remove(new)
+            raise
+        if self._file != NO_FILE:
+            disk.close(self._file)
+        self._file, self._size, self._number = file, len(data), len(records)
+        self._named = False
+        self._opened()
 
     def close(self) -> None:
         """Let the next one in."""
-        os.close(self._file)
-        os.close(self._lock)
+        if self._file != NO_FILE:
+            self._disk.close(self._file)
+        self._disk.close(self._lock)
 
     def __enter__(self) -> Journal:
         return self
@@ -101,67 +128,62 @@ class Journal:
     ) -> None:
         self.close()
 
-    def _mend(self, data: bytes, good: int, lost: int) -> None:
-        """Keep the readable entries; if more than a torn end is lost, keep a copy, too."""
-        self.trouble = f"{self._path}: {len(data) - good} bytes of a torn entry were cut off"
-        if lost:
-            copy = self._path.with_name(f"{self._path.name}.damaged")
-            copy.write_bytes(data)
-            self.trouble = f"{self._path}: {lost} damaged entries were left out; see {copy}"
+    def _read(self) -> Parsed:
+        """Open it to be written, if that can be; then read it."""
+        try:
+            self._opened()
+        except OSError as error:
+            if error.errno not in REFUSED:
+                raise
+            self._complain(f"{self._path}: {error.strerror}: missions are refused until it is not")
+        return parse(self._disk.read(self._path))
+
+    def _opened(self) -> int:
+        """The file, open to be written; tried again where the disk refused before."""
+        if self._file == NO_FILE:
+            self._file = self._disk.open(self._path)
+        if not self._named:  # a name survives the machine once its folder is written
+            self._disk.sync_folder(self._path.parent)
+            self._named = True
+        return self._file
+
+    def _mend(self, found: Parsed) -> None:
+        """Cut a torn end; where more is damaged keep a copy, and write what is whole anew."""
+        if not (found.known or found.entries):
+            raise BadInputError(f"--journal {self._path}: is no journal; name another file")
+        self.entries, self._number = found.entries, found.number
+        self._size = found.end
+        damaged = found.lost or not found.known
+        self.repaired = bool(found.torn or damaged)
+        try:
+            if damaged:
+                self._leave_out(found)
+            elif found.torn:
+                text = f"{self._path}: {found.torn} bytes of a torn entry were cut off"
+                self._complain(f"journal repaired: {text}")
+                file = self._opened()
+                self._disk.truncate(file, self._size)
+                self._disk.sync(file)
+        except OSError as error:
+            self._complain(f"it could not be written: {error.strerror}")
+
+    def _leave_out(self, found: Parsed) -> None:
+        copy = self._path.with_name(f"{self._path.name}.damaged")
+        lost = f"{found.lost} damaged entries were left out"
+        what = lost if found.lost else "its head was damaged"
+        self._complain(f"journal repaired: {self._path}: {what}; see {copy}")
+        file = self._disk.open(copy, new=True)
+        try:
+            self._write(file, self._disk.read(self._path))
+        finally:
+            self._disk.close(file)
         self.rewrite(self.entries)
 
+    def _write(self, file: int, data: bytes) -> None:
+        view = memoryview(data)
+        while view:
+            view = view[self._disk.write(file, bytes(view)) :]
+        self._disk.sync(file)
 
-def to_line(entry: Entry) -> bytes:
-    """Write an entry as its line."""
-    text = json.dumps(entry, separators=(",", ":")).encode()
-    return b"%08x %d %s\n" % (zlib.crc32(text), len(text), text)
-
-
-def parse(data: bytes) -> tuple[list[Entry], int, int]:
-    """Read a journal's bytes.
-
-    Returns:
-        Every entry that is whole; how many bytes belong to whole lines; how many damaged lines
-        there are that are not just the torn end.
-    """
-    entries: list[Entry] = []
-    good = damaged = bad_since = 0
-    for line in data.splitlines(keepends=True):
-        entry = _entry(line)
-        if entry is None:
-            bad_since += 1
-            continue
-        damaged, bad_since = damaged + bad_since, 0
-        entries.append(entry)
-        good += len(line)
-    return entries, good, damaged
-
-
-def _entry(line: bytes) -> Entry | None:
-    match = _LINE.fullmatch(line.removesuffix(b"\n"))
-    if match is None or not line.endswith(b"\n"):
-        return None
-    crc, length, text = match.groups()
-    if len(text) != int(length) or zlib.crc32(text) != int(crc, 16):
-        return None
-    try:
-        entry = json.loads(text)
-    except ValueError:
-        return None
-    return entry if isinstance(entry, dict) else None
-
-
-def _write(file: int, data: bytes) -> None:
-    view = memoryview(data)
-    while view:
-        view = view[os.write(file, view) :]
-    os.fsync(file)
-
-
-def _sync_folder(folder: Path) -> None:
-    """A new name is on the disk only when its folder is."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    def _complain(self, text: str) -> None:
+        self.trouble = "; ".join(filter(None, (self.trouble, text)))

@@ -32,6 +32,8 @@ class Seen(NamedTuple):
         horizon: How far cloud looks ahead [s]; NaN before its first command.
         rtt: Last round trip, hold excluded [s]; NaN likewise.
         loop_delay: Last `now - echo_stamp`, hold included [s]; NaN likewise.
+        mission_id: The mission that world was told to start last; 0 if none.
+        reached: How many of its waypoints world has been told are reached, or `MISSION_OVER`.
     """
 
     epoch: int
@@ -45,13 +47,21 @@ class Seen(NamedTuple):
     horizon: float = nan
     rtt: float = nan
     loop_delay: float = nan
+    mission_id: int = 0
+    reached: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class StartMission:
-    """Operator: fly this plan."""
+    """Operator: fly this plan.
+
+    Attributes:
+        plan: Checked.
+        mission_id: Names it on board, where its progress is kept, too; 0 for not at all.
+    """
 
     plan: Plan
+    mission_id: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +74,7 @@ class Continue:
         elapsed: How long the mission had lasted [s].
         world: The world that it was flown in; in another one it has failed.
         held: Whether the operator had stopped it.
+        mission_id: As it was started.
     """
 
     plan: Plan
@@ -71,6 +82,7 @@ class Continue:
     elapsed: float
     world: str
     held: bool = False
+    mission_id: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,14 +107,33 @@ class GoTo:
     Attributes:
         position: [m], world frame, shape (3,).
         yaw: [rad].
+        mission_id: Names the mission that it is on board; 0 for not at all.
     """
 
     position: Vector
     yaw: float = 0.0
+    mission_id: int = 0
 
 
-Verb: TypeAlias = StartMission | Continue | Hold | Resume | Cancel | GoTo
-"""What an operator can say; `Continue` is for teleop alone."""
+@dataclass(frozen=True, slots=True)
+class EmergencyStop:
+    """Operator: rotors off, at once, whatever the robot does."""
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledge:
+    """Operator: I have seen why the robot landed or was stopped; it may fly again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """Teleop itself, before it ends: let the robot hold until a successor goes on."""
+
+
+Verb: TypeAlias = (
+    StartMission | Continue | Hold | Resume | Cancel | GoTo | EmergencyStop | Acknowledge | Pause
+)
+"""What an operator can say; `Continue` and `Pause` are for teleop alone."""
 
 Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 """What teleop says."""
@@ -132,8 +163,8 @@ class Outcome:
     """How a mission ended.
 
     Attributes:
-        code: "done", "cancelled", "leg_timed_out", "timed_out", "world_restarted" or
-            "guard_stopped".
+        code: "done", "cancelled", "leg_timed_out", "timed_out", "world_restarted",
+            "guard_stopped", "emergency_stopped", "taken_over" or "end_lost".
         text: The same in words.
         waypoint: Index of the waypoint that was flown to at the end.
         reached: Number of waypoints reached.

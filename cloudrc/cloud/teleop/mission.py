@@ -7,8 +7,8 @@ A pure state machine (`State`), joined to controller and robot by messages only:
     teleop.handle_deadline(now_ns)      regularly, at 10 Hz or faster
     teleop.take_outputs()               after any of them: Setpoint, OperatorRequest, MissionEvent
 
-A `Setpoint` comes out when it changes and holds until the next; an `OperatorRequest` comes out at
-10 Hz until the robot is seen to have acted on it; each `MissionEvent` comes out once.
+A `Setpoint` holds until the next; an `OperatorRequest` comes out at 10 Hz until the robot is seen
+to have acted on it; each `MissionEvent` comes out once.
 
               StartMission             start seen             every waypoint reached
         IDLE -------------> STARTING -------------> FLYING --------------------------> DONE
@@ -16,42 +16,42 @@ A `Setpoint` comes out when it changes and holds until the next; an `OperatorReq
                                                      v |
                                                      HELD
 
-Cancel leads from STARTING, FLYING and HELD to CANCELLED; a limit of time, a world that restarts
-or a guard that lands lead to FAILED. Every end holds: the robot is asked to hold by itself, and
-the setpoint stays where it was seen. Times are integer nanoseconds of the caller's clock.
+Cancel leads from STARTING, FLYING and HELD to CANCELLED; a limit of time, a world that restarts,
+a guard that lands or an emergency stop lead to FAILED. Every end holds: the robot is asked to hold
+by itself, and the setpoint stays where it was seen. The robot keeps in mind, too, how many
+waypoints are reached and that a mission is over, for a teleop that forgets. Times are nanoseconds
+of the caller's clock.
 """
 
 from __future__ import annotations
 
-from math import dist
-
+from cloudrc.cloud.teleop import mission_rules as rules
 from cloudrc.cloud.teleop.messages import (
+    Acknowledge,
     Cancel,
     Continue,
+    EmergencyStop,
     GoTo,
     Hold,
     Outcome,
     Output,
+    Pause,
     Resume,
     Seen,
     StartMission,
     State,
     Verb,
 )
-from cloudrc.cloud.teleop.plan import Leg, Plan
+from cloudrc.cloud.teleop.mission_leg import LegWatch, overdue, where
+from cloudrc.cloud.teleop.plan import NO_PLAN, Leg, Plan
 from cloudrc.cloud.teleop.request import Repeater
-from cloudrc.errors import BadInputError
-from cloudrc.messages import ZERO, GuardState, Request, Setpoint, Start, Vector
+from cloudrc.messages import MISSION_OVER, GuardState, Request, Setpoint, Start, Vector
 from cloudrc.records import MissionEvent
 
 # An enum's member is slow to look up; these are asked for in every period.
-FLYING, WORST_GUARD = State.FLYING, GuardState.HOLD
-UNDER_WAY = (FLYING, State.STARTING, State.HELD)
+FLYING, STARTING = State.FLYING, State.STARTING
+UNDER_WAY = rules.UNDER_WAY
 NO_WAYPOINT = -1
-ANY_WORLD = ""
-"""Until the robot is seen to have started it does not matter which world it stands in."""
-NO_PLAN = Plan((Leg(ZERO),))
-"""Stands in until the first mission starts; never flown."""
 
 
 class Teleop:
@@ -60,22 +60,23 @@ class Teleop:
     Attributes:
         state: Of the mission.
         outcome: How it ended; None while there is none or it is under way.
+        requests: What is asked of the robot.
         outputs: What it has said since the last `take_outputs`.
     """
 
     def __init__(self) -> None:
         self.state = State.IDLE
         self.outcome: Outcome | None = None
-        self._requests = Repeater()
+        self.requests = Repeater()
         self.outputs: list[Output] = []
         self._seen: Seen | None = None
-        self._plan = NO_PLAN
-        self._leg = 0
-        self._world = ANY_WORLD
+        self._plan, self._mission_id = NO_PLAN, 0
+        self._leg, self._watch = 0, LegWatch()
+        self._world = rules.ANY_WORLD
         self._continued: Continue | None = None
+        self._unaimed = self._told = False  # told: the robot has been of this mission
         self._yaw = 0.0
-        self._began_ns = self._leg_began_ns = self._held_ns = 0
-        self._within_since_ns: int | None = None
+        self._began_ns = 0
 
     @property
     def leg(self) -> int:
@@ -85,7 +86,7 @@ class Teleop:
     @property
     def settled(self) -> bool:
         """Whether the robot is seen to have acted on the last request."""
-        return self._requests.settled
+        return self.requests.settled
 
     def elapsed(self, now_ns: int) -> float:
         """Time since the mission began [s]."""
@@ -106,79 +107,86 @@ class Teleop:
             BadInputError: If the state does not allow it or a value cannot be used; nothing has
                 changed then.
         """
+        rules.refuse_unless_fitting(verb, self.state)
         match verb:
-            case StartMission(plan):
-                self._refuse_unless("start", self.state not in UNDER_WAY, "cancel it first")
-                self._start(plan, now_ns)
+            case StartMission(plan, mission_id):
+                self._start(plan, mission_id, now_ns)
             case Continue():
-                self._refuse_unless("continue", self.state is State.IDLE, "it is not the first")
                 self._go_on(verb, now_ns)
             case Hold():
-                self._refuse_unless("hold", self.state is State.FLYING, "it has to be flying")
                 self._hold(now_ns)
             case Resume():
-                self._refuse_unless("resume", self.state is State.HELD, "it has to be held")
                 self._resume(now_ns)
             case Cancel():
-                self._refuse_unless("cancel", self.state in UNDER_WAY, "there is none under way")
-                self._end(State.CANCELLED, "cancelled", "mission cancelled", now_ns)
-            case GoTo(position, yaw):
-                leg = Leg(position, yaw)
-                moving = self.state in (State.STARTING, State.FLYING)
-                self._refuse_unless("goto", not moving, "hold or cancel it first")
-                self._go_to(leg, now_ns)
+                self._end("cancelled", "mission cancelled", now_ns)
+            case GoTo(position, yaw, mission_id):
+                self._go_to(Leg(position, yaw), mission_id, now_ns)
+            case EmergencyStop():
+                if self.state in UNDER_WAY:
+                    self._end("emergency_stopped", f"emergency stop {self._where()}", now_ns)
+                self.requests.ask(Request.ESTOP)
+            case Acknowledge():
+                self.requests.ask(Request.ACKNOWLEDGE, after=True)
+            case Pause():
+                self._tell("paused", self._leg, f"paused by shutdown {self._where()}", now_ns)
+                self.requests.ask(Request.END)
 
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry, at the instant [ns] at which it arrives."""
-        before, self._seen = self._seen, seen
-        started = self._requests.see(seen) and self.state is State.STARTING
+        before, self._seen, onboard = self._seen, seen, self._known_on_board(seen)
+        started = self.requests.see(seen) is Request.START and self.state is STARTING
         if self.state not in UNDER_WAY:
             if before is None or seen.epoch != before.epoch:
                 self._aim(seen.position, self._yaw, NO_WAYPOINT)
-        elif self._world not in (ANY_WORLD, seen.world):
-            self._fail("world_restarted", f"world restarted {self._where()}", now_ns)
+        elif harm := rules.harm_in(seen, self._mission_id, self._world, known=self._told):
+            code, text = harm
+            self._end(code, f"{text} {self._where()}", now_ns)
         elif started:
-            self._begin(now_ns)
-        elif seen.guard > WORST_GUARD and self.state is not State.STARTING:
-            self._fail("guard_stopped", f"guard went to {seen.guard.name} {self._where()}", now_ns)
-        while self.state is FLYING and self._is_reached(seen, now_ns):
-            self._advance(now_ns)
+            self._begin(seen, now_ns)
+        elif self._unaimed:
+            self._aim_ahead(seen)
+        while self._leg < onboard and self.state in (FLYING, State.HELD):
+            self._advance("known on board to be reached", now_ns)  # kept there, and lost here
+        while self.state is FLYING and self._watch.is_reached(self._to, seen, now_ns):
+            self._advance("reached", now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
         """Check the limits of time and repeat the request that is due at `now_ns` [ns]."""
         if self.state in UNDER_WAY:
             self._check_time(now_ns)
-        request = self._requests.due(now_ns)
+        request = self.requests.due(now_ns)
         if request is not None:
             self.outputs.append(request)
 
-    def _start(self, plan: Plan, now_ns: int) -> None:
-        self.state, self.outcome = State.STARTING, None
+    def _start(self, plan: Plan, mission_id: int, now_ns: int) -> None:
+        self.state, self.outcome = STARTING, None
         self._plan, self._leg, self._continued = plan, 0, None
-        self._began_ns = now_ns
+        self._mission_id, self._began_ns = mission_id, now_ns
         seen = self._seen
-        self._world = seen.world if seen and plan.start is Start.HERE else ANY_WORLD
-        self._requests.ask(Request.START, plan.start)
-        # Already now, so that the first command that the started robot gets leads the right way.
-        self._aim_at_leg()
+        self._world = seen.world if seen and plan.start is Start.HERE else rules.ANY_WORLD
+        self.requests.report(mission_id, 0)
+        self.requests.ask(Request.START, plan.start, after=True)
+        self._unaimed, self._told = True, False
+        self._aim_ahead(seen)
 
     def _go_on(self, before: Continue, now_ns: int) -> None:
         """Start again from here, at the waypoint that was flown to."""
-        self.state, self.outcome = State.STARTING, None
+        self.state, self.outcome = STARTING, None
         self._plan, self._leg, self._continued = before.plan, before.leg, before
+        self._mission_id, self._world = before.mission_id, before.world
+        self._unaimed, self._told = not before.held, True
         self._began_ns = now_ns - round(before.elapsed * 1e9)
-        self._world = before.world
-        self._requests.ask(Request.START, Start.HERE)
-        if not before.held:
-            self._aim_at_leg()
+        self.requests.report(self._mission_id, self._leg)
+        self.requests.ask(Request.START, Start.HERE)
+        if self._seen is not None:
+            self.see(self._seen, now_ns)  # it may be over, or the world another one
 
-    def _begin(self, now_ns: int) -> None:
+    def _begin(self, seen: Seen, now_ns: int) -> None:
         """The robot is seen to have started: the clocks of mission and leg begin."""
         plan, before = self._plan, self._continued
-        self.state = State.FLYING
-        self._begin_leg(now_ns)
-        if self._seen is not None:
-            self._world = self._seen.world
+        self.state, self._told = FLYING, True
+        self._watch.begin()
+        self._world = seen.world
         if before is not None:
             text = f"resumed after a restart of teleop {self._where()}"
             self._tell("resumed", self._leg, text, now_ns)
@@ -186,89 +194,94 @@ class Teleop:
                 self._hold(now_ns)
             return
         self._began_ns = now_ns
-        where = "from the spawn" if plan.start is Start.SPAWN else "from here"
-        self._tell("started", 0, f"mission started {where}, waypoints: {len(plan.legs)}", now_ns)
+        if self._unaimed:
+            self._unaimed = False
+            self._aim_at(self._leg)
+        place = "the spawn" if plan.start is Start.SPAWN else "here"
+        text = f"mission started from {place}, waypoints: {len(plan.legs)}"
+        self._tell("started", 0, text, now_ns)
 
-    def _begin_leg(self, now_ns: int) -> None:
-        self._leg_began_ns = now_ns
-        self._within_since_ns = None
+    def _aim_ahead(self, seen: Seen | None) -> None:
+        """Aim before the start is seen: the first command that is flown then leads the right way.
 
-    def _is_reached(self, seen: Seen, now_ns: int) -> bool:
-        """True once the robot has been seen near the waypoint for as long as the leg asks.
-
-        Time in HOLD does not count: the robot then waits on its own and does not do what the leg
-        is for, such as pressing on the board.
+        Not while the robot may still fly a mission whose end was lost: it would leave at once, past
+        the spawn, for a waypoint that is to be flown to from there.
         """
-        leg = self._plan.legs[self._leg]
-        if dist(seen.position, leg.position) > leg.tolerance or seen.guard is GuardState.HOLD:
-            self._within_since_ns = None
-            return False
-        if self._within_since_ns is None:
-            self._within_since_ns = now_ns
-        return now_ns - self._within_since_ns >= leg.dwell * 1e9
+        anew = self._plan.start is Start.SPAWN and self._continued is None
+        if not self._unaimed or seen is None or (anew and not self.requests.waits):
+            return
+        self._unaimed = False
+        leg = 0 if anew else max(self._leg, self._known_on_board(seen))
+        if leg < len(self._plan.legs):
+            self._aim_at(leg)
 
-    def _advance(self, now_ns: int) -> None:
+    @property
+    def _to(self) -> Leg:
+        """The leg that is flown."""
+        return self._plan.legs[self._leg]
+
+    def _known_on_board(self, seen: Seen) -> int:
+        """How many waypoints of this mission the robot knows to be reached."""
+        return seen.reached if seen.mission_id == self._mission_id != 0 else 0
+
+    def _advance(self, how: str, now_ns: int) -> None:
         """The waypoint is reached: on to the next, or done."""
         index, count = self._leg, len(self._plan.legs)
-        text = f"{self._waypoint_text()} reached at {self.elapsed(now_ns):.2f} s"
+        text = f"{where(self._plan, self._leg)} {how} at {self.elapsed(now_ns):.2f} s"
         self._tell("reached", index, text, now_ns)
         self._leg += 1
+        self.requests.report(self._mission_id, self._leg)
         if self._leg < count:
-            self._begin_leg(now_ns)
-            self._aim_at_leg()
+            self._watch.begin()
+            if self.state is FLYING:
+                self._aim_at(self._leg)
         else:
             text = f"mission done at {self.elapsed(now_ns):.2f} s"
-            self._end(State.DONE, "done", text, now_ns)
+            self._end("done", text, now_ns)
 
     def _hold(self, now_ns: int) -> None:
         self.state = State.HELD
-        self._held_ns = now_ns
         self._aim_here()
         self._tell("held", self._leg, f"held {self._where()}", now_ns)
 
     def _resume(self, now_ns: int) -> None:
         self.state = State.FLYING
-        self._leg_began_ns += now_ns - self._held_ns
-        self._within_since_ns = None
-        self._aim_at_leg()
+        self._watch.pause()
+        self._aim_at(self._leg)
         self._tell("resumed", self._leg, f"resumed {self._where()}", now_ns)
 
-    def _go_to(self, leg: Leg, now_ns: int) -> None:
+    def _go_to(self, leg: Leg, mission_id: int, now_ns: int) -> None:
         x, y, z = leg.position
         self._tell("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
         if self.state is State.HELD:
             self._aim(leg.position, leg.yaw, NO_WAYPOINT)
         else:
-            self._start(Plan((leg,), Start.HERE, leg.time_limit), now_ns)
+            self._start(Plan((leg,), Start.HERE, leg.time_limit), mission_id, now_ns)
 
     def _check_time(self, now_ns: int) -> None:
-        plan = self._plan
-        limit, leg = plan.time_limit, plan.legs[self._leg]
-        if now_ns - self._began_ns >= limit * 1e9:
-            if self.state is State.STARTING:
-                text = f"the robot has not started within {limit:g} s; is the link up?"
-            else:
-                text = f"mission not done within {limit:g} s: {self._where()}"
-            self._fail("timed_out", text, now_ns)
-        elif self.state is FLYING and now_ns - self._leg_began_ns >= leg.time_limit * 1e9:
-            text = f"{self._waypoint_text()} not reached within {leg.time_limit:g} s"
-            self._fail("leg_timed_out", text, now_ns)
+        elapsed, flown = self.elapsed(now_ns), self._watch.flown
+        late = overdue(self._plan, self._leg, self.state, elapsed, flown)
+        if late is not None:
+            self._end(*late, now_ns)
 
-    def _fail(self, code: str, text: str, now_ns: int) -> None:
-        self._end(State.FAILED, code, text, now_ns)
-
-    def _end(self, state: State, code: str, text: str, now_ns: int) -> None:
+    def _end(self, code: str, text: str, now_ns: int) -> None:
         """However the mission ends, the robot is asked to hold where it is."""
         waypoint = min(self._leg, len(self._plan.legs) - 1)
-        self.state = state
+        self.state = rules.ENDS.get(code, State.FAILED)
         self.outcome = Outcome(code, text, waypoint, reached=self._leg)
-        self._requests.ask(Request.END)
+        if code != "done" and self._mission_id:
+            self.requests.report(self._mission_id, MISSION_OVER)
+        on_ground = self._seen is not None and self._seen.guard is GuardState.GROUND
+        if code != "taken_over" or on_ground:  # where it would scrape along
+            self.requests.ask(Request.END)
+        else:
+            self.requests.forget()  # what flies is not ours to end
         self._aim_here()
         self._tell(code, waypoint, text, now_ns)
 
-    def _aim_at_leg(self) -> None:
-        leg = self._plan.legs[self._leg]
-        self._aim(leg.position, leg.yaw, self._leg)
+    def _aim_at(self, leg: int) -> None:
+        to = self._plan.legs[leg]
+        self._aim(to.position, to.yaw, leg)
 
     def _aim_here(self) -> None:
         if self._seen is not None:
@@ -281,12 +294,5 @@ class Teleop:
     def _tell(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
         self.outputs.append(MissionEvent(now_ns, event, waypoint, text))
 
-    def _waypoint_text(self) -> str:
-        return f"waypoint {self._leg + 1} of {len(self._plan.legs)}"
-
     def _where(self) -> str:
-        return f"on the way to {self._waypoint_text()}"
-
-    def _refuse_unless(self, verb: str, allowed: bool, why: str) -> None:
-        if not allowed:
-            raise BadInputError(f"{verb}: the mission is {self.state.name}; {why}")
+        return f"on the way to {where(self._plan, self._leg)}"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import isfinite, isnan
 
 from cloudrc.errors import BadInputError
-from cloudrc.messages import Start, Vector
+from cloudrc.messages import ZERO, Start, Vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,3 +68,7 @@ class Plan:
             raise BadInputError("a mission needs at least one waypoint")
         if not (isfinite(self.time_limit) and self.time_limit > 0):
             raise BadInputError(f"time limit {self.time_limit} s: has to be finite and above 0")
+
+
+NO_PLAN = Plan((Leg(ZERO),))
+"""Stands in until the first mission starts; never flown."""

@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 from cloudrc.cloud.teleop.messages import Seen
-from cloudrc.messages import OperatorRequest, Request, Start
+from cloudrc.messages import GuardState, OperatorRequest, Request, Start
 
 REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""
 UNNUMBERED = 0
+NO_EPOCH = -1
 
 
 class Repeater:
     """Repeats the newest request at 10 Hz until the robot is seen to have acted on it.
 
     A request supersedes the one before it, acknowledged or not: its number is higher, and the
-    robot acts on rising numbers only. Numbers go on from what the robot shows, so that a restarted
-    cloud counts on where its predecessor stopped; until the robot is in sight nothing is sent.
+    robot acts on rising numbers only; but an emergency stop is superseded by nothing. Numbers go on
+    from what the robot shows, so that a restarted cloud counts on where its predecessor stopped;
+    until the robot is in sight nothing is sent.
+
+    When nothing is asked, the robot is told how far the mission is until it shows that it knows.
     """
 
     def __init__(self) -> None:
         self._seen: Seen | None = None
         self._pending: OperatorRequest | None = None
+        self._afterwards: OperatorRequest | None = None
+        self._progress = OperatorRequest(UNNUMBERED, Request.PROGRESS)
         self._number = UNNUMBERED
         self._asked_epoch = 0
+        self._ended_epoch = NO_EPOCH  # in which a mission's end was acted on, and no start since
         self._due_ns = 0
 
     @property
@@ -30,28 +37,69 @@ class Repeater:
         """Whether nothing waits to be acted on."""
         return self._pending is None
 
-    def ask(self, request: Request, start: Start = Start.SPAWN) -> None:
-        """Begin to repeat a new request; `start` matters for Request.START only."""
-        self._pending = OperatorRequest(UNNUMBERED, request, start)
+    @property
+    def stopping(self) -> bool:
+        """Whether the robot has not been seen yet to act on an emergency stop."""
+        return self._pending is not None and self._pending.request is Request.ESTOP
 
-    def see(self, seen: Seen) -> bool:
+    @property
+    def waits(self) -> bool:
+        """Whether the robot is seen to fly on no command: on the ground, or told of the end."""
+        seen = self._seen
+        if seen is None or self._afterwards is not None:
+            return False
+        return seen.guard is GuardState.GROUND or seen.epoch == self._ended_epoch
+
+    def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
+        """Begin to repeat a new request.
+
+        Args:
+            request: What is asked.
+            start: Matters for Request.START only.
+            after: Whether to wait until the robot has acted on what was asked before.
+        """
+        asked = self._progress._replace(request=request, start=start)
+        if self._pending is not None and self._pending.request is Request.START:
+            self._ended_epoch = NO_EPOCH  # it may have been acted on
+        if self._pending is not None and (after or self.stopping):
+            if self._pending.request is not request:
+                self._afterwards = asked
+        else:
+            self._pending, self._afterwards = asked, None
+
+    def forget(self) -> None:
+        """Ask nothing any more, for the robot flies for somebody else; but stop it all the same."""
+        if not self.stopping:
+            self._pending = self._afterwards = None
+
+    def report(self, mission_id: int, reached: int) -> None:
+        """Tell the robot from now on how many waypoints of a mission are reached; 0: no mission."""
+        self._progress = self._progress._replace(mission_id=mission_id, reached=reached)
+        if self._pending is None:
+            self._due_ns = 0
+
+    def see(self, seen: Seen) -> Request | None:
         """Take note of what is seen.
 
         Returns:
-            True once for a request: when it is seen to have been acted on.
+            What was asked, once: when it is seen to have been acted on.
         """
-        self._seen = seen
-        acknowledged = self._is_acknowledged(seen)
-        if acknowledged:
-            self._pending = None
-        return acknowledged
+        self._seen, pending = seen, self._pending
+        if pending is None or not self._is_acknowledged(pending, seen):
+            return None
+        self._pending, self._afterwards = self._afterwards, None
+        self._ended_epoch = NO_EPOCH if pending.request is Request.START else seen.epoch
+        return pending.request
 
     def due(self, now_ns: int) -> OperatorRequest | None:
         """Return the request if a copy of it has to leave at `now_ns` [ns]."""
         pending, seen = self._pending, self._seen
-        if pending is None or seen is None:
+        if seen is None:
             return None
-        if pending.number == UNNUMBERED:
+        if pending is None:
+            return self._progress_due(seen, now_ns)
+        # A higher number than ours was acted on: an emergency stop has passed us by.
+        if pending.number == UNNUMBERED or seen.mission > pending.number:
             self._number = max(self._number, seen.mission) + 1
             pending = self._pending = pending._replace(number=self._number)
             self._asked_epoch = seen.epoch
@@ -60,9 +108,17 @@ class Repeater:
         self._due_ns = now_ns + REPEAT_NS
         return pending
 
-    def _is_acknowledged(self, seen: Seen) -> bool:
-        pending = self._pending
-        if pending is None or pending.number == UNNUMBERED or seen.mission != pending.number:
+    def _progress_due(self, seen: Seen, now_ns: int) -> OperatorRequest | None:
+        """The mission's progress, if the robot flies this very mission and does not know."""
+        told = self._progress
+        unknown = seen.mission_id == told.mission_id != 0 and seen.reached < told.reached
+        if not unknown or now_ns < self._due_ns:
+            return None
+        self._due_ns = now_ns + REPEAT_NS
+        return told
+
+    def _is_acknowledged(self, pending: OperatorRequest, seen: Seen) -> bool:
+        if pending.number == UNNUMBERED or seen.mission != pending.number:
             return False
         if pending.request is Request.START and pending.start is Start.SPAWN:
             # Until the epoch changes it is the old world that is seen.

@@ -15,11 +15,14 @@ from typing import Any
 from cloudrc.cloud.teleop import service_mission as missions
 from cloudrc.cloud.teleop.journal import Entry
 from cloudrc.cloud.teleop.messages import (
+    Acknowledge,
     Cancel,
     Continue,
+    EmergencyStop,
     GoTo,
     Hold,
     Output,
+    Pause,
     Resume,
     Seen,
     StartMission,
@@ -31,12 +34,14 @@ from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook
 from cloudrc.cloud.teleop.service_mission import Mission, Order, show_seen
 from cloudrc.cloud.teleop.verdict import Criteria, Failure, Verdict, Witness, judge
 from cloudrc.errors import BadInputError
-from cloudrc.messages import Setpoint, Start, Vector
+from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.records import Fault, MissionEvent
 
 SETPOINT_PERIOD_NS = 100_000_000
 """Time between two copies of the setpoint [ns], so that either process may restart."""
 QUEUE_MAX = 16
+LATCHED = (GuardState.LAND, GuardState.ESTOP)
+"""States of the guard that only the operator's acknowledgement leads out of."""
 
 
 class MissionService:
@@ -47,6 +52,7 @@ class MissionService:
         contact_speed_max: float,
         write: Callable[[Entry], None] = lambda entry: None,
         entries: Iterable[Entry] = (),
+        salt: bytes = b"",
     ) -> None:
         """Remember what was before; nothing is flown until the first deadline.
 
@@ -54,6 +60,7 @@ class MissionService:
             contact_speed_max: Below which the arm's tip may meet the board [m/s].
             write: Keeps an entry; raises OSError if it cannot.
             entries: What was kept before, oldest first.
+            salt: Random, so that the robot never takes a mission for one of another journal.
         """
         self._contact_speed_max = contact_speed_max
         self._teleop = Teleop()
@@ -63,8 +70,7 @@ class MissionService:
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
-        self._trouble = ""
-        self.book = MissionBook(write, entries)
+        self.book = MissionBook(write, entries, salt)
 
     @property
     def over(self) -> bool:
@@ -93,11 +99,12 @@ class MissionService:
             raise _busy(waiting[0], "cancel it first, or queue the new one")
         if len(waiting) > QUEUE_MAX:
             raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
+        self._refuse_if_stopped()
         mission = self.book.add(order)
         if waiting:
             self._note(mission, "queued", f"mission waits for {waiting[-1].id}", now_ns)
         else:
-            self._launch(mission, StartMission(order.plan), now_ns)
+            self._launch(mission, StartMission(order.plan, mission.number), now_ns)
         return mission, True
 
     def cancel(self, mission_id: str, now_ns: int) -> Mission:
@@ -137,15 +144,44 @@ class MissionService:
             ConflictError: If a mission is under way that is not held.
             UnavailableError: If it cannot be kept.
         """
-        verb, waiting = GoTo(position, yaw), self.book.open()
+        waiting = self.book.open()
         if waiting and waiting[0].state != missions.HELD:
             raise _busy(waiting[0], "hold or cancel it first")
         if waiting:
-            return self._operate(verb, now_ns)
+            return self._operate(GoTo(position, yaw), now_ns)
+        self._refuse_if_stopped()
         leg = Leg(position, yaw)
         mission = self.book.add(Order(Plan((leg,), Start.HERE, leg.time_limit), "goto"))
-        self._launch(mission, verb, now_ns)
+        self._launch(mission, GoTo(position, yaw, mission.number), now_ns)
         return mission
+
+    def stop_rotors(self, now_ns: int) -> Mission | None:
+        """Stop the rotors at once, in every state; a mission under way has failed.
+
+        Returns:
+            The mission that was under way, if there was one.
+        """
+        mission = self._current
+        self._teleop.operate(EmergencyStop(), now_ns)
+        self._collect(now_ns)
+        return mission
+
+    def acknowledge(self, now_ns: int) -> None:
+        """Release a robot that has landed or was stopped; raises ConflictError in a mission."""
+        if self._current is not None:
+            raise _busy(self._current, "there is nothing to acknowledge")
+        self._teleop.operate(Acknowledge(), now_ns)
+        self._collect(now_ns)
+
+    def pause(self, now_ns: int) -> None:
+        """Before this process ends: what is flown is held, for a successor to go on with."""
+        if self._current is not None:
+            self._operate(Pause(), now_ns)
+
+    @property
+    def settled(self) -> bool:
+        """Whether the robot is seen to have acted on the last request."""
+        return self._teleop.settled
 
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry."""
@@ -158,9 +194,10 @@ class MissionService:
 
     def handle_deadline(self, now_ns: int) -> None:
         """Start what waits, keep the limits of time, repeat what has to be repeated."""
+        self.book.catch_up(now_ns)
         waiting = self.book.open()
-        if self._current is None and waiting:
-            self._launch(waiting[0], _first_verb(waiting[0]), now_ns)
+        if self._current is None and waiting and not self._stopped:
+            self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
         if self._setpoint is not None and now_ns >= self._setpoint_ns:
@@ -180,6 +217,18 @@ class MissionService:
             "queue": [waits.id for waits in self.book.open() if waits is not mission],
             "seen": None if seen is None else show_seen(seen, (now_ns - self._seen_ns) * 1e-9),
         }
+
+    @property
+    def _stopped(self) -> str:
+        """Why nothing can fly before the operator acknowledges it; "" if it can."""
+        if self._teleop.requests.stopping:
+            return "an emergency stop is on its way to the robot"
+        guard = GuardState.GROUND if self._seen is None else self._seen.guard
+        return f"the guard is in {guard.name} and lets nothing fly" if guard in LATCHED else ""
+
+    def _refuse_if_stopped(self) -> None:
+        if self._stopped:
+            raise ConflictError(f"{self._stopped}; see why, then: cloudrc mission acknowledge")
 
     def _operate(self, verb: Verb, now_ns: int) -> Mission:
         mission = self._current
@@ -206,13 +255,8 @@ class MissionService:
         """Write down at once what the robot touches."""
         before, after = mission.witness, mission.witness.see(seen)
         mission.witness = after
-        elapsed = self._teleop.elapsed(now_ns)
-        if after.pipe_touches > before.pipe_touches:
-            text = f"the robot touched a pipe at {elapsed:.2f} s"
-            self._note(mission, "pipe_touched", text, now_ns)
-        if after.touch_speed != before.touch_speed:
-            text = f"board touched at {elapsed:.2f} s with {after.touch_speed:.2f} m/s"
-            self._note(mission, "board_touched", text, now_ns)
+        for event, text in after.news(before, self._teleop.elapsed(now_ns)):
+            self._note(mission, event, text, now_ns)
 
     def _collect(self, now_ns: int) -> None:
         for output in self._teleop.take_outputs():
@@ -246,19 +290,9 @@ class MissionService:
         if mission is self._current:
             changed["time_s"] = round(self._teleop.elapsed(now_ns), 3)
         self.book.note(mission, event, text, **changed)
-        if self.book.trouble != self._trouble:
-            self._trouble = self.book.trouble
-            if self._trouble:
-                self._outputs.append(Fault(now_ns, "journal", self._trouble))
-
-
-def _first_verb(mission: Mission) -> Verb:
-    """How to begin: anew, or where a teleop before this one left off."""
-    plan = mission.order.plan
-    if not mission.world:
-        return StartMission(plan)
-    held = mission.state == missions.HELD
-    return Continue(plan, mission.waypoint, mission.elapsed, mission.world, held)
+        trouble = self.book.news()
+        if trouble:
+            self._outputs.append(Fault(now_ns, "journal", trouble))
 
 
 def _busy(mission: Mission, advice: str) -> ConflictError:

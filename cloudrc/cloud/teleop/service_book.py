@@ -12,11 +12,22 @@ from itertools import islice, takewhile
 from typing import Any
 
 from cloudrc.cloud.teleop.journal import Entry
-from cloudrc.cloud.teleop.service_mission import Mission, Order, from_entry, order_entry
+from cloudrc.cloud.teleop.service_backlog import Backlog
+from cloudrc.cloud.teleop.service_mission import (
+    CANCELLED,
+    QUEUED,
+    Mission,
+    Order,
+    from_entry,
+    number_of,
+    order_entry,
+)
 from cloudrc.errors import CloudrcError
 
 KEPT = 100
 """Missions that have ended and are still known."""
+KEEP_PERIOD_NS = 1_000_000_000
+"""Between two tries to write what the disk has refused [ns]."""
 LOGGED = 5_000
 """Events, of all missions together, that can still be asked for."""
 
@@ -44,20 +55,23 @@ class MissionBook:
 
     Attributes:
         missions: By id.
-        trouble: Why the last entry could not be kept; "" if it was.
+        trouble: Why the disk has refused the last entry; "" if it has not.
     """
 
-    def __init__(self, write: Callable[[Entry], None], entries: Iterable[Entry]) -> None:
+    def __init__(
+        self, write: Callable[[Entry], None], entries: Iterable[Entry], salt: bytes = b""
+    ) -> None:
         """Read what was written before.
 
         Args:
             write: Keeps an entry; raises OSError if it cannot.
             entries: What was kept, oldest first.
+            salt: Makes numbers of missions that no other book has.
         """
-        self._write = write
+        self._backlog, self._salt = Backlog(write), salt
         self._numbered = self._events = 0
         self.missions: dict[str, Mission] = {}
-        self.trouble = ""
+        self.trouble, self._told, self._keep_ns = "", "", 0
         self._log: deque[dict[str, Any]] = deque(maxlen=LOGGED)
         for entry in entries:
             self._apply(entry)
@@ -92,16 +106,20 @@ class MissionBook:
         Raises:
             UnavailableError: If it cannot be kept; it then does not exist.
         """
-        entry = order_entry(Mission(f"m{self._numbered + 1}", order))
+        mission_id = f"m{self._numbered + 1}"
+        entry = order_entry(Mission(mission_id, order, number_of(mission_id, self._salt)))
         try:
-            self._write(entry)
+            self._backlog.append(entry)
         except OSError as error:
-            raise UnavailableError(f"the journal cannot be written: {error.strerror}") from error
+            raise UnavailableError(
+                f"no mission can start: the journal cannot be written: {error.strerror}; "
+                "free or mend its volume"
+            ) from error
         self._apply(entry)
         return self.missions[entry["mission"]]
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
-        """Write down what happens to a mission; a full disk does not stop a flight.
+        """Write down what happens to a mission, or as soon as the disk can be written again.
 
         Args:
             mission: Which.
@@ -111,18 +129,32 @@ class MissionBook:
                 witness, verdict.
         """
         entry = mission.entry(self._events + 1, event, text, **changed)
-        try:
-            self._write(entry)
-            self.trouble = ""
-        except OSError as error:
-            self.trouble = f"the journal cannot be written: {error.strerror}; free its volume"
+        self._try(lambda: self._backlog.note(entry))
         self._apply(entry)
+
+    def catch_up(self, now_ns: int) -> None:
+        """Write down what waits for the disk, if it is time [ns] for that."""
+        if self._backlog and now_ns >= self._keep_ns:
+            self._try(self._backlog.flush)
+            self._keep_ns = now_ns + (KEEP_PERIOD_NS if self.trouble else 0)
+
+    def news(self) -> str:
+        """Say once what is the trouble; "" if there is none, or it has been told."""
+        told, self._told = self._told, self.trouble
+        return "" if told == self.trouble else self.trouble
 
     def events_after(self, number: int) -> list[dict[str, Any]]:
         """Give the events of all missions that came after the one of this number."""
         if number > self._events:  # of a journal that is gone
             number = 0
         return list(takewhile(lambda event: event["id"] > number, reversed(self._log)))[::-1]
+
+    def _try(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+            self.trouble = self._told = ""
+        except OSError as error:
+            self.trouble = f"the journal cannot be written: {error.strerror}; free its volume"
 
     def _apply(self, entry: Entry) -> None:
         if entry["kind"] == "mission":
@@ -131,9 +163,18 @@ class MissionBook:
             self._numbered = int(mission.id.removeprefix("m"))
             self._forget_old()
         elif (known := self.missions.get(entry["mission"])) is not None:
+            waited = known.state == QUEUED
             known.apply(entry)
+            if waited and known.state not in (QUEUED, CANCELLED):
+                self._forsake_before(known)
             self._log.append(known.events[-1])
             self._events = entry["id"]
+
+    def _forsake_before(self, begun: Mission) -> None:
+        """Missions are flown one after the other: those before one that has begun are over."""
+        for mission in takewhile(lambda mission: mission is not begun, self.missions.values()):
+            if not mission.ended:
+                mission.forsake()
 
     def _forget_old(self) -> None:
         ended = [mission.id for mission in self.missions.values() if mission.ended]

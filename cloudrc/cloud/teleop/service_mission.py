@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict, dataclass, field
 from math import isfinite
 from typing import Any
 
 from cloudrc.cloud.teleop.journal import Entry
-from cloudrc.cloud.teleop.messages import Seen
+from cloudrc.cloud.teleop.messages import Continue, Seen, StartMission
 from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.cloud.teleop.verdict import Witness
+from cloudrc.cloud.teleop.verdict import Failure, Verdict, Witness
 from cloudrc.messages import Start
 
 QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
@@ -20,7 +21,6 @@ STATES = {
     "queued": QUEUED,
     "starting": STARTING,
     "started": FLYING,
-    "reached": FLYING,
     "resumed": FLYING,
     "held": HELD,
     "done": DONE,
@@ -29,6 +29,9 @@ STATES = {
     "leg_timed_out": FAILED,
     "world_restarted": FAILED,
     "guard_stopped": FAILED,
+    "emergency_stopped": FAILED,
+    "taken_over": FAILED,
+    "end_lost": FAILED,
 }
 """State of a mission after an event; one that is not named here changes nothing."""
 
@@ -59,6 +62,7 @@ class Mission:
     Attributes:
         id: Given by teleop.
         order: What was asked for.
+        number: Names it on board, where its progress is kept, too; below 2^63, 0 if it is not.
         state: One of `STATES`.
         world: Names the world in which it was started; "" before that.
         elapsed: How long it had lasted at its last event [s].
@@ -70,6 +74,7 @@ class Mission:
 
     id: str
     order: Order
+    number: int = 0
     state: str = QUEUED
     world: str = ""
     elapsed: float = 0.0
@@ -96,8 +101,15 @@ class Mission:
         self.elapsed, self.world = entry["time_s"], entry["world"]
         self.witness = Witness(**entry["witness"])
         self.verdict = entry.get("verdict", self.verdict)
-        if entry["event"] == "reached":
+        # A waypoint is reached once, whatever is told how often.
+        if entry["event"] == "reached" and entry["waypoint"] == len(self.reached):
             self.reached.append({"waypoint": entry["waypoint"], "time_s": entry["time_s"]})
+
+    def forsake(self) -> None:
+        """A later mission has begun: this one is over, although nothing kept says how it ended."""
+        text = "how it ended was not kept: the journal was damaged or could not be written"
+        self.state = FAILED
+        self.verdict = Verdict("failure", (Failure("end_lost", text),)).as_json()
 
     def entry(self, number: int, event: str, text: str, **changed: Any) -> Entry:
         """Make the entry of something that happens to the mission now."""
@@ -138,6 +150,7 @@ def order_entry(mission: Mission) -> Entry:
     return {
         "kind": "mission",
         "mission": mission.id,
+        "number": mission.number,
         "name": order.name,
         "key": order.key,
         "contact": order.contact,
@@ -154,7 +167,28 @@ def from_entry(entry: Entry) -> Mission:
     """Make the mission that an entry of kind "mission" began."""
     legs = tuple(Leg(tuple(position), *rest) for position, *rest in entry["legs"])
     plan = Plan(legs, Start[entry["start"]], entry["time_limit"])
-    return Mission(entry["mission"], Order(plan, entry["name"], entry["key"], entry["contact"]))
+    order = Order(plan, entry["name"], entry["key"], entry["contact"])
+    return Mission(entry["mission"], order, entry["number"])
+
+
+def number_of(mission_id: str, salt: bytes) -> int:
+    """Name a mission in 63 bits; ids begin again with a new journal, the salt does not.
+
+    Args:
+        mission_id: Ours, such as "m1".
+        salt: Bytes that no other journal had.
+    """
+    digest = hashlib.sha256(salt + mission_id.encode()).digest()
+    return int.from_bytes(digest[:8], "little") >> 1 or 1
+
+
+def first_verb(mission: Mission) -> StartMission | Continue:
+    """How to begin: anew, or where a teleop before this one left off."""
+    plan, number = mission.order.plan, mission.number
+    if not mission.world:
+        return StartMission(plan, number)
+    held = mission.state == HELD
+    return Continue(plan, mission.waypoint, mission.elapsed, mission.world, held, number)
 
 
 def show_seen(seen: Seen, age: float) -> dict[str, Any]:

@@ -107,6 +107,14 @@ class Witness:
             slip_ns=seen.slip_ns,
         )
 
+    def news(self, before: Witness, elapsed: float) -> Iterator[tuple[str, str]]:
+        """Say what is touched now and was not before, at `elapsed` [s]: event and text."""
+        if self.pipe_touches > before.pipe_touches:
+            yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
+        if self.touch_speed != before.touch_speed:
+            text = f"board touched at {elapsed:.2f} s with {self.touch_speed:.2f} m/s"
+            yield "board_touched", text
+
 
 def judge(
     outcome: Outcome, witness: Witness, criteria: Criteria, *, waypoints: int, elapsed: float

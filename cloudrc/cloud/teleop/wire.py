@@ -13,11 +13,14 @@ from typing import Any, TypeAlias
 from pydantic import TypeAdapter, ValidationError
 
 from cloudrc.cloud.teleop.messages import Output, Seen
-from cloudrc.messages import OperatorRequest, Setpoint
+from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import MissionEvent
 
 Message: TypeAlias = Seen | Output
 """What goes through the sockets: `Seen` to teleop, the others to cloud."""
+
+ALARM = OperatorRequest(0, Request.ESTOP)
+"""An emergency stop that passes teleop's own machine by; cloud gives it its number."""
 
 _KINDS: dict[str, TypeAdapter[Any]] = {
     kind.__name__: TypeAdapter(kind) for kind in (Seen, Setpoint, OperatorRequest, MissionEvent)

@@ -1,0 +1,102 @@
+"""The audit log: who commanded what, and what became of it; one line of JSON each, never a token.
+
+Requests do not wait for the disk: lines are written by a thread of its own, in order. What a slow
+disk makes too many is dropped and counted. The file is cut in two by size, so that it cannot fill
+the volume that the journal needs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+WAITING_MAX = 1_000
+"""Lines that wait for the disk."""
+SIZE_MAX = 8 << 20
+"""Of the file [bytes]; then it is renamed, in the place of the one before it."""
+STOP_LIMIT = 1.0
+"""For the last lines to be written [s]."""
+
+
+class Audit:
+    """An audit log that is written while it is open.
+
+    Attributes:
+        dropped: How many lines were not written.
+    """
+
+    def __init__(
+        self,
+        path: Path | None,
+        complain: Callable[[str], None] = lambda text: None,
+        size_max: int = SIZE_MAX,
+    ) -> None:
+        """Begin.
+
+        Args:
+            path: Where to; None for nowhere.
+            complain: Gets one line when it cannot be written, once.
+            size_max: When to begin a new file [bytes].
+        """
+        self.dropped = 0
+        self._path, self._complain, self._size_max = path, complain, size_max
+        self._waiting: queue.Queue[bytes | None] = queue.Queue(WAITING_MAX)
+        self._troubled = False
+        self._thread = threading.Thread(target=self._write_all, name="audit", daemon=True)
+        if path is not None:
+            self._thread.start()
+
+    def note(self, **what: Any) -> None:
+        """Write down what somebody commanded, with the time; never waits."""
+        if self._path is None:
+            return
+        now = datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="milliseconds")
+        line = json.dumps({"time": now, **what}, separators=(",", ":")).encode() + b"\n"
+        try:
+            self._waiting.put_nowait(line)
+        except queue.Full:
+            self.dropped += 1
+
+    def close(self) -> None:
+        """Write what waits, and end."""
+        if self._path is not None:
+            self._waiting.put(None)
+            self._thread.join(STOP_LIMIT)
+
+    def _write_all(self) -> None:
+        assert self._path is not None, "the thread is started for a file"
+        ends = False
+        while not ends:
+            lines = [self._waiting.get()]
+            while not self._waiting.empty():
+                lines.append(self._waiting.get())
+            ends = None in lines
+            data = [line for line in lines if line is not None]
+            try:
+                self._write(self._path, b"".join(data))
+                self._troubled = False
+            except OSError as error:
+                self.dropped += len(data)
+                if not self._troubled:
+                    self._complain(f"the audit log {self._path} cannot be written: {error}")
+                self._troubled = True
+
+    def _write(self, path: Path, data: bytes) -> None:
+        with open(path, "ab", opener=_private) as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+            full = file.tell() > self._size_max
+        if full:
+            path.replace(path.with_name(f"{path.name}.1"))
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)

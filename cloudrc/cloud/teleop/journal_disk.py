@@ -1,0 +1,79 @@
+"""The disk as the journal needs it: paths and bytes come in, what the kernel says comes out.
+
+In one place, so that a test can put a disk there that is full, forgets or breaks off at any step.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+
+
+class Disk:
+    """The machine's own disk; every method raises OSError if the kernel refuses."""
+
+    def lock(self, path: Path) -> int:
+        """Lock a file beside `path` for this process alone, or its folder where none can be made.
+
+        The folder is made if it is not there.
+
+        Raises:
+            BlockingIOError: If another process has it.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            file = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        except OSError:
+            file = os.open(path.parent, os.O_RDONLY)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(file)
+            raise
+        return file
+
+    def open(self, path: Path, *, new: bool = False) -> int:
+        """Open a file to append to it, made if it is not there; emptied if it shall be `new`."""
+        emptied = os.O_TRUNC if new else 0
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | emptied, 0o600)
+
+    def read(self, path: Path) -> bytes:
+        """Everything that a file holds."""
+        return path.read_bytes()
+
+    def write(self, file: int, data: bytes) -> int:
+        """Append; say how many bytes were taken."""
+        return os.write(file, data)
+
+    def size(self, file: int) -> int:
+        """Length of an open file [bytes]."""
+        return os.fstat(file).st_size
+
+    def truncate(self, file: int, size: int) -> None:
+        """Cut an open file to a length [bytes]."""
+        os.ftruncate(file, size)
+
+    def sync(self, file: int) -> None:
+        """Wait until what was written survives the machine."""
+        os.fsync(file)
+
+    def replace(self, new: Path, path: Path) -> None:
+        """Put a file in the place of another, in one step."""
+        new.replace(path)
+
+    def sync_folder(self, folder: Path) -> None:
+        """Wait until the names in a folder survive the machine."""
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def remove(self, path: Path) -> None:
+        """Delete a file, if it is there."""
+        path.unlink(missing_ok=True)
+
+    def close(self, file: int) -> None:
+        """Let an open file or lock go."""
+        os.close(file)

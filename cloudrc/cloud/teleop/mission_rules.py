@@ -1,0 +1,71 @@
+"""What a mission bears: verbs that do not fit its state are refused, harm that is seen ends it."""
+
+from __future__ import annotations
+
+from cloudrc.cloud.teleop.messages import (
+    Acknowledge,
+    Cancel,
+    Continue,
+    GoTo,
+    Hold,
+    Pause,
+    Resume,
+    Seen,
+    StartMission,
+    State,
+    Verb,
+)
+from cloudrc.errors import BadInputError
+from cloudrc.messages import MISSION_OVER, GuardState
+
+WORST_GUARD = GuardState.HOLD
+ANY_WORLD = ""
+"""Until the robot is seen to have started it does not matter which world it stands in."""
+UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
+ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
+"""By their codes; every other one is a failure."""
+RESTS = tuple(state for state in State if state not in UNDER_WAY)
+
+_RULES: dict[type[Verb], tuple[str, tuple[State, ...], str]] = {
+    StartMission: ("start", RESTS, "cancel it first"),
+    Continue: ("continue", (State.IDLE,), "it is not the first"),
+    Hold: ("hold", (State.FLYING,), "it has to be flying"),
+    Resume: ("resume", (State.HELD,), "it has to be held"),
+    Cancel: ("cancel", UNDER_WAY, "there is none under way"),
+    GoTo: ("goto", (State.HELD, *RESTS), "hold or cancel it first"),
+    Acknowledge: ("acknowledge", RESTS, "it flies"),
+    Pause: ("pause", UNDER_WAY, "there is none under way"),
+}
+"""Of each verb: its name, the states that allow it, and what is wrong with the others; an
+emergency stop is allowed in every state."""
+
+
+def refuse_unless_fitting(verb: Verb, state: State) -> None:
+    """Let a verb pass that fits the state of the mission.
+
+    Raises:
+        BadInputError: If it does not.
+    """
+    name, allowed, why = _RULES.get(type(verb), ("", (state,), ""))
+    if state not in allowed:
+        raise BadInputError(f"{name}: the mission is {state.name}; {why}")
+
+
+def harm_in(seen: Seen, mission_id: int, world: str, *, known: bool) -> tuple[str, str] | None:
+    """Say what ends a mission that is under way, if anything seen does: code and text.
+
+    Args:
+        seen: The newest telemetry.
+        mission_id: Of the mission.
+        world: In which it was started, or `ANY_WORLD`.
+        known: Whether the robot has been told of the mission: it then is the last that it knows.
+    """
+    if world not in (ANY_WORLD, seen.world):
+        return "world_restarted", "world restarted"
+    if known and seen.mission_id != mission_id:
+        return "taken_over", "somebody else has started another mission"
+    if seen.reached == MISSION_OVER and seen.mission_id == mission_id:
+        return "end_lost", "the robot knows it to be over, how it ended was not kept;"
+    if seen.guard > WORST_GUARD:
+        return "guard_stopped", f"guard went to {seen.guard.name}"
+    return None

@@ -1,0 +1,52 @@
+"""The alarm: an emergency stop that cloud sees through alone, until the robot is seen to stand."""
+
+from cloudrc.cloud.operator import REPEAT_NS, Alarm
+from cloudrc.messages import GuardState, OperatorRequest, Request
+
+ESTOP, TRACK = GuardState.ESTOP, GuardState.TRACK
+
+
+def sounding():
+    alarm = Alarm()
+    alarm.sound()
+    return alarm
+
+
+def test_it_is_silent_before_anybody_sounds_it():
+    assert Alarm().due(3, 10**18) is None
+
+
+def test_it_is_repeated_under_one_number_until_the_guard_is_seen_to_have_stopped():
+    alarm = sounding()
+    first = alarm.due(3, 50)
+    assert first == OperatorRequest(4, Request.ESTOP)
+    assert alarm.due(4, 50 + REPEAT_NS - 1) is None
+    alarm.see(TRACK, 3)
+    assert alarm.due(4, 50 + REPEAT_NS) == first
+    alarm.see(ESTOP, 4)
+    assert alarm.due(4, 10**18) is None
+
+
+def test_a_request_that_came_first_under_its_number_does_not_swallow_it():
+    """World acts on rising numbers only."""
+    alarm = sounding()
+    alarm.due(3, 0)
+    alarm.see(TRACK, 4)  # a start of teleop's own counting
+    assert alarm.due(4, REPEAT_NS).number == 5
+
+
+def test_a_request_after_it_does_not_overtake_it():
+    alarm = sounding()
+    alarm.due(3, 0)
+    assert alarm.due(7, REPEAT_NS).number == 8
+
+
+def test_sounded_twice_it_goes_on_and_after_its_end_it_begins_again():
+    alarm = sounding()
+    alarm.due(3, 0)
+    alarm.sound()
+    assert alarm.due(4, REPEAT_NS // 2) is None
+    alarm.see(ESTOP, 4)
+    alarm.see(GuardState.GROUND, 5)
+    alarm.sound()
+    assert alarm.due(5, REPEAT_NS // 2) == OperatorRequest(6, Request.ESTOP)

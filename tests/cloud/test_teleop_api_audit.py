@@ -1,0 +1,66 @@
+"""The audit log: who commanded what, on a disk that may be slow, full or missing."""
+
+import stat
+import time
+
+import pytest
+from api_harness import OPERATOR, READER, running
+
+A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
+
+
+@pytest.mark.promise("P-API-6")
+def test_commands_are_audited_with_who_and_what_became_of_them():
+    with running() as api:
+        api.post("/v1/missions", {**A_MISSION, "key": "uid"})
+        api.post("/v1/missions", A_MISSION)
+        api.post("/v1/hold", token=READER)
+        api.post("/v1/hold", token="a-wrong-token-of-some-length")
+        api.get("/v1/state")
+        api.post("/v1/estop")
+        lines = api.audited()
+        text = api.audit_file.read_text()
+        assert stat.S_IMODE(api.audit_file.stat().st_mode) == 0o600
+    assert [(w["role"], w["action"], w["mission"], w["status"]) for w in lines] == [
+        ("operator", "POST /v1/missions", "m1", 201),
+        ("operator", "POST /v1/missions", "m1", 409),
+        ("reader", "POST /v1/hold", None, 403),
+        ("operator", "POST /v1/estop", "m1", 200),
+    ]
+    assert "cancel it first" in lines[1]["outcome"]
+    assert {w["client"].partition(":")[0] for w in lines} == {"127.0.0.1"}
+    assert all(w["time"].endswith("+00:00") for w in lines)
+    assert OPERATOR not in text
+    assert READER not in text
+
+
+def test_the_audit_log_is_cut_by_size_and_a_disk_that_refuses_is_told_once(tmp_path):
+    from cloudrc.cloud.teleop.api_audit import Audit
+
+    path = tmp_path / "audit.jsonl"
+    audit = Audit(path, size_max=100)
+    for number in range(20):
+        audit.note(number=number)
+        time.sleep(0.002)
+    audit.close()
+    assert path.with_name("audit.jsonl.1").exists()
+    said = []
+    audit = Audit(tmp_path / "no" / "folder", said.append)
+    for _ in range(3):
+        audit.note(number=1)
+        time.sleep(0.01)
+    audit.close()
+    assert audit.dropped == 3
+    (complaint,) = said
+    assert "No such file or directory" in complaint
+
+
+def test_what_a_slow_disk_makes_too_many_is_dropped_and_counted(tmp_path, monkeypatch):
+    from cloudrc.cloud.teleop import api_audit
+
+    monkeypatch.setattr(api_audit, "WAITING_MAX", 2)
+    monkeypatch.setattr(api_audit.Audit, "_write_all", lambda self: None)
+    audit = api_audit.Audit(tmp_path / "audit")
+    for _ in range(5):
+        audit.note(x=1)
+    assert audit.dropped == 3

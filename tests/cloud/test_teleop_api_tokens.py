@@ -1,0 +1,116 @@
+"""Tokens: read from files, followed, kept as digests, compared in constant time, never shown."""
+
+import ast
+from pathlib import Path
+
+import pytest
+from api_harness import OPERATOR, READER
+
+from cloudrc.cloud.teleop import api_tokens
+from cloudrc.cloud.teleop.api_tokens import Tokens
+from cloudrc.errors import BadInputError
+
+
+def token_folder(folder, **tokens):
+    folder.mkdir(exist_ok=True)
+    for role, text in tokens.items():
+        (folder / role).write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("tokens", "said"),
+    [
+        ({}, "operator: No such file or directory; make one: openssl rand"),
+        ({"operator": "short"}, "operator: a token is 16 to 512 visible"),
+        ({"operator": "two words and more"}, "operator: a token is"),
+        ({"operator": "x" * 513}, "operator: a token is"),
+        ({"operator": "o" * 16, "reader": ""}, "reader: a token is"),
+        ({"operator": "o" * 16, "reader": "o" * 16 + "\n"}, "both roles have the same token"),
+    ],
+)
+def test_tokens_that_cannot_be_used_are_refused_and_not_shown(tmp_path, tokens, said):
+    with pytest.raises(BadInputError, match=said) as refused:
+        Tokens(token_folder(tmp_path / "t", **tokens))
+    assert not [text for text in tokens.values() if text and text in str(refused.value)]
+
+
+@pytest.mark.promise("P-API-3")
+def test_no_token_is_held_or_shown(tmp_path):
+    tokens = Tokens(token_folder(tmp_path / "t", operator=OPERATOR, reader=READER))
+    for shown in (repr(tokens), repr(vars(tokens)), str(tokens.caller(b"Bearer x" + b"y" * 20))):
+        assert OPERATOR not in shown
+        assert READER not in shown
+    caller = tokens.caller(f"Bearer {OPERATOR}".encode())
+    assert (caller.role, caller.name.startswith("operator-")) == ("operator", True)
+    assert len(caller.name) == len("operator-") + 8
+
+
+def compared_early(source):
+    """Lines of `Tokens.caller` that could take less time for a token that is nearly right.
+
+    A digest may be compared by `hmac.compare_digest` alone, with every one that is known: no other
+    comparison or look-up of what was given, and no way out of the loop before its end.
+    """
+    (function,) = (
+        node
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.FunctionDef) and node.name == "caller"
+    )
+    loops = [node for node in ast.walk(function) if isinstance(node, ast.For)]
+    compares = [call for call in ast.walk(function) if is_call(call, "hmac.compare_digest")]
+    inside = [node for loop in loops for node in ast.walk(loop)]
+    leaves = [n for n in inside if isinstance(n, ast.Break | ast.Return | ast.Continue)]
+    others = [
+        node
+        for node in ast.walk(function)
+        if isinstance(node, ast.Compare | ast.Subscript)
+        and {"given", "digest"} & {n.id for n in ast.walk(node) if isinstance(n, ast.Name)}
+    ]
+    assert [call for call in compares if call in inside] == compares != []
+    return [ast.unparse(node) for node in (*leaves, *others)]
+
+
+def is_call(node, name):
+    return isinstance(node, ast.Call) and ast.unparse(node.func) == name
+
+
+@pytest.mark.promise("P-API-3")
+def test_tokens_are_compared_in_constant_time(monkeypatch, tmp_path):
+    source = Path(api_tokens.__file__).read_text()
+    assert compared_early(source) == []
+    for before, after in (
+        ("found = caller\n", "found = caller\n                break\n"),
+        ("found = caller\n", "return caller\n"),
+        ("found = None\n", "found = known[given]\n"),
+        ("found = None\n", "found = given == 1\n"),
+    ):
+        assert before in source
+        assert compared_early(source.replace(before, after, 1))
+    seen = []
+    monkeypatch.setattr(
+        api_tokens.hmac, "compare_digest", lambda a, b: seen.append((a, b)) or a == b
+    )
+    tokens = Tokens(token_folder(tmp_path / "t", operator=OPERATOR, reader=READER))
+    for token in (OPERATOR, READER, OPERATOR[:-1] + "x", "x" * 500):
+        seen.clear()
+        tokens.caller(f"Bearer {token}".encode())
+        assert [(len(a), len(b)) for a, b in seen] == [(32, 32)] * 2  # digests, both, each time
+
+
+@pytest.mark.promise("P-API-4")
+def test_tokens_are_followed_when_they_change(tmp_path, monkeypatch):
+    monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
+    folder = token_folder(tmp_path / "t", operator=OPERATOR, reader=READER)
+    tokens = Tokens(folder)
+    old, new = f"Bearer {OPERATOR}".encode(), b"Bearer another-token-altogether"
+    assert (tokens.caller(old).role, tokens.caller(new)) == ("operator", None)
+    (folder / "new").write_text("another-token-altogether")
+    (folder / "new").replace(folder / "operator")
+    assert (tokens.caller(old), tokens.caller(new).role) == (None, "operator")
+    (folder / "reader").unlink()
+    assert tokens.caller(f"Bearer {READER}".encode()) is None
+    (folder / "operator").unlink()
+    assert tokens.caller(new) is None  # what cannot be read admits nobody
+    (folder / "operator").write_text(OPERATOR)
+    assert tokens.caller(old).role == "operator"

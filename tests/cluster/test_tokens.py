@@ -1,0 +1,60 @@
+"""The token of a release's API is read from its Secret; what is wrong is told without it."""
+
+from __future__ import annotations
+
+import base64
+
+import pytest
+from fake_api import FakeApi
+
+from cloudrc.cluster.access import Release
+from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.jobs import run_job
+from cloudrc.cluster.tokens import operator_token, secret_name
+
+
+def test_it_is_the_one_that_the_pod_mounts(running: FakeApi, release: Release) -> None:
+    assert secret_name(release) == "cloudrc-tokens"
+    assert operator_token(release) == "operator-token-of-the-release"
+
+
+def test_without_the_right_to_read_it_the_refusal_is_told(
+    running: FakeApi, release: Release
+) -> None:
+    running.refuse["GET", "secrets"] = (403, "secrets is forbidden")
+    with pytest.raises(ClusterError, match="secrets"):
+        operator_token(release)
+
+
+@pytest.mark.parametrize("data", [{}, {"reader": "eA=="}, {"operator": "%%%"}])
+def test_a_secret_without_a_token_is_named(
+    running: FakeApi, release: Release, data: dict[str, str]
+) -> None:
+    running.get("secrets", "cloudrc-tokens")["data"] = data
+    with pytest.raises(ClusterError, match=r"Secret 'cloudrc-tokens' .* has no token under"):
+        operator_token(release)
+
+
+def test_a_token_that_is_no_text_is_not_shown(running: FakeApi, release: Release) -> None:
+    data = {"operator": base64.b64encode(b"\xff\xfe secret").decode()}
+    running.get("secrets", "cloudrc-tokens")["data"] = data
+    with pytest.raises(ClusterError) as refused:
+        operator_token(release)
+    assert "secret'" not in str(refused.value)
+
+
+def test_a_release_of_another_version_has_none(running: FakeApi, release: Release) -> None:
+    running.get("pods", "cloud-1")["spec"]["volumes"] = []
+    with pytest.raises(ClusterError, match="upgrade it: helm upgrade"):
+        secret_name(release)
+
+
+def test_a_job_mounts_the_operators_token_and_no_other(running: FakeApi, release: Release) -> None:
+    run_job(release, {"waypoints": []}, name="first")
+    pod = running.get("jobs", "first")["spec"]["template"]["spec"]
+    volume = next(v["secret"] for v in pod["volumes"] if v["name"] == "tokens")
+    assert volume["secretName"] == "cloudrc-tokens"
+    assert volume["items"] == [{"key": "operator", "path": "operator"}]
+    (container,) = pod["containers"]
+    assert "--token-file=/etc/cloudrc-tokens/operator" in container["args"]
+    assert "operator-token" not in str(running.get("jobs", "first"))
