@@ -1,7 +1,7 @@
 """The recording's way in: an MCAP file goes in, whole or torn, its messages come out.
 
-A process that was killed leaves a file without an end. MCAP's stream reader takes it up to the
-last whole chunk (the seeking reader refuses it and the non-seeking one finds nothing).
+A process that was killed leaves a file without an end: it is read up to the last whole chunk, and
+what is damaged is left out (`cloudrc/record/scan.py`).
 """
 
 from __future__ import annotations
@@ -12,28 +12,14 @@ from pathlib import Path
 from cloudrc.errors import BadInputError
 from cloudrc.record.packages import missing
 from cloudrc.record.ros_types import is_known
+from cloudrc.record.scan import Scan
 from cloudrc.record.topics import TOPICS
+from cloudrc.record.writer import MISSING as MISSING
 
 try:
-    import zstandard  # noqa: F401  (mcap finds it by itself, but says less if it is missing)
-    from mcap.exceptions import EndOfFile, InvalidMagic
-    from mcap.records import (
-        Attachment,
-        Channel,
-        Chunk,
-        DataEnd,
-        McapRecord,
-        Message,
-        Metadata,
-        Schema,
-    )
-    from mcap.stream_reader import StreamReader, breakup_chunk
+    from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
 except ImportError as error:
     raise missing(error) from error
-
-
-MISSING = "missing"
-"""Key of the metadata under which a merged file keeps what its parts lacked."""
 
 
 @dataclass(slots=True)
@@ -65,26 +51,24 @@ def read_contents(path: Path) -> Contents:
     Raises:
         BadInputError: If nothing in it can be read.
     """
-    reading, reason = _Reading(), "it is cut short"
-    whole = False
+    reading = _Reading()
     try:
         with path.open("rb") as stream:
-            for record in StreamReader(stream, emit_chunks=True).records:
+            scan = Scan(stream)
+            for record in scan.definitions():
                 reading.take(record)
-        whole = True
+            for record in scan.records():
+                reading.take(record)
     except OSError as error:
         raise BadInputError(
             f"{path}: cannot be read ({error.strerror}); name a recording (.mcap)"
         ) from error
-    except InvalidMagic:
-        reason = "it is not an MCAP file"
-    except EndOfFile:
-        pass
-    except Exception as error:  # a torn file can fail anywhere inside the library
-        reason = f"it is damaged ({type(error).__name__})"
-    contents = reading.finish(whole)
-    if not whole and not contents.messages:
-        raise BadInputError(f"{path}: holds no readable message: {reason}; name another recording")
+    contents = reading.finish(scan)
+    if not scan.ended and not contents.messages:
+        reason = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"
+        raise BadInputError(
+            f"{path}: holds no readable message: it {reason}; name another recording"
+        )
     return contents
 
 
@@ -93,8 +77,6 @@ class _Reading:
 
     def __init__(self) -> None:
         self.contents = Contents()
-        self._ended = False
-        self._damaged = 0
         self._foreign: set[str] = set()
         self._types: dict[int, tuple[str, str]] = {}
         self._topics: dict[int, str] = {}
@@ -102,15 +84,7 @@ class _Reading:
 
     def take(self, record: McapRecord) -> None:
         contents = self.contents
-        if isinstance(record, Chunk):
-            try:
-                inner = breakup_chunk(record, validate_crc=True)
-            except Exception:  # whatever is wrong with one chunk, the next may be whole
-                self._damaged += 1
-                return
-            for each in inner:
-                self.take(each)
-        elif isinstance(record, Message):
+        if isinstance(record, Message):
             self._messages.append(record)
         elif isinstance(record, Schema):
             self._types[record.id] = record.name, record.data.decode("utf-8", "replace")
@@ -120,8 +94,6 @@ class _Reading:
             contents.metadata.update(record.metadata)
         elif isinstance(record, Attachment):
             contents.attachments[record.name] = record.data
-        elif isinstance(record, DataEnd):
-            self._ended = True
 
     def _open(self, channel: Channel) -> None:
         ros_type, text = self._types.get(channel.schema_id, ("", ""))
@@ -132,9 +104,9 @@ class _Reading:
         else:
             self._foreign.add(channel.topic)
 
-    def finish(self, whole: bool) -> Contents:
-        """Add the note to what was gathered; `whole` if the file ended as it should."""
-        # Only now, since the index names the topics too, should the first chunk be damaged.
+    def finish(self, scan: Scan) -> Contents:
+        """Add the note to what was gathered."""
+        # Only now, since a channel may be defined after a damaged chunk.
         topics = self._topics
         self.contents.messages = messages = [
             (topics[message.channel_id], message.log_time, message.data)
@@ -142,15 +114,18 @@ class _Reading:
             if message.channel_id in topics
         ]
         notes = []
-        if not whole and not self._ended:
+        if not scan.ended:
             until = messages[-1][1] * 1e-9 if messages else 0.0
             notes.append(
                 f"cut short: {len(messages)} messages were read, the last at {until:.2f} s"
             )
-        elif not whole:
+        elif scan.summary is None:
             notes.append(f"cut short in its index: all {len(messages)} messages were read")
-        if self._damaged:
-            notes.append(f"{self._damaged} damaged chunks were left out")
+        for kind, count in scan.dropped.items():
+            if kind != "messages":
+                notes.append(f"{count} damaged {kind} were left out")
+        if scan.checked is False and not scan.dropped:
+            notes.append("a byte outside the chunks is wrong")
         if self._foreign:
             names = ", ".join(sorted(self._foreign))
             notes.append(f"topics of another layout were left out: {names}")

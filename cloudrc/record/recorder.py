@@ -16,6 +16,11 @@ from typing import Protocol
 
 from cloudrc.records import Record
 
+TROUBLE = {
+    errno.ENOSPC: "disk full",
+    errno.EDQUOT: "disk quota used up",
+    errno.EROFS: "disk is read-only",
+}
 CAPACITY = 20_000
 """Records that the queue holds: some 30 s of either end."""
 
@@ -29,12 +34,18 @@ class Sink(Protocol):
     def flush(self) -> None:
         """Hand everything to the operating system."""
 
+    def sync(self) -> None:
+        """Have what was flushed survive the machine."""
+
+    def abandon(self, reason: str) -> None:
+        """After an error: cut off what is torn and note why; never raises."""
+
     def close(self) -> None:
         """End the file."""
 
 
 class Recorder:
-    """A queue between one thread that puts and one that drains.
+    """A queue between one thread that puts and one that drains; a third one may `sync`.
 
     Attributes:
         error: Why something was not recorded, in words; "" if all is well.
@@ -65,6 +76,7 @@ class Recorder:
         self._ended = False
         self._overflowed = 0
         self._unwritten = 0
+        self._refused: OSError | None = None  # by `sync`
 
     @property
     def dropped(self) -> int:
@@ -103,15 +115,34 @@ class Recorder:
                 self._write(sink, record)
         return taken
 
-    def flush(self) -> None:
-        """Hand what was written to the operating system; never raises."""
+    def flush(self, *, sync: bool = True) -> None:
+        """Hand what was written to the operating system; never raises.
+
+        Args:
+            sync: And to the disk, however long that takes.
+        """
         if self._sink and not self._ended:
             try:
                 self._sink.flush()
+                if sync:
+                    self.sync()
+                if self._refused is not None:
+                    raise self._refused
                 if self._size_max is not None and self._path.stat().st_size >= self._size_max:
                     raise OSError(errno.EFBIG, "it has grown to its limit")
             except OSError as error:
                 self._stop(error)
+
+    def sync(self) -> None:
+        """Have what was flushed survive the machine, however long that takes; never raises."""
+        sink = self._sink
+        if sink is not None and not self._ended:
+            try:
+                sink.sync()
+            except OSError as error:  # whoever drains gives the file up, at the next flush
+                self._refused = error
+            except ValueError:  # it was closed meanwhile
+                pass
 
     def close(self) -> None:
         """Write out the rest and end the file; never raises."""
@@ -149,10 +180,9 @@ class Recorder:
     def _stop(self, error: OSError) -> None:
         """Give the file up: what is in it stays readable, what comes now is counted."""
         self._ended = True
+        reason = f"recording stopped: {TROUBLE.get(error.errno or 0, error.strerror or error)}"
         self.error = (
-            f"{self._path}: recording stopped: {error.strerror or error};"
-            " make room or choose another folder; the flight goes on"
+            f"{self._path}: {reason}; make room or choose another folder; the flight goes on"
         )
         if self._sink:
-            with contextlib.suppress(OSError):
-                self._sink.close()
+            self._sink.abandon(reason)

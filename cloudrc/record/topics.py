@@ -1,9 +1,8 @@
 """The recording's one table: records go in, rows of topics come out.
 
 A record fans out to one or more topics; a topic is a table whose columns are the fields below,
-named as in `cloudrc/records.py`, after the column `stamp_ns`. MCAP, columns, documentation and
-tests all read this table; quaternions are `wxyz` and velocities in the world frame here, whatever
-the ROS message type asks for (`cloudrc/record/cdr.py` converts).
+named as in `cloudrc/records.py`, after the column `stamp_ns`. Quaternions are `wxyz` and velocities
+in the world frame here, whatever the ROS type asks for (`cloudrc/record/cdr.py` converts).
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from operator import attrgetter
 from typing import TypeAlias
 
 from cloudrc import records as rec
+from cloudrc.record.link_topics import LINK_TOPICS
 from cloudrc.record.schema import Field, Row, Topic, Values
 from cloudrc.records import Record
 
@@ -71,6 +71,8 @@ _TABLE = (
             Field("guard", "int", "", _GUARD, "telemetry.guard"),
             Field("pipe_contacts", "int", "", "begun in this mission", "telemetry.pipe_contacts"),
             Field("touch_speed", "float", "m/s", "tip on the board", "telemetry.touch_speed"),
+            Field("mission_id", "int", "", "mission started last", "telemetry.mission_id"),
+            Field("reached", "int", "", "waypoints known on board", "telemetry.reached"),
         ),
     ),
     Topic(
@@ -247,6 +249,7 @@ _TABLE = (
             Field("total", "int", "", "since the start"),
         ),
     ),
+    *LINK_TOPICS,
     Topic(
         "/lateness",
         "cloudrc_msgs/msg/Lateness",

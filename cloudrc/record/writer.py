@@ -2,12 +2,17 @@
 
 Profile `ros2`, schemas as `ros2msg`, messages as `cdr`, chunks compressed by zstd with their CRC.
 A chunk is closed and handed to the operating system after at most half a second of recording, so
-that a process that is killed loses no more.
+that a process that is killed loses no more. Chunks, attachments, the data as a whole and the index
+have checksums: no wrong byte goes unnoticed.
 """
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from io import FileIO
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -21,7 +26,9 @@ from cloudrc.records import Record
 
 try:
     import zstandard  # noqa: F401  (mcap finds it by itself, but says less if it is missing)
-    from mcap.writer import CompressionType, Writer
+    from mcap.data_stream import RecordBuilder
+    from mcap.records import DataEnd, Footer, Metadata
+    from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 except ImportError as error:
     raise missing(error) from error
 
@@ -29,6 +36,8 @@ CHUNK_NS = 500_000_000
 """Longest time between the first and the last message of a chunk [ns]."""
 METADATA = "cloudrc"
 """Name of the metadata record that says whose clock the file is on."""
+MISSING = "missing"
+"""Key of the metadata that says what a file lacks."""
 
 
 class McapWriter:
@@ -47,9 +56,14 @@ class McapWriter:
             OSError: If the file cannot be written.
         """
         self._owned = isinstance(target, Path)
-        self._stream = target.open("wb") if isinstance(target, Path) else target
+        # Unbuffered, since mcap's writer has a buffer of its own, which `abandon` has to pass by.
+        self._stream: IO[bytes] | FileIO
+        self._stream = target.open("wb", buffering=0) if isinstance(target, Path) else target
         # Any, because mcap's writer is not annotated throughout.
-        self._mcap: Any = Writer(self._stream, compression=CompressionType.ZSTD)
+        self._mcap: Any = Writer(
+            self._stream, compression=CompressionType.ZSTD, enable_data_crcs=True
+        )
+        self._whole = 0  # so many bytes have reached the file and end with a whole record
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._latest_ns = 0
@@ -116,11 +130,46 @@ class McapWriter:
         """Close the chunk and hand it to the operating system."""
         self._chunk_start_ns = None
         self._mcap.flush()
+        self._whole = self._stream.tell()
+
+    def sync(self) -> None:
+        """Have what was flushed survive the machine; may take seconds on a slow disk."""
+        if self._owned:
+            try:
+                os.fsync(self._stream.fileno())
+            except OSError as error:
+                if error.errno != errno.EINVAL:  # a pipe, or a file that leads nowhere
+                    raise
+
+    def abandon(self, reason: str) -> None:
+        """After an error: cut off what is torn, note why, end the file, as far as there is room.
+
+        Args:
+            reason: What a reader is told is missing.
+        """
+        note, end = RecordBuilder(), RecordBuilder()
+        Metadata(METADATA, {MISSING: reason}).write(note)
+        DataEnd(0).write(end)
+        Footer(0, 0, 0).write(end)
+        first = b"" if self._whole else MCAP0_MAGIC
+        last = _bytes(end) + MCAP0_MAGIC
+        for rest in (first + _bytes(note) + last, first + last, b""):
+            with suppress(
+                OSError, ValueError
+            ):  # not even room for that: less, or just whole chunks
+                self._stream.seek(self._whole)
+                self._stream.truncate()
+                if self._stream.write(rest) == len(rest):
+                    break
+        if self._owned:
+            with suppress(OSError):
+                self._stream.close()
 
     def close(self) -> None:
         """Write the index and close the file."""
         try:
             self._mcap.finish()
+            self._mcap.flush()
             self._stream.flush()
         finally:
             if self._owned:
@@ -143,3 +192,9 @@ class McapWriter:
         channel = int(self._mcap.register_channel(topic, "cdr", schema, metadata))
         self._channels[topic] = channel
         return channel
+
+
+def _bytes(builder: Any) -> bytes:
+    """What mcap's builder, which is not annotated, holds."""
+    data: bytes = builder.end()
+    return data

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
@@ -114,3 +115,35 @@ def assert_equal(one: Recording, other: Recording) -> None:
                 np.testing.assert_allclose(first, second, rtol=1e-12, atol=1e-8)
             else:
                 np.testing.assert_array_equal(first, second, err_msg=f"{topic} {name}")
+
+
+def counted(count: int) -> list[Record]:
+    """So many records of one count, 10 ms apart."""
+    return [rec.Counted(n * 10 * MS, "world", "sent", n) for n in range(count)]
+
+
+def open_mcap(path: Path) -> McapWriter:
+    return McapWriter(path, clock="world")
+
+
+class Shelf:
+    """A sink that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+        self.closed = False
+
+    def write(self, records: Iterable[Record]) -> None:
+        self.records += records
+
+    def flush(self) -> None:
+        pass
+
+    def sync(self) -> None:
+        pass
+
+    def abandon(self, reason: str) -> None:
+        self.closed = True
+
+    def close(self) -> None:
+        self.closed = True

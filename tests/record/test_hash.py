@@ -18,6 +18,9 @@ from cloudrc.messages import GuardState
 from cloudrc.record.hash import RecordHash
 from tests.record.samples import CLASSES, any_record, cloud_records, world_records
 
+LINK = rec.LinkChanged(1, True, "relay", "by hand", 0.1, 2.0, 0.04, 0.01, 0.1, 1e6, "{}")
+CHECK = rec.LinkChecked(1, True, "mean", 0.04, 0.05, 0.03, 0.06, "ok", 3000)
+
 
 def digest(*records: Any) -> str:
     found = RecordHash()
@@ -65,7 +68,13 @@ def variants(instance: Any) -> list[Any]:
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
 def test_every_value_counts(cls: type[Any]) -> None:
-    every = [*world_records(9), *cloud_records(9), rec.Lateness(1, "world", 0.1, 0.2, 3)]
+    every = [
+        *world_records(9),
+        *cloud_records(9),
+        rec.Lateness(1, "world", 0.1, 0.2, 3),
+        LINK,
+        CHECK,
+    ]
     record = next(each for each in every if type(each) is cls)
     if cls is rec.Control:
         record = record._replace(loop_delay=0.1)  # in place of NaN, which no change changes

@@ -1,0 +1,68 @@
+"""`cloudrc recover FILE`: a torn or damaged recording comes in, a clean one is left beside it."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.extras import require
+from cloudrc.cli.output import output_argument, written
+from cloudrc.errors import BadInputError
+
+if TYPE_CHECKING:
+    from cloudrc.record.recover import Recovery
+
+LOSSY = 1
+EPILOG = """\
+examples:
+  cloudrc recover runs/latest/world.mcap
+  cloudrc recover torn.mcap --to clean.mcap -o json
+
+exit codes: 0 complete, 1 something is lost (it says what), 2 nothing readable"""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap)")
+    parser.add_argument(
+        "-t",
+        "--to",
+        type=Path,
+        metavar="NEW",
+        help="the clean recording (default: FILE with '.recovered' before its ending)",
+    )
+    output_argument(parser)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Recover; say what is kept and what is not."""
+    require("a recovery", ("record",))
+    from cloudrc.record.recover import recover
+
+    source: Path = options.file
+    target = options.to or source.with_name(f"{source.stem}.recovered{source.suffix}")
+    if target.exists():
+        raise BadInputError(f"{target}: already there; name another file with --to")
+    recovery = recover(source, target)
+    if options.output == "table":
+        _show(recovery, target)
+    else:
+        print(written(_document(recovery, target), options.output))
+    return 0 if recovery.complete else LOSSY
+
+
+def _document(recovery: Recovery, target: Path) -> dict[str, object]:
+    summary = {"complete": recovery.complete, "share": recovery.share, "file": str(target)}
+    return {"schemaVersion": 1, **summary, **asdict(recovery)}
+
+
+def _show(recovery: Recovery, target: Path) -> None:
+    kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)
+    print(f"kept {recovery.share:.1%}: {kept or 'nothing'}")
+    for note in recovery.notes:
+        print(f"lossy: {note}")
+    if recovery.complete and recovery.index_is_new:
+        print("its index was missing or damaged and has been written anew; nothing is lost")
+    print(target)

@@ -1,0 +1,215 @@
+"""A torn or damaged recording goes in, a clean one and an account of what is lost come out.
+
+MCAP has no such tool in Python. Everything whole is kept: messages with their stamps, schemas and
+channels, attachments, metadata. The result has an index, checksums, and, if anything is missing, a
+note that says so to whoever reads it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from cloudrc import __version__
+from cloudrc.errors import BadInputError
+from cloudrc.record.packages import missing
+from cloudrc.record.scan import Scan
+from cloudrc.record.writer import METADATA, MISSING
+
+try:
+    from mcap.records import Attachment, Channel, Header, McapRecord, Message, Metadata, Schema
+    from mcap.writer import CompressionType, Writer
+except ImportError as error:
+    raise missing(error) from error
+
+KEPT = {Message: "messages", Attachment: "attachments", Metadata: "metadata"}
+
+
+@dataclass(slots=True)
+class Recovery:
+    """The account of a recovery.
+
+    Attributes:
+        size: Of the damaged file [bytes].
+        kept: How many of each kind are in the new file.
+        dropped: How many of each kind are not; what nobody can know of is only in `bytes_lost`.
+        bytes_lost: Bytes that belong to no whole record [bytes].
+        notes: What is missing or doubtful, in words.
+        index_is_new: Whether the old file had no index that could be read.
+    """
+
+    size: int
+    kept: dict[str, int] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
+    bytes_lost: int = 0
+    notes: list[str] = field(default_factory=list)
+    index_is_new: bool = False
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is missing or doubtful."""
+        return not self.notes
+
+    @property
+    def share(self) -> float:
+        """Share that was kept in [0, 1]: of the messages if their number is known, else bytes."""
+        kept, lost = self.kept.get("messages", 0), self.dropped.get("messages", 0)
+        if kept and not self.bytes_lost:
+            return kept / (kept + lost)
+        return 1.0 - self.bytes_lost / self.size if self.size else 0.0
+
+
+def recover(source: Path, target: Path) -> Recovery:
+    """Write a clean copy of a recording.
+
+    Args:
+        source: An MCAP file, possibly torn or damaged.
+        target: Written in one step: it is there whole or not at all.
+
+    Raises:
+        BadInputError: If nothing in the file can be read.
+        OSError: If the new file cannot be written.
+    """
+    try:
+        stream = source.open("rb")
+    except OSError as error:
+        raise BadInputError(
+            f"{source}: cannot be read ({error.strerror}); name a recording (.mcap)"
+        ) from error
+    with stream, _in_one_step(target) as new:
+        scan = Scan(stream)
+        copy = _Copy(new, scan)
+        for record in scan.records():
+            copy.take(record)
+        recovery = copy.finish()
+        if not any(recovery.kept.values()) and not recovery.complete:
+            what = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"
+            raise BadInputError(f"{source}: holds nothing that can be read: it {what}")
+    return recovery
+
+
+@contextmanager
+def _in_one_step(target: Path) -> Iterator[IO[bytes]]:
+    """A file that gets its name only when it is whole."""
+    part = target.with_name(f".{target.name}.part")
+    try:
+        with part.open("wb") as new:
+            yield new
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+class _Copy:
+    """Takes whole records in and writes them to a new file under numbers of its own."""
+
+    def __init__(self, new: IO[bytes], scan: Scan) -> None:
+        self._scan = scan
+        self._writer: Any = Writer(new, compression=CompressionType.ZSTD, enable_data_crcs=True)
+        self._started = False
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._new_schemas: dict[tuple[str, str, bytes], int] = {}
+        self._new_channels: dict[tuple[object, ...], int] = {}
+        self._numbers: dict[int, int] = {}  # of a channel, there and here
+        self._kept = dict.fromkeys(KEPT.values(), 0)
+        self._homeless = 0
+        for record in scan.definitions():
+            self._define(record)
+
+    def take(self, record: McapRecord) -> None:
+        """Copy a record that is whole."""
+        if isinstance(record, Header):
+            self._start(record.profile)
+        elif isinstance(record, Message):
+            self._message(record)
+        elif isinstance(record, Attachment):
+            self._start()
+            self._writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
+        elif isinstance(record, Metadata):
+            self._start()
+            self._writer.add_metadata(record.name, record.metadata)
+        else:
+            self._define(record)
+        kind = KEPT.get(type(record))
+        if kind:
+            self._kept[kind] += 1
+
+    def finish(self) -> Recovery:
+        """End the new file; say what is in it and what is not."""
+        scan = self._scan
+        self._start()
+        self._kept["messages"] -= self._homeless
+        dropped = dict(scan.dropped)
+        lost = dropped.get("messages", 0) + self._homeless
+        if scan.summary and scan.summary.messages is not None:
+            lost = max(lost, scan.summary.messages - self._kept["messages"])
+        if lost:
+            dropped["messages"] = lost
+        kept = self._kept | {"chunks": scan.chunks, "channels": len(self._new_channels)}
+        recovery = Recovery(scan.size, kept, dropped, scan.skipped, index_is_new=not scan.summary)
+        recovery.notes = self._notes(recovery)
+        if recovery.notes:
+            self._writer.add_metadata(METADATA, {MISSING: "; ".join(recovery.notes)})
+        self._writer.finish()
+        return recovery
+
+    def _notes(self, recovery: Recovery) -> list[str]:
+        scan, notes = self._scan, []
+        if not scan.is_mcap:
+            notes.append("the file does not begin as an MCAP file does")
+        if not scan.ended:
+            notes.append("cut short: the file has no end")
+        if recovery.dropped:
+            counts = ", ".join(f"{count} {kind}" for kind, count in recovery.dropped.items())
+            notes.append(f"left out: {counts}")
+        if recovery.bytes_lost:
+            notes.append(f"{recovery.bytes_lost} bytes belong to no whole record")
+        if scan.checked is False and not notes:
+            notes.append("a byte outside the chunks is wrong: metadata or a stamp may be")
+        return notes
+
+    def _start(self, profile: str = "") -> None:
+        if not self._started:
+            self._started = True
+            self._writer.start(profile=profile, library=f"cloudrc {__version__} recover")
+
+    def _define(self, record: McapRecord) -> None:
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel) and self._channels.get(record.id) != record:
+            self._channels[record.id] = record
+            self._numbers.pop(record.id, None)
+
+    def _message(self, message: Message) -> None:
+        number = self._numbers.get(message.channel_id) or self._open(message.channel_id)
+        if number is None:
+            self._homeless += 1
+            return
+        self._writer.add_message(
+            number, message.log_time, message.data, message.publish_time, message.sequence
+        )
+
+    def _open(self, there: int) -> int | None:
+        """Register a channel in the new file; None if the old one's is lost."""
+        channel = self._channels.get(there)
+        if channel is None or (channel.schema_id and channel.schema_id not in self._schemas):
+            return None
+        self._start()
+        schema, here = self._schemas.get(channel.schema_id), 0
+        if schema is not None:
+            content = (schema.name, schema.encoding, schema.data)
+            if content not in self._new_schemas:
+                self._new_schemas[content] = self._writer.register_schema(*content)
+            here = self._new_schemas[content]
+        values = (channel.topic, channel.message_encoding, here)
+        key = (*values, *channel.metadata.items())
+        if key not in self._new_channels:
+            self._new_channels[key] = self._writer.register_channel(*values, channel.metadata)
+        number = self._numbers[there] = self._new_channels[key]
+        return number
