@@ -14,8 +14,12 @@ from typing import TYPE_CHECKING
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
+    from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
+    from cloudrc.drivers.keyfile import KeyFile
     from cloudrc.drivers.realtime import Peer
+    from cloudrc.drivers.standing_check import StandingCheck
+    from cloudrc.link.profile import DirectionProfile
     from cloudrc.record.recorder import Recorder
     from cloudrc.records import Record
 
@@ -57,6 +61,20 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--listen", type=address, required=True, metavar="HOST:PORT", help="where to receive"
     )
+    parser.add_argument(
+        "--link",
+        type=Path,
+        metavar="FILE",
+        help="where the link tells its state; its changes are recorded (default: link.json beside"
+        " the route)",
+    )
+    parser.add_argument(
+        "--key",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="the tunnel's pre-shared key; followed while it flies ('cloudrc key new FILE')",
+    )
     target = parser.add_mutually_exclusive_group(required=True)
     target.add_argument("--peer", type=address, metavar="HOST:PORT", help="where to send")
     target.add_argument(
@@ -66,6 +84,37 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
         help="file that says where to send, HOST:PORT with the host as a number; it is waited for"
         " and followed",
     )
+
+
+def link_state(options: argparse.Namespace) -> Path | None:
+    """Find where the link of an end tells its state: the link's process writes it."""
+    given: Path | None = options.link
+    route: Path | None = options.route
+    return given if given is not None or route is None else route.with_name("link.json")
+
+
+def standing_check(
+    options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
+) -> StandingCheck:
+    """Judge the direction that an end hears by what is asked of it, and follow what that is."""
+    import json
+
+    from cloudrc.assembly import link_profile
+    from cloudrc.config.schema import Profile
+    from cloudrc.drivers.standing_check import StandingCheck
+    from cloudrc.link.verify_twin import Stream
+    from cloudrc.tunnel.codec import SIZES, Kind
+
+    def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
+        profile = Profile.model_validate_json(json.dumps(values))
+        return link_profile(profile.uplink), link_profile(profile.downlink)
+
+    asked = link_profile(experiment.uplink), link_profile(experiment.downlink)
+    kind = Kind.TELEMETRY if uplink else Kind.COMMAND
+    stream = Stream(experiment.seed, uplink, kind, SIZES[kind])
+    check = StandingCheck(uplink=uplink, stream=stream)
+    check.begin(asked, link_state(options), load)
+    return check
 
 
 def address(text: str) -> Address:
@@ -105,6 +154,26 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
     exporter = Exporter(role)
     exporter.serve(options.metrics)
     return exporter
+
+
+def open_keys(options: argparse.Namespace) -> KeyFile:
+    """Read the key of an end."""
+    import time
+
+    from cloudrc.drivers.keyfile import KeyFile, is_exposed
+
+    keys = KeyFile(options.key, time.monotonic_ns())
+    if is_exposed(options.key):
+        print(f"cloudrc: warning: everybody can read {options.key}: chmod 600", file=sys.stderr)
+    return keys
+
+
+def suite() -> int:
+    """The cipher that this machine is fast at."""
+    from cloudrc.drivers.machine import has_fast_aes
+    from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305
+
+    return AES_256_GCM if has_fast_aes() else CHACHA20_POLY1305
 
 
 def open_peer(options: argparse.Namespace) -> Peer:

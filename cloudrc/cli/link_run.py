@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 import socket
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,65 +18,44 @@ from cloudrc.drivers.process import StopSignal
 from cloudrc.records import Counted
 
 if TYPE_CHECKING:
+    from cloudrc.cli.tc_session import Programs
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.link.netem_tc import Run
     from cloudrc.link.sidecar import Machine, Sidecar
-    from cloudrc.link.sidecar_follow import Load, ProfileFile
-
-TC_PATIENCE = 5.0
-"""How long tc and ip may take [s]."""
-NOT_FOUND = 127
+    from cloudrc.link.sidecar_follow import Load
+    from cloudrc.link.sidecar_handed import Profiles
 
 
 def run(options: argparse.Namespace) -> int:
     """Shape one direction of the link until SIGTERM."""
     stop = StopSignal()  # first: the first process of a container ignores SIGTERM until then
+    from cloudrc.cli.tc_session import runner
     from cloudrc.link.netem_tables import write_tables
     from cloudrc.link.sidecar import Settings, Sidecar
     from cloudrc.link.sidecar_follow import ProfileFile
+    from cloudrc.link.sidecar_handed import HANDED_FILE, HandedProfile, Profiles
 
     warn_if_exposed(options.listen)
     exporter = open_exporter(options, "link")
     watcher = Metrics(exporter, options.direction, options.mode) if exporter else None
-    file = ProfileFile(options.profile, loader(options.direction), log)
+    load, handed = loader(options.direction), options.route.with_name(HANDED_FILE)
+    file = Profiles(ProfileFile(options.profile, load, log), HandedProfile(handed, load, log))
     profile, state = file.first(), options.route.with_name("link.json")
     settings = Settings(options.mode, options.direction, options.route, state)
     with TemporaryDirectory(prefix="tc-", dir=options.route.parent) as tables:
         write_tables(Path(tables))
-        sidecar = Sidecar(settings, _machine(options, runner(tables)), profile, watcher)
-        _follow(sidecar, file, options)
-        sidecar.run(stop)
+        programs = runner(tables)
+        machine = _machine(options, programs, Path(tables))
+        sidecar = Sidecar(settings, machine, profile, watcher)
+        try:
+            sidecar.run(stop, lambda: _follow(sidecar, file, options))
+        finally:
+            programs.close()
     return 0
 
 
 def log(line: str) -> None:
     """Say one line to people."""
     print(f"cloudrc link: {line}", file=sys.stderr, flush=True)
-
-
-def runner(tables: str) -> Run:
-    """Make what runs tc and ip; tc finds its distributions in the folder `tables`."""
-    from cloudrc.link.netem_tc import Answer
-
-    environment = {**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}
-
-    def answer(words: Sequence[str]) -> Answer:
-        try:
-            done = subprocess.run(
-                words,
-                capture_output=True,
-                text=True,
-                env=environment,
-                timeout=TC_PATIENCE,
-                check=False,
-            )
-        except FileNotFoundError:
-            return Answer(NOT_FOUND, "", "")
-        except subprocess.TimeoutExpired:
-            return Answer(1, "", f"no answer within {TC_PATIENCE:g} s")
-        return Answer(done.returncode, done.stdout, done.stderr)
-
-    return answer
 
 
 def loader(direction: str) -> Load:
@@ -104,30 +81,41 @@ def resolve(name: str) -> list[str]:
     return [str(entry[4][0]) for entry in found]
 
 
-def _machine(options: argparse.Namespace, run: Run) -> Machine:
+def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> Machine:
     from cloudrc.config.load import load_experiment
     from cloudrc.link.model import LinkDirection
     from cloudrc.link.netem import Netem
-    from cloudrc.link.netem_tc import may_shape
+    from cloudrc.link.netem_tc import may_shape, try_netem
     from cloudrc.link.profile import DirectionProfile
+    from cloudrc.link.relay_priority import settle
     from cloudrc.link.relay_shaper import RelayShaper
     from cloudrc.link.sidecar import Machine
     from cloudrc.tunnel.codec import peek
 
     seed = load_experiment(str(options.config)).seed
-    clock, origin_ns = time.monotonic_ns, time.monotonic_ns()
+    clock = time.monotonic_ns
 
-    def relay(profile: DirectionProfile) -> RelayShaper:
+    def relay(profile: DirectionProfile, origin_ns: int) -> RelayShaper:
+        settle()
         uplink = options.direction == "uplink"
         return RelayShaper(options.listen, LinkDirection(profile, seed, uplink, origin_ns), peek)
 
-    def netem(profile: DirectionProfile) -> Netem:
-        return Netem(run, profile, origin_ns=origin_ns, clock=clock, wait=time.sleep)
+    def netem(profile: DirectionProfile, origin_ns: int) -> Netem:
+        return Netem(
+            programs,
+            profile,
+            origin_ns=origin_ns,
+            clock=clock,
+            wait=time.sleep,
+            tables=tables,
+            log=log,
+        )
 
     return Machine(
         relay=relay,
         netem=netem,
         may_shape=may_shape(Path("/proc/self/status").read_text(encoding="ascii")),
+        try_netem=lambda: try_netem(programs),
         clock=clock,
         today=lambda: datetime.now(UTC).isoformat(timespec="seconds"),
         wait=time.sleep,
@@ -135,7 +123,7 @@ def _machine(options: argparse.Namespace, run: Run) -> Machine:
     )
 
 
-def _follow(sidecar: Sidecar, file: ProfileFile, options: argparse.Namespace) -> None:
+def _follow(sidecar: Sidecar, file: Profiles, options: argparse.Namespace) -> None:
     """Let threads of their own look after the profile's file and the peer's name."""
     from cloudrc.link.sidecar_follow import PEER_PERIOD, PROFILE_PERIOD, PeerName
 
@@ -170,6 +158,10 @@ class Metrics:
         """Show who shapes, and be ready."""
         self._exporter.shaped(shaper, self._direction, self._mode)
         self._exporter.ready(True)
+
+    def asked(self, delay: float) -> None:
+        """Show the mean delay that is asked for [s]."""
+        self._exporter.asked(self._direction, delay)
 
     def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
         """Show what became of the datagrams."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import socket
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.ends import EPILOG as EPILOG
@@ -35,6 +37,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     process_arguments(parser)
     for flag, text in ADDRESSES.items():
         parser.add_argument(flag, type=address, required=True, metavar="HOST:PORT", help=text)
+    parser.add_argument(
+        "--link",
+        type=Path,
+        metavar="DIR",
+        help="tell the link's state here, and follow what 'cloudrc link set' leaves (default: not)",
+    )
+    parser.add_argument(
+        "--fifo",
+        action="store_true",
+        help="run before ordinary processes (SCHED_FIFO) if this user may: a shorter tail",
+    )
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -43,42 +56,60 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.config.load import load_experiment
     from cloudrc.drivers.feed import Feed
     from cloudrc.drivers.process import StopSignal
-    from cloudrc.drivers.realtime import bind
     from cloudrc.link.relay import Relay
+    from cloudrc.link.relay_priority import settle
     from cloudrc.tunnel.codec import peek
 
     stop, exporter = StopSignal(), open_exporter(options, "link")
     experiment = load_experiment(str(options.config))
     uplink, downlink = assembly.build_links(experiment)
-    sides = []
-    for flag, listen in (
-        ("--world-side", options.world_side),
-        ("--cloud-side", options.cloud_side),
-    ):
-        warn_if_exposed(listen)
-        with listening(flag, listen):
-            sides.append(bind(listen))
     relay = Relay(
         uplink,
         downlink,
         peek,
-        world_side=sides[0],
-        cloud_side=sides[1],
+        world_side=_side("--world-side", options.world_side),
+        cloud_side=_side("--cloud-side", options.cloud_side),
         world_peer=options.world,
         cloud_peer=options.cloud,
     )
+    settle()
+    if options.fifo:
+        _run_first()
+    ask: Callable[[], bool] = stop
+    if options.link:
+        from cloudrc.cli.relay_control import controlled
+
+        ask = controlled(stop, options.link, experiment, (uplink, downlink), exporter, relay)
     Feed.on_stdout().ready()
     if exporter is None:
-        relay.run(stop)
+        relay.run(ask)
     else:
         for way, asked in (("uplink", experiment.uplink), ("downlink", experiment.downlink)):
             exporter.shaped("relay", way, "relay")
             exporter.asked(way, asked.delay_ms * 1e-3)
         exporter.ready(True)
-        relay.run(_counting(stop, relay, exporter))
+        relay.run(_counting(ask, relay, exporter))
     counts = ", ".join(f"{name} {count:g}" for name, count in relay.counts().items())
     print(f"cloudrc relay: {counts}", file=sys.stderr)
     return 0
+
+
+def _side(flag: str, listen: tuple[str, int]) -> socket.socket:
+    """Open the socket of one side."""
+    from cloudrc.drivers.realtime import bind
+
+    warn_if_exposed(listen)
+    with listening(flag, listen):
+        return bind(listen)
+
+
+def _run_first() -> None:
+    """Ask for SCHED_FIFO, and say what came of it."""
+    from cloudrc.link.relay_priority import ask_for_fifo
+
+    refused = ask_for_fifo()
+    said = f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO"
+    print(f"cloudrc relay: {said}", file=sys.stderr, flush=True)
 
 
 def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Callable[[], bool]:
@@ -94,8 +125,8 @@ def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Cal
         now_ns = time.monotonic_ns()
         if now_ns >= due_ns:
             due_ns = now_ns + COUNT_PERIOD_NS
-            outcomes = relay.outcomes().items()
-            exporter.see([Counted(now_ns, "link", name, total) for name, total in outcomes])
+            counts = relay.outcomes() | relay.recent()
+            exporter.see([Counted(now_ns, "link", name, n) for name, n in counts.items()])
         return stop()
 
     return ask

@@ -44,6 +44,8 @@ class Purpose(IntEnum):
     STATE = 3
     DUPLICATE = 4
     REORDER = 5
+    CORRUPT = 6
+    CORRUPT_BIT = 7
 
 
 def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:

@@ -10,7 +10,7 @@ from collections import deque
 from typing import TypeVar
 
 from cloudrc.link.draws import BLOCK, BLOCK_BITS, stream_key
-from cloudrc.link.fates import OVERTAKES, Fate, fates
+from cloudrc.link.fates import OVERTAKES, Fate, bit_flips, fates, reach
 from cloudrc.link.profile import DirectionProfile, Loss
 from cloudrc.link.timeline import Conditions, Timeline
 
@@ -32,6 +32,10 @@ class LinkDirection:
     With either, call `send` in the order of sending.
 
     A kind whose counter never moves meets the same fate every time: count repeated hellos, too.
+
+    Attributes:
+        corrupts: Whether datagrams may be damaged: then `corrupted` is to be asked.
+        least_delay_ns: No packet arrives sooner than so long after it was sent [ns].
     """
 
     def __init__(
@@ -48,20 +52,30 @@ class LinkDirection:
         """
         self._seed = seed
         self._uplink = uplink
-        self._origin_ns = origin_ns
+        self._origin_ns: int | None = origin_ns
         self._departures: deque[int] = deque()
         self._last_release_ns = 0
         self._passed = self._lost = self._blackout = self._queue = self._duplicated = 0
+        self._corrupted = 0
         self.replace_profile(profile)
 
-    def replace_profile(self, profile: DirectionProfile) -> None:
+    def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
         """Let other conditions hold from the next packet on.
 
-        Seed, origin, counts and what stands at the bottleneck stay: packet n meets the fate that
-        it would have met had the link had this profile from the start.
+        Seed, counts and what stands at the bottleneck stay: packet n meets the fate that it would
+        have met had the link had this profile from the start.
+
+        Args:
+            profile: Conditions.
+            restart: Whether their time line counts from the next packet; else from the origin.
         """
+        if restart:
+            self._origin_ns = None
+        self.corrupts = profile.corrupt > 0.0
         self._profile = profile
         self._timeline = Timeline(profile)
+        overtakes = profile.reorder > 0.0
+        self.least_delay_ns = 0 if overtakes else self._timeline.least_delay_ns(reach(profile))
         only = self._timeline.only()
         shaped = only is None or only.blackout or only.rate is not None or profile.keep_order
         self._always = None if shaped else only
@@ -95,11 +109,31 @@ class LinkDirection:
             return (now_ns + delays[0],)
         return self._counted(tuple([now_ns + delay for delay in delays]))
 
+    def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
+        """Give a datagram as it arrives: one bit is flipped if chance wants it so.
+
+        Only to be asked where `corrupts`; all copies of a packet are damaged alike.
+
+        Source: tc-netem(8), `corrupt`. Deviation: netem flips a bit anywhere in the frame, so that
+        the receiving kernel drops most of them by their checksums; here it is the datagram's.
+        """
+        key = stream_key(self._seed, self._uplink, epoch, kind)
+        place = bit_flips(key, counter >> BLOCK_BITS, self._profile.corrupt).get(
+            counter & _IN_BLOCK
+        )
+        if place is None or not data:
+            return data
+        self._corrupted += 1
+        bit = int(place * 8 * len(data))
+        damaged = bytearray(data)
+        damaged[bit >> 3] ^= 1 << (bit & 7)
+        return bytes(damaged)
+
     def counts(self) -> dict[str, int]:
         """Say how many packets have met which outcome so far.
 
         `passed` are those of which at least one copy arrives, `duplicated` those of them of which
-        two do; `lost`, `blackout` and `queue` did not arrive, by cause.
+        two do; `lost`, `blackout` and `queue` did not arrive, by cause; `corrupted` were damaged.
         """
         return {
             "passed": self._passed,
@@ -107,6 +141,7 @@ class LinkDirection:
             "blackout": self._blackout,
             "queue": self._queue,
             "duplicated": self._duplicated,
+            "corrupted": self._corrupted,
         }
 
     def _send_shaped(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
@@ -114,6 +149,8 @@ class LinkDirection:
 
         As in tc-netem, losses come before the bottleneck and a packet that overtakes passes it by.
         """
+        if self._origin_ns is None:
+            self._origin_ns = now_ns
         conditions = self._timeline.at(now_ns - self._origin_ns)
         if conditions.blackout:
             self._blackout += 1
@@ -163,8 +200,11 @@ class LinkDirection:
         """Make the delays of a block where conditions never change: the fast path of `send`."""
         base = always.delay_ns
         key = stream_key(self._seed, self._uplink, epoch, kind)
+        # Nearly all have one copy: worth a way of its own, since a relay does this in flight.
         table = [
-            tuple([max(0, base + entry) for entry in fate])
+            (base + fate[0] if base + fate[0] > 0 else 0,)
+            if len(fate) == 1
+            else tuple([max(0, base + entry) for entry in fate])
             for fate in fates(key, block, self._profile, always.jitter, always.loss)
         ]
         _forget_oldest(self._delays)

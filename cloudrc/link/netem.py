@@ -6,23 +6,28 @@
 
 The set-up is found again after a restart by its handles, changed in flight by `tc qdisc change`,
 which keeps what is queued, and removed by `close`. A root qdisc of somebody else is left alone.
+What others do to ours is seen within a second, put back, logged and counted.
 
 Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8).
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
+from cloudrc.link.netem_check import differences
+from cloudrc.link.netem_keep import BAND, LEAF, ROOT, Kept, counters, damage, is_ours
+from cloudrc.link.netem_steps import Steps, pause_ns
+from cloudrc.link.netem_tables import write_measured
 from cloudrc.link.netem_tc import Iproute2, Run
-from cloudrc.link.netem_text import STEP_NS, check, options
+from cloudrc.link.netem_text import check, limit, options
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay_lane import Address
 from cloudrc.link.timeline import Timeline
-
-ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
 
 # The kernel's own default for three bands: nothing falls into the fourth by its type of service.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
@@ -30,7 +35,11 @@ _UDP = "17"
 
 
 class Netem:
-    """One direction of the link in the kernel; a `Shaper`."""
+    """One direction of the link in the kernel; a `Shaper`.
+
+    Attributes:
+        steps: How well the time line has been followed so far.
+    """
 
     name = "netem"
 
@@ -42,6 +51,8 @@ class Netem:
         origin_ns: int,
         clock: Callable[[], int],
         wait: Callable[[float], None],
+        tables: Path | None = None,
+        log: Callable[[str], None] = lambda line: None,
     ) -> None:
         """Set up, without touching the network yet.
 
@@ -52,15 +63,25 @@ class Netem:
             origin_ns: When the link came up [ns]; the time line counts from it.
             clock: Tells the time on the clock of `origin_ns` [ns].
             wait: Sleeps for so long [s].
+            tables: That folder, where a profile's measured distribution is added.
+            log: Gets lines for people.
         """
         self._iproute2 = Iproute2(run)
-        self._profile = profile
-        self._timeline = Timeline(profile)
-        self._origin_ns = origin_ns
-        self._clock = clock
-        self._wait = wait
+        self._clock, self._wait = clock, wait
+        self._tables, self._log = tables, log
         self._device = ""
+        self._peer: Address | None = None
+        self._kept = Kept(log)
         self._applied: list[str] = []
+        self._stepped_ns = origin_ns
+        self.steps = Steps()
+        self._follow(profile, origin_ns)
+
+    def _follow(self, profile: DirectionProfile, origin_ns: int) -> None:
+        self._profile, self._timeline = profile, Timeline(profile)
+        self._origin_ns, self._room, self._piece = origin_ns, limit(profile), -1
+        if self._tables is not None:
+            write_measured(self._tables, profile)
 
     def follow_peer(self, peer: Address) -> Address:
         """Shape what goes to this peer from now on, on the interface that leads to it."""
@@ -68,53 +89,103 @@ class Netem:
         if device != self._device:
             self.close()
             self._device = device
+        self._peer = peer
         try:
             check(self._profile)
             if not self._applied:
                 self._set_up()
+                self._confirm()
             self._select(peer)
         except CloudrcError:
             self.close()
             raise
         return peer
 
-    def follow_profile(self, profile: DirectionProfile) -> None:
-        """Shape by this profile from now on; what is queued leaves when it would have."""
+    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+        """Shape by this profile from now on; what is queued leaves when it would have.
+
+        Args:
+            profile: Conditions.
+            restart: Whether their time line counts from now; else from when the old one did.
+        """
         check(profile)
-        before = self._profile, self._timeline
-        self._profile, self._timeline = profile, Timeline(profile)
+        before = self._profile, self._origin_ns
+        self._follow(profile, self._clock() if restart else self._origin_ns)
         try:
             self._apply("change")
-        except MissingPrerequisiteError:
-            self._profile, self._timeline = before
+            self._confirm()
+        except CloudrcError:
+            self._follow(*before)
+            self._apply("change")
             raise
 
     def step(self, timeout: float) -> None:
-        """Put into force what the time line says now, then wait, at most `timeout` [s]."""
-        self._apply("change")
-        steps = len(self._timeline.starts_ns) > 1
-        self._wait(min(timeout, STEP_NS * 1e-9) if steps else timeout)
+        """Put into force what the time line says, as it says it, for `timeout` [s]."""
+        until_ns = self._clock() + round(timeout * 1e9)
+        if self._kept.due(self._clock()):
+            self._look(self._qdiscs())
+        while True:
+            self._follow_time_line()
+            due_ns = self._next_ns()
+            wake_ns = until_ns if due_ns is None else min(due_ns, until_ns)
+            self._wait(max(0, wake_ns - self._clock()) * 1e-9)
+            if wake_ns >= until_ns:
+                return
 
     def counts(self) -> dict[str, int]:
-        """Say how many datagrams netem sent on, dropped (losses included) and holds."""
-        return counters(self._qdiscs())
+        """Say how many datagrams netem sent on, dropped (losses included) and holds.
+
+        Beside them the steps of the time line, and `restored`: how often another hand had removed
+        or changed what is set up here, and it was put back.
+        """
+        qdiscs = self._qdiscs()
+        counts = self._kept.counted(counters(qdiscs))
+        self._look(qdiscs)
+        return counts | self.steps.counts() | {"restored": self._kept.restored}
+
+    def released(self) -> dict[str, int]:
+        """Give nothing: the kernel does not tell when what was queued has left."""
+        return {}
 
     def close(self) -> None:
         """Remove the qdiscs, if they are ours; what is queued in them is lost."""
-        if self._device and _is_ours(self._qdiscs()):
+        if self._device and is_ours(self._qdiscs()):
             self._iproute2.tc("qdisc", "del", "dev", self._device, "root")
         self._device, self._applied = "", []
+
+    def _look(self, qdiscs: list[dict[str, Any]]) -> None:
+        """Put back what is not as it was set up."""
+        filters = self._kept.looks(self._clock())
+        if not self._applied or self._peer is None:
+            return
+        what = damage(qdiscs, self._applied)
+        lost = "removed" in what or (filters and not what and not self._filters_there())
+        if not what and not lost:
+            return
+        what = f"the qdisc of {self._device} {what or 'lost its filter'}"
+        before, self._applied = self._applied, []
+        try:
+            self._kept.counted(counters(qdiscs))
+            self._set_up()
+            self._confirm()
+            if lost:
+                self._select(self._peer)
+        except CloudrcError as error:
+            self._applied = before
+            self._kept.cannot(what, str(error))
+        else:
+            self._kept.put_back(what)
 
     def _set_up(self) -> None:
         """Put the qdiscs in place, those included that an earlier process left."""
         qdiscs, device = self._qdiscs(), self._device
         root = next((one for one in qdiscs if one.get("root")), {"handle": "0:"})
-        if root["handle"] != "0:" and not _is_ours(qdiscs):
+        if root["handle"] != "0:" and not is_ours(qdiscs):
             raise MissingPrerequisiteError(
                 f"{device} has a qdisc already ({root['kind']} {root['handle']}) that is not "
                 f"cloudrc's; remove it ('tc qdisc del dev {device} root'), or set link.mode=relay"
             )
-        if not _is_ours(qdiscs):
+        if not is_ours(qdiscs):
             self._add_root()
         there = any(one.get("handle") == LEAF for one in qdiscs)
         self._apply("change" if there else "add")
@@ -129,19 +200,56 @@ class Netem:
             self._iproute2.tc("qdisc", "del", *place)
             raise
 
+    def _follow_time_line(self) -> None:
+        try:
+            self._apply("change")
+        except CloudrcError:
+            before = self._kept.restored
+            self._look(self._qdiscs())
+            if self._kept.restored == before:
+                raise
+
     def _apply(self, verb: str) -> None:
         """Let what holds now be in force, unless it is."""
-        now = self._timeline.at(self._clock() - self._origin_ns)
-        wanted = options(self._profile, now)
+        elapsed_ns = self._clock() - self._origin_ns
+        starts_ns = self._timeline.starts_ns
+        piece = max(bisect_right(starts_ns, elapsed_ns) - 1, 0)
+        if piece == self._piece and self._applied:
+            return
+        wanted = options(self._profile, self._timeline.at(elapsed_ns), self._room)
         if wanted != self._applied:
             place = ("dev", self._device, "parent", BAND, "handle", LEAF)
             self._iproute2.tc("qdisc", verb, *place, "netem", *wanted)
             self._applied = wanted
+        # The first piece was not stepped to, and neither was one that is as the one before.
+        if 0 <= self._piece < piece:
+            done_ns, due_ns = self._clock(), self._origin_ns + starts_ns[piece]
+            self._stepped_ns = done_ns
+            self.steps.note(done_ns - due_ns, piece - self._piece - 1)
+            if piece == len(starts_ns) - 1:
+                self._log(self.steps.in_words())
+        self._piece = piece
+
+    def _next_ns(self) -> int | None:
+        """Say when to look at the time line again [ns]; None if nothing more will happen."""
+        following = self._piece + 1
+        if following >= len(self._timeline.starts_ns):
+            return None
+        return pause_ns(self._origin_ns + self._timeline.starts_ns[following], self._stepped_ns)
+
+    def _confirm(self) -> None:
+        """Read back what is in force, and refuse what is not as it was asked for."""
+        listed = next(one for one in self._qdiscs() if one.get("handle") == LEAF)
+        found = differences(self._applied, listed.get("options", {}))
+        if found:
+            raise BadInputError(
+                f"netem cannot do what is asked ({'; '.join(found)}); set link.mode=relay, which "
+                "can, or ask for other values"
+            )
 
     def _select(self, peer: Address) -> None:
         """Send the tunnel's flow to netem: first a new filter, then without the old ones."""
-        show = self._iproute2.show("filter", "show", "dev", self._device, "parent", ROOT)
-        old = sorted({int(one["pref"]) for one in show})
+        old = self._filters_there()
         new = next(number for number in range(1, len(old) + 2) if number not in old)
         try:
             self._add_filter(new, _u32(peer))
@@ -149,6 +257,10 @@ class Netem:
             self._add_filter(new, _flower(peer))
         for number in old:
             self._iproute2.tc("filter", "del", *self._filters(number))
+
+    def _filters_there(self) -> list[int]:
+        show = self._iproute2.show("filter", "show", "dev", self._device, "parent", ROOT)
+        return sorted({int(one["pref"]) for one in show})
 
     def _add_filter(self, number: int, match: Sequence[str]) -> None:
         self._iproute2.tc("filter", "add", *self._filters(number), "protocol", "ip", *match)
@@ -158,27 +270,6 @@ class Netem:
 
     def _qdiscs(self) -> list[dict[str, Any]]:
         return self._iproute2.show("qdisc", "show", "dev", self._device)
-
-
-def counters(qdiscs: list[dict[str, Any]]) -> dict[str, int]:
-    """Read what netem has counted from the objects of `tc -s -j qdisc show`.
-
-    Returns:
-        `forwarded`: sent on, copies included; `lost`: dropped, whether by chance or because the
-        queue was full; `held`: queued now. Empty if there is no such qdisc.
-    """
-    for one in qdiscs:
-        if one.get("handle") == LEAF and one.get("kind") == "netem":
-            return {"forwarded": one["packets"], "lost": one["drops"], "held": one["qlen"]}
-    return {}
-
-
-def _is_ours(qdiscs: list[dict[str, Any]]) -> bool:
-    """Say whether the root of an interface is what `Netem` puts there."""
-    return any(
-        one.get("root") and one.get("handle") == ROOT and one.get("kind") == "prio"
-        for one in qdiscs
-    )
 
 
 def _u32(peer: Address) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 
+_TRIAL = "7402:"
 _INSTEAD = "set link.mode=relay, which needs nothing of the kernel"
 
 
@@ -53,6 +54,23 @@ class Iproute2:
         return answer.output
 
 
+def try_netem(run: Run) -> None:
+    """Find out whether this kernel has netem, by a qdisc on the loopback that delays nothing.
+
+    A qdisc of somebody else is left alone: then nothing is found out.
+
+    Raises:
+        MissingPrerequisiteError: If there is none, or this container may not use it.
+    """
+    iproute2 = Iproute2(run)
+    root = next((q for q in iproute2.show("qdisc", "show", "dev", "lo") if q.get("root")), {})
+    if root.get("handle", "0:") not in ("0:", _TRIAL):
+        return
+    if root.get("handle") != _TRIAL:
+        iproute2.tc("qdisc", "add", "dev", "lo", "root", "handle", _TRIAL, "netem")
+    iproute2.tc("qdisc", "del", "dev", "lo", "root")
+
+
 def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
     """Put an answer that is not the wanted one into words: the cause, and what to do."""
     text = answer.error or answer.output
@@ -63,8 +81,8 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
         )
     if "qdisc kind is unknown" in text or (kind and "No such file or directory" in text):
         return MissingPrerequisiteError(
-            f"this kernel has no sch_{kind or 'netem'}; {_INSTEAD}, or use a node whose kernel has "
-            f"it (there: 'modprobe sch_{kind or 'netem'}')"
+            f"this kernel has no sch_{kind or 'netem'}; {_INSTEAD}, or use nodes whose kernel has "
+            f"it ('modprobe sch_{kind or 'netem'}' there) and a namespace for privileged pods"
         )
     if "classifier not found" in text:
         return MissingPrerequisiteError(

@@ -8,18 +8,21 @@ are not named as they were.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 from math import ceil
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.netem_tables import STRETCH
+from cloudrc.link.netem_tables import distribution_name, stretch
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 from cloudrc.link.timeline import Conditions, Timeline
 
-STEP_NS = 20_000_000
-"""How often the time line is looked at [ns]."""
+STEP_NS = 5_000_000
+"""Shortest time between two steps of the qdisc [ns]; what changes faster is passed over."""
 LIMIT = 10_000
 """Packets that the qdisc holds at once, as many as the relay."""
+DELAY_MAX_NS = 274_000_000_000
+"""tc keeps times in 64 ns ticks of 32 bits and refuses what is longer [ns]."""
 
 _IN_ORDER = "100gbit"
 """netem lets no packet leave before the one before it as soon as it has a rate, whichever."""
@@ -31,20 +34,18 @@ _PACKET_BITS = 8 * 200
 
 def check(profile: DirectionProfile) -> None:
     """Raise a BadInputError that names what netem cannot do of a profile."""
-    losses = [profile.loss, *(change.loss for change in profile.changes)]
-    jitters = [profile.jitter, *(change.jitter for change in profile.changes)]
-    rates = [profile.rate, *(change.rate for change in profile.changes)]
-    if profile.trace is not None:
-        _refuse("trace", "a delay that follows a file")
-    if any(isinstance(loss, GilbertElliott) and loss.delay_bad for loss in losses):
+    pieces = list(_pieces(profile))
+    if any(isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad for piece in pieces):
         _refuse("loss.delay_bad_ms", "more delay while a burst of losses lasts")
-    if any(rates) and any(jitters) and not profile.keep_order:
+    if any(piece.rate and piece.jitter for piece in pieces) and not profile.keep_order:
         _refuse("rate_kbit with jitter_ms but without keep_order", "overtaking behind a bottleneck")
-    for before_ns, after_ns in pairwise(Timeline(profile).starts_ns):
-        if after_ns - before_ns < STEP_NS:
+    if (slowest := max(piece.delay_ns for piece in pieces)) > DELAY_MAX_NS:
+        _refuse("delay_ms above 274000", f"its clock ends there, here {slowest * 1e-6:g} ms")
+    for blackout in profile.blackouts:
+        if blackout.duration * 1e9 < STEP_NS:
             _refuse(
-                "changes or blackouts less than 20 ms apart",
-                f"here {(after_ns - before_ns) * 1e-6:g} ms at {before_ns * 1e-9:g} s",
+                f"blackouts shorter than {STEP_NS * 1e-6:g} ms",
+                f"here {blackout.duration * 1e3:g} ms at {blackout.start:g} s",
             )
 
 
@@ -53,26 +54,39 @@ def notes(profile: DirectionProfile) -> list[str]:
     said = []
     if profile.jitter and profile.correlation:
         said.append(f"netem realises next to nothing of correlation {profile.correlation:g}")
+    if profile.corrupt:
+        said.append(
+            "netem corrupts frames, not datagrams: the receiving kernel drops most of them by "
+            f"their checksums, so that corrupt {profile.corrupt:g} is seen as loss"
+        )
+    starts = Timeline(profile).starts_ns
+    passed_over = sum(after - before < STEP_NS for before, after in pairwise(starts))
+    if passed_over:
+        said.append(
+            f"netem is stepped every {STEP_NS * 1e-6:g} ms at most: {passed_over} of "
+            f"{len(starts)} steps of the time line come sooner, and some are passed over"
+        )
     return said
 
 
-def options(profile: DirectionProfile, conditions: Conditions) -> list[str]:
+def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
     """Put what holds at one instant into tc's words.
 
     Args:
         profile: Passed `check`.
         conditions: That hold now.
+        room: Its `limit`, which takes long to work out for a trace [packets].
 
     Returns:
         Arguments for `tc qdisc add|change ... netem`.
     """
-    words = ["limit", str(_limit(profile, conditions)), "delay", _microseconds(conditions.delay_ns)]
+    words = ["limit", str(room), "delay", _microseconds(conditions.delay_ns)]
     if conditions.jitter:
-        jitter_ns = conditions.jitter * 1e9 * STRETCH[profile.distribution]
-        words += [_microseconds(jitter_ns), _percent(profile.correlation)]
-        words += ["distribution", profile.distribution]
+        words += [_microseconds(conditions.jitter * 1e9 * stretch(profile))]
+        words += [_percent(profile.correlation), "distribution", distribution_name(profile)]
     words += ["loss", *_loss(1.0 if conditions.blackout else conditions.loss)]
-    words += ["duplicate", _percent(profile.duplicate)]
+    words += ["duplicate", _percent(profile.duplicate), "corrupt", _percent(profile.corrupt)]
+    # tc refuses it without a delay, where nothing is there to be overtaken.
     if profile.reorder and conditions.delay_ns and not profile.keep_order:
         words += ["reorder", _percent(profile.reorder)]
     if conditions.rate is not None:
@@ -81,12 +95,22 @@ def options(profile: DirectionProfile, conditions: Conditions) -> list[str]:
     return [*words, "rate", _IN_ORDER if profile.keep_order else "0bit"]
 
 
-def _limit(profile: DirectionProfile, conditions: Conditions) -> int:
-    """Room for what is under way and, behind a bottleneck, for its queue alone [packets]."""
-    if conditions.rate is None:
+def limit(profile: DirectionProfile) -> int:
+    """Give room for what is under way at most and, behind a bottleneck, for its queue [packets].
+
+    One number for the whole time line: a step to a shorter delay must not turn packets away
+    because those of the longer one are still under way.
+    """
+    pieces = list(_pieces(profile))
+    if any(piece.rate is None for piece in pieces):
         return LIMIT
-    under_way = conditions.delay_ns * conditions.rate / (1e9 * _PACKET_BITS)
+    under_way = max(p.delay_ns * (p.rate or 0.0) for p in pieces) / (1e9 * _PACKET_BITS)
     return ceil(profile.queue_packets + under_way)
+
+
+def _pieces(profile: DirectionProfile) -> Iterator[Conditions]:
+    timeline = Timeline(profile)
+    return (timeline.at(start_ns) for start_ns in timeline.starts_ns)
 
 
 def _loss(loss: Loss) -> list[str]:

@@ -92,13 +92,16 @@ class DirectionProfile:
 
     Attributes:
         delay: One way [s].
-        jitter: uniform: half width; normal, pareto: standard deviation [s]. The mean stays `delay`,
-            except that a delay below 0 becomes 0.
+        jitter: uniform: half width; normal, pareto, table: standard deviation [s]. The mean stays
+            `delay`, except that a delay below 0 becomes 0.
         distribution: Of the delay about its mean.
+        table: With `distribution` table: values that are drawn with equal chance, mean 0, standard
+            deviation 1, rising, shape (n,) [1]; else ().
         correlation: Of the jitter of one packet with the next, in [0, 1].
         loss: Chance, or bursts.
         duplicate: Chance in [0, 1] that a packet arrives twice; the copy draws a delay of its own.
         reorder: Chance in [0, 1] that a packet overtakes: neither queue nor delay.
+        corrupt: Chance in [0, 1] that one bit of the datagram is flipped, in all its copies.
         keep_order: Packets never overtake each other (this undoes `reorder`).
         rate: Of the bottleneck [bit/s]; None has none.
         queue_packets: Packets at the bottleneck, the one on the wire included, beyond which the
@@ -110,14 +113,16 @@ class DirectionProfile:
 
     delay: float = 0.0
     jitter: float = 0.0
-    distribution: Literal["uniform", "normal", "pareto"] = "uniform"
+    distribution: Literal["uniform", "normal", "pareto", "table"] = "uniform"
     correlation: float = 0.0
     loss: Loss = 0.0
     duplicate: float = 0.0
     reorder: float = 0.0
+    corrupt: float = 0.0
     keep_order: bool = False
     rate: float | None = None
     queue_packets: int = 1000
     changes: tuple[Change, ...] = ()
     trace: Trace | None = None
     blackouts: tuple[Blackout, ...] = ()
+    table: tuple[float, ...] = ()

@@ -11,7 +11,9 @@ import socket
 from collections.abc import Callable
 
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.relay_lane import IN_FLIGHT_MAX, Address, Lane, Lanes, Peek, Side
+from cloudrc.link.relay_lane import IN_FLIGHT_MAX, Address, Lane, Peek, Side
+from cloudrc.link.relay_lanes import Lanes
+from cloudrc.link.relay_wait import tighten_slack
 
 LOOPBACK = "127.0.0.1"
 
@@ -57,22 +59,36 @@ class Relay:
         """
         self._world = Side(world_side, world_peer)
         self._cloud = Side(cloud_side, cloud_peer)
-        self._lanes = Lanes(
-            (
-                Lane(self._world, self._cloud, uplink, peek, in_flight_max),
-                Lane(self._cloud, self._world, downlink, peek, in_flight_max),
-            ),
-            origin_ns=None,
-        )
+        self._ways = {
+            "uplink": Lane(self._world, self._cloud, uplink, peek, in_flight_max),
+            "downlink": Lane(self._cloud, self._world, downlink, peek, in_flight_max),
+        }
+        self._lanes = Lanes(tuple(self._ways.values()), origin_ns=None)
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Forward until `stop` says True; it is asked at least every 0.1 s."""
-        while not stop():
-            self._lanes.step(_STOP_PERIOD)
+        """Forward, once, until `stop` says True; it is asked at least every 0.1 s."""
+        tighten_slack()
+        try:
+            while not stop():
+                self._lanes.run(_STOP_PERIOD)
+        finally:
+            self._lanes.close()
+
+    def take_in(self) -> None:
+        """Put on the link whatever has come: to be called before a direction's profile changes."""
+        self._lanes.take_in()
+
+    def released(self, way: str) -> dict[str, int]:
+        """Say how late datagrams of "uplink" or "downlink" left so far, as `Lane.released` does."""
+        return self._ways[way].released()
 
     def outcomes(self) -> dict[str, int]:
         """Count datagrams by what became of them, both ways together, as `Lanes.outcomes` does."""
         return self._lanes.outcomes()
+
+    def recent(self) -> dict[str, int]:
+        """Say how late datagrams left of late, both ways together, as `Lanes.recent` does."""
+        return self._lanes.recent()
 
     def counts(self) -> dict[str, float]:
         """Say what has happened so far, both ways together, as `Lanes.counts` does."""

@@ -9,7 +9,9 @@ import socket
 
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay_lane import Address, Lane, Lanes, Peek, Side
+from cloudrc.link.relay_lane import Address, Lane, Peek, Side
+from cloudrc.link.relay_lanes import Lanes
+from cloudrc.link.relay_wait import tighten_slack
 
 
 class RelayShaper:
@@ -38,6 +40,7 @@ class RelayShaper:
         self._outside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._lane = Lane(Side(self._inside), Side(self._outside), direction, peek)
         self._lanes = Lanes((self._lane,), origin_ns=0)
+        tighten_slack()
 
     def follow_peer(self, peer: Address) -> Address:
         """Send to this peer from now on; what is in flight goes there, too."""
@@ -45,19 +48,33 @@ class RelayShaper:
         host, port = self._inside.getsockname()
         return host, port
 
-    def follow_profile(self, profile: DirectionProfile) -> None:
-        """Shape by this profile from now on; what is in flight keeps the delay that it drew."""
-        self._lane.direction.replace_profile(profile)
+    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+        """Shape by this profile from now on; what is in flight keeps the delay that it drew.
+
+        Args:
+            profile: Conditions.
+            restart: Whether their time line counts from now; else from when the old one did.
+        """
+        self._lanes.take_in()  # what has come until now is of before
+        self._lane.direction.replace_profile(profile, restart=restart)
 
     def step(self, timeout: float) -> None:
         """Forward for a moment, at most `timeout` [s]."""
-        self._lanes.step(timeout)
+        self._lanes.run(timeout)
 
     def counts(self) -> dict[str, int]:
-        """Say how many datagrams met which outcome, as `Lanes.outcomes` does."""
-        return self._lane.counts()
+        """Say how many datagrams met which outcome so far, and how late they left of late.
+
+        As `Lanes.outcomes` and `Lanes.recent` do.
+        """
+        return self._lanes.outcomes() | self._lanes.recent()
+
+    def released(self) -> dict[str, int]:
+        """Say how late datagrams left since the beginning, as `Lane.released` does."""
+        return self._lane.released()
 
     def close(self) -> None:
         """Close the sockets; what is in flight is lost."""
+        self._lanes.close()
         self._inside.close()
         self._outside.close()

@@ -27,8 +27,12 @@ class Shaper(Protocol):
         """
         ...
 
-    def follow_profile(self, profile: DirectionProfile) -> None:
+    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
         """Shape by this profile from now on; what is in flight is not lost.
+
+        Args:
+            profile: Conditions.
+            restart: Whether their time line counts from now; else from when the old one did.
 
         Raises:
             CloudrcError: If it cannot; then the old profile stays in force.
@@ -41,6 +45,10 @@ class Shaper(Protocol):
 
     def counts(self) -> dict[str, int]:
         """Say how many datagrams met which outcome so far."""
+        ...
+
+    def released(self) -> dict[str, int]:
+        """Say how late datagrams left since the beginning; empty if that is not known here."""
         ...
 
     def close(self) -> None:

@@ -8,20 +8,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
-from cloudrc.link.netem_text import notes
+from cloudrc.link.netem_text import check, notes
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay_lane import Address
 from cloudrc.link.route import publish, publish_route, withdraw
 from cloudrc.link.shaper import Shaper
 from cloudrc.link.sidecar_follow import Loaded
+from cloudrc.link.state import RELEASED_SUFFIX, Change, LinkState, summary, to_text
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
-Make: TypeAlias = Callable[[DirectionProfile], Shaper]
+Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
+"""Makes a shaper from conditions and the instant [ns] that their time line counts from."""
 
 COUNT_PERIOD_NS = 1_000_000_000
 _WAIT = 0.05
@@ -54,6 +56,7 @@ class Machine:
         relay: Makes the relay.
         netem: Makes netem, without touching the network yet.
         may_shape: Whether this process is root with NET_ADMIN.
+        try_netem: Raises a CloudrcError if this kernel has no netem; leaves nothing behind.
         clock: Monotonic [ns].
         today: Date and time in UTC as text, for reports.
         wait: Sleeps for so long [s].
@@ -63,6 +66,7 @@ class Machine:
     relay: Make
     netem: Make
     may_shape: bool
+    try_netem: Callable[[], None]
     clock: Callable[[], int]
     today: Callable[[], str]
     wait: Callable[[float], None]
@@ -74,6 +78,10 @@ class Watcher(Protocol):
 
     def shapes(self, shaper: str) -> None:
         """Learn that from now on this shaper is in force, and that the route is told."""
+        ...
+
+    def asked(self, delay: float) -> None:
+        """Learn the mean delay [s] that the profile in force asks for."""
         ...
 
     def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
@@ -98,19 +106,28 @@ class Sidecar:
         self._machine = machine
         self._watcher = watcher
         self._reason = ""
+        self._origin_ns: int | None = None
+        self._state: LinkState | None = None
+        self._released = settings.state.with_suffix(RELEASED_SUFFIX)
+        self._seen = profile.change.number
 
-    def run(self, stop: Callable[[], bool]) -> None:
+    def run(
+        self, stop: Callable[[], bool], wait_for_peer: Callable[[], None] = lambda: None
+    ) -> None:
         """Shape until `stop` says True.
+
+        Args:
+            stop: Whether to end.
+            wait_for_peer: Called once it is sure that a strict mode can be kept: from then on the
+                peer is looked for.
 
         Raises:
             CloudrcError: If the mode is strict and its shaper cannot do what is asked.
         """
         withdraw(self._settings.route)  # an earlier process may have left one
-        if self._settings.mode == "netem" and not self._machine.may_shape:
-            raise MissingPrerequisiteError(
-                "link.mode=netem needs uid 0 and NET_ADMIN; give this container both, or set "
-                "link.mode=relay, which needs neither"
-            )
+        if self._settings.mode == "netem":
+            self._insist()
+        wait_for_peer()
         while self.peer is None:
             if stop():
                 return
@@ -120,10 +137,23 @@ class Sidecar:
                 self._shape(self.peer, stop)
         finally:
             withdraw(self._settings.route)
+            withdraw(self._released)
+
+    def _insist(self) -> None:
+        """Find out whether netem will do, before anybody is waited for."""
+        if not self._machine.may_shape:
+            raise MissingPrerequisiteError(
+                "link.mode=netem needs uid 0 and NET_ADMIN; give this container both, or set "
+                "link.mode=relay, which needs neither"
+            )
+        check(self.profile.direction)
+        self._machine.try_netem()
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
         """Shape with one shaper, until `stop` or until a profile asks for another one."""
         profile = self.profile
+        if self._origin_ns is None or (self._state and self._change_of(profile).restart):
+            self._origin_ns = self._machine.clock()
         shaper, route = self._choose(profile, peer)
         try:
             self._announce(shaper, route, profile)
@@ -137,18 +167,25 @@ class Sidecar:
                     if not self._replace(shaper, profile):
                         return
                 shaper.step(_STEP)
-                if self._watcher and (now_ns := self._machine.clock()) >= count_ns:
+                if (now_ns := self._machine.clock()) >= count_ns:
                     count_ns = now_ns + COUNT_PERIOD_NS
-                    self._watcher.counted(now_ns, shaper.counts())
+                    self._count(shaper, now_ns)
         finally:
             shaper.close()
+
+    def _count(self, shaper: Shaper, now_ns: int) -> None:
+        """Tell how it goes: the metrics what became of datagrams, this pod's end how late."""
+        if self._watcher:
+            self._watcher.counted(now_ns, shaper.counts())
+        if released := shaper.released():
+            publish(self._released, json.dumps(released))
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
         """Take the shaper of the mode, or find out which one works; say why."""
         machine, mode = self._machine, self._settings.mode
         self._reason = f"link.mode={mode}"
         if mode != "relay":
-            netem = machine.netem(profile.direction)
+            netem = machine.netem(profile.direction, self._origin_ns or 0)
             try:
                 if not machine.may_shape:
                     raise MissingPrerequisiteError("no uid 0 with NET_ADMIN")
@@ -161,20 +198,23 @@ class Sidecar:
                 for note in notes(profile.direction):
                     machine.log(note)
                 return netem, route
-        relay = machine.relay(profile.direction)
+        relay = machine.relay(profile.direction, self._origin_ns or 0)
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
         """Put a new profile in force; False if that takes another shaper."""
         try:
-            shaper.follow_profile(profile.direction)
+            shaper.follow_profile(profile.direction, restart=self._change_of(profile).restart)
         except CloudrcError as error:
             if self._settings.mode == "auto":
                 self._machine.log(f"changes the shaper: {_cause(error)}")
                 return False
             self._machine.log(f"the new profile is refused, the old one stays: {error}")
+            self._refuse(profile, str(error))
             return True
-        self._machine.log("the new profile is in force")
+        if self._change_of(profile).restart:
+            self._origin_ns = self._machine.clock()
+        self._machine.log(f"the new profile is in force ({self._change_of(profile).cause})")
         self._tell(shaper, profile)
         return True
 
@@ -186,17 +226,37 @@ class Sidecar:
         if self._watcher:
             self._watcher.shapes(shaper.name)
 
+    def _change_of(self, profile: Loaded) -> Change:
+        """Say who changed a profile; a note that was there before is not about this change."""
+        return profile.change if profile.change.number != self._seen else Change()
+
     def _tell(self, shaper: Shaper, profile: Loaded) -> None:
-        """Write for reports what shapes the link."""
-        state = {
-            "shaper": shaper.name,
-            "reason": self._reason,
-            "mode": self._settings.mode,
-            "direction": self._settings.direction,
-            "profile": profile.values,
-            "since": self._machine.today(),
-        }
-        publish(self._settings.state, json.dumps(state, indent=2) + "\n")
+        """Write for ends, users and reports what shapes the link from now on."""
+        before, change, asked = self._state, self._change_of(profile), summary(profile.direction)
+        self._state = LinkState(
+            shaper=shaper.name,
+            reason=self._reason,
+            mode=self._settings.mode,
+            direction=self._settings.direction,
+            profile=profile.values,
+            since=self._machine.today(),
+            since_ns=self._machine.clock(),
+            changes=before.changes + 1 if before else 0,
+            change=change.number,
+            cause=change.cause if before else "",
+            asked=asked,
+            origin_ns=self._origin_ns,
+        )
+        self._seen = profile.change.number
+        publish(self._settings.state, to_text(self._state))
+        if self._watcher:
+            self._watcher.asked(asked["delay"] or 0.0)
+
+    def _refuse(self, profile: Loaded, why: str) -> None:
+        """Write for users that their change did not take force."""
+        if self._state is not None:
+            self._state = replace(self._state, refused=profile.change.number, refusal=why)
+            publish(self._settings.state, to_text(self._state))
 
 
 def _cause(error: CloudrcError) -> str:

@@ -6,25 +6,36 @@ server may be slow. Here they are plain objects: file and names in, changes out.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay_lane import Address
+from cloudrc.link.state import CHANGE_FILE, Change, read_change
 
-PROFILE_PERIOD = 0.5
+if TYPE_CHECKING:
+    from cloudrc.link.relay_lane import Address
+
+PROFILE_PERIOD = 0.1
 """How often the profile's file is looked at [s]."""
 PEER_PERIOD = 1.0
 """How often the peer's name is resolved [s]."""
 
 
 class Loaded(NamedTuple):
-    """A profile as it was read: one direction in SI, and the file's values for people."""
+    """A profile as it was read: one direction in SI, and the file's values for people.
+
+    Attributes:
+        direction: The one that is shaped here.
+        values: Both, as in the file, defaults left out.
+        change: Who changed it last, and why.
+    """
 
     direction: DirectionProfile
     values: dict[str, Any]
+    change: Change = Change()
 
 
 Load = Callable[[Path], Loaded]
@@ -35,11 +46,12 @@ class ProfileFile:
     """A profile's file that may change.
 
     Kubernetes mounts a ConfigMap as a folder of links to `..data`, itself a link, which it swaps in
-    one step: the file's resolved path and inode change, not the path that it was given by.
+    one step: the file behind the path is another one then. A look is one system call, since there
+    are ten a second beside a shaper that must not be late.
     """
 
     def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
-        self._path = path
+        self._path, self._place = path, str(path)
         self._load = load
         self._log = log
         self._seen: object = None
@@ -47,7 +59,7 @@ class ProfileFile:
     def first(self) -> Loaded:
         """Read the file; raises a BadInputError."""
         self._seen = self._look()
-        return self._load(self._path)
+        return self._read()
 
     def poll(self) -> Loaded | None:
         """Read the file if it has changed; None if not, or if it is refused, which is logged."""
@@ -56,19 +68,26 @@ class ProfileFile:
             return None
         self._seen = seen
         try:
-            return self._load(self._path)
+            return self._read()
         except (BadInputError, OSError) as error:
             self._log(f"the new profile is refused, the old one stays: {error}")
             return None
 
+    def _read(self) -> Loaded:
+        loaded = self._load(self._path)
+        try:
+            told = self._path.with_name(CHANGE_FILE).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError):
+            return loaded
+        return loaded._replace(change=read_change(told))
+
     def _look(self) -> object:
         """Tell versions of the file apart; None while there is none."""
         try:
-            resolved = self._path.resolve(strict=True)
-            state = resolved.stat()
+            state = os.stat(self._place)
         except OSError:
             return None
-        return resolved, state.st_mtime_ns, state.st_ino, state.st_size
+        return state.st_mtime_ns, state.st_ino, state.st_size
 
 
 class PeerName:

@@ -50,6 +50,16 @@ class Timeline:
         """Say what holds `elapsed_ns` [ns] after the link came up."""
         return self._pieces[max(bisect_right(self.starts_ns, elapsed_ns) - 1, 0)]
 
+    def least_delay_ns(self, reach: float) -> int:
+        """Say which delay no packet falls below, whenever it is sent [ns], >= 0.
+
+        Args:
+            reach: How far below its mean a delay can fall, in units of the jitter [1].
+        """
+        passing = [piece for piece in self._pieces if not piece.blackout]
+        least = [piece.delay_ns - round(reach * piece.jitter * 1e9) for piece in passing]
+        return max(0, min(least, default=0))
+
     def only(self) -> Conditions | None:
         """Say what always holds; None if that changes over time."""
         return self._pieces[0] if len(self._pieces) == 1 else None

@@ -161,11 +161,12 @@ def _harm(flight: Flight) -> Iterator[Failure]:
         if len(stamps) > 1:
             text += f" ({len(stamps)} times)"
         yield _failure(flight, "pipe_touched", text, int(stamps[0]))
-    guard = flight.during("/guard")
+    guard, before = flight.during("/guard"), None
     for stamp_ns, state, cause in zip(
         guard["stamp_ns"], guard["state"], guard["cause"], strict=True
     ):
-        if state not in (GuardState.TRACK, GuardState.HOLD):
+        before, repeated = state, state == before  # LAND also tells of its touch-down
+        if state not in (GuardState.TRACK, GuardState.HOLD) and not repeated:
             text = f"the guard went to {GuardState(state).name}: {cause}"
             yield _failure(flight, "guard_intervened", text, int(stamp_ns))
     session = flight.during("/session")

@@ -9,22 +9,23 @@ import struct
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.cli.link_run import runner
+from cloudrc.cli.tc_session import Programs, runner
 from cloudrc.link.netem import Netem
-from cloudrc.link.netem_tc import Answer
 from cloudrc.link.profile import DirectionProfile
 
 NEAR, FAR = f"crc-near-{os.getpid()}", f"crc-far-{os.getpid()}"
 NEAR_HOST, FAR_HOST = "10.79.0.1", "10.79.0.2"
 DEVICE = "wire"
 PEER = (FAR_HOST, 7400)
+WITHIN = 0.002
+"""Of medians: a slow virtual machine now and then stands still, which means would show [s]."""
 _CLONE_NEWNET = 0x40000000
 _SO_TIMESTAMPNS = 35  # include/uapi/asm-generic/socket.h
 
@@ -57,6 +58,8 @@ def laboratory() -> Iterator[None]:
         sh("tc", "-n", NEAR, "qdisc", "del", "dev", DEVICE, "root")
         yield
     finally:
+        while _programs:
+            _programs.popitem()[1].close()
         for name in (NEAR, FAR):
             with suppress(UnableError):
                 sh("ip", "netns", "del", name)
@@ -74,10 +77,14 @@ def inside(name: str) -> Iterator[None]:
             library.setns(home.fileno(), _CLONE_NEWNET)
 
 
-def run_near(tables: Path) -> Callable[[Sequence[str]], Answer]:
+_programs: dict[Path, Programs] = {}
+
+
+def run_near(tables: Path) -> Programs:
     """Run tc and ip in the near namespace."""
-    run = runner(str(tables))
-    return lambda words: run(("ip", "netns", "exec", NEAR, *words))
+    if tables not in _programs:
+        _programs[tables] = runner(str(tables), ("ip", "netns", "exec", NEAR))
+    return _programs[tables]
 
 
 def netem(tables: Path, profile: DirectionProfile, origin_ns: int = 0) -> Netem:
@@ -87,6 +94,7 @@ def netem(tables: Path, profile: DirectionProfile, origin_ns: int = 0) -> Netem:
         origin_ns=origin_ns,
         clock=time.monotonic_ns,
         wait=time.sleep,
+        tables=tables,
     )
 
 
@@ -148,6 +156,26 @@ class Flow:
                 seconds, rest_ns = struct.unpack("=qq", notes[0][2])
                 number = int.from_bytes(data[:4], "little")
                 self.arrived.append((number, seconds * 1_000_000_000 + rest_ns))
+
+
+def measure(count: int, period: float = 0.01) -> Flow:
+    """Send a flow and wait for its end."""
+    flow = Flow()
+    flow.send(count, period)
+    return flow.settle()
+
+
+def told(words: str, **values: float) -> None:
+    """Print a number for those who watch with -s."""
+    print(words, {name: round(float(value), 5) for name, value in values.items()})
+
+
+def least(error: Callable[[], float], enough: float) -> float:
+    """The least of up to three errors: a machine that stands still for a while spoils one."""
+    found = error()
+    for _ in range(2):
+        found = found if found < enough else min(found, error())
+    return found
 
 
 def ping() -> float:

@@ -101,3 +101,16 @@ def test_what_overtakes_has_no_delay() -> None:
 @pytest.mark.parametrize("certain", [{"loss": 1.0}, {"loss": GilbertElliott(1.0, 0.0)}])
 def test_certain_loss_loses_everything(certain: dict[str, float | GilbertElliott]) -> None:
     assert set(flow(DirectionProfile(duplicate=1.0, **certain), 1000)) == {()}  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6])
+def test_a_table_is_drawn_from_about_its_mean(correlation: float) -> None:
+    """A quarter of the packets is late by 1.73 jitters, the others are early by 0.58."""
+    table = (-1 / sqrt(3),) * 3 + (sqrt(3),)
+    profile = DirectionProfile(0.045, 0.005, "table", correlation, table=table)
+    sample = delays(profile, COUNT)
+    assert set(np.round(sample * 1e9)) == {round(45e6 + 5e6 * value) for value in set(table)}
+    assert sample.mean() == pytest.approx(0.045, abs=0.0002)
+    assert sample.std() == pytest.approx(0.005, rel=0.02)
+    lag_one = np.corrcoef(sample[:-1], sample[1:])[0, 1]
+    assert (lag_one > 0.3) if correlation else (abs(lag_one) < 0.03)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.trace import parse_trace, read_trace
+from cloudrc.link.trace import parse_trace, read_table, read_trace
 
 
 def test_a_trace_is_read_into_si(tmp_path: Path) -> None:
@@ -47,6 +47,8 @@ def test_a_file_from_a_spreadsheet_is_read(tmp_path: Path) -> None:
         ("time_s,delay_ms\n0,inf\n", "line 2: delay_ms is inf"),
         ("time_s,delay_ms\n0,fast\n", "line 2: delay_ms is 'fast'; give a number"),
         ("time_s,delay_ms\n0\n", "line 2: delay_ms is nothing; give a number"),
+        ("time_s,delay_ms\n0,0.045\n1,0.07\n", "delay_ms is 0.07 at most, which looks like sec"),
+        ("time_s,delay_ms,delay_us\n0,1,1\n", "line 1: delay_ms and delay_us; give one"),
         ("time_s,delay_ms\n0,1,2\n", "line 2: more values than columns; give 2"),
         ("time_s,delay_ms,loss\n0,45,1.2\n", "line 2: loss is 1.2; give a number from 0 to 1"),
         ("time_s,delay_ms,loss\n0,45,nan\n", "line 2: loss is nan"),
@@ -73,3 +75,22 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\xff")
     with pytest.raises(BadInputError, match="not a text file"):
         read_trace(tmp_path / "binary.csv")
+
+
+def test_short_delays_are_given_in_microseconds_and_none_at_all_in_any_unit() -> None:
+    assert parse_trace(["time_s,delay_us", "0,45"], "x").delays == pytest.approx((45e-6,))
+    assert parse_trace(["time_s,delay_ms", "0,0", "1,0"], "x").delays == (0.0, 0.0)
+
+
+def test_a_table_is_what_arrived_scaled_to_mean_0_and_deviation_1(tmp_path: Path) -> None:
+    path = tmp_path / "trace.csv"
+    path.write_text("time_s,delay_ms,loss\n0,60,0\n1,40,0.5\n2,900,1\n3,40,0\n4,60,0\n")
+    assert read_table(path) == pytest.approx((-1.0, -1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize("rows", ["0,45,0", "0,45,0\n1,45,0", "0,45,1\n1,50,1"])
+def test_a_table_without_a_spread_is_refused(tmp_path: Path, rows: str) -> None:
+    path = tmp_path / "trace.csv"
+    path.write_text(f"time_s,delay_ms,loss\n{rows}\n")
+    with pytest.raises(BadInputError, match="at least two different delays"):
+        read_table(path)

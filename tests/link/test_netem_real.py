@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -13,62 +12,19 @@ from typing import Literal
 import netem_laboratory as lab
 import numpy as np
 import pytest
-from netem_laboratory import Flow
+from netem_laboratory import WITHIN, Flow, least, measure, told
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.netem import Netem
-from cloudrc.link.netem_tables import STRETCH, table, write_tables
+from cloudrc.link.netem_tables import STRETCH, table
 from cloudrc.link.netem_text import check
-from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
+from cloudrc.link.profile import DirectionProfile, GilbertElliott
 
-LATE = 0.4
-"""How late a step may be where starting `tc` takes a tenth of a second [s]."""
 Distribution = Literal["uniform", "normal", "pareto"]
 pytestmark = pytest.mark.netem
-WITHIN = 0.002
-"""Of medians: a slow virtual machine now and then stands still, which means would show [s]."""
-
-
-@pytest.fixture(scope="module")
-def tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    folder = tmp_path_factory.mktemp("tc")
-    write_tables(folder)
-    try:
-        with lab.laboratory():
-            yield folder
-    except lab.UnableError as error:
-        pytest.exit(f"netem cannot be tested here: {error}", MissingPrerequisiteError.exit_code)
-
-
-@pytest.fixture
-def shaped(tables: Path) -> Iterator[Netem]:
-    """netem without conditions, in force."""
-    netem = lab.netem(tables, DirectionProfile())
-    assert netem.follow_peer(lab.PEER) == lab.PEER
-    yield netem
-    netem.close()
-
-
-def measure(count: int, period: float = 0.01) -> Flow:
-    flow = Flow()
-    flow.send(count, period)
-    return flow.settle()
-
-
-def told(words: str, **values: float) -> None:
-    """Print a number for those who watch with -s."""
-    print(words, {name: round(value, 5) for name, value in values.items()})
-
-
-def least(error: Callable[[], float], enough: float) -> float:
-    """The least of up to three errors: a machine that stands still for a while spoils one."""
-    found = error()
-    for _ in range(2):
-        found = found if found < enough else min(found, error())
-    return found
 
 
 def test_the_delay_is_applied_to_the_tunnels_flow_alone(shaped: Netem) -> None:
@@ -150,12 +106,17 @@ def test_the_order_is_kept_where_asked(shaped: Netem) -> None:
 
 def test_a_bottleneck_has_its_rate(shaped: Netem) -> None:
     shaped.follow_profile(DirectionProfile(rate=400e3, queue_packets=1000))
-    flow = Flow()
-    flow.send(100, 0.0)
-    flow.settle()
-    took = (flow.arrived[-1][1] - flow.arrived[0][1]) * 1e-9
-    told("400 kbit/s asked", measured=99 * 200 * 8 / took)  # 172 bytes and 28 of headers
-    assert 99 * 200 * 8 / took == pytest.approx(400e3, rel=0.03)
+
+    def off() -> float:
+        flow = Flow()
+        flow.send(100, 0.0)
+        flow.settle()
+        took = (flow.arrived[-1][1] - flow.arrived[0][1]) * 1e-9
+        measured = 99 * 200 * 8 / took  # 172 bytes and 28 of headers
+        told("400 kbit/s asked", measured=measured)
+        return abs(measured / 400e3 - 1.0)
+
+    assert least(off, 0.03) < 0.03
 
 
 def test_duplicates_and_packets_that_overtake(shaped: Netem) -> None:
@@ -165,30 +126,6 @@ def test_duplicates_and_packets_that_overtake(shaped: Netem) -> None:
     shaped.follow_profile(DirectionProfile(delay=0.050, reorder=0.3))
     early = (measure(500, 0.003).delays() < 0.030).mean()
     assert early == pytest.approx(0.3, abs=0.11)
-
-
-def test_a_time_line_is_stepped(tables: Path) -> None:
-    profile = DirectionProfile(
-        delay=0.02, changes=(Change(2.5, delay=0.1),), blackouts=(Blackout(3.5, 0.3),)
-    )
-    origin_ns = time.monotonic_ns() + 5_000_000_000  # by then it is set up
-    begun_ns = origin_ns + time.time_ns() - time.monotonic_ns()
-    netem, flow = lab.netem(tables, profile, origin_ns), Flow()
-    netem.follow_peer(lab.PEER)
-    while time.monotonic_ns() < origin_ns + 4_500_000_000:
-        flow.send(1, 0.01, meanwhile=lambda: netem.step(0.0))
-    netem.close()
-    flow.settle()
-    since = {n: (at_ns - begun_ns) * 1e-9 for n, at_ns in enumerate(flow.sent_ns)}
-    delays = dict(zip(flow.numbers(), flow.delays(), strict=True))
-    before = [delays[n] for n in delays if since[n] < 2.45]
-    after = [delays[n] for n in delays if since[n] > 2.5 + LATE]
-    lost = [since[n] for n in since if n not in delays and since[n] < 4.2]
-    told("step", before=np.median(before), after=np.median(after), dark=max(lost) - min(lost))
-    assert np.median(before) == pytest.approx(0.02, abs=0.005)
-    assert np.median(after) == pytest.approx(0.1, abs=0.005)
-    assert min(lost) == pytest.approx(3.5, abs=LATE)
-    assert max(lost) == pytest.approx(3.8, abs=LATE)
 
 
 def test_it_is_set_up_once_and_removed_without_a_trace(tables: Path) -> None:
@@ -206,6 +143,32 @@ def test_it_is_set_up_once_and_removed_without_a_trace(tables: Path) -> None:
     second.close()
     second.close()
     assert lab.qdiscs() == before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("del", "dev", lab.DEVICE, "root"),
+        ("del", "dev", lab.DEVICE, "parent", "7400:4"),
+        ("change", "dev", lab.DEVICE, "parent", "7400:4", "handle", "7401:", "netem"),
+    ],
+    ids=["root", "leaf", "changed"],
+)
+def test_what_another_hand_removes_is_put_back_within_a_second(
+    shaped: Netem, words: tuple[str, ...]
+) -> None:
+    shaped.follow_profile(DirectionProfile(delay=0.060))
+    restored = shaped.counts()["restored"]
+    lab.sh("tc", "-n", lab.NEAR, "qdisc", *words)
+    assert "60ms" not in lab.qdiscs()
+    began = time.monotonic()
+    while shaped.counts()["restored"] == restored:
+        assert time.monotonic() < began + 5.0
+        shaped.step(0.1)
+    told(f"put back after {words[0]}", seconds=time.monotonic() - began)
+    filters = lab.sh("tc", "-n", lab.NEAR, "filter", "show", "dev", lab.DEVICE, "parent", "7400:")
+    assert filters.count("flowid 7400:4") == 1
+    assert least(lambda: float(abs(np.median(measure(50).delays()) - 0.060)), 0.01) < 0.01
 
 
 def test_a_qdisc_of_somebody_else_is_left_alone(tables: Path) -> None:

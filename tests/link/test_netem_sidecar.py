@@ -19,8 +19,10 @@ from cloudrc.errors import MissingPrerequisiteError
 
 pytestmark = pytest.mark.netem
 ROOT = Path(__file__).resolve().parents[2]
-PATIENCE = 60.0
-"""A slow virtual machine takes many seconds to load Python [s]."""
+NEAR = 0.01
+"""Of a median one-way delay, beside a process that needs the processor, too [s]."""
+PATIENCE = 180.0
+"""A slow virtual machine takes a minute to load Python while others need the processor [s]."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,13 +45,15 @@ def until(condition: Callable[[], bool], patience: float = PATIENCE) -> float:
 class Pod:
     """A link container in the near namespace."""
 
-    def __init__(self, folder: Path, profile: str, mode: str, *prefix: str) -> None:
+    def __init__(
+        self, folder: Path, profile: str, mode: str, *prefix: str, peer: str = lab.FAR_HOST
+    ) -> None:
         self.route, self.state = folder / "route", folder / "link.json"
         self.profile, self.log = folder / "profile.yaml", folder / "log"
         self.profile.write_text(profile)
         command = [*prefix, sys.executable, "-m", "cloudrc", "link", "run", "--config", "paper"]
         command += ["--profile", str(self.profile), "--direction", "uplink", "--mode", mode]
-        command += ["--peer", f"{lab.FAR_HOST}:7400", "--route", str(self.route)]
+        command += ["--peer", f"{peer}:7400", "--route", str(self.route)]
         with self.log.open("w") as log:
             words = ["ip", "netns", "exec", lab.NEAR, *command]
             self.process = subprocess.Popen(words, cwd=ROOT, stderr=log)
@@ -71,8 +75,8 @@ class Pod:
 def pod(tmp_path: Path) -> Iterator[Callable[..., Pod]]:
     pods: list[Pod] = []
 
-    def make(profile: str, mode: str, *prefix: str) -> Pod:
-        pods.append(Pod(tmp_path, profile, mode, *prefix))
+    def make(profile: str, mode: str, *prefix: str, **options: str) -> Pod:
+        pods.append(Pod(tmp_path, profile, mode, *prefix, **options))
         return pods[-1]
 
     yield make
@@ -82,10 +86,13 @@ def pod(tmp_path: Path) -> Iterator[Callable[..., Pod]]:
         one.process.wait()
 
 
-def median_delay() -> float:
-    flow = lab.Flow()
-    flow.send(50)
-    return float(np.median(flow.settle().delays()))
+def off(asked: float) -> float:
+    """By how much the median one-way delay is off [s]; the least of up to three."""
+
+    def error() -> float:
+        return float(abs(np.median(lab.measure(50).delays()) - asked))
+
+    return lab.least(error, NEAR)
 
 
 def test_it_takes_netem_follows_the_profile_and_leaves_nothing(pod: Callable[..., Pod]) -> None:
@@ -94,14 +101,28 @@ def test_it_takes_netem_follows_the_profile_and_leaves_nothing(pod: Callable[...
     state = link.ready()
     assert (state["shaper"], state["mode"], state["direction"]) == ("netem", "auto", "uplink")
     assert link.route.read_text() == f"{lab.FAR_HOST}:7400\n"
-    assert median_delay() == pytest.approx(0.060, abs=0.01)
+    assert off(0.060) < NEAR
     link.profile.write_text("uplink: {delay_ms: 120}\n")
     took = until(lambda: "delay 120ms" in lab.qdiscs())
-    assert median_delay() == pytest.approx(0.120, abs=0.01)
+    assert off(0.120) < NEAR
+    until(lambda: json.loads(link.state.read_text())["changes"] == 1)
+    state = json.loads(link.state.read_text())
+    assert state["asked"]["delay"] == pytest.approx(0.120)
     ended = link.end()
     print("change took", round(took, 2), "end took", round(ended, 2))
     assert lab.qdiscs() == before
     assert not link.route.exists()
+
+
+def test_a_qdisc_that_is_deleted_in_flight_is_put_back_and_logged(pod: Callable[..., Pod]) -> None:
+    link = pod("uplink: {delay_ms: 60}\n", "netem")
+    link.ready()
+    lab.sh("tc", "-n", lab.NEAR, "qdisc", "del", "dev", lab.DEVICE, "root")
+    took = until(lambda: "delay 60ms" in lab.qdiscs())
+    print("put back after", round(took, 2))
+    until(lambda: "was removed by another hand, and put back (1 times" in link.log.read_text())
+    assert off(0.060) < NEAR
+    link.end()
 
 
 def test_a_profile_that_netem_cannot_do_takes_the_relay(pod: Callable[..., Pod]) -> None:
@@ -133,8 +154,10 @@ def test_without_the_capability_auto_takes_the_relay_and_netem_refuses(
     assert "needs uid 0 and NET_ADMIN" in strict.log.read_text()
 
 
-def test_strict_netem_refuses_a_profile_by_name(pod: Callable[..., Pod]) -> None:
-    link = pod("uplink: {rate_kbit: 100, jitter_ms: 3}\n", "netem")
+def test_strict_netem_refuses_a_profile_by_name_and_waits_for_nobody(
+    pod: Callable[..., Pod],
+) -> None:
+    link = pod("uplink: {rate_kbit: 100, jitter_ms: 3}\n", "netem", peer="nobody.invalid")
     assert link.process.wait(PATIENCE) == 2
     assert "netem cannot do rate_kbit with jitter_ms but without keep_order" in link.log.read_text()
     assert "netem" not in lab.qdiscs()

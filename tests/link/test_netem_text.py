@@ -14,31 +14,39 @@ from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError
 from cloudrc.link.draws import Purpose, stream_key
 from cloudrc.link.fates import shape
-from cloudrc.link.netem_tables import ENTRIES, STRETCH, table, write_tables
-from cloudrc.link.netem_text import check, notes, options
+from cloudrc.link.netem_tables import (
+    ENTRIES,
+    STRETCH,
+    distribution_name,
+    stretch,
+    table,
+    write_measured,
+    write_tables,
+)
+from cloudrc.link.netem_text import check, limit, notes, options
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
 from cloudrc.link.timeline import Timeline
 
 
 def text(profile: DirectionProfile, at: float = 0.0) -> str:
     check(profile)
-    return " ".join(options(profile, Timeline(profile).at(round(at * 1e9))))
+    return " ".join(options(profile, Timeline(profile).at(round(at * 1e9)), limit(profile)))
 
 
 def test_nothing_asked_takes_everything_back() -> None:
     assert text(DirectionProfile()) == (
-        "limit 10000 delay 0.000us loss random 0% duplicate 0% rate 0bit"
+        "limit 10000 delay 0.000us loss random 0% duplicate 0% corrupt 0% rate 0bit"
     )
 
 
 def test_everything_that_netem_has_is_named() -> None:
     profile = DirectionProfile(
         delay=0.045, jitter=0.0255, distribution="normal", correlation=0.25, loss=0.015,
-        duplicate=0.02, reorder=0.1,
+        duplicate=0.02, reorder=0.1, corrupt=0.005,
     )  # fmt: skip
     assert text(profile) == (
         "limit 10000 delay 45000.000us 25500.000us 25% distribution normal "
-        "loss random 1.5% duplicate 2% reorder 10% rate 0bit"
+        "loss random 1.5% duplicate 2% corrupt 0.5% reorder 10% rate 0bit"
     )
 
 
@@ -84,13 +92,13 @@ BURSTS = GilbertElliott(0.1, 0.5, delay_bad=0.04)
 @pytest.mark.parametrize(
     ("profile", "key"),
     [
-        (DirectionProfile(trace=Trace((0.0,), (0.1,))), "trace"),
+        (DirectionProfile(300.0), "delay_ms above 274000"),
+        (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 300.0))), "here 300000 ms"),
         (DirectionProfile(loss=BURSTS), "loss.delay_bad_ms"),
         (DirectionProfile(changes=(Change(1.0, loss=BURSTS),)), "loss.delay_bad_ms"),
         (DirectionProfile(jitter=0.01, rate=1e6), "without keep_order"),
         (DirectionProfile(rate=1e6, changes=(Change(1.0, jitter=0.1),)), "without keep_order"),
-        (DirectionProfile(blackouts=(Blackout(1.0, 0.01),)), "10 ms at 1 s"),
-        (DirectionProfile(changes=(Change(1.0), Change(1.005))), "less than 20 ms apart"),
+        (DirectionProfile(blackouts=(Blackout(1.0, 0.004),)), "here 4 ms at 1 s"),
     ],
 )
 def test_what_netem_cannot_do_is_refused_by_its_name(profile: DirectionProfile, key: str) -> None:
@@ -103,6 +111,39 @@ def test_what_netem_does_otherwise_is_said() -> None:
     profile = DirectionProfile(0.1, 0.01, correlation=0.3)
     assert notes(profile) == ["netem realises next to nothing of correlation 0.3"]
     assert notes(replace(profile, correlation=0.0)) == []
+    assert "seen as loss" in notes(DirectionProfile(corrupt=0.01))[0]
+    trace = Trace((0.0, 0.1, 0.101, 0.102), (0.1, 0.2, 0.3, 0.4))
+    assert notes(DirectionProfile(trace=trace)) == [
+        "netem is stepped every 5 ms at most: 2 of 4 steps of the time line come sooner, and some "
+        "are passed over"
+    ]
+
+
+def test_the_limit_is_that_of_the_longest_delay_on_the_time_line() -> None:
+    profile = DirectionProfile(delay=0.01, rate=2e6, queue_packets=100)
+    assert limit(replace(profile, changes=(Change(1.0, delay=0.3),))) == 475
+    assert limit(replace(profile, trace=Trace((0.0, 1.0), (0.3, 0.01)))) == 475
+    assert limit(replace(profile, changes=(Change(1.0, delay=0.3),), rate=None)) == 10_000
+
+
+def test_a_measured_distribution_becomes_a_table_of_its_own(tmp_path: Path) -> None:
+    drawn = np.random.default_rng(1).exponential(size=3000)
+    values = tuple(np.sort((drawn - drawn.mean()) / drawn.std()).tolist())
+    profile = DirectionProfile(0.04, 0.002, distribution="table", table=values)
+    write_measured(tmp_path, profile)
+    name = distribution_name(profile)
+    jitter = 2000 * stretch(profile)
+    assert f"delay 40000.000us {jitter}.000us 0% distribution {name}" in text(profile)
+    _, *rows = (tmp_path / f"{name}.dist").read_text().splitlines()
+    entries = np.array([int(word) for row in rows for word in row.split()])
+    assert len(entries) == ENTRIES
+    assert np.abs(entries).max() < 2**15
+    shares = np.linspace(0.01, 0.99, 50)
+    assert np.quantile(entries * stretch(profile) / 8192, shares) == pytest.approx(
+        np.quantile(values, shares), abs=0.01
+    )
+    write_measured(tmp_path, replace(profile, distribution="normal"))
+    assert [file.name for file in tmp_path.iterdir()] == [f"{name}.dist"]
 
 
 @pytest.mark.parametrize("name", names("profile"))

@@ -12,10 +12,11 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Machine, Mode, Settings, Sidecar
 from cloudrc.link.sidecar_follow import Loaded
+from cloudrc.link.state import Change
 
 PEER, NEXT = ("10.244.0.7", 7400), ("10.244.0.9", 7400)
 NO_NETEM = MissingPrerequisiteError("this kernel has no sch_netem; set link.mode=relay")
-REFUSED = BadInputError("netem cannot do trace (a file); set link.mode=relay")
+REFUSED = BadInputError("netem cannot do delay_ms above 274000 (far); set link.mode=relay")
 
 
 class Shaper:
@@ -30,10 +31,11 @@ class Shaper:
         self._bench.did.append(f"{self.name} {peer[0]}")
         return peer if self.name == "netem" else ("127.0.0.1", 7401)
 
-    def follow_profile(self, profile: DirectionProfile) -> None:
+    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
         if self.name == "netem" and profile.delay == 9.0:
             raise REFUSED
-        self._bench.did.append(f"{self.name} {profile.delay:g} s")
+        again = " from now" if restart else ""
+        self._bench.did.append(f"{self.name} {profile.delay:g} s{again}")
 
     def step(self, timeout: float) -> None:
         assert timeout <= 0.1
@@ -41,6 +43,9 @@ class Shaper:
 
     def counts(self) -> dict[str, int]:
         return {"forwarded": len(self._bench.did)}
+
+    def released(self) -> dict[str, int]:
+        return {"released": 1, "overflow": 0} if self.name == "relay" else {}
 
     def close(self) -> None:
         self._bench.did.append(f"{self.name} closes")
@@ -62,11 +67,17 @@ class Bench:
         self.now_ns = 0
         self.plan: list[tuple[float, Callable[[], None]]] = []
         self.counted_ns: list[int] = []
+        self.origins_ns: list[int] = []
+        self.delays: list[float] = []
+        self.no_netem: Exception | None = None
         self.route, self.state = folder / "route", folder / "link.json"
         machine = Machine(
-            relay=lambda _: Shaper(self, "relay"),
-            netem=lambda asked: Shaper(self, "netem", REFUSED if asked.delay == 9.0 else refuses),
+            relay=lambda _, origin_ns: self.make("relay", origin_ns),
+            netem=lambda asked, origin_ns: self.make(
+                "netem", origin_ns, REFUSED if asked.delay == 9.0 else refuses
+            ),
             may_shape=may_shape,
+            try_netem=self.try_netem,
             clock=lambda: self.now_ns,
             today=lambda: "2026-01-02T03:04:05+00:00",
             wait=self.wait,
@@ -76,6 +87,14 @@ class Bench:
         loaded = Loaded(profile or DirectionProfile(), {"description": "nothing"})
         self.sidecar = Sidecar(settings, machine, loaded, self)
         self.sidecar.peer = PEER
+
+    def make(self, name: str, origin_ns: int, refuses: Exception | None = None) -> Shaper:
+        self.origins_ns.append(origin_ns)
+        return Shaper(self, name, refuses)
+
+    def try_netem(self) -> None:
+        if self.no_netem:
+            raise self.no_netem
 
     def at(self, time: float, action: Callable[[], None]) -> None:
         self.plan.append((time, action))
@@ -93,11 +112,15 @@ class Bench:
     def shapes(self, shaper: str) -> None:
         self.did.append(f"metric {shaper}")
 
+    def asked(self, delay: float) -> None:
+        self.delays.append(delay)
+
     def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
         self.counted_ns.append(stamp_ns)
 
-    def replace(self, delay: float) -> None:
-        self.sidecar.profile = Loaded(DirectionProfile(delay), {"description": f"{delay:g} s"})
+    def replace(self, delay: float, change: Change = Change()) -> None:  # noqa: B008
+        values = {"description": f"{delay:g} s"}
+        self.sidecar.profile = Loaded(DirectionProfile(delay), values, change)
 
 
 def told(bench: Bench) -> dict[str, object]:
@@ -130,6 +153,14 @@ def test_auto_takes_netem_where_it_works(tmp_path: Path) -> None:
         "direction": "uplink",
         "profile": {"description": "nothing"},
         "since": "2026-01-02T03:04:05+00:00",
+        "since_ns": 0,
+        "changes": 0,
+        "change": "",
+        "cause": "",
+        "asked": {"delay": 0.0, "jitter": 0.0, "loss": 0.0, "rate": None},
+        "origin_ns": 0,
+        "refused": "",
+        "refusal": "",
     }
 
 
@@ -137,7 +168,7 @@ def test_auto_takes_netem_where_it_works(tmp_path: Path) -> None:
     ("refuses", "may_shape", "reason"),
     [
         (NO_NETEM, True, "this kernel has no sch_netem"),
-        (REFUSED, True, "netem cannot do trace (a file)"),
+        (REFUSED, True, "netem cannot do delay_ms above 274000 (far)"),
         (None, False, "no uid 0 with NET_ADMIN"),
     ],
 )
@@ -154,7 +185,7 @@ def test_auto_takes_the_relay_where_it_does_not_and_says_why(
     ("refuses", "may_shape", "words"),
     [
         (NO_NETEM, True, "no sch_netem; set"),
-        (REFUSED, True, "cannot do trace"),
+        (REFUSED, True, "cannot do delay_ms"),
         (None, False, "needs uid 0 and NET_ADMIN"),
     ],
 )
@@ -194,8 +225,58 @@ def test_a_new_profile_is_followed_within_a_step(tmp_path: Path) -> None:
     bench = Bench(tmp_path, "relay")
     bench.at(1.0, lambda: bench.replace(0.5))
     bench.at(1.15, lambda: bench.did.append("later"))
-    assert bench.run().did[2:4] == ["relay 0.5 s", "later"]
-    assert told(bench)["profile"] == {"description": "0.5 s"}
+    assert bench.run().did[2:4] == ["relay 0.5 s from now", "later"]
+    state = told(bench)
+    assert state["profile"] == {"description": "0.5 s"}
+    assert (state["changes"], state["cause"]) == (1, "the profile's file changed")
+    assert state["asked"] == {"delay": 0.5, "jitter": 0.0, "loss": 0.0, "rate": None}
+    assert bench.delays == [0.0, 0.5]
+
+
+def test_who_changed_the_profile_is_told_once_and_may_let_its_time_line_go_on(
+    tmp_path: Path,
+) -> None:
+    bench = Bench(tmp_path, "relay")
+    states: list[dict[str, object]] = []
+    by_hand = Change("a1", "downlink.delay_ms=500", restart=False)
+    bench.at(1.0, lambda: bench.replace(0.5, by_hand))
+    bench.at(1.5, lambda: states.append(told(bench)))
+    bench.at(2.0, lambda: bench.replace(0.1, by_hand))  # helm changed the file, the note stayed
+    bench.run()
+    assert [one for one in bench.did if " s" in one] == ["relay 0.5 s", "relay 0.1 s from now"]
+    assert (states[0]["change"], states[0]["cause"]) == ("a1", "downlink.delay_ms=500")
+    assert 1.0e9 <= float(str(states[0]["since_ns"])) <= 1.2e9
+    assert told(bench)["cause"] == "the profile's file changed"
+
+
+def test_a_change_that_is_refused_is_told_with_its_number(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, "netem")
+    bench.at(1.0, lambda: bench.replace(9.0, Change("b2", "far", restart=True)))
+    state = told(bench.run())
+    assert (state["changes"], state["refused"]) == (0, "b2")
+    assert "netem cannot do delay_ms" in str(state["refusal"])
+
+
+def test_strict_netem_fails_before_anybody_is_waited_for(tmp_path: Path) -> None:
+    for no_netem, profile, words in (
+        (NO_NETEM, None, "no sch_netem; set"),
+        (None, DirectionProfile(300.0), "delay_ms above 274000"),
+    ):
+        bench = Bench(tmp_path, "netem", profile=profile)
+        bench.sidecar.peer, bench.no_netem = None, no_netem
+        with pytest.raises((MissingPrerequisiteError, BadInputError), match=words):
+            bench.run()
+        assert bench.now_ns == 0
+
+
+def test_the_time_line_counts_from_when_the_link_came_up(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, "auto")
+    bench.sidecar.peer = None
+    bench.at(2.0, lambda: setattr(bench.sidecar, "peer", PEER))
+    bench.at(2.5, lambda: bench.replace(9.0, Change("c3", "for the relay", restart=False)))
+    bench.run()
+    assert len(set(bench.origins_ns)) == 1
+    assert 2.0e9 <= bench.origins_ns[0] < 2.2e9
 
 
 def test_a_profile_that_netem_cannot_do_is_refused_or_takes_the_relay(tmp_path: Path) -> None:
@@ -203,7 +284,7 @@ def test_a_profile_that_netem_cannot_do_is_refused_or_takes_the_relay(tmp_path: 
         bench = Bench(tmp_path, mode)  # type: ignore[arg-type]
         bench.at(1.0, lambda bench=bench: bench.replace(9.0))  # type: ignore[misc]
         assert bench.run().did[-1] == did
-        assert any("netem cannot do trace" in line for line in bench.log)
+        assert any("netem cannot do delay_ms" in line for line in bench.log)
         assert told(bench)["shaper"] == did.split()[0]
 
 

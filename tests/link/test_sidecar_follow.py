@@ -13,6 +13,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Change, DirectionProfile
 from cloudrc.link.route import publish_route, withdraw
 from cloudrc.link.sidecar_follow import PeerName, ProfileFile
+from cloudrc.link.state import Change as Note
 
 
 class ConfigMap:
@@ -55,6 +56,23 @@ def test_a_swapped_config_map_is_read_once(config_map: ConfigMap) -> None:
     assert loaded.direction.delay == pytest.approx(0.07)
     assert loaded.values == {"description": "new", "uplink": {"delay_ms": 70.0}}
     assert file.poll() is None
+
+
+def test_the_note_beside_the_profile_says_who_changed_it(config_map: ConfigMap) -> None:
+    config_map.put("uplink: {delay_ms: 40}\n")
+    file, _ = follow(config_map)
+    assert file.first().change == Note()
+    note = config_map.file.with_name("change.json")
+    for text, change in (
+        ('{"number": "a1", "cause": "by hand", "restart": false}', Note("a1", "by hand", False)),
+        ("{", Note()),
+        ('{"number": "a1"}', Note()),
+    ):
+        note.write_text(text)
+        config_map.put("uplink: {delay_ms: 50}\n")
+        loaded = file.poll()
+        assert loaded is not None
+        assert loaded.change == change
 
 
 def test_what_is_invalid_is_refused_in_one_line_until_it_is_mended(config_map: ConfigMap) -> None:
@@ -132,6 +150,15 @@ def test_a_route_is_whole_or_not_there(tmp_path: Path) -> None:
     withdraw(route)
     withdraw(route)
     assert os.listdir(tmp_path) == []
+
+
+def test_a_new_time_line_may_count_from_the_next_packet() -> None:
+    after = DirectionProfile(0.02, changes=(Change(5.0, delay=0.2),))
+    link = LinkDirection(DirectionProfile(0.04), 1, True, 0)
+    link.replace_profile(after, restart=True)
+    for now, delay in ((7.0, 0.02), (11.9, 0.02), (12.1, 0.2)):
+        (release_ns,) = link.send(1, 3, 0, 172, round(now * 1e9))
+        assert release_ns == round(now * 1e9) + round(delay * 1e9)
 
 
 def test_a_link_with_a_new_profile_keeps_seed_origin_and_counts() -> None:

@@ -21,6 +21,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay import bind_loopback
 from cloudrc.link.relay_shaper import RelayShaper
+from cloudrc.link.sidecar_handed import Handed, write_handed
 from cloudrc.tunnel.codec import Kind, encode_header
 
 pytestmark = pytest.mark.process
@@ -149,6 +150,30 @@ def test_a_change_in_flight_acts_within_a_second_and_loses_nothing(
     assert np.median(delays[-20:]) == pytest.approx(0.020, abs=0.01)
     state = json.loads(link.route.with_name("link.json").read_text())
     assert state["profile"]["description"] == "quick"
+
+
+def test_what_is_handed_over_inside_is_in_force_when_the_command_ends(
+    pod: Callable[..., Pod],
+) -> None:
+    link = pod("uplink: {delay_ms: 300}\n").ready()
+    note = json.dumps({"number": "a1", "cause": "by hand", "restart": True})
+    files = {"profile.yaml": "uplink: {delay_ms: 20}\n"}
+    command = [sys.executable, "-m", "cloudrc", "link", "set", "--inside", str(link.route.parent)]
+    began = time.monotonic()
+    done = subprocess.run(
+        command,
+        input=write_handed(Handed(note, "", files)),
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    print(f"in force after {time.monotonic() - began:.2f} s")
+    told = json.loads(done.stdout)
+    assert (told["change"], told["cause"], told["asked"]["delay"]) == ("a1", "by hand", 0.02)
+    link.send(20)
+    until(lambda: len(link.arrived) == 20)
+    assert np.median(link.delays(range(20))) == pytest.approx(0.02, abs=0.01)
 
 
 def test_a_profile_that_is_wrong_changes_nothing(pod: Callable[..., Pod]) -> None:

@@ -17,6 +17,7 @@ from tests.metrics.flights import DONE, ONE_PIPE, flown, paper, straight_flight
 
 UNITS = {"s", "m", "m/s", "N", "1"}
 NAMES = plugins.names("metrics")
+WAYS = ("uplink", "downlink")
 PROMISED = {
     *("duration", "contact_time", "min_clearance", "min_clearance_flight", "pipe_contacts"),
     *("tip_speed", "steady_contact_force", "waypoints_reached", "prediction_error_rms"),
@@ -67,6 +68,9 @@ def test_the_papers_flight_has_every_number_but_those_of_real_time_and_hovering(
     assert absent == {
         *("real_time_factor", "world_slip", "world_lateness_p99", "cloud_lateness_p99"),
         "missed_periods",
+        *(f"release_error_{share}_{way}" for share in ("p50", "p99", "p999") for way in WAYS),
+        *(f"released_early_{way}" for way in WAYS),
+        *(f"relay_{name}_{way}" for name in ("overflow", "stalled") for way in WAYS),
         *("steady_error_x", "steady_error_y", "steady_error_z"),
     }
 

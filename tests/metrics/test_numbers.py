@@ -250,3 +250,22 @@ def test_time_zero_is_the_first_track() -> None:
     log = flown()
     log.world.append(GuardChange(at(4), GuardState.TRACK, "fresh command again"))
     assert log.flight().start_ns == START
+
+
+def test_a_relay_tells_how_late_it_was() -> None:
+    log = flown()
+    assert measured("release_error_p99_uplink", log.flight()) is None
+    log.world += [
+        Counted(at(n), "link", f"uplink_{name}", total)
+        for n, name, total in (
+            (1.0, "release_error_p99_ns", 90_000),
+            (2.0, "release_error_p99_ns", 40_000),
+            (2.0, "released_early", 0),
+            (2.0, "overflow", 3),
+        )
+    ]
+    flight = log.flight()
+    assert measured("release_error_p99_uplink", flight) == pytest.approx(40e-6)
+    assert measured("released_early_uplink", flight) == 0.0
+    assert measured("relay_overflow_uplink", flight) == 3.0
+    assert measured("relay_overflow_downlink", flight) is None

@@ -81,7 +81,7 @@ def test_it_says_what_happened_in_words(page: str) -> None:
     assert "The mission succeeded." in text
     assert "The drone reached all 7 waypoints in 30.9 s" in text
     assert "It flew through 3 pipes, never nearer than 152 mm to a wall." in text
-    assert "Its arm touched the board after 27.6 s at 0.12 m/s" in text
+    assert "Its arm touched the board after 27.7 s at 0.12 m/s" in text
     assert "cloudrc run config.yaml --mode virtual" in text
     assert "a" * 64 in text
 

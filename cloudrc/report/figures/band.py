@@ -37,7 +37,7 @@ def band(direction: Direction) -> Band | None:
     """
     try:
         steps = _traced(direction) if direction.trace else [(0.0, direction.delay_ms)]
-    except (OSError, KeyError, ValueError):
+    except (OSError, LookupError, ValueError):
         return None
     delay, jitter = steps[0][1], direction.jitter_ms
     changes = {} if direction.trace else {c.at_s: c.delay_ms for c in direction.changes}
@@ -60,5 +60,8 @@ def at(steps: Band, time: Array) -> tuple[Array, Array]:
 def _traced(direction: Direction) -> list[tuple[float, float]]:
     """Read instants [s] and delays [ms] of a trace; the first row also holds before its time."""
     with Path(str(direction.trace)).open(newline="") as file:
-        rows = [(float(row["time_s"]), float(row["delay_ms"])) for row in DictReader(file)]
+        table = list(DictReader(file, skipinitialspace=True))
+    # Short delays are in microseconds: `cloudrc.link.trace` has checked the file.
+    column, scale = ("delay_ms", 1.0) if "delay_ms" in table[0] else ("delay_us", 1e-3)
+    rows = [(float(row["time_s"]), float(row[column]) * scale) for row in table]
     return [(0.0, rows[0][1]), *rows]

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from cloudrc.metrics._flight import Array
 from cloudrc.metrics._round_trip import round_trips
-from cloudrc.report.figures import band
+from cloudrc.report.figures.asked import bounds
 from cloudrc.report.figures.events import legend, mark_events
 from cloudrc.report.figures.style import (
     BLACK,
@@ -67,13 +67,13 @@ def _draw_one_way(axes: Axes, subject: Subject) -> None:
     if not shown:
         text = "not known: the two ends\ndo not share a clock"
         axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
-    bounds = [band.band(direction) for direction in (subject.uplink, subject.downlink)]
     time = np.linspace(0.0, subject.duration, 600)
     tops: list[Array] = []
-    for index, steps in enumerate(bounds):
-        if steps is not None:
-            low, high = band.at(steps, time - subject.link_start)
-            label = "_" if index and tops else "profile"
+    for uplink in (True, False):
+        found = bounds(subject, time, uplink=uplink)
+        if found is not None:
+            low, high = found
+            label = "_" if tops else "profile"
             axes.fill_between(time, low * 1e3, high * 1e3, color=LIGHT, lw=0, label=label, zorder=1)
             tops.append(high * 1e3)
     _finish(axes, subject, "one-way delay (ms)", [*shown, *tops])
@@ -88,11 +88,10 @@ def _draw_loop(axes: Axes, subject: Subject) -> None:
     time = subject.flight.seconds(control["stamp_ns"])
     axes.plot(time, horizon, color=BLACK, label="estimate", zorder=4)
     shown = [loop_delay, horizon]
-    both = [band.band(direction) for direction in (subject.uplink, subject.downlink)]
-    if both[0] is not None and both[1] is not None:
-        time = np.linspace(0.0, subject.duration, 600)
-        bounds = [band.at(steps, time - subject.link_start) for steps in both if steps is not None]
-        low, high = (sum(pair) * 1e3 for pair in zip(*bounds, strict=True))
+    time = np.linspace(0.0, subject.duration, 600)
+    up, down = (bounds(subject, time, uplink=uplink) for uplink in (True, False))
+    if up is not None and down is not None:
+        low, high = (up[0] + down[0]) * 1e3, (up[1] + down[1]) * 1e3
         axes.fill_between(time, low, high, color=LIGHT, lw=0, label="profile", zorder=1)
         axes.plot(time, (low + high) / 2, color=GREEN, lw=0.8, ls="--", label="mean", zorder=3)
         shown.append(high)

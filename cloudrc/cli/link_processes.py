@@ -1,0 +1,197 @@
+"""The two processes of a link, started for a test of themselves: each shapes one way, as in pods.
+
+world's shore --> `cloudrc link run --direction uplink`   --> cloud's shore
+cloud's shore --> `cloudrc link run --direction downlink` --> world's shore
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from cloudrc.drivers.route import parse
+from cloudrc.errors import MissingPrerequisiteError, TimedOutError
+from cloudrc.link.state import STATE_FILE, LinkState, from_text
+
+LOOPBACK = "127.0.0.1"
+WAYS = ("uplink", "downlink")
+START_LIMIT = 90.0
+"""For both to shape; a slow machine takes many seconds to load Python [s]."""
+STOP_LIMIT = 2.0
+_LOOK = 0.02
+_PATIENCE = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where one direction's shaper runs.
+
+    Attributes:
+        peer: Where its datagrams end.
+        listen: Where it takes them in, if it is a relay.
+        metrics: Where it tells of itself.
+        inside: Words before its command line: "ip netns exec NAME", or none.
+    """
+
+    peer: tuple[str, int]
+    listen: tuple[str, int]
+    metrics: tuple[str, int]
+    inside: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class Shaping:
+    """One direction's process.
+
+    Attributes:
+        place: Where it runs.
+        folder: Its files: route, state, log.
+        process: Running or ended.
+    """
+
+    place: Place
+    folder: Path
+    process: subprocess.Popen[bytes]
+    log: Path = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.log = self.folder / "log"
+
+    def route(self) -> tuple[str, int] | None:
+        """Where to send, once it shapes."""
+        try:
+            return parse((self.folder / "route").read_text(encoding="ascii"))
+        except (OSError, ValueError):
+            return None
+
+    def state(self) -> LinkState:
+        """What it says that it does."""
+        return from_text((self.folder / STATE_FILE).read_text(encoding="utf-8"))
+
+    def metrics(self) -> str:
+        """What it counts, in Prometheus' text; "" if it does not answer."""
+        host, port = self.place.metrics
+        if self.place.inside:  # its loopback is not ours
+            reader = (
+                "import urllib.request as u; "
+                f"print(u.urlopen('http://{host}:{port}/metrics', timeout=3).read().decode())"
+            )
+            words = [*self.place.inside, sys.executable, "-c", reader]
+            done = subprocess.run(words, capture_output=True, text=True, check=False)
+            return done.stdout
+        try:
+            with urllib.request.urlopen(f"http://{host}:{port}/metrics", timeout=_PATIENCE) as page:
+                return str(page.read().decode())
+        except OSError:
+            return ""
+
+    def last_words(self) -> str:
+        """The last line of its log."""
+        lines = self.log.read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "it left no message"
+
+
+@contextlib.contextmanager
+def shaping(
+    places: Mapping[str, Place], config: str, profile: str, mode: str, fifo: bool = False
+) -> Iterator[dict[str, Shaping]]:
+    """Run both directions' shapers; they have ended afterwards.
+
+    Args:
+        places: By direction.
+        config: The experiment, as YAML.
+        profile: The profile in force, as YAML.
+        mode: "relay", "netem" or "auto".
+        fifo: Whether relays ask for SCHED_FIFO.
+
+    Raises:
+        MissingPrerequisiteError: If one cannot shape; it says why.
+        TimedOutError: If one does not begin to.
+    """
+    running: dict[str, Shaping] = {}
+    with tempfile.TemporaryDirectory(prefix="cloudrc-verify-") as text:
+        folder = Path(text)
+        (folder / "experiment.yaml").write_text(config, encoding="utf-8")
+        (folder / "profile.yaml").write_text(profile, encoding="utf-8")
+        try:
+            for way, place in places.items():
+                running[way] = _start(folder, way, place, mode)
+            _wait(running)
+            yield running
+        finally:
+            _stop([one.process for one in running.values()])
+
+
+def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[int]:
+    """Find ports on 127.0.0.1 that nobody uses now."""
+    sockets = [socket.socket(socket.AF_INET, kind) for _ in range(count)]
+    try:
+        for one in sockets:
+            one.bind((LOOPBACK, 0))
+        return [int(one.getsockname()[1]) for one in sockets]
+    finally:
+        for one in sockets:
+            one.close()
+
+
+def _start(folder: Path, way: str, place: Place, mode: str) -> Shaping:
+    own = folder / way
+    own.mkdir()
+    command: Sequence[str] = (
+        *place.inside,
+        *(sys.executable, "-m", "cloudrc", "link", "run"),
+        f"--config={folder / 'experiment.yaml'}",
+        f"--profile={folder / 'profile.yaml'}",
+        f"--direction={way}",
+        f"--mode={mode}",
+        f"--peer={place.peer[0]}:{place.peer[1]}",
+        f"--listen={place.listen[0]}:{place.listen[1]}",
+        f"--metrics={place.metrics[0]}:{place.metrics[1]}",
+        f"--route={own / 'route'}",
+    )
+    with (own / "log").open("wb") as log:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,  # Ctrl-C reaches this process alone, which ends them
+        )
+    return Shaping(place, own, process)
+
+
+def _wait(running: Mapping[str, Shaping]) -> None:
+    until = time.monotonic() + START_LIMIT
+    while not all(one.route() for one in running.values()):
+        for way, one in running.items():
+            code = one.process.poll()
+            if code is not None:
+                words = one.last_words().removeprefix("cloudrc: error: ")
+                raise MissingPrerequisiteError(f"the {way} is not shaped: {words}")
+        if time.monotonic() > until:
+            raise TimedOutError(f"the link was not up within {START_LIMIT:g} s; try again")
+        time.sleep(_LOOK)
+
+
+def _stop(processes: Sequence[subprocess.Popen[bytes]]) -> None:
+    for process in processes:
+        with contextlib.suppress(OSError):
+            os.kill(process.pid, signal.SIGCONT)
+        process.terminate()
+    until = time.monotonic() + STOP_LIMIT
+    for process in processes:
+        try:
+            process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

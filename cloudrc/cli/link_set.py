@@ -1,0 +1,279 @@
+"""`cloudrc link set`: change the link of a flight under way, here or in a cluster."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import secrets
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from time import monotonic, sleep
+from typing import TYPE_CHECKING, Any
+
+from cloudrc.cli.cluster_flags import place, place_arguments
+from cloudrc.cli.output import output_argument, written
+from cloudrc.cluster.errors import ClusterError
+from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
+
+if TYPE_CHECKING:
+    from cloudrc.cli.link_edit import Edit
+    from cloudrc.cluster.link import LinkParts, Place
+    from cloudrc.link.state import LinkState
+
+    Look = Callable[[], list[LinkState]]
+
+EPILOG = """\
+where:
+  the run that flies here ('cloudrc run --mode local'), found by itself or by
+  --run; or a release: with --context, -n or --release, or if none flies here
+
+examples:
+  cloudrc link set downlink.delay_ms=120 uplink.loss=0.02
+  cloudrc link set --profile handover
+  cloudrc link set --profile wifi uplink.rate_kbit=400 -n demo
+
+Keys are those of a profile's direction. A profile's time line counts from now;
+single values leave it as it goes. The change is recorded, and lasts until the
+next one, the end of the run, or 'helm upgrade'."""
+INSIDE = Path("/run/cloudrc")
+"""In a link container: where the chart lets route, state and what is handed over lie."""
+LOCAL_PATIENCE = 5.0
+"""For the relay of a run here to take a change over [s]; it takes 0.2."""
+LOOK_PERIOD = 0.05
+"""Between two looks [s]."""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        "settings", nargs="*", metavar="KEY=VALUE", help="uplink.KEY=VALUE or downlink.KEY=VALUE"
+    )
+    parser.add_argument("--profile", metavar="NAME", help="a profile that ships, or a file")
+    parser.add_argument("--run", type=Path, metavar="DIR", help="folder of the run that flies here")
+    output_argument(parser)
+    parser.add_argument(
+        "--inside", type=Path, nargs="?", const=INSIDE, metavar="DIR", help=argparse.SUPPRESS
+    )
+    place_arguments(parser)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Set the link, and say what is in force then."""
+    if options.inside is not None:
+        from cloudrc.cli import link_inside
+
+        return link_inside.execute(options.inside)
+    began, number = monotonic(), secrets.token_hex(4)
+    folder = _folder_here(options)
+    if folder is not None:
+        edit, look = _set_here(options, folder, number)
+        states = _await(look, number, LOCAL_PATIENCE, f"see {folder.parent / 'relay.log'}")
+    else:
+        edit, look = _set_in_cluster(options, number)
+        states = _await(look, number, 0.0, "see the logs of the link containers")
+    took = monotonic() - began
+    for note in edit.notes:
+        print(f"cloudrc: note: {note}", file=sys.stderr)
+    if options.output != "table":
+        print(written(_document(states, number, took), options.output))
+    else:
+        _show(states, took)
+    return 0
+
+
+def _folder_here(options: argparse.Namespace) -> Path | None:
+    """Find the link of the run that flies here, unless the flags name a cluster."""
+    from cloudrc.cli.folder import RUNS
+    from cloudrc.drivers.local import LINK_FOLDER
+
+    in_cluster = options.context or options.namespace or options.release
+    if options.run is not None:
+        if in_cluster:
+            raise BadInputError("--run names a run here, the other flags a cluster; give one")
+        if not (options.run / LINK_FOLDER).is_dir():
+            raise BadInputError(f"--run {options.run}: no run flies there")
+        return Path(options.run / LINK_FOLDER)
+    folder = RUNS / "latest" / LINK_FOLDER
+    if in_cluster:
+        return None
+    return folder if folder.is_dir() else _folder_elsewhere(LINK_FOLDER)
+
+
+def _folder_elsewhere(name: str) -> Path | None:
+    """Find the link of the only run of this user that flies, wherever it was started."""
+    from cloudrc.drivers.flights import under_way
+
+    found = [run for run in under_way() if (run / name).is_dir()]
+    if len(found) > 1:
+        names = " or ".join(f"--run {run}" for run in found)
+        raise BadInputError(f"{len(found)} runs fly here; say which: {names}")
+    if not found:
+        return None
+    print(f"cloudrc: the run that flies in {found[0]}", file=sys.stderr, flush=True)
+    return found[0] / name
+
+
+def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[Edit, Look]:
+    """Leave a new profile where the run's relay looks for it."""
+    from cloudrc.cli.link_edit import DIRECTIONS, edit
+    from cloudrc.cli.relay_control import PROFILE_FILE
+    from cloudrc.config.document import Document
+    from cloudrc.link.route import publish
+    from cloudrc.link.state import CHANGE_FILE, from_text
+
+    def look() -> list[LinkState]:
+        try:
+            texts = [(folder / f"{way}.json").read_text("utf-8") for way in DIRECTIONS]
+            return [from_text(text) for text in texts]
+        except (OSError, ValueError):
+            return []
+
+    states = look()
+    if not states:
+        raise BadInputError(f"{folder.parent}: no link is up there (yet); wait for the start")
+    made = edit(Document(states[0].profile), options.profile, options.settings)
+    publish(folder / CHANGE_FILE, _change(made, number))
+    publish(folder / PROFILE_FILE, json.dumps(made.values, indent=2) + "\n")
+    return made, look
+
+
+def _set_in_cluster(options: argparse.Namespace, number: str) -> tuple[Edit, Look]:
+    """Leave a new profile in the release's ConfigMap, and hand it to both link containers."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from cloudrc.cluster.access import DEFAULT_RELEASE
+    from cloudrc.cluster.link import Place
+
+    where = Place(options.context, options.namespace, options.release or DEFAULT_RELEASE)
+    with ThreadPoolExecutor(1) as pool:
+        looking = pool.submit(_link_of, options, where)
+        # Meanwhile, since it takes as long: a change is to be in force within a second.
+        from cloudrc.cli.link_cluster import change_profile
+        from cloudrc.cli.link_edit import check
+        from cloudrc.link.state import from_text
+
+        if looking.exception() is not None:
+            check(options.profile, options.settings)  # what is wrong here comes first
+        link = looking.result()
+    made, texts = change_profile(
+        where,
+        link,
+        options.profile,
+        options.settings,
+        lambda edit: _change(edit, number),
+    )
+    try:
+        states = [from_text(text) for text in texts]
+    except ValueError as error:
+        raise ClusterError(f"a link container is of another version: {error}") from error
+    return made, lambda: states
+
+
+def _link_of(options: argparse.Namespace, where: Place) -> LinkParts:
+    """Look at the release's link; if it is not there find out why."""
+    from cloudrc.cluster.link import read_link
+
+    try:
+        found = read_link(where)
+        failed = ClusterError(
+            f"release '{where.name}' has no link to change; is it a release of cloudrc? see: "
+            "helm list --all-namespaces"
+        )
+    except ClusterError as error:
+        found, failed = None, error
+    if found is not None:
+        return found
+    from cloudrc.cluster.pods import find_pod
+
+    try:
+        release = place(options)
+        for part in ("world", "cloud"):
+            find_pod(release, part)  # says best what is wrong
+    except MissingPrerequisiteError as error:
+        if options.context or options.namespace:
+            raise
+        raise MissingPrerequisiteError(
+            f"no run flies here (start one: cloudrc run; or name its folder: --run), and {error}"
+        ) from None
+    raise failed
+
+
+def _change(edit: Edit, number: str) -> str:
+    return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
+
+
+def _await(look: Look, number: str, patience: float, where: str) -> list[LinkState]:
+    """Wait until both directions say that the change is in force.
+
+    Raises:
+        CloudrcError: If it is refused, or not in force in time.
+    """
+    until = monotonic() + patience
+    while True:
+        states = look()
+        for state in states:
+            if state.refused == number:
+                raise _RefusedError(f"the {state.direction} is as it was: {state.refusal}")
+        if states and all(state.change == number for state in states):
+            return states
+        if monotonic() > until:
+            late = [s.direction for s in states if s.change != number] or ["link"]
+            raise TimedOutError(
+                f"the {' and '.join(late)} did not take the change over within {patience:g} s; "
+                f"{where}"
+            )
+        sleep(LOOK_PERIOD)
+
+
+class _RefusedError(CloudrcError):
+    """The link cannot be what was asked for."""
+
+    exit_code = 2
+
+
+def _document(states: list[LinkState], number: str, took: float) -> dict[str, object]:
+    from dataclasses import asdict
+
+    links = {state.direction: asdict(state) for state in states}
+    return {"schemaVersion": 1, "change": number, "seconds": round(took, 3), "links": links}
+
+
+def _show(states: list[LinkState], took: float) -> None:
+    from cloudrc.cli.output import table
+
+    heads = ("DIRECTION", "SHAPER", "DELAY", "JITTER", "LOSS", "RATE", "BESIDE")
+    print(table([heads, *map(_row, states)]))
+    print(f"in force after {took:.1f} s")
+
+
+def _row(state: LinkState) -> tuple[str, ...]:
+    asked, own = state.asked, state.profile.get(state.direction, {})
+    delay, jitter = (asked.get(key) or 0.0 for key in ("delay", "jitter"))
+    loss, rate = asked.get("loss") or 0.0, asked.get("rate")
+    shape = f" {own.get('distribution', 'uniform')}" if jitter else ""
+    return (
+        state.direction,
+        state.shaper,
+        f"{delay * 1e3:g} ms",
+        f"{jitter * 1e3:g} ms{shape}",
+        f"{loss * 100:.3g} %",
+        f"{rate * 1e-3:g} kbit/s" if rate else "-",
+        ", ".join(_beside(own)) or "-",
+    )
+
+
+def _beside(own: Mapping[str, Any]) -> Iterator[str]:
+    """Name what else a direction is asked for: its time line, and what befalls single packets."""
+    for key in ("changes", "blackouts"):
+        if own.get(key):
+            yield f"{len(own[key])} {key}"
+    if own.get("trace"):
+        yield f"trace {Path(own['trace']).name}"
+    for key in ("duplicate", "reorder", "corrupt"):
+        if own.get(key):
+            yield f"{key} {own[key] * 100:.3g} %"
+    if own.get("correlation"):
+        yield f"correlation {own['correlation']:g}"
+    if own.get("keep_order"):
+        yield "order kept"

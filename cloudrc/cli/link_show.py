@@ -1,0 +1,152 @@
+"""`cloudrc link show PROFILE`: a profile comes in; its picture and its numbers go out."""
+
+from __future__ import annotations
+
+import argparse
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.extras import require
+from cloudrc.errors import BadInputError
+
+if TYPE_CHECKING:
+    from cloudrc.config.schema import Direction, Profile
+    from cloudrc.link.profile import DirectionProfile
+    from cloudrc.link.trace_sample import Numbers, Stream
+    from cloudrc.report.figures.link import Way
+
+EPILOG = """\
+examples:
+  cloudrc link show lossy
+  cloudrc link show my.yaml --seconds 120 -o my.svg
+  cloudrc link show trace.csv
+
+The model of the link itself is asked, packet by packet at 100 Hz, so a flight
+with the same seed meets these delays. Of a link that does not change, the
+numbers are of 100000 packets. All delays are one way."""
+RATE_HZ = 100
+WAYS = ("uplink", "downlink")
+TAG_SIZE = 16
+"""What sealing adds to a datagram [bytes]."""
+STEADY = 100_000
+"""Packets for the numbers of a link that does not change."""
+SECONDS = 30.0
+"""Time that the picture shows at least [s]."""
+KINDS = ("png", "svg", "pdf")
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the action's arguments."""
+    parser.add_argument(
+        "profile", metavar="PROFILE", help="a shipped profile, a file, or a trace in CSV"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help=".png, .svg or .pdf (default: NAME.png)"
+    )
+    parser.add_argument(
+        "--seconds", type=float, metavar="S", help="to show (default: 30, or until all has changed)"
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="default: 1")
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Draw the profile and print its numbers; the last line is the picture's path."""
+    require("a picture of a link", ("report",))
+    output = options.output or Path(f"{Path(options.profile).stem}.png")
+    if output.suffix[1:] not in KINDS:
+        raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
+    if options.seconds is not None and not 0.0 < options.seconds <= 86_400.0:
+        raise BadInputError(f"--seconds {options.seconds:g}: give a number above 0, at most 86400")
+    if options.seed < 0:
+        raise BadInputError(f"--seed {options.seed}: give a whole number that is not negative")
+    from cloudrc.report.figures.link import picture
+
+    profile = _profile(options.profile)
+    ways: dict[str, Way] = {}
+    counted: dict[str, Numbers] = {}
+    for name in ("uplink",) if _is_trace(options.profile) else WAYS:
+        asked = getattr(profile, name)
+        ways[name], counted[name] = _way(asked, name, options.seed, options.seconds)
+    title = ": ".join(filter(None, (Path(options.profile).stem, profile.description)))
+    output.write_bytes(picture(title, ways["uplink"], ways.get("downlink"), output.suffix[1:]))
+    print(title)
+    print(_table(counted))
+    print(output)
+    return 0
+
+
+def _is_trace(name: str) -> bool:
+    return name.endswith(".csv")
+
+
+def _profile(name: str) -> Profile:
+    from cloudrc.config.load import load_profile
+    from cloudrc.config.schema import Direction, Profile
+    from cloudrc.link.trace import read_trace
+
+    if _is_trace(name):
+        path = Path(name).absolute()
+        read_trace(path)
+        return Profile(description="a trace", uplink=Direction(trace=str(path)))
+    return load_profile(name)
+
+
+def _way(asked: Direction, name: str, seed: int, seconds: float | None) -> tuple[Way, Numbers]:
+    """Send a stream one way, and for the numbers of a steady link a longer one."""
+    from cloudrc.assembly import link_profile
+    from cloudrc.link.timeline import Timeline
+    from cloudrc.link.trace_sample import numbers
+    from cloudrc.report.figures.link import Way
+
+    profile = link_profile(asked)
+    starts_ns = Timeline(profile).starts_ns
+    last = starts_ns[-1] * 1e-9
+    duration = seconds or (last if profile.trace and last else max(SECONDS, 1.1 * last))
+    stream = _stream(profile, name, seed, round(duration * RATE_HZ))
+    many = _stream(profile, name, seed, STEADY) if len(starts_ns) == 1 else stream
+    counted = numbers(many)
+    return Way(asked, stream.sent, stream.delays, many.delays, counted.runs), counted
+
+
+def _stream(profile: DirectionProfile, name: str, seed: int, count: int) -> Stream:
+    from cloudrc.link.model import LinkDirection
+    from cloudrc.link.trace_sample import sample
+    from cloudrc.tunnel.codec import BODY_SIZES, HEADER_SIZE, Kind
+
+    uplink = name == "uplink"
+    kind = Kind.TELEMETRY if uplink else Kind.COMMAND
+    size = HEADER_SIZE + BODY_SIZES[kind] + TAG_SIZE
+    link = LinkDirection(profile, seed, uplink)
+    return sample(link, kind, max(count, 1), 1_000_000_000 // RATE_HZ, size)
+
+
+def _table(counted: dict[str, Numbers]) -> str:
+    from cloudrc.cli.output import table
+
+    both = list(counted.values())
+
+    def row(name: str, unit: str, values: list[float], scale: float = 1.0) -> list[str]:
+        cells = ["-" if isnan(value) else f"{value * scale:.4g}" for value in values]
+        return [name, *cells, unit]
+
+    rows = [
+        ["one way", *(counted if len(counted) > 1 else ("",)), ""],
+        row("mean", "ms", [each.mean for each in both], 1e3),
+        row("standard deviation", "ms", [each.deviation for each in both], 1e3),
+        row("least", "ms", [each.least for each in both], 1e3),
+        row("median", "ms", [each.median for each in both], 1e3),
+        row("99 %", "ms", [each.p99 for each in both], 1e3),
+        row("most", "ms", [each.most for each in both], 1e3),
+        row("correlation with the next", "", [each.correlation for each in both]),
+        row("overtaken by a later one", "%", [each.overtaken for each in both], 1e2),
+        row("duplicated", "%", [each.duplicated for each in both], 1e2),
+        row("lost", "%", [each.loss for each in both], 1e2),
+        row("lost in a row, mean", "", [_mean(each.runs) for each in both]),
+        row("lost in a row, most", "", [float(max(each.runs, default=0)) for each in both]),
+    ]
+    return table(rows, right=range(1, len(both) + 1))
+
+
+def _mean(runs: tuple[int, ...]) -> float:
+    return sum(runs) / len(runs) if runs else float("nan")

@@ -1,0 +1,206 @@
+"""The link of a release in flight: both ends are asked what they hear; a verdict goes out.
+
+The tunnel's own datagrams are the probes, so that nothing but the shaped flow is measured. Each end
+judges the direction that it hears and serves the rows at /link.json of its metrics port; the link
+containers' metrics say who shapes, and what has passed there.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import urllib.request
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from math import nan
+from typing import Any, NamedTuple
+
+from cloudrc.cli.link_verify_notes import on_jitter
+from cloudrc.cli.link_verify_text import NOT_JUDGED, Said
+from cloudrc.errors import TimedOutError
+from cloudrc.link.verify_causes import Evidence, Findings, find_causes
+from cloudrc.link.verify_evidence import Samples, of_metrics, samples, shaper_of
+from cloudrc.link.verify_judge import Row
+
+END_PORT, LINK_PORT = 9100, 9102
+PERIOD = 2.0
+"""Between two questions [s]."""
+_PATIENCE = 3.0
+_SENT_MIN = 1500
+_SHARES = ("loss", "reordered", "duplicated")
+_RATE_HZ = 100.0
+_WINDOW_MAX = 25_000
+"""Of the tunnel's own datagrams, and how many an end judges together at most."""
+_DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Pod:
+    """Where an end and its link container answer: URLs without a path."""
+
+    end: str
+    link: str
+
+
+def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -> Said:
+    """Wait until both ends have a verdict.
+
+    Args:
+        pods: "world" and "cloud".
+        title: Names the release.
+        limit: How long to wait [s].
+        tell: Hears what is going on.
+
+    Raises:
+        TimedOutError: If an end cannot be asked within the time.
+    """
+    hears = {"uplink": "cloud", "downlink": "world"}
+    sends = {"uplink": "world", "downlink": "cloud"}
+    until, seen = time.monotonic() + limit, dict[str, dict[str, Any]]()
+    before = {way: _counters(pods[end], way) for way, end in sends.items()}
+    while True:
+        tell(", ".join(_progress(way, seen.get(way, {})) for way in hears))
+        time.sleep(PERIOD)
+        seen |= {way: found for way, end in hears.items() if (found := _ask(pods[end]))}
+        verdicts = {way: found["verdict"] for way, found in seen.items()}
+        if len(seen) == len(hears) and "open" not in verdicts.values():
+            break
+        if time.monotonic() > until:
+            break
+    tell("")
+    silent = [end for way, end in hears.items() if way not in seen]
+    if silent:
+        raise TimedOutError(
+            f"{' and '.join(silent)} could not be asked within {limit:g} s: are the pods ready?"
+        )
+    findings = {
+        way: _findings(seen[way], way, before[way], _counters(pods[sends[way]], way))
+        for way in hears
+    }
+    names = sorted({one.evidence.shaper or "nobody knows" for one in findings.values()})
+    return Said(
+        title=title,
+        shaper=f"shaped by {' and '.join(names)}",
+        findings=findings,
+        probes={way: _describe(seen[way]) for way in hears},
+        notes=[note for way in hears for note in _notes(way, seen[way])],
+        causes=find_causes(findings),
+        more="too few datagrams yet: the ends go on judging, ask again (above: when)",
+    )
+
+
+def _ask(pod: Pod) -> dict[str, Any] | None:
+    """What an end thinks of the direction that it hears; None if it does not answer."""
+    try:
+        found: dict[str, Any] = json.loads(_get(f"{pod.end}/link.json"))
+    except (OSError, ValueError):
+        return None
+    return found
+
+
+def _get(url: str) -> str:
+    with _DIRECTLY.open(url, timeout=_PATIENCE) as page:
+        return str(page.read().decode())
+
+
+class _Counters(NamedTuple):
+    """What has been counted of a direction: sent by its end; and all that its link tells."""
+
+    sent: int | None
+    link: Samples
+
+
+def _counters(sender: Pod, way: str) -> _Counters:
+    """Ask the end that sends and the link that shapes it; what does not answer tells nothing."""
+    try:
+        ours, link = samples(_get(f"{sender.end}/metrics")), samples(_get(f"{sender.link}/metrics"))
+    except OSError:
+        return _Counters(None, {})
+    sent = ours.get(("cloudrc_datagrams_total", f'direction="{way}",outcome="sent"'))
+    return _Counters(None if sent is None else int(sent), link)
+
+
+def _findings(found: Mapping[str, Any], way: str, before: _Counters, after: _Counters) -> Findings:
+    """Join what one end heard with what the other's link container tells."""
+    known = Evidence(shaper=shaper_of(after.link, way))
+    known = of_metrics(after.link, 0, known)
+    earlier = of_metrics(before.link, 0, known).passed
+    sent = after.sent - before.sent if after.sent and before.sent else 0
+    passed = known.passed - earlier if known.passed and earlier else None
+    # Counts are told once a second each, so that few say nothing.
+    enough = sent >= _SENT_MIN and passed is not None
+    known = replace(
+        known,
+        sent=sent if enough else None,
+        passed=passed if enough else None,
+        unread=None,  # since it began: long ago
+    )
+    delay = after.link.get(("cloudrc_link_delay_seconds", f'direction="{way}"'), nan)
+    return Findings(_rows(found, delay), known)
+
+
+def _rows(found: Mapping[str, Any], delay: float) -> list[Row]:
+    rows = []
+    for row in found["rows"]:
+        if row["verdict"] == "told":
+            continue
+        name = str(row["quantity"])
+        values = [float(row.get(key, nan)) for key in ("asked", "measured", "low", "high")]
+        asked, measured, low, high = values
+        unit, applied = "1" if name in _SHARES else "s", delay if name == "mean" else nan
+        rows.append(Row(name, unit, asked, applied, measured, low, high, row["verdict"]))
+    return rows
+
+
+def _describe(found: Mapping[str, Any]) -> str:
+    counts = [int(row["datagrams"]) for row in found["rows"]]
+    return f"{max(counts, default=0)} of the tunnel's own datagrams"
+
+
+def _notes(way: str, found: Mapping[str, Any]) -> list[str]:
+    if not found["rows"]:
+        what = "commands" if way == "downlink" else "telemetry"
+        hint = "fly a mission first" if way == "downlink" else "is the other end ready?"
+        return [f"{way}: no {what} to judge it by, or its profile changes by itself; {hint}"]
+    rows = {str(row["quantity"]): row for row in found["rows"]}
+    notes = []
+    if "round_trip" in rows:
+        notes.append(f"{way}: the ends do not share a clock: round trips are judged, not one way")
+    elif "mean" not in rows and "loss" in rows:
+        notes.append(f"{way}: delays {NOT_JUDGED}: the ends do not share a clock")
+    if "rate" in rows:
+        rate = float(rows["rate"]["asked"]) * 1e-3
+        notes.append(f"{way}: rate of {rate:.0f} kbit/s {NOT_JUDGED}: its datagrams come alone")
+    if "jitter_share" in rows:
+        notes += on_jitter(way, float(rows["jitter_share"]["measured"]))
+    if "time_line" in rows and (share := float(rows["time_line"]["measured"])) < _WATCHED:
+        notes.append(
+            f"{way}: of its time line {share:.0%} was watched and as asked, the rest {NOT_JUDGED}; "
+            "'cloudrc link set --profile' starts it anew"
+        )
+    return notes + _needed(way, found)
+
+
+_WATCHED = 0.85
+"""A time line of which so much was seen is as good as seen: a session takes 2 s to settle."""
+
+
+def _progress(way: str, found: Mapping[str, Any]) -> str:
+    """Say in a few words how far an end is."""
+    needed = _needed(way, found)
+    return needed[0] if needed else f"{way}: {found.get('verdict', 'silent')}"
+
+
+def _needed(way: str, found: Mapping[str, Any]) -> list[str]:
+    """Say how long it takes, if there is no verdict yet."""
+    rows = {row["quantity"]: row for row in found.get("rows", ())}
+    if found.get("verdict") != "open" or "datagrams" not in rows:
+        return []
+    needs, there = int(rows["datagrams"]["asked"]), int(rows["datagrams"]["measured"])
+    if needs > _WINDOW_MAX:
+        names = ", ".join(str(name) for name, row in rows.items() if row["verdict"] == "open")
+        return [f"{way}: {names} {NOT_JUDGED}: takes {needs} datagrams, more than are kept"]
+    seconds = max(0, needs - there) / _RATE_HZ
+    return [f"{way}: {there} of {needs} datagrams, {seconds:.0f} s more"]

@@ -1,0 +1,49 @@
+"""What is said beside the table of a verdict: how it was probed, and what was not judged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from cloudrc.cli.link_verify_text import NOT_JUDGED
+from cloudrc.link.verify_causes import Findings
+from cloudrc.link.verify_expect import JITTER_SHARES, has_jitter
+from cloudrc.link.verify_plan import LONGEST, Plan
+from cloudrc.link.verify_rate import SIZE, Trains
+
+
+def shaper_in_words(findings: Mapping[str, Findings]) -> str:
+    """Say who shapes both directions."""
+    names = sorted({one.evidence.shaper for one in findings.values()})
+    return f"shaped by {' and '.join(names)}"
+
+
+def describe(plan: Plan, trains: Trains | None) -> str:
+    """Say what is sent through a direction."""
+    schedule = plan.schedule
+    text = f"{schedule.count} probes of {schedule.size} bytes, {1 / schedule.period:.0f} per second"
+    if trains and trains.count:
+        text += f"; {trains.count} trains of {trains.length} x {SIZE} bytes"
+    return text
+
+
+def notes(way: str, plan: Plan, trains: Trains | None) -> Iterator[str]:
+    """Say what is judged more loosely than usual, or not at all."""
+    if not plan.enough:
+        seconds = plan.needs * plan.schedule.period
+        yield (
+            f"{way}: its delays scatter so that {seconds:.0f} s of probes are needed (default: "
+            f"at most {LONGEST:.0f}); give --seconds {seconds:.0f}"
+        )
+    if has_jitter(plan.profile):
+        yield from on_jitter(way, plan.expects.share)
+    if trains and not trains.judges:
+        yield f"{way}: rate {NOT_JUDGED}: it is too high to be told from none"
+
+
+def on_jitter(way: str, share: float) -> Iterator[str]:
+    """Say by which share [1] jitter may be off, unless it is the usual tenth."""
+    usual = JITTER_SHARES[0]
+    if not share:
+        yield f"{way}: jitter {NOT_JUDGED}: too little of its delays' scatter is jitter"
+    elif share > usual:
+        yield f"{way}: jitter judged within {share:.0%} only: its tail hides {usual:.0%}"

@@ -1,0 +1,181 @@
+"""The verdict on a link for people and for programs: a table on a terminal, or JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, isnan
+from typing import Any
+
+from cloudrc.cli.output import paint, table
+from cloudrc.link.verify_causes import Cause, Findings
+from cloudrc.link.verify_judge import Row
+
+COLOURS = {"ok": "green", "off": "red", "open": "yellow"}
+NAMES = {
+    "mean": "delay, mean",
+    "deviation": "standard deviation",
+    "variation": "delay variation",
+    "middle": "deviation, middle",
+    "loss": "lost",
+    "reordered": "reordered",
+    "duplicated": "duplicated",
+    "corrupted": "damaged",
+    "rate": "rate",
+    "round_trip": "round trip, mean",
+}
+HEADINGS = ("", "asked", "applied", "measured", "allowed", "verdict")
+_SCALES = {"s": (1e3, "ms"), "1": (1e2, "%"), "bit/s": (1e-3, "kbit/s")}
+DIGITS = 2
+NOT_JUDGED = "NOT JUDGED"
+"""In a note: something that was asked for is not known to be so."""
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What was found out about a link.
+
+    Attributes:
+        title: What was asked for.
+        shaper: Who shapes it, in words.
+        findings: By direction.
+        probes: What was sent, in words, by direction.
+        notes: What else there is to know.
+        causes: Why it is not believed.
+        more: What helps if it is undecided.
+    """
+
+    title: str
+    shaper: str
+    findings: Mapping[str, Findings]
+    probes: Mapping[str, str]
+    notes: Sequence[str]
+    causes: Sequence[Cause]
+    more: str = "too few probes to say; give --seconds more"
+
+    @property
+    def verdict(self) -> str:
+        """Believed, not believed, or undecided."""
+        ways = [[row.verdict for row in deciding(one.rows)] for one in self.findings.values()]
+        if any("off" in verdicts for verdicts in ways):
+            return "not believed"
+        return "believed" if all(set(verdicts) == {"ok"} for verdicts in ways) else "undecided"
+
+
+def deciding(rows: Sequence[Row]) -> list[Row]:
+    """Rows that a verdict rests on: a rate too high to be measured does not hold it up."""
+    return [
+        row
+        for row in rows
+        if row.verdict != "told" and not (row.name == "rate" and row.verdict == "open")
+    ]
+
+
+def as_text(said: Said) -> str:
+    """Lay out a table per direction, the causes, and the verdict in the last line."""
+    rows: list[tuple[str, ...]] = []
+    for way, found in said.findings.items():
+        rows.append((way, *HEADINGS[1:]))
+        rows += [_cells(row) for row in found.rows]
+    lines = table(rows, right=[1, 2, 3, 4]).splitlines()
+    verdicts = iter([row.verdict for found in said.findings.values() for row in found.rows])
+    painted, index = [f"{said.title}: {said.shaper}"], 0
+    for way, found in said.findings.items():
+        painted += ["", paint(lines[index], "bold"), paint(f"  {said.probes[way]}", "dim")]
+        for line in lines[index + 1 : index + 1 + len(found.rows)]:
+            verdict = next(verdicts)
+            cut = line.rindex(verdict)
+            painted.append(line[:cut] + paint(verdict, COLOURS[verdict]))
+        index += 1 + len(found.rows)
+    painted += ["", *said.notes] if said.notes else [""]
+    painted += [f"  {cause.way}: {cause.text}  [{cause.code}]" for cause in said.causes]
+    return "\n".join([*painted, _last_line(said)])
+
+
+def _last_line(said: Said) -> str:
+    verdict = said.verdict
+    colours = {"believed": "green", "not believed": "red", "undecided": "yellow"}
+    partly = any(NOT_JUDGED in note for note in said.notes)
+    but = f", but for what is {NOT_JUDGED} (above)" if partly else ""
+    words = {
+        "believed": f"BELIEVED: the link is what was asked for{but}",
+        "not believed": "NOT BELIEVED: the link is not what was asked for",
+        "undecided": f"UNDECIDED: {said.more}",
+    }
+    return paint(words[verdict], colours[verdict])
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    scale, unit = _SCALES[row.unit if row.name not in SHARES else "1"]
+    return (
+        f"  {NAMES[row.name]} [{unit}]",
+        _number(row.asked * scale),
+        _number(row.applied * scale),
+        _number(row.measured * scale),
+        _range(row.low * scale, row.high * scale),
+        row.verdict,
+    )
+
+
+SHARES = ("loss", "reordered", "duplicated", "corrupted")
+
+
+def _number(value: float) -> str:
+    if isnan(value):
+        return "-"
+    if value == inf or value > 1e12:
+        return "none"
+    return f"{value:.{DIGITS}f}" if abs(value) < 1e4 else f"{value:.0f}"
+
+
+def _range(low: float, high: float) -> str:
+    if low > high:
+        return "-"
+    if low <= 0.0:
+        return f"<= {_number(high)}"
+    return f"{_number(low)} .. {_number(high)}"
+
+
+def as_document(said: Said) -> dict[str, Any]:
+    """Write it for programs; numbers in SI, shares in [0, 1]; what is unknown is left out."""
+    return {
+        "schemaVersion": 1,
+        "verdict": said.verdict,
+        "link": said.title,
+        "shaper": said.shaper,
+        "causes": [cause._asdict() for cause in said.causes],
+        "notes": list(said.notes),
+        "directions": {
+            way: {
+                "probes": said.probes[way],
+                "rows": [_object(row) for row in found.rows],
+                "evidence": _evidence(found),
+            }
+            for way, found in said.findings.items()
+        },
+    }
+
+
+def _object(row: Row) -> dict[str, Any]:
+    return {
+        key: value
+        for key, value in row._asdict().items()
+        if not isinstance(value, float) or isfinite(value)
+    }
+
+
+def _evidence(found: Findings) -> dict[str, Any]:
+    evidence = found.evidence
+    names = (
+        "shaper",
+        "why",
+        "interface",
+        "elsewhere",
+        "layers",
+        "sent",
+        "passed",
+        "unread",
+        "late",
+    )
+    values = {name: getattr(evidence, name) for name in (*names, "throttled")}
+    return {name: value for name, value in values.items() if value not in (None, "", ())}

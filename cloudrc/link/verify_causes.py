@@ -1,0 +1,290 @@
+"""Why a link is not what was asked: rows that are off and what shapers say come in, causes go out.
+
+What can be read (qdiscs, counters, release errors, the profile in force) goes before what can only
+be concluded from the numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import isnan
+from typing import NamedTuple
+
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.verify_judge import Row
+from cloudrc.link.verify_words import kbit, ms, said, times
+
+LATE = 1.5e-3
+"""A shaper whose 99th percentile of the release error is above this [s] does not get its CPU."""
+PASSED_SHARE = 0.9
+"""If the shaper has seen less than this share of what arrived, the rest goes another way."""
+UNREAD_SHARE = 0.003
+"""If it has left more than this share of what was sent unread, it does not get its CPU."""
+_NOTHING = 0.15
+"""Share of the delay asked for below which nothing shapes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What the machine says about one direction's shaper.
+
+    Attributes:
+        shaper: "relay", "netem", "none" if it is known that there is none, "" if nothing is known.
+        why: Why there is none, or this one, in the words of who chose it; "" if nobody says.
+        interface: Over which the flow leaves; "" if that is not known.
+        elsewhere: Interfaces that have a netem qdisc although the flow does not leave there.
+        layers: Shapers that the flow passes, as far as they can be seen; None if unknown.
+        applied: What is in force as the shaper tells it; None if it does not.
+        sent: Datagrams that this end sent; None if not counted.
+        passed: Those of them that the shaper has counted; None if it does not count.
+        unread: Those that the kernel dropped since the shaper did not read them; None if unknown.
+        late: 99th percentile of the shaper's release error [s]; None if it does not measure it.
+        throttled: Share of the CPU's periods in which the shaper was stopped, in [0, 1]; None
+            if unknown.
+        restored: How often another hand had removed or changed netem's qdisc, which was put back.
+    """
+
+    shaper: str = ""
+    why: str = ""
+    interface: str = ""
+    elsewhere: tuple[str, ...] = ()
+    layers: int | None = None
+    applied: DirectionProfile | None = None
+    sent: int | None = None
+    passed: int | None = None
+    unread: int | None = None
+    late: float | None = None
+    throttled: float | None = None
+    restored: int = 0
+
+
+class Cause(NamedTuple):
+    """One cause: a word for machines, a direction ("uplink", "downlink" or "both"), a sentence."""
+
+    code: str
+    way: str
+    text: str
+
+
+class Findings(NamedTuple):
+    """What is known about one direction."""
+
+    rows: Sequence[Row]
+    evidence: Evidence
+
+
+def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
+    """Name what is wrong with a link; nothing if no row is off.
+
+    Args:
+        findings: By direction.
+    """
+    found = {way: _first(way, one) for way, one in findings.items() if _off(one.rows)}
+    silent = [way for way, cause in found.items() if cause.code in _UNSHAPED]
+    shaped = [way for way in findings if way not in silent]
+    if len(silent) == 1 and shaped:
+        way, other = silent[0], shaped[0]
+        detail = found[way].text
+        text = f"only the {other} is shaped: {detail}"
+        found[way] = Cause("one_direction", way, text)
+    # What a shaper without its CPU does to losses is known: what is off beyond that is told, too.
+    also = [_beyond(way, findings[way]) for way, one in found.items() if one.code == "throttled"]
+    return _merged(found) + [cause for cause in also if cause is not None]
+
+
+_UNSHAPED = ("no_qdisc", "wrong_interface", "no_sch_netem", "not_shaped")
+
+
+def _merged(found: Mapping[str, Cause]) -> list[Cause]:
+    """Say once what is true of both directions."""
+    causes = list(found.values())
+    if len(causes) == 2 and causes[0].code == causes[1].code:
+        text = causes[0].text
+        return [causes[0]._replace(way="both")] if text == causes[1].text else causes
+    return causes
+
+
+def _off(rows: Sequence[Row]) -> dict[str, Row]:
+    return {row.name: row for row in rows if row.verdict == "off"}
+
+
+def _first(way: str, one: Findings) -> Cause:
+    """Take the first explanation that holds."""
+    off = _off(one.rows)
+    explanations = (_of_machine(one), _of_order(off), _of_delay(one), _of_chance(off))
+    for explanation in explanations:
+        for code, text in explanation:
+            return Cause(code, way, text)
+    names = " and ".join(off)
+    return Cause("unexplained", way, f"{names}: not as asked, and nothing explains it")
+
+
+def _beyond(way: str, one: Findings) -> Cause | None:
+    """Explain losses but for what a shaper had no time to read."""
+    evidence, row = one.evidence, _off(one.rows).get("loss")
+    if row is None:
+        return None
+    unread = (evidence.unread or 0) / evidence.sent if evidence.sent else 0.0
+    measured = max(0.0, row.measured - unread)
+    if row.low <= measured <= row.high:
+        return None
+    code, text = next(_of_chance({"loss": row._replace(measured=measured)}))
+    return Cause(code, way, text)
+
+
+def _of_machine(one: Findings) -> Iterator[tuple[str, str]]:
+    """Look at what can be read."""
+    evidence, rows = one.evidence, one.rows
+    if evidence.shaper == "none":
+        if "sch_netem" in evidence.why:
+            yield "no_sch_netem", f"{evidence.why}; set link.mode=relay, which needs none"
+        elif evidence.elsewhere:
+            yield "wrong_interface", _wrong_interface(evidence)
+        else:
+            where = evidence.interface or "the interface that the flow leaves by"
+            yield "no_qdisc", f"there is no qdisc of ours on {where}: nothing shapes the flow"
+    if evidence.restored:
+        times = f"{evidence.restored} times" if evidence.restored > 1 else "once"
+        yield "no_qdisc", f"another hand removed or changed the qdisc {times}; it was put back"
+    sent, passed, unread = evidence.sent, evidence.passed, evidence.unread
+    if sent and unread is not None and unread > UNREAD_SHARE * sent:
+        text = (
+            f"the shaper had no time to read {unread} of {sent} datagrams: it does not get its CPU"
+        )
+        yield "throttled", f"{text}; raise its limit or take load off the machine"
+    arrived = None if sent is None else round(sent * (1.0 - _lost_share(rows)))
+    if arrived and passed is not None and passed < PASSED_SHARE * arrived:
+        text = f"of {arrived} datagrams that arrived, {passed} passed the shaper"
+        yield "bypassed", f"{text}: the others took another way"
+    if evidence.layers is not None and evidence.layers > 1:
+        yield "shaped_twice", f"the flow passes {evidence.layers} shapers: remove all but one"
+    if evidence.throttled:
+        yield (
+            "throttled",
+            f"the shaper was stopped by its CPU limit in {evidence.throttled:.0%} of the periods: "
+            "raise link.resources.limits.cpu",
+        )
+    if evidence.late is not None and evidence.late > LATE and _may_be_lateness(rows, evidence.late):
+        yield (
+            "throttled",
+            f"the shaper releases late, 1 % by more than {evidence.late * 1e3:.1f} ms: it does not "
+            "get its CPU; raise its limit or take load off the machine",
+        )
+
+
+def _lost_share(rows: Sequence[Row]) -> float:
+    return next((row.measured for row in rows if row.name == "loss"), 0.0)
+
+
+def _may_be_lateness(rows: Sequence[Row], late: float) -> bool:
+    """Say whether releases so late [s] may explain what is off: delays, and not by more."""
+    off, found = _off(rows), {row.name: row for row in rows}
+    if not {"mean", "deviation"} <= found.keys():
+        return False
+    mean, deviation = found["mean"], found["deviation"]
+    by = mean.measured - mean.asked
+    if by > late or ("mean" in off and by < 0.0):
+        return False
+    if "rate" in off and off["rate"].measured > off["rate"].asked:
+        return False
+    spread = deviation.measured**2 - deviation.asked**2
+    if spread > late**2 or ("deviation" in off and spread < 0.0):
+        return False
+    return any(name in off for name in ("mean", "rate", *_SCATTER))
+
+
+def _wrong_interface(evidence: Evidence) -> str:
+    there = " and ".join(evidence.elsewhere)
+    return f"the flow leaves by {evidence.interface}, but the qdisc is on {there}"
+
+
+def _of_order(off: Mapping[str, Row]) -> Iterator[tuple[str, str]]:
+    """Order first: packets that may not overtake wait, which shifts their mean, too."""
+    row = off.get("reordered")
+    if row is None:
+        return
+    if row.measured < 0.2 * row.asked and not _unshaped(off):
+        yield (
+            "order_kept",
+            f"{row.asked:.1%} of the packets should be overtaken, {row.measured:.1%} are: order is "
+            "kept although reordering was asked for",
+        )
+    if row.asked < 0.01 and row.measured > row.asked:
+        yield "order_broken", f"{row.measured:.1%} of the packets are overtaken, none should be"
+
+
+def _unshaped(off: Mapping[str, Row]) -> bool:
+    mean = off.get("mean")
+    return mean is not None and mean.measured < _NOTHING * mean.asked
+
+
+def _of_delay(one: Findings) -> Iterator[tuple[str, str]]:
+    """Conclude from the delays."""
+    off, applied = _off(one.rows), one.evidence.applied
+    mean = off.get("mean")
+    if mean is not None and not isnan(mean.measured):
+        told = said(mean, applied)
+        ratio = mean.measured / mean.asked if mean.asked else 0.0
+        if mean.measured < max(_NOTHING * mean.asked, 5e-4):
+            yield "not_shaped", f"the mean is {ms(mean.measured)}: nothing shapes the flow{told}"
+        if 1.8 < ratio < 2.2:
+            yield "doubled_delay", f"{times(mean)}: it is shaped twice, or asked for twice{told}"
+        if 0.45 < ratio < 0.55:
+            text = f"{times(mean)}: a round trip was taken for one way{told}"
+            yield "halved_delay", text
+        if "rate" in off:
+            yield from _of_rate(off)
+        yield "wrong_delay", f"{times(mean)}{told}"
+    if "rate" in off:
+        yield from _of_rate(off)
+    row = off.get("deviation") or off.get("variation") or off.get("middle")
+    if row is not None:
+        word = _SCATTER[row.name]
+        text = f"{word} {ms(row.measured)} instead of {ms(row.asked)}: another jitter"
+        yield "wrong_jitter", text
+
+
+_SCATTER = {
+    "deviation": "standard deviation",
+    "variation": "variation",
+    "middle": "deviation in the middle",
+}
+
+
+def _of_rate(off: Mapping[str, Row]) -> Iterator[tuple[str, str]]:
+    row = off["rate"]
+    if row.measured > row.asked:
+        text = f"{kbit(row.measured)} instead of {kbit(row.asked)}: the rate is ignored"
+        yield "rate_ignored", text
+    else:
+        yield "slow", f"{kbit(row.measured)} instead of {kbit(row.asked)}: something is slower"
+
+
+def _of_chance(off: Mapping[str, Row]) -> Iterator[tuple[str, str]]:
+    """Losses and copies."""
+    row = off.get("loss")
+    if row is not None:
+        text = f"{row.measured:.2%} are lost, {row.asked:.2%} should be"
+        if row.measured > 0.999:
+            yield (
+                "nothing_arrives",
+                "not one probe arrives: is the route open, the other end there?",
+            )
+        if row.measured < 0.05 * row.asked:
+            yield "no_loss", f"{text}: loss is not applied"
+        elif row.measured < row.asked:
+            yield "less_loss", text
+        else:
+            yield "more_loss", text
+    for name, (code, word) in _MARKS.items():
+        row = off.get(name)
+        if row is not None:
+            yield code, f"{row.measured:.2%} {word}, {row.asked:.2%} should"
+
+
+_MARKS = {
+    "duplicated": ("wrong_duplicates", "arrive twice"),
+    "corrupted": ("wrong_corruption", "arrive damaged"),
+    "reordered": ("wrong_order", "come overtaken"),
+}

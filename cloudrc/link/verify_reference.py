@@ -1,0 +1,239 @@
+"""What probes ought to meet on a link: a profile and instants of sending go in, fates come out.
+
+A second opinion: it shares the profile and its time line with the model, but none of the code that
+draws. Whole runs are drawn at once with numpy's own generator, so that what is measured is judged
+against what was asked, not against what our model made of it.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from statistics import NormalDist
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
+from cloudrc.link.timeline import Conditions, Timeline
+
+Floats: TypeAlias = NDArray[np.float64]
+Flags: TypeAlias = NDArray[np.bool_]
+
+WIRE_BYTES = 28
+"""IPv4 and UDP headers [bytes]. Source: RFC 791, RFC 768."""
+
+_GRID: Floats = np.linspace(-7.0, 7.0, 14_001)
+_CDF: Floats = np.array([NormalDist().cdf(z) for z in _GRID.tolist()])
+_PARETO_EXPONENT, _PARETO_CUT = 3.0, 1e-3
+
+
+class Fates(NamedTuple):
+    """What became of the probes of some runs, one row each.
+
+    Attributes:
+        arrived: Whether at least one copy did, shape (runs, n).
+        delay: Of the first copy [s], shape (runs, n); 0 where none arrived.
+        overtaken: Whether a probe sent later was there before it, shape (runs, n).
+        doubled: Whether two copies arrived, shape (runs, n).
+    """
+
+    arrived: Flags
+    delay: Floats
+    overtaken: Flags
+    doubled: Flags
+
+
+def draw(
+    profile: DirectionProfile, sent: Floats, size: int, runs: int, rng: np.random.Generator
+) -> Fates:
+    """Send the same probes over so many links of a profile.
+
+    A queue that overflows is not simulated: do not offer more than the bottleneck passes.
+
+    Args:
+        profile: What is asked of the direction.
+        sent: When each leaves, since the link came up, rising [s], shape (n,).
+        size: Of each, UDP payload [bytes].
+        runs: How many links.
+        rng: Chance.
+    """
+    pieces = _pieces(profile, sent)
+    shape = (runs, len(sent))
+    lost, extra = _losses(pieces, shape, rng)
+    delay = np.maximum(0.0, _bases(pieces) + extra + _jitters(profile, pieces, shape, rng))
+    overtakes = rng.random(shape) < profile.reorder
+    queued = _queue(pieces, sent, size, lost | overtakes)
+    arrival = sent + np.where(overtakes, 0.0, queued + delay)
+    arrival[lost] = -np.inf
+    doubled = ~lost & (rng.random(shape) < profile.duplicate)
+    copy = np.full(shape, -np.inf)
+    if profile.duplicate:
+        later = _bases(pieces) + extra * ~overtakes
+        later = np.maximum(0.0, later + _jitters(profile, pieces, shape, rng, copies=True))
+        copy = np.where(doubled, sent + queued + later, copy)
+    if profile.keep_order:
+        arrival = np.where(lost, arrival, _in_order(arrival, copy))
+    else:
+        arrival = np.where(doubled, np.minimum(arrival, copy), arrival)
+    late = overtaken(arrival, lost)
+    return Fates(~lost, np.where(lost, 0.0, arrival - sent), late, doubled)
+
+
+def _in_order(arrival: Floats, copy: Floats) -> Floats:
+    """Let nothing arrive before what was sent before it; a copy is sent right after its original.
+
+    Args:
+        arrival: Of the originals [s], shape (runs, n); -infinity where there is none.
+        copy: Of the copies [s], likewise.
+    """
+    both = np.stack((arrival, copy), axis=2).reshape(arrival.shape[0], -1)
+    kept: Floats = np.maximum.accumulate(both, axis=1)[:, ::2]
+    return kept
+
+
+def instants(count: int, period: float, begin: float = 0.0) -> Floats:
+    """When so many probes leave, one per `period` [s], the first at `begin` [s], shape (count,)."""
+    return begin + np.arange(count, dtype=np.float64) * period
+
+
+def overtaken(arrival: Floats, lost: Flags) -> Flags:
+    """Tell which probes came after one that was sent later.
+
+    Source: RFC 4737, section 3: a packet is reordered if it is older than the newest seen.
+
+    Args:
+        arrival: Of the first copy [s], in the order of sending, shape (..., n).
+        lost: Whether none arrived, shape (..., n).
+    """
+    there = np.where(lost, np.inf, arrival)
+    first_of_later = np.minimum.accumulate(there[..., ::-1], axis=-1)[..., ::-1]
+    result = np.zeros(arrival.shape, dtype=np.bool_)
+    result[..., :-1] = there[..., :-1] > first_of_later[..., 1:]
+    return result & ~lost
+
+
+def _pieces(profile: DirectionProfile, sent: Floats) -> list[tuple[slice, Conditions]]:
+    """Cut the probes into stretches in which the same conditions hold."""
+    timeline = Timeline(profile)
+    cuts = np.searchsorted(sent, np.array(timeline.starts_ns[1:]) * 1e-9).tolist()
+    edges = [0, *cuts, len(sent)]
+    return [
+        (slice(start, stop), timeline.at(begin_ns))
+        for start, stop, begin_ns in zip(edges, edges[1:], timeline.starts_ns, strict=False)
+        if stop > start
+    ]
+
+
+def _bases(pieces: list[tuple[slice, Conditions]]) -> Floats:
+    return np.concatenate(
+        [np.full(part.stop - part.start, now.delay_ns * 1e-9) for part, now in pieces]
+    )
+
+
+def _losses(
+    pieces: list[tuple[slice, Conditions]], shape: tuple[int, int], rng: np.random.Generator
+) -> tuple[Flags, Floats]:
+    """Draw who is lost, and what the bad state adds to the others' delay [s]."""
+    lost, extra = np.zeros(shape, dtype=np.bool_), np.zeros(shape)
+    draws = rng.random(shape)
+    for part, now in pieces:
+        if now.blackout:
+            lost[:, part] = True
+        elif isinstance(now.loss, GilbertElliott):
+            bad = _bad(now.loss, (shape[0], part.stop - part.start), rng)
+            lost[:, part] = draws[:, part] < np.where(bad, now.loss.loss_bad, now.loss.loss_good)
+            extra[:, part] = bad * now.loss.delay_bad
+        else:
+            lost[:, part] = draws[:, part] < now.loss
+    return lost, extra
+
+
+def _bad(loss: GilbertElliott, shape: tuple[int, int], rng: np.random.Generator) -> Flags:
+    """Run the two-state chain from its stationary distribution."""
+    states = np.zeros(shape, dtype=np.bool_)
+    if not loss.bad_start:
+        return states
+    draws = rng.random(shape)
+    bad = draws[:, 0] < bad_share(loss)
+    states[:, 0] = bad
+    for n in range(1, shape[1]):
+        bad = np.where(bad, draws[:, n] >= loss.bad_end, draws[:, n] < loss.bad_start)
+        states[:, n] = bad
+    return states
+
+
+def bad_share(loss: GilbertElliott) -> float:
+    """Say which share of packets meets the bad state, in [0, 1]."""
+    return loss.bad_start / (loss.bad_start + loss.bad_end) if loss.bad_start else 0.0
+
+
+def mean_loss(loss: Loss) -> float:
+    """Say which share of packets is lost in the long run, in [0, 1]."""
+    if not isinstance(loss, GilbertElliott):
+        return loss
+    share = bad_share(loss)
+    return share * loss.loss_bad + (1.0 - share) * loss.loss_good
+
+
+def _jitters(
+    profile: DirectionProfile,
+    pieces: list[tuple[slice, Conditions]],
+    shape: tuple[int, int],
+    rng: np.random.Generator,
+    copies: bool = False,
+) -> Floats:
+    """Draw what jitter adds [s]."""
+    scale = np.concatenate([np.full(part.stop - part.start, now.jitter) for part, now in pieces])
+    if not scale.any():
+        return np.zeros(shape)
+    correlation = 0.0 if copies else profile.correlation
+    normal = rng.standard_normal(shape)
+    if correlation:
+        fresh = sqrt(1.0 - correlation**2)
+        for n in range(1, shape[1]):
+            normal[:, n] = correlation * normal[:, n - 1] + fresh * normal[:, n]
+    variates: Floats = normal if profile.distribution == "normal" else _shaped(profile, normal)
+    return scale * variates
+
+
+def _shaped(profile: DirectionProfile, normal: Floats) -> Floats:
+    """Turn normal variates into those of a profile's distribution, ranks kept."""
+    share = np.interp(normal, _GRID, _CDF)
+    if profile.distribution == "uniform":
+        return 2.0 * share - 1.0
+    if profile.distribution == "table":
+        table = np.array(profile.table)
+        return table[np.minimum((share * len(table)).astype(np.int64), len(table) - 1)]
+    low, power = _PARETO_CUT, -1.0 / _PARETO_EXPONENT
+    survival = 1.0 - (1.0 - low) * share
+    mean = _moment(power, low)
+    return (survival**power - mean) / sqrt(_moment(2.0 * power, low) - mean**2)
+
+
+def _moment(power: float, low: float) -> float:
+    """Mean of s**power for s uniform in (low, 1)."""
+    return float((1.0 - low ** (power + 1.0)) / ((power + 1.0) * (1.0 - low)))
+
+
+def _queue(
+    pieces: list[tuple[slice, Conditions]], sent: Floats, size: int, absent: Flags
+) -> Floats | float:
+    """Work out how long each waits at the bottleneck and on its wire [s].
+
+    Lindley's recursion d_n = max(t_n, d_(n-1)) + s_n, which is C_n + max over j of t_j - C_(j-1)
+    with C the sum of all s so far.
+    """
+    if all(now.rate is None for _, now in pieces):
+        return 0.0
+    bits = (size + WIRE_BYTES) * 8.0
+    wire: Any = np.concatenate(
+        [
+            np.full(part.stop - part.start, bits / now.rate if now.rate else 0.0)
+            for part, now in pieces
+        ]
+    )
+    service = np.where(absent, 0.0, wire)
+    done = np.cumsum(service, axis=1)
+    waits: Floats = done + np.maximum.accumulate(sent - done + service, axis=1) - sent
+    return np.where(absent, 0.0, waits)

@@ -1,0 +1,246 @@
+"""Figure of a link: what a profile does to a steady stream goes in, four panels come out.
+
+Delay over time with what was lost, the tail of its distribution, and how many were lost in a row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from io import BytesIO
+from typing import TypeAlias
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
+
+from cloudrc.config.schema import Direction
+from cloudrc.metrics._flight import Array
+from cloudrc.report.figures import band
+from cloudrc.report.figures.style import (
+    DOWNLINK,
+    GREY,
+    LIGHT,
+    PAGE,
+    RC,
+    UPLINK,
+    VERMILION,
+    new_figure,
+    panel,
+)
+
+RUNS_SHOWN = 20
+"""Runs of losses longer than this are drawn as this."""
+BLACKOUT = "#f7dccb"
+"""Colour of the times in which nothing passes: a light one of what is lost."""
+DOTS = 6000
+"""Dots in one panel, beyond which they would hide each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One direction, asked for and drawn; n packets over time, m for the statistics.
+
+    Attributes:
+        asked: Conditions asked for.
+        sent: When each packet left, since the link came up [s], shape (n,).
+        delays: One way, NaN for the lost [s], shape (n,).
+        many: Delays for the distribution, NaN for the lost [s], shape (m,).
+        runs: Losses in a row among those, one entry per run.
+    """
+
+    asked: Direction
+    sent: Array
+    delays: Array
+    many: Array
+    runs: tuple[int, ...]
+
+
+_Named: TypeAlias = tuple[Way, str, str]
+"""A direction, its name and its colour."""
+
+
+def picture(title: str, uplink: Way, downlink: Way | None, kind: str) -> bytes:
+    """Draw a link.
+
+    Args:
+        title: Above the panels.
+        uplink: World to cloud.
+        downlink: Cloud to world; None for a trace, which has one direction.
+        kind: png, svg or pdf.
+
+    Returns:
+        The file's content; the same for the same link.
+    """
+    target = BytesIO()
+    with matplotlib.rc_context(RC):
+        figure = draw(title, uplink, downlink)
+        date = {"png": None, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
+        figure.savefig(target, format=kind, metadata=date)
+    return target.getvalue()
+
+
+def draw(title: str, uplink: Way, downlink: Way | None) -> Figure:
+    """Draw the panels; call it where `style.RC` is in force."""
+    figure = new_figure(PAGE, 4.4)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=9.5)
+    ways: list[_Named] = [(uplink, "uplink" if downlink else "one way", UPLINK)]
+    if downlink:
+        ways.append((downlink, "downlink", DOWNLINK))
+    top = 1.12 * max(_top(way) for way, _, _ in ways)
+    grid = figure.add_gridspec(2, 2)
+    for place, (way, name, colour) in enumerate(ways):
+        axes = figure.add_subplot(grid[0, place] if downlink else grid[0, :])
+        panel(axes, "ab"[place], name)
+        _draw_delay(axes, way, colour, top)
+    _draw_tail(figure.add_subplot(grid[1, 0]), "bc"[len(ways) - 1], ways)
+    _draw_runs(figure.add_subplot(grid[1, 1]), "cd"[len(ways) - 1], ways)
+    return figure
+
+
+def _top(way: Way) -> float:
+    """The highest delay that an axis has to show [ms]."""
+    shown = way.delays[np.isfinite(way.delays)] * 1e3
+    return max(float(shown.max(initial=0.0)), 1.0)
+
+
+def _draw_delay(axes: Axes, way: Way, colour: str, top: float) -> None:
+    """Draw each packet as a dot over what was asked for, the lost along the lower edge."""
+    duration = float(way.sent[-1]) if len(way.sent) else 1.0
+    steps = band.band(way.asked)
+    if steps is not None and (way.asked.trace is None or way.asked.jitter_ms):
+        time = np.linspace(0.0, duration, 2000)
+        low, high = band.at(steps, time)
+        axes.fill_between(time, low * 1e3, high * 1e3, color=LIGHT, lw=0, zorder=1, label="profile")
+    _hatch_blackouts(axes, way.asked, duration)
+    thin = slice(None, None, max(1, len(way.sent) // DOTS))
+    axes.plot(
+        way.sent[thin],
+        way.delays[thin] * 1e3,
+        ".",
+        ms=1.8,
+        mew=0,
+        color=colour,
+        rasterized=True,
+        zorder=2,
+    )
+    axes.plot([], [], "o", ms=3.5, mew=0, color=colour, label="packet")
+    lost = way.sent[np.isnan(way.delays)]
+    if len(lost):
+        bottom = np.full(len(lost), -0.045 * top)
+        axes.plot(lost, bottom, "|", ms=4.0, mew=0.5, color=VERMILION, clip_on=False, zorder=3)
+        axes.plot([], [], "|", ms=5.0, mew=1.0, color=VERMILION, label="lost")
+    axes.set_xlim(0.0, duration)
+    axes.set_ylim((-0.09 if len(lost) else -0.02) * top, top)
+    axes.set_xlabel("time since the link came up (s)")
+    axes.set_ylabel("one-way delay (ms)")
+    _legend(axes)
+
+
+def _hatch_blackouts(axes: Axes, asked: Direction, duration: float) -> None:
+    """Mark when nothing passed; what is too short to be seen is as wide as a line."""
+    shown = [blackout for blackout in asked.blackouts if blackout.start_s < duration]
+    for index, blackout in enumerate(shown):
+        axes.axvspan(
+            blackout.start_s,
+            blackout.start_s + max(blackout.duration_s, duration / 300),
+            color=BLACKOUT,
+            lw=0,
+            zorder=1.5,
+            label="_" if index else "silent",
+        )
+
+
+def _draw_tail(axes: Axes, letter: str, ways: list[_Named]) -> None:
+    """Draw which share of the packets is later than a delay: a tail is seen on a log scale."""
+    panel(axes, letter, "distribution")
+    least = 1e-2
+    for (way, name, colour), style in zip(ways, ("-", "--"), strict=False):
+        delays = np.sort(way.many[np.isfinite(way.many)]) * 1e3
+        if not len(delays):
+            continue
+        later = 1.0 - np.arange(1, len(delays) + 1) / len(delays)
+        least = min(least, 1.0 / len(delays))
+        # A step at each packet would make a file of megabytes: at most 1500 of them are kept.
+        rows = np.unique(np.geomspace(1, len(delays), 1500).astype(int))
+        rows = np.unique(np.concatenate((rows - 1, len(delays) - rows)))
+        shown = np.concatenate(([0.0, delays[0]], delays[rows]))
+        share = np.concatenate(([1.0, 1.0], later[rows]))
+        axes.plot(
+            shown,
+            share,
+            color=colour,
+            ls=style,
+            drawstyle="steps-post",
+            label=name if len(ways) == 2 else "_",
+        )
+    axes.set_yscale("log")
+    axes.set_ylim(max(least, 1e-4) / 1.3, 1.3)
+    for level, name in ((0.5, "median"), (0.01, "99 %")):
+        axes.axhline(level, color=GREY, lw=0.6, ls=(0, (1, 2)), zorder=1)
+        axes.text(
+            0.995,
+            level * 1.12,
+            name,
+            color=GREY,
+            fontsize=7.5,
+            ha="right",
+            va="bottom",
+            transform=axes.get_yaxis_transform(),
+        )
+    right = max(axes.get_xlim()[1], 1.0)
+    axes.set_xlim(-0.005 * right, right)
+    axes.set_xlabel("one-way delay (ms)")
+    axes.set_ylabel("share that is later")
+    _legend(axes)
+
+
+def _draw_runs(axes: Axes, letter: str, ways: list[_Named]) -> None:
+    """Draw how often so many packets in a row are lost, per 1000 that were sent."""
+    panel(axes, letter, "losses in a row")
+    longest, most, least = 1, 0.0, np.inf
+    offsets = (-0.2, 0.2) if len(ways) == 2 else (0.0,)
+    for offset, (way, name, colour) in zip(offsets, ways, strict=True):
+        if not way.runs:
+            continue
+        lengths = np.minimum(way.runs, RUNS_SHOWN)
+        counts = np.bincount(lengths, minlength=2)[1:] * 1e3 / len(way.many)
+        longest = max(longest, len(counts))
+        most, least = max(most, counts.max()), min(least, counts[counts > 0].min())
+        places = np.arange(1, len(counts) + 1) + offset
+        axes.bar(
+            places, counts, width=0.38, color=colour, lw=0, label=name if len(ways) == 2 else "_"
+        )
+    axes.set_xlabel("packets lost in a row" + f" ({RUNS_SHOWN}: or more)" * (longest == RUNS_SHOWN))
+    axes.set_ylabel("runs per 1000 packets")
+    axes.grid(visible=False, axis="x")
+    if not any(way.runs for way, _, _ in ways):
+        axes.text(0.5, 0.5, "no packet was lost", ha="center", transform=axes.transAxes)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        return
+    _scale_runs(axes, longest, least, most)
+    _legend(axes)
+
+
+def _scale_runs(axes: Axes, longest: int, least: float, most: float) -> None:
+    """Choose limits that leave room for nothing but whole decades, and ticks at whole runs."""
+    axes.set_yscale("log")
+    axes.set_ylim(10.0 ** np.floor(np.log10(least) - 0.01), 10.0 ** np.ceil(np.log10(most) + 0.01))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    few = max(longest, 5) <= 10
+    axes.set_xlim(0.4, max(longest, 5) + 0.6)
+    axes.set_xticks(np.arange(1, max(longest, 5) + 1) if few else [1, *range(5, longest + 1, 5)])
+
+
+def _legend(axes: Axes) -> None:
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=4,
+            columnspacing=1.0,
+            handletextpad=0.4,
+        )

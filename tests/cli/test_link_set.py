@@ -1,0 +1,217 @@
+"""`cloudrc link set`: what is asked for becomes a profile, takes force, and is read back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli import link_set
+from cloudrc.cli.link_edit import edit
+from cloudrc.cli.main import main
+from cloudrc.cli.relay_control import RelayControl
+from cloudrc.config.document import Document
+from cloudrc.errors import BadInputError
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.sidecar_follow import Loaded
+from cloudrc.link.state import LinkState
+
+TIMED = {
+    "uplink": {"delay_ms": 40.0},
+    "downlink": {
+        "delay_ms": 25.0,
+        "jitter_ms": 8.0,
+        "changes": [
+            {"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0},
+            {"at_s": 12.0, "loss": 0.1},
+        ],
+        "blackouts": [{"start_s": 20.0, "duration_s": 0.3}],
+    },
+}
+
+
+def test_single_values_leave_all_else_as_it_is() -> None:
+    made = edit(Document(dict(TIMED)), None, ["uplink.loss=0.02", "link.uplink.delay_ms=60"])
+    assert made.values == {**TIMED, "uplink": {"delay_ms": 60.0, "loss": 0.02}}
+    assert made.cause == "uplink.loss=0.02, link.uplink.delay_ms=60"
+    assert not made.restart
+    assert made.notes == []
+
+
+def test_what_is_set_by_hand_is_not_changed_by_the_time_line_any_more() -> None:
+    made = edit(Document(dict(TIMED)), None, ["downlink.delay_ms=120"])
+    assert made.values["downlink"]["delay_ms"] == 120.0
+    assert made.values["downlink"]["changes"] == [
+        {"at_s": 9.0, "jitter_ms": 20.0},
+        {"at_s": 12.0, "loss": 0.1},
+    ]
+    assert made.notes == ["the downlink's time line does not change delay_ms any more"]
+    assert not made.restart, "blackouts and the other values go on when they were due"
+
+
+def test_a_delay_by_hand_ends_a_trace(tmp_path: Path) -> None:
+    trace = tmp_path / "t.csv"
+    trace.write_text("time_s,delay_ms\n0,40\n")
+    before = Document({"uplink": {"trace": str(trace)}})
+    made = edit(before, None, ["uplink.delay_ms=20"])
+    assert made.values == {"uplink": {"delay_ms": 20.0}}
+    assert made.notes == ["the uplink does not follow its trace any more"]
+
+
+def test_a_profile_takes_the_old_ones_place_and_begins_anew() -> None:
+    made = edit(Document(dict(TIMED)), "satellite", ["uplink.delay_ms=280"])
+    assert made.values["uplink"]["delay_ms"] == 280.0
+    assert made.values["downlink"]["delay_ms"] == 300.0
+    assert made.values["downlink"]["queue_packets"] == 100
+    assert (made.cause, made.restart) == ("profile satellite, uplink.delay_ms=280", True)
+    assert "guard.command_age_max_ms=800" in made.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("profile", "settings", "words"),
+    [
+        (None, [], "nothing to set"),
+        (None, ["delay_ms=3"], "delay_ms: give a value of uplink or downlink"),
+        (None, ["uplink=3"], "uplink: give a value of uplink or downlink"),
+        (None, ["uplink.delay=3"], "delay_ms"),
+        (None, ["uplink.loss=1.5"], "link set: uplink.loss: 1.5"),
+        ("nowhere", [], "nowhere"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(
+    profile: str | None, settings: list[str], words: str
+) -> None:
+    with pytest.raises(BadInputError) as refused:
+        edit(Document(dict(TIMED)), profile, settings)
+    assert words in str(refused.value)
+
+
+class Flight:
+    """A run here whose relay looks whenever the command waits."""
+
+    def __init__(self, folder: Path) -> None:
+        direction = DirectionProfile(0.045)
+        self.links = {way: LinkDirection(direction, 1, way == "uplink") for way in
+                      ("uplink", "downlink")}  # fmt: skip
+        values = {way: {"delay_ms": 45.0} for way in self.links}
+        first = {way: Loaded(direction, values) for way in self.links}
+        folder.mkdir(parents=True)
+        self.delays: list[tuple[str, float]] = []
+        note = lambda way, delay: self.delays.append((way, delay))  # noqa: E731
+        self.control = RelayControl(folder / "link", self.links, first, note)
+
+    def wait(self, _: float) -> None:
+        self.control.look()
+        self.control.swap()
+
+    def delay(self, way: str) -> float:
+        """One way, of a packet that is sent now [s]."""
+        return self.links[way].send(1, 3, 0, 172, 0)[0] * 1e-9
+
+
+@pytest.fixture
+def flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Flight:
+    monkeypatch.chdir(tmp_path)
+    found = Flight(tmp_path / "runs" / "latest")
+    monkeypatch.setattr(link_set, "sleep", found.wait)
+    return found
+
+
+def test_a_run_here_is_found_changed_and_read_back(
+    flight: Flight, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["link", "set", "downlink.delay_ms=120", "uplink.loss=0.02"]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[1].split()[:4] == ["uplink", "relay", "45", "ms"]
+    assert shown[2].split()[:4] == ["downlink", "relay", "120", "ms"]
+    assert (flight.delay("uplink"), flight.delay("downlink")) == pytest.approx((0.045, 0.120))
+    assert flight.delays[-2:] == [("uplink", 0.045), ("downlink", 0.12)]
+    assert main(["link", "set", "--profile", "paper-p1", "-o", "json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["links"]["downlink"]["profile"]["downlink"]["delay_ms"] == 20.0
+    assert document["links"]["downlink"]["cause"] == "profile paper-p1"
+    assert document["links"]["downlink"]["changes"] == 2
+
+
+def test_a_relay_that_does_not_answer_is_said(
+    flight: Flight, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link_set, "LOCAL_PATIENCE", 0.0)
+    monkeypatch.setattr(link_set, "sleep", lambda _: None)
+    assert main(["link", "set", "downlink.delay_ms=120"]) == 4
+    assert "the uplink and downlink did not take the change over" in capsys.readouterr().err
+
+
+def test_a_change_that_the_link_refuses_is_an_error_with_its_words(
+    flight: Flight, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path("runs/latest/link")
+
+    def refuse(_: float) -> None:
+        number = json.loads((folder / "change.json").read_text())["number"]
+        state = json.loads((folder / "uplink.json").read_text())
+        state |= {"refused": number, "refusal": "netem cannot do this"}
+        (folder / "uplink.json").write_text(json.dumps(state))
+
+    monkeypatch.setattr(link_set, "sleep", refuse)
+    assert main(["link", "set", "uplink.delay_ms=1"]) == 2
+    assert "the uplink is as it was: netem cannot do this" in capsys.readouterr().err
+
+
+def test_without_a_flight_it_says_what_to_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
+    assert main(["link", "set", "uplink.delay_ms=1", "--run", "nowhere"]) == 2
+    assert "--run nowhere: no run flies there" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["downlink.dely_ms=3"],
+        ["downlink.loss=2"],
+        ["sideways.loss=0.1"],
+        ["--profile", "nosuch"],
+        [],
+    ],
+)
+def test_without_a_flight_what_is_wrong_comes_first(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
+    assert main(["link", "set", *words]) == 2
+
+
+def test_the_table_names_all_that_is_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    own = {"corrupt": 0.1, "reorder": 0.05, "duplicate": 0.01, "correlation": 0.4,
+           "keep_order": True, "blackouts": [{}]}  # fmt: skip
+    state = LinkState("relay", "", "relay", "uplink", {"uplink": own}, "", 1)
+    link_set._show([state], 0.2)
+    beside = "1 blackouts, duplicate 1 %, reorder 5 %, corrupt 10 %, correlation 0.4, order kept"
+    assert beside in capsys.readouterr().out
+
+
+def test_the_only_run_that_flies_is_found_wherever_it_was_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [tmp_path / "a", tmp_path / "b"]
+    for run in runs:
+        (run / "link").mkdir(parents=True)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    flying = [runs[0], tmp_path / "without-a-link"]
+    monkeypatch.setattr("cloudrc.drivers.flights.under_way", lambda: flying)
+    assert main(["link", "set", "uplink.loss=0.1"]) == 2
+    said = capsys.readouterr().err
+    assert f"the run that flies in {runs[0]}" in said
+    assert "no link is up there (yet)" in said
+    flying.append(runs[1])
+    assert main(["link", "set", "uplink.loss=0.1"]) == 2
+    assert f"2 runs fly here; say which: --run {runs[0]} or --run {runs[1]}" in (
+        capsys.readouterr().err
+    )

@@ -1,0 +1,156 @@
+"""`cloudrc link`: what there is, a trace of a run or a log, a picture of a profile."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.link import ACTIONS
+from cloudrc.cli.main import main
+from cloudrc.link.trace import read_table, read_trace
+
+PING = "\n".join(
+    f"[{100 + n / 5 + 0.04:.6f}] 64 bytes from 192.0.2.1: icmp_seq={n} ttl=57 time={40 + n % 3} ms"
+    for n in range(20)
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight of some seconds over a link with losses."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    line = f"run steps --mode virtual --set mission.steps.count=2 --out {folder} -o json"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
+        assert main([*line.split(), "--set", "link.profile=lossy"]) == 0
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_every_action_explains_itself_in_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    for action in ACTIONS:
+        with pytest.raises(SystemExit):
+            main(["link", action, "--help"])
+        text = capsys.readouterr().out
+        assert max(map(len, text.splitlines())) <= 80, action
+
+
+def test_an_action_has_to_be_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["link"]) == 2
+    assert "an action is missing" in capsys.readouterr().err
+
+
+def test_a_run_has_both_ways(run: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["link", "record", str(run), "-o", "trace.csv"]) == 0
+    said = capsys.readouterr().out
+    for way in ("uplink", "downlink"):
+        trace = read_trace(here / f"trace-{way}.csv")
+        assert len(trace.times) > 700
+        assert trace.losses is not None
+        assert 0.005 < sum(trace.losses) / len(trace.losses) < 0.15
+        assert 0.020 <= min(trace.delays) < max(trace.delays) <= 0.080
+        assert f"--set link.{way}.trace=trace-{way}.csv" in said
+        assert f"distribution: table, table: trace-{way}.csv" in said
+        assert read_table(here / f"trace-{way}.csv")
+
+
+def test_one_way_of_a_recording_alone(run: Path, here: Path) -> None:
+    recording = str(run / "mission.mcap")
+    assert main(["link", "record", recording, "-o", "t.csv", "--direction", "downlink"]) == 0
+    assert [path.name for path in here.iterdir()] == ["t.csv"]
+
+
+def test_half_of_a_runs_round_trips(run: Path, here: Path) -> None:
+    """Newest wins prefers the quick ones: less than the 30 ms that the profile has one way."""
+    assert main(["link", "record", str(run), "-o", "t.csv", "--halve-rtt"]) == 0
+    trace = read_trace(here / "t.csv")
+    assert trace.losses is None
+    assert 0.020 < sum(trace.delays) / len(trace.delays) < 0.035
+
+
+def test_a_ping_log(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "ping.log").write_text(PING)
+    assert main(["link", "record", "ping.log", "-o", "t.csv"]) == 2
+    assert "--halve-rtt" in capsys.readouterr().err
+    assert main(["link", "record", "ping.log", "-o", "t.csv", "--halve-rtt"]) == 0
+    assert "half of each round trip 20.48" in capsys.readouterr().out
+    assert read_trace(here / "t.csv").delays[:3] == pytest.approx((0.020, 0.0205, 0.021))
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("a.csv", b"time_s,delay_ms\n0,0.045\n", "looks like seconds"),
+        ("a.csv", b"\xff\xfe", "not a text file"),
+        ("a.json", b'{"round_trips": []}', "choose --direction uplink"),
+        ("a.json.gz", b"not packed", "cannot be unpacked"),
+        ("a.mcap", b"\x89MCAP0\r\n", "a.mcap"),
+        ("a.json.gz", gzip.compress(b"{}", mtime=0), "choose --direction"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(
+    name: str, data: bytes, says: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / name).write_bytes(data)
+    assert main(["link", "record", name, "-o", "t.csv"]) == 2
+    message = capsys.readouterr().err
+    assert says in message
+    assert message.count("\n") == 1
+    assert not (here / "t.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("record nowhere -o t.csv", "nowhere: no such file or folder"),
+        ("record . -o t.csv", "has no mission.mcap"),
+        ("show paper-p9", "paper-p"),
+        ("show ideal -o ideal.gif", "end its name in .png, .svg or .pdf"),
+        ("show ideal --seconds 0", "--seconds 0: give a number above 0"),
+        ("show ideal --seconds nan", "--seconds nan: give a number above 0"),
+        ("show ideal --seed=-1", "--seed -1"),
+        ("show nowhere.csv", "No such file"),
+    ],
+)
+def test_a_wrong_line_is_refused(line: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["link", *line.split()]) == 2
+    assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
+def test_a_profile_is_drawn_and_put_into_numbers(
+    kind: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["link", "show", "handover", "--seconds", "12", "-o", f"a.{kind}"]
+    assert main(line) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("handover: LTE")
+    assert lines[1].split() == ["one", "way", "uplink", "downlink"]
+    assert lines[2].split()[0] == "mean"
+    assert 25.0 < float(lines[2].split()[1]) < 35.0
+    assert lines[-1] == f"a.{kind}"
+    first = (here / f"a.{kind}").read_bytes()
+    assert main(line) == 0
+    assert (here / f"a.{kind}").read_bytes() == first, "the same link gives the same picture"
+
+
+def test_a_trace_has_one_way(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = "\n".join(f"{n / 100},{40 + n % 7},{int(n % 10 == 0)}" for n in range(500))
+    (here / "t.csv").write_text(f"time_s,delay_ms,loss\n{rows}\n")
+    assert main(["link", "show", "t.csv"]) == 0
+    said = capsys.readouterr().out
+    assert "downlink" not in said
+    assert (here / "t.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("loss", [0.0, 1.0])
+def test_a_link_that_loses_nothing_or_all_is_drawn(loss: float, here: Path) -> None:
+    (here / "mine.yaml").write_text(f"uplink: {{loss: {loss}}}\n")
+    assert main(["link", "show", "./mine.yaml"]) == 0

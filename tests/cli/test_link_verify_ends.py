@@ -1,0 +1,150 @@
+"""`cloudrc link verify --ends`: what `helm test` asks the pods of a release, over real HTTP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+
+import pytest
+
+from cloudrc.cli import link_verify_ends
+from cloudrc.cli.link_verify_ends import Pod, verify_ends
+from cloudrc.cli.link_verify_text import as_text
+from cloudrc.drivers.exporter import Exporter
+from cloudrc.errors import TimedOutError
+from cloudrc.records import Counted, LinkChecked
+
+SENT_PER_LOOK = 2000
+
+
+@dataclass
+class Release:
+    """The exporters of two pods; whatever is asked of them makes their counters go on."""
+
+    world: Exporter
+    cloud: Exporter
+    links: dict[str, Exporter]
+    pods: dict[str, Pod]
+    bypassed: bool = False
+    looks: int = 0
+
+    def hears(self, end: str, mean: str, *, trip: bool = False) -> None:
+        """Let an end come to a verdict on the direction that it hears."""
+        exporter, uplink = (self.cloud, True) if end == "cloud" else (self.world, False)
+        measured = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}[mean]
+        name = "round_trip" if trip else "mean"
+        exporter.see(
+            [
+                LinkChecked(5, uplink, name, 0.045, measured, 0.043, 0.047, mean, 3300),
+                LinkChecked(5, uplink, "loss", 0.0, 0.0, 0.0, 0.02, "ok", 3300),
+            ]
+        )
+
+    def count(self, seconds: float) -> None:
+        """Time passes: both ends send, and their links see it."""
+        self.looks += 1
+        total = self.looks * SENT_PER_LOOK
+        for exporter in (self.world, self.cloud):
+            exporter.see([Counted(self.looks, "end", "sent", total)])
+        for exporter in self.links.values():
+            exporter.see([Counted(self.looks, "link", "received", 7 if self.bypassed else total)])
+
+
+@pytest.fixture
+def release(monkeypatch: pytest.MonkeyPatch) -> Iterator[Release]:
+    with ExitStack() as open_ones:
+
+        def served(role: str) -> tuple[Exporter, str]:
+            exporter = open_ones.enter_context(closing(Exporter(role)))
+            return exporter, f"http://127.0.0.1:{exporter.serve('127.0.0.1:0')}"
+
+        (world, at_world), (cloud, at_cloud) = served("world"), served("cloud")
+        (up, at_up), (down, at_down) = served("link"), served("link")
+        for link, way in ((up, "uplink"), (down, "downlink")):
+            link.shaped("relay", way, "auto")
+            link.asked(way, 0.045)
+        pods = {"world": Pod(at_world, at_up), "cloud": Pod(at_cloud, at_down)}
+        made = Release(world, cloud, {"uplink": up, "downlink": down}, pods)
+        made.count(0.0)
+        monkeypatch.setattr(link_verify_ends.time, "sleep", made.count)
+        yield made
+
+
+def ask(release: Release, limit: float = 30.0) -> link_verify_ends.Said:
+    return verify_ends(release.pods, "demo", limit, lambda line: None)
+
+
+def test_a_release_is_believed_once_both_ends_do(release: Release) -> None:
+    release.hears("world", "ok")
+    release.hears("cloud", "ok")
+    said = ask(release)
+    assert said.verdict == "believed"
+    assert said.shaper == "shaped by relay"
+    assert said.findings["uplink"].rows[0].applied == 0.045
+    assert said.findings["uplink"].evidence.passed == said.findings["uplink"].evidence.sent
+    assert as_text(said).splitlines()[-1].startswith("BELIEVED")
+
+
+def test_what_one_end_hears_is_named_for_its_direction(release: Release) -> None:
+    release.hears("world", "off")
+    release.hears("cloud", "ok")
+    said = ask(release)
+    assert said.verdict == "not believed"
+    assert [(cause.code, cause.way) for cause in said.causes] == [("doubled_delay", "downlink")]
+
+
+def test_counters_at_both_ends_show_a_bypass(release: Release) -> None:
+    release.bypassed = True
+    release.hears("world", "off")
+    release.hears("cloud", "off")
+    release.looks = 1
+    said = ask(release)
+    assert {cause.code for cause in said.causes} == {"bypassed"}
+
+
+def test_without_commands_it_says_to_fly_first(release: Release) -> None:
+    release.hears("cloud", "ok")
+    said = ask(release, 0.0)
+    assert said.verdict == "undecided"
+    assert any("fly a mission first" in note for note in said.notes)
+
+
+def test_round_trips_are_told_as_such(release: Release) -> None:
+    release.hears("world", "ok")
+    release.hears("cloud", "ok", trip=True)
+    assert "do not share a clock" in "".join(ask(release).notes)
+
+
+def test_what_the_ends_cannot_judge_is_said_and_no_blank_belief(release: Release) -> None:
+    release.hears("world", "ok")
+    release.hears("cloud", "ok")
+    for name, asked, measured in (
+        ("rate", 2e6, float("nan")), ("time_line", 1.0, 0.0), ("jitter_share", 0.1, 0.25),
+    ):  # fmt: skip
+        row = LinkChecked(5, True, name, asked, measured, measured, measured, "told", 3300)
+        release.cloud.see([row])
+    said = ask(release)
+    text = as_text(said)
+    assert said.verdict == "believed"
+    assert "rate of 2000 kbit/s NOT JUDGED" in text
+    assert "0% was watched" in text
+    assert "within 25% only" in text
+    assert text.splitlines()[-1].endswith("but for what is NOT JUDGED (above)")
+
+
+def test_what_is_undecided_says_how_long_it_takes(release: Release) -> None:
+    release.hears("world", "ok")
+    release.hears("cloud", "open")
+    release.cloud.see([LinkChecked(5, True, "datagrams", 8800, 3300, 0.0, 0.0, "told", 3300)])
+    said = ask(release, 0.0)
+    assert said.verdict == "undecided"
+    assert "uplink: 3300 of 8800 datagrams, 55 s more" in said.notes
+    assert "ask again" in as_text(said).splitlines()[-1]
+    release.cloud.see([LinkChecked(5, True, "datagrams", 115_000, 25_000, 0.0, 0.0, "told", 3300)])
+
+
+def test_ends_that_do_not_answer_are_a_timeout(release: Release) -> None:
+    release.world.close()
+    with pytest.raises(TimedOutError, match="world could not be asked"):
+        ask(release, 0.0)

@@ -1,0 +1,79 @@
+"""tc kept running answers as a tc that is started anew, only sooner; here tc is a script."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.tc_session import Programs
+
+TC = f"""#!{sys.executable}
+import sys
+from pathlib import Path
+log = Path(__file__).with_name("log")
+def answer(words):
+    with log.open("a") as file:
+        file.write(" ".join(words) + chr(10))
+    if "lacks" in words:
+        print("Error: Specified qdisc kind is unknown.", file=sys.stderr, flush=True)
+        return 2
+    if "show" in words:
+        print('[{{"kind":"netem"}}]' if "eth0" in words else "[]", flush=True)
+    return 0
+if "-batch" not in sys.argv:
+    sys.exit(answer(sys.argv[1:]))
+for number, line in enumerate(sys.stdin, start=1):
+    if line.split()[-1] == "dies":
+        break
+    if answer(line.split()):
+        print(f"Command failed -:{{number}}", file=sys.stderr, flush=True)
+"""
+CHANGE = ("tc", "qdisc", "change", "dev", "eth0", "netem")
+SHOW = ("tc", "-s", "-j", "qdisc", "show", "dev", "eth0")
+
+
+@pytest.fixture
+def programs(tmp_path: Path) -> Programs:
+    program = tmp_path / "tc"
+    program.write_text(TC)
+    program.chmod(0o755)
+    return Programs({"PATH": f"{tmp_path}:/usr/bin:/bin", "HOME": str(tmp_path)})
+
+
+def asked(tmp_path: Path) -> list[str]:
+    return [line for line in (tmp_path / "log").read_text().splitlines() if line[-2:] != "lo"]
+
+
+def test_changes_and_listings_go_through_one_process(programs: Programs, tmp_path: Path) -> None:
+    for _ in range(3):
+        assert programs((*CHANGE, "delay", "1us")) == (0, "", "")
+        assert programs(SHOW) == (0, '[{"kind":"netem"}]', "")
+    assert asked(tmp_path) == ["qdisc change dev eth0 netem delay 1us", "qdisc show dev eth0"] * 3
+    programs.close()
+
+
+def test_an_error_is_told_with_tcs_words_and_is_not_the_end(programs: Programs) -> None:
+    for _ in range(2):
+        code, _, error = programs((*CHANGE, "lacks"))
+        assert code
+        assert "qdisc kind is unknown" in error
+        assert programs((*SHOW, "lacks")).code
+        assert programs(SHOW).output == '[{"kind":"netem"}]'
+    programs.close()
+
+
+def test_other_commands_are_processes_of_their_own(programs: Programs, tmp_path: Path) -> None:
+    assert programs(("tc", "qdisc", "add", "dev", "eth0", "root", "prio")).code == 0
+    assert programs(("tc", "qdisc", "add", "lacks")).code == 2
+    assert programs(("no-such-program",)).code == 127
+    assert asked(tmp_path)[0] == "qdisc add dev eth0 root prio"
+
+
+def test_one_that_died_is_replaced(programs: Programs) -> None:
+    assert programs(SHOW).code == 0
+    assert programs((*CHANGE, "dies")).code == 0  # asked again, in a process of its own
+    assert programs(SHOW).output == '[{"kind":"netem"}]'
+    programs.close()
+    programs.close()

@@ -1,0 +1,163 @@
+"""The standing check in flight: by the tunnel's own datagrams, drawn here without any flight."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from math import nan
+from pathlib import Path
+
+import pytest
+from standing_flights import (
+    DRAWS,
+    P1,
+    PAPER,
+    ZERO,
+    arrivals,
+    checked,
+    downlink,
+    newest,
+)
+
+from cloudrc.drivers.standing_check import StandingCheck
+from cloudrc.drivers.standing_tally import Tally
+from cloudrc.exposition.check import Check
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.records import Arrival, Control, Lateness, LinkChecked, Record
+
+FAULTS = {
+    "mean": replace(PAPER, delay=PAPER.delay * 1.5),
+    "deviation": replace(PAPER, jitter=PAPER.jitter * 1.3),
+    "loss": replace(PAPER, loss=0.1),
+    "reordered": replace(PAPER, keep_order=True, jitter=PAPER.jitter * 0.9),
+    "duplicated": replace(PAPER, duplicate=0.2),
+}
+
+
+@pytest.mark.parametrize("quantity", FAULTS)
+def test_a_link_that_is_not_what_was_asked_is_a_fault_told_once(quantity: str) -> None:
+    records, faults = checked(downlink(PAPER), arrivals(FAULTS[quantity]))
+    assert newest(records)[quantity].verdict == "off"
+    assert [fault.code for fault in faults] == ["link"]
+    assert faults[0].text.startswith("the downlink is not what was asked for: ")
+
+
+def test_ends_that_wake_late_are_not_the_links_fault() -> None:
+    """4 ms more than asked, at an end whose wakes are 2 ms late in the mean, and so the other's."""
+    slow = replace(PAPER, delay=PAPER.delay + 0.0045)
+    assert checked(downlink(PAPER), arrivals(slow, 100.0))[1], "of punctual ends it is"
+    heard: list[Record] = []
+    for arrival in arrivals(slow, 100.0):
+        heard += [arrival, Lateness(arrival.stamp_ns, "world", 0.002, 0.0002, 0)]
+    records, faults = checked(downlink(PAPER), heard)
+    assert faults == []
+    assert newest(records)["mean"].verdict == "open"
+
+
+def test_one_long_stall_of_an_end_is_not_the_links_fault() -> None:
+    """For half a second nobody reads what has come."""
+    stalled: list[Record] = []
+    begin_ns, end_ns = 20_000_000_000, 20_500_000_000
+    for arrival in arrivals(P1, 32.0):
+        late_ns = end_ns - arrival.stamp_ns if begin_ns < arrival.stamp_ns < end_ns else 0
+        stamp_ns = arrival.stamp_ns + late_ns
+        stalled.append(arrival._replace(stamp_ns=stamp_ns, delay=arrival.delay + late_ns * 1e-9))
+        if not late_ns:
+            late = 0.5 if 0 < stamp_ns - end_ns < 11_000_000 else 1e-4
+            stalled.append(Lateness(stamp_ns, "world", late, 1e-4, 0))
+    records, faults = checked(downlink(P1), stalled)
+    assert faults == []
+    assert newest(records)["deviation"].verdict == "open"
+
+
+def test_without_a_shared_clock_there_are_no_one_way_delays() -> None:
+    records, _ = checked(downlink(PAPER), arrivals(PAPER, overhead=nan))
+    assert set(newest(records)) - {"datagrams"} == {"loss", "reordered", "duplicated"}
+
+
+def control(stamp_ns: int, rtt: float) -> Control:
+    return Control(
+        stamp_ns, 1, 0, 0, 0.0, rtt, rtt, ZERO, ZERO, (1.0, *ZERO), ZERO, ZERO, 0, ZERO, 0.0,
+        ZERO, ZERO, ZERO,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("slower", "verdict"), [(0.0, "ok"), (0.030, "off")])
+def test_cloud_judges_round_trips_then(slower: float, verdict: str) -> None:
+    """20 ms and 40 ms without jitter: every round trip takes 60 ms."""
+    asked = (DirectionProfile(0.020), DirectionProfile(0.040))
+    check = StandingCheck(uplink=True, stream=DRAWS._replace(uplink=True))
+    check.follow(asked)
+    heard: list[Record] = []
+    for arrival in arrivals(asked[0], overhead=nan):
+        heard.append(arrival._replace(uplink=True))
+        heard.append(control(arrival.stamp_ns, 0.060 + slower + arrival.counter * 1e-9))
+    records, _ = checked(check, heard)
+    trip = newest(records)["round_trip"]
+    assert trip.asked == pytest.approx(0.060, abs=1e-4)
+    assert trip.verdict == verdict
+
+
+def test_a_new_profile_is_judged_by_from_then_on() -> None:
+    check = downlink(PAPER)
+    slow = replace(PAPER, delay=0.120)
+    assert checked(check, arrivals(PAPER, 30.0))[1] == []
+    check.follow((slow, slow))
+    later = [
+        arrival._replace(stamp_ns=arrival.stamp_ns + 30_000_000_000, counter=arrival.counter + 3000)
+        for arrival in arrivals(slow, 60.0)
+    ]
+    records, faults = checked(check, later)
+    assert faults == []
+    assert newest(records)["mean"].asked == pytest.approx(0.120, abs=1e-3)
+
+
+def test_the_profile_is_followed_in_the_state_of_the_link(tmp_path: Path) -> None:
+    from threading import Event
+
+    seen = Event()
+    check, slow = downlink(PAPER), DirectionProfile(0.070)
+    follow = check.follow
+
+    def watched(asked: tuple[DirectionProfile, DirectionProfile]) -> None:
+        follow(asked)
+        if asked[1] == slow:
+            seen.set()
+
+    check.follow = watched  # type: ignore[method-assign]
+    state = {"shaper": "relay", "reason": "", "mode": "relay", "direction": "uplink"}
+    state |= {"profile": {"downlink": {"delay_ms": 70}}, "since": "", "since_ns": 0}  # type: ignore[dict-item]
+    (tmp_path / "link.json").write_text(json.dumps(state))
+    check.begin((PAPER, PAPER), tmp_path / "link.json", lambda values: (DirectionProfile(), slow))
+    assert seen.wait(20.0)
+    records, _ = checked(check, arrivals(slow))
+    assert newest(records)["mean"].asked == pytest.approx(0.070)
+
+
+def test_a_new_session_begins_anew() -> None:
+    tally = Tally()
+    assert tally.see(Arrival(0, False, 1, 500, 0.05, True)), "what was before is not judged"
+    assert not tally.see(Arrival(0, False, 1, 503, 0.05, True))
+    assert tally.block.arrived == 1
+    assert not tally.see(Arrival(0, False, 1, 502, 0.07, True))
+    assert (tally.block.late, tally.block.pairs) == (1, 1)
+    assert tally.block.steps == pytest.approx(0.02)
+    assert not tally.see(Arrival(0, False, 1, 502, 0.07, True))
+    assert (tally.block.copies, tally.block.arrived) == (1, 2)
+    for counter in range(504, 700):
+        tally.see(Arrival(0, False, 1, counter, 0.05, True))
+    block = tally.take()
+    assert (block.sent, block.lost) == (700 - 500 - 128, 1), "501 can still arrive until then"
+    assert tally.see(Arrival(0, False, 2, 0, 0.05, True))
+
+
+def test_what_is_exposed_is_the_newest_verdict() -> None:
+    check = Check("uplink")
+    assert check.read() == {}
+    check.see(LinkChecked(1, True, "mean", 0.04, nan, 0.03, 0.05, "open", 100))
+    assert check.read() == {}
+    for verdict in ("ok", "off"):
+        check.see(LinkChecked(2, True, verdict, 0.04, 0.09, 0.03, 0.05, verdict, 900))
+    assert check.read() == {"cloudrc_link_believed": {("uplink",): 0.0}}
+    found = json.loads(check.text())
+    assert (found["verdict"], len(found["rows"]), found["rows"][0]["datagrams"]) == ("off", 2, 900)

@@ -1,0 +1,90 @@
+"""The judge of `make bench-link`: misses are said, and a missing compiler is exit 3."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.tunnel.codec import Kind
+from tools.bench_link.draws import measure_bursts
+from tools.bench_link.flow import EPOCH, SIZE, Flow
+from tools.bench_link.judge import judge
+from tools.bench_link.release import OF_ASYNCIO, OF_C, OURS, WAKE, Releases
+from tools.bench_link.report import bursts, releases
+
+ROOT = Path(__file__).resolve().parents[2]
+MS = 1_000_000
+START = 1_700_000_000_000_000_000
+PROFILE = DirectionProfile(0.040, 0.030, loss=0.1)
+
+
+def flow(late_ns: int) -> Flow:
+    """What a relay does that is always so late."""
+    made, link = Flow(True), LinkDirection(PROFILE, 1, True, START)
+    for number in range(500):
+        made.sent[number] = START + number * 10 * MS
+        for at_ns in link.send(EPOCH, Kind.TELEMETRY, number, SIZE, made.sent[number]):
+            made.arrived.append((at_ns + late_ns, number))
+    made.arrived.sort()
+    return made
+
+
+def test_an_honest_flow_is_as_drawn() -> None:
+    judged = judge(flow(20_000), PROFILE, 1, START)
+    assert (judged.wrongly_lost, judged.wrongly_arrived, judged.swapped) == (0, 0, 0)
+    assert judged.errors == pytest.approx(20e-6)
+    assert judged.errors.size < 500
+    assert judged.measured - judged.drawn == pytest.approx(judged.errors, abs=1e-9)
+
+
+def test_what_is_lost_invented_or_swapped_is_found() -> None:
+    found = flow(0)
+    lost = next(n for n in range(500) if n not in {number for _, number in found.arrived})
+    del found.arrived[7]
+    found.arrived.append((START, lost))
+    found.arrived[100], found.arrived[101] = found.arrived[101], found.arrived[100]
+    judged = judge(found, PROFILE, 1, START)
+    assert (judged.wrongly_lost, judged.wrongly_arrived, judged.swapped) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("ours_us", "missed"), [(20.0, set()), (80.0, {"p50", "p99", "asyncio"}), (-5.0, {"early"})]
+)
+def test_release_errors_are_judged_against_the_anchors_of_the_run(
+    ours_us: float, missed: set[str]
+) -> None:
+    sizes = {OURS: ours_us, OF_C: 40.0, OF_ASYNCIO: 1100.0, WAKE: 30.0}
+    found = Releases(
+        {name: [np.full(1000, us * 1e-6)] for name, us in sizes.items()},
+        {name: [0.05] for name in (OURS, OF_C, OF_ASYNCIO)},
+    )
+    lines = releases(found, fifo=True)
+    wrong = [line.what for line in lines if not line.held]
+    if missed == {"early"}:
+        assert "released early" in wrong
+    else:
+        assert len(wrong) == len(missed)
+        assert all(any(word in what for what in wrong) for word in missed)
+
+
+def test_bursts_are_as_asked_in_200_000_packets() -> None:
+    assert all(line.held for line in bursts(measure_bursts()))
+
+
+def test_without_a_compiler_it_ends_with_3(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.bench_link", "--only", "bursts"],
+        cwd=ROOT,
+        env={"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 3, done.stderr
+    assert "no C compiler" in done.stderr
+    assert done.stdout == ""

@@ -1,0 +1,84 @@
+"""Time lines and traces in the kernel: stepped when they are due, and measured at the far end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import netem_laboratory as lab
+import numpy as np
+import pytest
+from netem_laboratory import WITHIN, Flow, least, told
+
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, Trace
+
+LATE = 0.1
+"""How late a step may be where the machine now and then stands still [s]."""
+pytestmark = pytest.mark.netem
+
+
+def test_a_time_line_is_stepped(tables: Path) -> None:
+    profile = DirectionProfile(
+        delay=0.02, changes=(Change(2.5, delay=0.1),), blackouts=(Blackout(3.5, 0.3),)
+    )
+    origin_ns = time.monotonic_ns() + 5_000_000_000  # by then it is set up
+    begun_ns = origin_ns + time.time_ns() - time.monotonic_ns()
+    netem, flow = lab.netem(tables, profile, origin_ns), Flow()
+    netem.follow_peer(lab.PEER)
+    while time.monotonic_ns() < origin_ns + 4_500_000_000:
+        flow.send(1, 0.01, meanwhile=lambda: netem.step(0.0))
+    netem.close()
+    flow.settle()
+    since = {n: (at_ns - begun_ns) * 1e-9 for n, at_ns in enumerate(flow.sent_ns)}
+    delays = dict(zip(flow.numbers(), flow.delays(), strict=True))
+    before = [delays[n] for n in delays if since[n] < 2.45]
+    after = [delays[n] for n in delays if since[n] > 2.5 + LATE]
+    lost = [since[n] for n in since if n not in delays and since[n] < 4.2]
+    told("step", before=np.median(before), after=np.median(after), dark=max(lost) - min(lost))
+    assert np.median(before) == pytest.approx(0.02, abs=0.005)
+    assert np.median(after) == pytest.approx(0.1, abs=0.005)
+    assert min(lost) == pytest.approx(3.5, abs=LATE)
+    assert max(lost) == pytest.approx(3.8, abs=LATE)
+
+
+def follow(tables: Path, trace: Trace) -> tuple[float, float]:
+    """Measure how a trace is followed: correlation with it, and the median error [s]."""
+    profile = DirectionProfile(trace=trace)
+    origin_ns = time.monotonic_ns() + 3_000_000_000  # by then it is set up
+    begun_ns = origin_ns + time.time_ns() - time.monotonic_ns()
+    netem, flow = lab.netem(tables, profile, origin_ns), Flow()
+    netem.follow_peer(lab.PEER)
+    sender = threading.Thread(target=flow.send, args=(600, 0.02))
+    sender.start()
+    while sender.is_alive():
+        netem.step(0.1)
+    flow.settle()
+    netem.close()
+    since = (np.array(flow.sent_ns)[flow.numbers()] - begun_ns) * 1e-9
+    times = np.array(trace.times)
+    rows = (since > 0.0) & (since < times[-1])
+    asked = np.array(trace.delays)[np.searchsorted(times, since[rows], side="right") - 1]
+    measured = flow.delays()[rows]
+    correlation = float(np.corrcoef(asked, measured)[0, 1])
+    error = float(np.median(measured - asked))
+    told(netem.steps.in_words(), correlation=correlation, median_error=error)
+    assert netem.steps.applied + netem.steps.passed_over == len(times) - 1
+    assert len(flow.arrived) == 600, "steps lose nothing"
+    return correlation, error
+
+
+def test_a_trace_is_followed(tables: Path) -> None:
+    """60 to 140 ms in waves of 4 s, one row per 20 ms; measured at the instants of sending."""
+    times = 0.02 * np.arange(400)
+    delays = 0.1 + 0.04 * np.sin(0.5 * np.pi * times)
+    trace = Trace(tuple(times.tolist()), tuple(delays.tolist()))
+    errors: list[float] = []
+
+    def off() -> float:
+        correlation, error = follow(tables, trace)
+        errors.append(abs(error))
+        return 1.0 - correlation
+
+    assert least(off, 0.02) < 0.02
+    assert min(errors) < 3 * WITHIN, "its clock is slow, and steps are late there, too"

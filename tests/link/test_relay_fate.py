@@ -1,0 +1,100 @@
+"""The same fate in every mode: a relay does to packet n what the virtual model draws for it.
+
+Kernel stamps at both ends: how late Python is woken here changes nothing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from link_flows import SIZE
+
+from cloudrc.link.model import LinkDirection
+from cloudrc.tunnel.codec import Kind
+from tools.bench_link.anchors import fifo_allowed
+from tools.bench_link.flow import EPOCH, Flow, run_flow
+from tools.bench_link.profiles import (
+    SEED,
+    Links,
+    correlation,
+    measure,
+    profiles_of,
+    shipped,
+    write_trace,
+)
+from tools.bench_link.relays import ours
+
+pytestmark = pytest.mark.process
+STEADY = ("lossy", "paper-p3")
+"""Without queue, kept order or time line: the fate does not depend on the instant of sending."""
+PATIENCE = 5e-3
+"""With a busy machine [s]; what the relay can do is measured by `make bench-link`."""
+LIVELY: dict[str, object] = {
+    "profile": "ideal",
+    "uplink": {"delay_ms": 20, "jitter_ms": 15, "duplicate": 0.2, "loss": 0.2, "reorder": 0.1},
+}
+
+
+def sound(folder: Path, link: dict[str, object], rate: float, seconds: float) -> list[Flow]:
+    relay = ours(folder, link)
+    flows = run_flow(relay.ways, rate, seconds, 0.5)
+    relay.stop()
+    return flows
+
+
+@pytest.mark.parametrize("name", [*STEADY, "lively"])
+def test_a_relay_run_draws_the_virtual_sequence(tmp_path: Path, name: str) -> None:
+    """Asked of a model that never saw a clock: which numbers arrive, how often, how late."""
+    link = LIVELY if name == "lively" else {"profile": name}
+    flows = sound(tmp_path, link, 200.0, 1.5)
+    for flow, profile in zip(flows, profiles_of(tmp_path, link), strict=True):
+        virtual = LinkDirection(profile, SEED, flow.uplink)
+        kind = Kind.TELEMETRY if flow.uplink else Kind.COMMAND
+        drawn = {n: sorted(virtual.send(EPOCH, kind, n, SIZE, 0)) for n in range(len(flow.sent))}
+        measured: dict[int, list[int]] = {n: [] for n in drawn}
+        for at_ns, number in flow.arrived:
+            measured[number].append(at_ns - flow.sent[number])
+        assert {n: len(delays) for n, delays in measured.items()} == {
+            n: len(delays) for n, delays in drawn.items()
+        }
+        errors = [
+            late - delay
+            for n in drawn
+            for late, delay in zip(sorted(measured[n]), drawn[n], strict=True)
+        ]
+        assert min(errors) >= 0, "early"
+        assert np.median(errors) < PATIENCE * 1e9
+
+
+def check(folder: Path, links: Links, seconds: float, *, exact: bool) -> None:
+    for row in measure(folder, links, seconds, fifo=exact and fifo_allowed()):
+        judged, where = row.judged, f"{row.name} {row.direction}"
+        assert judged.wrongly_lost == judged.wrongly_arrived == 0, where
+        assert judged.errors.min() >= 0.0, where
+        assert np.median(judged.errors) < PATIENCE, where
+        if exact:
+            assert judged.swapped == 0, where
+            assert judged.errors.mean() <= 0.3e-3, where
+            assert judged.errors.std() <= 0.5e-3, where
+        if row.name == "trace":
+            trace = profiles_of(folder, links["trace"])[0]
+            assert correlation(judged, trace) >= 0.98, where
+
+
+def replay(folder: Path) -> dict[str, object]:
+    write_trace(folder / "trace.csv", 60.0)
+    return {"profile": "ideal", "uplink": {"trace": str(folder / "trace.csv")}}
+
+
+def test_a_slice_of_profiles_with_queue_and_kept_order(tmp_path: Path) -> None:
+    """`lte` has a rate and keeps order, `satellite` and `wifi` lose in bursts, too."""
+    links: Links = {name: {"profile": name} for name in ("lte", "satellite", "wifi")}
+    check(tmp_path, links, 2.0, exact=False)
+
+
+@pytest.mark.full
+def test_every_shipped_profile_for_a_minute(tmp_path: Path) -> None:
+    links: Links = {name: {"profile": name} for name in shipped()}
+    check(tmp_path, links | {"trace": replay(tmp_path)}, 60.0, exact=True)

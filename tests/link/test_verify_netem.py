@@ -1,0 +1,115 @@
+"""netem verified as between two pods: a true link, and the faults that only a kernel can have."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from cloudrc.cli import link_processes
+from cloudrc.cli import link_verify_run as run
+from cloudrc.cli.link_processes import Shaping, shaping
+from cloudrc.cli.link_verify import find
+from cloudrc.cli.link_verify_netem import DEVICE
+from cloudrc.cli.link_verify_run import Asked, Bank, banks
+from cloudrc.cli.link_verify_text import Said, as_text
+from cloudrc.config.load import dump
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.link.verify_causes import find_causes
+
+pytestmark = pytest.mark.netem
+SETTINGS = [
+    f"link.{way}.{key}"
+    for way in ("uplink", "downlink")
+    for key in ("delay_ms=400", "jitter_ms=80")  # far above what an emulated machine adds
+]
+PROFILE = "uplink: &both {delay_ms: 400, jitter_ms: 80}\ndownlink: *both\n"
+SECONDS = 17.0
+"""At 100 probes a second, which a slow machine can send [s]."""
+
+
+class Link:
+    """A link that is up, and is probed as often as wanted."""
+
+    def __init__(
+        self, asked: Mapping[str, Asked], ends: Mapping[str, Bank], ways: Mapping[str, Shaping]
+    ) -> None:
+        self.asked, self.ends, self.ways = asked, ends, ways
+
+    def verify(self) -> Said:
+        findings = run.probe(self.asked, self.ends, self.ways, lambda line: None)
+        said = Said(
+            "netem", "netem", findings, dict.fromkeys(findings, ""), [], find_causes(findings)
+        )
+        print(as_text(said))
+        return said
+
+    def tc(self, way: str, *words: str) -> None:
+        """Meddle with the kernel behind the back of the link's process."""
+        command = [*self.ways[way].place.inside, "tc", *words]
+        subprocess.run(command, check=True, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def plan() -> dict[str, Asked]:
+    return run.plan(find("ideal", SETTINGS), SECONDS)
+
+
+@contextmanager
+def up(plan: dict[str, Asked], profile: str = PROFILE) -> Iterator[Link]:
+    """A link whose processes were told `profile`, whatever was asked for."""
+    try:
+        with banks("netem") as ends:
+            places = {way: bank.place for way, bank in ends.items()}
+            with shaping(places, dump(find("ideal", SETTINGS)), profile, "netem") as ways:
+                yield Link(plan, ends, ways)
+    except MissingPrerequisiteError as error:
+        pytest.exit(f"netem cannot be tested here: {error}", CloudrcError.exit_code + 2)
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_processes, "START_LIMIT", 300.0)  # emulated processors are slow
+
+
+def codes(said: Said) -> set[str]:
+    return {cause.code for cause in said.causes}
+
+
+def test_a_true_link_is_believed_and_one_whose_qdisc_was_gone_is_not(
+    plan: dict[str, Asked],
+) -> None:
+    with up(plan) as link:
+        # A true link is believed, unless an emulated processor has let it wait: three tries.
+        said = next(
+            said
+            for tries in range(3)
+            if (said := link.verify()).verdict == "believed" or tries == 2
+        )
+        assert said.verdict == "believed"
+        for found in said.findings.values():
+            evidence: Any = found.evidence
+            assert (evidence.shaper, evidence.interface, evidence.layers) == ("netem", DEVICE, 1)
+            assert evidence.applied.delay == pytest.approx(0.400, abs=1e-4), "read back from tc"
+        link.tc("uplink", "qdisc", "del", "dev", DEVICE, "root")  # put back within a second or so
+        broken = link.verify()
+        assert broken.verdict != "believed"
+        assert {cause.way for cause in broken.causes} == {"uplink"}
+
+
+def test_a_doubled_delay_is_named(plan: dict[str, Asked]) -> None:
+    with up(plan, PROFILE.replace("400", "800")) as link:
+        doubled = link.verify()
+        assert codes(doubled) == {"doubled_delay"}
+        for found in doubled.findings.values():
+            assert found.evidence.applied is not None
+            assert found.evidence.applied.delay == pytest.approx(0.800, abs=1e-4)
+
+
+def test_a_link_that_delays_one_direction_only_is_named(plan: dict[str, Asked]) -> None:
+    bare = PROFILE.replace("downlink: *both", "downlink: {}")
+    with up(plan, bare) as link:
+        assert [(c.code, c.way) for c in link.verify().causes] == [("one_direction", "downlink")]

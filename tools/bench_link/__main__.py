@@ -1,0 +1,100 @@
+"""`make bench-link`: measure the relay, print asked beside measured, and the anchors beside both.
+
+Close other programs first: the tails of every row are the machine's, too, which is why the anchors
+run in turns with the relay. Exit codes: 0 all held, 1 something did not, 3 no C compiler.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from cloudrc.cli.output import table
+from cloudrc.errors import CloudrcError
+from tools.bench_link import report
+from tools.bench_link.anchors import compile_anchors, fifo_allowed, wake_lateness
+from tools.bench_link.draws import measure_bursts
+from tools.bench_link.overload import measure_overload
+from tools.bench_link.profiles import Links, measure, shipped, write_trace
+from tools.bench_link.release import measure_releases, measure_throughput
+from tools.bench_link.report import TRACE, Line
+
+STARTING = 7.0
+"""Until all links are up, about [s]."""
+STAGES = ("release", "throughput", "profiles", "overload", "bursts")
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="make bench-link", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="a tenth of the time; for a look")
+    parser.add_argument("--only", action="append", choices=STAGES, help="this stage; repeatable")
+    parser.add_argument("-o", "--output", choices=("table", "json"), default="table")
+    options = parser.parse_args()
+    try:
+        with TemporaryDirectory(prefix="bench-link-") as folder:
+            lines, details = _measure(Path(folder), options.only or STAGES, quick=options.quick)
+    except CloudrcError as error:
+        print(f"bench-link: {error}", file=sys.stderr)
+        return error.exit_code
+    if options.output == "json":
+        print(json.dumps({"lines": [line._asdict() for line in lines], "profiles": details}))
+    else:
+        _print(lines, details)
+    return 0 if all(line.held for line in lines) else 1
+
+
+def _measure(
+    folder: Path, stages: tuple[str, ...], *, quick: bool
+) -> tuple[list[Line], list[dict[str, object]]]:
+    programs, fifo = compile_anchors(folder), fifo_allowed()
+    lines: list[Line] = []
+    details: list[dict[str, object]] = []
+    for stage in stages:
+        print(f"bench-link: {stage} ...", file=sys.stderr, flush=True)
+        if stage == "release":
+            rounds = (2, 3.0) if quick else (5, 6.0)
+            lines += report.releases(measure_releases(folder, programs, *rounds, fifo=fifo), fifo)
+        elif stage == "throughput":
+            floods = (2, 1.0) if quick else (5, 1.5)
+            lines += report.throughput(measure_throughput(folder, programs[1], *floods))
+        elif stage == "profiles":
+            seconds = 6.0 if quick else 60.0
+            write_trace(folder / "trace.csv", 60.0)
+            trace = {"trace": str(folder / "trace.csv")}
+            links: Links = {name: {"profile": name} for name in shipped()}
+            links[TRACE] = {"profile": "ideal", "uplink": trace, "downlink": trace}
+            with ThreadPoolExecutor(1) as pool:  # what the machine does in the same minute
+                count = round(1000 * (seconds + STARTING))
+                late = pool.submit(wake_lateness, programs[0], count, fifo=fifo)
+                measured = measure(folder, links, seconds, fifo=fifo)
+            found, details = report.profiles(folder, measured, links, late.result())
+            lines += found
+        elif stage == "overload":
+            lines += report.overload(measure_overload(folder, 100_000, 2.0 if quick else 10.0))
+        else:
+            lines += report.bursts(measure_bursts())
+    return lines, details
+
+
+def _print(lines: list[Line], details: list[dict[str, object]]) -> None:
+    system = f"Linux {platform.release()}, {os.cpu_count()} CPUs, load {os.getloadavg()[0]:.1f}"
+    rows: list[tuple[str, ...]] = [(system, "asked", "measured", "anchor", "")]
+    rows += [
+        (line.what, line.asked, line.measured, line.anchor, "" if line.held else "MISSED")
+        for line in lines
+    ]
+    print(table(rows))
+    if details:
+        print("\nmeasured minus drawn delay, both ways at 100 Hz; all links at the same time")
+        print(table([tuple(details[0]), *(tuple(map(str, row.values())) for row in details)]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
