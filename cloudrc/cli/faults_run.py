@@ -1,0 +1,120 @@
+"""`cloudrc faults list` and `run`: scenarios by name, their results as text, JSON and JUnit."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.extras import require
+from cloudrc.cli.output import paint, table, written
+
+if TYPE_CHECKING:
+    from cloudrc.faults.document import Result
+    from cloudrc.faults.scenario import Mode, Scenario
+
+COLOURS = {"passed": "green", "FAILED": "red", "skipped": "yellow"}
+FAILED = 1
+
+
+def show(options: argparse.Namespace) -> int:
+    """List the faults."""
+    from cloudrc.faults.catalogue import scenarios
+
+    found = scenarios(_mode(options))
+    if options.output != "table":
+        names = ("id", "name", "mode", "injects", "expects", "loses", "shows")
+        faults = [{n: getattr(each, n) for n in names} for each in found]
+        print(written({"schemaVersion": 1, "faults": faults}, options.output))
+        return 0
+    rows = [("fault", "name", "what is done", "what has to follow")]
+    rows += [(each.id, each.name, each.injects, each.expects) for each in found]
+    print(table(rows))
+    return 0
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run one fault or all of them; 1 if a check did not pass."""
+    from cloudrc.faults import document
+    from cloudrc.faults.catalogue import find, scenarios
+
+    mode = _mode(options)
+    if mode == "cluster":
+        _look_for_release(options)
+    chosen = scenarios(mode) if options.all else [find(options.name, mode)]
+    say = print if options.output == "table" else _silent
+    results = []
+    for result in _results(chosen, options):
+        results.append(result)
+        _say(result, options.all, say)
+    if options.junit is not None:
+        options.junit.write_text(document.as_junit(results, options.seed), encoding="utf-8")
+    if options.document is not None:
+        text = document.as_markdown(results, options.seed)
+        options.document.write_text(text, encoding="utf-8")
+    if options.output != "table":
+        print(written(document.as_json(results, options.seed), options.output))
+    failed = sum(result.failed for result in results)
+    passed = sum(result.passed for result in results)
+    say(f"\nseed {options.seed}: {passed} of {len(results)} passed, {failed} failed")
+    return FAILED if failed else 0
+
+
+def _look_for_release(options: argparse.Namespace) -> None:
+    """Say it once, and not with every fault, if there is no cluster or no release in it."""
+    require("faults in a cluster", ("kube",))
+    from cloudrc.cluster.pods import find_pod
+    from cloudrc.faults.real_cluster import place, release_there
+
+    place.update(namespace=options.namespace, release=options.release)
+    find_pod(release_there(), "world")
+
+
+def _mode(options: argparse.Namespace) -> Mode:
+    return "cluster" if options.cluster else "real" if options.real else "virtual"
+
+
+def _results(chosen: Sequence[Scenario], options: argparse.Namespace) -> Iterator[Result]:
+    names = [(each.name, each.mode, options.seed) for each in chosen]
+    if options.jobs == 1 or len(chosen) == 1 or _mode(options) != "virtual":
+        yield from map(_run, names)
+        return
+    with ProcessPoolExecutor(options.jobs) as pool:
+        yield from pool.map(_run, names)
+
+
+def _run(which: tuple[str, Mode, int]) -> Result:
+    """Run one, in this process or in one of a pool; what breaks it is part of the result."""
+    from cloudrc.faults.catalogue import find
+    from cloudrc.faults.document import Result
+    from cloudrc.faults.scenario import Outcome
+
+    name, mode, seed = which
+    scenario, began = find(name, mode), time.monotonic()
+    try:
+        return Result(scenario, scenario.run(seed), time.monotonic() - began)
+    except Exception as error:  # a broken scenario has failed, and the others still run
+        text = f"{type(error).__name__}: {error}"
+        return Result(scenario, Outcome(), time.monotonic() - began, text)
+
+
+def _say(result: Result, briefly: bool, say: Callable[[str], object]) -> None:
+    scenario, outcome = result.scenario, result.outcome
+    word = paint(result.word, COLOURS[result.word])
+    sha = f"  {outcome.sha256[:12]}" if outcome.sha256 else ""
+    say(f"{word:8} {scenario.id:4} {scenario.name:26} {result.seconds:6.1f} s{sha}")
+    for reason in filter(None, (result.error, outcome.skipped)):
+        say(f"           {reason}")
+    shown: Iterable[str] = (
+        f"         {'' if check.passed else 'x '}{check.show()}"
+        for check in outcome.checks
+        if not (briefly and check.passed)
+    )
+    for line in shown:
+        say(line)
+
+
+def _silent(text: str) -> None:
+    """Nothing but JSON on stdout."""

@@ -1,0 +1,186 @@
+"""Questions that many scenarios ask about a flight."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import dist, hypot, inf, nan
+
+from cloudrc.exposition.histogram import Histogram
+from cloudrc.exposition.live import Live
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.scenario import Outcome
+from cloudrc.messages import GuardState
+from cloudrc.record.columns import Recording
+from cloudrc.records import CommandApplied, GroundTruth, SessionOpened
+from cloudrc.report.document import Run
+from cloudrc.report.write import assess
+
+STANDS = 0.05
+"""Below this speed the robot counts as standing [m/s]."""
+WINDOW_NS = 1_000_000_000
+"""In which transitions are counted [ns]."""
+
+
+def changes_into(flight: Flight, state: GuardState, before: float = inf) -> list[float]:
+    """When the guard went into a state in a mission [s].
+
+    Args:
+        flight: Which.
+        state: Of the guard.
+        before: Only up to this instant [s].
+    """
+    return [
+        change.stamp_ns * 1e-9
+        for change in flight.changes
+        if change.state is state and change.cause != "mission ended" and _at(change) < before
+    ]
+
+
+def holds(flight: Flight) -> int:
+    """How often the robot held although its mission was under way."""
+    ends = [event.stamp_ns * 1e-9 for event in flight.events("done", "failed", "cancelled")]
+    return len(changes_into(flight, GuardState.HOLD, min(ends, default=inf)))
+
+
+def basis_age_at_hold(flight: Flight) -> float:
+    """Largest age [s] that the newest applied command's basis had when the guard went to HOLD."""
+    applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
+    ages_ns = []
+    for change in flight.changes:
+        if change.state is GuardState.HOLD and change.cause != "mission ended":
+            before = [r.basis_stamp_ns for r in applied if r.stamp_ns <= change.stamp_ns]
+            if before:
+                ages_ns.append(change.stamp_ns - max(before))
+    return max(ages_ns, default=nan) * 1e-9
+
+
+def stopping_time(flight: Flight, since: float) -> float:
+    """How long it takes until the robot is below 0.05 m/s and stays so for 0.2 s [s].
+
+    Args:
+        flight: Which.
+        since: From when on [s].
+    """
+    slow_since = nan
+    for record in flight.trajectory():
+        now = record.stamp_ns * 1e-9
+        if now < since:
+            continue
+        if hypot(*record.odometry.velocity) > STANDS:
+            slow_since = nan
+        elif slow_since != slow_since:
+            slow_since = now
+        elif now - slow_since >= 0.2:
+            return slow_since - since
+    return nan
+
+
+def drift(flight: Flight, start: float, end: float) -> float:
+    """Largest distance from where the robot was at first [m].
+
+    Args:
+        flight: Which.
+        start: First instant [s].
+        end: Last instant [s].
+    """
+    path = positions(flight, start, end)
+    return max((dist(path[0], place) for place in path), default=nan) if path else nan
+
+
+def positions(flight: Flight, start: float, end: float) -> list[tuple[float, float, float]]:
+    """Where the base was [m], every 10 ms.
+
+    Args:
+        flight: Which.
+        start: First instant [s].
+        end: Last instant [s].
+    """
+    return [r.odometry.position for r in flight.trajectory() if start <= r.stamp_ns * 1e-9 <= end]
+
+
+def resumed_after(flight: Flight, back: float) -> float:
+    """How long it took until the guard was in TRACK again [s].
+
+    Args:
+        flight: Which.
+        back: From when on [s].
+    """
+    times = [time for time in changes_into(flight, GuardState.TRACK) if time >= back - 1e-9]
+    return times[0] - back if times else nan
+
+
+def busiest_second(flight: Flight) -> int:
+    """Most changes of the guard between TRACK and HOLD within any second."""
+    flown = (GuardState.TRACK, GuardState.HOLD)
+    times_ns = [change.stamp_ns for change in flight.changes if change.state in flown]
+    return max((sum(t <= u < t + WINDOW_NS for u in times_ns) for t in times_ns), default=0)
+
+
+def number(flight: Flight, name: str) -> float:
+    """A number of the report [its unit is any unit]; NaN if it is not known."""
+    recording = Recording.from_records(flight.of_world, flight.of_cloud)
+    numbers = assess(recording, flight.experiment, Run("virtual", "virtual")).numbers
+    return numbers[name].value if name in numbers else nan
+
+
+def applied_in_order(flight: Flight) -> bool:
+    """Whether the commands applied never step back in (epoch, counter), nor come twice."""
+    order = [(r.epoch, r.counter) for r in flight.of_world if isinstance(r, CommandApplied)]
+    return all(first < second for first, second in pairwise(order))
+
+
+def waypoints_in_order(flight: Flight) -> bool:
+    """Whether each waypoint was reached exactly once, in its order."""
+    reached = [event.waypoint for event in flight.events("reached")]
+    return reached == list(range(len(reached)))
+
+
+def same_path(one: Flight, other: Flight) -> bool:
+    """Whether two robots flew the very same way, bit by bit."""
+    return _path(one) == _path(other)
+
+
+def epochs(flight: Flight) -> list[int]:
+    """Every epoch that world opened."""
+    records = flight.of_world
+    return [r.epoch for r in records if isinstance(r, SessionOpened) and r.end == "world"]
+
+
+def safe(outcome: Outcome, flight: Flight) -> None:
+    """Check the invariants, and take the run's hash over."""
+    counts = flight.watch.counts
+    breaches = counts["fence"] + counts["cap"] + counts["stop"]
+    outcome.same("collisions", counts["collision"], 0)
+    outcome.same("breaches of the fence, a cap or the stop rule", breaches, 0)
+    outcome.same("ticks flown on stale commands", counts["stale"], 0)
+    outcome.sha256 = flight.sha256()
+
+
+def done(outcome: Outcome, flight: Flight) -> None:
+    """Check that the mission was flown to its end, every waypoint once and in order."""
+    outcome.true("mission done", flight.mission.state == "done")
+    outcome.true("each waypoint reached once, in order", waypoints_in_order(flight))
+
+
+def _path(flight: Flight) -> list[GroundTruth]:
+    return flight.trajectory()
+
+
+def _at(change: object) -> float:
+    return change.stamp_ns * 1e-9  # type: ignore[attr-defined, no-any-return]
+
+
+def metric(flight: Flight, end: str, name: str, *labels: str) -> float:
+    """What a process of an end would show of a metric at the end of the flight [any unit].
+
+    Args:
+        flight: Which.
+        end: "world" or "cloud".
+        name: Of the metric, without its prefix.
+        labels: Values of its labels.
+    """
+    live = Live(end)
+    live.see(flight.of_world if end == "world" else flight.of_cloud)
+    reading = live.read().get(f"cloudrc_{name}", {})
+    assert not isinstance(reading, Histogram), "a histogram has no one value"
+    return float(reading.get(labels, nan))

@@ -1,0 +1,48 @@
+"""All scenarios: the families are found by their files' names, their faults sorted by number."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+
+import cloudrc.faults
+from cloudrc.errors import BadInputError
+from cloudrc.faults.scenario import Mode, Scenario
+
+PREFIX = "family_"
+
+
+def scenarios(mode: Mode | None = None) -> list[Scenario]:
+    """List the faults, sorted.
+
+    Args:
+        mode: Only those that run there; None for all.
+    """
+    found: list[Scenario] = []
+    for module in pkgutil.iter_modules(cloudrc.faults.__path__):
+        if module.name.startswith(PREFIX):
+            family = importlib.import_module(f"cloudrc.faults.{module.name}")
+            found += family.SCENARIOS
+    chosen = [each for each in found if mode is None or each.mode == mode]
+    return sorted(chosen, key=lambda each: (each.number, each.mode))
+
+
+def find(name: str, mode: Mode) -> Scenario:
+    """Give a fault by its number (F13) or name (cloud-killed).
+
+    Raises:
+        BadInputError: If there is none in this mode; names those that there are.
+    """
+    there = scenarios(mode)
+    for each in there:
+        if name.lower() in (each.id.lower(), each.name):
+            return each
+    for other in scenarios():
+        if name.lower() in (other.id.lower(), other.name):
+            flag = "" if other.mode == "virtual" else f" --{other.mode}"
+            raise BadInputError(
+                f"{other.id} {other.name} is not in mode {mode}; try:"
+                f" cloudrc faults run {other.name}{flag}"
+            )
+    names = ", ".join(f"{each.id} {each.name}" for each in there) or "none"
+    raise BadInputError(f"no fault '{name}' in mode {mode}; there are: {names}")

@@ -1,0 +1,159 @@
+"""Faults of the link's timing: disorder, copies, a step of the delay, asymmetry, jitter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import isnan
+
+from cloudrc.faults import asks, meters
+from cloudrc.faults.family_link import HOUR_NS, instant
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.mortal import Clock
+from cloudrc.faults.options import Shape
+from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.link.profile import Change
+from cloudrc.records import Arrival, Control
+
+
+def _disorder(seed: int) -> Outcome:
+    outcome = Outcome()
+    shape: Shape = lambda profile: replace(  # noqa: E731
+        profile, delay=0.05, jitter=0.0, reorder=0.25
+    )
+    flight = Flight(seed=seed, uplink=shape, downlink=shape).fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.true("commands applied in order, none twice", asks.applied_in_order(flight))
+    outcome.least(
+        "metric datagrams_reordered_total downlink",
+        asks.metric(flight, "world", "datagrams_reordered_total", "downlink"),
+        100,
+    )
+    meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "late", since=0.0)
+    outcome.least("late commands dropped", flight.count("late"), 100)
+    return outcome
+
+
+def _copies(seed: int) -> Outcome:
+    outcome = Outcome()
+    steady: Shape = lambda profile: replace(profile, jitter=0.0)  # noqa: E731
+    twice: Shape = lambda profile: replace(profile, jitter=0.0, duplicate=1.0)  # noqa: E731
+    clean = Flight(seed=seed, uplink=steady, downlink=steady).fly_mission()
+    flight = Flight(seed=seed, uplink=twice, downlink=twice).fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.true("the same path, bit by bit", asks.same_path(clean, flight))
+    outcome.least(
+        "metric datagrams_total repeated",
+        asks.metric(flight, "world", "datagrams_total", "downlink", "repeated"),
+        1000,
+    )
+    outcome.least("copies dropped", flight.count("repeated"), 1000)
+    return outcome
+
+
+def _delay_step(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed)
+    shape: Shape = lambda profile: replace(  # noqa: E731
+        profile, delay=0.01, jitter=0.0, changes=(Change(at, delay=0.1),)
+    )
+    flight = Flight("cloud.estimator=split", seed=seed, uplink=shape, downlink=shape).fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    late = [
+        abs(r.horizon - r.loop_delay) / r.loop_delay
+        for r in flight.of_cloud
+        if isinstance(r, Control) and at + 0.5 <= r.stamp_ns * 1e-9 < at + 2.0
+    ]
+    outcome.most("delay estimate off after 0.5 s, share", max(late, default=float("nan")), 0.2)
+    outcome.same("HOLDs", asks.holds(flight), 0)
+    meters.moves(outcome, flight, "cloud", "delay_estimate_seconds", since=at)
+    shown = meters.reading(
+        "cloud", meters.seen_by(flight, "cloud", at + meters.SOON), "delay_estimate_seconds"
+    )
+    outcome.least("metric delay_estimate_seconds", shown, 0.15, "s")
+    return outcome
+
+
+def _asymmetry(seed: int) -> Outcome:
+    outcome = Outcome()
+    flight = Flight(
+        "link.profile=ideal",
+        "link.uplink.delay_ms=10",
+        "link.downlink.delay_ms=190",
+        seed=seed,
+        cloud_clock=Clock(offset_ns=HOUR_NS),
+    ).fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.same("HOLDs", asks.holds(flight), 0)
+    rtt = meters.reading("cloud", flight.of_cloud, "rtt_seconds")
+    outcome.most("metric rtt_seconds, its mean is off 0.2 s by", abs(rtt - 0.2), 0.01, "s")
+    arrivals = [r for r in (*flight.of_world, *flight.of_cloud) if isinstance(r, Arrival)]
+    outcome.true("no one-way delay is claimed", all(isnan(r.delay) for r in arrivals))
+    return outcome
+
+
+def _jitter(seed: int) -> Outcome:
+    outcome = Outcome()
+    flight = Flight("link.profile=paper-p3", seed=seed).fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.same("jitter 40 ms: HOLDs", asks.holds(flight), 0)
+    wild: Shape = lambda profile: replace(profile, delay=0.15, jitter=0.15)  # noqa: E731
+    flight = Flight(seed=seed, uplink=wild, downlink=wild).fly(60.0)
+    asks.safe(outcome, flight)
+    meters.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=0.0)
+    outcome.most(
+        "jitter 150 ms: changes of the guard in any second", asks.busiest_second(flight), 2
+    )
+    return outcome
+
+
+SCENARIOS = (
+    Scenario(
+        6,
+        "reordering",
+        "25 % of the datagrams overtake the others by 50 ms",
+        "late commands are dropped, never applied",
+        "the late ones",
+        "cloudrc_datagrams_total{outcome=late}, cloudrc_datagrams_reordered_total",
+        _disorder,
+    ),
+    Scenario(
+        7,
+        "duplication",
+        "every datagram arrives twice",
+        "the same path, bit by bit",
+        "none",
+        "cloudrc_datagrams_total{outcome=repeated}",
+        _copies,
+    ),
+    Scenario(
+        10,
+        "delay-step",
+        "the round trip steps from 20 to 200 ms",
+        "estimator `split` within 20 % in 0.5 s; no HOLD, caps hold",
+        "none",
+        "cloudrc_delay_estimate_seconds",
+        _delay_step,
+    ),
+    Scenario(
+        11,
+        "asymmetric-delay",
+        "10 ms up, 190 ms down, two clocks an hour apart",
+        "ages use the round trip: flown in TRACK; no one-way delay is claimed",
+        "none",
+        "cloudrc_rtt_seconds; one-way delays are absent",
+        _asymmetry,
+    ),
+    Scenario(
+        12,
+        "jitter",
+        "jitter of 40 ms, then of 150 ms about 150 ms",
+        "first TRACK, then HOLD and TRACK without chatter: <= 2 changes in any second",
+        "none",
+        "cloudrc_guard_transitions_total",
+        _jitter,
+    ),
+)

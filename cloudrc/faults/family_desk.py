@@ -1,0 +1,146 @@
+"""Faults around the operator: floods, impossible and rival missions, slow readers, shutdown."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import suppress
+from math import nan
+from pathlib import Path
+from typing import Any
+
+from cloudrc import assembly
+from cloudrc.cloud.teleop.api_bridge import Bridge
+from cloudrc.cloud.teleop.api_gate import Gate, Receive, Scope, Send
+from cloudrc.cloud.teleop.service_book import LOGGED, UnavailableError
+from cloudrc.cloud.teleop.service_mission import Order
+from cloudrc.faults import asks, meters
+from cloudrc.faults.family_link import instant
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.messages import GuardState
+
+PER_PERIOD = 10
+"""Requests in every 10 ms: 1,000 in a second."""
+
+
+def _flood(seed: int) -> Outcome:
+    """Through the API's bridge, as its threads do; the loop of cloud is another process."""
+    outcome, bridge, answers = Outcome(), Bridge(), [0, 0]
+    clean, flight = Flight(seed=seed).fly_mission(), Flight(seed=seed)
+    service = flight.desk.service
+    assert service is not None
+    bridge.open(service)
+
+    def ask(now_ns: int) -> None:
+        for _ in range(PER_PERIOD * 10):
+            try:
+                bridge.submit(lambda service, now_ns: service.state(now_ns))
+                answers[0] += 1
+            except UnavailableError:
+                answers[1] += 1
+        for call in bridge.take():
+            call(now_ns)
+
+    for n in range(10, 300):
+        flight.cloud.at(n * 0.1, ask)
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    outcome.true("the same path, bit by bit", asks.same_path(clean, flight))
+    outcome.least("requests answered", answers[0], 1000)
+    outcome.least("requests refused as too many", answers[1], 1000)
+    refused = _at_the_gate(1000)
+    meters.counts(outcome, "teleop", "api_busy", refused, "api_rejected_total", "busy")
+    return outcome
+
+
+def _at_the_gate(count: int) -> int:
+    """Have so many requests come at once to the API's gate; say how many it calls too many."""
+
+    async def application(scope: Scope, receive: Receive, send: Send) -> None:
+        return
+
+    async def nothing(message: Any = None) -> Any:
+        return {}
+
+    gate = Gate(application, tokens=None)
+    for _ in range(count):
+        asking = gate({"method": "GET", "path": "/v1/state", "headers": []}, nothing, nothing)
+        with suppress(StopIteration):  # nothing in it waits for anybody
+            asking.send(None)
+    return gate.counts["busy"]
+
+
+def _slow_reader(seed: int) -> Outcome:
+    outcome = Outcome()
+    flight = Flight(seed=seed).fly_mission()
+    service = flight.desk.service
+    assert service is not None
+    newest = service.book.events_after(0)[-1]["id"]
+    plan = assembly.build_plan(flight.experiment)
+    for n in range(LOGGED):
+        service.create(Order(plan, f"{n}"), n)
+        service.cancel(service.book.open()[0].id, n)
+    waiting = service.book.events_after(newest)
+    outcome.most("events kept for a reader that does not read", len(waiting), LOGGED)
+    outcome.true("the newest are kept", waiting[-1]["id"] > newest + LOGGED)
+    outcome.true("those kept have no gap", _gapless([event["id"] for event in waiting]))
+    asks.safe(outcome, flight)
+    return outcome
+
+
+def _gapless(numbers: list[int]) -> bool:
+    return numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def _shutdown(seed: int) -> Outcome:
+    """SIGTERM of the cloud pod: teleop holds the mission, writes it down; a new pod goes on."""
+    outcome, at = Outcome(), instant(seed, 6.0, 20.0)
+    with tempfile.TemporaryDirectory() as folder:
+        flight = Flight(seed=seed, journal=Path(folder) / "missions.journal")
+
+        def ask(now_ns: int) -> None:
+            assert flight.desk.service is not None
+            flight.desk.service.pause(now_ns)
+
+        flight.cloud.at(at, ask)
+        flight.cloud.at(at + 1.0, lambda now_ns: flight.kill_cloud_pod(now_ns, 3.0))
+        flight.fly_mission()
+        asks.safe(outcome, flight)
+        into = [c.stamp_ns * 1e-9 for c in flight.changes if c.state is GuardState.HOLD]
+        outcome.most("HOLD after", min((t - at for t in into if t > at), default=nan), 2.0, "s")
+        meters.moves(outcome, flight, "teleop", "mission_state", since=at)
+        outcome.true("the new pod finishes the mission", flight.mission.state == "done")
+        outcome.true("each waypoint reached once, in order", asks.waypoints_in_order(flight))
+        flight.desk.kill()
+    return outcome
+
+
+SCENARIOS = (
+    Scenario(
+        26,
+        "api-flood",
+        "1,000 requests a second at the API's bridge",
+        "none: the same path, bit by bit",
+        "requests beyond what is taken: refused as too many",
+        "cloudrc_api_rejected_total",
+        _flood,
+    ),
+    Scenario(
+        32,
+        "slow-reader",
+        "a reader of the event stream does not read for 5,000 events",
+        "the oldest are dropped for that reader alone; memory stays bounded",
+        "its events",
+        "a gap in the numbers of its events; no metric",
+        _slow_reader,
+    ),
+    Scenario(
+        33,
+        "shutdown",
+        "SIGTERM of the cloud pod in a mission, a new one 3 s later",
+        "HOLD; the journal is written; the new pod goes on",
+        "none",
+        "paused by shutdown, cloudrc_mission_state",
+        _shutdown,
+    ),
+)

@@ -1,0 +1,260 @@
+"""Faults of the two ends: killed, evicted, paused, throttled, restarted, overloaded."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import nan
+
+import numpy as np
+
+from cloudrc.faults import asks, meters
+from cloudrc.faults.family_link import AGE_MAX, instant
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.options import blackouts
+from cloudrc.faults.scenario import Check, Outcome, Scenario
+from cloudrc.messages import GuardState
+from cloudrc.records import CommandApplied, GroundTruth
+
+
+def _cloud_killed(seed: int) -> Outcome:
+    outcome, at, down = Outcome(), instant(seed), 0.8
+    flight = Flight(seed=seed)
+    flight.cloud.at(at, lambda now_ns: flight.kill_cloud(now_ns, down))
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.most("HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
+    commands = [r.stamp_ns * 1e-9 - at for r in flight.of_world if isinstance(r, CommandApplied)]
+    again = min((t for t in commands if t > down), default=nan)
+    outcome.most("the new process commands after", again, 2.0, "s")
+    outcome.most("TRACK again after its start", asks.resumed_after(flight, at + down), 1.0, "s")
+    opened = asks.epochs(flight)
+    outcome.true("a new epoch, higher than all before", opened == sorted(set(opened)))
+    meters.moves(outcome, flight, "world", "session_epoch", since=at)
+    outcome.least("epochs opened", len(opened), 3)
+    return outcome
+
+
+def _cloud_evicted(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed)
+    flight = Flight(seed=seed)
+    flight.cloud.at(at, lambda now_ns: flight.kill_cloud_pod(now_ns, 5.0))
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.most("away for 5 s: HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
+    outcome.least("the journal tells: resumed", len(flight.events("resumed")), 1)
+    meters.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=at)
+    outcome.checks += _evicted_for_long(seed)
+    return outcome
+
+
+def _evicted_for_long(seed: int) -> list[Check]:
+    outcome, at = Outcome(), instant(seed, 1.6, 2.6)
+    flight = Flight("criteria.time_limit_s=400", seed=seed, honest=False)
+    flight.cloud.at(at, lambda now_ns: flight.kill_cloud_pod(now_ns, 90.0))
+    flight.fly(at + 100.0)
+    asks.safe(outcome, flight)
+    held = next(iter(asks.changes_into(flight, GuardState.HOLD)), nan)
+    landed = next(iter(asks.changes_into(flight, GuardState.LAND)), nan)
+    outcome.most("away for 90 s: LAND after HOLD", landed - held, 60.01, "s")
+    again = [time for time in asks.changes_into(flight, GuardState.TRACK) if time > landed]
+    outcome.same("flown again without the operator", len(again), 0)
+    return outcome.checks
+
+
+def _cloud_paused(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed)
+    flight = Flight(seed=seed)
+    flight.cloud.at(at, lambda now_ns: flight.cloud.freeze(now_ns, 5.0))
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.most("HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
+    applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
+    old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > AGE_MAX * 1e9]
+    outcome.same("commands applied that were too old", len(old), 0)
+    meters.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=at)
+    # Who stands still shows nothing: it has 5 s from when it goes on.
+    meters.moves(outcome, flight, "cloud", "loop_missed_periods_total", since=at + 4.99)
+    missed = asks.metric(flight, "cloud", "loop_missed_periods_total")
+    outcome.least("metric loop_missed_periods_total at the end", missed, 490)
+    return outcome
+
+
+def _throttled(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed, 4.0, 8.0)
+    for quota in (0.5, 0.3, 0.1):
+        flight = Flight("link.profile=paper-p1", seed=seed)
+        flight.cloud.throttle(at, 10.0, quota)
+        flight.fly_mission()
+        asks.safe(outcome, flight)
+        asks.done(outcome, flight)
+        what = f"quota of {quota:.0%}"
+        outcome.same(f"{what}: HOLDs", asks.holds(flight), 0)
+        meters.moves(outcome, flight, "cloud", "loop_missed_periods_total", since=at)
+        missed = flight.count("missed_periods", "cloud")
+        outcome.least(f"{what}: missed periods counted", missed, 100)
+    return outcome
+
+
+def _world_restarted(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed)
+    flight = Flight(seed=seed)
+    flight.world.at(at, lambda now_ns: flight.kill_world(now_ns, 2.0))
+    flight.fly(at + 12.0)
+    asks.safe(outcome, flight)
+    after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
+    outcome.same("changes of the guard after it", len(after), 0)
+    path = [r for r in flight.trajectory() if r.stamp_ns * 1e-9 > at]
+    moved = max((abs(r.odometry.velocity[2]) for r in path), default=nan)
+    outcome.most("speed on the ground", moved, 0.01, "m/s")
+    verdict = str(flight.mission.verdict)
+    outcome.true("mission failed", flight.mission.state == "failed")
+    outcome.true("with the code world_restarted", "world_restarted" in verdict)
+    opened = asks.epochs(flight)
+    outcome.true("a new epoch, higher than all before", opened == sorted(set(opened)))
+    meters.moves(outcome, flight, "world", "session_epoch", since=at + 2.0)
+    meters.moves(outcome, flight, "cloud", "missions_total", "world_restarted", since=at + 2.0)
+    return outcome
+
+
+def _world_overloaded(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed, 4.0, 8.0)
+    flight = Flight("criteria.time_limit_s=120", seed=seed)
+    for n in range(100):
+        flight.world.at(at + 0.1 * n, lambda now_ns: flight.world.freeze(now_ns, 0.09))
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    outcome.true("no tick is skipped", _gapless(flight.trajectory()))
+    slip = flight.world.inner.slip_ns * 1e-9  # type: ignore[union-attr]
+    outcome.least("simulated time slows: slip", slip, 3.0, "s")
+    meters.moves(outcome, flight, "world", "world_slip_seconds_total", since=at)
+    seen = meters.seen_by(flight, "world", at + meters.SOON)
+    factor = meters.reading("world", seen, "real_time_factor")
+    outcome.most("metric real_time_factor", factor, 0.95)
+    outcome.true("mission done", flight.mission.state == "done")
+    return outcome
+
+
+def _world_paused(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed)
+    flight = Flight("link.profile=paper-p1", seed=seed)
+    flight.world.at(at, lambda now_ns: flight.world.freeze(now_ns, 0.2))
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.true("no tick is skipped", _gapless(flight.trajectory()))
+    outcome.true("commands applied in order, none twice", asks.applied_in_order(flight))
+    slip = flight.world.inner.slip_ns * 1e-9  # type: ignore[union-attr]
+    outcome.most("slip", slip, 0.2, "s")
+    outcome.least("slip told", slip, 0.1, "s")
+    meters.moves(outcome, flight, "world", "world_slip_seconds_total", since=at)
+    meters.moves(outcome, flight, "world", "loop_lateness_seconds", since=at)
+    return outcome
+
+
+def _gapless(path: list[GroundTruth]) -> bool:
+    stamps = [record.stamp_ns for record in path]
+    return all(b - a == 10_000_000 for a, b in pairwise(stamps))
+
+
+def _swizzle(seed: int) -> Outcome:
+    """Freeze uplink, downlink, cloud and teleop one by one, let them go in random order."""
+    outcome = Outcome()
+    rng = np.random.Generator(np.random.PCG64([seed, 40]))
+    starts = 8.0 + np.cumsum(rng.uniform(0.1, 1.0, 4))
+    ends = rng.permutation(starts[-1] + np.cumsum(rng.uniform(0.1, 1.5, 4)))
+    spans = [(float(a), float(b - a)) for a, b in zip(starts, ends, strict=True)]
+    flight = Flight(
+        "criteria.time_limit_s=120",
+        seed=seed,
+        uplink=blackouts(spans[0]),
+        downlink=blackouts(spans[1]),
+    )
+    flight.cloud.at(spans[2][0], lambda now_ns: flight.cloud.freeze(now_ns, spans[2][1]))
+    flight.cloud.at(spans[3][0], lambda _: flight.desk.kill())
+    flight.cloud.at(spans[3][0] + spans[3][1], lambda _: flight.desk.start())
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.most("HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
+    since = float(starts[0])
+    meters.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=since)
+    return outcome
+
+
+SCENARIOS = (
+    Scenario(
+        13,
+        "cloud-killed",
+        "SIGKILL of the cloud process, a new one 0.8 s later",
+        "HOLD by 252 ms; the new process commands in <= 2 s; the same waypoint goes on",
+        "cloud's memory only",
+        "a new session, cloudrc_session_epoch",
+        _cloud_killed,
+    ),
+    Scenario(
+        14,
+        "cloud-evicted",
+        "the cloud pod, teleop included, is away for 5 s and for 90 s",
+        "HOLD, resumes from the journal; after 60 s LAND, latched",
+        "as F3",
+        "mission resumed, or why it failed; cloudrc_guard_transitions_total",
+        _cloud_evicted,
+    ),
+    Scenario(
+        15,
+        "cloud-paused",
+        "SIGSTOP of the cloud process for 5 s",
+        "HOLD; of what it computed before nothing is applied",
+        "none",
+        "cloudrc_guard_transitions_total, then cloudrc_loop_missed_periods_total",
+        _cloud_paused,
+    ),
+    Scenario(
+        16,
+        "cloud-throttled",
+        "CPU quota of 50, 30 and 10 % of a 100 ms period for 10 s",
+        "stalls of up to 90 ms ride inside the age limit",
+        "none",
+        "cloudrc_loop_missed_periods_total",
+        _throttled,
+    ),
+    Scenario(
+        17,
+        "world-restarted",
+        "the world pod restarts within 2 s",
+        "back on the ground, never airborne without power; a new epoch; nothing resumes alone",
+        "the flight in progress",
+        "mission failed: world_restarted; cloudrc_missions_total, cloudrc_session_epoch",
+        _world_restarted,
+    ),
+    Scenario(
+        18,
+        "world-overloaded",
+        "the world gets less CPU than real time needs, for 10 s",
+        "simulated time slows, no guard tick is skipped",
+        "none",
+        "cloudrc_world_slip_seconds_total, cloudrc_real_time_factor",
+        _world_overloaded,
+    ),
+    Scenario(
+        39,
+        "world-paused",
+        "the world process stands still for 200 ms",
+        "it catches up in simulated time, no command is applied twice",
+        "none",
+        "cloudrc_world_slip_seconds_total, cloudrc_loop_lateness_seconds",
+        _world_paused,
+    ),
+    Scenario(
+        40,
+        "swizzle-clog",
+        "uplink, downlink, cloud and teleop freeze one by one and return in random order",
+        "always a safe state; the mission goes on",
+        "as above",
+        "each cause in the guard's changes, cloudrc_guard_transitions_total",
+        _swizzle,
+    ),
+)

@@ -1,0 +1,294 @@
+"""Faults by intent: damaged, forged, replayed, malformed datagrams, floods, a lying cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import islice
+from math import inf, nan
+
+import numpy as np
+
+from cloudrc.cloud.endpoint import CloudEndpoint
+from cloudrc.faults import asks, meters
+from cloudrc.faults.family_link import AGE_MAX, instant
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.liar import Liar, Lie
+from cloudrc.faults.mortal import Mortal, Tamper
+from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.messages import Command, GuardState
+from cloudrc.records import Control
+from cloudrc.tunnel import codec
+
+Generator = np.random.Generator
+REFUSED = ("tag", "malformed", "version", "direction", "old_epoch", "repeated")
+"""What a hostile datagram is counted under."""
+GREETED = ("hello", "unanswered")
+"""What a captured greeting is counted under: a challenge is all it gets, if anything."""
+SETTLED = 2.0
+"""When the session of a new flight stands [s]; a greeting that is answered could hasten it."""
+FLOOD = 100
+"""Datagrams of garbage per honest one: 10,000 in a second."""
+
+
+def generator(seed: int, use: int) -> Generator:
+    """Chance of one use."""
+    return np.random.Generator(np.random.PCG64([seed, use]))
+
+
+def flipped(data: bytes, rng: Generator, flips: int) -> bytes:
+    """A datagram with some bits turned over."""
+    bits = bytearray(data)
+    for place in rng.choice(8 * len(data), min(flips, 8 * len(data)), replace=False).tolist():
+        bits[place >> 3] ^= 1 << (place & 7)
+    return bytes(bits)
+
+
+def _corruption(seed: int) -> Outcome:
+    """One bit in a hundred datagrams, and for a second one bit in a hundred of all."""
+    outcome, at, rng = Outcome(), instant(seed), generator(seed, 8)
+    flight = Flight(seed=seed)
+    toll = Toll()
+
+    def tamper(mortal: Mortal) -> Tamper:
+        def tampered(data: bytes, now_ns: int) -> list[bytes]:
+            storm = at <= now_ns * 1e-9 < at + 1.0
+            flips = int(rng.binomial(8 * len(data), 0.01)) if storm else int(rng.random() < 0.01)
+            if not flips:
+                return [data]
+            toll.give(mortal, flipped(data, rng, flips), now_ns)
+            return []
+
+        return tampered
+
+    flight.world.tamper, flight.cloud.tamper = tamper(flight.world), tamper(flight.cloud)
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.most("HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
+    meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "tag", since=at)
+    outcome.least("corrupted datagrams", toll.given, 100)
+    outcome.same("of them taken", toll.taken, 0)
+    return outcome
+
+
+class Toll:
+    """Counts hostile datagrams, and those of them that were not refused for what they are."""
+
+    def __init__(self) -> None:
+        self.given = self.taken = 0
+
+    def give(self, mortal: Mortal, data: bytes, now_ns: int) -> None:
+        """Hand one to an end."""
+        before = _refused(mortal)
+        mortal.receive_now(data, now_ns)
+        self.given += 1
+        self.taken += _refused(mortal) != before + 1
+
+
+def _refused(mortal: Mortal) -> int:
+    counts = mortal.inner._counts  # type: ignore[union-attr]
+    return sum(counts.get(name, 0) for name in (*REFUSED, *GREETED))
+
+
+def _unharmed(
+    seed: int,
+    hostile: Callable[[Flight, bytes, Generator], list[bytes]],
+    *refusals: str,
+    since: float = 0.0,
+) -> Outcome:
+    """Fly with hostile datagrams beside the honest ones: nothing may be any different."""
+    outcome, rng, toll = Outcome(), generator(seed, 20), Toll()
+    clean, flight = Flight(seed=seed).fly_mission(), Flight(seed=seed)
+
+    def tamper(data: bytes, now_ns: int) -> list[bytes]:
+        for strange in hostile(flight, data, rng):
+            toll.give(flight.world, strange, now_ns)
+        return [data]
+
+    flight.world.tamper = tamper
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.true("the same path, bit by bit", asks.same_path(clean, flight))
+    for refusal in refusals:
+        labels = ("downlink", refusal)
+        meters.moves(outcome, flight, "world", "datagrams_total", *labels, since=since)
+    seen = [asks.metric(flight, "world", "datagrams_total", "downlink", each) for each in REFUSED]
+    outcome.least("metric datagrams_total, refused", sum(n for n in seen if n == n), 900)
+    outcome.least("hostile datagrams", toll.given, 1000)
+    outcome.same("of them taken", toll.taken, 0)
+    outcome.true("they opened no session", asks.epochs(clean) == asks.epochs(flight))
+    return outcome
+
+
+def _flood(seed: int) -> Outcome:
+    def garbage(flight: Flight, data: bytes, rng: Generator) -> list[bytes]:
+        size = len(data)
+        block = rng.bytes(FLOOD * size)
+        pieces = [block[at : at + size] for at in range(0, len(block), size)]
+        head = data[: codec.HEADER_SIZE]
+        return [
+            # Noise; a right head before noise that is too short; one before as much as it takes.
+            (piece, head + piece[:32], head + piece[len(head) :])[n % 3]
+            for n, piece in enumerate(pieces)
+        ]
+
+    return _unharmed(seed, garbage, "malformed", "tag")
+
+
+def _old_session(seed: int) -> Outcome:
+    """Record a whole flight; play it to a world and a cloud that have both been started anew."""
+    captured: list[bytes] = []
+    first = Flight(seed=seed, life=7)
+
+    def record(data: bytes, now_ns: int) -> list[bytes]:
+        captured.append(data)
+        return [data]
+
+    first.world.tamper = first.cloud.tamper = record
+    first.fly_mission()
+    tape = iter(captured)
+
+    def replayed(flight: Flight, data: bytes, rng: Generator) -> list[bytes]:
+        return [] if flight.now < SETTLED else list(islice(tape, 6))
+
+    return _unharmed(seed, replayed, "tag", since=SETTLED)
+
+
+def _forgery(seed: int) -> Outcome:
+    """Every honest datagram is preceded by copies of it with one bit, or its counter, changed."""
+
+    def forged(flight: Flight, data: bytes, rng: Generator) -> list[bytes]:
+        ahead = data[:8] + (2**63).to_bytes(8, "little") + data[16:]
+        return [flipped(data, rng, 1), flipped(data, rng, 2), ahead]
+
+    return _unharmed(seed, forged, "tag")
+
+
+def _malformed(seed: int) -> Outcome:
+    def strange(flight: Flight, data: bytes, rng: Generator) -> list[bytes]:
+        longer = codec.DATAGRAM_MAX + 1
+        cut = int(rng.integers(0, len(data)))
+        other = bytes([data[0] + 1]) + data[1:]
+        return [b"", data[:cut], data + b"\0", bytes(longer), data[:1] * 2048, other]
+
+    return _unharmed(seed, strange, "malformed", "version")
+
+
+LIES: dict[str, Lie] = {
+    "NaN": lambda command, control: command._replace(velocity=(nan, 0.0, 0.0)),
+    "infinite": lambda command, control: command._replace(velocity=(0.0, inf, 0.0)),
+    "yaw NaN": lambda command, control: command._replace(yaw_rate=nan),
+}
+CLAMPED: dict[str, Lie] = {
+    "1e308": lambda command, control: command._replace(velocity=(1e308, -1e308, 1e308)),
+    "denormal": lambda command, control: command._replace(velocity=(5e-324, 0.0, 0.0)),
+    "100 m/s": lambda command, control: command._replace(velocity=(100.0, 0.0, 0.0)),
+    "yaw 1e9": lambda command, control: command._replace(yaw_rate=1e9),
+}
+
+
+LIMITED = {"1e308": "speed", "100 m/s": "speed", "yaw 1e9": "yaw_rate"}
+"""Which limit of the guard each of them meets."""
+
+
+def _between(first: float, last: float, lie: Lie) -> Lie:
+    def lying(command: Command, control: Control) -> Command:
+        now = control.stamp_ns * 1e-9
+        return lie(command, control) if first <= now < last else command
+
+    return lying
+
+
+def _liar(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed)
+    for name, lie in LIES.items():
+        flight = _lied_to(seed, _between(at, at + 1.0, lie))
+        asks.safe(outcome, flight)
+        lands = asks.changes_into(flight, GuardState.LAND)
+        labels = ("downlink", "not_finite")
+        meters.moves(outcome, flight, "world", "datagrams_total", *labels, since=at)
+        outcome.most(f"{name}: LAND after", (lands or [nan])[0] - at, 1.0, "s")
+        again = [t for t in asks.changes_into(flight, GuardState.TRACK) if t > (lands or [0.0])[0]]
+        outcome.same(f"{name}: flown again without the operator", len(again), 0)
+        causes = " ".join(c.cause for c in flight.changes if c.state is GuardState.LAND)
+        outcome.true(f"{name}: the cause is told", "impossible commands" in causes)
+    for name, lie in CLAMPED.items():
+        flight = _lied_to(seed, _between(at, at + 1.0, lie))
+        asks.safe(outcome, flight)
+        refused = sum("impossible" in change.cause for change in flight.changes)
+        outcome.same(f"{name}: taken for impossible", refused, 0)
+        if limit := LIMITED.get(name):
+            outcome.least(f"{name}: clamped", flight.count(f"limited_{limit}"), 20)
+            meters.moves(outcome, flight, "world", "guard_limited_total", limit, since=at)
+    one = _lied_to(seed, _between(at, at + 0.005, LIES["NaN"]))
+    asks.safe(outcome, one)
+    outcome.same("a single NaN: LAND", len(asks.changes_into(one, GuardState.LAND)), 0)
+    asks.done(outcome, one)
+    return outcome
+
+
+def _lied_to(seed: int, lie: Lie) -> Flight:
+    def tempt(cloud: CloudEndpoint) -> None:
+        cloud._loop = Liar(cloud._loop, lie)  # type: ignore[assignment]
+
+    return Flight(seed=seed, honest=False, tempt=tempt).fly(40.0)
+
+
+SCENARIOS = (
+    Scenario(
+        8,
+        "corruption",
+        "1 % of the datagrams lose a bit; for 1 s, 1 % of all bits turn over",
+        "corrupted datagrams are dropped",
+        "those",
+        "cloudrc_datagrams_total{outcome=tag}",
+        _corruption,
+    ),
+    Scenario(
+        20,
+        "garbage-flood",
+        "10,000 datagrams of garbage per second at the world's port",
+        "no effect: the same path, bit by bit",
+        "none",
+        "cloudrc_datagrams_total{outcome=malformed}, {outcome=tag}",
+        _flood,
+    ),
+    Scenario(
+        21,
+        "old-session",
+        "a captured flight is played to both ends after their restart",
+        "no effect: the same path, bit by bit",
+        "none",
+        "cloudrc_datagrams_total{outcome=tag}",
+        _old_session,
+    ),
+    Scenario(
+        22,
+        "forged-command",
+        "copies with bits turned over, and with a counter far ahead",
+        "no effect: the same path, bit by bit",
+        "none",
+        "cloudrc_datagrams_total{outcome=tag}",
+        _forgery,
+    ),
+    Scenario(
+        23,
+        "invalid-values",
+        "NaN, infinite, huge and over-limit values with a valid seal",
+        "refused or clamped; 5 refused in 1 s: LAND, latched",
+        "those commands",
+        "guard LAND with its cause, cloudrc_datagrams_total{outcome=not_finite}, "
+        "cloudrc_guard_limited_total",
+        _liar,
+    ),
+    Scenario(
+        24,
+        "malformed",
+        "empty, truncated, oversized datagrams and those of another version",
+        "dropped before any cryptography: the same path, bit by bit",
+        "those",
+        "cloudrc_datagrams_total{outcome=malformed}, {outcome=version}",
+        _malformed,
+    ),
+)

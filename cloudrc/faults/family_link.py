@@ -1,0 +1,186 @@
+"""Faults of the link that lose datagrams: silence, short and long, loss, loss in bursts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cloudrc.faults import asks, meters
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.options import Shape, blackouts
+from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.link.profile import GilbertElliott
+from cloudrc.messages import GuardState
+
+HOUR_NS = 3_600_000_000_000
+AGE_MAX = 0.252 + 1e-9
+"""`command_age_max` and one tick, rounding allowed [s]."""
+
+
+def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
+    """Choose when a fault begins [s]: anywhere in the flight through the pipes.
+
+    Args:
+        seed: Of the scenario.
+        first: Earliest instant [s].
+        last: Latest instant [s].
+    """
+    return float(np.random.Generator(np.random.PCG64([seed, 77])).uniform(first, last))
+
+
+def _short_silence(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed)
+    cut = blackouts((at, 0.1))
+    flight = Flight(seed=seed, uplink=cut, downlink=cut).fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.same("HOLDs", asks.holds(flight), 0)
+    meters.moves(outcome, flight, "world", "datagrams_lost_total", "downlink", since=at)
+    for name, link in (("uplink", flight.uplink), ("downlink", flight.downlink)):
+        outcome.most(f"datagrams lost, {name}", link.counts()["blackout"], 11)
+    return outcome
+
+
+def _silence(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed)
+    for duration in (0.5, 3.0, 20.0):
+        cut = blackouts((at, duration))
+        flight = Flight(
+            "guard.speed_max_mps=1.5",
+            "criteria.time_limit_s=150",
+            seed=seed,
+            uplink=cut,
+            downlink=cut,
+        ).fly_mission(150.0)
+        asks.safe(outcome, flight)
+        asks.done(outcome, flight)
+        began = next(iter(asks.changes_into(flight, GuardState.HOLD)), at)
+        what = f"{duration:g} s of silence"
+        outcome.most(f"{what}: HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
+        back = at + duration
+        if duration >= 3.0:
+            outcome.most(
+                f"{what}: below 0.05 m/s after", asks.stopping_time(flight, began), 1.0, "s"
+            )
+            outcome.most(f"{what}: drift", asks.drift(flight, began + 2.0, back), 0.10, "m")
+        meters.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=at)
+        meters.moves(outcome, flight, "cloud", "commands_frozen_total", since=at)
+        outcome.most(f"{what}: resumed after", asks.resumed_after(flight, back), 1.0, "s")
+    return outcome
+
+
+def _long_silence(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed, 1.6, 2.6)
+    cut = blackouts((at, 75.0))
+    flight = Flight(
+        "criteria.time_limit_s=200", seed=seed, uplink=cut, downlink=cut, honest=False
+    ).fly(at + 80.0)
+    asks.safe(outcome, flight)
+    held = next(iter(asks.changes_into(flight, GuardState.HOLD)), -1.0)
+    lands = asks.changes_into(flight, GuardState.LAND)
+    landed = lands[0] if lands else float("nan")
+    outcome.most("LAND after HOLD", landed - held, 60.01, "s")
+    outcome.least("LAND not before", landed - held, 59.99, "s")
+    path = [r for r in flight.trajectory() if r.stamp_ns * 1e-9 >= landed + 1.5]
+    sinking = [-r.odometry.velocity[2] for r in path[:50]]
+    outcome.most("descent", max(sinking, default=float("nan")), 0.55, "m/s")
+    outcome.true(
+        "rotors stopped on the ground",
+        path[-1].odometry.velocity == (0.0, 0.0, 0.0) or abs(path[-1].odometry.velocity[2]) < 0.01,
+    )
+    outcome.true(
+        "it stays down until the operator acknowledges",
+        not [t for t in asks.changes_into(flight, GuardState.TRACK) if t > landed],
+    )
+    outcome.true("the mission says why", "guard" in str(flight.mission.verdict))
+    meters.moves(outcome, flight, "world", "guard_state", since=at)
+    outcome.least("metric guard_state at the end", asks.metric(flight, "world", "guard_state"), 3)
+    return outcome
+
+
+def _loss(seed: int) -> Outcome:
+    outcome = Outcome()
+    lossy: Shape = lambda profile: replace(profile, loss=0.3)  # noqa: E731
+    clean = Flight(seed=seed).fly_mission()
+    flight = Flight(seed=seed, uplink=lossy, downlink=lossy).fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.same("HOLDs", asks.holds(flight), 0)
+    ratio = asks.number(flight, "tracking_rms_measured") / asks.number(
+        clean, "tracking_rms_measured"
+    )
+    outcome.most("tracking error over that without loss", ratio, 1.5)
+    outcome.least(
+        "metric datagrams_lost_total downlink",
+        asks.metric(flight, "world", "datagrams_lost_total", "downlink"),
+        500,
+    )
+    outcome.least("loss shown", asks.number(flight, "loss_uplink"), 0.25)
+    return outcome
+
+
+def _bursts(seed: int) -> Outcome:
+    outcome = Outcome()
+    for packets in (5, 20, 50):
+        bursts = GilbertElliott(bad_start=1 / 200, bad_end=1 / packets)
+        shape: Shape = lambda profile, bursts=bursts: replace(profile, loss=bursts)  # type: ignore[misc]  # noqa: E731
+        flight = Flight(
+            "criteria.time_limit_s=150", seed=seed, uplink=shape, downlink=shape
+        ).fly_mission(150.0)
+        asks.safe(outcome, flight)
+        asks.done(outcome, flight)
+        moved = asks.metric(flight, "world", "guard_transitions_total", "hold")
+        outcome.least("metric guard_transitions_total hold", moved, 1)
+        text = f"bursts of {packets * 10} ms: changes of the guard in any second"
+        outcome.most(text, asks.busiest_second(flight), 2)
+    return outcome
+
+
+SCENARIOS = (
+    Scenario(
+        1,
+        "short-blackout",
+        "both directions silent for 0.1 s",
+        "stays in TRACK, no step above the acceleration cap",
+        "at most 11 samples per direction",
+        "cloudrc_datagrams_lost_total",
+        _short_silence,
+    ),
+    Scenario(
+        2,
+        "blackout",
+        "both directions silent for 0.5, 3 and 20 s",
+        "HOLD at 252 ms, below 0.05 m/s in 1 s, drift <= 0.10 m, resumes <= 1 s after return",
+        "samples in the gap",
+        "guard HOLD with its cause, cloudrc_guard_transitions_total",
+        _silence,
+    ),
+    Scenario(
+        3,
+        "long-blackout",
+        "both directions silent for 75 s",
+        "HOLD, LAND after 60 s at 0.5 m/s, rotors stop on the ground, latched",
+        "the mission, which says so",
+        "guard LAND with its cause, cloudrc_guard_state",
+        _long_silence,
+    ),
+    Scenario(
+        4,
+        "random-loss",
+        "30 % independent loss both ways",
+        "TRACK, tracking error <= 1.5 times that without loss",
+        "30 % of the samples",
+        "cloudrc_datagrams_lost_total, loss in the report",
+        _loss,
+    ),
+    Scenario(
+        5,
+        "burst-loss",
+        "Gilbert-Elliott loss, mean bursts of 50, 200 and 500 ms",
+        "TRACK and HOLD without chatter: <= 2 changes in any second",
+        "in bursts",
+        "cloudrc_guard_transitions_total",
+        _bursts,
+    ),
+)

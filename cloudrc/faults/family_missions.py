@@ -1,0 +1,185 @@
+"""Faults of missions: impossible ones, rivals, orders that come twice, points out of reach."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf, nan
+from typing import Any
+
+import numpy as np
+
+from cloudrc import assembly
+from cloudrc.cloud.endpoint import CloudEndpoint
+from cloudrc.cloud.teleop.service import MissionService
+from cloudrc.cloud.teleop.service_book import ConflictError
+from cloudrc.cloud.teleop.service_mission import Mission, Order
+from cloudrc.config.mission_check import check_mission
+from cloudrc.config.problems import Problem
+from cloudrc.config.schema import Mission as MissionSchema
+from cloudrc.faults import asks, meters
+from cloudrc.faults.family_link import instant
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.liar import Liar
+from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.geometry.placement import overlapped_pipe
+from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.messages import ZERO, Command, GuardState
+from cloudrc.records import Control
+
+
+def _impossible(seed: int) -> Outcome:
+    outcome, scene = Outcome(), load_scene("pipes")
+    wall = _wall_of(scene)
+    cases: dict[str, tuple[Any, str]] = {
+        "outside the fence": ((100.0, 0.0, 1.0), "nearest legal point"),
+        "in a pipe's wall": (wall, "overlaps the wall"),
+        "far below the floor": ((0.0, 0.0, -5.0), "beyond the fence"),
+    }
+    for name, (position, word) in cases.items():
+        mission = MissionSchema.model_validate(
+            {"waypoints": ({"position_m": (0.0, 0.0, 1.0)}, {"position_m": position})}
+        )
+        problems = check_mission(mission, scene)
+        outcome.true(f"{name}: refused, with the reason", word in _text(problems))
+        outcome.true(f"{name}: names the waypoint's index", "1" in _paths(problems))
+    for name, value in (("NaN", nan), ("infinite", inf), ("a word", "high")):
+        outcome.true(f"{name}: refused", _refused({"position_m": (0.0, 0.0, value)}))
+    outcome.true("none at all: refused", bool(check_mission(MissionSchema(), scene)))
+    many = {"waypoints": ({"position_m": (0.0, 0.0, 1.0)},) * 10_001}
+    outcome.true("10,001 waypoints: refused", _refuses(many))
+    return outcome
+
+
+def _wall_of(scene: Scene) -> tuple[float, float, float]:
+    """A point in the wall of a pipe: what the check itself finds."""
+    for y in np.linspace(-8.0, 5.0, 131):
+        for z in np.linspace(0.3, 2.4, 22):
+            points = np.array([[x, y, z] for x in np.linspace(-2.5, 9.0, 116)])
+            hits = np.flatnonzero(overlapped_pipe(scene, points, np.zeros(len(points))) >= 0)
+            if len(hits):
+                x, y, z = points[hits[0]].tolist()
+                return (x, y, z)
+    raise AssertionError("the scene has no pipe")
+
+
+def _text(problems: list[Problem]) -> str:
+    return " ".join(map(str, problems))
+
+
+def _paths(problems: list[Problem]) -> set[str]:
+    return {part for problem in problems for part in problem.path}
+
+
+def _refused(waypoint: dict[str, Any]) -> bool:
+    return _refuses({"waypoints": (waypoint,)})
+
+
+def _refuses(document: dict[str, Any]) -> bool:
+    try:
+        MissionSchema.model_validate(document)
+    except ValueError:
+        return True
+    return False
+
+
+def _unreachable(seed: int) -> Outcome:
+    """The robot cannot get on: what it is told to fly comes to nothing."""
+    outcome, at = Outcome(), instant(seed, 12.0, 20.0)
+
+    def tempt(cloud: CloudEndpoint) -> None:
+        def stalled(command: Command, control: Control) -> Command:
+            return command if control.stamp_ns * 1e-9 < at else command._replace(velocity=ZERO)
+
+        cloud._loop = Liar(cloud._loop, stalled)  # type: ignore[assignment]
+
+    flight = Flight("criteria.time_limit_s=300", seed=seed, tempt=tempt, honest=False)
+    flight.fly_mission(200.0)
+    asks.safe(outcome, flight)
+    outcome.true("the mission ends", flight.mission.state == "failed")
+    verdict = str(flight.mission.verdict)
+    outcome.true("with the code leg_timed_out", "leg_timed_out" in verdict)
+    outcome.true("it says which waypoint", "waypoint" in verdict and "not reached" in verdict)
+    ended = max(event.stamp_ns for event in flight.events("leg_timed_out")) * 1e-9
+    meters.moves(outcome, flight, "teleop", "missions_total", "leg_timed_out", since=ended - 0.01)
+    outcome.true("the robot holds", flight.state_at(flight.run.now_ns) is GuardState.HOLD)
+    return outcome
+
+
+def _rival_mission(seed: int) -> Outcome:
+    outcome, at, named = Outcome(), instant(seed), [""]
+    clean, flight = Flight(seed=seed).fly_mission(), Flight(seed=seed)
+
+    def post(now_ns: int) -> None:
+        try:
+            flight.order(now_ns)
+        except ConflictError as error:
+            named[0] = error.mission
+
+    flight.cloud.at(at, post)
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.true("the second is refused, naming the first", named[0] == flight.mission.id)
+    outcome.true("the same path, bit by bit", asks.same_path(clean, flight))
+    return outcome
+
+
+def _twice(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed)
+    flight, seen = Flight(seed=seed, start=False), list[Mission]()
+
+    def post(service: MissionService) -> Callable[[int], None]:
+        plan = assembly.build_plan(flight.experiment)
+        return lambda now_ns: seen.append(service.create(Order(plan, key="job-1"), now_ns)[0])
+
+    assert flight.desk.service is not None
+    for time in (0.1, 0.1, at, at + 1.0):
+        flight.cloud.at(time, post(flight.desk.service))
+    flight.fly(1.0).fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.same("missions made by 4 orders under one key", len({m.id for m in seen}), 1)
+    outcome.same("missions in the journal", len(flight.desk.missions), 1)
+    ends = {mission.state for mission in seen}
+    outcome.true("all report the same end", ends == {"done"})
+    return outcome
+
+
+SCENARIOS = (
+    Scenario(
+        27,
+        "impossible-mission",
+        "waypoints of NaN, in a wall, beyond the fence, 10,001 of them",
+        "refused as a whole, before anything is flown",
+        "nothing",
+        "index, value, reason and the nearest legal point; no metric",
+        _impossible,
+    ),
+    Scenario(
+        28,
+        "waypoint-not-reached",
+        "what the cloud commands comes to nothing",
+        "HOLD; the leg ends by its limit of time",
+        "that leg",
+        "mission failed: leg_timed_out, with the waypoint; cloudrc_missions_total",
+        _unreachable,
+    ),
+    Scenario(
+        34,
+        "second-mission",
+        "another mission is ordered while one is flown",
+        "refused with the id of the one under way, which flies the same path, bit by bit",
+        "none",
+        "409 with the mission's id; no metric",
+        _rival_mission,
+    ),
+    Scenario(
+        35,
+        "job-twice",
+        "the same order under the same key, four times",
+        "one mission; all four report the same end",
+        "none",
+        "the same mission; no metric",
+        _twice,
+    ),
+)

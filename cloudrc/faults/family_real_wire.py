@@ -1,0 +1,119 @@
+"""Faults with real sockets and files: a flood of garbage, slow scrapers, a killed recorder."""
+
+from __future__ import annotations
+
+import socket
+import time
+from math import nan
+
+import numpy as np
+
+from cloudrc.faults.family_intruder import REFUSED
+from cloudrc.faults.family_real import REAL, WORKING, finish, holds
+from cloudrc.faults.real_processes import LOOPBACK, Processes, flood
+from cloudrc.faults.scenario import Outcome, Scenario
+
+
+def _garbage(seed: int) -> Outcome:
+    outcome, seconds = Outcome(), 20
+    # The robot stays for as long at its first waypoint, so that the mission outlives the flood.
+    with Processes("mission.waypoints.1.dwell_s=15", "criteria.time_limit_s=120", seed=seed) as run:
+        run.reached(1)
+        began, since = run.scrape(), time.monotonic()
+        attacker = flood(run.ports["world"], 10_000, seconds)
+        sent = int(attacker.communicate(timeout=4 * seconds)[0])
+        ended, until = run.scrape(), time.monotonic()
+        lost = 'cloudrc_datagrams_lost_total{direction="downlink"}'
+        outcome.least("garbage sent per second", sent / seconds, 9_000)
+        outcome.same("honest datagrams lost", ended.get(lost, 0) - began.get(lost, 0), 0)
+        risen = {k: v - began.get(k, 0) for k, v in ended.items() if "datagrams_total" in k}
+        refused = {name: _of(risen, name) for name in REFUSED}
+        outcome.least("garbage counted as refused, share", sum(refused.values()) / sent, 0.9)
+        outcome.least("of it right in form, refused by its tag, share", refused["tag"] / sent, 0.05)
+        finish(outcome, run)
+        outcome.same("HOLDs meanwhile", holds(run, since, until), 0)
+    return outcome
+
+
+def _of(readings: dict[str, float], name: str) -> float:
+    return sum(v for k, v in readings.items() if f'outcome="{name}"' in k)
+
+
+def _recorder_killed(seed: int) -> Outcome:
+    """The world process records; it is killed while it tells what it has recorded."""
+    outcome = Outcome()
+    with Processes(seed=seed) as run:
+        run.reached(WORKING)
+        flown = run.scrape()
+        assert flown
+        before_ns = time.monotonic_ns()
+        run.kill("world")
+        recording, recovery = run.recording("world")
+        # World's clock follows the machine's monotonic one.
+        last_ns = int(recording["/ground_truth"]["stamp_ns"][-1])
+        outcome.most("stretch lost", (before_ns - last_ns) * 1e-9, 0.5, "s")
+        outcome.least("kept, share of the bytes", recovery.share, 0.99)
+        outcome.same("damaged chunks", recovery.dropped.get("chunks", 0), 0)
+    return outcome
+
+
+def _slow_scrapers(seed: int) -> Outcome:
+    outcome = Outcome()
+    with Processes(seed=seed) as run:
+        run.reached(1)
+        address = (LOOPBACK, run.ports["metrics"])
+        since = time.monotonic()
+        slow = [socket.create_connection(address) for _ in range(40)]
+        for each in slow:
+            each.sendall(b"GET /metrics HTTP/1.1\r\n")  # and never an end
+        took = []
+        for _ in range(20):
+            began = time.monotonic()
+            try:
+                run.scrape(timeout=1.0)
+                took.append(time.monotonic() - began)
+            except OSError:
+                took.append(nan)
+            time.sleep(0.2)
+        until = time.monotonic()
+        for each in slow:
+            each.close()
+        outcome.most("longest scrape beside 40 slow ones", float(np.max(took)), 1.0, "s")
+        finish(outcome, run)
+        outcome.same("HOLDs meanwhile", holds(run, since, until), 0)
+    return outcome
+
+
+SCENARIOS = (
+    Scenario(
+        20,
+        "garbage-flood",
+        "10,000 datagrams of garbage per second at the world's port for 20 s, a third of "
+        "it as long as a command and with its head",
+        "no honest datagram is lost, no HOLD",
+        "none",
+        "cloudrc_datagrams_total by outcome",
+        _garbage,
+        REAL,
+    ),
+    Scenario(
+        30,
+        "recorder-killed",
+        "SIGKILL of the world process, which records",
+        "the rest of the recording recovers",
+        "at most 0.5 s",
+        "cloudrc recover",
+        _recorder_killed,
+        REAL,
+    ),
+    Scenario(
+        31,
+        "slow-scrapers",
+        "40 clients that never end their request, at the metrics of the world",
+        "a scrape is answered in < 1 s; no HOLD",
+        "none",
+        "-",
+        _slow_scrapers,
+        REAL,
+    ),
+)

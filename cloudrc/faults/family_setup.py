@@ -1,0 +1,215 @@
+"""Faults of the surroundings: clocks, names, configuration, keys, and a second cloud."""
+
+from __future__ import annotations
+
+from math import nan
+
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.faults import asks, meters
+from cloudrc.faults.crowd import Crowd
+from cloudrc.faults.family_link import AGE_MAX, HOUR_NS, instant
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.mortal import Clock
+from cloudrc.faults.options import SECRET
+from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.walls import jumping_wall_clock
+from cloudrc.link.sidecar_follow import PeerName
+from cloudrc.messages import GuardState
+from cloudrc.records import Fault
+from cloudrc.tunnel.keys import Key, KeySet
+
+BAD_KEYS = (
+    ("guard.command_age_max_ms=0", "guard.command_age_max_ms"),
+    ("guard.command_age_max_ms=.inf", "guard.command_age_max_ms"),
+    ("guard.speed_max_mps=-1", "guard.speed_max_mps"),
+    ("guard.speed_max_mps=.nan", "guard.speed_max_mps"),
+    ("guard.command_age_max=0.25", "command_age_max_ms"),
+    ("link.uplink.delay=45", "delay_ms"),
+    ("link.profile=paper-p9", "paper-p"),
+    ("cloud.predictor=kalmann", "constant_velocity"),
+    ("world.robot=pelikan", "pelican"),
+)
+"""What is set, and a word that the refusal has to name."""
+
+
+def _wall_clocks(seed: int) -> Outcome:
+    outcome = Outcome()
+    clean = Flight(seed=seed).fly_mission()
+    with jumping_wall_clock():
+        flight = Flight(seed=seed).fly_mission()
+    asks.safe(outcome, flight)
+    outcome.true(
+        "wall clocks step: the same records, bit by bit", clean.sha256() == flight.sha256()
+    )
+    for role in ("world", "cloud"):
+        shown = [meters.shown(each, role) for each in (clean, flight)]
+        outcome.true(f"every reading of {role} is the same", shown[0] == shown[1])
+    for hours in (-1, 1):
+        apart = Flight(seed=seed, cloud_clock=Clock((48 + hours) * HOUR_NS)).fly_mission()
+        text = f"cloud's clock {48 + hours} h ahead: the same path, bit by bit"
+        outcome.true(text, asks.same_path(clean, apart))
+    for ppm in (-500, 500):
+        drifting = Flight(seed=seed, cloud_clock=Clock(HOUR_NS, ppm)).fly_mission()
+        asks.safe(outcome, drifting)
+        asks.done(outcome, drifting)
+        outcome.same(f"drift of {ppm} ppm: HOLDs", asks.holds(drifting), 0)
+    return outcome
+
+
+def _names(seed: int) -> Outcome:
+    """The peer's name stops to be resolved, then has another address."""
+    outcome, said, fails = Outcome(), list[str](), [False]
+    addresses = [["10.0.0.7"]]
+
+    def resolve(name: str) -> list[str]:
+        if fails[0]:
+            raise OSError(-3, "Temporary failure in name resolution")
+        return addresses[0]
+
+    peer = PeerName(("cloud", 7400), resolve, said.append)
+    first = peer.poll()
+    fails[0] = True
+    kept = [peer.poll() for _ in range(30)]
+    outcome.true("keeps the peer while DNS fails", set(kept) == {first})
+    outcome.same("lines in the log about it", len(said) - 1, 1)
+    outcome.true("it says so", "cannot be resolved" in said[-1])
+    fails[0], addresses[0] = False, ["10.0.0.9"]
+    outcome.true("follows the new address", peer.poll() == ("10.0.0.9", 7400))
+    outcome.true("it says that too", "was 10.0.0.7" in said[-1])
+    return outcome
+
+
+def _two_clouds(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed, 4.0, 12.0)
+    flight = Flight(seed=seed, second=at)
+    crowd = flight.cloud.inner
+    assert isinstance(crowd, Crowd)
+    opened: list[int] = []
+    flight.world.at(at + 5.0, lambda _: opened.extend(_epochs_so_far(flight)))
+
+    def leave(now_ns: int) -> None:
+        crowd.members = crowd.members[1:]
+
+    flight.cloud.at(at + 6.0, leave)
+    flight.fly(at + 14.0)
+    asks.safe(outcome, flight)
+    outcome.same("epochs while both are there", max(opened, default=-1), 2)
+    outcome.same("HOLDs while both are there", _holds_before(flight, at + 6.0), 0)
+    meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "busy", since=at)
+    meters.moves(outcome, flight, "world", "sessions_refused_total", since=at)
+    outcome.least("the second is refused", flight.world.inner._counts["busy"], 1)  # type: ignore[union-attr]
+    outcome.most("HOLD once the first is gone", asks.basis_age_at_hold(flight), AGE_MAX, "s")
+    later = [epoch for epoch in asks.epochs(flight) if epoch > 2]
+    outcome.true("then the second gets a higher epoch", bool(later))
+    outcome.true("commands applied in order, none twice", asks.applied_in_order(flight))
+    return outcome
+
+
+def _epochs_so_far(flight: Flight) -> list[int]:
+    return [flight.epoch]
+
+
+def _holds_before(flight: Flight, until: float) -> int:
+    return len(asks.changes_into(flight, GuardState.HOLD, until))
+
+
+def _configuration(seed: int) -> Outcome:
+    outcome = Outcome()
+    for setting, word in BAD_KEYS:
+        text = ""
+        try:
+            load_experiment("paper", [setting])
+        except BadInputError as error:
+            text = str(error)
+        outcome.true(f"{setting} is refused, naming {word}", word in text)
+    outcome.same("exit code", BadInputError.exit_code, 2)
+    return outcome
+
+
+def _secrets(seed: int) -> Outcome:
+    outcome, wrong = Outcome(), KeySet(Key(bytes(31) + b"\1"))
+    flight = Flight(seed=seed, secrets={"world": SECRET, "cloud": wrong}).fly(5.0)
+    asks.safe(outcome, flight)
+    outcome.same("wrong key: sessions", len(asks.epochs(flight)), 0)
+    outcome.same("wrong key: changes of the guard", len(flight.changes), 0)
+    meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "tag", since=0.0)
+    told = [r.text for r in (*flight.of_world, *flight.of_cloud) if isinstance(r, Fault)]
+    outcome.true("wrong key: it is told", any("key" in text for text in told))
+
+    new = KeySet(Key(b"the next key of the fault suite!"), SECRET.current, 20.0)
+    outcome.checks += _rotated(seed, new, gap=8.0, holds=0).checks
+    late = new._replace(overlap=2.0)
+    outcome.checks += _rotated(seed, late, gap=8.0, holds=1).checks
+    return outcome
+
+
+def _rotated(seed: int, new: KeySet, gap: float, holds: int) -> Outcome:
+    """World reads the new Secret, cloud a while later: within the overlap, or too late."""
+    outcome, at = Outcome(), instant(seed, 4.0, 8.0)
+    flight = Flight("criteria.time_limit_s=120", seed=seed)
+    flight.world.at(at, lambda now_ns: flight.rings["world"].replace(new, now_ns))
+    flight.cloud.at(at + gap, lambda now_ns: flight.rings["cloud"].replace(new, now_ns))
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    what = f"rotated within {new.overlap:g} s of overlap, {gap:g} s apart"
+    if holds:
+        outcome.least(f"{what}: HOLDs", asks.holds(flight), 1)
+        back = asks.resumed_after(flight, at + gap)
+        outcome.most(f"{what}: TRACK again after", back if back == back else nan, 2.0, "s")
+    else:
+        outcome.same(f"{what}: HOLDs", asks.holds(flight), 0)
+    return outcome
+
+
+SCENARIOS = (
+    Scenario(
+        9,
+        "clock-steps",
+        "wall clocks step to 1970, 2106 and by an hour, two clocks lie hours "
+        "apart, one drifts by 500 ppm",
+        "the same flight, bit by bit; drift is flown in TRACK",
+        "none",
+        "nothing, no metric moves: no wall clock reaches the loop",
+        _wall_clocks,
+    ),
+    Scenario(
+        19,
+        "dns-failure",
+        "the peer's name is not resolved for 30 s, then has a new address",
+        "keeps the last peer, follows the new one",
+        "none",
+        "one line in the log of the link; no metric",
+        _names,
+    ),
+    Scenario(
+        25,
+        "two-clouds",
+        "a second cloud with the same key; later the first one leaves",
+        "the first keeps authority while fresh; after HOLD the second gets a higher epoch; "
+        "commands never interleave",
+        "none",
+        "cloudrc_datagrams_total{outcome=busy}, cloudrc_sessions_refused_total",
+        _two_clouds,
+    ),
+    Scenario(
+        37,
+        "bad-configuration",
+        "unknown keys, wrong units, limits of 0, infinity and NaN",
+        "refused with the path of the key and the nearest known one, exit code 2",
+        "nothing",
+        "one line; no metric, there is no process",
+        _configuration,
+    ),
+    Scenario(
+        38,
+        "secret-wrong-or-rotated",
+        "another key in cloud; a rotation within and beyond the overlap",
+        "no session, GROUND; within the overlap no HOLD; beyond it HOLD until both "
+        "have the new key",
+        "none",
+        "fault 'key' at both ends, cloudrc_datagrams_total{outcome=tag}",
+        _secrets,
+    ),
+)

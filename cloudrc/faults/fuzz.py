@@ -1,0 +1,170 @@
+"""One schedule in virtual time: it goes in, the invariants that broke come out.
+
+An operator flies mission after mission: what has ended is followed by the next one, what is latched
+is acknowledged. In the calm at the end the robot must be flying again, or it is stuck.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
+from cloudrc.faults.adversary import temptation
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.inject import inject
+from cloudrc.faults.mortal import Clock
+from cloudrc.faults.remains import Remains
+from cloudrc.faults.schedule import Schedule, shaped
+from cloudrc.faults.walls import steppable_wall_clock
+from cloudrc.faults.watch import Breach
+from cloudrc.messages import GuardState
+from cloudrc.records import GuardChange, Record
+
+LATCHED = (GuardState.LAND, GuardState.ESTOP)
+BACK = 10.0
+"""In so long of calm the robot must have flown [s]."""
+ALWAYS = frozenset({"fence", "cap", "stop", "stale", "error"})
+"""Invariants that are looked at in every flight."""
+PATIENCE_NS = 1_000_000_000
+"""The operator does something at most this often [ns]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What a schedule showed.
+
+    Attributes:
+        schedule: That was flown.
+        breaches: The first invariants that broke; none if all held.
+        sha256: Over all records, if they were kept.
+        margin: Smallest distance of the base to the fence's walls and ceiling [m].
+        speed: Largest speed that was let through [m/s].
+        holds: How often the guard held although the mission was on.
+        missions: How many missions were done.
+    """
+
+    schedule: Schedule
+    breaches: tuple[Breach, ...]
+    sha256: str
+    margin: float
+    speed: float
+    holds: int
+    missions: int
+
+    @property
+    def kinds(self) -> set[str]:
+        """Of the breaches."""
+        return {breach.kind for breach in self.breaches}
+
+
+def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
+    """Fly a schedule.
+
+    Args:
+        schedule: What befalls the flight.
+        keep: Whether records are kept and hashed; takes twice as long.
+    """
+    second = schedule.of("second_cloud")
+    offset = schedule.cloud_offset or schedule.cloud_drift
+    flight = Flight(
+        f"link.profile={schedule.profile}",
+        seed=schedule.seed,
+        cloud_clock=Clock(round((schedule.cloud_offset + 1e6) * 1e9), schedule.cloud_drift)
+        if offset
+        else None,
+        uplink=lambda profile: shaped(schedule, profile, "up"),
+        downlink=lambda profile: shaped(schedule, profile, "down"),
+        honest=not schedule.policy,
+        keep=keep,
+        tempt=temptation(schedule) if schedule.policy else None,
+        second=second[0].at if second else None,
+    )
+    operator = Operator(flight)
+    flight.listeners.append(operator.look)
+    remains = Remains(flight, schedule)
+    with steppable_wall_clock() as wall:
+        inject(flight, schedule, wall)
+        try:
+            flight.fly(schedule.duration)
+        except Exception as error:  # an end has to survive whatever comes
+            flight.watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
+    remains.judge()
+    looked_at = judged(schedule)
+    if "stuck" in looked_at:
+        _ask_whether_stuck(flight, operator)
+    watch, holds = flight.watch, _holds(flight)
+    if "alarm" in looked_at:
+        for hold in holds:  # nothing has gone wrong
+            watch.note(hold.stamp_ns, "alarm", f"HOLD in a clean flight: {hold.cause}")
+    return Finding(
+        schedule,
+        tuple(watch.breaches),
+        flight.sha256() if keep else "",
+        watch.margin,
+        watch.speed,
+        len(holds),
+        sum(event.event == "done" for event in flight.desk.events),
+    )
+
+
+def _holds(flight: Flight) -> list[GuardChange]:
+    """HOLDs that are not a mission's end."""
+    held = [change for change in flight.changes if change.state is GuardState.HOLD]
+    return [change for change in held if change.cause != "mission ended"]
+
+
+class Operator:
+    """Keeps missions coming, and acknowledges what is latched."""
+
+    def __init__(self, flight: Flight) -> None:
+        self._flight = flight
+        self._next_ns = 0
+        self.tracked_ns = -1
+
+    def look(self, records: list[Record], now_ns: int) -> None:
+        """Look at the robot, every 100 ms."""
+        flight = self._flight
+        state = flight.changes[-1].state if flight.changes else GuardState.GROUND
+        if state is GuardState.TRACK:
+            self.tracked_ns = now_ns
+        service = flight.desk.service
+        if service is None or now_ns < self._next_ns or flight.cloud.inner is None:
+            return
+        seen = service.seen
+        if not seen or (flight.desk.missions and not flight.mission.ended):
+            return
+        self._next_ns = now_ns + PATIENCE_NS
+        try:
+            if state in LATCHED:
+                service.acknowledge(flight.cloud.clock.at(now_ns))
+            else:
+                flight.order(now_ns)
+        except (ConflictError, UnavailableError):
+            return
+
+
+def judged(schedule: Schedule) -> frozenset[str]:
+    """Say which invariants a schedule is held to.
+
+    Under a cloud that means no good a contact is no breach, and nobody has to get on; what goes
+    wrong to the end leaves no time to find back; a HOLD is a false alarm where nothing goes wrong.
+    """
+    kinds = set(ALWAYS)
+    if not schedule.policy:
+        kinds.add("collision")
+        if schedule.duration - schedule.quiet_from >= BACK:
+            kinds.add("stuck")
+        if not schedule.events:
+            kinds.add("alarm")
+    if schedule.of(*Remains.KINDS):
+        kinds.add("recording")
+    return frozenset(kinds)
+
+
+def _ask_whether_stuck(flight: Flight, operator: Operator) -> None:
+    if flight.run.now_ns - operator.tracked_ns > BACK * 1e9:
+        change = flight.changes[-1] if flight.changes else None
+        state = f"{change.state.name} ({change.cause})" if change else "GROUND"
+        mission = flight.mission.state if flight.desk.missions else "none"
+        text = f"not flown in {BACK:g} s of calm: guard {state}, mission {mission}"
+        flight.watch.note(flight.run.now_ns, "stuck", text)

@@ -1,0 +1,97 @@
+"""What the metrics of a flight's processes would show, and when they begin to move."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import nan
+
+from cloudrc.exposition.histogram import Histogram
+from cloudrc.exposition.live import Live
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.scenario import Outcome
+from cloudrc.records import Counted, Record
+
+SOON = 5.0
+"""By when a fault has to show in its metric [s]."""
+
+
+def reading(role: str, records: Iterable[Record], name: str, *labels: str) -> float:
+    """Read a metric [any unit] after some records; of a histogram the mean; NaN if it is absent.
+
+    Args:
+        role: Of the process: "world", "cloud" or "teleop".
+        records: That it has seen, oldest first.
+        name: Of the metric, without its prefix.
+        labels: Values of its labels.
+    """
+    live = Live(role)
+    live.see(records)
+    shown = live.read().get(f"cloudrc_{name}", {})
+    if isinstance(shown, Histogram):
+        count = shown.cumulative()[-1]
+        return shown.total / count if count else nan
+    return float(shown.get(labels, nan))
+
+
+def shown(flight: Flight, role: str) -> dict[str, object]:
+    """Read every metric that a process shows at the end of a flight; of a histogram its counts."""
+    live = Live(role)
+    live.see(flight.of_world if role == "world" else flight.of_cloud)
+    return {
+        name: (each.total, each.cumulative()) if isinstance(each, Histogram) else each
+        for name, each in live.read().items()
+    }
+
+
+def seen_by(flight: Flight, role: str, until: float) -> list[Record]:
+    """List what a process has recorded.
+
+    Args:
+        flight: Which.
+        role: Of the process.
+        until: Instant of virtual time [s].
+    """
+    if role == "teleop":
+        records: Iterable[Record] = flight.desk.events
+    else:
+        records = flight.of_world if role == "world" else flight.of_cloud
+    clock = flight.world.clock if role == "world" else flight.cloud.clock
+    until_ns = clock.at(round(until * 1e9))
+    return [record for record in records if record.stamp_ns <= until_ns]
+
+
+def moves(
+    outcome: Outcome, flight: Flight, role: str, name: str, *labels: str, since: float
+) -> None:
+    """Check that a metric reads otherwise within 5 s of a fault.
+
+    Args:
+        outcome: Of the scenario.
+        flight: Which.
+        role: Of the process that shows the metric.
+        name: Of the metric, without its prefix.
+        labels: Values of its labels.
+        since: When the fault begins [s].
+    """
+    before, after = (
+        reading(role, seen_by(flight, role, until), name, *labels)
+        for until in (since, since + SOON)
+    )
+    moved = after == after and before != after  # absent before is as good as another value
+    shown = " ".join((name, *labels))
+    outcome.true(f"metric {shown} moves within {SOON:g} s", moved)
+
+
+def counts(outcome: Outcome, role: str, counted: str, total: int, name: str, *labels: str) -> None:
+    """Check that what a process has counted shows in its metric, and is not zero.
+
+    Args:
+        outcome: Of the scenario.
+        role: Of the process.
+        counted: Its own name for it.
+        total: How often it has happened.
+        name: Of the metric, without its prefix.
+        labels: Values of its labels.
+    """
+    value = reading(role, [Counted(0, role, counted, total)], name, *labels)
+    outcome.least(f"metric {' '.join((name, *labels))}", value, 1)

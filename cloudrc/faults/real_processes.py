@@ -1,0 +1,251 @@
+"""World, cloud and teleop as processes of this machine, for a scenario to kill, stop and flood."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+from cloudrc.config.load import dump, load_experiment
+from cloudrc.drivers.epochs import replace_durably
+from cloudrc.errors import TimedOutError
+from cloudrc.faults.options import SECRET
+from cloudrc.record.columns import Recording, Table
+from cloudrc.record.recover import Recovery, recover
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.keys import write
+
+LIMIT = 60.0
+"""For whatever is waited for [s]."""
+LOOPBACK = "127.0.0.1"
+PERIOD = 0.05
+"""Between two looks at whether something has come about [s]."""
+
+
+class Processes:
+    """A robot and its cloud, joined by loopback, without an emulated link.
+
+    Attributes:
+        folder: With configuration, key, journal and recordings.
+        running: The process of each name that was started last.
+    """
+
+    def __init__(self, *settings: str, seed: int = 1) -> None:
+        """Start all three; the experiment's mission begins by itself.
+
+        Args:
+            settings: Over the experiment `paper`, as `--set` takes them.
+            seed: Of the experiment.
+        """
+        self._temporary = tempfile.TemporaryDirectory(prefix="cloudrc-")
+        self.folder = Path(self._temporary.name)
+        experiment = load_experiment("paper", [*settings, f"seed={seed}"])
+        (self.folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+        replace_durably(self.folder / "key", write(SECRET).encode())
+        self.ports = dict(zip(("world", "cloud", "metrics"), _free_ports(3), strict=True))
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self._all: list[subprocess.Popen[bytes]] = []
+        self._recordings = 0
+        self.start("teleop", "--start")
+        self.start("world")
+        self.start("cloud")
+
+    def start(self, name: str, *more: str) -> None:
+        """Start a process; one that is started again has a recording of its own."""
+        self._recordings += 1
+        record = ["--record", f"{name}-{self._recordings}.mcap"]
+        here, there = (f"{LOOPBACK}:{self.ports[end]}" for end in ("world", "cloud"))
+        flags = {
+            "world": [
+                *("--listen", here, "--peer", there, "--key", "key", "--epochs", "epochs"),
+                *("--metrics", f"{LOOPBACK}:{self.ports['metrics']}", *record),
+            ],
+            "cloud": [
+                *("--listen", there, "--peer", here, "--key", "key", "--teleop", ".", *record),
+            ],
+            "teleop": ["--socket", ".", "--journal", "journal"],
+        }
+        command = [sys.executable, "-m", "cloudrc", name, "--config", "config.yaml"]
+        with (self.folder / f"{name}.log").open("ab") as log:
+            process = subprocess.Popen(
+                [*command, *flags[name], *more],
+                cwd=self.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+        self.running[name] = process
+        self._all.append(process)
+
+    def send(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to a process."""
+        self.running[name].send_signal(number)
+
+    def kill(self, name: str) -> float:
+        """SIGKILL; return when that was [s, monotonic clock]."""
+        self.running[name].kill()
+        killed = time.monotonic()
+        self.running[name].wait(LIMIT)
+        return killed
+
+    def end(self, name: str) -> float:
+        """SIGTERM; return how long it took until the process had ended [s]."""
+        began = time.monotonic()
+        self.send(name, signal.SIGTERM)
+        self.running[name].wait(LIMIT)
+        return time.monotonic() - began
+
+    def events(self) -> list[str]:
+        """What has happened to the mission, as the journal has it."""
+        from cloudrc.cloud.teleop.journal_format import parse
+
+        path = self.folder / "journal"
+        if not path.exists():
+            return []
+        return [str(e["event"]) for e in parse(path.read_bytes()).entries if e["kind"] == "event"]
+
+    def until(self, text: str, condition: Callable[[], bool], limit: float = LIMIT) -> None:
+        """Wait until something has come about.
+
+        Args:
+            text: What, in words.
+            condition: Whether it has.
+            limit: For how long [s].
+
+        Raises:
+            TimedOutError: If it does not.
+        """
+        end = time.monotonic() + limit
+        while not condition():
+            if time.monotonic() > end:
+                raise TimedOutError(f"{text}: not within {limit:g} s; {self._last_words()}")
+            time.sleep(PERIOD)
+
+    def reached(self, count: int) -> None:
+        """Wait until so many waypoints are reached."""
+        self.until(f"{count} waypoints reached", lambda: self.events().count("reached") >= count)
+
+    def over(self) -> None:
+        """Wait until the mission has ended."""
+        ends = {"done", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped"}
+        self.until("the mission ended", lambda: bool(ends & set(self.events())), 2 * LIMIT)
+
+    def recording(self, name: str, which: int = -1) -> tuple[Recording, Recovery]:
+        """Recover a recording of a process and read it; by default the newest."""
+        paths = sorted(self.folder.glob(f"{name}-*.mcap"), key=lambda path: path.stat().st_ctime)
+        paths = [path for path in paths if "recovered" not in path.name]
+        clean = self.folder / f"{paths[which].stem}.recovered-{time.monotonic_ns()}.mcap"
+        recovery = recover(paths[which], clean)
+        return Recording.read(clean), recovery
+
+    def table(self, topic: str) -> Table:
+        """A topic of world's recording."""
+        return self.recording("world")[0][topic]
+
+    def scrape(self, timeout: float = 5.0) -> dict[str, float]:
+        """Read world's metrics [any unit].
+
+        Args:
+            timeout: For the answer [s].
+        """
+        url = f"http://{LOOPBACK}:{self.ports['metrics']}/metrics"
+        with urllib.request.urlopen(url, timeout=timeout) as answer:
+            lines = answer.read().decode().splitlines()
+        samples = (line.rpartition(" ") for line in lines if not line.startswith("#"))
+        return {name: float(value) for name, _, value in samples}
+
+    def close(self) -> None:
+        """End everything and forget the folder."""
+        for process in self._all:
+            process.kill()
+            process.wait()
+        self._temporary.cleanup()
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _last_words(self) -> str:
+        words = []
+        for name in self.running:
+            lines = (self.folder / f"{name}.log").read_text(errors="replace").splitlines()
+            words.append(f"{name}: {lines[-1] if lines else 'nothing'}")
+        return "; ".join(words)
+
+
+def _free_ports(count: int) -> list[int]:
+    """Ports of the loopback that nobody uses now."""
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    try:
+        for each in sockets:
+            each.bind((LOOPBACK, 0))
+        return [each.getsockname()[1] for each in sockets]
+    finally:
+        for each in sockets:
+            each.close()
+
+
+FLOOD = """
+import os, random, socket, struct, sys, time
+port, rate, seconds, version, direction, kind, size = map(int, sys.argv[1:])
+udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+def noise(n):  # pure; behind a right head, too short; as long as a command, for early epochs
+    if n % 3 == 0:
+        return os.urandom(16 + n % 200)
+    epoch, generation = 1 + n % 2, n // 2 % 2
+    number = random.getrandbits(40)
+    head = struct.pack("<BBIBBQ", version, direction, epoch, generation, kind, number)
+    return head + os.urandom(n % 40 if n % 3 == 1 else size - len(head))
+began, sent = time.monotonic(), 0
+while (now := time.monotonic() - began) < seconds:
+    while sent < now * rate:
+        udp.sendto(noise(sent), ("127.0.0.1", port))
+        sent += 1
+    time.sleep(0.001)
+print(sent)
+"""
+
+
+def flood(port: int, rate: int, seconds: int) -> subprocess.Popen[bytes]:
+    """Send garbage to a port of the loopback, so many datagrams a second, for so long [s]."""
+    kind = int(codec.Kind.COMMAND)
+    form = (codec.VERSION, int(codec.Direction.DOWNLINK), kind, codec.SIZES[kind])
+    command = [sys.executable, "-c", FLOOD, *map(str, (port, rate, seconds, *form))]
+    return subprocess.Popen(command, stdout=subprocess.PIPE)
+
+
+def throttle(pid: int, share: float) -> Path | None:
+    """Give a process a share in [0, 1] of a processor, by a cgroup; None if that is not allowed."""
+    for root, quota in (("/sys/fs/cgroup/cpu", "cpu.cfs_quota_us"), ("/sys/fs/cgroup", "cpu.max")):
+        group = Path(root) / f"cloudrc-{pid}"
+        try:
+            group.mkdir()
+            value = f"{round(share * 100_000)}"
+            (group / quota).write_text(value if "cfs" in quota else f"{value} 100000")
+            (group / "cgroup.procs").write_text(str(pid))
+        except OSError:
+            if group.exists():
+                group.rmdir()
+            continue
+        return group
+    return None
+
+
+def release(group: Path, pid: int) -> None:
+    """Take a process out of its cgroup, and the cgroup away."""
+    (group.parent / "cgroup.procs").write_text(str(pid))
+    group.rmdir()

@@ -1,0 +1,136 @@
+"""A fault by name: its injector runs, its checks say whether what has to follow did follow."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import isfinite
+from typing import Literal, TypeAlias
+
+Mode: TypeAlias = Literal["virtual", "real", "cluster"]
+Relation: TypeAlias = Literal["<=", ">=", "=="]
+
+_COMPARE = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
+YES = "yes"
+"""Takes the place of a unit: the check is a question, its measure 1 for yes and 0 for no."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing that has to follow.
+
+    Attributes:
+        text: What, in words.
+        measured: What came out, in `unit` [any unit].
+        relation: How it has to compare with the limit.
+        limit: As promised, in `unit` [any unit].
+        unit: Of both; "" for counts, `YES` for yes (1) or no (0).
+    """
+
+    text: str
+    measured: float
+    relation: Relation
+    limit: float
+    unit: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether it did follow; what could not be measured did not."""
+        known = isfinite(self.measured)
+        return known and bool(_COMPARE[self.relation](self.measured, self.limit))
+
+    def show(self) -> str:
+        """One line: the promise and what was measured."""
+        if self.unit == YES:
+            return f"{self.text}: {'yes' if self.measured else 'NO'}"
+        unit = f" {self.unit}" if self.unit else ""
+        sign = "" if self.relation == "==" else f"{self.relation} "
+        return f"{self.text}: {self.measured:.4g}{unit} ({sign}{self.limit:.4g})"
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What running a scenario showed.
+
+    Attributes:
+        checks: In order.
+        sha256: Over all records of the run; "" where there are none.
+        skipped: Why it could not be run here; "" if it was.
+    """
+
+    checks: list[Check] = field(default_factory=list)
+    sha256: str = ""
+    skipped: str = ""
+
+    def most(self, text: str, measured: float, limit: float, unit: str = "") -> None:
+        """Check that something is at most its limit.
+
+        Args:
+            text: What is checked.
+            measured: What came out [any unit].
+            limit: What was promised [any unit].
+            unit: Of both.
+        """
+        self.checks.append(Check(text, measured, "<=", limit, unit))
+
+    def least(self, text: str, measured: float, limit: float, unit: str = "") -> None:
+        """Check that something is at least its limit.
+
+        Args:
+            text: What is checked.
+            measured: What came out [any unit].
+            limit: What was promised [any unit].
+            unit: Of both.
+        """
+        self.checks.append(Check(text, measured, ">=", limit, unit))
+
+    def same(self, text: str, measured: float, limit: float, unit: str = "") -> None:
+        """Check that something is exactly what was promised.
+
+        Args:
+            text: What is checked.
+            measured: What came out [any unit].
+            limit: What was promised [any unit].
+            unit: Of both.
+        """
+        self.checks.append(Check(text, measured, "==", limit, unit))
+
+    def true(self, text: str, holds: bool) -> None:
+        """Check that something is so."""
+        self.checks.append(Check(text, float(holds), "==", 1.0, YES))
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed, and there were some."""
+        return bool(self.checks) and all(check.passed for check in self.checks)
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """A fault of the table, and what must follow from it.
+
+    Attributes:
+        number: As in the table: 13 for F13.
+        name: For the command line: cloud-killed.
+        injects: What is done, in words.
+        expects: What the robot does and within what time, in words.
+        loses: What may be lost.
+        shows: What the user sees, or which metric moves.
+        run: Brings it about with a seed, and checks.
+        mode: Where it runs.
+    """
+
+    number: int
+    name: str
+    injects: str
+    expects: str
+    loses: str
+    shows: str
+    run: Callable[[int], Outcome]
+    mode: Mode = "virtual"
+
+    @property
+    def id(self) -> str:
+        """Name of the fault: F13."""
+        return f"F{self.number}"

@@ -1,0 +1,219 @@
+"""What befalls one flight: a list of faults, each with its time, that a YAML file can hold."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, TypeAlias
+
+import yaml
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from cloudrc.errors import BadInputError
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
+
+KINDS: dict[str, str] = {
+    "blackout": "no datagram passes",
+    "delay": "one-way delay rises by value [s]",
+    "jitter": "jitter rises to value [s]",
+    "loss": "a share of value is lost",
+    "bursts": "loss in bursts of value packets",
+    "corruption": "a share of value has a bit turned over",
+    "garbage": "value datagrams of garbage before every honest one",
+    "replay": "value captured datagrams before every honest one",
+    "cloud_killed": "the cloud process is away",
+    "pod_killed": "the cloud pod, teleop with it, is away",
+    "teleop_killed": "teleop is away",
+    "cloud_paused": "the cloud process stands still",
+    "cloud_throttled": "the cloud process runs for a share of value of each 100 ms",
+    "world_paused": "the world process stands still",
+    "world_killed": "the world restarts",
+    "world_throttled": "the world process runs for a share of value of each 100 ms",
+    "wall_clock": "the wall clock of both ends steps by value [s], and stays there",
+    "journal_full": "the journal refuses every entry",
+    "journal_torn": "the cloud pod is away, its journal has lost its last value bytes",
+    "journal_rotten": "the cloud pod is away, a bit of its journal is wrong, at a share of value",
+    "api_flood": "value requests to teleop in every 100 ms",
+    "recorder_full": "world's recording has room for value bytes more",
+    "recorder_slow": "every fsync of world's recording takes value [s]",
+    "second_cloud": "another cloud with the same key joins",
+    "key_rotated": "world reads a new key, cloud after the duration",
+    "second_order": "another mission is ordered",
+    "held": "the operator holds the mission, resumes it after the duration",
+}
+"""Every kind of fault."""
+WAYS = ("both", "up", "down")
+SHARES = ("loss", "corruption", "cloud_throttled", "world_throttled", "journal_rotten")
+"""Kinds whose value is a share, in [0, 1]."""
+VALUE_MAX = 1e9
+DURATION_MAX = 86_400.0
+"""Of a flight, and of everything in it [s]."""
+OFFSET_MAX = 1e6
+"""Between the two clocks [s]."""
+_CONFIG = ConfigDict(extra="forbid")
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One fault.
+
+    Attributes:
+        kind: One of `KINDS`.
+        at: When it begins [s].
+        duration: How long it lasts [s].
+        value: How bad it is, as `KINDS` says [any unit].
+        way: Of the link: "both", "up" or "down".
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
+    kind: str
+    at: float
+    duration: float = 0.0
+    value: float = 0.0
+    way: str = "both"
+
+    @property
+    def end(self) -> float:
+        """When it is over [s]."""
+        return self.at + self.duration
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """All that befalls one flight.
+
+    Attributes:
+        seed: Of the link, and of everything random in the faults.
+        profile: Of the link.
+        events: In any order.
+        duplicate: Share of datagrams that arrive twice, in [0, 1].
+        reorder: Share of datagrams that overtake others, in [0, 1].
+        cloud_offset: Cloud's clock minus world's [s]; 0 for one shared clock.
+        cloud_drift: How fast cloud's clock is [ppm], a whole number.
+        policy: Of an adversary in the place of cloud; "" for an honest cloud.
+        duration: Of the flight [s].
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
+    seed: int
+    profile: str = "paper-p2"
+    events: tuple[Event, ...] = ()
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    cloud_offset: float = 0.0
+    cloud_drift: int = 0
+    policy: str = ""
+    duration: float = 60.0
+
+    @property
+    def quiet_from(self) -> float:
+        """When the last fault is over [s]."""
+        return max((event.end for event in self.events), default=0.0)
+
+    def of(self, *kinds: str) -> list[Event]:
+        """List the faults of some kinds, by time."""
+        return sorted((e for e in self.events if e.kind in kinds), key=lambda e: e.at)
+
+
+LinkEvents: TypeAlias = list[Event]
+
+
+def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> DirectionProfile:
+    """Put a schedule's faults of the link over the conditions of one direction."""
+    mine = [event for event in schedule.events if event.way in ("both", way)]
+    blackouts = [Blackout(e.at, e.duration) for e in mine if e.kind == "blackout"]
+    waves = [e for e in mine if e.kind in ("delay", "jitter", "loss", "bursts")]
+    edges = sorted({instant for event in waves for instant in (event.at, event.end)})
+    changes = tuple(_change(profile, [e for e in waves if e.at <= t < e.end], t) for t in edges)
+    return replace(
+        profile,
+        blackouts=(*profile.blackouts, *blackouts),
+        changes=(*profile.changes, *changes) if not profile.changes else profile.changes,
+        duplicate=max(profile.duplicate, schedule.duplicate),
+        reorder=max(profile.reorder, schedule.reorder),
+    )
+
+
+def _change(profile: DirectionProfile, active: LinkEvents, at: float) -> Change:
+    """The conditions from an instant on, with all that is going on then."""
+    delay, jitter, loss = profile.delay, profile.jitter, profile.loss
+    for event in active:
+        if event.kind == "delay":
+            delay += event.value
+        elif event.kind == "jitter":
+            jitter = max(jitter, event.value)
+        elif event.kind == "loss":
+            loss = event.value
+        else:
+            loss = GilbertElliott(bad_start=0.01, bad_end=1.0 / max(event.value, 1.0))
+    return Change(at, delay=delay, jitter=jitter, loss=loss)
+
+
+def dump(schedule: Schedule, note: str = "") -> str:
+    """Write a schedule as YAML, with a note of what it showed."""
+    document: dict[str, Any] = {
+        name: value
+        for name, value in asdict(schedule).items()
+        if name not in ("events",) and value != getattr(Schedule(0), name)
+    }
+    document["seed"] = schedule.seed
+    document["events"] = [
+        {name: value for name, value in asdict(event).items() if value or name == "at"}
+        for event in sorted(schedule.events, key=lambda event: event.at)
+    ]
+    head = "".join(f"# {line}\n" for line in note.splitlines())
+    text: str = yaml.safe_dump(document, sort_keys=False, width=100)
+    return head + text
+
+
+def load(path: Path) -> Schedule:
+    """Read a schedule.
+
+    Raises:
+        BadInputError: If it is none, or nothing that could be flown.
+    """
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        schedule = _SCHEDULE.validate_python(document)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise _none(path, f"{place}: {first['msg']}" if place else first["msg"]) from error
+    except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
+        raise _none(path, " ".join(str(error).split())) from error
+    if problem := _problem(schedule):
+        raise _none(path, problem)
+    return schedule
+
+
+_SCHEDULE = TypeAdapter(Schedule)
+
+
+def _none(path: Path, text: str) -> BadInputError:
+    return BadInputError(f"{path}: is no schedule of faults: {text}")
+
+
+def _problem(schedule: Schedule) -> str:
+    """What cannot be flown, in words; "" if all can."""
+    numbers = {
+        "seed": (schedule.seed, 0, 2**63),
+        "duration": (schedule.duration, 0.1, DURATION_MAX),
+        "duplicate": (schedule.duplicate, 0.0, 1.0),
+        "reorder": (schedule.reorder, 0.0, 1.0),
+        "cloud_offset": (schedule.cloud_offset, -OFFSET_MAX, OFFSET_MAX),
+        "cloud_drift": (schedule.cloud_drift, -100_000, 100_000),
+    }
+    for n, event in enumerate(schedule.events):
+        if event.kind not in KINDS:
+            return f"events.{n}.kind: no fault '{event.kind}'; there are: {', '.join(KINDS)}"
+        if event.way not in WAYS:
+            return f"events.{n}.way: '{event.way}' is none of {', '.join(WAYS)}"
+        numbers[f"events.{n}.at"] = (event.at, 0.0, DURATION_MAX)
+        numbers[f"events.{n}.duration"] = (event.duration, 0.0, DURATION_MAX)
+        lowest = -VALUE_MAX if event.kind == "wall_clock" else 0.0
+        highest = 1.0 if event.kind in SHARES else VALUE_MAX
+        numbers[f"events.{n}.value"] = (event.value, lowest, highest)
+    for place, (value, low, high) in numbers.items():
+        if not low <= value <= high:  # NaN is not, either
+            return f"{place}: {value:g} is not between {low:g} and {high:g}"
+    return ""

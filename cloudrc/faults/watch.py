@@ -1,0 +1,182 @@
+"""The invariants, looked at in every step of the physics, by nobody who could be wrong with them.
+
+No fence breach: the base stays inside the fence, with its rotors stopped, too; what is flown stays
+below the caps and can be stopped in time, before the floor, too, unless the robot lands. No motion
+on stale commands: in TRACK the newest accepted command's basis is never older than its limit. No
+collision, under an honest cloud: nothing but the arm's tip touches anything, and that the board.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from math import sqrt
+from typing import Any, NamedTuple
+
+from cloudrc.geometry.fence import HIGH, LOW
+from cloudrc.messages import ZERO, Command, GuardState, Vector
+from cloudrc.records import Contact
+
+TICK_NS = 2_000_000
+"""Of the physics [ns]."""
+SLACK = 1e-9
+"""For rounding [m/s]."""
+FLOWN = (GuardState.TRACK, GuardState.HOLD, GuardState.LAND)
+ABOVE_GROUND = (GuardState.TRACK, GuardState.HOLD)
+REPORTED = 5
+"""Of each kind."""
+
+
+class Breach(NamedTuple):
+    """An invariant that did not hold.
+
+    Attributes:
+        time: World's clock [s].
+        kind: "collision", "fence", "cap", "stop", "stale", "stuck", "alarm", "recording" or
+            "error".
+        text: What happened.
+    """
+
+    time: float
+    kind: str
+    text: str
+
+
+class Watch:
+    """Watches one world.
+
+    Attributes:
+        breaches: The first ones of each kind.
+        counts: Of all of them, by kind.
+        margin: Smallest distance of the base to a face of the fence other than the floor [m].
+        speed: Largest speed flown [m/s].
+    """
+
+    def __init__(self, speed_max: float, acceleration_max: float, age_max_ns: int) -> None:
+        """Learn the limits, from the configuration and not from the guard.
+
+        Args:
+            speed_max: Cap on the reference [m/s].
+            acceleration_max: Cap on its change [m/s^2].
+            age_max_ns: Of a command's basis [ns].
+        """
+        self._speed_max, self._step_max = (
+            speed_max + SLACK,
+            acceleration_max * TICK_NS * 1e-9 + SLACK,
+        )
+        self._age_max_ns = age_max_ns
+        self.breaches: list[Breach] = []
+        self.counts: Counter[str] = Counter()
+        self.margin, self.speed = 9.0, 0.0
+        self._hit: tuple[int, str] | None = None
+
+    def attach(self, world: Any, start_ns: int) -> None:
+        """Look at every step of a world that begins now, and at every command that it accepts."""
+        robot = world.robot
+        simulator, guard = robot.simulator, robot.guard
+        step, offer = simulator.step, guard.offer
+        now_ns, basis_ns, before = start_ns, -1, ZERO
+        age_max_ns, flown = self._age_max_ns, FLOWN
+        tracking, landing = GuardState.TRACK, GuardState.LAND
+
+        def watched_offer(command: Command, when_ns: int) -> Any:
+            nonlocal basis_ns
+            refusal = offer(command, when_ns)
+            if not refusal and command.basis_stamp_ns > basis_ns:
+                basis_ns = command.basis_stamp_ns
+            return refusal
+
+        def watched_step(rotor_speeds: Any) -> None:
+            nonlocal now_ns, before
+            state, reference = guard.state, guard.reference
+            position = simulator.readings.position
+            self._look_at_fence(position, now_ns)
+            if state in flown:
+                self._look_at_stop(position, reference, state is landing, now_ns)
+                if reference is not before:
+                    self._look_at_caps(before, reference, state is tracking, now_ns)
+                if state is tracking and now_ns - basis_ns > age_max_ns:
+                    age = (now_ns - basis_ns) * 1e-9
+                    self.note(now_ns, "stale", f"TRACK on a command {age:.3f} s old")
+            before = reference
+            step(rotor_speeds)
+            now_ns += TICK_NS
+
+        simulator.step, guard.offer = watched_step, watched_offer
+
+    def _look_at_fence(self, position: Vector, now_ns: int) -> None:
+        x, y, z = position
+        (xl, yl, zl), (xh, yh, zh) = LOW, HIGH
+        margin = min(x - xl, xh - x, y - yl, yh - y, zh - z)
+        if z < zl:
+            self.note(now_ns, "fence", f"base at ({x:.2f}, {y:.2f}, {z:.2f}), below the floor")
+        if margin < self.margin:
+            self.margin = margin
+            if margin < 0.0:
+                text = f"base at ({x:.2f}, {y:.2f}, {z:.2f})"
+                if self._hit is not None:
+                    hit_ns, body = self._hit
+                    text += f", {(now_ns - hit_ns) * 1e-9:.2f} s after it hit {body}"
+                self.note(now_ns, "fence", text)
+
+    def _look_at_stop(self, position: Vector, reference: Vector, lands: bool, now_ns: int) -> None:
+        (x, y, z), (vx, vy, vz) = position, reference
+        (xl, yl, zl), (xh, yh, zh) = LOW, HIGH
+        if not (
+            stops(vx, x - xl, xh - x)
+            and stops(vy, y - yl, yh - y)
+            and (stops(vz, z - zl, zh - z) or (lands and vz < 0.0))
+        ):
+            text = f"({vx:.3f}, {vy:.3f}, {vz:.3f}) m/s at ({x:.2f}, {y:.2f}, {z:.2f})"
+            self.note(now_ns, "stop", f"reference {text}")
+
+    def _look_at_caps(self, before: Vector, reference: Vector, ramped: bool, now_ns: int) -> None:
+        (ux, uy, uz), (vx, vy, vz) = before, reference
+        speed = sqrt(vx * vx + vy * vy + vz * vz)
+        if speed > self.speed:
+            self.speed = speed
+        if not speed <= self._speed_max:  # NaN is no speed either
+            self.note(now_ns, "cap", f"reference {speed:.3f} m/s")
+        # Slowing down may be as hard as it must: at the fence, or when something was hit.
+        jump = sqrt(_growth(ux, vx) ** 2 + _growth(uy, vy) ** 2 + _growth(uz, vz) ** 2)
+        if ramped and not jump <= self._step_max:
+            self.note(now_ns, "cap", f"reference grows by {jump:.9f} m/s in a tick")
+
+    def see(self, contact: Contact, guard: GuardState, honest: bool) -> None:
+        """Judge a contact; under a cloud that is not honest it only explains what comes later."""
+        body = contact.body
+        self._hit = (contact.stamp_ns, body)
+        if not honest:
+            return
+        landing = guard not in ABOVE_GROUND
+        allowed = (body == "board" and contact.tip) or (landing and body == "floor")
+        if not allowed:
+            part = "tip" if contact.tip else "body"
+            self.note(contact.stamp_ns, "collision", f"{part} touched {body} in {guard.name}")
+
+    def note(self, now_ns: int, kind: str, text: str) -> None:
+        """Note a breach of some kind at an instant [ns]."""
+        self.counts[kind] += 1
+        if self.counts[kind] <= REPORTED:
+            self.breaches.append(Breach(now_ns * 1e-9, kind, text))
+
+
+def stops(speed: float, below: float, above: float) -> bool:
+    """Say whether the robot can stop before the face that it flies towards.
+
+    Source: DESIGN, section 5: 0.2 v + v^2/6 <= distance - 0.1.
+
+    Args:
+        speed: Component of the velocity along an axis [m/s].
+        below: Distance to the face at the axis' lower end [m].
+        above: Distance to the one at its upper end [m].
+    """
+    if speed > 0.0:
+        return speed * (0.2 + speed / 6.0) <= above - 0.1 + SLACK
+    return speed == 0.0 or speed * (speed / 6.0 - 0.2) <= below - 0.1 + SLACK
+
+
+def _growth(before: float, after: float) -> float:
+    """By how much a component leads further away from rest than before [m/s]."""
+    if before * after < 0.0:
+        return abs(after)
+    return max(abs(after) - abs(before), 0.0)

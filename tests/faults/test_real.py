@@ -1,0 +1,38 @@
+"""The faults that make sense with real processes, on this machine and in a cluster."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from cloudrc.faults.catalogue import scenarios
+from cloudrc.faults.scenario import Scenario
+
+REAL = scenarios("real")
+QUICK = ("cloud-killed", "recorder-killed", "slow-scrapers")
+"""A flight each: they pass before anything lands; the others take minutes."""
+
+
+@pytest.mark.process
+@pytest.mark.promise("P-FAULT-1")
+@pytest.mark.parametrize(
+    "scenario",
+    [pytest.param(r, marks=[] if r.name in QUICK else pytest.mark.full, id=r.name) for r in REAL],
+)
+def test_a_fault_with_real_processes_is_survived(scenario: Scenario) -> None:
+    outcome = scenario.run(1)
+    assert not outcome.skipped or scenario.name not in QUICK
+    assert [check.show() for check in outcome.checks if not check.passed] == []
+
+
+def test_what_is_listed_for_a_mode_can_be_run_there() -> None:
+    for flag, mode in (("--real", "real"), ("--cluster", "cluster")):
+        command = [sys.executable, "-m", "cloudrc", "faults", "list", flag, "-o", "json"]
+        document = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+        assert document["schemaVersion"] == 1
+        listed = document["faults"]
+        assert [each["name"] for each in listed] == [each.name for each in scenarios(mode)]  # type: ignore[arg-type]
+        assert {each["mode"] for each in listed} == {mode}

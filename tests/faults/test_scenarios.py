@@ -1,0 +1,204 @@
+"""Every fault of the table has a scenario that passes, and one seed is one run."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as Xml
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.errors import BadInputError
+from cloudrc.faults import document
+from cloudrc.faults.catalogue import find, scenarios
+from cloudrc.faults.document import Result
+from cloudrc.faults.scenario import Check, Outcome, Scenario
+
+FAULTS = range(1, 41)
+QUICK = ("short-blackout", "cloud-killed", "forged-command", "bad-configuration")
+SHARED = scenarios("virtual")
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "safety" / "faults.md"
+
+
+@pytest.mark.promise("P-FAULT-1")
+def test_every_fault_of_the_table_has_a_scenario() -> None:
+    assert {each.number for each in scenarios()} == set(FAULTS)
+    names = [(each.name, each.mode) for each in scenarios()]
+    assert len(names) == len(set(names))
+
+
+@pytest.mark.promise("P-FAULT-1")
+def test_the_page_is_of_these_faults_and_every_check_on_it_has_passed() -> None:
+    """`make faults`, which CI runs, writes it, and fails where a check does."""
+    page = PAGE.read_text(encoding="utf-8")
+    table, _, measured = page.partition("\n## Measured\n")
+    rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| F")]
+    named = [(each.id, each.name, each.injects, each.expects) for each in scenarios()]
+    told = [(*row[0].removeprefix("| ").split(" ", 1), row[1], row[2]) for row in rows]
+    assert sorted(told) == sorted(named), "run make faults"
+    assert {int(name[1:]) for name, *_ in told} == set(FAULTS)
+    passed = re.findall(r"\| (\d+) of (\d+) passed \|", table)
+    assert len(passed) == len(SHARED)
+    assert [pair for pair in passed if pair[0] != pair[1] or pair[0] == "0"] == []
+    assert "FAILED" not in measured
+    assert ": NO" not in measured
+
+
+@pytest.mark.promise("P-FAULT-1")
+def test_where_a_metric_is_named_it_was_looked_at_and_else_it_says_that_there_is_none() -> None:
+    _, _, measured = PAGE.read_text(encoding="utf-8").partition("\n## Measured\n")
+    sections = dict(re.findall(r"### (F\d+) [^\n]*\n(.*?)(?=\n### |\Z)", measured, re.DOTALL))
+    silent = []
+    for each in SHARED:
+        asked = set(re.findall(r"metric (\w+)", sections[each.id]))
+        named = set(re.findall(r"cloudrc_(\w+)", each.shows))
+        if named - asked or not (named or "no metric" in each.shows):
+            silent.append((each.id, sorted(named - asked)))
+    assert silent == []
+
+
+@pytest.mark.promise("P-FAULT-1")
+@pytest.mark.parametrize("name", QUICK)
+def test_a_fault_is_survived(name: str) -> None:
+    outcome = find(name, "virtual").run(1)
+    assert [check.show() for check in outcome.checks if not check.passed] == []
+    assert outcome.checks
+
+
+@pytest.mark.full
+@pytest.mark.promise("P-FAULT-1")
+@pytest.mark.parametrize("scenario", SHARED, ids=lambda each: each.name)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_every_fault_is_survived(scenario: Scenario, seed: int) -> None:
+    outcome = scenario.run(seed)
+    assert [check.show() for check in outcome.checks if not check.passed] == []
+
+
+@pytest.mark.promise("P-FAULT-5")
+def test_one_seed_is_one_run() -> None:
+    scenario = find("F40", "virtual")
+    first, second, other = scenario.run(3), scenario.run(3), scenario.run(4)
+    assert first.sha256 == second.sha256 != other.sha256
+    assert first.checks == second.checks
+
+
+def test_an_unknown_fault_is_bad_input() -> None:
+    with pytest.raises(BadInputError, match="no fault 'F99' in mode virtual; there are: F1 "):
+        find("F99", "virtual")
+
+
+@pytest.mark.parametrize(
+    ("check", "passed"),
+    [
+        (Check("", 1.0, "<=", 1.0), True),
+        (Check("", 1.1, "<=", 1.0), False),
+        (Check("", 0.9, ">=", 1.0), False),
+        (Check("", 1.0, "==", 1.0), True),
+        (Check("", float("nan"), "<=", 1.0), False),
+        (Check("", float("inf"), ">=", 1.0), False),
+    ],
+)
+def test_what_is_not_measured_has_not_passed(check: Check, passed: bool) -> None:
+    assert check.passed is passed
+
+
+def results() -> list[Result]:
+    good, bad, none = Outcome(sha256="ab" * 32), Outcome(), Outcome(skipped="not here")
+    good.most("HOLD after", 0.252, 0.252, "s")
+    good.most("HOLD after", 0.1, 0.252, "s")
+    good.true("mission done", True)
+    bad.same("collisions", 2, 0)
+    scenario = find("F13", "virtual")
+    return [
+        Result(scenario, good, 1.0),
+        Result(scenario, bad, 2.0),
+        Result(scenario, none, 0.0),
+        Result(scenario, Outcome(), 0.0, "ValueError: broken"),
+    ]
+
+
+def test_results_as_junit() -> None:
+    suite = Xml.fromstring(document.as_junit(results(), 7))
+    assert suite.attrib["failures"] == "2"
+    assert suite.attrib["skipped"] == "1"
+    failures = [case.find("failure") for case in suite]
+    texts = ["" if failure is None else failure.attrib["message"] for failure in failures]
+    assert texts == ["", "collisions: 2 (0)", "", "ValueError: broken"]
+
+
+def test_results_as_a_table_show_the_worst_of_each_promise() -> None:
+    text = document.as_markdown(results(), 7)
+    assert "HOLD after: 0.252 s (<= 0.252), 2 times" in text
+    assert "mission done: yes" in text
+    assert "1 of 4 scenarios passed" in text
+
+
+def test_the_command_prints_json_and_exits_by_the_checks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    junit = tmp_path / "faults.xml"
+    assert main(["faults", "run", "F37", "-o", "json", "--junit", str(junit)]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["schemaVersion"] == 1
+    assert printed["faults"][0]["result"] == "passed"
+    checks = {check["text"]: check["unit"] for check in printed["faults"][0]["checks"]}
+    assert checks["exit code"] == ""
+    assert "yes" in checks.values()
+    assert Xml.parse(junit).getroot().attrib["tests"] == "1"
+
+
+def test_a_failed_check_ends_in_exit_code_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from cloudrc.cli import faults_run
+
+    monkeypatch.setattr(faults_run, "_run", lambda which: results()[1])
+    assert main(["faults", "run", "F13"]) == 1
+    assert "collisions: 2 (0)" in capsys.readouterr().out
+
+
+def test_the_list_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["faults", "list"]) == 0
+    listed = re.findall(r"^(F\d+) ", capsys.readouterr().out, re.MULTILINE)
+    assert {f"F{n}" for n in FAULTS if n != 31} <= set(listed)
+
+
+def test_without_a_name_or_an_action_it_says_what_is_missing(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["faults"]) == 2
+    assert main(["faults", "run"]) == 2
+    assert main(["faults", "run", "nothing"]) == 2
+    assert "there are: F1 short-blackout" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ("run F31", 2, "try: cloudrc faults run slow-scrapers --real"),
+        ("run F12 --real", 2, "try: cloudrc faults run jitter"),
+        ("run F37 --seed -1", 2, "'-1' is not a whole number"),
+        ("run F37 --seed 1e9", 2, "'1e9' is not a whole number"),
+        ("fuzz --first -5 --seeds 1", 2, "'-5' is not a whole number"),
+        ("run F37 --junit none/x.xml", 2, "no file can be written there"),
+        ("run F37 --document /", 2, "no file can be written there"),
+        ("fuzz --seeds 1 --document none/x.md", 2, "no file can be written there"),
+        ("run --all --cluster", 3, "no cluster is configured"),
+        ("run F13 --cluster", 3, "no cluster is configured"),
+    ],
+)
+def test_what_cannot_be_done_is_said_at_once_and_in_one_line(
+    words: str,
+    code: int,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("KUBECONFIG", "/nowhere/config")
+    monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", "/nowhere/c")
+    assert main(["faults", *words.split()]) == code
+    out, err = capsys.readouterr()
+    assert said in err
+    assert (out, err.count("\n")) == ("", 1)

@@ -1,0 +1,124 @@
+"""The watch itself: what it calls a breach, and what not."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from cloudrc.faults.watch import Watch, stops
+from cloudrc.messages import ZERO, Command, GuardState
+from cloudrc.records import Contact
+
+MS = 1_000_000
+INSIDE, OUTSIDE = (1.0, 1.0, 1.0), (9.3, 1.0, 1.0)
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
+
+
+class World:
+    """A robot that is wherever a test puts it."""
+
+    def __init__(self):
+        self.readings = SimpleNamespace(position=INSIDE)
+        self.state, self.reference, self.steps = TRACK, ZERO, 0
+        self.watch = Watch(6.0, 12.0, 250 * MS)
+        self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
+        self.guard = SimpleNamespace(state=TRACK, reference=ZERO, offer=lambda command, now: None)
+        self.robot = SimpleNamespace(simulator=self.simulator, guard=self.guard)
+        self.watch.attach(self, 0)
+        self.guard.offer(Command(0, 0, 0, ZERO, 0.0), 0)
+
+    def _step(self, rotor_speeds):
+        self.steps += 1
+
+    def tick(self, *references, state=TRACK, position=INSIDE):
+        """Fly references, one a tick, and say what kinds of breach there were."""
+        for reference in references:
+            self.guard.state, self.guard.reference = state, reference
+            self.readings.position = position
+            self.simulator.step(None)
+        return set(self.watch.counts)
+
+
+@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.parametrize("state", GuardState)
+def test_the_base_may_not_be_outside_in_any_state_rotors_stopped_or_not(state):
+    assert World().tick(ZERO, state=state) == set()
+    assert World().tick(ZERO, state=state, position=OUTSIDE) == {"fence"}
+
+
+def test_a_breach_says_how_long_before_something_was_hit():
+    world = World()
+    contact = Contact(0, "board", INSIDE, ZERO, ZERO, False)
+    world.watch.see(contact, TRACK, honest=False)
+    world.tick(ZERO, position=OUTSIDE)
+    assert [breach.text for breach in world.watch.breaches] == [
+        "base at (9.30, 1.00, 1.00), 0.00 s after it hit board"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("reference", "kinds"),
+    [((0.02, 0.013, 0.0), set()), ((0.02, 0.014, 0.0), {"cap"}), ((6.001, 0.0, 0.0), {"cap"})],
+)
+def test_the_reference_grows_no_faster_than_the_cap(reference, kinds):
+    assert World().tick(reference) == kinds
+
+
+def test_it_may_slow_down_at_once_and_is_not_held_to_the_cap_while_it_brakes():
+    assert World().tick((0.02, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, -0.02, 0.0)) == set()
+    assert World().tick((0.1, 0.0, 0.0), state=HOLD) == set()
+    assert World().tick((0.02, 0.0, 0.0), (-0.025, 0.0, 0.0)) == {"cap"}
+
+
+def test_what_cannot_stop_is_found_in_flight_only():
+    near = (8.9, 1.0, 1.0)  # 0.2 v + v^2/6 <= 0.2: 0.647 m/s
+    assert World().tick((0.64, 0.0, 0.0), state=HOLD, position=near) == set()
+    assert World().tick((0.66, 0.0, 0.0), state=HOLD, position=near) == {"stop"}
+    assert World().tick((0.66, 0.0, 0.0), state=ESTOP, position=near) == set()
+
+
+def test_the_floor_is_a_face_unless_the_robot_lands():
+    low = (1.0, 1.0, 0.5)  # 0.2 v + v^2/6 <= 0.4: 1.061 m/s
+    assert World().tick((0.0, 0.0, -1.06), state=HOLD, position=low) == set()
+    assert World().tick((0.0, 0.0, -1.07), state=HOLD, position=low) == {"stop"}
+    assert World().tick((0.0, 0.0, -1.07), state=LAND, position=low) == set()
+    assert World().tick((9.0, 0.0, -1.07), state=LAND, position=low) == {"stop", "cap"}
+    assert World().tick(ZERO, state=LAND, position=(1.0, 1.0, -0.01)) == {"fence"}
+
+
+def test_track_is_for_fresh_commands():
+    world = World()
+    assert world.tick(*[ZERO] * 126) == set()
+    assert world.tick(ZERO) == {"stale"}
+
+
+@pytest.mark.parametrize(
+    ("speed", "below", "above", "can"),
+    [
+        (0.0, 0.0, 0.0, True),
+        (1.0, 0.0, 0.47, True),
+        (1.0, 9.0, 0.46, False),
+        (-1.0, 0.47, 0.0, True),
+        (-1.0, 0.46, 9.0, False),
+    ],
+)
+def test_stopping_counts_towards_the_face_ahead(speed, below, above, can):
+    assert stops(speed, below, above) == can
+
+
+@pytest.mark.parametrize(
+    ("body", "tip", "state", "kinds"),
+    [
+        ("board", True, TRACK, set()),
+        ("board", False, TRACK, {"collision"}),
+        ("pipe_1", True, TRACK, {"collision"}),
+        ("floor", False, HOLD, {"collision"}),
+        ("floor", False, LAND, set()),
+    ],
+)
+def test_under_an_honest_cloud_nothing_but_the_tip_touches_and_that_the_board(
+    body, tip, state, kinds
+):
+    for honest, found in ((True, kinds), (False, set())):
+        watch = Watch(6.0, 12.0, 250 * MS)
+        watch.see(Contact(0, body, INSIDE, ZERO, ZERO, tip), state, honest)
+        assert set(watch.counts) == found

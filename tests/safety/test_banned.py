@@ -1,0 +1,132 @@
+"""What runs foreign bytes as code is nowhere in the tree: read from the syntax tree."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SHIPPED = [*sorted((ROOT / "cloudrc").rglob("*.py")), *sorted((ROOT / "tools").rglob("*.py"))]
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
+
+MODULES = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "jsonpickle"}
+CALLS = {"eval", "exec", "__import__"}
+LOADERS = {"load", "load_all", "full_load", "full_load_all", "unsafe_load", "unsafe_load_all"}
+SAFE_LOADERS = {"SafeLoader", "CSafeLoader"}
+
+
+def breaches(tree: ast.Module) -> Iterator[str]:
+    """What in a file may not be there."""
+    safe = _safe_loaders(tree)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = [alias.name for alias in node.names]
+            modules = [node.module or ""] if isinstance(node, ast.ImportFrom) else names
+            for module in modules:
+                if module.split(".")[0] in MODULES:
+                    yield f"{node.lineno}: imports {module}"
+        elif isinstance(node, ast.Call):
+            yield from _of_call(node, safe)
+
+
+def _of_call(node: ast.Call, safe: set[str]) -> Iterator[str]:
+    name = ast.unparse(node.func)
+    if name.removeprefix("builtins.") in CALLS:
+        yield f"{node.lineno}: calls {name}"
+    for keyword in node.keywords:
+        off = isinstance(keyword.value, ast.Constant) and keyword.value.value is False
+        if keyword.arg == "shell" and not off:
+            yield f"{node.lineno}: shell={ast.unparse(keyword.value)}"
+        if keyword.arg == "allow_pickle" and not off:
+            yield f"{node.lineno}: allow_pickle"
+    if name in ("os.system", "os.popen"):
+        yield f"{node.lineno}: calls {name}"
+    module, _, called = name.rpartition(".")
+    if module == "yaml" and called in LOADERS:
+        given = [*node.args[1:2], *(k.value for k in node.keywords if k.arg == "Loader")]
+        if not given or not all(_is_safe(loader, safe) for loader in given):
+            yield f"{node.lineno}: {name} without a safe loader"
+
+
+def _is_safe(loader: ast.expr, safe: set[str]) -> bool:
+    return ast.unparse(loader).rpartition(".")[2] in SAFE_LOADERS | safe
+
+
+def _safe_loaders(tree: ast.Module) -> set[str]:
+    """Names in a file that stand for nothing but safe loaders, or derive from them."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef) and node.bases:
+            if all(_is_safe(base, found) for base in node.bases):
+                found.add(node.name)
+        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            value = ast.unparse(node.value)
+            if "SafeLoader" in value and "Unsafe" not in value:
+                found.add(node.targets[0].id)
+    return found
+
+
+def found_in(paths: list[Path]) -> dict[str, list[str]]:
+    every = {p: list(breaches(ast.parse(p.read_text())))
+             for p in paths}  # fmt: skip
+    return {path.relative_to(ROOT).as_posix(): found for path, found in every.items() if found}
+
+
+@pytest.mark.promise("P-CODE-1")
+def test_nothing_that_ships_runs_foreign_bytes() -> None:
+    assert found_in(SHIPPED) == {}
+
+
+def test_nor_does_a_test() -> None:
+    """Tests may time what the paper's tunnel did, and name what is banned."""
+    allowed = {"tests/safety/test_banned.py"}
+    found = {place: what for place, what in found_in(TESTS).items() if place not in allowed}
+    found = {
+        place: [one for one in what if "imports pickle" not in one] for place, what in found.items()
+    }
+    assert {place: what for place, what in found.items() if what} == {}
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "def f():\n    import marshal as m",
+        "import dill, json",
+        "eval('1')",
+        "exec(text)",
+        "builtins.eval(text)",
+        "__import__('os')",
+        "yaml.load(text)",
+        "yaml.load(text, yaml.Loader)",
+        "yaml.load(text, Loader=yaml.UnsafeLoader)",
+        "yaml.unsafe_load(text)",
+        "yaml.full_load(text)",
+        "yaml.load_all(text)",
+        "subprocess.run(command, shell=True)",
+        "subprocess.run(command, shell=is_shell)",
+        "os.system(command)",
+        "numpy.load(path, allow_pickle=True)",
+    ],
+)
+def test_a_breach_is_found(code: str) -> None:
+    assert list(breaches(ast.parse(code)))
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "yaml.safe_load(text)",
+        "yaml.load(text, yaml.CSafeLoader)",
+        "class Mine(yaml.SafeLoader): ...\nyaml.load(text, Loader=Mine)",
+        "subprocess.run(command, shell=False)",
+        "model.eval()",
+        "json.load(file)",
+    ],
+)
+def test_what_is_harmless_is_not(code: str) -> None:
+    assert list(breaches(ast.parse(code))) == []

@@ -1,0 +1,103 @@
+"""The promises of guard and link, from end to end: bytes arrive, and a robot moves or does not."""
+
+from __future__ import annotations
+
+from math import hypot, isfinite, nan
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from talking import MS, Talk, talking
+
+from cloudrc.messages import GuardState, Request, Start
+from cloudrc.records import CommandApplied, GroundTruth, GuardChange
+
+PERIOD = 10 * MS
+AGE_MAX = 250 * MS
+FLOATS = st.one_of(
+    st.floats(width=64),
+    st.sampled_from([nan, float("inf"), -float("inf"), 1e308, -1e308, 5e-324, -0.0, 6.0, 1e9]),
+)
+
+
+def fly(talk: Talk, seconds: float, velocity: tuple[float, float, float]) -> None:
+    """A command every 10 ms."""
+    for _ in range(round(seconds * 100)):
+        talk.wait(talk.now_ns + PERIOD)
+        talk.send(talk.command(velocity))
+
+
+@pytest.mark.promise("P-GUARD-1")
+def test_without_fresh_commands_the_robot_brakes_and_holds() -> None:
+    talk = talking()
+    fly(talk, 1.0, (0.0, 0.0, 0.8))
+    fly(talk, 1.5, (0.0, 1.0, 0.0))
+    last = talk.now_ns
+    talk.wait(last + 20_000 * MS)
+    hold = next(r for r in talk.take(GuardChange) if r.state is GuardState.HOLD)
+    basis_ns = max(r.basis_stamp_ns for r in talk.take(CommandApplied))
+    assert AGE_MAX < hold.stamp_ns - basis_ns <= AGE_MAX + 2 * MS
+    flown = [r for r in talk.take(GroundTruth) if r.stamp_ns >= last]
+    speeds = [hypot(*r.odometry.velocity) for r in flown]
+    assert speeds[0] > 0.5, "it flies when its commands end"
+    before = [s for r, s in zip(flown, speeds, strict=True) if r.stamp_ns <= hold.stamp_ns]
+    braked = [s for r, s in zip(flown, speeds, strict=True) if r.stamp_ns > hold.stamp_ns]
+    assert max(braked) <= max(before) + 0.05, "from then on it only slows down"
+    path = [r for r in flown if r.stamp_ns >= hold.stamp_ns + 1_000 * MS]
+    assert max(hypot(*r.odometry.velocity) for r in path) < 0.05
+    assert path[-1].stamp_ns > last + 19_000 * MS
+    first = path[0].odometry.position
+    assert max(hypot(*(a - b for a, b in zip(r.odometry.position, first, strict=True)))
+               for r in path) <= 0.10  # fmt: skip
+
+
+@pytest.mark.promise("P-GUARD-2")
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(FLOATS, FLOATS, FLOATS), min_size=20, max_size=60))
+def test_whatever_the_cloud_sends_what_is_flown_is_finite_and_within_the_caps(velocities) -> None:
+    talk = talking()
+    fly(talk, 0.3, (0.0, 0.0, 0.5))
+    for velocity in velocities:
+        fly(talk, 0.02, velocity)
+    for record in talk.take(GroundTruth):
+        assert all(map(isfinite, (*record.reference, *record.odometry.position)))
+        assert hypot(*record.reference) <= 6.0 + 1e-9
+
+
+@pytest.mark.promise("P-LINK-1")
+def test_a_datagram_of_which_any_bit_differs_changes_nothing() -> None:
+    talk = talking()
+    fly(talk, 0.2, (0.0, 0.0, 0.5))
+    applied = len(talk.take(CommandApplied))
+    valid = talk.command((3.0, 3.0, 3.0))
+    for bit in range(8 * len(valid)):
+        forged = bytearray(valid)
+        forged[bit // 8] ^= 1 << bit % 8
+        talk.send(bytes(forged))
+    for cut in range(len(valid)):
+        talk.send(valid[:cut])
+    talk.wait(talk.now_ns + 100 * MS)
+    assert len(talk.take(CommandApplied)) <= applied + 1  # one was waiting
+    assert all(r.velocity != (3.0, 3.0, 3.0) for r in talk.take(CommandApplied))
+    talk.send(valid)
+    talk.wait(talk.now_ns + 20 * MS)
+    assert talk.take(CommandApplied)[-1].velocity == (3.0, 3.0, 3.0)
+
+
+@pytest.mark.promise("P-LINK-2")
+def test_what_was_captured_is_worth_nothing_after_a_restart_of_both_ends() -> None:
+    captured: list[bytes] = []
+    talk = talking()
+    send = talk.send
+    talk.send = lambda data: (captured.append(data), send(data))[1]  # type: ignore[method-assign]
+    talk.request(2, Request.START, Start.HERE)
+    fly(talk, 1.0, (0.0, 0.0, 0.5))
+    assert talk.take(CommandApplied)
+    after = Talk(last_epoch=1, nonce=b"world again")
+    after.hello(b"cloud again")
+    after.wait(20 * MS)
+    for data in captured:
+        after.send(data)
+        after.wait(after.now_ns + PERIOD)
+    assert not after.take(CommandApplied)
+    assert not after.take(GuardChange)
