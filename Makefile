@@ -9,6 +9,10 @@ REGISTRY ?=
 CLUSTER ?= cloudrc
 IMAGES := world cloud
 SCRIPTS := .ci/run
+# Flights at once in the search for faults.
+JOBS ?= $(shell nproc 2>/dev/null || echo 2)
+# What the search finds is shrunk and becomes a test, until it is mended a failing one.
+STORE := --store tests/faults/regressions
 BUILD_ARGS := --build-arg VERSION=$(VERSION) \
 	--build-arg SOURCE=$(or $(filter https://%,$(shell git config remote.origin.url)),unpublished) \
 	--build-arg REVISION=$(or $(shell git rev-parse HEAD 2>/dev/null),unknown)
@@ -19,7 +23,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio websockets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process e2e test-netem nightly lint types bench pictures docs images kind-load lock chart-docs clean
+.PHONY: help demo test process e2e e2e-full test-netem faults figures nightly lint types bench bench-link pictures docs images kind-load lock chart-docs clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -35,14 +39,33 @@ process: $(VENV)/dev ## run the tests that start processes and take real time
 
 # With KUBECONFIG set, the release goes into that cluster, and nothing is made or removed but ours.
 e2e: $(VENV)/dev ## fly on a kind cluster of its own, or that of KUBECONFIG (KEEP=1 leaves it)
+	$(bin)/pytest -m 'e2e and not full' tests/e2e $(if $(KEEP),--keep)
+
+e2e-full: $(VENV)/dev ## the same with every fault of the cluster's suite, its Secret rotated: minutes
 	$(bin)/pytest -m e2e tests/e2e $(if $(KEEP),--keep)
 
+# Without root or sch_netem pytest exits with 3; make turns every failure into its own 2.
 test-netem: $(VENV)/dev ## run the tests of the kernel's netem; needs root and sch_netem
-	$(bin)/pytest -m netem tests/link
+	$(bin)/pytest -m netem -rP tests/link
 
-nightly: $(VENV)/dev ## run every test, with the full numbers: minutes
+faults: $(VENV)/dev ## bring every fault about, compose 200 at random; writes docs/safety/faults.md
+	$(bin)/cloudrc faults run --all --jobs $(JOBS) --document docs/safety/faults.md
+	$(bin)/cloudrc faults fuzz --seeds 200 --jobs $(JOBS) --document docs/safety/search.md $(STORE)
+	$(bin)/cloudrc faults fuzz --adversarial --seeds 200 --jobs $(JOBS) \
+		--document docs/safety/adversary.md $(STORE)
+
+figures: $(VENV)/dev ## print the numbers of safety that tests have measured: asked, measured, of how many
+	$(bin)/python tools/figures.py
+
+nightly: $(VENV)/dev ## run every test, with the full numbers, and 500 hours of faults
 	$(bin)/pytest -n auto -m 'not process and not e2e and not netem'
 	$(bin)/pytest -m process
+	$(bin)/cloudrc faults run --all --real
+	$(bin)/cloudrc faults fuzz --clean --seeds 600 --jobs $(JOBS) $(STORE)
+	$(bin)/cloudrc faults fuzz --adversarial --seeds 5000 --jobs $(JOBS) $(STORE)
+	$(bin)/cloudrc faults fuzz --seeds 30000 --jobs $(JOBS) $(STORE)
+	$(bin)/python tools/figures.py
+	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 
 lint: $(VENV)/dev ## check format and rules
 	$(bin)/ruff format --check .
@@ -57,6 +80,9 @@ types: $(VENV)/dev ## check types
 
 bench: $(VENV)/all ## measure the closed loop against raw physics
 	$(bin)/cloudrc bench
+
+bench-link: $(VENV)/all ## measure the relay against what was asked, and C anchors; needs cc
+	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 
 pictures: $(VENV)/all ## draw the README's picture from a flight
 	rm -rf build/pictures

@@ -6,7 +6,8 @@ Drivers know endpoints by contract only, world and cloud never meet: here they a
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import inf, radians
+from itertools import pairwise
+from math import dist, inf, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,15 +21,26 @@ from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.config import schema
 from cloudrc.config.parameters import build
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
-from cloudrc.link.trace import read_trace
+from cloudrc.link.trace import read_table, read_trace
 from cloudrc.messages import Start
 
 if TYPE_CHECKING:
     from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
 
 MS_TO_NS = 1_000_000
+CRUISE_SPEED = 1.0
+"""That a leg is expected to be flown at, at least, if the guard allows it [m/s]."""
+SETTLE_TIME = 4.0
+"""Expected for a leg's beginning and end [s]."""
+LEG_PATIENCE = 3.0
+"""A leg that takes so many times what is expected has failed [1]. Source: fault F28."""
+ONLY_MISSION = 1
+"""Number on board of the mission of a cloud that flies no other."""
+FENCE_SPAN = dist(fence.LOW, fence.HIGH)
+"""The longest way that there is [m]."""
 
 
 def build_world(
@@ -44,7 +56,8 @@ def build_world(
         clock: Its monotonic clock [ns]; read last, since a scene takes a while to compile.
     """
     from cloudrc.world.endpoint import WorldEndpoint
-    from cloudrc.world.guard import Guard, Limits
+    from cloudrc.world.guard import Guard
+    from cloudrc.world.guard_limits import Limits
     from cloudrc.world.low_level import LowLevel
     from cloudrc.world.robot import Robot
     from cloudrc.world.sensors import Sensors
@@ -52,10 +65,13 @@ def build_world(
 
     world, guard = experiment.world, experiment.guard
     limits = Limits(
+        fence_low=fence.LOW,
+        fence_high=fence.HIGH,
         command_age_max_ns=round(guard.command_age_max_ms * MS_TO_NS),
         speed_max=guard.speed_max_mps,
         acceleration_max=guard.acceleration_max_mps2,
         yaw_rate_max=guard.yaw_rate_max_radps,
+        hold_max_ns=round(guard.hold_max_s * 1e9),
     )
     robot = Robot(
         Simulator(world.robot, world.scene), LowLevel(**world.low_level.model_dump()), Guard(limits)
@@ -95,7 +111,7 @@ def build_cloud(
     start_ns = clock()
     if teleop is None:
         teleop = Teleop()
-        teleop.operate(StartMission(build_plan(experiment)), start_ns)
+        teleop.operate(StartMission(build_plan(experiment), ONLY_MISSION), start_ns)
     newest_wins = experiment.tunnel.order == "newest"
     return CloudEndpoint(loop, teleop, identity, newest_wins=newest_wins, start_ns=start_ns)
 
@@ -110,22 +126,30 @@ def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDire
 
 def build_plan(experiment: ResolvedExperiment) -> Plan:
     """Turn the experiment's mission into legs."""
-    return mission_plan(experiment.mission, experiment.criteria.time_limit_s, experiment.seed)
+    return mission_plan(
+        experiment.mission,
+        experiment.criteria.time_limit_s,
+        experiment.seed,
+        speed_max=experiment.guard.speed_max_mps or inf,
+    )
 
 
-def mission_plan(mission: schema.Mission, time_limit: float, seed: int = 0) -> Plan:
+def mission_plan(
+    mission: schema.Mission, time_limit: float, seed: int = 0, *, speed_max: float = inf
+) -> Plan:
     """Turn a mission into legs.
 
     Args:
         mission: Checked.
         time_limit: Of the whole mission [s].
         seed: Of random steps.
+        speed_max: That the guard allows [m/s].
     """
-    legs = (
-        _step_legs(mission.steps, seed)
-        if mission.steps is not None
-        else tuple(_leg(waypoint) for waypoint in mission.waypoints)
-    )
+    if mission.steps is not None:
+        legs = _step_legs(mission.steps, seed)
+    else:
+        ways = pairwise((None, *mission.waypoints))
+        legs = tuple(_leg(before, waypoint, speed_max) for before, waypoint in ways if waypoint)
     return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
 
@@ -139,23 +163,32 @@ def link_profile(direction: schema.Direction) -> DirectionProfile:
         loss=_loss(direction.loss),
         duplicate=direction.duplicate,
         reorder=direction.reorder,
+        corrupt=direction.corrupt,
         keep_order=direction.keep_order,
         rate=_scaled(direction.rate_kbit, 1e3),
         queue_packets=direction.queue_packets,
         changes=tuple(_change(change) for change in direction.changes),
         trace=None if direction.trace is None else read_trace(Path(direction.trace)),
         blackouts=tuple(Blackout(b.start_s, b.duration_s) for b in direction.blackouts),
+        table=_table(direction),
     )
 
 
-def _leg(waypoint: schema.Waypoint) -> Leg:
-    return Leg(
-        waypoint.position_m,
-        radians(waypoint.yaw_deg),
-        waypoint.tolerance_m,
-        waypoint.dwell_s,
-        waypoint.time_limit_s,
-    )
+def _table(direction: schema.Direction) -> tuple[float, ...]:
+    if direction.distribution != "table" or direction.table is None:
+        return ()
+    return read_table(Path(direction.table))
+
+
+def _leg(before: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: float) -> Leg:
+    limit = waypoint.time_limit_s
+    if limit is None:
+        # The first leg's beginning is not known: as far as the fence is wide.
+        way = FENCE_SPAN if before is None else dist(before.position_m, waypoint.position_m)
+        expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
+        limit = round(LEG_PATIENCE * expected, 1)
+    yaw = radians(waypoint.yaw_deg)
+    return Leg(waypoint.position_m, yaw, waypoint.tolerance_m, waypoint.dwell_s, limit)
 
 
 def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:

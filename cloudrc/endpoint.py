@@ -24,6 +24,10 @@ from cloudrc.records import Record
 class Endpoint(Protocol):
     """One end of the tunnel, sans I/O. Times are integer nanoseconds of its own clock."""
 
+    @property
+    def sealed(self) -> bool:
+        """Whether its datagrams are sealed; one whose are not must not come near a socket."""
+
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
         """Take in one datagram; one that is not valid is counted and dropped, never raised."""
 

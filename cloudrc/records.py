@@ -10,6 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple, TypeAlias
 
 from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
+from cloudrc.records_link import LinkChanged as LinkChanged
+from cloudrc.records_link import LinkChecked as LinkChecked
 
 
 class TelemetrySent(NamedTuple):
@@ -259,5 +261,7 @@ Record: TypeAlias = (
     | MissionEvent
     | Fault
     | Counted
+    | LinkChanged
+    | LinkChecked
     | Lateness
 )

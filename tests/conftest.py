@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Callable, Iterator
 
 import pytest
+
+from tools import figures
 
 # A shell that starts the tests in the background lets them ignore Ctrl-C, and so would all the
 # processes that they start, though to end on Ctrl-C is what some of these are tested for.
@@ -19,3 +22,39 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     if os.environ.get("REQUIRE_ALL") and reporter and reporter.stats.get("skipped"):
         reporter.write_line("REQUIRE_ALL: tests were skipped; see -rs", red=True)
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.fixture(autouse=True)
+def flights_of_others_are_not_seen(
+    request: pytest.FixtureRequest,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whoever runs the tests may fly something else meanwhile."""
+    if "e2e" in request.path.parts:
+        return  # kind's containers may need the first one
+    base = tmp_path_factory.getbasetemp()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(base))
+    monkeypatch.setenv("XDG_STATE_HOME", str(base / "state"))
+
+
+@pytest.fixture
+def figure(request: pytest.FixtureRequest) -> Callable[..., None]:
+    """Note a number: figure("HOLD after", 0.252, "<=", 0.252, "s"); `make figures` prints it."""
+
+    def note(
+        name: str, measured: float, relation: str, asked: float, unit: str = "", count: int = 1
+    ) -> None:
+        figures.note(request.node.nodeid, name, measured, relation, asked, unit, count)
+
+    return note
+
+
+@pytest.fixture(autouse=True)
+def signals_stay_as_they_were() -> Iterator[None]:
+    """A command that a test calls may take over signals, as a process of its own should."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        if signal.getsignal(number) is not handler:
+            signal.signal(number, handler)

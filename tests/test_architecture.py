@@ -19,6 +19,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "messages": set(),
     "records": set(),
+    "records_link": set(),
     "endpoint": set(),
     "geometry": set(),
     "plugins": set(),
@@ -34,21 +35,29 @@ MAY_IMPORT: dict[str, set[str]] = {
     "report": {"record", "metrics", "config", "geometry"},
     "cluster": {"config"},
     "assembly": EVERYTHING,
+    "faults": EVERYTHING,
     "cli": EVERYTHING,
     "__main__": {"cli"},
     "__init__": set(),
 }
-ALWAYS = {"errors", "messages", "records", "__version__"}
+ALWAYS = {"errors", "messages", "records", "records_link", "__version__"}
+
+# Faults with real processes and sockets, and a wall clock that is made to jump.
+REAL = ("faults/real_", "faults/family_real", "faults/family_cluster", "faults/walls")
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it.
 RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/",),
     # The simulator packs forces straight into MuJoCo's buffers: nothing else is as fast.
-    "struct": ("tunnel/codec", "record/", "world/simulator"),
-    "yaml": ("config/", "link/", "record/", "report/", "cli/"),
-    "pydantic": ("config/", "link/", "cli/", "cloud/teleop/wire", "cloud/teleop/api"),
+    # The relay reads the kernel's stamp of every datagram, and reads and sends them in batches.
+    "struct": ("tunnel/codec", "record/", "world/simulator", "link/relay_"),
+    "yaml": ("config/", "link/", "record/", "report/", "cli/", "faults/schedule"),
+    "pydantic": (
+        *("config/", "link/", "cli/", "cloud/teleop/wire", "cloud/teleop/api"),
+        "faults/schedule",
+    ),
     **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("cloud/teleop/api",)),
-    "fcntl": ("cloud/teleop/journal",),
+    "fcntl": ("cloud/teleop/journal", "drivers/flights"),
     "matplotlib": ("report/",),
     "mcap": ("record/",),
     "rosbags": ("record/",),
@@ -56,13 +65,13 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "prometheus_client": ("drivers/",),
     "argparse": ("cli/",),
     "importlib.metadata": ("plugins", "cli/", "report/"),
-    "pkgutil": ("plugins",),
-    "subprocess": ("drivers/", "cli/", "cluster/"),
+    "pkgutil": ("plugins", "faults/catalogue"),
+    "subprocess": ("drivers/", "cli/", "cluster/", *REAL),
     "multiprocessing": ("drivers/", "cli/"),
     "concurrent": ("cli/", "cloud/teleop/api"),
     **dict.fromkeys(
         ("time", "socket", "selectors", "select", "threading", "asyncio", "signal"),
-        ("drivers/", "link/relay", "cloud/teleop/api", "cluster/", "cli/"),
+        ("drivers/", "link/relay", "cloud/teleop/api", "cluster/", "cli/", *REAL),
     ),
     **dict.fromkeys(("random", "secrets", "uuid"), ("drivers/", "cluster/", "cli/")),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),

@@ -86,9 +86,20 @@ class Placement(Values):
     )
 
 
+class Epochs(Values):
+    """The volume on which the number of world's last session outlives the pod."""
+
+    existing_claim: Name = Field("", description="A claim to use in place of one made here")
+    storage_class_name: str = Field("", description="Class of the volume; empty: the cluster's own")
+    size: Quantity = Field("1Mi", description="Size of the volume [bytes]")
+
+
 class WorldPod(Placement):
     """The robot's pod."""
 
+    epochs: Epochs = Field(
+        Epochs(), description="Where the number of the last session outlives the pod"
+    )
     resources: Resources = resources("60m", "96Mi", "1", "256Mi")
     recording_size_limit: Quantity = Field(
         "1Gi", description="Room for the recording, which ends at nine tenths of it [bytes]"
@@ -131,11 +142,22 @@ class Service(Values):
     annotations: Texts = Field({}, description="Annotations of the Service")
 
 
+class Tokens(Values):
+    """Who may call the API."""
+
+    existing_secret: Name = Field(
+        "",
+        description="A Secret with a token under `operator`, who commands, and if you like one "
+        "under `reader`, who looks; empty: both are made once and kept",
+    )
+
+
 class Teleop(Values):
     """Missions, operator's hand and HTTP API, in the cloud pod."""
 
     resources: Resources = resources("30m", "72Mi", "1", "192Mi")
     journal: Journal = Field(Journal(), description="Where missions outlive the pod")
+    tokens: Tokens = Field(Tokens(), description="Who may call the API")
     service: Service = Field(Service(), description="Where the API is reached")
     allow_from: tuple[Peer, ...] = Field(
         (), description="Who may call the API besides this release's missions; NetworkPolicy peers"

@@ -7,7 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import chosen, end_arguments, open_exporter, open_peer, open_recorder
+from cloudrc.cli.ends import (
+    chosen,
+    end_arguments,
+    link_state,
+    open_exporter,
+    open_keys,
+    open_peer,
+    open_recorder,
+    standing_check,
+    suite,
+)
 
 if TYPE_CHECKING:
     from cloudrc.cloud.endpoint import Operator
@@ -41,8 +51,9 @@ def execute(options: argparse.Namespace) -> int:
     exporter = open_exporter(options, "cloud")
     experiment, clock = load_experiment(str(options.config)), clock_id()
     recorder = open_recorder(options, "cloud", clock)
+    keys = open_keys(options)
     peer = open_peer(options)
-    identity = CloudIdentity(clock, os.urandom(16))
+    identity = CloudIdentity(clock, os.urandom(16), keys.ring, suite())
     teleop = _join(options.teleop) if options.teleop else None
     cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns, teleop)
     run_end(
@@ -55,6 +66,9 @@ def execute(options: argparse.Namespace) -> int:
         exporter=exporter,
         watched=options.feed,
         choose=chosen(options, lambda: cloud.guard is GuardState.TRACK),
+        link=link_state(options),
+        check=standing_check(options, experiment, uplink=True),
+        keys=keys,
     )
     return 0
 

@@ -123,7 +123,9 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
         for key in ("estimator", "predictor", "controller")
     }
     paths |= {
-        f"link.{key}.trace": getattr(experiment.link, key).trace for key in ("uplink", "downlink")
+        f"link.{key}.{name}": getattr(getattr(experiment.link, key), name)
+        for key in ("uplink", "downlink")
+        for name in ("trace", "table")
     }
     for key, name in paths.items():
         if name is not None and ("/" in name or name.endswith(".py")):

@@ -9,8 +9,17 @@ from collections.abc import Callable, Iterable
 from typing import TextIO
 
 from cloudrc.cli.output import columns, is_live, paint, unread_is_fine
+from cloudrc.drivers.feed import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
-from cloudrc.records import Control, Fault, GuardChange, MissionEvent, Record, TelemetrySent
+from cloudrc.records import (
+    Control,
+    Fault,
+    GuardChange,
+    LinkChanged,
+    MissionEvent,
+    Record,
+    TelemetrySent,
+)
 
 ENDINGS = ("done", "cancelled", "timed_out")
 REDRAW_PERIOD = 0.1  # [s]: faster than one can read, slow enough to cost nothing
@@ -58,6 +67,8 @@ class FlightView:
                         self._event(f"{record.state.name}: {record.cause}")
                 case Fault():
                     self._event(record.text)
+                case LinkChanged():
+                    self._event(in_words(record))
                 case MissionEvent():
                     self._ended = record.event in ENDINGS
                     self._event(record.text)

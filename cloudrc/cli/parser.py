@@ -18,11 +18,14 @@ GROUPS: dict[str, dict[str, str]] = {
         "run": "fly an experiment and write its report",
         "mission": "fly and steer missions, here or in a cluster",
         "report": "write the report of a recorded run again",
+        "recover": "make a torn or damaged recording whole again",
         "bench": "measure how fast the closed loop runs here",
+        "faults": "bring faults about on purpose, and check what follows",
     },
     "look around": {
         "list": "experiments, profiles, predictors and what else there is",
         "doctor": "check whether this machine can fly, and say what to mend",
+        "link": "the emulated network: draw, record, verify and change it",
         "completion": "print a completion script for your shell",
     },
     "processes (started by 'run --mode local')": {
@@ -30,7 +33,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "cloud": "the remote controller",
         "teleop": "missions, operator and their HTTP API",
         "relay": "the emulated link between them",
-        "link": "the emulated link of one pod: 'cloudrc link run'",
+        "key": "the key that world and cloud share: 'cloudrc key new FILE'",
     },
 }
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}

@@ -12,17 +12,19 @@ from cloudrc.cluster.errors import ClusterError, WaitedTooLongError
 from cloudrc.cluster.forward import API_PORT, DIRECTLY, forwarded
 from cloudrc.cluster.jobs import delete_job, list_jobs, read_job
 from cloudrc.cluster.pods import list_pods
+from cloudrc.cluster.tokens import operator_token
 
 ANSWER_LIMIT = 10.0
 """For the API to answer [s]."""
 
 
-def cancel(release: Release, name: str) -> str:
+def cancel(release: Release, name: str, token: str | None = None) -> str:
     """Cancel the mission of a Job, or the Job itself where it has not posted its mission yet.
 
     Args:
         release: Where it flies.
         name: Of the Job.
+        token: Of an operator; None to read the release's own.
 
     Returns:
         What was done, in words.
@@ -41,12 +43,13 @@ def cancel(release: Release, name: str) -> str:
             f"Job '{name}' is deleted; no cloud pod runs now: if its mission was posted before, "
             f"it goes on when one does, then: {end}"
         )
+    token = token or operator_token(release)
     with forwarded(release, pod, [API_PORT]) as ports:
         api = f"http://127.0.0.1:{ports[API_PORT]}/v1/missions"
-        missions = _ask(api)["missions"]
+        missions = _ask(api, token)["missions"]
         found = next((m for m in missions if m["key"] == status.uid), None)
         if found is not None:
-            _ask(f"{api}/{found['id']}/cancel", post=True)
+            _ask(f"{api}/{found['id']}/cancel", token, post=True)
             return f"mission {found['id']} ({found['name']}) of Job '{name}' is cancelled"
     delete_job(release, name)
     return f"Job '{name}' had not posted its mission: deleted"
@@ -71,8 +74,9 @@ def under_way(release: Release) -> tuple[str, str]:
     if not pod:
         return "", ""
     try:
+        token = operator_token(release)
         with forwarded(release, pod, [API_PORT]) as ports:
-            missions = _ask(f"http://127.0.0.1:{ports[API_PORT]}/v1/missions")["missions"]
+            missions = _ask(f"http://127.0.0.1:{ports[API_PORT]}/v1/missions", token)["missions"]
     except (ClusterError, WaitedTooLongError):
         return "", ""  # a release that is broken may be mended by installing it again
     ended = ("done", "failed", "cancelled")
@@ -86,8 +90,9 @@ def _running_cloud(release: Release) -> str:
     return next((str(pod.metadata.name) for pod in pods if pod.status.phase == "Running"), "")
 
 
-def _ask(url: str, *, post: bool = False) -> Any:
-    request = urllib.request.Request(url, method="POST" if post else "GET")
+def _ask(url: str, token: str, *, post: bool = False) -> Any:
+    headers = {"Authorization": f"Bearer {token}"}
+    request = urllib.request.Request(url, headers=headers, method="POST" if post else "GET")
     try:
         with DIRECTLY.open(request, timeout=ANSWER_LIMIT) as answer:
             return json.loads(answer.read() or b"null")

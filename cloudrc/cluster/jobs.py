@@ -12,6 +12,7 @@ from cloudrc.cluster import manifest
 from cloudrc.cluster.access import REQUEST_TIMEOUT, Release
 from cloudrc.cluster.errors import ClusterError, explained
 from cloudrc.cluster.pods import find_pod, list_pods
+from cloudrc.cluster.tokens import secret_name
 
 API_CONTAINER = "teleop"
 API_PORT_NAME = "api"
@@ -106,6 +107,7 @@ def find_follower(release: Release) -> manifest.Follower:
         policy,
         pull_secrets,
         _api_url(release),
+        secret_name(release),
         _placement(release, home),
         _reference(home),
     )

@@ -16,6 +16,7 @@ from cloudrc.cluster.access import Release
 COMPONENT = "mission"
 FOLDER = "/etc/cloudrc-mission"
 FILE = "mission.yaml"
+TOKENS = "/etc/cloudrc-tokens"
 KEY = "MISSION_KEY"
 UID_LABEL = "batch.kubernetes.io/controller-uid"
 """Kubernetes puts the Job's UID under it on the Job's pod."""
@@ -39,6 +40,7 @@ class Follower:
         pull_policy: Of that image.
         pull_secrets: Names of Secrets for the image's registry.
         api: URL of the release's API inside the cluster.
+        tokens: Name of the Secret with the API's tokens.
         placement: `nodeSelector`, `tolerations` and `affinity` of the release's cloud pod.
         owner: Reference to the release's cloud Deployment: missions go when the release goes.
     """
@@ -47,6 +49,7 @@ class Follower:
     pull_policy: str
     pull_secrets: tuple[str, ...]
     api: str
+    tokens: str
     placement: Mapping[str, Any] = field(default_factory=dict)
     owner: Mapping[str, Any] | None = None
 
@@ -128,17 +131,30 @@ def _pod(name: str, follower: Follower, queue: bool) -> dict[str, Any]:
             "runAsNonRoot": True,
             "runAsUser": USER,
             "runAsGroup": USER,
+            "fsGroup": USER,
             "seccompProfile": {"type": "RuntimeDefault"},
         },
         "imagePullSecrets": [{"name": secret} for secret in follower.pull_secrets],
         "containers": [_container(follower, queue)],
-        "volumes": [{"name": "mission", "configMap": {"name": name}}],
+        "volumes": [
+            {"name": "mission", "configMap": {"name": name}},
+            {"name": "tokens", "secret": _operators_alone(follower.tokens)},
+        ],
+    }
+
+
+def _operators_alone(secret: str) -> dict[str, Any]:
+    return {
+        "secretName": secret,
+        "defaultMode": 0o440,
+        "items": [{"key": "operator", "path": "operator"}],
     }
 
 
 def _container(follower: Follower, queue: bool) -> dict[str, Any]:
     arguments = ["mission", "fly", f"--api={follower.api}"]
-    arguments += [f"--mission={FOLDER}/{FILE}", f"--key=$({KEY})", *(["--queue"] if queue else [])]
+    arguments += [f"--token-file={TOKENS}/operator", f"--mission={FOLDER}/{FILE}"]
+    arguments += [f"--key=$({KEY})", *(["--queue"] if queue else [])]
     return {
         "name": "mission",
         "image": follower.image,
@@ -160,5 +176,8 @@ def _container(follower: Follower, queue: bool) -> dict[str, Any]:
             "requests": {"cpu": "10m", "memory": "48Mi"},
             "limits": {"cpu": "500m", "memory": "128Mi"},
         },
-        "volumeMounts": [{"name": "mission", "mountPath": FOLDER, "readOnly": True}],
+        "volumeMounts": [
+            {"name": "mission", "mountPath": FOLDER, "readOnly": True},
+            {"name": "tokens", "mountPath": TOKENS, "readOnly": True},
+        ],
     }

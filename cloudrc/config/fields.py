@@ -9,6 +9,16 @@ from pydantic import BaseModel, ConfigDict, Field
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+# A limit that limits nothing, or stops everything, is none: the guard's have bounds on both sides.
+COMMAND_AGE_MS = 1, 10_000
+"""Least and largest limit of a command's age [ms]."""
+CommandAge = Annotated[
+    float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1], allow_inf_nan=False)
+]
+Speed = Annotated[float, Field(ge=0.01, le=10, allow_inf_nan=False)]
+Acceleration = Annotated[float, Field(ge=0.1, le=100, allow_inf_nan=False)]
+YawRate = Annotated[float, Field(ge=0.01, le=10, allow_inf_nan=False)]
+Patience = Annotated[float, Field(ge=0.1, le=3600, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 

@@ -9,7 +9,7 @@ is said at once, each with the line it stands in.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,16 +17,18 @@ from pydantic import BaseModel, ValidationError
 
 from cloudrc.config import overrides, parameters, problems, shipped, yaml_text
 from cloudrc.config.document import Document
+from cloudrc.config.fields import COMMAND_AGE_MS
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem
 from cloudrc.config.resolved import COMMAND_AGE_MAX_MS, ResolvedExperiment, speed_cap
 from cloudrc.config.schema import Experiment, Mission, Profile
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
-from cloudrc.link.trace import read_trace
+from cloudrc.link.trace import read_table, read_trace
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _DIRECTIONS = ("uplink", "downlink")
+_FILES: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
 
 
 def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
@@ -72,6 +74,11 @@ def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
     return _load_profile(str(name), folder or Path())[1]
 
 
+def check_profile(document: Document, name: str) -> Profile:
+    """Check a link profile that was put together in memory; raises BadInputError."""
+    return _validate(document, Profile, name, _resolve_traces(document, ()))
+
+
 def load_mission(name: str | Path, folder: Path | None = None) -> Mission:
     """Load a mission by its name or path (relative to `folder`); raises BadInputError.
 
@@ -92,8 +99,7 @@ def dump(experiment: ResolvedExperiment) -> str:
 
 def _load_profile(name: str, folder: Path) -> tuple[Document, Profile]:
     document = shipped.read("profile", name, folder)
-    wrong = _resolve_traces(document, ())
-    return document, _validate(document, Profile, name, wrong)
+    return document, check_profile(document, name)
 
 
 def _validate(document: Document, model: type[_Model], name: str, found: list[Problem]) -> _Model:
@@ -157,10 +163,16 @@ def _inline_profile(document: Document) -> list[Problem]:
             _lay_under(document, ("link", key), file, key)
     age_max = profile.command_age_max_ms or COMMAND_AGE_MAX_MS
     _default(document, ("guard", "command_age_max_ms"), age_max)
-    age_max = document.get("guard", "command_age_max_ms")
-    if isinstance(age_max, int | float) and age_max > 0:
-        _default(document, ("guard", "speed_max_mps"), speed_cap(age_max))
+    _default(document, ("guard", "speed_max_mps"), speed_cap(_age_max(document)))
     return []
+
+
+def _age_max(document: Document) -> float:
+    """The age that the guard allows [ms]; what cannot be one is refused later, and alone."""
+    age_max = document.get("guard", "command_age_max_ms")
+    least, largest = COMMAND_AGE_MS
+    usable = type(age_max) in (int, float) and least <= age_max <= largest  # true is no number
+    return age_max if usable else COMMAND_AGE_MAX_MS
 
 
 def _lay_under(document: Document, path: yaml_text.Path, file: Document, key: str) -> None:
@@ -201,18 +213,17 @@ def _forget_profile(document: Document) -> None:
 
 
 def _resolve_traces(document: Document, above: yaml_text.Path) -> list[Problem]:
-    """Make the paths of traces absolute."""
+    """Make the paths of traces and tables absolute, and read them to see whether they can be."""
     found = []
-    for key in _DIRECTIONS:
-        path = (*above, key, "trace")
-        trace = document.get(*path)
-        if not isinstance(trace, str):
+    for path in ((*above, key, name) for key in _DIRECTIONS for name in _FILES):
+        given = document.get(*path)
+        if not isinstance(given, str):
             continue
         source = document.source(path)
-        absolute = (source.folder / Path(trace).expanduser()).resolve()
+        absolute = (source.folder / Path(given).expanduser()).resolve()
         document.graft(path, str(absolute), source)
         try:
-            read_trace(absolute)
+            _FILES[path[-1]](absolute)
         except BadInputError as error:
             found.append(Problem(path, "", str(error)))
     return found

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
-from cloudrc.config.fields import NotNegative, Positive, Section, Share
+from cloudrc.config.fields import CommandAge, NotNegative, Positive, Section, Share
 
 
 class GilbertElliott(Section):
@@ -58,15 +58,19 @@ class Direction(Section):
 
     delay_ms: NotNegative = Field(0.0, description="One way [ms]")
     jitter_ms: NotNegative = Field(
-        0.0, description="uniform: half width; normal, pareto: standard deviation [ms]"
+        0.0, description="uniform: half width; normal, pareto, table: standard deviation [ms]"
     )
-    distribution: Literal["uniform", "normal", "pareto"] = Field(
-        "uniform", description="Of the jitter"
+    distribution: Literal["uniform", "normal", "pareto", "table"] = Field(
+        "uniform", description="Of the jitter; table: that of the delays in the file `table`"
+    )
+    table: str | None = Field(
+        None, description="CSV file as for trace, whose delays, scaled, are the distribution"
     )
     correlation: Share = Field(0.0, description="Of the jitter of one packet with the next")
     loss: Loss = Field(0.0, description="Chance, or bursts")
     duplicate: Share = Field(0.0, description="Chance that a packet arrives twice")
     reorder: Share = Field(0.0, description="Chance that a packet overtakes: no delay at all")
+    corrupt: Share = Field(0.0, description="Chance that one bit of a packet is flipped")
     keep_order: bool = Field(False, description="Packets never overtake each other")
     rate_kbit: Positive | None = Field(None, description="Rate of the bottleneck [kbit/s]")
     queue_packets: Annotated[int, Field(ge=1, le=1_000_000)] = Field(
@@ -77,6 +81,12 @@ class Direction(Section):
         None, description="CSV file: time_s,delay_ms[,loss]; relative to the file that names it"
     )
     blackouts: tuple[Blackout, ...] = Field((), description="Times in which nothing passes")
+
+    @model_validator(mode="after")
+    def _has_its_table(self) -> Direction:
+        if self.distribution == "table" and self.table is None:
+            raise ValueError("distribution: table needs the key table: a CSV file of delays")
+        return self
 
     @field_validator("changes")
     @classmethod
@@ -96,6 +106,6 @@ class Profile(Section):
     description: str = Field("", description="One line for lists")
     uplink: Direction = Field(Direction(), description="World to cloud")
     downlink: Direction = Field(Direction(), description="Cloud to world")
-    command_age_max_ms: Positive | None = Field(
+    command_age_max_ms: CommandAge | None = Field(
         None, description="Command age limit that this link needs [ms]"
     )

@@ -36,7 +36,7 @@ class Problem:
 
 
 def from_pydantic(
-    error: ValidationError, model: type[BaseModel], prefix: Path = ()
+    error: ValidationError, model: type[BaseModel], prefix: Path = (), limit: int | None = None
 ) -> list[Problem]:
     """Put pydantic's errors into words.
 
@@ -44,8 +44,10 @@ def from_pydantic(
         error: As raised by `model`.
         model: Whose keys, ranges and units are named.
         prefix: Keys above the model's own.
+        limit: How many problems are put into words; None for all.
     """
-    return [_problem(detail, model, prefix) for detail in error.errors(include_url=False)]
+    details = error.errors(include_url=False)[:limit]
+    return [_problem(detail, model, prefix) for detail in details]
 
 
 def refuse(document: Document, problems: Iterable[Problem], name: str) -> None:

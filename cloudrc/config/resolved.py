@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from math import sqrt
 
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
-from cloudrc.config.fields import Positive
+from cloudrc.config.fields import CommandAge, Speed
 from cloudrc.config.schema import Cloud, Direction, Experiment, Guard, Mission, PlugIn
 
 COMMAND_AGE_MAX_MS = 250.0
@@ -32,12 +32,23 @@ def speed_cap(command_age_max_ms: float) -> float:
 class ResolvedGuard(Guard):
     """A guard whose limits are all known."""
 
-    command_age_max_ms: Positive = Field(
+    command_age_max_ms: CommandAge = Field(
         COMMAND_AGE_MAX_MS, description="A command whose basis is older is not flown [ms]"
     )
-    speed_max_mps: Positive = Field(
+    speed_max_mps: Speed = Field(
         speed_cap(COMMAND_AGE_MAX_MS), description="Cap on the commanded speed [m/s]"
     )
+
+    @field_validator("speed_max_mps")
+    @classmethod
+    def _can_be_stopped(cls, speed_max: float, info: ValidationInfo) -> float:
+        age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
+        if speed_max > speed_cap(age_max) + 1e-6:
+            raise ValueError(
+                f"at most {speed_cap(age_max):g} m/s can be stopped from in time while commands "
+                f"may be {age_max:g} ms old; lower it, or guard.command_age_max_ms"
+            )
+        return speed_max
 
 
 class ResolvedCloud(Cloud):

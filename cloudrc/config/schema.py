@@ -11,7 +11,17 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Discriminator, Field, Tag
 
-from cloudrc.config.fields import Finite, NotNegative, Positive, Section
+from cloudrc.config.fields import (
+    Acceleration,
+    CommandAge,
+    Finite,
+    NotNegative,
+    Patience,
+    Positive,
+    Section,
+    Speed,
+    YawRate,
+)
 from cloudrc.config.network import (
     Blackout,
     Change,
@@ -56,7 +66,11 @@ class Waypoint(Section):
     yaw_deg: Finite = Field(0.0, description="Heading [deg]")
     tolerance_m: Positive = Field(0.10, description="Distance that counts as there [m]")
     dwell_s: NotNegative = Field(0.5, description="How long to stay within the tolerance [s]")
-    time_limit_s: Positive = Field(60.0, description="Time allowed for this leg [s]")
+    time_limit_s: Positive | None = Field(
+        None,
+        description="Time allowed for this leg, in which the robot is seen to fly on commands [s]; "
+        "default: 3 times what it is expected to take",
+    )
 
 
 class Steps(Section):
@@ -118,18 +132,21 @@ class World(Section):
 class Guard(Section):
     """What the onboard guard allows; configured on world's side only."""
 
-    command_age_max_ms: Positive | None = Field(
+    command_age_max_ms: CommandAge | None = Field(
         None,
         description="A command whose basis is older is not flown [ms]; "
         "default: the link profile's own, else 250",
     )
-    speed_max_mps: Positive | None = Field(
+    speed_max_mps: Speed | None = Field(
         None,
         description="Cap on the commanded speed [m/s]; default: what can be stopped from within "
         "8.7 m although commands may be that old, 6 at 250 ms",
     )
-    acceleration_max_mps2: Positive = Field(12.0, description="Cap on its change [m/s^2]")
-    yaw_rate_max_radps: Positive = Field(1.0, description="Cap on the yaw rate [rad/s]")
+    acceleration_max_mps2: Acceleration = Field(12.0, description="Cap on its change [m/s^2]")
+    yaw_rate_max_radps: YawRate = Field(1.0, description="Cap on the yaw rate [rad/s]")
+    hold_max_s: Patience = Field(
+        60.0, description="HOLD for so long during a mission ends in LAND [s]"
+    )
 
 
 class Tunnel(Section):

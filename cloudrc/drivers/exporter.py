@@ -30,6 +30,7 @@ from cloudrc.records import Record
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 """What `generate_latest` writes."""
+JSON = "application/json"
 STILL_MAX = 5.0
 """A loop that has said nothing for so long stands still [s]; each says something every second."""
 
@@ -96,6 +97,9 @@ class Exporter:
             host, _, port = address.rpartition(":")
             address = host, int(port)
         pages = {"/metrics": self._page, "/healthz": self._liveness, "/readyz": self._readiness}
+        end = self._live.end
+        if end is not None:
+            pages["/link.json"] = lambda: Answer(200, end.check.text().encode(), JSON)
         self._server = ProbeServer(address, pages)
         return int(self._server.server_address[1])
 

@@ -14,12 +14,20 @@ from enum import IntEnum
 from typing import Any, get_origin, get_type_hints
 
 from cloudrc import records as kinds
-from cloudrc.records import Control, Fault, GuardChange, MissionEvent, Record, TelemetrySent
+from cloudrc.records import (
+    Control,
+    Fault,
+    GuardChange,
+    LinkChanged,
+    MissionEvent,
+    Record,
+    TelemetrySent,
+)
 
 READY = "ready"
 """The line that a process writes once it can receive."""
 PERIOD_NS = 100_000_000
-EVENTS = (GuardChange, MissionEvent, Fault)
+EVENTS = (GuardChange, MissionEvent, Fault, LinkChanged)
 """Every one of these is told."""
 SAMPLED = (TelemetrySent, Control)
 """Of these one every 100 ms."""
@@ -38,6 +46,7 @@ class Feed:
         """
         self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
+        self._links: dict[bool, str] = {}
         os.set_blocking(descriptor, False)
 
     @classmethod
@@ -55,9 +64,19 @@ class Feed:
         """Tell those of the records that somebody who watches wants to see."""
         for record in records:
             if isinstance(record, EVENTS):
+                if isinstance(record, LinkChanged) and not self._is_news(record):
+                    continue
                 self._write(to_line(record) if self._watched else in_words(record))
             elif self._watched and isinstance(record, SAMPLED) and self._due(record):
                 self._write(to_line(record))
+
+    def _is_news(self, record: LinkChanged) -> bool:
+        """Tell a change of the link from one that is noted again because a mission begins.
+
+        A change of the other direction, which is recorded here, too, is no news of this one.
+        """
+        told, self._links[record.uplink] = self._links.get(record.uplink), record.conditions
+        return told != record.conditions and bool(record.cause)
 
     def _due(self, record: Record) -> bool:
         last_ns = self._told_ns.get(type(record))
@@ -78,10 +97,15 @@ def to_line(record: Record) -> str:
     return json.dumps([type(record).__name__, record])
 
 
-def in_words(event: GuardChange | MissionEvent | Fault) -> str:
-    """Say what has happened, for a log."""
+def in_words(event: GuardChange | MissionEvent | Fault | LinkChanged) -> str:
+    """Say what has happened, for a log or a screen."""
     if isinstance(event, GuardChange):
         return f"guard: {event.state.name}, {event.cause}"
+    if isinstance(event, LinkChanged):
+        way = "uplink" if event.uplink else "downlink"
+        jitter = f" ± {event.jitter * 1e3:g}" if event.jitter else ""
+        loss = f", loss {event.loss * 100:.3g} %" if event.loss else ""
+        return f"link: {way} {event.delay * 1e3:g}{jitter} ms{loss} ({event.cause})"
     return event.text
 
 

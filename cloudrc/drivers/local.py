@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import selectors
+import shutil
 import socket
 import subprocess
 import sys
@@ -18,9 +19,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cloudrc.drivers import flights
+from cloudrc.drivers.epochs import replace_durably
 from cloudrc.drivers.feed import READY, from_line
 from cloudrc.errors import InvalidRunError, TimedOutError
 from cloudrc.records import Record
+from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
 START_LIMIT = 60.0
 """For a process to become ready [s]; a cold start reads some 100 MB from disk."""
@@ -32,6 +36,10 @@ SILENCE_LIMIT = 5.0
 LOOPBACK = "127.0.0.1"
 API_FILE = "api.json"
 """In the folder of a run that flies: where its operator's API is."""
+AUDIT_FILE = "audit.jsonl"
+"""Likewise, and afterwards, too: who commanded what over it, if anybody did."""
+LINK_FOLDER = "link"
+"""Likewise: where its relay tells what it does, and is told to do otherwise."""
 
 
 class ProcessDiedError(InvalidRunError):
@@ -78,6 +86,7 @@ class LocalRun:
             api: Whether the operator gets an API while it flies; api.json then says where.
         """
         self._folder, self._see, self._api = folder, see, api
+        self._key = folder  # until there is one
         self._children: list[Child] = []
         self._selector = selectors.DefaultSelector()
 
@@ -93,7 +102,13 @@ class LocalRun:
             KeyboardInterrupt: If the user interrupts. The processes have ended in every case.
         """
         # A socket's path is short; that of the run's folder need not be.
-        with tempfile.TemporaryDirectory(prefix="cloudrc-") as sockets:
+        # Nobody else may look into this one, which holds the key of this run alone, too.
+        with (
+            tempfile.TemporaryDirectory(prefix="cloudrc-") as sockets,
+            flights.announced(self._folder),
+        ):
+            self._key = Path(sockets) / "key"
+            replace_durably(self._key, write(KeySet(Key(os.urandom(KEY_SIZE)))).encode("ascii"))
             self._fly(limit, sockets)
 
     def _fly(self, limit: float, sockets: str) -> None:
@@ -105,6 +120,7 @@ class LocalRun:
                 f"--cloud-side={from_cloud}",
                 f"--world={world}",
                 f"--cloud={cloud}",
+                f"--link={self._folder / LINK_FOLDER}",
             )
             self._start_end("world", world, from_world)
             self._start_teleop(sockets)
@@ -114,13 +130,22 @@ class LocalRun:
         finally:
             self._stop()
             (self._folder / API_FILE).unlink(missing_ok=True)
+            shutil.rmtree(self._folder / LINK_FOLDER, ignore_errors=True)
 
     def _start_end(self, name: str, listen: str, peer: str, *options: str) -> None:
         record = self._folder / f"{name}.mcap"
-        self._start(name, f"--listen={listen}", f"--peer={peer}", f"--record={record}", *options)
+        link = self._folder / LINK_FOLDER / ("uplink.json" if name == "world" else "downlink.json")
+        ways = (f"--listen={listen}", f"--peer={peer}", f"--link={link}", f"--key={self._key}")
+        self._start(name, *ways, f"--record={record}", *options)
 
     def _start_teleop(self, sockets: str) -> None:
-        api = [f"--api={LOOPBACK}:0", f"--api-file={self._folder / API_FILE}"] if self._api else []
+        api: list[str] = []
+        if self._api:  # a socket file that this user alone can open: no token is needed
+            api = [
+                f"--api=unix:{sockets}/api.sock",
+                f"--api-file={self._folder / API_FILE}",
+                f"--audit={self._folder / AUDIT_FILE}",
+            ]
         self._start("teleop", f"--socket={sockets}", "--start", *api)
 
     def _start(self, name: str, *options: str) -> None:

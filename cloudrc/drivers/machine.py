@@ -1,4 +1,4 @@
-"""What a process knows of the machine that it runs on: whose monotonic clock it reads."""
+"""What a process knows of its machine: whose monotonic clock it reads, which cipher is fast."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 LINUX_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+CPU_INFO = Path("/proc/cpuinfo")
 MACOS_BOOT_ID = ("sysctl", "-n", "kern.bootsessionuuid")
 
 
@@ -22,6 +23,16 @@ def clock_id() -> bytes:
     except ValueError:
         named = b""
     return named if len(named) == 16 else os.urandom(16)
+
+
+def has_fast_aes() -> bool:
+    """Whether the processor computes AES itself; where nobody can say, it is taken to."""
+    try:
+        lines = CPU_INFO.read_text(errors="replace").splitlines()
+    except OSError:
+        return True
+    flags = [line for line in lines if line.lower().startswith(("flags", "features"))]
+    return not flags or "aes" in flags[0].split()
 
 
 def _boot_id() -> str:

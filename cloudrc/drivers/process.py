@@ -9,10 +9,13 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Protocol
 
 from cloudrc.drivers.feed import Feed
+from cloudrc.drivers.keyfile import KeyFile
+from cloudrc.drivers.link_notes import LinkNotes
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.drivers.recording import Recorder, RecordingThread
 from cloudrc.endpoint import Endpoint
@@ -20,6 +23,7 @@ from cloudrc.records import Counted, Fault, Record
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
+    from cloudrc.drivers.standing_check import StandingCheck
 
 
 class StopSignal:
@@ -73,6 +77,9 @@ def run_end(
     exporter: Exporter | None = None,
     watched: bool = True,
     choose: Callable[[list[Record]], list[Record]] = list,
+    link: Path | None = None,
+    check: StandingCheck | None = None,
+    keys: KeyFile | None = None,
 ) -> bool:
     """Fly one end until it is asked to stop or `over()`; its recording is whole afterwards.
 
@@ -87,12 +94,16 @@ def run_end(
         exporter: Gets the records too, if they are to become metrics.
         watched: Whether a supervisor reads the feed.
         choose: Says what of its records is recorded.
+        link: File in which the link tells its state; its changes are recorded.
+        check: Judges the link by what this end hears.
+        keys: Followed, if there is such a file.
 
     Returns:
         True if it was done by itself, False if it was stopped.
     """
     feed, thread = Feed.on_stdout(watched=watched), RecordingThread(recorder)
     taps = _Taps(end, recorder, feed, exporter, choose)
+    taps.watch = _Watch(end, link, check, keys, slip_ns)
     thread.start()
     feed.ready()
     try:
@@ -103,8 +114,39 @@ def run_end(
     return over()
 
 
+class _Watch:
+    """What an end notes beside its flight: new keys, a changed link, whether that is as asked."""
+
+    def __init__(
+        self,
+        end: str,
+        link: Path | None,
+        check: StandingCheck | None,
+        keys: KeyFile | None,
+        slip_ns: Callable[[], int],
+    ) -> None:
+        self._notes = LinkNotes(link, uplink=end == "world") if link is not None else None
+        self._check, self._keys, self._slip_ns = check, keys, slip_ns
+
+    def after(self, records: list[Record]) -> list[Record]:
+        """Say what is to be noted after these records."""
+        noted: list[Record] = []
+        now_ns, slip_ns = time.monotonic_ns(), self._slip_ns()
+        if self._keys is not None:
+            noted += self._keys.follow(now_ns)
+        if self._notes is not None:
+            noted += self._notes.after(records, now_ns, slip_ns)
+        if self._check is not None:
+            noted += self._check.after([*records, *noted], now_ns - slip_ns)
+        return noted
+
+
 class _Taps:
-    """Where an end's records go: into its recording, to who watches, into its metrics."""
+    """Where an end's records go: into its recording, to who watches, into its metrics.
+
+    Attributes:
+        watch: What adds to them.
+    """
 
     def __init__(
         self,
@@ -116,11 +158,14 @@ class _Taps:
     ) -> None:
         self._end, self._recorder, self._feed = end, recorder, feed
         self._exporter, self._choose = exporter, choose
+        self.watch: _Watch | None = None
         self._trouble, self._dropped = "", 0
 
     def __call__(self, records: list[Record]) -> None:
         """Take records in; never waits."""
         recorder, exporter = self._recorder, self._exporter
+        if self.watch is not None:
+            records = records + self.watch.after(records)
         recorder.put(self._choose(records))
         self._feed.tell(records)
         if exporter is not None:

@@ -20,6 +20,8 @@ from cloudrc.tunnel.codec import DATAGRAM_MAX
 
 DRAIN_MAX = 256
 """Datagrams taken per wake, so that a flood cannot keep the loop from its deadlines."""
+RECEIVE_BUFFER = 1 << 22
+"""Asked of the kernel, which may give less: room for honest datagrams behind a flood [bytes]."""
 SINK_PERIOD_NS = 20_000_000
 WAIT_MAX_NS = 100_000_000
 ROUTE_PERIOD_NS = 500_000_000
@@ -85,6 +87,7 @@ def bind(listen: tuple[str, int]) -> socket.socket:
     """Open a UDP socket that does not block."""
     udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     udp.setblocking(False)
+    udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
     try:
         udp.bind(listen)
     except OSError:
@@ -111,7 +114,12 @@ def serve(
         sink: Gets the records, at least every 20 ms; must not block.
         stop: Asked at every wake, at most 100 ms apart.
         slip_ns: By how much world's clock lags [ns].
+
+    Raises:
+        ValueError: If its datagrams are not sealed.
     """
+    if not endpoint.sealed:
+        raise ValueError(f"{end} has no key, and nothing leaves a process unsealed")
     gc.collect()
     gc.freeze()  # what is loaded now stays: the collector need not look at it in flight
     sink_ns = time.monotonic_ns()

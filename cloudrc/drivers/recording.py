@@ -1,7 +1,9 @@
 """The recording of a process in real time: a thread that empties the recorder into its file.
 
 It takes a few records at a time and rests in between, so that the loop, which shares the
-interpreter with it, is never kept waiting for longer than a fraction of a millisecond.
+interpreter with it, is never kept waiting for longer than a fraction of a millisecond. A second
+thread waits for the disk: one that takes seconds keeps nothing from the operating system, which
+keeps what it has when the process is killed.
 """
 
 from __future__ import annotations
@@ -27,8 +29,8 @@ landed after a loss of the link."""
 PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
 BATCH = 16
 """Records written at a time."""
-IDLE = 0.02
-"""Rest when the queue is empty [s]."""
+IDLE = 0.1
+"""Rest when the queue is empty [s]: a wake costs more than a few records."""
 BUSY = 0.001
 """Rest when more is waiting [s]."""
 FLUSH = 0.25
@@ -41,8 +43,11 @@ class Recorder(Protocol):
     def drain(self, max_records: int = ...) -> int:
         """Write out at most so many records; say how many were taken from the queue."""
 
-    def flush(self) -> None:
+    def flush(self, *, sync: bool = ...) -> None:
         """Hand what was written to the operating system."""
+
+    def sync(self) -> None:
+        """Have what was flushed survive the machine; may take seconds."""
 
     def close(self) -> None:
         """Write out the rest and end the file."""
@@ -89,10 +94,13 @@ class RecordingThread:
         self._stopping = threading.Event()
         # A daemon, so that a disk that hangs cannot keep the process from ending.
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+        self._flushed, self._over = threading.Event(), False
+        self._syncing = threading.Thread(target=self._sync, name="recording-sync", daemon=True)
 
     def start(self) -> None:
         """Begin to write."""
         self._thread.start()
+        self._syncing.start()
 
     def stop(self, timeout: float = 1.5) -> bool:
         """Write out the rest, end the file and wait for that.
@@ -114,6 +122,17 @@ class RecordingThread:
             rest = BUSY if recorder.drain(BATCH) == BATCH else IDLE
             now = time.monotonic()
             if now - flushed >= FLUSH:
-                recorder.flush()
+                recorder.flush(sync=False)
+                self._flushed.set()
                 flushed = now
         recorder.close()
+        self._over = True
+        self._flushed.set()
+
+    def _sync(self) -> None:
+        while True:
+            self._flushed.wait()
+            self._flushed.clear()
+            if self._over:
+                return
+            self._recorder.sync()

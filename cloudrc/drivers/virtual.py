@@ -23,7 +23,16 @@ PERIOD_NS = 100_000_000
 
 
 class Link(Protocol):
-    """One direction of the emulated network."""
+    """One direction of the emulated network.
+
+    Attributes:
+        corrupts: Whether `corrupted` is to be asked.
+    """
+
+    corrupts: bool
+
+    def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
+        """Give the datagram as it arrives, damaged or not."""
 
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> tuple[int, ...]:
         """When the copies of this datagram arrive [ns]: none, one or two."""
@@ -113,6 +122,9 @@ class VirtualRun:
     def _send(self, datagrams: list[bytes], link: Link, *, to_world: bool) -> None:
         for data in datagrams:
             kind, epoch, counter = peek(data)
-            for arrival_ns in link.send(epoch, kind, counter, len(data), self.now_ns):
+            arrivals = link.send(epoch, kind, counter, len(data), self.now_ns)
+            if link.corrupts and arrivals:
+                data = link.corrupted(epoch, kind, counter, data)
+            for arrival_ns in arrivals:
                 self._sent += 1
                 heappush(self._flying, (arrival_ns, self._sent, to_world, data))

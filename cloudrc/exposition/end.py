@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from math import nan
 
+from cloudrc.exposition.check import Check
 from cloudrc.exposition.histogram import Histogram
 from cloudrc.exposition.labels import (
     DELAY_BUCKETS,
+    DIRECTIONS,
     LATENESS_BUCKETS,
+    ONLY_CLOUD,
+    ONLY_WORLD,
     OUTCOMES,
     PERIOD_BUCKETS,
     Labels,
@@ -15,20 +19,27 @@ from cloudrc.exposition.labels import (
 from cloudrc.exposition.part import Handlers, Readings, chosen, plain
 from cloudrc.exposition.streams import Stream
 from cloudrc.messages import NEVER_NS
-from cloudrc.records import Arrival, Counted, Lateness, SessionOpened
+from cloudrc.records import Arrival, Counted, Lateness, LinkChecked, SessionOpened
 
 SILENCE_NS = 2_000_000_000
 """An end that has heard nothing for so long has no peer [ns]."""
 
 
 class End:
-    """World or cloud; the incoming direction is the one that it hears."""
+    """World or cloud; the incoming direction is the one that it hears.
+
+    Attributes:
+        check: The standing check of that direction.
+    """
 
     def __init__(self, incoming: str, outgoing: str) -> None:
         """Begin before the first session; the directions are "uplink" and "downlink"."""
         self._incoming, self._outgoing = incoming, outgoing
+        others = ONLY_CLOUD if incoming == DIRECTIONS[1] else ONLY_WORLD
+        self._outcomes = tuple(name for name in OUTCOMES[1:] if name not in others)
         self._counts: dict[str, int] = {}
         self._stream = Stream()
+        self.check = Check(incoming)
         self._one_way, self._age = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
         self._period, self._lateness = Histogram(PERIOD_BUCKETS), Histogram(LATENESS_BUCKETS)
         self._busy = 0.0
@@ -45,6 +56,7 @@ class End:
             Counted: self._see_count,
             Lateness: self._see_wake,
             SessionOpened: self._see_session,
+            LinkChecked: self.check.see,
         }
 
     @property
@@ -89,10 +101,10 @@ class End:
     def read(self) -> Readings:
         """See `Part`."""
         counts, stream, incoming = self._counts, self._stream, (self._incoming,)
-        received = chosen(OUTCOMES[1:], counts)
+        received = chosen(self._outcomes, counts)
         datagrams: dict[Labels, float] = {(*incoming, name): n for name, n in received.items()}
         datagrams[self._outgoing, "sent"] = counts.get("sent", 0)
-        readings: Readings = {
+        readings: Readings = self.check.read() | {
             "cloudrc_session_epoch": plain(self._epoch),
             "cloudrc_sessions_opened_total": plain(self._sessions),
             "cloudrc_datagrams_total": datagrams,

@@ -18,12 +18,21 @@ OUTCOMES = (
     "repeated",
     "old_epoch",
     "not_finite",
+    "future",
     "malformed",
     "version",
     "direction",
     "accept_ignored",
+    "tag",
+    "hello",
+    "busy",
+    "unanswered",
 )
 """What becomes of a datagram; all but "sent" are told by its receiver."""
+ONLY_WORLD = {"stale", "not_finite", "future", "hello", "unanswered"}
+ONLY_CLOUD = {"accept_ignored"}
+LIMITS = ("speed", "yaw_rate", "fence")
+"""Of the guard."""
 PLUGINS = ("estimator", "predictor", "controller")
 GUARD_STATES = ("ground", "track", "hold", "land", "estop")
 """In the order of `cloudrc.messages.GuardState`."""
@@ -38,15 +47,23 @@ MISSION_OUTCOMES = (
     "guard_stopped",
     "other",
 )
+API_REFUSALS = ("token", "role", "busy", "slow")
+"""Why the API does not serve: no valid token, a reader's token, too many requests or connections,
+a client that dawdles."""
 BODIES = ("pipe", "board", "floor", "other")
 """Kinds of bodies: `pipe_2` is a "pipe", and what else a scene may have is "other"."""
-LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unsent")
+LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
+"""As `cloudrc.link.relay_lanes.Lanes.outcomes` explains them."""
 SHAPERS = ("relay", "netem")
 LINK_MODES = ("auto", "relay", "netem")
 
-DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.25, 0.5, 1.0)
-PERIOD_BUCKETS = (0.005, 0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
+DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 0.5, 1.0)
+PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
 """Around the 10 ms of both loops."""
 LATENESS_BUCKETS = (0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
+RELEASE_PERCENTILES = {"50": "p50", "99": "p99", "99.9": "p999"}
+"""Label -> how `cloudrc.link.relay_errors` names it."""
+STEP_PERCENTILES = {"50": "p50", "99": "p99"}
+"""Label -> how `cloudrc.link.netem_steps` names it."""
 
 Labels = tuple[str, ...]

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-from cloudrc.exposition.labels import DIRECTIONS, LINK_MODES, LINK_OUTCOMES, SHAPERS, Labels
-from cloudrc.exposition.part import Handlers, Readings, by, chosen
+from cloudrc.exposition.labels import (
+    DIRECTIONS,
+    LINK_MODES,
+    LINK_OUTCOMES,
+    RELEASE_PERCENTILES,
+    SHAPERS,
+    STEP_PERCENTILES,
+    Labels,
+)
+from cloudrc.exposition.part import Handlers, Readings, by, chosen, plain
 from cloudrc.records import Counted
 
 
@@ -47,4 +55,23 @@ class Link:
             "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
             "cloudrc_link_delay_seconds": by(dict(self._delays)),
             "cloudrc_link_datagrams_total": by(chosen(LINK_OUTCOMES, self._counts)),
-        }
+        } | (self._released() | self._stepped() | self._restored())
+
+    def _stepped(self) -> Readings:
+        """Say how late a qdisc was stepped; empty if none was."""
+        counts = dict(self._counts)
+        named = {label: f"step_lateness_{name}_ns" for label, name in STEP_PERCENTILES.items()}
+        late = {label: counts[name] * 1e-9 for label, name in named.items() if name in counts}
+        return {"cloudrc_link_step_lateness_seconds": by(late)}
+
+    def _restored(self) -> Readings:
+        """Say how often netem was put back; empty if no netem has told."""
+        restored = self._counts.get("restored")
+        return {} if restored is None else {"cloudrc_link_restored_total": plain(restored)}
+
+    def _released(self) -> Readings:
+        """Say how late a relay was; empty if no relay has told."""
+        counts = dict(self._counts)  # copied at once: the other thread may go on
+        named = {label: f"release_error_{name}_ns" for label, name in RELEASE_PERCENTILES.items()}
+        late = {label: counts[name] * 1e-9 for label, name in named.items() if name in counts}
+        return {"cloudrc_link_release_error_seconds": by(late)}

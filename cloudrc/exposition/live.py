@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from cloudrc.exposition.api import Api
 from cloudrc.exposition.cloud import CloudEnd
 from cloudrc.exposition.end import End
 from cloudrc.exposition.labels import CLOUD, LINK, TELEOP, WORLD
@@ -32,7 +33,8 @@ class Live:
         self.end: End | None = {WORLD: WorldEnd, CLOUD: CloudEnd}.get(role, lambda: None)()
         self.link = Link() if role == LINK else None
         mission = Mission(always=role == TELEOP) if role in (CLOUD, TELEOP) else None
-        parts: tuple[Part | None, ...] = (self.end, self.link, mission)
+        api = Api() if role == TELEOP else None
+        parts: tuple[Part | None, ...] = (self.end, self.link, mission, api)
         self._parts = [part for part in parts if part is not None]
         self._handlers: dict[type, Callable[[Any], None]] = {}
         for part in self._parts:

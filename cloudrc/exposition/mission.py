@@ -6,7 +6,7 @@ from cloudrc.exposition.labels import MISSION_OUTCOMES, MISSION_STATES
 from cloudrc.exposition.part import Handlers, Readings, by, plain
 from cloudrc.records import MissionEvent
 
-UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
+UNDER_WAY = ("started", "reached", "held", "resumed", "goto", "paused")
 """Events of a mission that goes on; every other event ends it."""
 NO_WAYPOINT = -1
 
@@ -36,7 +36,7 @@ class Mission:
         elif event == "reached":
             self._reached += 1
             self._waypoint = record.waypoint + 1
-        elif event == "held":
+        elif event in ("held", "paused"):
             self._state = "held"
         elif event != "goto":
             self._state, self._waypoint = "flying", record.waypoint

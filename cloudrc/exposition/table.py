@@ -17,21 +17,23 @@ from cloudrc.exposition.labels import (
     ENDS,
     GUARD_STATES,
     LATENESS_BUCKETS,
+    LIMITS,
     LINK,
     LINK_MODES,
     LINK_OUTCOMES,
-    MISSION,
-    MISSION_OUTCOMES,
-    MISSION_STATES,
     OUTCOMES,
     PERIOD_BUCKETS,
     PLUGINS,
+    RELEASE_PERCENTILES,
     ROLES,
     SHAPERS,
+    STEP_PERCENTILES,
     TERMS,
     WORLD,
 )
 from cloudrc.exposition.metric import Kind, Metric, counter, delay, gauge, numbered
+from cloudrc.exposition.table_check import CHECK
+from cloudrc.exposition.table_mission import MISSIONS
 
 _ENTRIES = (
     # Every process.
@@ -59,6 +61,11 @@ _ENTRIES = (
     # Both ends: session and link.
     gauge("cloudrc_session_epoch", "Number of the session under way.", ENDS),
     counter("cloudrc_sessions_opened_total", "Sessions opened since this process began.", ENDS),
+    counter(
+        "cloudrc_sessions_refused_total",
+        "Requests for a session that were refused because another cloud has authority.",
+        (WORLD,),
+    ),
     counter(
         "cloudrc_datagrams_total",
         "Datagrams by what became of them; told once a second.",
@@ -96,6 +103,7 @@ _ENTRIES = (
         " prove that they share a clock.",
         (WORLD,),
     ),
+    *CHECK,
     delay(
         "cloudrc_age_of_information_seconds",
         "Now minus the stamp of the newest datagram used, in every period: of odometry in cloud,"
@@ -163,6 +171,7 @@ _ENTRIES = (
     ),
     gauge("cloudrc_command_yaw_rate_radians_per_second", "Yaw rate commanded.", (CLOUD,)),
     counter("cloudrc_horizon_clamped_total", "Delay estimates above 1 s or below 0.", (CLOUD,)),
+    counter("cloudrc_commands_frozen_total", "Commands to stand still: no echo comes.", (CLOUD,)),
     counter(
         "cloudrc_plugin_failures_total",
         "Calls of a plug-in that raised or gave something not finite.",
@@ -181,6 +190,18 @@ _ENTRIES = (
         (WORLD,),
         state=GUARD_STATES,
     ),
+    counter(
+        "cloudrc_guard_limited_total",
+        "Commands (ticks: fence) that a limit of the guard changed.",
+        (WORLD,),
+        limit=LIMITS,
+    ),
+    counter(
+        "cloudrc_guard_held_seconds_total",
+        "Time in HOLD while a mission was on; told once a second.",
+        (WORLD,),
+    ),
+    counter("cloudrc_guard_starts_refused_total", "Starts refused in LAND or ESTOP.", (WORLD,)),
     counter(
         "cloudrc_contacts_total",
         "Times that the robot began to touch a body of the scene, by its kind.",
@@ -224,11 +245,7 @@ _ENTRIES = (
         "Records that did not reach the recording.",
         ENDS,
     ),
-    # Mission: in the process that flies it.
-    gauge("cloudrc_mission_state", f"State of the mission: {numbered(MISSION_STATES)}.", MISSION),
-    gauge("cloudrc_mission_waypoint", "Index of the waypoint flown to; -1 if none.", MISSION),
-    counter("cloudrc_waypoints_reached_total", "Waypoints reached.", MISSION),
-    counter("cloudrc_missions_total", "Missions ended.", MISSION, outcome=MISSION_OUTCOMES),
+    *MISSIONS,
     # Link.
     Metric(
         "cloudrc_link_info",
@@ -243,11 +260,28 @@ _ENTRIES = (
         (LINK,),
         direction=DIRECTIONS,
     ),
+    gauge(
+        "cloudrc_link_step_lateness_seconds",
+        "How late netem's qdisc took the last 10,000 steps of its time line; absent without steps.",
+        (LINK,),
+        percentile=tuple(STEP_PERCENTILES),
+    ),
     counter(
         "cloudrc_link_datagrams_total",
         "Datagrams at the shaper by what became of them.",
         (LINK,),
         outcome=LINK_OUTCOMES,
+    ),
+    counter(
+        "cloudrc_link_restored_total",
+        "How often another hand had removed or changed netem's qdisc, and it was put back.",
+        (LINK,),
+    ),
+    gauge(
+        "cloudrc_link_release_error_seconds",
+        "How late datagrams left the relay in the last 10 s; absent with netem.",
+        (LINK,),
+        percentile=tuple(RELEASE_PERCENTILES),
     ),
 )
 

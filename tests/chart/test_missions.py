@@ -146,7 +146,11 @@ def test_the_chart_makes_the_same_job_as_the_program() -> None:
     from cloudrc.cluster.access import Release
 
     follower = manifest.Follower(
-        "cloudrc/cloud:0.1.0", "IfNotPresent", (), "http://demo-cloudrc-api:8080"
+        "cloudrc/cloud:0.1.0",
+        "IfNotPresent",
+        (),
+        "http://demo-cloudrc-api:8080",
+        "demo-cloudrc-tokens",
     )
     made = manifest.job(Release(None, "lab", "demo"), "m", follower, limit=60.0, queue=False)
     (job,) = jobs(ENABLED)

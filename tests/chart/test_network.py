@@ -7,6 +7,7 @@ from typing import Any
 from rendering import Object, containers, of_kind, pod_specs, render
 
 TUNNEL, DNS, API = {("UDP", 7400)}, {("UDP", 53), ("TCP", 53)}, {("TCP", 8080)}
+LINK_TEST = {("TCP", 9100), ("TCP", 9102)}
 PROMETHEUS = {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "monitoring"}}}
 
 
@@ -48,8 +49,13 @@ def test_every_pod_is_selected_both_ways() -> None:
 
 def test_only_the_tunnel_and_the_api_come_in() -> None:
     found = policies()
-    assert said(found["world"], "ingress") == [(["cloud"], TUNNEL)]
-    assert said(found["cloud"], "ingress") == [(["world"], TUNNEL), (["mission", "test"], API)]
+    test = (["test"], LINK_TEST)
+    assert said(found["world"], "ingress") == [(["cloud"], TUNNEL), test]
+    assert said(found["cloud"], "ingress") == [
+        (["world"], TUNNEL),
+        (["mission", "test"], API),
+        test,
+    ]
     assert said(found["mission"], "ingress") == said(found["test"], "ingress") == []
 
 
@@ -62,7 +68,11 @@ def test_only_the_tunnel_names_and_the_api_go_out() -> None:
     assert said(found["world"], "egress") == [(["cloud"], TUNNEL), names]
     assert said(found["cloud"], "egress") == [(["world"], TUNNEL), names]
     assert said(found["mission"], "egress") == [(["cloud"], API), names]
-    assert said(found["test"], "egress") == [(["cloud"], API), names]
+    assert said(found["test"], "egress") == [
+        (["cloud"], API),
+        (["cloud", "world"], LINK_TEST),
+        names,
+    ]
 
 
 def test_scraping_is_admitted_by_name_and_to_all_metrics_ports() -> None:
@@ -82,7 +92,7 @@ def test_scraping_is_admitted_by_name_and_to_all_metrics_ports() -> None:
 def test_others_may_call_the_api_when_named() -> None:
     found = policies({"teleop": {"allowFrom": [PROMETHEUS]}})
     assert PROMETHEUS in found["cloud"]["ingress"][1]["from"]
-    assert len(found["world"]["ingress"]) == 1
+    assert all(PROMETHEUS not in rule["from"] for rule in found["world"]["ingress"])
 
 
 def test_they_can_be_left_out() -> None:

@@ -5,8 +5,21 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
+
+from cloudrc.cli.bench_wire import measure_wire
+
+
+@pytest.mark.process
+def test_a_sealed_odometry_costs_an_eighth_of_the_papers_pickled_one(
+    figure: Callable[..., None],
+) -> None:
+    wire = measure_wire()
+    figure("seal, open and codec of an odometry over a pickled round trip", wire.ratio, "<=", 0.12)
+    assert 1000 <= wire.pickled_size <= 1100  # as large as the paper's
+    assert wire.ratio <= 0.12
 
 
 @pytest.mark.process  # by itself: what runs beside it takes its caches away

@@ -41,14 +41,22 @@ def taken() -> Iterator[str]:
 @pytest.mark.parametrize(
     ("command", "flag", "others"),
     [
-        ("world", "--listen", ["--peer", FREE]),
-        ("cloud", "--listen", ["--peer", FREE]),
+        ("world", "--listen", ["--peer", FREE, "--key", "KEY"]),
+        ("cloud", "--listen", ["--peer", FREE, "--key", "KEY"]),
         ("relay", "--world-side", ["--cloud-side", FREE, "--world", FREE, "--cloud", FREE]),
     ],
 )
 def test_an_address_in_use_is_named_with_its_flag(
-    command: str, flag: str, others: list[str], taken: str, capsys: pytest.CaptureFixture[str]
+    command: str,
+    flag: str,
+    others: list[str],
+    taken: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    (tmp_path / "key").write_bytes(bytes(32))
+    (tmp_path / "key").chmod(0o600)
+    others = [str(tmp_path / "key") if word == "KEY" else word for word in others]
     assert main([command, *CONFIG, flag, taken, *others]) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"cloudrc: error: {flag} {taken}: cannot receive there: Address already")
@@ -81,7 +89,10 @@ def test_whoever_is_stopped_while_it_starts_leaves_a_whole_recording(
 
     monkeypatch.setattr(assembly, f"build_{end}", stopped)
     record = tmp_path / "end.mcap"
-    free = [free_port(), "--peer", FREE, "--record", str(record)]
+    (tmp_path / "key").write_bytes(bytes(32))
+    (tmp_path / "key").chmod(0o600)
+    key = ["--key", str(tmp_path / "key")]
+    free = [free_port(), "--peer", FREE, "--record", str(record), *key]
     assert main([end, *CONFIG, "--listen", *free]) == 0
     assert record.read_bytes().endswith(MCAP_MAGIC)
 

@@ -14,6 +14,7 @@ from teleop_harness import A, B
 from cloudrc.cli import mission_follow, mission_local
 from cloudrc.cli.main import main
 from cloudrc.cli.mission_http import Api
+from cloudrc.cli.token import reader
 
 FILE = """
 description: Two points
@@ -44,10 +45,12 @@ Command = Callable[..., int]
 
 
 @pytest.fixture
-def mission(api: Running) -> Command:
+def mission(api: Running, monkeypatch: pytest.MonkeyPatch) -> Command:
     def run(*words: str) -> int:
         verb, *rest = words
         return main(["mission", verb, "--api", api.url, *rest])
+
+    monkeypatch.setenv("CLOUDRC_TOKEN_FILE", str(api.token_file))
 
     return run
 
@@ -187,13 +190,60 @@ def test_list_status_and_logs(
     assert "no mission 'm9'" in capsys.readouterr().err
 
 
-def test_the_run_that_flies_here_is_found_by_itself(
-    api: Running, folder: Path, capsys: pytest.CaptureFixture[str]
+def test_the_run_that_flies_here_is_found_by_itself_and_wants_no_token(
+    folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (folder / "runs" / "latest").mkdir(parents=True)
-    (folder / "runs" / "latest" / "api.json").write_text(json.dumps({"url": api.url}))
-    assert main(["mission", "status"]) == 0
-    assert "no mission is under way" in capsys.readouterr().out
+    with running(unix=True) as api:
+        (folder / "runs" / "latest").mkdir(parents=True)
+        (folder / "runs" / "latest" / "api.json").write_text(json.dumps({"url": api.url}))
+        assert main(["mission", "status"]) == 0
+        assert "no mission is under way" in capsys.readouterr().out
+        api.post_local("/v1/missions", {"waypoints": [{"position_m": [-1.0, -4.0, 1.0]}]})
+        assert main(["mission", "estop"]) == 0
+        said = capsys.readouterr().out
+        assert said.splitlines() == [
+            "emergency stop: the robot is told to stop its rotors until it has",
+            "mission m1 has failed",
+        ]
+
+
+def test_emergency_stop_and_acknowledgement(
+    api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert mission("estop") == 0
+    assert api.alarms
+    api.until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
+    assert mission("run", "two.yaml") == 5
+    assert "cloudrc mission acknowledge" in capsys.readouterr().err
+    assert mission("acknowledge") == 0
+    api.until(lambda: api.get("/v1/state")["seen"]["guard"] == "GROUND")
+    assert "acknowledged" in capsys.readouterr().out
+
+
+def test_the_token_comes_from_a_file_of_the_flag_or_the_environment(
+    api: Running,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    command = ["mission", "hold", "--api", api.url]
+    assert main(command) == 5
+    assert "wants a token; name its file: --token-file FILE" in capsys.readouterr().err
+    (folder / "wrong").write_text("not-the-operators-token\n")
+    monkeypatch.setenv("CLOUDRC_TOKEN_FILE", str(folder / "wrong"))
+    assert main(command) == 5
+    assert "does not know this token" in capsys.readouterr().err
+    assert main([*command, "--token-file", str(api.folder.name) + "/reader"]) == 5
+    assert "may look, not command" in capsys.readouterr().err
+    assert main([*command, "--token-file", str(api.token_file)]) == 5
+    assert "no mission is under way" in capsys.readouterr().err
+    (folder / "wrong").write_text("two words")
+    assert main(command) == 2
+    assert "holds no token" in capsys.readouterr().err
+    assert main([*command, "--token-file", "none"]) == 2
+    error = capsys.readouterr().err
+    assert "--token-file none: No such file or directory" in error
+    assert "two words" not in error
 
 
 def test_without_run_and_cluster_both_ways_out_are_named(
@@ -215,7 +265,7 @@ def test_a_missing_verb_or_point_is_refused(capsys: pytest.CaptureFixture[str]) 
 
 def test_events_can_be_followed(api: Running) -> None:
     api.post("/v1/missions", {"waypoints": [{"position_m": B}]})
-    stream = Api(api.url).events()
+    stream = Api(api.url, reader(api.token_file)).events()
     assert [next(stream)["event"] for _ in range(2)] == ["starting", "started"]
     stream.close()
 

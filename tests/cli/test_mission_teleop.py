@@ -25,12 +25,15 @@ def test_without_fastapi_the_api_is_refused_and_the_extra_named(
 
 @pytest.mark.process
 def test_what_it_cannot_have_is_named(tmp_path: Path) -> None:
+    (tmp_path / "operator").write_text("a token of the operator".replace(" ", "-"))
+    tokens = f"--tokens={tmp_path}"
     with socket.create_server(("127.0.0.1", 0)) as taken:
         api = f"--api=127.0.0.1:{taken.getsockname()[1]}"
         cases = {
-            (str(tmp_path), api): "choose another address",
+            (str(tmp_path), api, tokens): "choose another address",
+            (str(tmp_path), api): "--api HOST:PORT needs --tokens DIR",
             ("x" * 200,): "longer than 107 bytes",
-            (str(tmp_path), "--api=nowhere"): "'nowhere' is not HOST:PORT",
+            (str(tmp_path), "--api=nowhere"): "nowhere' is not HOST:PORT",
             (str(tmp_path), "--journal=/proc/journal"): "/proc/journal",
             (str(tmp_path), "--mission=none"): "none",
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,8 @@ from fake_api import FakeApi, deployment, kubeconfig, pod
 
 from cloudrc.cluster import deploy, errors, follow
 from cloudrc.cluster.access import Release, connect
+
+TOKEN = "operator-token-of-the-release"
 
 
 @pytest.fixture
@@ -43,6 +46,9 @@ def running(api: FakeApi, release: Release) -> FakeApi:
         "spec": {"ports": [{"name": "api", "port": 8080, "targetPort": "api"}]},
     }
     api.put("services", "demo", service)
+    token = base64.b64encode(TOKEN.encode()).decode()
+    tokens = {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}}
+    api.put("secrets", "demo", tokens)
     return api
 
 

@@ -21,6 +21,17 @@ VERSION_KEYS = (
 )
 
 
+def _merge(target: dict[str, Any], patch: dict[str, Any]) -> None:
+    """Lay a patch over an object, as RFC 7396 says."""
+    for key, value in patch.items():
+        if isinstance(value, dict):
+            _merge(target.setdefault(key, {}), value)
+        elif value is None:
+            target.pop(key, None)
+        else:
+            target[key] = value
+
+
 class FakeApi:
     """Holds objects by (plural, namespace, name); `refuse` answers a verb with a code."""
 
@@ -77,6 +88,8 @@ class FakeApi:
                 return 404, {"message": f'{plural} "{name}" not found', "code": 404}
             if subresource == "log":
                 return 200, self.logs.get(name, "")
+            if method == "PATCH":
+                _merge(self.objects[plural, namespace, name], body)
             if method == "DELETE":
                 return 200, self.objects.pop((plural, namespace, name))
             return 200, self.objects[plural, namespace, name]
@@ -109,7 +122,7 @@ class FakeApi:
                 self.end_headers()
                 self.wfile.write(data)
 
-            do_GET = do_POST = do_DELETE = reply  # noqa: N815
+            do_GET = do_POST = do_DELETE = do_PATCH = reply  # noqa: N815
 
             def log_message(self, *words: Any) -> None:
                 pass
@@ -166,7 +179,13 @@ def pod(
     containers = [{"name": "cloud"}, {"name": "teleop", "image": "cloudrc/cloud:0.1.0"}]
     return {
         "metadata": {"name": name, "labels": {**labels(component), **more.pop("labels", {})}},
-        "spec": {"containers": containers},
+        "spec": {
+            "containers": containers,
+            "volumes": [
+                {"name": "data", "emptyDir": {}},
+                {"name": "tokens", "secret": {"secretName": "cloudrc-tokens"}},
+            ],
+        },
         "status": {"phase": phase, "conditions": conditions, "containerStatuses": [status]},
     }
 

@@ -24,6 +24,7 @@ class FakeTeleop(ThreadingHTTPServer):
     def __init__(self) -> None:
         self.missions: list[dict[str, str]] = []
         self.posted: list[str] = []
+        self.tokens: set[str | None] = set()
         self.refuses = False
         teleop = self
 
@@ -38,6 +39,7 @@ class FakeTeleop(ThreadingHTTPServer):
                 )
 
             def answer(self, code: int, body: object) -> None:
+                teleop.tokens.add(self.headers["Authorization"])
                 self.send_response(code)
                 self.end_headers()
                 self.wfile.write(json.dumps(body).encode())
@@ -64,6 +66,7 @@ def test_the_mission_of_a_job_is_found_by_its_key(teleop: FakeTeleop, release: R
     teleop.missions = [{"id": "m1", "key": "another"}, {"id": "m2", "key": job.uid, "name": "up"}]
     assert cancel(release, "first") == "mission m2 (up) of Job 'first' is cancelled"
     assert teleop.posted == ["/v1/missions/m2/cancel"]
+    assert teleop.tokens == {"Bearer operator-token-of-the-release"}
 
 
 def test_a_job_that_has_not_posted_yet_is_deleted(
@@ -102,3 +105,10 @@ def test_what_the_api_refuses_is_told(teleop: FakeTeleop, release: Release) -> N
     teleop.missions, teleop.refuses = [{"id": "m1", "key": job.uid, "name": ""}], True
     with pytest.raises(ClusterError, match="it is over"):
         cancel(release, "first")
+
+
+def test_a_token_that_is_given_is_sent(teleop: FakeTeleop, release: Release) -> None:
+    job = run_job(release, MISSION, name="first")
+    teleop.missions = [{"id": "m2", "name": "hop", "key": job.uid}]
+    cancel(release, "first", "a-token-of-mine-alone")
+    assert teleop.tokens == {"Bearer a-token-of-mine-alone"}

@@ -75,7 +75,7 @@ def test_a_job_goes_with_its_release_and_runs_where_that_does(
 
 def test_a_long_release_has_missions_too(running: FakeApi, release: Release) -> None:
     for body in list(running.objects.values()):
-        body["metadata"]["labels"]["app.kubernetes.io/instance"] = "r" * 53
+        body["metadata"].setdefault("labels", {})["app.kubernetes.io/instance"] = "r" * 53
     status = run_job(replace(release, name="r" * 53), MISSION)
     assert len(status.name) <= 63 - len("-xxxxx")
 

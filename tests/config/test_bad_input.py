@@ -56,6 +56,34 @@ def test_all_problems_are_listed_with_their_lines(mine: Path) -> None:
     ])  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("key", "values", "bounds"),
+    [
+        ("command_age_max_ms", ("0", "1e-9", "1e300", "true", "x"), ">= 1 and <= 10000 or null"),
+        ("speed_max_mps", ("0", "1e-320", "1e300"), ">= 0.01 and <= 10 or null"),
+        ("acceleration_max_mps2", ("0", "1e-9", "1e300"), ">= 0.1 and <= 100"),
+        ("yaw_rate_max_radps", ("0", "1e-9", "1e300"), ">= 0.01 and <= 10"),
+        ("hold_max_s", ("0", "1e-10", "1e30"), ">= 0.1 and <= 3600"),
+    ],
+)
+def test_limits_of_the_guard_have_bounds_and_a_wrong_one_is_the_only_problem(
+    mine: Path, key: str, values: tuple[str, ...], bounds: str
+) -> None:
+    for value in values:
+        text = refused(mine, "mission: hover\n", f"guard.{key}={value}")
+        (line,) = text.splitlines()
+        assert line.startswith(f"--set: guard.{key}: "), line
+        assert f"must be a number {bounds}" in line
+
+
+def test_a_profile_cannot_take_the_guards_limit_away(tmp_path: Path) -> None:
+    path = tmp_path / "slow.yaml"
+    for age in ("0", "1e-9", "1e9"):
+        path.write_text(f"command_age_max_ms: {age}\n")
+        with pytest.raises(BadInputError, match=r"command_age_max_ms: .* >= 1 and <= 10000"):
+            load_profile(path)
+
+
 def test_thousands_of_problems_are_not(mine: Path) -> None:
     points = ", ".join(["{position_m: [0, 0, 1], dwell_s: -1}"] * 2000)
     text = refused(mine, f"mission: {{waypoints: [{points}]}}\n")
@@ -160,7 +188,9 @@ def test_an_index_behind_the_end() -> None:
         ("uplink: {loss: 1.2}", "uplink.loss: 1.2: must be a number >= 0 and <= 1"),
         ("uplink: {loss: {bad_start: .1, bad_end: 0}}", "uplink.loss: bad_end must be above 0"),
         ("uplink: {loss: {bad_start: .1}}", "uplink.loss.bad_end: is missing; must be a number"),
-        ("uplink: {jitter_ms: 3, distribution: gauss}", "must be 'uniform', 'normal' or 'pareto'"),
+        ("uplink: {jitter_ms: 3, distribution: gauss}", "'normal', 'pareto' or 'table'"),
+        ("uplink: {distribution: table}", "uplink: distribution: table needs the key table"),
+        ("uplink: {table: nowhere.csv}", "uplink.table: trace "),
         ("uplink: {changes: [{at_s: 5}, {at_s: 5}]}", "uplink.changes: at_s must rise: entry 1"),
         ("uplink: {queue_packets: 1.5}", "must be a whole number >= 1"),
         ("uplink: {keep_order: yes}", "must be true or false"),

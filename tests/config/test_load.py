@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.assembly import link_profile
 from cloudrc.config import shipped, yaml_text
 from cloudrc.config.load import dump, load_experiment, load_profile
 from cloudrc.config.resolved import ResolvedExperiment
@@ -142,7 +143,10 @@ def test_paths_are_relative_to_the_file_that_names_them(
     links = tmp_path / "links"
     links.mkdir()
     (links / "trace.csv").write_text("time_s,delay_ms\n0,20\n1,40\n")
-    (links / "traced.yaml").write_text("uplink: {trace: trace.csv}\n")
+    (links / "traced.yaml").write_text(
+        "uplink: {trace: trace.csv}\n"
+        "downlink: {distribution: table, table: trace.csv, delay_ms: 30, jitter_ms: 10}\n"
+    )
     (tmp_path / "there.yaml").write_text("waypoints: [{position_m: [0, 0, 1]}]\n")
     (tmp_path / "still.py").write_text(
         "from cloudrc.cloud.predictors import Predictor\n\ndef build() -> Predictor:\n"
@@ -154,6 +158,8 @@ def test_paths_are_relative_to_the_file_that_names_them(
     )
     experiment = load_experiment(tmp_path / "mine.yaml")
     assert experiment.uplink.trace == str(links / "trace.csv")
+    assert experiment.downlink.table == str(links / "trace.csv")
+    assert link_profile(experiment.downlink).table == pytest.approx((-1.0, 1.0))
     assert experiment.link.profile == str(links / "traced.yaml")
     assert experiment.cloud.predictor.name == str(tmp_path / "still.py")
     assert experiment.mission.waypoints[0].position_m == (0, 0, 1)

@@ -13,15 +13,24 @@ from prometheus_client.parser import text_string_to_metric_families
 from cloudrc import __version__
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.exporter import Exporter
-from cloudrc.exposition.labels import BODIES, ENDS, LINK_OUTCOMES, ROLES
+from cloudrc.exposition.labels import (
+    BODIES,
+    DIRECTIONS,
+    ENDS,
+    LINK_OUTCOMES,
+    ROLES,
+)
 from cloudrc.exposition.metric import Kind
 from cloudrc.exposition.table import METRICS, of_role
+from cloudrc.link.netem_steps import Steps
+from cloudrc.link.relay_errors import Recent, ReleaseErrors
 from cloudrc.messages import ZERO
 from cloudrc.records import (
     Contact,
     Control,
     Counted,
     Lateness,
+    LinkChecked,
     MissionEvent,
     Record,
     TelemetrySent,
@@ -43,8 +52,21 @@ def flight() -> Flight:
             if isinstance(record, PERIODS):
                 seen[end].append(Lateness(record.stamp_ns, end, 80e-6, 300e-6, 0))
     seen["world"] += [Contact(0, body, ZERO, ZERO, ZERO, True) for body in BODIES]
+    for end in ENDS:
+        way = DIRECTIONS[ENDS.index(end) - 1]
+        seen[end] += [
+            LinkChecked(9, way == "uplink", name, 0.1, 0.1, 0.0, 0.2, "ok", 3000)
+            for name in ("mean", "deviation", "loss")
+        ]
     seen["teleop"] = [r for r in seen["cloud"] if isinstance(r, MissionEvent)]
-    seen["link"] = [Counted(0, "link", name, 5) for name in LINK_OUTCOMES]
+    errors = ReleaseErrors()
+    for late_ns in (3_000, 30_000, 300_000, 3_000_000, 300_000_000):
+        errors.observe(late_ns)
+    counts = dict.fromkeys(LINK_OUTCOMES, 5) | Recent().counts(errors) | {"restored": 1}
+    seen["link"] = [Counted(0, "link", name, total) for name, total in counts.items()]
+    steps = Steps()
+    steps.note(1_000_000, 0)
+    seen["link"] += [Counted(0, "link", name, total) for name, total in steps.counts().items()]
     return seen
 
 

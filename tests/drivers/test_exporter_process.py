@@ -18,7 +18,7 @@ import pytest
 from cloudrc.cli.main import main
 from cloudrc.config.load import dump, load_experiment
 
-LISTEN = ["--listen", "127.0.0.1:7499"]
+LISTEN = ["--listen", "127.0.0.1:7499", "--key", "key"]
 
 
 @pytest.mark.parametrize("flags", [[], ["--peer", "127.0.0.1:1", "--route", "route"]])
@@ -65,6 +65,7 @@ class Pods:
         self.folder = folder
         experiment = load_experiment("hover", ["mission.waypoints.0.dwell_s=60"])
         (folder / "experiment.yaml").write_text(dump(experiment))
+        (folder / "key").write_bytes(bytes(32))
         ports = free_ports(4)
         self.tunnel = {"world": ports[0], "cloud": ports[1]}
         self.metrics = {"world": ports[2], "cloud": ports[3]}
@@ -73,6 +74,7 @@ class Pods:
     def start(self, end: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "cloudrc", end]
         command += ["--config", str(self.folder / "experiment.yaml")]
+        command += ["--key", str(self.folder / "key")]
         command += ["--listen", f"127.0.0.1:{self.tunnel[end]}"]
         command += ["--route", str(self.folder / f"{end}.route")]
         command += ["--metrics", f"127.0.0.1:{self.metrics[end]}"]

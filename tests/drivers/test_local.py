@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.drivers import flights
+
 pytestmark = pytest.mark.process
 
 FLOWN = (0, 6)
@@ -108,6 +110,7 @@ def operate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True)
 
 
+@pytest.mark.promise("P-API-6")
 def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
     folder = tmp_path / "run"
     run = start(folder)
@@ -121,10 +124,20 @@ def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
     assert status["mission"]["state"] == "held"
     assert status["seen"]["position_m"] == pytest.approx([0.3, 0.0, 0.8], abs=0.1)
     assert "flying" in operate(folder, "resume").stdout
+    anywhere = [sys.executable, "-m", "cloudrc", "mission", "status", "-o", "json"]
+    found = subprocess.run(anywhere, capture_output=True, text=True, cwd="/")
+    assert found.stderr == f"cloudrc: the run that flies in {folder}\n"
+    assert json.loads(found.stdout)["mission"]["state"] == "flying"
     assert "INTERRUPTED" in operate(folder, "cancel").stdout
     run.communicate(timeout=60)
     assert run.returncode == 1
     assert report(folder)["failures"][0]["code"] == "cancelled"
+    audit = [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines()]
+    said = [(line["action"].rpartition("/")[2], line["status"], line["client"]) for line in audit]
+    done = [("missions", 409), ("hold", 200), ("goto", 422), ("goto", 200), ("resume", 200)]
+    assert said[:5] == [(action, status, "local") for action, status in done]
+    assert said[5][0] == "cancel"
+    assert flights.under_way() == []
 
 
 def test_without_fastapi_it_flies_without_an_api_and_says_so(tmp_path):

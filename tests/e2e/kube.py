@@ -15,9 +15,11 @@ from typing import Any
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
+from cloudrc.cli.mission_http import Api
 from cloudrc.cluster.access import Release, connect
 from cloudrc.cluster.fetch import fetch_metrics
-from cloudrc.cluster.forward import DIRECTLY, api_url
+from cloudrc.cluster.forward import api_url
+from cloudrc.cluster.tokens import operator_token
 
 ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "charts" / "cloudrc"
@@ -153,11 +155,9 @@ def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
 
 def missions() -> list[dict[str, Any]]:
     """All missions that the API knows, oldest first."""
-    with (
-        api_url(None, NAMESPACE, NAME) as url,
-        DIRECTLY.open(f"{url}/v1/missions", timeout=10) as answer,
-    ):
-        return list(json.load(answer)["missions"])
+    token = operator_token(connect(None, NAMESPACE, NAME))
+    with api_url(None, NAMESPACE, NAME) as url:
+        return list(Api(url, lambda: token).get("/v1/missions")["missions"])
 
 
 @dataclass

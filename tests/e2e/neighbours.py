@@ -168,10 +168,23 @@ def apply_anywhere(documents: list[dict[str, Any]]) -> None:
     command("kubectl", "apply", "--filename=-", given=yaml.safe_dump_all(documents))
 
 
+def beside_prometheus(*words: str, given: str = "") -> str:
+    """What a command in the pod of Prometheus says, and of what it is given on its input."""
+    where = ("exec", f"--namespace={MONITORING}", "--stdin", "prometheus", "--container=prometheus")
+    return kubectl(*where, "--", *words, given=given)
+
+
 def promtool(*words: str, given: str) -> str:
     """What the tool of Prometheus says, and of what it is given on its standard input."""
-    where = ("exec", f"--namespace={MONITORING}", "--stdin", "prometheus", "--container=prometheus")
-    return kubectl(*where, "--", "promtool", *words, given=given)
+    return beside_prometheus("promtool", *words, given=given)
+
+
+def rules_tried(rules: str, tests: str) -> str:
+    """What `promtool test rules` says; it wants both as files side by side."""
+    folder = beside_prometheus("mktemp", "--directory").strip()
+    for name, text in {"rules.yaml": rules, "tests.yaml": tests}.items():
+        beside_prometheus("tee", f"{folder}/{name}", given=text)
+    return beside_prometheus("promtool", "test", "rules", f"{folder}/tests.yaml")
 
 
 class Prometheus:

@@ -7,6 +7,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -29,7 +30,7 @@ from kube import (
     scrapes,
     value,
 )
-from neighbours import MONITORING, Prometheus, install_prometheus, promtool, stranger
+from neighbours import MONITORING, Prometheus, install_prometheus, promtool, rules_tried, stranger
 
 MISSION = "paper-mission"
 ASKED_CPU = 0.200
@@ -162,6 +163,11 @@ def test_promtool_has_nothing_to_say_about_the_metrics(first: FirstFlight, compo
 def test_promtool_accepts_the_alerts(prometheus: None) -> None:
     said = promtool("check", "rules", "/dev/stdin", given=(CHART / "files/rules.yaml").read_text())
     assert "SUCCESS" in said
+
+
+def test_the_alerts_fire_when_they_should_and_only_then(prometheus: None) -> None:
+    tests = Path(__file__).with_name("alerts.yaml").read_text()
+    assert "SUCCESS" in rules_tried((CHART / "files/rules.yaml").read_text(), tests)
 
 
 Ask = Callable[[str], list[dict[str, Any]]]

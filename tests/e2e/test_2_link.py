@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from kube import (
@@ -25,6 +27,8 @@ from kube import (
     value,
 )
 
+SET_WITHIN = 2.0
+"""For `link set` to be in force, from its start [s]; 1 s is asked for on an idle machine."""
 TOLERANCE = 0.002
 """Of a mean one-way delay [s]. Source: issue, "Numbers it must reach"."""
 MEANS = {"paper-p1": 0.020, "paper-p3": 0.070, "paper-p2": 0.045}
@@ -99,6 +103,37 @@ def test_both_delays_are_the_profiles_within_two_milliseconds(
         mean = (later_total - total) / (later_number - number)
         note(f"{profile} {direction}: {mean * 1e3:.2f} ms, wanted {MEANS[profile] * 1e3:.0f} ms")
         assert abs(mean - MEANS[profile]) < TOLERANCE
+
+
+def set_link(*words: str) -> dict[str, Any]:
+    """Set the link of the flight by hand; gives what is in force then."""
+    done = cloudrc("link", "set", *words, "-n", NAMESPACE, "--release", NAME, "-o", "json")
+    assert done.returncode == 0, done.stderr
+    document: dict[str, Any] = json.loads(done.stdout)
+    return document
+
+
+def test_the_link_is_set_by_hand_and_read_back(flight: None, note: Callable[[str], None]) -> None:
+    try:
+        told = set_link("downlink.delay_ms=120", "downlink.jitter_ms=0")
+        note(f"link set: in force after {told['seconds']:.2f} s")
+        assert told["seconds"] < SET_WITHIN
+        assert told["links"]["downlink"]["asked"]["delay"] == 0.12
+        time.sleep(SETTLE)
+        total, number = counts("downlink")
+        time.sleep(5.0)
+        later_total, later_number = counts("downlink")
+        mean = (later_total - total) / (later_number - number)
+        note(f"set by hand downlink: {mean * 1e3:.2f} ms, wanted 120 ms")
+        assert abs(mean - 0.12) < TOLERANCE
+    finally:
+        told = set_link("--profile", "paper-p2")
+        note(f"link set: in force after {told['seconds']:.2f} s")
+    assert told["links"]["downlink"]["asked"]["delay"] == 0.045
+    # Cloud sends the downlink, which has changed; the uplink is as it was, and no news of world's.
+    said = "link: downlink 45 ± 25 ms (profile paper-p2)"
+    log = ("logs", pod("cloud")["metadata"]["name"], "-c", "cloud")
+    eventually(lambda: said in kubectl(*log), "cloud has noted it for its recording", 5.0)
 
 
 def objects() -> dict[str, int]:

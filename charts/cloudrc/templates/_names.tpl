@@ -47,6 +47,10 @@ app.kubernetes.io/part-of: cloudrc
 {{ .Values.secret.existingSecret | default (printf "%s-tunnel" (include "cloudrc.fullname" .)) }}
 {{- end }}
 
+{{- define "cloudrc.tokensName" -}}
+{{ .Values.teleop.tokens.existingSecret | default (printf "%s-tokens" (include "cloudrc.fullname" .)) }}
+{{- end }}
+
 {{- define "cloudrc.serviceAccountName" -}}
 {{- if .root.Values.serviceAccount.create -}}
 {{ include "cloudrc.fullname" .root }}-{{ .component }}

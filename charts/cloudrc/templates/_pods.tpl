@@ -89,7 +89,7 @@ affinity:
 - name: run
   emptyDir:
     medium: Memory
-    sizeLimit: 1Mi
+    sizeLimit: 4Mi
 - name: data
   emptyDir:
     sizeLimit: {{ (index .root.Values .component).recordingSizeLimit }}

@@ -18,6 +18,17 @@
     - {port: 7400, protocol: UDP}
 {{- end }}
 
+{{/* `helm test` asks both ends what they hear of the link, and the link containers what they do. */}}
+{{- define "cloudrc.linkTest" -}}
+- from:
+    - podSelector:
+        matchLabels:
+          {{- include "cloudrc.selector" (dict "root" . "component" "test") | nindent 10 }}
+  ports:
+    - {port: 9100, protocol: TCP}
+    - {port: 9102, protocol: TCP}
+{{- end }}
+
 {{/* Scraping, where somebody is admitted: takes (dict "root" $ "ports" LIST). */}}
 {{- define "cloudrc.scrape" -}}
 {{- with .root.Values.metrics.allowFrom }}

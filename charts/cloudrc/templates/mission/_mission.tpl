@@ -25,6 +25,7 @@
     - mission
     - fly
     - --api=http://{{ include "cloudrc.fullname" .root }}-api:{{ .root.Values.teleop.service.port }}
+    - --token-file=/etc/cloudrc-tokens/operator
     - --mission=/etc/cloudrc-mission/mission.yaml
     - --key=$(MISSION_KEY)
     {{- if .queue }}
@@ -43,6 +44,20 @@
     {{- toYaml .root.Values.mission.resources | nindent 4 }}
   volumeMounts:
     - {name: mission, mountPath: /etc/cloudrc-mission, readOnly: true}
+    - {name: tokens, mountPath: /etc/cloudrc-tokens, readOnly: true}
+{{- end }}
+
+{{/* Volumes of a pod that flies a mission: takes (dict "root" $ "name" CONFIGMAP). */}}
+{{- define "cloudrc.missionVolumes" -}}
+- name: mission
+  configMap:
+    name: {{ .name }}
+- name: tokens
+  secret:
+    secretName: {{ include "cloudrc.tokensName" .root }}
+    defaultMode: 0440
+    items:
+      - {key: operator, path: operator}
 {{- end }}
 
 {{- define "cloudrc.missionPodTemplate" -}}

@@ -1,0 +1,54 @@
+"""World's epoch outlives its pod on a volume of its own; both ends read the key from a file."""
+
+from __future__ import annotations
+
+import pytest
+from rendering import Object, containers, of_kind, pod_specs, render
+
+
+def argument(objects: list[Object], end: str, flag: str) -> str:
+    arguments = containers(pod_specs(objects)[end])[end]["args"]
+    return next(str(word).partition("=")[2] for word in arguments if word.startswith(flag + "="))
+
+
+def volume_at(objects: list[Object], end: str, path: str) -> Object:
+    """The volume that holds a file, by where it is mounted."""
+    pod = pod_specs(objects)[end]
+    mounts = containers(pod)[end]["volumeMounts"]
+    name = next(m["name"] for m in mounts if path.startswith(m["mountPath"] + "/"))
+    return next(volume for volume in pod["volumes"] if volume["name"] == name)
+
+
+@pytest.mark.parametrize("end", ["world", "cloud"])
+def test_an_end_reads_its_key_from_the_secret_and_not_from_its_arguments(end: str) -> None:
+    objects = render()
+    volume = volume_at(objects, end, argument(objects, end, "--key"))
+    assert volume["secret"]["secretName"] == "demo-cloudrc-tunnel"
+    assert argument(objects, end, "--key").endswith("/key")
+
+
+def test_the_link_sees_no_key() -> None:
+    for end in ("world", "cloud"):
+        mounts = containers(pod_specs(render())[end])["link"]["volumeMounts"]
+        assert "secret" not in {mount["name"] for mount in mounts}
+
+
+def test_the_epoch_is_on_a_claim_that_the_chart_makes() -> None:
+    objects = render()
+    volume = volume_at(objects, "world", argument(objects, "world", "--epochs"))
+    assert volume["persistentVolumeClaim"]["claimName"] == "demo-cloudrc-epochs"
+    assert "epochs" in of_kind(objects, "PersistentVolumeClaim")
+
+
+def test_ones_own_claim_comes_first() -> None:
+    objects = render({"world": {"epochs": {"existingClaim": "mine"}}})
+    volume = volume_at(objects, "world", argument(objects, "world", "--epochs"))
+    assert volume["persistentVolumeClaim"]["claimName"] == "mine"
+    assert "epochs" not in of_kind(objects, "PersistentVolumeClaim")
+
+
+def test_class_and_size_are_values() -> None:
+    epochs = {"storageClassName": "fast", "size": "8Mi"}
+    claim = of_kind(render({"world": {"epochs": epochs}}), "PersistentVolumeClaim")["epochs"]
+    assert claim["spec"]["storageClassName"] == "fast"
+    assert claim["spec"]["resources"]["requests"]["storage"] == "8Mi"

@@ -1,0 +1,48 @@
+"""`helm test` asks both ends for their verdict on the link: with time enough, without rights."""
+
+from __future__ import annotations
+
+from rendering import Object, containers, pod_specs, render
+
+from cloudrc.cli.link_verify import ENDS_LIMIT
+from cloudrc.cli.parser import build
+
+HELM_WAITS = 300.0
+"""For one hook, unless --timeout says otherwise [s]."""
+
+
+def link_test(values: Object | None = None) -> Object:
+    (found,) = (
+        thing
+        for thing in render(values)
+        if thing["kind"] == "Pod" and thing["metadata"]["name"].endswith("-test-link")
+    )
+    return found
+
+
+def test_it_comes_after_the_flight_and_is_kept_where_it_failed() -> None:
+    annotations = link_test()["metadata"]["annotations"]
+    assert annotations["helm.sh/hook"] == "test"
+    assert int(annotations["helm.sh/hook-weight"]) > 0, "commands flow once a mission has flown"
+    assert "hook-failed" not in annotations["helm.sh/hook-delete-policy"]
+    assert link_test()["spec"]["restartPolicy"] == "Never"
+
+
+def test_it_has_the_time_that_a_verdict_takes_and_helm_waits_for_it() -> None:
+    deadline = link_test()["spec"]["activeDeadlineSeconds"]
+    assert ENDS_LIMIT + 10.0 <= deadline < HELM_WAITS
+
+
+def test_its_command_is_one_of_ours_and_asks_this_releases_ends() -> None:
+    (container,) = link_test()["spec"]["containers"]
+    options = build(["link"]).parse_args(container["args"])
+    names = {name.rsplit("-", 1)[-1] for name in options.ends.split(",")}
+    assert names == {"world", "cloud"}
+    hosts = {thing["metadata"]["name"] for thing in render() if thing["kind"] == "Service"}
+    assert set(options.ends.split(",")) <= hosts
+
+
+def test_it_has_no_more_rights_than_cloud() -> None:
+    own = link_test()["spec"]["containers"][0]["securityContext"]
+    assert own == containers(pod_specs(render())["cloud"])["cloud"]["securityContext"]
+    assert "NET_ADMIN" not in str(own)

@@ -1,0 +1,81 @@
+"""The API's tokens: made once and kept, or somebody else's; each pod gets those that it needs."""
+
+from __future__ import annotations
+
+import base64
+
+import pytest
+from rendering import Object, a_namespace, containers, holding, notes, of_kind, pod_specs, render
+
+OURS: Object = {"teleop": {"tokens": {"existingSecret": "lab-tokens"}}}
+MISSION: Object = {"mission": {"enabled": True}}
+
+
+def tokens(objects: list[Object]) -> Object:
+    return of_kind(objects, "Secret")["tokens"]
+
+
+def mounted(pod: Object) -> Object | None:
+    found = [v["secret"] for v in pod["volumes"] if v["name"] == "tokens"]
+    return found[0] if found else None
+
+
+def test_two_that_differ_are_made() -> None:
+    data = tokens(render())["data"]
+    operator, reader = (base64.b64decode(data[role]) for role in ("operator", "reader"))
+    assert len(operator) == len(reader) == 48
+    assert operator != reader
+
+
+def test_an_upgrade_finds_them_and_uninstalling_keeps_them() -> None:
+    installed = render(lookup=a_namespace())
+    upgraded = render(lookup=holding(installed, a_namespace()))
+    assert tokens(upgraded) == tokens(installed)
+    assert tokens(upgraded)["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"
+
+
+def test_ones_own_come_first() -> None:
+    there = holding([{"kind": "Secret", "metadata": {"name": "lab-tokens"}}], a_namespace())
+    objects = render({**OURS, **MISSION}, lookup=there)
+    assert "tokens" not in of_kind(objects, "Secret")
+    pods = pod_specs(objects)
+    names = {(mounted(pods[pod]) or {})["secretName"] for pod in ("cloud", "mission", "test")}
+    assert names == {"lab-tokens"}
+
+
+def test_missing_ones_are_refused_with_the_command_that_makes_them() -> None:
+    said = "no Secret 'lab-tokens' in namespace 'lab'; make it: .* --from-file=operator"
+    with pytest.raises(Exception, match=said):
+        render(OURS, lookup=a_namespace())
+
+
+def test_teleop_has_all_missions_the_operators_and_nobody_else_any() -> None:
+    pods = pod_specs(render(MISSION))
+    assert mounted(pods["world"]) is None
+    assert "items" not in (mounted(pods["cloud"]) or {})
+    for pod in ("mission", "test"):
+        (item,) = (mounted(pods[pod]) or {})["items"]
+        assert item == {"key": "operator", "path": "operator"}
+        (container,) = pods[pod]["containers"]
+        assert "--token-file=/etc/cloudrc-tokens/operator" in container["args"]
+    mounts = {
+        name: [m["name"] for m in container["volumeMounts"]]
+        for name, container in containers(pods["cloud"]).items()
+    }
+    assert [name for name, found in mounts.items() if "tokens" in found] == ["teleop"]
+
+
+def test_the_api_in_the_pod_is_served_with_tokens_and_audited() -> None:
+    teleop = containers(pod_specs(render())["cloud"])["teleop"]
+    assert "--tokens=/etc/cloudrc-tokens" in teleop["args"]
+    assert [a for a in teleop["args"] if a.startswith("--audit=/var/lib/cloudrc-journal/")]
+
+
+def test_they_are_not_printed_and_in_no_environment() -> None:
+    objects = render(MISSION)
+    data = tokens(objects)["data"]
+    for pod in pod_specs(objects).values():
+        assert "secretKeyRef" not in str(pod)
+    for token in data.values():
+        assert token not in notes()
+        assert base64.b64decode(token).decode() not in notes()

@@ -1,0 +1,102 @@
+"""Which run `cloudrc mission` means, wherever it was started and whoever else flies."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from api_harness import Running, running
+
+from cloudrc.cli.main import main
+from cloudrc.drivers import flights
+
+Printed = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's folder, where no run is."""
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return folder
+
+
+@contextlib.contextmanager
+def flying(folder: Path) -> Iterator[Running]:
+    """A run that flies in this folder."""
+    folder.mkdir(parents=True)
+    with running(unix=True) as api, flights.announced(folder):
+        (folder / "api.json").write_text(json.dumps({"url": api.url}))
+        yield api
+
+
+def test_the_emergency_stop_reaches_the_only_run_from_any_folder(
+    tmp_path: Path, capsys: Printed
+) -> None:
+    with flying(tmp_path / "out") as api:
+        assert main(["mission", "estop"]) == 0
+        assert len(api.alarms) == 1
+    said = capsys.readouterr()
+    assert said.out.startswith("emergency stop: the robot is told")
+    assert said.err == f"cloudrc: the run that flies in {tmp_path / 'out'}\n"
+
+
+def test_of_several_one_has_to_be_named(tmp_path: Path, capsys: Printed) -> None:
+    with flying(tmp_path / "a") as a, flying(tmp_path / "b") as b:
+        assert main(["mission", "estop"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        for name in "ab":
+            assert f"--run {tmp_path / name}" in line
+        assert (a.alarms, b.alarms) == ([], [])
+        assert main(["mission", "estop", "--run", str(tmp_path / "b")]) == 0
+        assert (len(a.alarms), len(b.alarms)) == (0, 1)
+
+
+def test_the_newest_run_of_this_folder_comes_first(
+    tmp_path: Path, elsewhere: Path, capsys: Printed
+) -> None:
+    with flying(tmp_path / "a") as a, flying(elsewhere / "runs" / "latest") as here:
+        assert main(["mission", "estop"]) == 0
+        assert (len(a.alarms), len(here.alarms)) == (0, 1)
+        assert capsys.readouterr().err == ""
+
+
+def test_runs_that_were_killed_or_have_no_api_are_not_asked_about(
+    tmp_path: Path, elsewhere: Path
+) -> None:
+    with flying(tmp_path / "out") as api:
+        with running(unix=True) as dead:
+            url = dead.url
+        (elsewhere / "runs" / "latest").mkdir(parents=True)
+        (elsewhere / "runs" / "latest" / "api.json").write_text(json.dumps({"url": url}))
+        with flights.announced(tmp_path / "without an API"):
+            assert main(["mission", "estop"]) == 0
+        assert len(api.alarms) == 1
+
+
+def test_where_none_flies_one_is_told_how_to_name_it(capsys: Printed) -> None:
+    assert main(["mission", "estop"]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no run flies here" in line
+    assert "--run, --api" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--run", "nowhere"], "--run nowhere: no run with an API flies there"),
+        (["--run", "nowhere", "-n", "demo"], "the other flags a cluster; give one"),
+    ],
+)
+def test_a_run_that_is_not_there_is_one_sentence(
+    words: list[str], said: str, capsys: Printed
+) -> None:
+    assert main(["mission", "estop", *words]) == 2
+    assert said in capsys.readouterr().err

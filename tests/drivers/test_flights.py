@@ -1,0 +1,112 @@
+"""Flights say where they are, to their user alone and for as long as they last."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cloudrc.drivers import flights
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from cloudrc.drivers import flights
+with flights.announced(Path(sys.argv[1])):
+    assert flights.under_way()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.fixture(autouse=True)
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    for name, folder in (("XDG_RUNTIME_DIR", "runtime"), ("XDG_STATE_HOME", "state")):
+        (tmp_path / folder).mkdir()
+        monkeypatch.setenv(name, str(tmp_path / folder))
+    return flights.places()
+
+
+def test_a_flight_is_found_while_it_lasts_and_leaves_nothing(
+    tmp_path: Path, places: list[Path]
+) -> None:
+    with flights.announced(tmp_path / "a"):
+        assert flights.under_way() == [tmp_path / "a"]
+        with flights.announced(tmp_path / "b"):
+            assert set(flights.under_way()) == {tmp_path / "a", tmp_path / "b"}
+        assert flights.under_way() == [tmp_path / "a"]
+    assert flights.under_way() == []
+    assert list(places[0].iterdir()) == []
+
+
+def test_it_is_told_by_its_whole_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with flights.announced(Path("runs/hover-1")):
+        monkeypatch.chdir("/")
+        assert flights.under_way() == [tmp_path / "runs" / "hover-1"]
+
+
+def test_a_flight_that_fails_is_over(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), flights.announced(tmp_path):
+        raise KeyboardInterrupt
+    assert flights.under_way() == []
+
+
+@pytest.mark.process
+def test_a_flight_that_is_killed_is_over_and_is_cleared_away(
+    tmp_path: Path, places: list[Path]
+) -> None:
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    (left,) = places[0].glob("*.json")
+    assert json.loads(left.read_text())["run"] == str(tmp_path)
+    assert flights.under_way() == []
+    assert not left.exists()
+
+
+def test_folder_and_files_are_this_users_alone(tmp_path: Path, places: list[Path]) -> None:
+    with flights.announced(tmp_path):
+        (file,) = places[0].iterdir()
+        assert stat.S_IMODE(places[0].stat().st_mode) == 0o700
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o500])
+def test_where_others_may_write_or_nobody_may_the_second_place_is_taken(
+    tmp_path: Path, places: list[Path], mode: int
+) -> None:
+    if os.getuid() == 0 and mode == 0o500:
+        places[0].parent.parent.joinpath("cloudrc").write_text("in the way")  # root may all
+    else:
+        places[0].mkdir(parents=True)
+        places[0].chmod(mode)
+    with flights.announced(tmp_path):
+        assert len(list(places[1].iterdir())) == 1
+        assert flights.under_way() == [tmp_path]
+
+
+def test_what_somebody_else_could_have_written_is_not_read(
+    tmp_path: Path, places: list[Path]
+) -> None:
+    with flights.announced(tmp_path):
+        places[0].chmod(0o777)
+        assert flights.under_way() == []
+
+
+def test_where_nothing_can_be_written_it_flies_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(flights, "places", lambda: [Path("/proc/nowhere")])
+    with flights.announced(tmp_path):
+        assert flights.under_way() == []
+
+
+def test_a_file_that_says_nothing_is_no_flight(places: list[Path]) -> None:
+    places[0].mkdir(parents=True, mode=0o700)
+    (places[0] / "1.json").write_text("[]")
+    assert flights.under_way() == []
