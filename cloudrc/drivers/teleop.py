@@ -113,13 +113,14 @@ def serve_teleop(
         wait_ns = max(0, deadline_ns - time.monotonic_ns())
         select.select([peer], [], [], wait_ns * 1e-9)
         now_ns = time.monotonic_ns()
-        for data in peer.receive():
+        arrived = peer.receive()
+        for call in calls():  # first: what has arrived may already show what a call asked for
+            call(now_ns)
+        for data in arrived:
             try:
                 machine.see(decode(data), now_ns)
             except ValueError:
                 continue
-        for call in calls():
-            call(now_ns)
         if now_ns >= deadline_ns:
             machine.handle_deadline(now_ns)
             deadline_ns += ((now_ns - deadline_ns) // PERIOD_NS + 1) * PERIOD_NS

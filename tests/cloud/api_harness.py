@@ -107,7 +107,8 @@ class Running:
             return error.code, json.loads(error.read())
 
     def audited(self):
-        """What the audit log has, once it is written."""
+        """What the audit log has, once every request is done with; nothing is served after."""
+        self.server.stop()
         self.audit.close()
         lines = self.audit_file.read_text().splitlines() if self.audit_file.exists() else []
         return [json.loads(line) for line in lines]

@@ -162,7 +162,19 @@ def test_a_thousand_posts_at_once_under_one_key_are_one_mission():
         assert [entry["kind"] for entry in api.flight.kept].count("mission") == 1
 
 
-def test_an_alarm_goes_out_before_the_loop_is_asked():
+def test_an_alarm_goes_out_at_once_and_teleop_is_asked_before_it_can_see_its_effect():
+    with running() as api:
+        steps, submit = [], api.bridge.submit
+        api.bridge.submit = lambda *call, **how: (steps.append("asked"), submit(*call, **how))[1]
+        api.bridge.alarm = lambda: steps.append("alarm")
+        api.post("/v1/estop")
+        assert steps == ["asked", "alarm"]
+        api.bridge.closed = "another teleop flies"
+        assert api.post("/v1/estop") == (503, {"detail": "another teleop flies"})
+        assert steps[2:] == ["asked", "alarm"]
+
+
+def test_an_emergency_stop_is_one_alarm():
     with running() as api:
         api.flight.teleop.create(Order(PLAN), 0)
         status, answer = api.post("/v1/estop")
@@ -180,7 +192,7 @@ def test_a_fault_of_the_application_is_one_line_and_500():
             assert (status, answer) == (500, {"detail": "the API failed; see teleop's log"})
         (line,) = api.complaints
         assert line.startswith("the API failed at /v1/hold: TypeError")
-        assert api.gate.counts["failed"] == 2
+        api.until(lambda: api.gate.counts["failed"] == 2)  # counted after the answer
 
 
 def test_nothing_but_http_gets_an_answer(idle):

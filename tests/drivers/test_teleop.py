@@ -150,6 +150,23 @@ def test_deadlines_calls_and_messages_meet_in_one_loop(peers, service):
     assert service.machine.seen == [POINT]
 
 
+def test_what_is_asked_for_comes_before_what_has_arrived(peers):
+    """An emergency stop is asked for before the robot is seen to have stopped."""
+    machine, stops = Machine(), iter([False, True])
+    calls = [lambda now_ns: machine.seen.append("asked")]
+    peers[1].send(encode(POINT))
+    serve_teleop(
+        machine,
+        peers[0],
+        encode,
+        decode,
+        calls=lambda: calls,
+        tell=lambda told: None,
+        stop=lambda: next(stops),
+    )
+    assert machine.seen == ["asked", POINT]
+
+
 def test_events_wait_for_a_cloud_that_is_away_and_keep_their_order(peers, service, tmp_path):
     _, cloud = peers
     cloud.close()

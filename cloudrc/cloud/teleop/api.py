@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from math import radians
 from typing import Any
@@ -88,9 +89,12 @@ def create_app(bridge: Bridge, surroundings: Surroundings) -> FastAPI:
     return app
 
 
-async def _ask(bridge: Bridge, call: Call, *, urgent: bool = False) -> Any:
-    future = asyncio.wrap_future(bridge.submit(call, urgent=urgent))
-    return await asyncio.wait_for(future, ANSWER_LIMIT)
+async def _ask(bridge: Bridge, call: Call) -> Any:
+    return await _answer(bridge.submit(call))
+
+
+async def _answer(future: Future[Any]) -> Any:
+    return await asyncio.wait_for(asyncio.wrap_future(future), ANSWER_LIMIT)
 
 
 async def _body(request: Request) -> bytes:
@@ -179,8 +183,11 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
         **_gives(models.Stopped, "The robot is told until it obeys"),
     )
     async def stop() -> JSONResponse:
-        bridge.alarm()
-        mission = await _ask(bridge, lambda s, now_ns: s.stop_rotors(now_ns), urgent=True)
+        try:  # the call is there before the robot can be seen to have stopped
+            stopped = bridge.submit(lambda s, now_ns: s.stop_rotors(now_ns), urgent=True)
+        finally:
+            bridge.alarm()
+        mission = await _answer(stopped)
         return JSONResponse({"id": mission.id if mission else None, "state": "stopping"})
 
     @router.post(
