@@ -1,17 +1,17 @@
 """`cloudrc link set` in a cluster: the ConfigMap's files become a profile, and that becomes files.
 
-They go into the ConfigMap, so that the change lasts, and at the same time straight to both link
-containers, so that it is in force within a second. A trace lies beside the profile, and is named
-relative to it.
+They go straight to both link containers, so that the change is in force within a second, and then
+into the ConfigMap, so that it lasts. A trace lies beside the profile, and is named relative to it.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from cloudrc.cli.link_edit import DIRECTIONS, FILES, Edit, edit
 from cloudrc.cluster.errors import ClusterError
@@ -33,13 +33,27 @@ SIZE_MAX = 1_000_000
 _KEY = re.compile(r"[^-._a-zA-Z0-9]")
 
 
-def change_profile(
+class HandedOver(NamedTuple):
+    """A change that the link containers have been given.
+
+    Attributes:
+        edit: What was changed.
+        told: What uplink and downlink tell of themselves then.
+        keep: Writes it into the ConfigMap, so that it lasts; raises a ClusterError.
+    """
+
+    edit: Edit
+    told: list[str]
+    keep: Callable[[], None]
+
+
+def hand_profile(
     place: Place,
     link: LinkParts,
     profile: str | None,
     settings: Sequence[str],
     change: Callable[[Edit], str],
-) -> tuple[Edit, list[str]]:
+) -> HandedOver:
     """Change the profile of a release, and wait until both directions have taken it over.
 
     Args:
@@ -48,9 +62,6 @@ def change_profile(
         profile: As `link_edit.edit` takes it.
         settings: Likewise.
         change: Says who changed it and why, as the text of the file beside the profile.
-
-    Returns:
-        The edit, and what uplink and downlink tell of themselves then.
 
     Raises:
         CloudrcError: If what is asked for is not valid, or the cluster refuses.
@@ -63,26 +74,25 @@ def change_profile(
     before = read_change(link.files.get(CHANGE_FILE, "")).number
     handed = Handed(files[CHANGE_FILE], before, {PROFILE: files[PROFILE], **whole})
     text = write_handed(handed)
-    with ThreadPoolExecutor(len(COMPONENTS) + 1) as pool:
-        lasting = pool.submit(write_files, place, link.name, files)
+    with ThreadPoolExecutor(len(COMPONENTS)) as pool:
         told = [pool.submit(hand_over, place, link.pods[part], text) for part in COMPONENTS]
-    return made, _told(lasting, told)
-
-
-def _told(lasting: Future[None], told: Sequence[Future[str]]) -> list[str]:
-    """Give what both told; say of a failure what holds all the same."""
     refused = [error for one in told if isinstance(error := one.exception(), CloudrcError)]
-    lost = lasting.exception()
-    if isinstance(lost, CloudrcError):
-        if len(refused) < len(told):
-            lost = ClusterError(f"{lost}; the link changes, until its containers start again")
-        raise lost
+
+    def keep() -> None:
+        try:
+            write_files(place, link.name, files)
+        except CloudrcError as error:
+            if len(refused) == len(told):
+                raise
+            text = f"{error}; the link changes, until its containers start again"
+            raise ClusterError(text) from None
+
     if refused:
+        keep()
         raise ClusterError(
             f"{refused[0]}; the ConfigMap has the change, and the pods follow it within 2 minutes"
         )
-    lasting.result()
-    return [one.result() for one in told]
+    return HandedOver(made, [one.result() for one in told], keep)
 
 
 def with_files(

@@ -69,10 +69,12 @@ def execute(options: argparse.Namespace) -> int:
     if folder is not None:
         edit, look = _set_here(options, folder, number)
         states = _await(look, number, LOCAL_PATIENCE, f"see {folder.parent / 'relay.log'}")
+        took = monotonic() - began
     else:
-        edit, look = _set_in_cluster(options, number)
+        edit, look, keep = _set_in_cluster(options, number)
         states = _await(look, number, 0.0, "see the logs of the link containers")
-    took = monotonic() - began
+        took = monotonic() - began
+        keep()  # what a link cannot be is not kept either
     for note in edit.notes:
         print(f"cloudrc: note: {note}", file=sys.stderr)
     if options.output != "table":
@@ -138,8 +140,10 @@ def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[E
     return made, look
 
 
-def _set_in_cluster(options: argparse.Namespace, number: str) -> tuple[Edit, Look]:
-    """Leave a new profile in the release's ConfigMap, and hand it to both link containers."""
+def _set_in_cluster(
+    options: argparse.Namespace, number: str
+) -> tuple[Edit, Look, Callable[[], None]]:
+    """Hand a new profile to both link containers; what is left to do is to make it last."""
     from concurrent.futures import ThreadPoolExecutor
 
     from cloudrc.cluster.access import DEFAULT_RELEASE
@@ -149,14 +153,14 @@ def _set_in_cluster(options: argparse.Namespace, number: str) -> tuple[Edit, Loo
     with ThreadPoolExecutor(1) as pool:
         looking = pool.submit(_link_of, options, where)
         # Meanwhile, since it takes as long: a change is to be in force within a second.
-        from cloudrc.cli.link_cluster import change_profile
+        from cloudrc.cli.link_cluster import hand_profile
         from cloudrc.cli.link_edit import check
         from cloudrc.link.state import from_text
 
         if looking.exception() is not None:
             check(options.profile, options.settings)  # what is wrong here comes first
         link = looking.result()
-    made, texts = change_profile(
+    made, told, keep = hand_profile(
         where,
         link,
         options.profile,
@@ -164,10 +168,10 @@ def _set_in_cluster(options: argparse.Namespace, number: str) -> tuple[Edit, Loo
         lambda edit: _change(edit, number),
     )
     try:
-        states = [from_text(text) for text in texts]
+        states = [from_text(text) for text in told]
     except ValueError as error:
         raise ClusterError(f"a link container is of another version: {error}") from error
-    return made, lambda: states
+    return made, lambda: states, keep
 
 
 def _link_of(options: argparse.Namespace, where: Place) -> LinkParts:

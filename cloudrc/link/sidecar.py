@@ -27,7 +27,7 @@ Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 
 COUNT_PERIOD_NS = 1_000_000_000
 _WAIT = 0.05
-_STEP = 0.1
+_STEP = 0.05
 """Longest time in which a change that was left here is not seen [s]."""
 
 

@@ -18,7 +18,7 @@ from cloudrc.link.state import CHANGE_FILE, Change, read_change
 if TYPE_CHECKING:
     from cloudrc.link.relay_lane import Address
 
-PROFILE_PERIOD = 0.1
+PROFILE_PERIOD = 0.05
 """How often the profile's file is looked at [s]."""
 PEER_PERIOD = 1.0
 """How often the peer's name is resolved [s]."""
@@ -47,7 +47,7 @@ class ProfileFile:
 
     Kubernetes mounts a ConfigMap as a folder of links to `..data`, itself a link, which it swaps in
     one step: the file behind the path is another one then. A look is one system call, since there
-    are ten a second beside a shaper that must not be late.
+    are twenty a second beside a shaper that must not be late.
     """
 
     def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:

@@ -111,7 +111,8 @@ def test_the_profile_changes_for_good_and_both_pods_get_it_at_once(
         assert handed["files"] == {"profile.yaml": cluster.patched()["profile.yaml"]}
         assert (json.loads(handed["change"]), handed["after"]) == (change, "")
     asked = cluster.asked()
-    assert len(asked) == 4, "one look, one patch, two pods"
+    verbs = [word for line in asked for word in line.split() if word in ("get", "exec", "patch")]
+    assert verbs == ["get", "exec", "exec", "patch"], "in force first, then for good"
     assert all(line.startswith("--context=kind --namespace=demo ") for line in asked)
     shown = capsys.readouterr().out.splitlines()
     assert shown[2].split()[:4] == ["downlink", "netem", "120", "ms"]
@@ -184,6 +185,7 @@ def test_a_refusal_by_the_link_is_the_users_error(
     path.write_text(json.dumps(state))
     assert main(["link", "set", "downlink.corrupt=0.5", "-n", "demo"]) == 2
     assert "the downlink is as it was: netem cannot do that" in capsys.readouterr().err
+    assert not any(" patch " in line for line in cluster.asked()), "it does not last either"
 
 
 def test_a_release_that_is_not_there_is_said(
