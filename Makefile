@@ -54,7 +54,7 @@ faults: $(VENV)/dev ## bring every fault about, compose 200 at random; writes do
 	$(bin)/cloudrc faults fuzz --adversarial --seeds 200 --jobs $(JOBS) \
 		--document docs/safety/adversary.md $(STORE)
 
-figures: $(VENV)/dev ## print the numbers of safety that tests have measured: asked, measured, of how many
+figures: $(VENV)/dev ## print the numbers of link and safety that tests have measured: asked, measured, of how many
 	$(bin)/python tools/figures.py
 
 nightly: $(VENV)/dev ## run every test, with the full numbers, and 500 hours of faults

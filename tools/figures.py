@@ -1,4 +1,4 @@
-"""The numbers of safety: tests note what they measured, this prints it beside what was asked.
+"""The numbers of link and safety: tests note what they measured, this prints it beside what was asked.
 
 `make figures` prints what the tests have noted since `make clean`; the full numbers need
 `make nightly`, the slices of CI are noted by `make test` and `make process`.

@@ -50,17 +50,25 @@ def test_a_million_draws_match_their_distribution(
     distribution: Literal["uniform", "normal", "pareto"],
     cumulative: Callable[[Any], Array],
     deviation: float,
+    figure: Callable[..., None],
 ) -> None:
     fates = np.array(drawn(DirectionProfile(DELAY, JITTER, distribution, loss=LOSS)))
     lost = fates < 0
+    off = abs(lost.mean() - LOSS)
+    figure("a million draws: loss off by", 100 * off, "<=", 0.056, "%", COUNT)
     assert lost.mean() == pytest.approx(LOSS, abs=4 * sqrt(LOSS * (1 - LOSS) / COUNT))
     sample = np.sort((fates[~lost] * 1e-9 - DELAY) / JITTER)
+    figure(
+        "a million draws: mean off by", abs(sample.mean()) * JITTER * 1e6, "<=", 20.2, "us", COUNT
+    )
     assert sample.mean() == pytest.approx(0.0, abs=4 / sqrt(sample.size))
     assert sample.std() == pytest.approx(deviation, rel=0.01)
     some = sample[:: COUNT // 2000]
     share = np.linspace(0, 1, sample.size)[:: COUNT // 2000]
     # Kolmogorov and Smirnov's distance; by chance above it once in a thousand seeds.
-    assert np.abs(cumulative(some) - share).max() < 1.95 / sqrt(sample.size)
+    distance = np.abs(cumulative(some) - share).max()
+    figure("a million draws: from their distribution", distance, "<=", 1.97e-3, count=COUNT)
+    assert distance < 1.95 / sqrt(sample.size)
 
 
 def test_a_million_fates_have_the_bursts_asked_for() -> None:
@@ -69,10 +77,15 @@ def test_a_million_fates_have_the_bursts_asked_for() -> None:
     assert np.mean(fates < 0) == pytest.approx(share_bad * 0.6 + (1 - share_bad) * 0.005, rel=0.02)
 
 
-def test_two_hundred_thousand_packets_have_the_loss_and_the_burst_length_asked_for() -> None:
+def test_two_hundred_thousand_packets_have_the_loss_and_the_burst_length_asked_for(
+    figure: Callable[..., None],
+) -> None:
     """The chain alone, everything in the bad state lost: 1/11 lost, 5 packets long, to 10 %."""
     lost = np.array(drawn(DirectionProfile(loss=GilbertElliott(0.02, 0.2)), 200_000)) < 0
     edges = np.flatnonzero(np.diff(np.concatenate(([0], lost, [0]))))
     lengths = edges[1::2] - edges[::2]
+    for name, measured, asked in (("loss", lost.mean(), 1 / 11), ("burst", lengths.mean(), 5.0)):
+        off = 100 * abs(measured / asked - 1)
+        figure(f"Gilbert-Elliott: {name} off by", off, "<=", 10.0, "%", lost.size)
     assert lost.mean() == pytest.approx(1 / 11, rel=0.1)
     assert lengths.mean() == pytest.approx(5.0, rel=0.1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -51,7 +52,7 @@ def test_a_true_link_is_believed(name: str) -> None:
 
 
 @pytest.mark.full
-def test_200_true_links_of_200_are_believed() -> None:
+def test_200_true_links_of_200_are_believed(figure: Callable[..., None]) -> None:
     shipped = [link_profile(load_profile(name).uplink) for name in names("profile")]
     rng = np.random.default_rng(1)
     links = [(profile, seed) for profile in shipped for seed in range(12)]
@@ -63,6 +64,7 @@ def test_200_true_links_of_200_are_believed() -> None:
         assert plan.plan.enough, f"{profile} needs {plan.plan.needs} probes"
         if wrong := doubts(probe(plan, profile, seed)):
             found[profile, seed] = wrong
+    figure("true links: not believed", len(found), "==", 0, count=len(links))
     assert found == {}
 
 
@@ -96,8 +98,10 @@ FAULTS: dict[str, tuple[DirectionProfile, DirectionProfile, DirectionProfile, Ev
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_named(fault: str) -> None:
-    assert {cause.code for cause in verify(*FAULTS[fault])} == {fault}
+def test_a_fault_is_named(fault: str, figure: Callable[..., None]) -> None:
+    causes = {cause.code for cause in verify(*FAULTS[fault])}
+    figure("seeded faults of the link: not named", int(causes != {fault}), "==", 0)
+    assert causes == {fault}
 
 
 def test_a_relay_that_does_not_get_its_cpu_is_named() -> None:

@@ -59,7 +59,7 @@ def _measure(
     for stage in stages:
         print(f"bench-link: {stage} ...", file=sys.stderr, flush=True)
         if stage == "release":
-            rounds = (2, 3.0) if quick else (5, 6.0)
+            rounds = (2, 3.0) if quick else (5, 20.0)  # 100,000 of each in all
             lines += report.releases(measure_releases(folder, programs, *rounds, fifo=fifo), fifo)
         elif stage == "throughput":
             floods = (2, 1.0) if quick else (5, 1.5)

@@ -14,7 +14,6 @@ from tools.bench_link.profiles import Links, Row, correlation, profiles_of
 from tools.bench_link.release import OF_ASYNCIO, OF_C, OURS, WAKE, Releases
 
 TRACE = "trace"
-EARLY_SAMPLE = 100_000
 MEMORY_MAX = 64 << 20
 US, MS = 1e6, 1e3
 
