@@ -6,7 +6,6 @@ Drivers know endpoints by contract only, world and cloud never meet: here they a
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 from math import dist, inf, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -130,7 +129,7 @@ def build_plan(experiment: ResolvedExperiment) -> Plan:
         experiment.mission,
         experiment.criteria.time_limit_s,
         experiment.seed,
-        speed_max=experiment.guard.speed_max_mps or inf,
+        speed_max=experiment.guard.speed_max_mps,
     )
 
 
@@ -148,8 +147,9 @@ def mission_plan(
     if mission.steps is not None:
         legs = _step_legs(mission.steps, seed)
     else:
-        ways = pairwise((None, *mission.waypoints))
-        legs = tuple(_leg(before, waypoint, speed_max) for before, waypoint in ways if waypoint)
+        befores = (None, *mission.waypoints)
+        ways = zip(befores, mission.waypoints, strict=False)  # none leaves the last one
+        legs = tuple(_leg(before, waypoint, speed_max) for before, waypoint in ways)
     return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
 

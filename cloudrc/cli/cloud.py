@@ -7,17 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import (
-    chosen,
-    end_arguments,
-    link_state,
-    open_exporter,
-    open_keys,
-    open_peer,
-    open_recorder,
-    standing_check,
-    suite,
-)
+from cloudrc.cli.ends import end_arguments
+from cloudrc.cli.opened import open_end, suite
 
 if TYPE_CHECKING:
     from cloudrc.cloud.endpoint import Operator
@@ -36,7 +27,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Control."""
-    from cloudrc.drivers.process import StopSignal, run_end
+    from cloudrc.drivers.process import StopSignal
 
     stop = StopSignal()
     import os
@@ -44,31 +35,14 @@ def execute(options: argparse.Namespace) -> int:
 
     from cloudrc import assembly
     from cloudrc.cloud.endpoint import CloudIdentity
-    from cloudrc.config.load import load_experiment
-    from cloudrc.drivers.machine import clock_id
     from cloudrc.messages import GuardState
 
-    exporter = open_exporter(options, "cloud")
-    experiment, clock = load_experiment(str(options.config)), clock_id()
-    recorder = open_recorder(options, "cloud", clock)
-    keys = open_keys(options)
-    peer = open_peer(options)
-    identity = CloudIdentity(clock, os.urandom(16), keys.ring, suite())
+    opened = open_end(options, "cloud")
+    identity = CloudIdentity(opened.clock, os.urandom(16), opened.keys.ring, suite())
     teleop = _join(options.teleop) if options.teleop else None
-    cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns, teleop)
-    run_end(
-        cloud,
-        peer,
-        recorder,
-        end="cloud",
-        stop=stop,
-        over=lambda: cloud.mission_over,
-        exporter=exporter,
-        watched=options.feed,
-        choose=chosen(options, lambda: cloud.guard is GuardState.TRACK),
-        link=link_state(options),
-        check=standing_check(options, experiment, uplink=True),
-        keys=keys,
+    cloud = assembly.build_cloud(opened.experiment, identity, time.monotonic_ns, teleop)
+    opened.fly(
+        cloud, stop, lambda: cloud.guard is GuardState.TRACK, over=lambda: cloud.mission_over
     )
     return 0
 

@@ -118,6 +118,8 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
     Raises:
         BadInputError: Names the key.
     """
+    from cloudrc.config.load import FILES
+
     paths = {
         f"cloud.{key}": getattr(experiment.cloud, key).name
         for key in ("estimator", "predictor", "controller")
@@ -125,7 +127,7 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
     paths |= {
         f"link.{key}.{name}": getattr(getattr(experiment.link, key), name)
         for key in ("uplink", "downlink")
-        for name in ("trace", "table")
+        for name in FILES
     }
     for key, name in paths.items():
         if name is not None and ("/" in name or name.endswith(".py")):

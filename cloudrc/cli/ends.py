@@ -1,12 +1,11 @@
-"""What the three process commands share: their flags, their socket addresses, their recorder."""
+"""What the process commands share: their flags, their socket addresses, their metrics."""
 
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,14 +13,7 @@ from typing import TYPE_CHECKING
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.drivers.keyfile import KeyFile
-    from cloudrc.drivers.realtime import Peer
-    from cloudrc.drivers.standing_check import StandingCheck
-    from cloudrc.link.profile import DirectionProfile
-    from cloudrc.record.recorder import Recorder
-    from cloudrc.records import Record
 
 Address = tuple[str, int]
 EPILOG = """\
@@ -86,37 +78,6 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def link_state(options: argparse.Namespace) -> Path | None:
-    """Find where the link of an end tells its state: the link's process writes it."""
-    given: Path | None = options.link
-    route: Path | None = options.route
-    return given if given is not None or route is None else route.with_name("link.json")
-
-
-def standing_check(
-    options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
-) -> StandingCheck:
-    """Judge the direction that an end hears by what is asked of it, and follow what that is."""
-    import json
-
-    from cloudrc.assembly import link_profile
-    from cloudrc.config.schema import Profile
-    from cloudrc.drivers.standing_check import StandingCheck
-    from cloudrc.link.verify_twin import Stream
-    from cloudrc.tunnel.codec import SIZES, Kind
-
-    def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
-        profile = Profile.model_validate_json(json.dumps(values))
-        return link_profile(profile.uplink), link_profile(profile.downlink)
-
-    asked = link_profile(experiment.uplink), link_profile(experiment.downlink)
-    kind = Kind.TELEMETRY if uplink else Kind.COMMAND
-    stream = Stream(experiment.seed, uplink, kind, SIZES[kind])
-    check = StandingCheck(uplink=uplink, stream=stream)
-    check.begin(asked, link_state(options), load)
-    return check
-
-
 def address(text: str) -> Address:
     """Read HOST:PORT, as argparse calls it."""
     host, _, port = text.rpartition(":")
@@ -156,40 +117,6 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
     return exporter
 
 
-def open_keys(options: argparse.Namespace) -> KeyFile:
-    """Read the key of an end."""
-    import time
-
-    from cloudrc.drivers.keyfile import KeyFile, is_exposed
-
-    keys = KeyFile(options.key, time.monotonic_ns())
-    if is_exposed(options.key):
-        print(f"cloudrc: warning: everybody can read {options.key}: chmod 600", file=sys.stderr)
-    return keys
-
-
-def suite() -> int:
-    """The cipher that this machine is fast at."""
-    from cloudrc.drivers.machine import has_fast_aes
-    from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305
-
-    return AES_256_GCM if has_fast_aes() else CHACHA20_POLY1305
-
-
-def open_peer(options: argparse.Namespace) -> Peer:
-    """Bind the socket of an end, which sends to its peer or where its route leads."""
-    from cloudrc.drivers.realtime import Peer
-    from cloudrc.drivers.route import Route
-
-    warn_if_exposed(options.listen)
-    with listening("--listen", options.listen):
-        if options.route is None:
-            return Peer.bind(options.listen, options.peer)
-        if not options.route.exists():
-            print(f"cloudrc: nothing is sent until there is {options.route}", file=sys.stderr)
-        return Peer.bind(options.listen, Route(options.route))
-
-
 @contextmanager
 def listening(flag: str, listen: Address) -> Iterator[None]:
     """Open a socket at an address inside; if that fails, say which flag asked for what."""
@@ -200,24 +127,3 @@ def listening(flag: str, listen: Address) -> Iterator[None]:
             f"{flag} {listen[0]}:{listen[1]}: cannot receive there: {error.strerror or error};"
             " name an address of this machine and a port that is free"
         ) from error
-
-
-def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:
-    """Make the recorder of a process; without a file it writes into nothing."""
-    from cloudrc.record.recorder import Recorder
-    from cloudrc.record.writer import McapWriter
-
-    return Recorder(
-        options.record or Path(os.devnull),
-        lambda file: McapWriter(file, clock=clock, clock_id=clock_id.hex()),
-        size_max=round(0.9 * options.record_max) if options.record_max else None,
-    )
-
-
-def chosen(
-    options: argparse.Namespace, flies: Callable[[], bool]
-) -> Callable[[list[Record]], list[Record]]:
-    """What chooses the records for the recording."""
-    from cloudrc.drivers.recording import FlightsOnly
-
-    return FlightsOnly(flies) if options.record_flights else list

@@ -22,7 +22,8 @@ examples:
 
 exit codes: 0 every check passed, 1 one did not, 2 no such fault,
   3 or 5 no cluster or no release there (--cluster)"""
-SEED_MAX = 2**63 - 1
+SEED_MAX = 2**63 - 1 - COUNT_MAX
+"""Of the first one: those counted from it fit into 64 bits, too."""
 ACTIONS = {
     "list": "all faults, what is done and what has to follow",
     "run": "bring faults about and check what follows",
@@ -47,8 +48,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def seed(text: str) -> int:
     """Read the seed of a generator of chance, as argparse calls it."""
-    if not text.isdecimal() or int(text) > SEED_MAX - COUNT_MAX:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 on")
+    if not text.isdecimal() or int(text) > SEED_MAX:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {SEED_MAX}")
     return int(text)
 
 

@@ -119,7 +119,7 @@ def _brief(finding: Finding) -> dict[str, Any]:
     }
 
 
-def _report(finding: Finding, store: Path | None, say: bool) -> dict[str, Any]:
+def _report(finding: Finding, store: Path, say: bool) -> dict[str, Any]:
     """Shrink a failing schedule, print it, and keep it."""
     from cloudrc.faults.fuzz import fly
     from cloudrc.faults.schedule import dump
@@ -136,17 +136,14 @@ def _report(finding: Finding, store: Path | None, say: bool) -> dict[str, Any]:
     text = dump(smallest, f"Found by seed {finding.schedule.seed}.\n{note}")
     if say:
         print(f"\n{paint('FAILED', 'red')} seed {finding.schedule.seed}\n{text}", flush=True)
-    path = None
-    if store is not None:
-        store.mkdir(parents=True, exist_ok=True)
-        name = f"{'-'.join(sorted(kinds))}-{smallest.policy or 'seed'}-{smallest.seed}.yaml"
-        path = store / name
-        path.write_text(text, encoding="utf-8")
+    store.mkdir(parents=True, exist_ok=True)
+    path = store / f"{'-'.join(sorted(kinds))}-{smallest.policy or 'seed'}-{smallest.seed}.yaml"
+    path.write_text(text, encoding="utf-8")
     return {
         "seed": finding.schedule.seed,
         "breaches": [breach._asdict() for breach in finding.breaches],
         "schedule": asdict(smallest),
-        "file": str(path) if path else "",
+        "file": str(path),
     }
 
 

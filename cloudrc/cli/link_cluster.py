@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from cloudrc.cli.link_edit import DIRECTIONS, FILES, Edit, edit
+from cloudrc.cli.link_edit import DIRECTIONS, Edit, edit
 from cloudrc.cluster.errors import ClusterError
 from cloudrc.cluster.link import (
     COMPONENTS,
@@ -24,6 +24,7 @@ from cloudrc.cluster.link import (
     write_files,
 )
 from cloudrc.config import document, yaml_text
+from cloudrc.config.load import FILES
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.link.sidecar_handed import Handed, write_handed
 from cloudrc.link.state import CHANGE_FILE, read_change

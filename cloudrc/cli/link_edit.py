@@ -14,16 +14,15 @@ from typing import Any
 
 from cloudrc.config import overrides, shipped
 from cloudrc.config.document import SETTING, Document, Source
-from cloudrc.config.load import check_profile, load_profile
+from cloudrc.config.load import FILES, check_profile, load_profile
 from cloudrc.config.overrides import Override
+from cloudrc.config.schema import Change
 from cloudrc.errors import BadInputError
 
 DIRECTIONS = ("uplink", "downlink")
-ON_TIME_LINE = ("delay_ms", "jitter_ms", "loss", "rate_kbit")
+ON_TIME_LINE = Change.model_fields.keys() - {"at_s"}
 """Values that a time line's changes may set."""
 TIME_LINES = ("changes", "trace", "blackouts")
-FILES = ("trace", "table")
-"""Keys whose values are paths."""
 _HERE = "link set"
 _EXAMPLE = "for example downlink.delay_ms=120, or --profile handover"
 

@@ -9,16 +9,15 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cloudrc.cluster.forward import DIRECTLY
 from cloudrc.drivers.route import parse
 from cloudrc.errors import MissingPrerequisiteError, TimedOutError
 from cloudrc.link.state import STATE_FILE, LinkState, from_text
@@ -83,14 +82,14 @@ class Shaping:
         host, port = self.place.metrics
         if self.place.inside:  # its loopback is not ours
             reader = (
-                "import urllib.request as u; "
-                f"print(u.urlopen('http://{host}:{port}/metrics', timeout=3).read().decode())"
+                "import urllib.request as u; ask = u.build_opener(u.ProxyHandler({})).open; "
+                f"print(ask('http://{host}:{port}/metrics', timeout=3).read().decode())"
             )
             words = [*self.place.inside, sys.executable, "-c", reader]
             done = subprocess.run(words, capture_output=True, text=True, check=False)
             return done.stdout
         try:
-            with urllib.request.urlopen(f"http://{host}:{port}/metrics", timeout=_PATIENCE) as page:
+            with DIRECTLY.open(f"http://{host}:{port}/metrics", timeout=_PATIENCE) as page:
                 return str(page.read().decode())
         except OSError:
             return ""
@@ -103,7 +102,7 @@ class Shaping:
 
 @contextlib.contextmanager
 def shaping(
-    places: Mapping[str, Place], config: str, profile: str, mode: str, fifo: bool = False
+    places: Mapping[str, Place], config: str, profile: str, mode: str
 ) -> Iterator[dict[str, Shaping]]:
     """Run both directions' shapers; they have ended afterwards.
 
@@ -112,7 +111,6 @@ def shaping(
         config: The experiment, as YAML.
         profile: The profile in force, as YAML.
         mode: "relay", "netem" or "auto".
-        fifo: Whether relays ask for SCHED_FIFO.
 
     Raises:
         MissingPrerequisiteError: If one cannot shape; it says why.
@@ -130,18 +128,6 @@ def shaping(
             yield running
         finally:
             _stop([one.process for one in running.values()])
-
-
-def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[int]:
-    """Find ports on 127.0.0.1 that nobody uses now."""
-    sockets = [socket.socket(socket.AF_INET, kind) for _ in range(count)]
-    try:
-        for one in sockets:
-            one.bind((LOOPBACK, 0))
-        return [int(one.getsockname()[1]) for one in sockets]
-    finally:
-        for one in sockets:
-            one.close()
 
 
 def _start(folder: Path, way: str, place: Place, mode: str) -> Shaping:

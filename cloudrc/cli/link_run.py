@@ -87,7 +87,7 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
     from cloudrc.link.netem import Netem
     from cloudrc.link.netem_tc import may_shape, try_netem
     from cloudrc.link.profile import DirectionProfile
-    from cloudrc.link.relay_priority import settle
+    from cloudrc.link.relay_priority import ask_for_fifo, settle
     from cloudrc.link.relay_shaper import RelayShaper
     from cloudrc.link.sidecar import Machine
     from cloudrc.tunnel.codec import peek
@@ -97,6 +97,8 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
 
     def relay(profile: DirectionProfile, origin_ns: int) -> RelayShaper:
         settle()
+        if not ask_for_fifo():  # most pods may not, and need not
+            log("the relay runs under SCHED_FIFO")
         uplink = options.direction == "uplink"
         return RelayShaper(options.listen, LinkDirection(profile, seed, uplink, origin_ns), peek)
 

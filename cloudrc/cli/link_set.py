@@ -12,6 +12,7 @@ from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.cluster_flags import place, place_arguments
+from cloudrc.cli.here import find_here, link_of, nobody_here, run_argument
 from cloudrc.cli.output import output_argument, written
 from cloudrc.cluster.errors import ClusterError
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 EPILOG = """\
 where:
   the run that flies here ('cloudrc run --mode local'), found by itself or by
-  --run; or a release: with --context, -n or --release, or if none flies here
+  --run; or a release: with --context, -n or --release, if none flies here, and
+  always as 'kubectl cloudrc link set'
 
 examples:
   cloudrc link set downlink.delay_ms=120 uplink.loss=0.02
@@ -50,7 +52,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "settings", nargs="*", metavar="KEY=VALUE", help="uplink.KEY=VALUE or downlink.KEY=VALUE"
     )
     parser.add_argument("--profile", metavar="NAME", help="a profile that ships, or a file")
-    parser.add_argument("--run", type=Path, metavar="DIR", help="folder of the run that flies here")
+    run_argument(parser)
     output_argument(parser)
     parser.add_argument(
         "--inside", type=Path, nargs="?", const=INSIDE, metavar="DIR", help=argparse.SUPPRESS
@@ -65,14 +67,18 @@ def execute(options: argparse.Namespace) -> int:
 
         return link_inside.execute(options.inside)
     began, number = monotonic(), secrets.token_hex(4)
-    folder = _folder_here(options)
+    folder = find_here(options, link_of, "no run flies there")
     if folder is not None:
         edit, look = _set_here(options, folder, number)
-        states = _await(look, number, LOCAL_PATIENCE, f"see {folder.parent / 'relay.log'}")
+        late = f"within {LOCAL_PATIENCE:g} s; see {folder.parent / 'relay.log'}"
+        states = _await(look, number, LOCAL_PATIENCE, late)
         took = monotonic() - began
     else:
         edit, look, keep = _set_in_cluster(options, number)
-        states = _await(look, number, 0.0, "see the logs of the link containers")
+        from cloudrc.cli.link_inside import PATIENCE
+
+        late = f"within {PATIENCE:g} s; see the logs of the link containers"
+        states = _await(look, number, 0.0, late)  # the containers have waited
         took = monotonic() - began
         keep()  # what a link cannot be is not kept either
     for note in edit.notes:
@@ -82,38 +88,6 @@ def execute(options: argparse.Namespace) -> int:
     else:
         _show(states, took)
     return 0
-
-
-def _folder_here(options: argparse.Namespace) -> Path | None:
-    """Find the link of the run that flies here, unless the flags name a cluster."""
-    from cloudrc.cli.folder import RUNS
-    from cloudrc.drivers.local import LINK_FOLDER
-
-    in_cluster = options.context or options.namespace or options.release
-    if options.run is not None:
-        if in_cluster:
-            raise BadInputError("--run names a run here, the other flags a cluster; give one")
-        if not (options.run / LINK_FOLDER).is_dir():
-            raise BadInputError(f"--run {options.run}: no run flies there")
-        return Path(options.run / LINK_FOLDER)
-    folder = RUNS / "latest" / LINK_FOLDER
-    if in_cluster:
-        return None
-    return folder if folder.is_dir() else _folder_elsewhere(LINK_FOLDER)
-
-
-def _folder_elsewhere(name: str) -> Path | None:
-    """Find the link of the only run of this user that flies, wherever it was started."""
-    from cloudrc.drivers.flights import under_way
-
-    found = [run for run in under_way() if (run / name).is_dir()]
-    if len(found) > 1:
-        names = " or ".join(f"--run {run}" for run in found)
-        raise BadInputError(f"{len(found)} runs fly here; say which: {names}")
-    if not found:
-        return None
-    print(f"cloudrc: the run that flies in {found[0]}", file=sys.stderr, flush=True)
-    return found[0] / name
 
 
 def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[Edit, Look]:
@@ -195,11 +169,7 @@ def _link_of(options: argparse.Namespace, where: Place) -> LinkParts:
         for part in ("world", "cloud"):
             find_pod(release, part)  # says best what is wrong
     except MissingPrerequisiteError as error:
-        if options.context or options.namespace:
-            raise
-        raise MissingPrerequisiteError(
-            f"no run flies here (start one: cloudrc run; or name its folder: --run), and {error}"
-        ) from None
+        raise nobody_here(options, error, "--run") from None
     raise failed
 
 
@@ -207,8 +177,14 @@ def _change(edit: Edit, number: str) -> str:
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 
-def _await(look: Look, number: str, patience: float, where: str) -> list[LinkState]:
+def _await(look: Look, number: str, patience: float, remedy: str) -> list[LinkState]:
     """Wait until both directions say that the change is in force.
+
+    Args:
+        look: Reads what they tell of themselves.
+        number: Of the change.
+        patience: For it to take force [s].
+        remedy: How long was waited in all, and where to look why.
 
     Raises:
         CloudrcError: If it is refused, or not in force in time.
@@ -223,10 +199,7 @@ def _await(look: Look, number: str, patience: float, where: str) -> list[LinkSta
             return states
         if monotonic() > until:
             late = [s.direction for s in states if s.change != number] or ["link"]
-            raise TimedOutError(
-                f"the {' and '.join(late)} did not take the change over within {patience:g} s; "
-                f"{where}"
-            )
+            raise TimedOutError(f"the {' and '.join(late)} did not take the change over {remedy}")
         sleep(LOOK_PERIOD)
 
 

@@ -27,8 +27,6 @@ with the same seed meets these delays. Of a link that does not change, the
 numbers are of 100000 packets. All delays are one way."""
 RATE_HZ = 100
 WAYS = ("uplink", "downlink")
-TAG_SIZE = 16
-"""What sealing adds to a datagram [bytes]."""
 STEADY = 100_000
 """Packets for the numbers of a link that does not change."""
 SECONDS = 30.0
@@ -112,13 +110,12 @@ def _way(asked: Direction, name: str, seed: int, seconds: float | None) -> tuple
 def _stream(profile: DirectionProfile, name: str, seed: int, count: int) -> Stream:
     from cloudrc.link.model import LinkDirection
     from cloudrc.link.trace_sample import sample
-    from cloudrc.tunnel.codec import BODY_SIZES, HEADER_SIZE, Kind
+    from cloudrc.tunnel.codec import SIZES, Kind
 
     uplink = name == "uplink"
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
-    size = HEADER_SIZE + BODY_SIZES[kind] + TAG_SIZE
     link = LinkDirection(profile, seed, uplink)
-    return sample(link, kind, max(count, 1), 1_000_000_000 // RATE_HZ, size)
+    return sample(link, kind, max(count, 1), 1_000_000_000 // RATE_HZ, SIZES[kind])
 
 
 def _table(counted: dict[str, Numbers]) -> str:

@@ -31,7 +31,8 @@ With --mode cluster a release that flies is judged by the tunnel's own
 datagrams: those of 15 to 30 s where a relay shapes, whose draws are known; of
 1 to 4 min where netem does. What cannot be judged is said.
 
-exit codes: 0 believed, 1 not, 2 bad input, 3 missing prerequisite"""
+exit codes: 0 believed, 1 not, or undecided, 2 bad input,
+3 missing prerequisite, 4 no answer in time, 5 cluster"""
 DEFAULT = "paper"
 SHAPERS = ("relay", "netem")
 ENDS_LIMIT = 270.0
@@ -136,13 +137,14 @@ def find(target: str, settings: list[str]) -> ResolvedExperiment:
     """Find the experiment that is meant: a profile's name or file stands for its link alone."""
     from cloudrc.config import shipped
     from cloudrc.config.load import load_experiment
+    from cloudrc.config.schema import Experiment, Profile
 
     if target in shipped.names("experiment"):
         return load_experiment(target, settings)
     is_profile = target in shipped.names("profile")
     if shipped.is_path(target):
         tree = shipped.read("profile", target, _here()).tree
-        is_profile = not {"link", "mission", "cloud", "world"} & set(tree)
+        is_profile = set(tree).isdisjoint(set(Experiment.model_fields) - set(Profile.model_fields))
     elif not is_profile:
         names = ", ".join([*shipped.names("profile"), *shipped.names("experiment")])
         raise BadInputError(f"no profile or experiment named '{target}'; available: {names}")

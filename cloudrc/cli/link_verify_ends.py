@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import time
-import urllib.request
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import nan
@@ -17,21 +16,20 @@ from typing import Any, NamedTuple
 
 from cloudrc.cli.link_verify_notes import on_jitter
 from cloudrc.cli.link_verify_text import NOT_JUDGED, Said
+from cloudrc.cluster.fetch import METRICS
+from cloudrc.cluster.forward import DIRECTLY
 from cloudrc.errors import TimedOutError
 from cloudrc.link.verify_causes import Evidence, Findings, find_causes
 from cloudrc.link.verify_evidence import Samples, of_metrics, samples, shaper_of
 from cloudrc.link.verify_judge import Row
+from cloudrc.link.verify_standing import PERIOD, WINDOW_MAX
 
-END_PORT, LINK_PORT = 9100, 9102
-PERIOD = 2.0
+END_PORT, LINK_PORT = METRICS["world"]["world"], METRICS["world"]["link"]
+LOOK_PERIOD = 2.0
 """Between two questions [s]."""
 _PATIENCE = 3.0
 _SENT_MIN = 1500
 _SHARES = ("loss", "reordered", "duplicated")
-_RATE_HZ = 100.0
-_WINDOW_MAX = 25_000
-"""Of the tunnel's own datagrams, and how many an end judges together at most."""
-_DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 Tell = Callable[[str], None]
 
@@ -62,7 +60,7 @@ def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -
     before = {way: _counters(pods[end], way) for way, end in sends.items()}
     while True:
         tell(", ".join(_progress(way, seen.get(way, {})) for way in hears))
-        time.sleep(PERIOD)
+        time.sleep(LOOK_PERIOD)
         seen |= {way: found for way, end in hears.items() if (found := _ask(pods[end]))}
         verdicts = {way: found["verdict"] for way, found in seen.items()}
         if len(seen) == len(hears) and "open" not in verdicts.values():
@@ -101,7 +99,7 @@ def _ask(pod: Pod) -> dict[str, Any] | None:
 
 
 def _get(url: str) -> str:
-    with _DIRECTLY.open(url, timeout=_PATIENCE) as page:
+    with DIRECTLY.open(url, timeout=_PATIENCE) as page:
         return str(page.read().decode())
 
 
@@ -199,8 +197,8 @@ def _needed(way: str, found: Mapping[str, Any]) -> list[str]:
     if found.get("verdict") != "open" or "datagrams" not in rows:
         return []
     needs, there = int(rows["datagrams"]["asked"]), int(rows["datagrams"]["measured"])
-    if needs > _WINDOW_MAX:
+    if needs > WINDOW_MAX:
         names = ", ".join(str(name) for name, row in rows.items() if row["verdict"] == "open")
         return [f"{way}: {names} {NOT_JUDGED}: takes {needs} datagrams, more than are kept"]
-    seconds = max(0, needs - there) / _RATE_HZ
+    seconds = max(0, needs - there) * PERIOD
     return [f"{way}: {there} of {needs} datagrams, {seconds:.0f} s more"]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cloudrc.assembly import link_profile
-from cloudrc.cli.link_processes import LOOPBACK, WAYS, Place, Shaping, free_ports, shaping
+from cloudrc.cli.link_processes import LOOPBACK, WAYS, Place, Shaping, shaping
 from cloudrc.cli.link_verify_late import LateWatch
 from cloudrc.cli.link_verify_notes import describe, notes, shaper_in_words
 from cloudrc.cli.link_verify_probes import PROBE, TRAIN, Probes
@@ -21,6 +21,7 @@ from cloudrc.cli.link_verify_text import Said
 from cloudrc.config import yaml_text
 from cloudrc.config.load import dump
 from cloudrc.config.schema import Profile
+from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.sounder import Shore, Volley, sound
 from cloudrc.link.verify_causes import Evidence, Findings, find_causes
 from cloudrc.link.verify_corrupt import refusing

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import place_arguments, timeout_argument
-from cloudrc.cli.mission_here import run_argument, url_here
+from cloudrc.cli.here import find_here, run_argument, url_of
 from cloudrc.cli.output import output_argument
 from cloudrc.cli.token import reader, token_argument, token_file
 
@@ -35,6 +35,8 @@ names. 'run' and 'fly' end with its verdict: 0 done, 1 failed, 6 not real time.
 and a landing after a lost link are left by 'acknowledge'. An API that is called
 over a network asks for a token: --token-file, CLOUDRC_TOKEN_FILE, or for a
 release of the chart its Secret, read with your own rights in the cluster."""
+
+NO_API = "no run with an API flies there; name another folder, or --api URL"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -95,7 +97,7 @@ def execute(options: argparse.Namespace) -> int:
     verb: str = options.verb
     if verb == "fly":
         return mission_local.fly(options)
-    url = options.api or url_here(options)
+    url = options.api or find_here(options, url_of, NO_API)
     if url is None and verb in mission_cluster.VERBS:
         in_cluster: Callable[[argparse.Namespace], int] = mission_cluster.VERBS[verb]
         return in_cluster(options)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import place
 from cloudrc.cli.extras import require
+from cloudrc.cli.here import nobody_here
 from cloudrc.cli.mission_check import check_on, parse
 from cloudrc.cli.mission_http import Api
 from cloudrc.cli.mission_local import read_mission
@@ -140,11 +141,7 @@ def _place(options: argparse.Namespace) -> Release:
     try:
         return place(options)
     except MissingPrerequisiteError as error:
-        if options.context or options.namespace:
-            raise
-        raise MissingPrerequisiteError(
-            f"no run flies here (start one: cloudrc run; or name one: --run, --api), and {error}"
-        ) from None
+        raise nobody_here(options, error, "--run, --api") from None
 
 
 def _row(job: JobStatus) -> tuple[str, ...]:

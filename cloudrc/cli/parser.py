@@ -22,10 +22,11 @@ GROUPS: dict[str, dict[str, str]] = {
         "bench": "measure how fast the closed loop runs here",
         "faults": "bring faults about on purpose, and check what follows",
     },
-    "look around": {
+    "look around, set up": {
         "list": "experiments, profiles, predictors and what else there is",
         "doctor": "check whether this machine can fly, and say what to mend",
         "link": "the emulated network: draw, record, verify and change it",
+        "key": "the key that world and cloud share: 'cloudrc key new FILE'",
         "completion": "print a completion script for your shell",
     },
     "processes (started by 'run --mode local')": {
@@ -33,7 +34,6 @@ GROUPS: dict[str, dict[str, str]] = {
         "cloud": "the remote controller",
         "teleop": "missions, operator and their HTTP API",
         "relay": "the emulated link between them",
-        "key": "the key that world and cloud share: 'cloudrc key new FILE'",
     },
 }
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}

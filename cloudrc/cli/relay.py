@@ -19,10 +19,12 @@ from cloudrc.cli.ends import (
 )
 
 if TYPE_CHECKING:
+    from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.relay import Relay
 
 COUNT_PERIOD_NS = 1_000_000_000
+WAYS = ("uplink", "downlink")
 
 ADDRESSES = {
     "--world-side": "where to receive from world",
@@ -84,14 +86,25 @@ def execute(options: argparse.Namespace) -> int:
     if exporter is None:
         relay.run(ask)
     else:
-        for way, asked in (("uplink", experiment.uplink), ("downlink", experiment.downlink)):
+        if not options.link:  # else whoever follows it has told
+            show_asked(exporter, experiment)
+        for way in WAYS:
             exporter.shaped("relay", way, "relay")
-            exporter.asked(way, asked.delay_ms * 1e-3)
         exporter.ready(True)
         relay.run(_counting(ask, relay, exporter))
     counts = ", ".join(f"{name} {count:g}" for name, count in relay.counts().items())
     print(f"cloudrc relay: {counts}", file=sys.stderr)
     return 0
+
+
+def show_asked(exporter: Exporter, experiment: ResolvedExperiment) -> None:
+    """Show the mean delay that each direction is asked to have at its beginning."""
+    from cloudrc.assembly import link_profile
+    from cloudrc.link.state import summary
+
+    for way in WAYS:
+        asked = summary(link_profile(getattr(experiment, way)))
+        exporter.asked(way, asked["delay"] or 0.0)
 
 
 def _side(flag: str, listen: tuple[str, int]) -> socket.socket:

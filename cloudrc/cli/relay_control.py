@@ -2,7 +2,7 @@
 
     DIR/profile.json, change.json    what is asked for; not there before the first change
     DIR/uplink.json, downlink.json   what is in force (`cloudrc/link/state.py`)
-    DIR/uplink.released...           how late its datagrams left so far, written once a second
+    DIR/uplink.released...           how late its datagrams left so far, every other second
 
 Files are read and written by a thread of its own; the relay's loop only swaps the conditions.
 """
@@ -10,12 +10,12 @@ Files are read and written by a thread of its own; the relay's loop only swaps t
 from __future__ import annotations
 
 import json
-import os
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from cloudrc.link.relay import Relay
 
 PROFILE_FILE = "profile.json"
-RELEASED_PERIOD = 1.0
-"""Between two tellings of how late datagrams left [s]."""
+RELEASED_PERIOD = 2.0
+"""Between two tellings of how late datagrams left [s]: as often as an end notes it."""
 
 
 def controlled(
@@ -95,8 +95,8 @@ class RelayControl:
         self._folder, self._links, self._asked, self._take_in = folder, links, asked, take_in
         self._released, self._told = released, 0.0
         folder.mkdir(exist_ok=True)
-        self._file, self._seen = folder / PROFILE_FILE, 0
-        self._files = {way: ProfileFile(self._file, loader(way), _log) for way in links}
+        file = folder / PROFILE_FILE
+        self._files = {way: ProfileFile(file, loader(way), _log) for way in links}
         self._wanted: deque[tuple[str, Loaded]] = deque()
         self._done: deque[tuple[str, Loaded, int]] = deque()
         self._changes = dict.fromkeys(links, -1)
@@ -127,15 +127,16 @@ class RelayControl:
 
     def look(self) -> None:
         """Look once for a change, and tell of those that are in force."""
-        seen = _version(self._file)
-        if seen != self._seen:
-            self._seen = seen
-            for way, file in self._files.items():
-                loaded = file.poll()
-                if loaded is not None:
-                    self._wanted.append((way, loaded))
+        for way, file in self._files.items():
+            if (loaded := file.poll()) is not None:
+                self._wanted.append((way, loaded))
+        with suppress(OSError):  # a full disk: what is not told is told at the next look
+            self._tell_all()
+
+    def _tell_all(self) -> None:
         while self._done:
-            self._tell(*self._done.popleft())
+            self._tell(*self._done[0])
+            self._done.popleft()
         if time.monotonic() - self._told >= RELEASED_PERIOD:
             self._told = time.monotonic()
             for way in self._links:
@@ -148,8 +149,7 @@ class RelayControl:
             time.sleep(PROFILE_PERIOD / 2 if self._wanted else PROFILE_PERIOD)
 
     def _tell(self, way: str, loaded: Loaded, since_ns: int) -> None:
-        self._changes[way] += 1
-        changed = self._changes[way] > 0
+        changes = self._changes[way] + 1
         values: dict[str, Any] = loaded.values
         asked = summary(loaded.direction)
         state = LinkState(
@@ -160,24 +160,16 @@ class RelayControl:
             profile=values,
             since=datetime.now(UTC).isoformat(timespec="seconds"),
             since_ns=since_ns,
-            changes=self._changes[way],
+            changes=changes,
             change=loaded.change.number,
-            cause=loaded.change.cause if changed else "",
+            cause=loaded.change.cause if changes else "",
             asked=asked,
             # A time line that came up with the link counts from its first datagram.
-            origin_ns=since_ns if changed and loaded.change.restart else None,
+            origin_ns=since_ns if changes and loaded.change.restart else None,
         )
-        publish(self._folder / f"{way}.json", to_text(state))
         self._asked(way, asked["delay"] or 0.0)
-
-
-def _version(path: Path) -> int:
-    """Tell versions of a file apart in 2 us, which the relay's loop does not feel; 0: not there."""
-    try:
-        status = os.stat(path)
-    except OSError:
-        return 0
-    return hash((status.st_mtime_ns, status.st_ino, status.st_size))
+        publish(self._folder / f"{way}.json", to_text(state))
+        self._changes[way] = changes
 
 
 def _log(line: str) -> None:

@@ -189,7 +189,7 @@ def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> Mi
     limit, salt = experiment.criteria.contact_speed_max_mps, os.urandom(SALT_SIZE)
     if journal is None:
         return MissionService(limit, salt=salt)
-    service = MissionService(limit, journal.append, journal.entries, salt)
+    service = MissionService(limit, journal.append, journal.entries, salt=salt)
     known = [entry for entry in journal.entries if service.book.knows(entry)]
     if len(known) < len(journal.entries):
         with suppress(OSError):  # a full disk: it is done at the next start

@@ -66,8 +66,8 @@ class ServedApi:
 
 def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> ServedApi:
     """Answer from now on, if only that teleop is not ready yet."""
+    import json
     from functools import partial
-    from math import inf
 
     from cloudrc import assembly
     from cloudrc.cloud.teleop.api import Surroundings, create_app
@@ -77,13 +77,13 @@ def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> Se
     from cloudrc.cloud.teleop.api_server import ApiServer
     from cloudrc.cloud.teleop.api_tokens import Tokens
     from cloudrc.geometry.scene import load_scene
+    from cloudrc.link.route import publish
 
     if not isinstance(options.api, Path):
         warn_if_exposed(options.api)
     criteria, bridge = experiment.criteria, Bridge()
     scene = load_scene(experiment.world.scene)
-    speed_max = experiment.guard.speed_max_mps or inf
-    plan = partial(assembly.mission_plan, speed_max=speed_max)
+    plan = partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps)
     surroundings = Surroundings(scene, criteria.time_limit_s, criteria.contact, plan)
     tokens = Tokens(options.tokens) if options.tokens else None
     audit = Audit(options.audit, complain)
@@ -91,7 +91,7 @@ def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> Se
     server = ApiServer(gate, bridge, options.api)
     server.start()
     if options.api_file is not None:
-        _write_url(options.api_file, server.url)
+        publish(options.api_file, json.dumps({"schemaVersion": 1, "url": server.url}) + "\n")
     return ServedApi(bridge, server, audit)
 
 
@@ -107,12 +107,3 @@ def api_address(text: str) -> Address | Path:
     host, colon, port = text.rpartition(":")
     host = host if colon else LOOPBACK
     return (host, 0) if host and port == "0" else address(f"{host}:{port}")
-
-
-def _write_url(path: Path, url: str) -> None:
-    """Write it in one step: who waits for the file finds it whole."""
-    import json
-
-    new = path.with_name(f"{path.name}.new")
-    new.write_text(json.dumps({"schemaVersion": 1, "url": url}) + "\n", encoding="utf-8")
-    new.replace(path)

@@ -8,17 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import (
-    chosen,
-    end_arguments,
-    link_state,
-    open_exporter,
-    open_keys,
-    open_peer,
-    open_recorder,
-    standing_check,
-    suite,
-)
+from cloudrc.cli.ends import end_arguments
+from cloudrc.cli.opened import open_end, suite
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,44 +25,25 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Fly."""
-    from cloudrc.drivers.process import StopSignal, run_end
+    from cloudrc.drivers.process import StopSignal
 
     stop = StopSignal()
     import os
     import time
 
     from cloudrc import assembly
-    from cloudrc.config.load import load_experiment
-    from cloudrc.drivers.machine import clock_id
     from cloudrc.world.endpoint import WorldIdentity
 
-    exporter = open_exporter(options, "world")
-    experiment, clock = load_experiment(str(options.config)), clock_id()
-    recorder = open_recorder(options, "world", clock)
-    keys = open_keys(options)
-    peer = open_peer(options)
+    opened = open_end(options, "world")
     identity = WorldIdentity(
-        clock,
+        opened.clock,
         os.urandom(16),
-        ring=keys.ring,
+        ring=opened.keys.ring,
         suite=suite(),
         next_epoch=_epochs(options.epochs) if options.epochs else None,
     )
-    world = assembly.build_world(experiment, identity, time.monotonic_ns)
-    run_end(
-        world,
-        peer,
-        recorder,
-        end="world",
-        stop=stop,
-        slip_ns=lambda: world.slip_ns,
-        exporter=exporter,
-        watched=options.feed,
-        choose=chosen(options, lambda: world.robot.guard.armed),
-        link=link_state(options),
-        check=standing_check(options, experiment, uplink=False),
-        keys=keys,
-    )
+    world = assembly.build_world(opened.experiment, identity, time.monotonic_ns)
+    opened.fly(world, stop, lambda: world.robot.guard.armed, slip_ns=lambda: world.slip_ns)
     return 0
 
 

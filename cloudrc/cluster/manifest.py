@@ -12,6 +12,7 @@ from math import ceil
 from typing import Any
 
 from cloudrc.cluster.access import Release
+from cloudrc.cluster.tokens import OPERATOR, VOLUME
 
 COMPONENT = "mission"
 FOLDER = "/etc/cloudrc-mission"
@@ -138,7 +139,7 @@ def _pod(name: str, follower: Follower, queue: bool) -> dict[str, Any]:
         "containers": [_container(follower, queue)],
         "volumes": [
             {"name": "mission", "configMap": {"name": name}},
-            {"name": "tokens", "secret": _operators_alone(follower.tokens)},
+            {"name": VOLUME, "secret": _operators_alone(follower.tokens)},
         ],
     }
 
@@ -147,13 +148,13 @@ def _operators_alone(secret: str) -> dict[str, Any]:
     return {
         "secretName": secret,
         "defaultMode": 0o440,
-        "items": [{"key": "operator", "path": "operator"}],
+        "items": [{"key": OPERATOR, "path": OPERATOR}],
     }
 
 
 def _container(follower: Follower, queue: bool) -> dict[str, Any]:
     arguments = ["mission", "fly", f"--api={follower.api}"]
-    arguments += [f"--token-file={TOKENS}/operator", f"--mission={FOLDER}/{FILE}"]
+    arguments += [f"--token-file={TOKENS}/{OPERATOR}", f"--mission={FOLDER}/{FILE}"]
     arguments += [f"--key=$({KEY})", *(["--queue"] if queue else [])]
     return {
         "name": "mission",
@@ -178,6 +179,6 @@ def _container(follower: Follower, queue: bool) -> dict[str, Any]:
         },
         "volumeMounts": [
             {"name": "mission", "mountPath": FOLDER, "readOnly": True},
-            {"name": "tokens", "mountPath": TOKENS, "readOnly": True},
+            {"name": VOLUME, "mountPath": TOKENS, "readOnly": True},
         ],
     }

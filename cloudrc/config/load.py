@@ -28,7 +28,8 @@ from cloudrc.link.trace import read_table, read_trace
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _DIRECTIONS = ("uplink", "downlink")
-_FILES: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
+FILES: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
+"""Keys of a direction whose values are paths, and what reads them."""
 
 
 def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
@@ -215,7 +216,7 @@ def _forget_profile(document: Document) -> None:
 def _resolve_traces(document: Document, above: yaml_text.Path) -> list[Problem]:
     """Make the paths of traces and tables absolute, and read them to see whether they can be."""
     found = []
-    for path in ((*above, key, name) for key in _DIRECTIONS for name in _FILES):
+    for path in ((*above, key, name) for key in _DIRECTIONS for name in FILES):
         given = document.get(*path)
         if not isinstance(given, str):
             continue
@@ -223,7 +224,7 @@ def _resolve_traces(document: Document, above: yaml_text.Path) -> list[Problem]:
         absolute = (source.folder / Path(given).expanduser()).resolve()
         document.graft(path, str(absolute), source)
         try:
-            _FILES[path[-1]](absolute)
+            FILES[path[-1]](absolute)
         except BadInputError as error:
             found.append(Problem(path, "", str(error)))
     return found

@@ -45,6 +45,9 @@ MISSION_OUTCOMES = (
     "leg_timed_out",
     "world_restarted",
     "guard_stopped",
+    "emergency_stopped",
+    "taken_over",
+    "end_lost",
     "other",
 )
 API_REFUSALS = ("token", "role", "busy", "slow")
@@ -57,10 +60,10 @@ LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unre
 SHAPERS = ("relay", "netem")
 LINK_MODES = ("auto", "relay", "netem")
 
-DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 0.5, 1.0)
+DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
 PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
 """Around the 10 ms of both loops."""
-LATENESS_BUCKETS = (0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
+LATENESS_BUCKETS = (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1)
 RELEASE_PERCENTILES = {"50": "p50", "99": "p99", "99.9": "p999"}
 """Label -> how `cloudrc.link.relay_errors` names it."""
 STEP_PERCENTILES = {"50": "p50", "99": "p99"}

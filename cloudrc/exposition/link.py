@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from cloudrc.exposition.labels import (
     DIRECTIONS,
     LINK_MODES,
@@ -55,23 +57,17 @@ class Link:
             "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
             "cloudrc_link_delay_seconds": by(dict(self._delays)),
             "cloudrc_link_datagrams_total": by(chosen(LINK_OUTCOMES, self._counts)),
-        } | (self._released() | self._stepped() | self._restored())
-
-    def _stepped(self) -> Readings:
-        """Say how late a qdisc was stepped; empty if none was."""
-        counts = dict(self._counts)
-        named = {label: f"step_lateness_{name}_ns" for label, name in STEP_PERCENTILES.items()}
-        late = {label: counts[name] * 1e-9 for label, name in named.items() if name in counts}
-        return {"cloudrc_link_step_lateness_seconds": by(late)}
+            "cloudrc_link_release_error_seconds": self._late("release_error", RELEASE_PERCENTILES),
+            "cloudrc_link_step_lateness_seconds": self._late("step_lateness", STEP_PERCENTILES),
+        } | self._restored()
 
     def _restored(self) -> Readings:
         """Say how often netem was put back; empty if no netem has told."""
         restored = self._counts.get("restored")
         return {} if restored is None else {"cloudrc_link_restored_total": plain(restored)}
 
-    def _released(self) -> Readings:
-        """Say how late a relay was; empty if no relay has told."""
+    def _late(self, what: str, percentiles: Mapping[str, str]) -> dict[Labels, float]:
+        """Say how late a relay was, or a qdisc was stepped [s]; empty if nobody has told."""
         counts = dict(self._counts)  # copied at once: the other thread may go on
-        named = {label: f"release_error_{name}_ns" for label, name in RELEASE_PERCENTILES.items()}
-        late = {label: counts[name] * 1e-9 for label, name in named.items() if name in counts}
-        return {"cloudrc_link_release_error_seconds": by(late)}
+        named = {label: f"{what}_{name}_ns" for label, name in percentiles.items()}
+        return by({label: counts[name] * 1e-9 for label, name in named.items() if name in counts})

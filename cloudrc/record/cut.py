@@ -10,7 +10,8 @@ from dataclasses import replace
 
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import Mission
-from cloudrc.record.reader import MISSING, Contents
+from cloudrc.record.reader import Contents
+from cloudrc.record.writer import MISSING
 
 UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
 """Events of a mission that goes on; every other event ends it."""

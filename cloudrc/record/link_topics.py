@@ -40,7 +40,12 @@ LINK_TOPICS = (
             Field("measured", "float", "s or 1", "likewise"),
             Field("low", "float", "s or 1", "least that is believed, likewise"),
             Field("high", "float", "s or 1", "most that is believed, likewise"),
-            Field("verdict", "string", "", "ok, off, or open where there were too few to say"),
+            Field(
+                "verdict",
+                "string",
+                "",
+                "ok, off, open where there were too few to say; told judges nothing",
+            ),
             Field("datagrams", "int", "", "that this rests on"),
         ),
     ),

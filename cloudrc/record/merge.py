@@ -19,9 +19,9 @@ from cloudrc.record.cdr import shifted
 from cloudrc.record.columns import Recording
 from cloudrc.record.offset import SAME_CLOCK, ClockOffset, clock_offset
 from cloudrc.record.order import merged
-from cloudrc.record.reader import MISSING, Contents, read_contents
+from cloudrc.record.reader import Contents, read_contents
 from cloudrc.record.slip import WorldTime
-from cloudrc.record.writer import McapWriter
+from cloudrc.record.writer import MISSING, McapWriter
 from cloudrc.records import Record
 
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}

@@ -14,7 +14,7 @@ from cloudrc.record.packages import missing
 from cloudrc.record.ros_types import is_known
 from cloudrc.record.scan import Scan
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import MISSING as MISSING
+from cloudrc.record.writer import MISSING
 
 try:
     from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema

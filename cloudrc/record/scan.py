@@ -124,11 +124,6 @@ class Scan:
             self._crc = zlib.crc32(payload, zlib.crc32(head, self._crc))
             yield from self._take(opcode, payload)
 
-    @property
-    def whole(self) -> bool:
-        """Whether nothing is missing or doubtful; what the index says does not matter."""
-        return self.ended and self.checked is not False and not self.dropped and not self.skipped
-
     def _take(self, opcode: int, payload: bytes) -> Iterator[McapRecord]:
         try:
             record = parse(opcode, payload)

@@ -78,7 +78,7 @@ def handlers() -> Iterator[None]:
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("end", ["world", "cloud"])
 def test_whoever_is_stopped_while_it_starts_leaves_a_whole_recording(
-    end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The first process of a container ignores a signal that it does not handle yet."""
     build = getattr(assembly, f"build_{end}")
@@ -90,11 +90,13 @@ def test_whoever_is_stopped_while_it_starts_leaves_a_whole_recording(
     monkeypatch.setattr(assembly, f"build_{end}", stopped)
     record = tmp_path / "end.mcap"
     (tmp_path / "key").write_bytes(bytes(32))
-    (tmp_path / "key").chmod(0o600)
+    (tmp_path / "key").chmod(0o644)
     key = ["--key", str(tmp_path / "key")]
     free = [free_port(), "--peer", FREE, "--record", str(record), *key]
     assert main([end, *CONFIG, "--listen", *free]) == 0
     assert record.read_bytes().endswith(MCAP_MAGIC)
+    said = f"cloudrc: warning: everybody can read {tmp_path / 'key'}: chmod 600"
+    assert said in capsys.readouterr().err.splitlines()
 
 
 @pytest.mark.parametrize(

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from errno import ENOSPC
 from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import link_set
+from cloudrc.cli import link_set, relay_control
 from cloudrc.cli.link_edit import edit
 from cloudrc.cli.main import main
 from cloudrc.cli.relay_control import RelayControl
 from cloudrc.config.document import Document
+from cloudrc.drivers import flights
 from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
@@ -111,12 +114,34 @@ class Flight:
         return self.links[way].send(1, 3, 0, 172, 0)[0] * 1e-9
 
 
+def test_what_a_full_disk_does_not_take_is_told_once_it_has_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = Flight(tmp_path / "run")
+    folder = tmp_path / "run" / "link"
+
+    def full(path: Path, text: str) -> None:
+        raise OSError(ENOSPC, "No space left on device")
+
+    (folder / "profile.json").write_text('{"uplink": {"delay_ms": 80}}')
+    with monkeypatch.context() as disk:
+        disk.setattr(relay_control, "publish", full)
+        for _ in range(3):
+            flight.wait(0.05)
+    assert flight.delay("uplink") == pytest.approx(0.08), "in force all the same"
+    flight.wait(0.05)
+    states = [json.loads((folder / f"{way}.json").read_text()) for way in ("uplink", "downlink")]
+    assert [state["changes"] for state in states] == [1, 1]
+    assert states[0]["asked"]["delay"] == 0.08
+
+
 @pytest.fixture
-def flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Flight:
+def flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Flight]:
     monkeypatch.chdir(tmp_path)
     found = Flight(tmp_path / "runs" / "latest")
     monkeypatch.setattr(link_set, "sleep", found.wait)
-    return found
+    with flights.announced(tmp_path / "runs" / "latest"):
+        yield found
 
 
 def test_a_run_here_is_found_changed_and_read_back(
@@ -141,7 +166,10 @@ def test_a_relay_that_does_not_answer_is_said(
     monkeypatch.setattr(link_set, "LOCAL_PATIENCE", 0.0)
     monkeypatch.setattr(link_set, "sleep", lambda _: None)
     assert main(["link", "set", "downlink.delay_ms=120"]) == 4
-    assert "the uplink and downlink did not take the change over" in capsys.readouterr().err
+    assert capsys.readouterr().err == (
+        "cloudrc: error: the uplink and downlink did not take the change over within 0 s; "
+        f"see {Path('runs/latest/relay.log')}\n"
+    )
 
 
 def test_a_change_that_the_link_refuses_is_an_error_with_its_words(
@@ -194,24 +222,3 @@ def test_the_table_names_all_that_is_asked(capsys: pytest.CaptureFixture[str]) -
     link_set._show([state], 0.2)
     beside = "1 blackouts, duplicate 1 %, reorder 5 %, corrupt 10 %, correlation 0.4, order kept"
     assert beside in capsys.readouterr().out
-
-
-def test_the_only_run_that_flies_is_found_wherever_it_was_started(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    runs = [tmp_path / "a", tmp_path / "b"]
-    for run in runs:
-        (run / "link").mkdir(parents=True)
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    flying = [runs[0], tmp_path / "without-a-link"]
-    monkeypatch.setattr("cloudrc.drivers.flights.under_way", lambda: flying)
-    assert main(["link", "set", "uplink.loss=0.1"]) == 2
-    said = capsys.readouterr().err
-    assert f"the run that flies in {runs[0]}" in said
-    assert "no link is up there (yet)" in said
-    flying.append(runs[1])
-    assert main(["link", "set", "uplink.loss=0.1"]) == 2
-    assert f"2 runs fly here; say which: --run {runs[0]} or --run {runs[1]}" in (
-        capsys.readouterr().err
-    )

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import gzip
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from cloudrc.cli.link import ACTIONS
+from cloudrc.cli.link_verify import find
 from cloudrc.cli.main import main
+from cloudrc.cli.relay import show_asked
+from cloudrc.config.load import load_experiment
 from cloudrc.link.trace import read_table, read_trace
+from tests.record.samples import world_records, write
 
 PING = "\n".join(
     f"[{100 + n / 5 + 0.04:.6f}] 64 bytes from 192.0.2.1: icmp_seq={n} ttl=57 time={40 + n % 3} ms"
@@ -75,6 +80,15 @@ def test_half_of_a_runs_round_trips(run: Path, here: Path) -> None:
     assert 0.020 < sum(trace.delays) / len(trace.delays) < 0.035
 
 
+def test_a_recording_without_round_trips_has_no_halves(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = write(here / "world.mcap", world_records(5))
+    assert main(["link", "record", str(recording), "-o", "t.csv", "--halve-rtt"]) == 2
+    said = "world.mcap: holds no round trip; give the folder of a run that flew\n"
+    assert capsys.readouterr().err.endswith(said)
+
+
 def test_a_ping_log(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "ping.log").write_text(PING)
     assert main(["link", "record", "ping.log", "-o", "t.csv"]) == 2
@@ -117,11 +131,32 @@ def test_what_cannot_be_used_is_refused_in_one_line(
         ("show ideal --seconds nan", "--seconds nan: give a number above 0"),
         ("show ideal --seed=-1", "--seed -1"),
         ("show nowhere.csv", "No such file"),
+        ("verify --seconds 0.5", "--seconds 0.5: give a number from 1 to 3600"),
+        ("verify --seconds nan", "--seconds nan: give a number from 1 to 3600"),
+        ("verify --ends world", "--ends world: give two hosts, WORLD,CLOUD"),
+        ("verify --ends world,", "--ends world,: give two hosts, WORLD,CLOUD"),
     ],
 )
 def test_a_wrong_line_is_refused(line: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["link", *line.split()]) == 2
     assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("key", ["seed: 7", "criteria: {}", "guard: {}", "tunnel: {}"])
+def test_a_file_with_any_key_of_an_experiment_is_verified_as_one(key: str, here: Path) -> None:
+    (here / "mine.yaml").write_text(key + "\n")
+    assert find("./mine.yaml", []).uplink == load_experiment("./mine.yaml").uplink
+    (here / "mine.yaml").write_text("description: mine\nuplink: {delay_ms: 12}\n")
+    assert find("./mine.yaml", []).uplink.delay_ms == 12.0
+
+
+def test_the_delay_that_a_relay_shows_is_that_of_its_trace(here: Path) -> None:
+    (here / "t.csv").write_text("time_s,delay_ms\n0,40\n5,90\n")
+    (here / "mine.yaml").write_text("link: {uplink: {trace: t.csv}, downlink: {delay_ms: 25}}\n")
+    told: dict[str, float] = {}
+    exporter = SimpleNamespace(asked=told.__setitem__)
+    show_asked(exporter, load_experiment("./mine.yaml"))  # type: ignore[arg-type]
+    assert told == {"uplink": 0.04, "downlink": 0.025}
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
 from cloudrc.cli import link_verify_ends
+from cloudrc.cli.link_processes import Place, Shaping
 from cloudrc.cli.link_verify_ends import Pod, verify_ends
 from cloudrc.cli.link_verify_text import as_text
 from cloudrc.drivers.exporter import Exporter
@@ -69,6 +72,28 @@ def release(monkeypatch: pytest.MonkeyPatch) -> Iterator[Release]:
         made.count(0.0)
         monkeypatch.setattr(link_verify_ends.time, "sleep", made.count)
         yield made
+
+
+@pytest.fixture
+def proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A proxy that nobody serves: whoever asks it gets no answer."""
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+
+
+def test_a_proxy_of_the_environment_is_not_asked(
+    release: Release, proxy: None, tmp_path: Path
+) -> None:
+    release.hears("world", "ok")
+    release.hears("cloud", "ok")
+    assert {row.verdict for one in ask(release).findings.values() for row in one.rows} == {"ok"}
+    metrics = ("127.0.0.1", int(release.pods["world"].link.rpartition(":")[2]))
+    for inside in ((), ("env",)):
+        place = Place(metrics, metrics, metrics, inside)
+        shaping = Shaping(place, tmp_path, subprocess.Popen(["true"]))
+        assert "cloudrc_link_info" in shaping.metrics()
+        shaping.process.wait()
 
 
 def ask(release: Release, limit: float = 30.0) -> link_verify_ends.Said:

@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from cloudrc.cli.faults import SEED_MAX
 from cloudrc.cli.main import INTERNAL, main
 from cloudrc.cli.parser import COMMANDS, build, unknown
 from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError
@@ -76,6 +77,7 @@ def test_no_argument_prints_help(capsys: pytest.CaptureFixture[str]) -> None:
         ("completion", "required: shell"),
         ("bench --repeats 0", "'0' is not a whole number from 1 to 100000"),
         ("bench --repeats=-3", "'-3' is not a whole number from 1 to 100000"),
+        (f"faults fuzz --first {2**63}", f"is not a whole number from 0 to {SEED_MAX}"),
     ],
 )
 def test_a_wrong_line_is_refused_in_one_line(

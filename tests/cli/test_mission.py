@@ -145,7 +145,13 @@ def test_an_api_that_is_not_there_ends_with_4_or_5(capsys: pytest.CaptureFixture
     captured = capsys.readouterr()
     assert captured.err.count("Connection refused") == 2
     assert captured.out.count("waiting") == 1
-    assert main(["mission", "status", "--api", "here"]) == 2
+
+
+@pytest.mark.parametrize("url", ["here", "unix:", "ftp://h:1", "http://me@h:1", "http://"])
+def test_an_api_without_a_usable_url_is_said(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["mission", "status", "--api", url]) == 2
+    said = f"cloudrc: error: --api {url}: give http://HOST:PORT or unix:PATH\n"
+    assert capsys.readouterr().err == said
 
 
 def test_the_operators_verbs(

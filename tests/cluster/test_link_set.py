@@ -40,7 +40,9 @@ else:
     (folder / f"handed-{pod}.json").write_text(json.dumps(document))
     change = json.loads(document["change"])
     state = json.loads((folder / f"state-{pod}.json").read_text())
-    print(json.dumps({**state, "change": change["number"], "cause": change["cause"]}))
+    if not (folder / f"deaf-{pod}").exists():
+        state |= {"change": change["number"], "cause": change["cause"]}
+    print(json.dumps(state))
 """
 
 
@@ -186,6 +188,26 @@ def test_a_refusal_by_the_link_is_the_users_error(
     assert main(["link", "set", "downlink.corrupt=0.5", "-n", "demo"]) == 2
     assert "the downlink is as it was: netem cannot do that" in capsys.readouterr().err
     assert not any(" patch " in line for line in cluster.asked()), "it does not last either"
+
+
+def test_a_container_that_does_not_take_it_over_was_waited_for(
+    cluster: Cluster, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (cluster.folder / "deaf-cloud-1").touch()
+    assert main(["link", "set", "downlink.delay_ms=120", "-n", "demo"]) == 4
+    assert capsys.readouterr().err == (
+        "cloudrc: error: the downlink did not take the change over within 5 s; "
+        "see the logs of the link containers\n"
+    )
+
+
+def test_a_container_of_another_version_is_said(
+    cluster: Cluster, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (cluster.folder / "state-cloud-1.json").write_text("{}")
+    assert main(["link", "set", "downlink.delay_ms=120", "-n", "demo"]) == 5
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "a link container is of another version: not the state of a link" in line
 
 
 def test_a_release_that_is_not_there_is_said(

@@ -190,4 +190,4 @@ def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> N
     assert "recording stopped: it has grown to its limit" in recorder.error
     assert recorder.dropped > 0
     assert 20_000 <= path.stat().st_size < 100_000
-    assert "cut short" not in Recording.read(path).note
+    assert Recording.read(path).note == "recording stopped: it has grown to its limit"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from typing import Any
@@ -99,6 +100,22 @@ def test_what_was_set_before_the_mission_holds_from_its_start() -> None:
     subject = subject_of(told(-0.5, True, Direction(delay_ms=9.0), "by hand", 300.0))
     assert low(subject, 0.0) == pytest.approx(0.009)
     assert set_in_flight(subject) == []
+
+
+@pytest.mark.parametrize("count", [4, 8])
+def test_numbers_of_changes_close_together_do_not_print_over_each_other(count: int) -> None:
+    each = [told(3.0 + 0.1 * n, True, CALM, f"number {n + 1}") for n in range(count)]
+    subject = subject_of(*each, told(6.0, True, CALM, "the last"))
+    with matplotlib.rc_context(RC):
+        figure = delay.draw(subject)
+        figure.draw_without_rendering()
+        for axes in figure.axes:
+            labels = [text for text in axes.texts if text.get_text().isdecimal()]
+            boxes = [label.get_window_extent() for label in labels]
+            assert len(boxes) == count + 1
+            overlaps = [a.overlaps(b) for a, b in itertools.combinations(boxes, 2)]
+            assert not any(overlaps)
+            assert boxes[-1].y0 == pytest.approx(boxes[0].y0), "back in the first row"
 
 
 def test_the_figure_is_drawn_with_all_of_it() -> None:

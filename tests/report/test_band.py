@@ -35,9 +35,10 @@ def test_changes_hold_from_their_instant_on() -> None:
     assert bounds(direction, 25.0) == pytest.approx((0.065, 0.075))
 
 
-def test_a_trace_stands_in_place_of_the_delay(tmp_path: Path) -> None:
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])  # the second as Excel writes it
+def test_a_trace_stands_in_place_of_the_delay(tmp_path: Path, encoding: str) -> None:
     trace = tmp_path / "trace.csv"
-    trace.write_text("time_s,delay_ms,loss\n1,30,0\n5,90,0\n")
+    trace.write_text("time_s,delay_ms,loss\n1,30,0\n5,90,0\n", encoding=encoding)
     direction = Direction(delay_ms=5.0, jitter_ms=10.0, trace=str(trace))
     assert bounds(direction, 0.0) == pytest.approx((0.020, 0.040))  # the first row holds before it
     assert bounds(direction, 6.0) == pytest.approx((0.080, 0.100))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from csv import DictReader
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from cloudrc.config.schema import Direction
+from cloudrc.errors import BadInputError
+from cloudrc.link.trace import read_trace
 from cloudrc.metrics._flight import Array
 
 
@@ -36,8 +37,8 @@ def band(direction: Direction) -> Band | None:
         None if the delays come from a trace that is no longer there.
     """
     try:
-        steps = _traced(direction) if direction.trace else [(0.0, direction.delay_ms)]
-    except (OSError, LookupError, ValueError):
+        steps = _traced(Path(direction.trace)) if direction.trace else [(0.0, direction.delay_ms)]
+    except BadInputError:
         return None
     delay, jitter = steps[0][1], direction.jitter_ms
     changes = {} if direction.trace else {c.at_s: c.delay_ms for c in direction.changes}
@@ -57,11 +58,8 @@ def at(steps: Band, time: Array) -> tuple[Array, Array]:
     return steps.low[rows], steps.high[rows]
 
 
-def _traced(direction: Direction) -> list[tuple[float, float]]:
+def _traced(path: Path) -> list[tuple[float, float]]:
     """Read instants [s] and delays [ms] of a trace; the first row also holds before its time."""
-    with Path(str(direction.trace)).open(newline="") as file:
-        table = list(DictReader(file, skipinitialspace=True))
-    # Short delays are in microseconds: `cloudrc.link.trace` has checked the file.
-    column, scale = ("delay_ms", 1.0) if "delay_ms" in table[0] else ("delay_us", 1e-3)
-    rows = [(float(row["time_s"]), float(row[column]) * scale) for row in table]
-    return [(0.0, rows[0][1]), *rows]
+    trace = read_trace(path)
+    delays = [delay * 1e3 for delay in trace.delays]
+    return [(0.0, delays[0]), *zip(trace.times, delays, strict=True)]

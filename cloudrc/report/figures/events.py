@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from math import inf
 from typing import TypeAlias
 
 from matplotlib.axes import Axes
@@ -13,6 +15,12 @@ from cloudrc.report.figures.subject import Subject
 
 Span: TypeAlias = tuple[float, float]
 HATCH = "#b0b0b0"
+LABEL_WIDTH = 0.05
+"""Of a number beside a triangle, as a part of the narrowest panel's time axis [1]."""
+ROW_HEIGHT = 8
+"""Between two rows of numbers [points]."""
+ROWS = 8
+"""Of numbers, that a panel has room for."""
 LEGEND = (
     " Behind the curves, red: the guard flew by itself (HOLD); hatched: the link was silent; "
     "dotted: the link changed."
@@ -40,19 +48,36 @@ def mark_events(axes: Axes, subject: Subject) -> None:
         axes.axvspan(begin, end, fc="none", ec=HATCH, hatch="////", lw=0, zorder=0.6)
     for instant in changed:
         axes.axvline(instant, color=GREY, lw=0.7, ls=(0, (1, 2)))
-    for number, (instant, _) in enumerate(set_in_flight(subject), start=1):
-        _mark_set(axes, instant, number)
+    instants = [instant for instant, _ in set_in_flight(subject)]
+    rows = _rows(instants, LABEL_WIDTH * subject.duration)
+    for number, (instant, row) in enumerate(zip(instants, rows, strict=True), start=1):
+        _mark_set(axes, instant, number, row)
 
 
-def _mark_set(axes: Axes, instant: float, number: int) -> None:
-    """Mark at [s] that the link was set by hand: a line, and a triangle with its number on top."""
+def _rows(instants: list[float], width: float) -> Iterator[int]:
+    """Choose the row of each label, from above, so that none is printed over another.
+
+    Args:
+        instants: Where each begins, rising [s].
+        width: Of a label [s].
+    """
+    last = [-inf] * ROWS
+    for instant in instants:
+        free = (row for row, before in enumerate(last) if instant - before >= width)
+        row = next(free, last.index(min(last)))
+        last[row] = instant
+        yield row
+
+
+def _mark_set(axes: Axes, instant: float, number: int, row: int) -> None:
+    """Mark at [s] that the link was set by hand: a line, a triangle on top, its number in a row."""
     place = axes.get_xaxis_transform()
     axes.axvline(instant, color=PURPLE, lw=0.8, zorder=2.5)
     axes.plot(instant, 1.0, "v", ms=6.5, mew=0, color=PURPLE, transform=place, clip_on=False)
     axes.annotate(
         str(number),
         (instant, 1.0),
-        (3.5, -9),
+        (3.5, -9 - ROW_HEIGHT * row),
         xycoords=place,
         textcoords="offset points",
         fontsize=7.0,

@@ -1,19 +1,23 @@
-"""Which run `cloudrc mission` means, wherever it was started and whoever else flies."""
+"""Which run `cloudrc mission` and `cloudrc link set` mean, wherever started, whoever else flies."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from api_harness import Running, running
 
+from cloudrc.cli.here import QUIET_LIMIT
 from cloudrc.cli.main import main
 from cloudrc.drivers import flights
 
 Printed = pytest.CaptureFixture[str]
+SET = ["link", "set", "uplink.loss=0.1"]
 
 
 @pytest.fixture(autouse=True)
@@ -91,12 +95,71 @@ def test_where_none_flies_one_is_told_how_to_name_it(capsys: Printed) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--run", "nowhere"], "--run nowhere: no run with an API flies there"),
-        (["--run", "nowhere", "-n", "demo"], "the other flags a cluster; give one"),
+        (["mission", "estop"], "--run nowhere: no run with an API flies there"),
+        (["mission", "estop", "-n", "demo"], "the other flags a cluster; give one"),
+        (SET, "--run nowhere: no run flies there"),
+        ([*SET, "-n", "demo"], "the other flags a cluster; give one"),
     ],
 )
 def test_a_run_that_is_not_there_is_one_sentence(
     words: list[str], said: str, capsys: Printed
 ) -> None:
-    assert main(["mission", "estop", *words]) == 2
-    assert said in capsys.readouterr().err
+    assert main([*words, "--run", "nowhere"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def with_link(folder: Path, *, killed: bool = False) -> Path:
+    """A run's folder whose relay tells nothing (yet), or that a killed one has left behind."""
+    link = folder / "link"
+    link.mkdir(parents=True)
+    if killed:
+        begun = link.stat().st_mtime - QUIET_LIMIT
+        os.utime(link, (begun, begun))
+    return folder
+
+
+def test_a_link_is_set_on_the_only_run_that_flies(tmp_path: Path, capsys: Printed) -> None:
+    run = with_link(tmp_path / "a", killed=True)
+    with flights.announced(run), flights.announced(tmp_path / "without a link"):
+        assert main(SET) == 2
+        said = capsys.readouterr().err
+        assert said.startswith(f"cloudrc: the run that flies in {run}\n")
+        assert f"{run}: no link is up there (yet); wait for the start" in said
+        with flights.announced(with_link(tmp_path / "b")):
+            assert main(SET) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        for name in "ab":
+            assert f"--run {tmp_path / name}" in line
+
+
+def test_the_link_of_a_run_that_was_killed_is_not_set(
+    tmp_path: Path, elsewhere: Path, capsys: Printed
+) -> None:
+    dead = with_link(elsewhere / "runs" / "latest", killed=True)
+    assert main(SET) == 3
+    assert "no run flies here (start one: cloudrc run; or name one: --run)" in (
+        capsys.readouterr().err
+    )
+    assert main([*SET, "--run", str(dead)]) == 2
+    assert f"--run {dead}: no run flies there" in capsys.readouterr().err
+    with flights.announced(with_link(tmp_path / "out")):
+        assert main(SET) == 2
+    assert f"{tmp_path / 'out'}: no link is up there" in capsys.readouterr().err
+
+
+def test_a_run_that_could_not_announce_itself_is_known_by_what_it_tells(
+    elsewhere: Path, capsys: Printed
+) -> None:
+    with_link(elsewhere / "runs" / "latest")
+    assert main(SET) == 2
+    assert "runs/latest: no link is up there (yet)" in capsys.readouterr().err
+
+
+def test_kubectl_never_means_a_run_here(
+    elsewhere: Path, monkeypatch: pytest.MonkeyPatch, capsys: Printed
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc", *SET])
+    with flights.announced(with_link(elsewhere / "runs" / "latest")):
+        assert main() == 3
+    assert "KUBECONFIG" in capsys.readouterr().err

@@ -1,0 +1,133 @@
+"""Which run on this machine a command means: flags come in, its API or its link goes out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import socket
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+from urllib.parse import urlsplit
+
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
+
+_Found = TypeVar("_Found")
+KUBECTL_PLUGIN = "kubectl-cloudrc"
+"""What this program is called when kubectl starts it."""
+CONNECT_LIMIT = 1.0
+"""For the API of a run on this machine to take a connection [s]."""
+QUIET_LIMIT = 5.0
+"""A relay that has written nothing for so long is gone, if its run is not announced [s]."""
+
+
+def run_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare the flag."""
+    parser.add_argument("--run", type=Path, metavar="DIR", help="folder of a run that flies here")
+
+
+def find_here(
+    options: argparse.Namespace, there: Callable[[Path], _Found | None], nobody: str
+) -> _Found | None:
+    """Find what a command wants of the run that flies here, unless a cluster is meant.
+
+    That of ./runs/latest comes first, then the only other one of this user, wherever it was
+    started.
+
+    Args:
+        options: With `run_argument` and `cluster_flags.place_arguments`.
+        there: Finds it in the folder of a run; None if none flies there.
+        nobody: What to say of a folder that was named, if so.
+
+    Raises:
+        BadInputError: If there are several others, or none where the flag says.
+    """
+    in_cluster = options.context or options.namespace or options.release
+    if options.run is not None:
+        if in_cluster:
+            raise BadInputError("--run names a run here, the other flags a cluster; give one")
+        if (found := there(options.run)) is None:
+            raise BadInputError(f"--run {options.run}: {nobody}")
+        return found
+    if in_cluster or Path(sys.argv[0]).name.startswith(KUBECTL_PLUGIN):
+        return None
+    from cloudrc.cli.folder import RUNS
+    from cloudrc.drivers.flights import under_way
+
+    if (found := there(RUNS / "latest")) is not None:
+        return found
+    others = [(run, found) for run in under_way() if (found := there(run)) is not None]
+    if len(others) > 1:
+        names = " or ".join(f"--run {run}" for run, _ in others)
+        raise BadInputError(f"{len(others)} runs fly here; say which: {names}")
+    if not others:
+        return None
+    ((run, found),) = others
+    print(f"cloudrc: the run that flies in {run}", file=sys.stderr, flush=True)
+    return found
+
+
+def nobody_here(
+    options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
+) -> MissingPrerequisiteError:
+    """Say beside what a cluster lacks, unless the flags name one, that a run here would do.
+
+    Args:
+        options: As of `find_here`.
+        error: What it lacks.
+        flags: Which would have named a run here.
+    """
+    if options.context or options.namespace:
+        return error
+    return MissingPrerequisiteError(
+        f"no run flies here (start one: cloudrc run; or name one: {flags}), and {error}"
+    )
+
+
+def link_of(run: Path) -> Path | None:
+    """Find where the relay of the run in this folder is told to change; None if none flies there.
+
+    A run that was killed leaves that behind, too.
+    """
+    from cloudrc.drivers.flights import under_way
+    from cloudrc.drivers.local import LINK_FOLDER
+
+    folder = run / LINK_FOLDER
+    try:
+        quiet = time.time() - folder.stat().st_mtime
+    except OSError:
+        return None
+    return folder if run.resolve() in under_way() or quiet < QUIET_LIMIT else None
+
+
+def url_of(run: Path) -> str | None:
+    """Find where the API of the run in this folder is; None if none flies there."""
+    from cloudrc.drivers.local import API_FILE
+
+    try:
+        url = str(json.loads((run / API_FILE).read_text(encoding="utf-8"))["url"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return None if _is_gone(url) else url
+
+
+def _is_gone(url: str) -> bool:
+    """Say whether nobody listens: a run that was killed leaves its file behind."""
+    from cloudrc.cli.mission_http import UNIX
+
+    try:
+        if url.startswith(UNIX):
+            with socket.socket(socket.AF_UNIX) as listening:
+                listening.settimeout(CONNECT_LIMIT)
+                listening.connect(url.removeprefix(UNIX))
+        else:
+            parts = urlsplit(url)
+            where = parts.hostname or "", parts.port or 0
+            socket.create_connection(where, CONNECT_LIMIT).close()
+    except (ConnectionRefusedError, FileNotFoundError):
+        return True
+    except (OSError, ValueError):
+        return False  # whatever it is, the verb itself says it better
+    return False

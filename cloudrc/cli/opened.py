@@ -1,0 +1,175 @@
+"""What world and cloud open before they are built, from their flags, and how they fly then."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from cloudrc.cli.ends import listening, open_exporter, warn_if_exposed
+
+if TYPE_CHECKING:
+    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.drivers.exporter import Exporter
+    from cloudrc.drivers.keyfile import KeyFile
+    from cloudrc.drivers.process import StopSignal
+    from cloudrc.drivers.realtime import Peer
+    from cloudrc.drivers.standing_check import StandingCheck
+    from cloudrc.endpoint import Endpoint
+    from cloudrc.link.profile import DirectionProfile
+    from cloudrc.record.recorder import Recorder
+    from cloudrc.records import Record
+
+
+class Opened(NamedTuple):
+    """What an end has before it is built, and flies with.
+
+    Attributes:
+        options: The command's.
+        name: "world" or "cloud".
+        exporter: Of its metrics; None if nobody wants them.
+        experiment: What it flies.
+        clock: Which machine's clock it has.
+        recorder: Where its records go.
+        keys: The tunnel's.
+        peer: Its socket.
+    """
+
+    options: argparse.Namespace
+    name: str
+    exporter: Exporter | None
+    experiment: ResolvedExperiment
+    clock: bytes
+    recorder: Recorder
+    keys: KeyFile
+    peer: Peer
+
+    def fly(
+        self,
+        endpoint: Endpoint,
+        stop: StopSignal,
+        flies: Callable[[], bool],
+        *,
+        over: Callable[[], bool] = lambda: False,
+        slip_ns: Callable[[], int] = lambda: 0,
+    ) -> None:
+        """Fly the end that was built, as `process.run_end`; `flies` says whether it does now."""
+        from cloudrc.drivers.process import run_end
+
+        options = self.options
+        run_end(
+            endpoint,
+            self.peer,
+            self.recorder,
+            end=self.name,
+            stop=stop,
+            over=over,
+            slip_ns=slip_ns,
+            exporter=self.exporter,
+            watched=options.feed,
+            choose=_chosen(options, flies),
+            link=_link_state(options),
+            check=_standing_check(options, self.experiment, uplink=self.name == "cloud"),
+            keys=self.keys,
+        )
+
+
+def open_end(options: argparse.Namespace, name: str) -> Opened:
+    """Open what the "world" or the "cloud" needs; what cannot be had is said by its flag."""
+    from cloudrc.config.load import load_experiment
+    from cloudrc.drivers.machine import clock_id
+
+    exporter = open_exporter(options, name)
+    experiment, clock = load_experiment(str(options.config)), clock_id()
+    recorder = _open_recorder(options, name, clock)
+    keys = _open_keys(options)
+    return Opened(options, name, exporter, experiment, clock, recorder, keys, _open_peer(options))
+
+
+def suite() -> int:
+    """The cipher that this machine is fast at."""
+    from cloudrc.drivers.machine import has_fast_aes
+    from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305
+
+    return AES_256_GCM if has_fast_aes() else CHACHA20_POLY1305
+
+
+def _open_keys(options: argparse.Namespace) -> KeyFile:
+    """Read the key of an end."""
+    import time
+
+    from cloudrc.drivers.keyfile import KeyFile, is_exposed
+
+    keys = KeyFile(options.key, time.monotonic_ns())
+    if is_exposed(options.key):
+        print(f"cloudrc: warning: everybody can read {options.key}: chmod 600", file=sys.stderr)
+    return keys
+
+
+def _open_peer(options: argparse.Namespace) -> Peer:
+    """Bind the socket of an end, which sends to its peer or where its route leads."""
+    from cloudrc.drivers.realtime import Peer
+    from cloudrc.drivers.route import Route
+
+    warn_if_exposed(options.listen)
+    with listening("--listen", options.listen):
+        if options.route is None:
+            return Peer.bind(options.listen, options.peer)
+        if not options.route.exists():
+            print(f"cloudrc: nothing is sent until there is {options.route}", file=sys.stderr)
+        return Peer.bind(options.listen, Route(options.route))
+
+
+def _open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:
+    """Make the recorder of a process; without a file it writes into nothing."""
+    from cloudrc.record.recorder import Recorder
+    from cloudrc.record.writer import McapWriter
+
+    return Recorder(
+        options.record or Path(os.devnull),
+        lambda file: McapWriter(file, clock=clock, clock_id=clock_id.hex()),
+        size_max=round(0.9 * options.record_max) if options.record_max else None,
+    )
+
+
+def _chosen(
+    options: argparse.Namespace, flies: Callable[[], bool]
+) -> Callable[[list[Record]], list[Record]]:
+    """What chooses the records for the recording."""
+    from cloudrc.drivers.recording import FlightsOnly
+
+    return FlightsOnly(flies) if options.record_flights else list
+
+
+def _link_state(options: argparse.Namespace) -> Path | None:
+    """Find where the link of an end tells its state: the link's process writes it."""
+    given: Path | None = options.link
+    route: Path | None = options.route
+    return given if given is not None or route is None else route.with_name("link.json")
+
+
+def _standing_check(
+    options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
+) -> StandingCheck:
+    """Judge the direction that an end hears by what is asked of it, and follow what that is."""
+    import json
+
+    from cloudrc.assembly import link_profile
+    from cloudrc.config.schema import Profile
+    from cloudrc.drivers.standing_check import StandingCheck
+    from cloudrc.link.verify_twin import Stream
+    from cloudrc.tunnel.codec import SIZES, Kind
+
+    def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
+        profile = Profile.model_validate_json(json.dumps(values))
+        return link_profile(profile.uplink), link_profile(profile.downlink)
+
+    asked = link_profile(experiment.uplink), link_profile(experiment.downlink)
+    kind = Kind.TELEMETRY if uplink else Kind.COMMAND
+    stream = Stream(experiment.seed, uplink, kind, SIZES[kind])
+    check = StandingCheck(uplink=uplink, stream=stream)
+    check.begin(asked, _link_state(options), load)
+    return check
