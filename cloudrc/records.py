@@ -188,7 +188,8 @@ class MissionEvent(NamedTuple):
     Attributes:
         stamp_ns: [ns], cloud's clock.
         event: "started", "reached", "held", "resumed", "goto"; at the end its outcome: "done",
-            "cancelled", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped".
+            "cancelled", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped",
+            "emergency_stopped", "taken_over", "end_lost".
         waypoint: Index of the waypoint concerned; -1 if none.
         text: The same in words.
     """

@@ -48,6 +48,7 @@ COUNT_PERIOD_NS = 1_000_000_000
 MISSED_MAX = 50
 """So many missed periods are a fault worth telling; a few happen on any machine."""
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
+_new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
 
 
 class CloudEndpoint:
@@ -132,8 +133,9 @@ class CloudEndpoint:
         self.teleop.handle_deadline(now_ns)
         if self.teleop.outputs:
             self._take_from_teleop()
-        if self._session.epoch and (alarm := self._alarm.due(self._asked, now_ns)) is not None:
-            self._relay(alarm)
+        if self._alarm.sounds and self._session.epoch:
+            if (alarm := self._alarm.due(self._asked, now_ns)) is not None:
+                self._relay(alarm)
         if self.teleop.outcome is None:
             self._flying_ns = now_ns
         if self._session.epoch and self._loop.ready and self._setpoint is not None:
@@ -227,7 +229,7 @@ class CloudEndpoint:
         if self._clock_is_shared:
             stamp_ns, slip_ns = codec.decode_stamps(body)
             delay = (now_ns - stamp_ns - slip_ns) * 1e-9
-        self._records.append(Arrival(now_ns, True, epoch, counter, delay, used))
+        self._records.append(_new(Arrival, (now_ns, True, epoch, counter, delay, used)))
         if used:
             telemetry = codec.decode_telemetry(body)
             self.guard = telemetry.guard

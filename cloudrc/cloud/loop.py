@@ -28,6 +28,7 @@ Source: DESIGN, section 5."""
 PLUG_IN_ERRORS = (Exception, SystemExit)
 """A plug-in is foreign code: anything may come out of it; a person's Ctrl-C is not its own."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
+_new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
 
 
 class ControlLoop:
@@ -101,12 +102,13 @@ class ControlLoop:
         else:
             output = self._steer(estimate, setpoint, dt, now_ns)
         hold_ns = now_ns - self._basis_arrival_ns
-        command = Command(now_ns, basis.stamp_ns, hold_ns, output.velocity, output.yaw_rate)
+        velocity, yaw_rate = output.velocity, output.yaw_rate
+        command = _new(Command, (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate))
         try:
             self._predictor.commanded(command)
         except PLUG_IN_ERRORS as error:
             self._note("predictor", error, now_ns)
-        return command, Control(
+        known = (
             now_ns,
             epoch,
             counter,
@@ -120,12 +122,13 @@ class ControlLoop:
             estimate.velocity,
             setpoint.position,
             setpoint.waypoint,
-            output.velocity,
-            output.yaw_rate,
+            velocity,
+            yaw_rate,
             output.proportional,
             output.integral,
             output.derivative,
         )
+        return command, _new(Control, known)
 
     def take_faults(self) -> list[Fault]:
         """Hand over what went wrong for the first time since the last call."""

@@ -233,7 +233,7 @@ def encode_command(command: Command) -> bytes:
 def decode_command(body: bytes) -> Command:
     """Read the body of a COMMAND datagram; numbers may be anything, NaN included."""
     stamp_ns, basis_stamp_ns, basis_hold_ns, x, y, z, yaw_rate = _COMMAND.unpack(body)
-    return Command(stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate)
+    return _new(Command, (stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate))
 
 
 def encode_operator(request: OperatorRequest) -> bytes:

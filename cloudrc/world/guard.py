@@ -109,19 +109,17 @@ class Guard:
         self._tracked_ns = self._held_ns = -SETTLE_NS
         self._enter(GROUND, now_ns, cause)
 
-    def start_mission(self, now_ns: int) -> bool:
+    def start_mission(self, now_ns: int) -> None:
         """The operator starts a mission: from here on fresh commands are flown.
 
-        Returns:
-            False if the operator first has to acknowledge why the robot landed or was stopped.
+        Not while the operator has to acknowledge first why the robot landed or was stopped.
         """
         if self.latched:
-            return False
+            return
         if not self.armed:
             self.forget_commands()  # only what is computed for this mission counts
         self.armed = True
         self._alone_ns = now_ns
-        return True
 
     def end_mission(self, now_ns: int) -> None:
         """The mission is over: hold here until the operator starts the next one."""

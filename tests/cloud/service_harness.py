@@ -25,7 +25,7 @@ class ServiceFlight(Flight):
 
     def restart_teleop(self):
         """A new process, that has nothing but the journal."""
-        self.teleop = MissionService(0.25, self.write, json.loads(json.dumps(self.kept)))
+        self.teleop = MissionService(0.25, self.write, json.loads(json.dumps(self.kept)), salt=b"")
 
     def write(self, entry):
         self.tries += 1

@@ -7,9 +7,10 @@ import time
 
 import pytest
 from api_harness import OPERATOR, READER, connect, head, running
+from service_harness import ServiceFlight
 
-from cloudrc.cloud.teleop import api, api_connections, api_events
-from cloudrc.cloud.teleop.api_bridge import WAITING_MAX
+from cloudrc.cloud.teleop import api, api_connections, api_errors, api_events
+from cloudrc.cloud.teleop.api_bridge import WAITING_MAX, Bridge
 from cloudrc.cloud.teleop.api_gate import Bucket, Limits
 
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
@@ -52,28 +53,14 @@ def test_the_emergency_stop_is_served_while_a_flood_is_refused():
 
 @pytest.mark.promise("P-API-8")
 def test_the_emergency_stop_passes_by_what_waits_for_the_loop():
-    with running() as one:
-        one.bridge.take = lambda take=one.bridge.take: time.sleep(0.01) or take()
-        calls = []
-        for number in range(WAITING_MAX):
-            one.bridge.submit(lambda s, now_ns, number=number: calls.append(number))
-        urgent = one.bridge.submit(lambda s, now_ns: calls.append("stop"), urgent=True)
-        urgent.result(5.0)
-        assert calls.index("stop") == 0 or calls[: calls.index("stop")] == calls[:-1]
-
-
-def test_an_urgent_call_is_made_first():
-    with running(ready=False) as one:
-        one.bridge.open(one.flight.teleop)
-        with_order = []
-        one._stopping.set()
-        one._thread.join()
-        for number in range(3):
-            one.bridge.submit(lambda s, n, number=number: with_order.append(number))
-        one.bridge.submit(lambda s, n: with_order.append("stop"), urgent=True)
-        for call in one.bridge.take():
-            call(0)
-        assert with_order == ["stop", 0, 1, 2]
+    bridge, calls = Bridge(), []
+    bridge.open(ServiceFlight().teleop)
+    for number in range(WAITING_MAX):
+        bridge.submit(lambda s, now_ns, number=number: calls.append(number))
+    bridge.submit(lambda s, now_ns: calls.append("stop"), urgent=True)
+    for call in bridge.take():
+        call(0)
+    assert calls == ["stop", *range(WAITING_MAX - 1)]
 
 
 def test_so_many_are_worked_on_at_once_and_no_more(monkeypatch):
@@ -104,6 +91,12 @@ def test_so_many_streams_and_no_more(monkeypatch):
         assert one.get("/v1/state")
         stream.close()
         one.until(lambda: one.gate._in_flight["operator", "stream"] == 0)
+
+
+@pytest.mark.promise("P-API-9")
+def test_the_limits_are_those_that_are_promised():
+    limits = (api_connections.HEAD_LIMIT, api_errors.BODY_LIMIT, api_connections.SEND_LIMIT)
+    assert limits == (5.0, 5.0, 10.0)
 
 
 @pytest.mark.promise("P-API-9")

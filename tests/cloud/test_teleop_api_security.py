@@ -3,12 +3,11 @@
 import concurrent.futures
 import json
 import os
-import socket
 import stat
 import urllib.request
 
 import pytest
-from api_harness import OPERATOR, READER, running
+from api_harness import OPERATOR, READER, connect, running
 from service_harness import PLAN
 
 from cloudrc.cli.mission_http import Api, UnreachableError
@@ -77,7 +76,7 @@ def test_only_a_bearer_is_known(idle, header):
 
 
 def test_two_headers_are_none(idle):
-    connection = raw(idle)
+    connection = connect(idle)
     line = f"Authorization: Bearer {OPERATOR}\r\n"
     connection.sendall(f"GET /v1/state HTTP/1.1\r\nHost: x\r\n{line}{line}\r\n".encode())
     assert b" 401 " in connection.recv(4096)
@@ -87,7 +86,7 @@ def test_two_headers_are_none(idle):
 def test_the_scheme_is_written_in_any_case_and_a_stranger_is_told_what_is_wanted(idle):
     request = idle.request("/v1/state", headers={"Authorization": f"bEARER {OPERATOR}"}, token=None)
     assert idle.send(request)[0] == 200
-    connection = raw(idle)
+    connection = connect(idle)
     connection.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
     assert b"www-authenticate: Bearer" in connection.recv(4096)
     connection.close()
@@ -139,9 +138,12 @@ def test_a_socket_file_that_is_not_there_is_one_sentence(tmp_path):
         ApiServer(api.gate, api.bridge, tmp_path / "no" / "folder")
 
 
-def raw(api):
-    host, _, port = api.url.removeprefix("http://").partition(":")
-    return socket.create_connection((host, int(port)), timeout=10.0)
+def test_a_file_where_the_socket_shall_be_is_left_alone(tmp_path):
+    precious = tmp_path / "thesis"
+    precious.write_text("mine")
+    with running(unix=True) as api, pytest.raises(BadInputError, match="in use; choose another"):
+        ApiServer(api.gate, api.bridge, precious)
+    assert (BadInputError.exit_code, precious.read_text()) == (2, "mine")
 
 
 @pytest.mark.promise("P-MISSION-3")
@@ -197,7 +199,7 @@ def test_a_fault_of_the_application_is_one_line_and_500():
 
 def test_nothing_but_http_gets_an_answer(idle):
     for data in (b"\x00" * 100, b"GET\r\n\r\n", b"\x16\x03\x01\x02\x00", b"A" * 20_000):
-        connection = raw(idle)
+        connection = connect(idle)
         connection.sendall(data)
         answer = connection.recv(4096)
         assert answer == b"" or b" 400 " in answer

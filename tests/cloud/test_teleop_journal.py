@@ -27,6 +27,26 @@ def test_it_is_there_when_it_is_opened_again(tmp_path):
     assert path.stat().st_mode & 0o777 == 0o600
 
 
+@pytest.mark.promise("P-JOURNAL-1")
+def test_what_is_written_is_on_the_disk_when_it_returns(tmp_path, monkeypatch):
+    path, synced = tmp_path / "journal", []
+
+    def fsync(file):
+        synced.append((os.readlink(f"/proc/self/fd/{file}"), os.fstat(file).st_size))
+        true_fsync(file)
+
+    with Journal(path) as journal:
+        true_fsync = os.fsync
+        monkeypatch.setattr(os, "fsync", fsync)
+        journal.append(SOME[0])
+        assert synced == [(str(path), len(whole(SOME[:1])))]
+        synced.clear()
+        journal.rewrite(SOME)
+    new, folder = synced
+    assert new == (f"{path}.new", len(whole(SOME)))
+    assert folder[0] == str(tmp_path)
+
+
 @pytest.mark.promise("P-JOURNAL-2")
 def test_a_torn_end_is_cut_and_reported(tmp_path):
     path = tmp_path / "journal"

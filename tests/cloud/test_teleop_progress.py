@@ -142,7 +142,7 @@ class KilledFlight(ServiceFlight):
         if self.journal is not None:
             self.disk.crash(power=True)
         self.journal = Journal(PATH, self.disk)
-        self.teleop = MissionService(0.25, self.journal.append, self.journal.entries)
+        self.teleop = MissionService(0.25, self.journal.append, self.journal.entries, salt=b"")
 
     def reached(self):
         return [r["waypoint"] for r in self.view("m1")["reached"]]

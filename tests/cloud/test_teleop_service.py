@@ -4,6 +4,7 @@ import pytest
 from service_harness import PLAN, ServiceFlight, flying
 from teleop_harness import AWAY, A, B, C
 
+from cloudrc.cli.teleop import _open_service
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.cloud.teleop.service import QUEUE_MAX
 from cloudrc.cloud.teleop.service_book import (
@@ -12,6 +13,9 @@ from cloudrc.cloud.teleop.service_book import (
     UnavailableError,
     UnknownMissionError,
 )
+from cloudrc.cloud.teleop.service_mission import ENDED, STATES, Order
+from cloudrc.config.load import load_experiment
+from cloudrc.exposition.labels import MISSION_OUTCOMES
 from cloudrc.messages import GuardState, Request, Setpoint, Start
 
 QUICK = Plan((Leg(A, dwell=0.0),), Start.HERE)
@@ -31,6 +35,18 @@ def test_a_mission_is_flown_and_every_waypoint_noted_once():
     assert [reached["waypoint"] for reached in view["reached"]] == [0, 1, 2]
     assert [event["id"] for event in view["events"]] == [1, 2, 3, 4, 5, 6]
     assert view["verdict"] == {"outcome": "success", "exit_code": 0, "failures": []}
+
+
+def test_every_end_of_a_mission_is_counted_under_its_own_name():
+    ends = {event for event, state in STATES.items() if state in ENDED}
+    assert ends <= set(MISSION_OUTCOMES)
+
+
+def test_two_journals_number_their_first_missions_differently():
+    services = [_open_service(load_experiment("paper"), None) for _ in range(2)]
+    first, other = (service.create(Order(PLAN), 0)[0] for service in services)
+    assert first.id == other.id == "m1"
+    assert first.number != other.number
 
 
 def test_the_same_key_is_answered_with_the_same_mission_for_ever():

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
+from cloudrc.cloud.endpoint import CloudEndpoint
+from cloudrc.cloud.identity import CloudIdentity
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.drivers.virtual import VirtualRun
@@ -14,7 +15,8 @@ from cloudrc.record.hash import RecordHash
 from cloudrc.records import Record
 from cloudrc.report.document import Run
 from cloudrc.report.write import Assessment, assess
-from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
+from cloudrc.world.endpoint import WorldEndpoint
+from cloudrc.world.identity import WorldIdentity
 
 CLOCK = b"one clock for all"[:16]
 LIMIT_NS = 150_000_000_000

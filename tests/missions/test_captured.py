@@ -6,14 +6,14 @@ import pytest
 from flying import CLOCK
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudIdentity
+from cloudrc.cloud.identity import CloudIdentity
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.records import Arrival, CommandApplied, SessionOpened
 from cloudrc.tunnel.codec import Kind, peek
 from cloudrc.tunnel.handshake import COOKIE_NS
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.world.endpoint import WorldIdentity
+from cloudrc.world.identity import WorldIdentity
 
 EXPERIMENT = load_experiment("hover", ["mission.waypoints.0.dwell_s=1"])
 SECOND_NS = 1_000_000_000

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from talking import MS, Talk, talking
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudIdentity
+from cloudrc.cloud.identity import CloudIdentity
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState
 from cloudrc.records import (
@@ -24,7 +24,7 @@ from cloudrc.records import (
     TelemetrySent,
 )
 from cloudrc.tunnel import codec
-from cloudrc.world.endpoint import WorldIdentity
+from cloudrc.world.identity import WorldIdentity
 
 EXPERIMENT = load_experiment("hover", ["link.profile=ideal"])
 

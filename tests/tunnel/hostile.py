@@ -20,7 +20,8 @@ from types import SimpleNamespace
 
 from bare_world import Bare, BareCloud, ring
 
-from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
+from cloudrc.cloud.endpoint import CloudEndpoint
+from cloudrc.cloud.identity import CloudIdentity
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
 from cloudrc.tunnel.session import pair

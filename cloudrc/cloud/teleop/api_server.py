@@ -112,15 +112,13 @@ def _bound_file(path: Path) -> socket.socket:
     """A Unix socket that its owner alone can connect to, from its first instant."""
     unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
-    before = os.umask(0o177)
     try:
-        path.unlink(missing_ok=True)
+        if path.is_socket():  # of a server before this one
+            path.unlink()
         unix.bind(str(path))
     except OSError as error:
         unix.close()
         raise BadInputError(
             f"--api unix:{path}: {error.strerror or error}; choose another path"
         ) from error
-    finally:
-        os.umask(before)
     return unix

@@ -87,7 +87,7 @@ class Tokens:
         except BadInputError:
             self._known = ()
 
-    def _look(self) -> list[tuple[int, int] | None]:
+    def _look(self) -> list[tuple[int, int, int] | None]:
         return [_stamp(self._folder / role) for role in ROLES]
 
     def _read(self) -> tuple[tuple[bytes, Caller], ...]:
@@ -118,9 +118,9 @@ def _read_token(path: Path) -> bytes:
     return token
 
 
-def _stamp(path: Path) -> tuple[int, int] | None:
+def _stamp(path: Path) -> tuple[int, int, int] | None:
     try:
         found = path.stat()
     except OSError:
         return None
-    return found.st_mtime_ns, found.st_ino
+    return found.st_mtime_ns, found.st_ino, found.st_size

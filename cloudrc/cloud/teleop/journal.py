@@ -12,11 +12,9 @@ import errno
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 
 from cloudrc.cloud.teleop.journal_disk import Disk
-from cloudrc.cloud.teleop.journal_format import MAGIC, Parsed, parse, to_record
-from cloudrc.cloud.teleop.journal_format import Entry as Entry
+from cloudrc.cloud.teleop.journal_format import MAGIC, Entry, Parsed, parse, to_bytes, to_record
 from cloudrc.errors import BadInputError, CloudrcError
 
 REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EDQUOT)
@@ -94,8 +92,8 @@ class Journal:
             OSError: If the disk refuses; the journal is then as before.
         """
         disk, new = self._disk, self._path.with_name(f"{self._path.name}.new")
-        records = [to_record(number, entry) for number, entry in enumerate(entries, 1)]
-        data = b"".join((MAGIC, *records))
+        entries = list(entries)
+        data = to_bytes(entries)
         file = disk.open(new, new=True)
         try:
             self._write(file, data)
@@ -107,7 +105,7 @@ class Journal:
             raise
         if self._file != NO_FILE:
             disk.close(self._file)
-        self._file, self._size, self._number = file, len(data), len(records)
+        self._file, self._size, self._number = file, len(data), len(entries)
         self._named = False
         self._opened()
 
@@ -120,12 +118,7 @@ class Journal:
     def __enter__(self) -> Journal:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _read(self) -> Parsed:

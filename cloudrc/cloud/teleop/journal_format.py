@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import zlib
+from collections.abc import Iterable
 from typing import Any, NamedTuple, TypeAlias
 
 Entry: TypeAlias = dict[str, Any]
@@ -54,6 +55,11 @@ def to_record(number: int, entry: Entry) -> bytes:
     counted = len(payload).to_bytes(4, "little") + number.to_bytes(8, "little")
     crc = zlib.crc32(payload, zlib.crc32(counted))
     return b"".join((MARK, counted, crc.to_bytes(4, "little"), payload))
+
+
+def to_bytes(entries: Iterable[Entry]) -> bytes:
+    """Write a whole journal."""
+    return b"".join((MAGIC, *(to_record(number, e) for number, e in enumerate(entries, 1))))
 
 
 def parse(data: bytes) -> Parsed:

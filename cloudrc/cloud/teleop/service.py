@@ -13,7 +13,7 @@ from dataclasses import asdict
 from typing import Any
 
 from cloudrc.cloud.teleop import service_mission as missions
-from cloudrc.cloud.teleop.journal import Entry
+from cloudrc.cloud.teleop.journal_format import Entry
 from cloudrc.cloud.teleop.messages import (
     Acknowledge,
     Cancel,
@@ -52,7 +52,8 @@ class MissionService:
         contact_speed_max: float,
         write: Callable[[Entry], None] = lambda entry: None,
         entries: Iterable[Entry] = (),
-        salt: bytes = b"",
+        *,
+        salt: bytes,
     ) -> None:
         """Remember what was before; nothing is flown until the first deadline.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from cloudrc.cloud.teleop.journal import Entry
+from cloudrc.cloud.teleop.journal_format import Entry
 from cloudrc.cloud.teleop.service_mission import STATES
 
 PASSING_MAX = 1_000

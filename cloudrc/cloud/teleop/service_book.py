@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from itertools import islice, takewhile
 from typing import Any
 
-from cloudrc.cloud.teleop.journal import Entry
+from cloudrc.cloud.teleop.journal_format import Entry
 from cloudrc.cloud.teleop.service_backlog import Backlog
 from cloudrc.cloud.teleop.service_mission import (
     CANCELLED,
@@ -59,7 +59,7 @@ class MissionBook:
     """
 
     def __init__(
-        self, write: Callable[[Entry], None], entries: Iterable[Entry], salt: bytes = b""
+        self, write: Callable[[Entry], None], entries: Iterable[Entry], salt: bytes
     ) -> None:
         """Read what was written before.
 

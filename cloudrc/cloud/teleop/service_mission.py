@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from math import isfinite
 from typing import Any
 
-from cloudrc.cloud.teleop.journal import Entry
+from cloudrc.cloud.teleop.journal_format import Entry
 from cloudrc.cloud.teleop.messages import Continue, Seen, StartMission
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.cloud.teleop.verdict import Failure, Verdict, Witness
