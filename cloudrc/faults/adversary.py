@@ -15,7 +15,8 @@ import numpy as np
 
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.errors import BadInputError
-from cloudrc.faults.liar import Liar, Lie
+from cloudrc.faults.liar import Lie, tempting
+from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Schedule
 from cloudrc.geometry.fence import HIGH, LOW
 from cloudrc.messages import ZERO, Command, Vector
@@ -38,18 +39,12 @@ def temptation(schedule: Schedule) -> Callable[[CloudEndpoint], None]:
     if schedule.policy not in POLICIES:
         names = ", ".join(POLICIES)
         raise BadInputError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
-    rng = np.random.Generator(np.random.PCG64([schedule.seed, 666]))
-    lie = POLICIES[schedule.policy](rng)
-
-    def tempt(cloud: CloudEndpoint) -> None:
-        cloud._loop = Liar(cloud._loop, lie)  # type: ignore[assignment]
-
-    return tempt
+    return tempting(POLICIES[schedule.policy](generator(schedule.seed, 666)))
 
 
 def choose(seed: int) -> Schedule:
     """Give the adversary of a seed, on a link of its own choice."""
-    rng = np.random.Generator(np.random.PCG64([seed, 665]))
+    rng = generator(seed, 665)
     names = sorted(POLICIES)
     profile = ("ideal", "paper-p1", "paper-p2", "paper-p3")[int(rng.integers(4))]
     return Schedule(seed, profile, policy=names[seed % len(names)])

@@ -5,13 +5,12 @@ from __future__ import annotations
 from itertools import pairwise
 from math import dist, hypot, inf, nan
 
-from cloudrc.exposition.histogram import Histogram
-from cloudrc.exposition.live import Live
 from cloudrc.faults.flight import Flight
+from cloudrc.faults.meters import reading
 from cloudrc.faults.scenario import Outcome
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import CommandApplied, GroundTruth, SessionOpened
+from cloudrc.records import CommandApplied, GuardChange, SessionOpened
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 
@@ -29,28 +28,24 @@ def changes_into(flight: Flight, state: GuardState, before: float = inf) -> list
         state: Of the guard.
         before: Only up to this instant [s].
     """
-    return [
-        change.stamp_ns * 1e-9
-        for change in flight.changes
-        if change.state is state and change.cause != "mission ended" and _at(change) < before
-    ]
+    changes = [c for c in flight.changes if c.state is state and c.cause != "mission ended"]
+    return [at for change in changes if (at := change.stamp_ns * 1e-9) < before]
 
 
-def holds(flight: Flight) -> int:
-    """How often the robot held although its mission was under way."""
-    ends = [event.stamp_ns * 1e-9 for event in flight.events("done", "failed", "cancelled")]
-    return len(changes_into(flight, GuardState.HOLD, min(ends, default=inf)))
+def held(flight: Flight) -> list[GuardChange]:
+    """HOLDs that are not a mission's end."""
+    held = [change for change in flight.changes if change.state is GuardState.HOLD]
+    return [change for change in held if change.cause != "mission ended"]
 
 
 def basis_age_at_hold(flight: Flight) -> float:
     """Largest age [s] that the newest applied command's basis had when the guard went to HOLD."""
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     ages_ns = []
-    for change in flight.changes:
-        if change.state is GuardState.HOLD and change.cause != "mission ended":
-            before = [r.basis_stamp_ns for r in applied if r.stamp_ns <= change.stamp_ns]
-            if before:
-                ages_ns.append(change.stamp_ns - max(before))
+    for change in held(flight):
+        before = [r.basis_stamp_ns for r in applied if r.stamp_ns <= change.stamp_ns]
+        if before:
+            ages_ns.append(change.stamp_ns - max(before))
     return max(ages_ns, default=nan) * 1e-9
 
 
@@ -137,7 +132,7 @@ def waypoints_in_order(flight: Flight) -> bool:
 
 def same_path(one: Flight, other: Flight) -> bool:
     """Whether two robots flew the very same way, bit by bit."""
-    return _path(one) == _path(other)
+    return one.trajectory() == other.trajectory()
 
 
 def epochs(flight: Flight) -> list[int]:
@@ -162,14 +157,6 @@ def done(outcome: Outcome, flight: Flight) -> None:
     outcome.true("each waypoint reached once, in order", waypoints_in_order(flight))
 
 
-def _path(flight: Flight) -> list[GroundTruth]:
-    return flight.trajectory()
-
-
-def _at(change: object) -> float:
-    return change.stamp_ns * 1e-9  # type: ignore[attr-defined, no-any-return]
-
-
 def metric(flight: Flight, end: str, name: str, *labels: str) -> float:
     """What a process of an end would show of a metric at the end of the flight [any unit].
 
@@ -179,8 +166,5 @@ def metric(flight: Flight, end: str, name: str, *labels: str) -> float:
         name: Of the metric, without its prefix.
         labels: Values of its labels.
     """
-    live = Live(end)
-    live.see(flight.of_world if end == "world" else flight.of_cloud)
-    reading = live.read().get(f"cloudrc_{name}", {})
-    assert not isinstance(reading, Histogram), "a histogram has no one value"
-    return float(reading.get(labels, nan))
+    records = flight.of_world if end == "world" else flight.of_cloud
+    return reading(end, records, name, *labels)

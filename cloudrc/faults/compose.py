@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import KINDS, WAYS, Event, Schedule
 
 CALM = 45.0
@@ -49,7 +50,7 @@ RANGES: dict[str, tuple[float, float, float]] = {
 
 def compose(seed: int) -> Schedule:
     """Make the schedule of a seed: 1 to 12 faults within 45 s, then 15 s of calm."""
-    rng = np.random.Generator(np.random.PCG64([seed, 40]))
+    rng = generator(seed, 40)
     events: list[Event] = []
     kinds = sorted(KINDS)
     for _ in range(int(rng.integers(1, 13))):

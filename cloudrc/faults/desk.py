@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cloud.teleop.journal import Entry, Journal
+from cloudrc.cloud.teleop.journal import Journal
+from cloudrc.cloud.teleop.journal_format import Entry
 from cloudrc.cloud.teleop.messages import Outcome, Output, Seen
 from cloudrc.cloud.teleop.plan import Plan
 from cloudrc.cloud.teleop.service import MissionService
@@ -62,7 +63,7 @@ class Desk:
             self.repairs.append(self._journal.trouble)
         entries, self._started = list(self.entries), self._started + 1
         salt = b"%s %d" % (self._name, self._started)  # in production it is random
-        self.service = MissionService(self._contact_speed_max, self._keep, entries, salt)
+        self.service = MissionService(self._contact_speed_max, self._keep, entries, salt=salt)
 
     def kill(self) -> None:
         """Teleop is gone, and what it had not written down with it."""
@@ -91,23 +92,23 @@ class Desk:
 
     @property
     def outputs(self) -> Sequence[Output | Fault]:
-        """See `cloudrc.cloud.endpoint.Operator`."""
+        """See `cloudrc.cloud.operator.Operator`."""
         return self._outputs
 
     def see(self, seen: Seen, now_ns: int) -> None:
-        """See `cloudrc.cloud.endpoint.Operator`."""
+        """See `cloudrc.cloud.operator.Operator`."""
         if self.service is not None:
             self.service.see(seen, now_ns)
             self._collect()
 
     def handle_deadline(self, now_ns: int) -> None:
-        """See `cloudrc.cloud.endpoint.Operator`."""
+        """See `cloudrc.cloud.operator.Operator`."""
         if self.service is not None:
             self.service.handle_deadline(now_ns)
             self._collect()
 
     def take_outputs(self) -> Sequence[Output | Fault]:
-        """See `cloudrc.cloud.endpoint.Operator`."""
+        """See `cloudrc.cloud.operator.Operator`."""
         outputs, self._outputs = self._outputs, []
         return outputs
 

@@ -9,10 +9,10 @@ from math import nan
 from pathlib import Path
 
 from cloudrc.faults import asks, meters
-from cloudrc.faults.family_intruder import Generator, generator
+from cloudrc.faults.family_intruder import Generator
 from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.scenario import Outcome, Scenario, generator
 from cloudrc.faults.scribe import ForgetfulWriter, FullDisk, Scribe, SlowWriter
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder

@@ -8,13 +8,13 @@ from math import inf, nan
 
 import numpy as np
 
-from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.faults import asks, meters
-from cloudrc.faults.family_link import AGE_MAX, instant
+from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.liar import Liar, Lie
+from cloudrc.faults.held import AGE_MAX
+from cloudrc.faults.liar import Lie, tempting
 from cloudrc.faults.mortal import Mortal, Tamper
-from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.scenario import Outcome, Scenario, generator
 from cloudrc.messages import Command, GuardState
 from cloudrc.records import Control
 from cloudrc.tunnel import codec
@@ -28,11 +28,6 @@ SETTLED = 2.0
 """When the session of a new flight stands [s]; a greeting that is answered could hasten it."""
 FLOOD = 100
 """Datagrams of garbage per honest one: 10,000 in a second."""
-
-
-def generator(seed: int, use: int) -> Generator:
-    """Chance of one use."""
-    return np.random.Generator(np.random.PCG64([seed, use]))
 
 
 def flipped(data: bytes, rng: Generator, flips: int) -> bytes:
@@ -229,10 +224,7 @@ def _liar(seed: int) -> Outcome:
 
 
 def _lied_to(seed: int, lie: Lie) -> Flight:
-    def tempt(cloud: CloudEndpoint) -> None:
-        cloud._loop = Liar(cloud._loop, lie)  # type: ignore[assignment]
-
-    return Flight(seed=seed, honest=False, tempt=tempt).fly(40.0)
+    return Flight(seed=seed, honest=False, tempt=tempting(lie)).fly(40.0)
 
 
 SCENARIOS = (

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.service_book import ConflictError
 from cloudrc.cloud.teleop.service_mission import Mission, Order
@@ -19,7 +18,7 @@ from cloudrc.config.schema import Mission as MissionSchema
 from cloudrc.faults import asks, meters
 from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.liar import Liar
+from cloudrc.faults.liar import tempting
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.geometry.placement import overlapped_pipe
 from cloudrc.geometry.scene import Scene, load_scene
@@ -86,12 +85,10 @@ def _unreachable(seed: int) -> Outcome:
     """The robot cannot get on: what it is told to fly comes to nothing."""
     outcome, at = Outcome(), instant(seed, 12.0, 20.0)
 
-    def tempt(cloud: CloudEndpoint) -> None:
-        def stalled(command: Command, control: Control) -> Command:
-            return command if control.stamp_ns * 1e-9 < at else command._replace(velocity=ZERO)
+    def stalled(command: Command, control: Control) -> Command:
+        return command if control.stamp_ns * 1e-9 < at else command._replace(velocity=ZERO)
 
-        cloud._loop = Liar(cloud._loop, stalled)  # type: ignore[assignment]
-
+    tempt = tempting(stalled)
     flight = Flight("criteria.time_limit_s=300", seed=seed, tempt=tempt, honest=False)
     flight.fly_mission(200.0)
     asks.safe(outcome, flight)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from math import nan
-
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.faults import asks, meters
 from cloudrc.faults.crowd import Crowd
-from cloudrc.faults.family_link import AGE_MAX, HOUR_NS, instant
+from cloudrc.faults.family_link import HOUR_NS, instant
 from cloudrc.faults.flight import Flight
+from cloudrc.faults.held import AGE_MAX
 from cloudrc.faults.mortal import Clock
 from cloudrc.faults.options import SECRET
 from cloudrc.faults.scenario import Outcome, Scenario
@@ -53,7 +52,7 @@ def _wall_clocks(seed: int) -> Outcome:
         drifting = Flight(seed=seed, cloud_clock=Clock(HOUR_NS, ppm)).fly_mission()
         asks.safe(outcome, drifting)
         asks.done(outcome, drifting)
-        outcome.same(f"drift of {ppm} ppm: HOLDs", asks.holds(drifting), 0)
+        outcome.same(f"drift of {ppm} ppm: HOLDs", len(asks.held(drifting)), 0)
     return outcome
 
 
@@ -86,7 +85,7 @@ def _two_clouds(seed: int) -> Outcome:
     crowd = flight.cloud.inner
     assert isinstance(crowd, Crowd)
     opened: list[int] = []
-    flight.world.at(at + 5.0, lambda _: opened.extend(_epochs_so_far(flight)))
+    flight.world.at(at + 5.0, lambda _: opened.append(flight.epoch))
 
     def leave(now_ns: int) -> None:
         crowd.members = crowd.members[1:]
@@ -95,7 +94,8 @@ def _two_clouds(seed: int) -> Outcome:
     flight.fly(at + 14.0)
     asks.safe(outcome, flight)
     outcome.same("epochs while both are there", max(opened, default=-1), 2)
-    outcome.same("HOLDs while both are there", _holds_before(flight, at + 6.0), 0)
+    held = asks.changes_into(flight, GuardState.HOLD, at + 6.0)
+    outcome.same("HOLDs while both are there", len(held), 0)
     meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "busy", since=at)
     meters.moves(outcome, flight, "world", "sessions_refused_total", since=at)
     outcome.least("the second is refused", flight.world.inner._counts["busy"], 1)  # type: ignore[union-attr]
@@ -104,14 +104,6 @@ def _two_clouds(seed: int) -> Outcome:
     outcome.true("then the second gets a higher epoch", bool(later))
     outcome.true("commands applied in order, none twice", asks.applied_in_order(flight))
     return outcome
-
-
-def _epochs_so_far(flight: Flight) -> list[int]:
-    return [flight.epoch]
-
-
-def _holds_before(flight: Flight, until: float) -> int:
-    return len(asks.changes_into(flight, GuardState.HOLD, until))
 
 
 def _configuration(seed: int) -> Outcome:
@@ -155,11 +147,11 @@ def _rotated(seed: int, new: KeySet, gap: float, holds: int) -> Outcome:
     asks.done(outcome, flight)
     what = f"rotated within {new.overlap:g} s of overlap, {gap:g} s apart"
     if holds:
-        outcome.least(f"{what}: HOLDs", asks.holds(flight), 1)
+        outcome.least(f"{what}: HOLDs", len(asks.held(flight)), 1)
         back = asks.resumed_after(flight, at + gap)
-        outcome.most(f"{what}: TRACK again after", back if back == back else nan, 2.0, "s")
+        outcome.most(f"{what}: TRACK again after", back, 2.0, "s")
     else:
-        outcome.same(f"{what}: HOLDs", asks.holds(flight), 0)
+        outcome.same(f"{what}: HOLDs", len(asks.held(flight)), 0)
     return outcome
 
 

@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterable
 from typing import Any, Unpack
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
+from cloudrc.cloud.endpoint import CloudEndpoint
+from cloudrc.cloud.identity import CloudIdentity
 from cloudrc.cloud.teleop.service_mission import Mission
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedExperiment
@@ -27,7 +28,8 @@ from cloudrc.messages import GuardState
 from cloudrc.record.hash import RecordHash
 from cloudrc.records import Contact, Counted, GroundTruth, GuardChange, MissionEvent, Record
 from cloudrc.tunnel.keys import KeyRing, KeySet
-from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
+from cloudrc.world.endpoint import WorldEndpoint
+from cloudrc.world.identity import WorldIdentity
 
 SHARED = b"one clock for all"[:16]
 OTHER = b"another clock..."
@@ -44,7 +46,6 @@ class Flight:
         of_world: World's records, if they are kept.
         of_cloud: Cloud's records, likewise.
         changes: Of the guard.
-        contacts: Of the robot.
         generations: How many processes there have been of each end.
         rings: The keys of the processes that live, by end.
         secrets: What their key files hold, by end.
@@ -78,7 +79,6 @@ class Flight:
         self.of_world: list[Record] = []
         self.of_cloud: list[Record] = []
         self.changes: list[GuardChange] = []
-        self.contacts: list[Contact] = []
         self._hash = RecordHash()
         self.watch = _watch(self.experiment)
         limit = self.experiment.criteria.contact_speed_max_mps
@@ -250,7 +250,6 @@ class Flight:
             if kind is GuardChange:
                 self.changes.append(record)  # type: ignore[arg-type]
             elif kind is Contact:
-                self.contacts.append(record)  # type: ignore[arg-type]
                 self.watch.see(record, self.state_at(record.stamp_ns), self._honest)  # type: ignore[arg-type]
 
     def state_at(self, stamp_ns: int) -> GuardState:

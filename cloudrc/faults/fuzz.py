@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from cloudrc.cloud.teleop.service import LATCHED
 from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
 from cloudrc.faults.adversary import temptation
+from cloudrc.faults.asks import held
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.inject import inject
 from cloudrc.faults.mortal import Clock
@@ -18,9 +20,8 @@ from cloudrc.faults.schedule import Schedule, shaped
 from cloudrc.faults.walls import steppable_wall_clock
 from cloudrc.faults.watch import Breach
 from cloudrc.messages import GuardState
-from cloudrc.records import GuardChange, Record
+from cloudrc.records import Record
 
-LATCHED = (GuardState.LAND, GuardState.ESTOP)
 BACK = 10.0
 """In so long of calm the robot must have flown [s]."""
 ALWAYS = frozenset({"fence", "cap", "stop", "stale", "error"})
@@ -92,7 +93,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
     looked_at = judged(schedule)
     if "stuck" in looked_at:
         _ask_whether_stuck(flight, operator)
-    watch, holds = flight.watch, _holds(flight)
+    watch, holds = flight.watch, held(flight)
     if "alarm" in looked_at:
         for hold in holds:  # nothing has gone wrong
             watch.note(hold.stamp_ns, "alarm", f"HOLD in a clean flight: {hold.cause}")
@@ -105,12 +106,6 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         len(holds),
         sum(event.event == "done" for event in flight.desk.events),
     )
-
-
-def _holds(flight: Flight) -> list[GuardChange]:
-    """HOLDs that are not a mission's end."""
-    held = [change for change in flight.changes if change.state is GuardState.HOLD]
-    return [change for change in held if change.cause != "mission ended"]
 
 
 class Operator:

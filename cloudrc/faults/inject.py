@@ -9,14 +9,14 @@ import numpy as np
 
 from cloudrc import assembly
 from cloudrc.cloud.teleop.api_bridge import Bridge, Call
-from cloudrc.cloud.teleop.journal import Entry
-from cloudrc.cloud.teleop.journal_format import MAGIC, parse, to_record
+from cloudrc.cloud.teleop.journal_format import MAGIC, parse, to_bytes
 from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
 from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.faults.family_intruder import flipped
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.mortal import Mortal, Tamper
 from cloudrc.faults.options import SECRET
+from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.faults.walls import Wall
 from cloudrc.tunnel.keys import Key, KeySet
@@ -122,17 +122,12 @@ def _order(flight: Flight, now_ns: int) -> None:
 def _damage(flight: Flight, event: Event, now_ns: int) -> None:
     """The pod dies, and its journal is not what it was: torn at the end, or wrong in one bit."""
     flight.kill_cloud_pod(now_ns, event.duration)
-    data = bytearray(_journal(flight.desk.entries))
+    data = bytearray(to_bytes(flight.desk.entries))
     if event.kind == "journal_torn":
         del data[max(len(MAGIC), len(data) - int(event.value)) :]
     else:
         data[min(int(event.value * len(data)), len(data) - 1)] ^= 4
     flight.desk.entries = parse(bytes(data)).entries
-
-
-def _journal(entries: list[Entry]) -> bytes:
-    records = [to_record(number, entry) for number, entry in enumerate(entries, 1)]
-    return b"".join((MAGIC, *records))
 
 
 def _flood(flight: Flight, event: Event, now_ns: int) -> None:
@@ -160,7 +155,7 @@ def _intrude(flight: Flight, schedule: Schedule) -> None:
     """Damage, forge and replay datagrams on their way."""
     events = schedule.of("corruption", "garbage", "replay")
     if events:
-        rng = np.random.Generator(np.random.PCG64([schedule.seed, 41]))
+        rng = generator(schedule.seed, 41)
         for way, end in (("down", flight.world), ("up", flight.cloud)):
             mine = [event for event in events if event.way in ("both", way)]
             if mine:

@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
+from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.messages import Command, Setpoint
 from cloudrc.records import Control
 
 Lie: TypeAlias = Callable[[Command, Control], Command]
 """What is sent in place of a command; what cloud knew when it made it stands in the record."""
+
+
+def tempting(lie: Lie) -> Callable[[CloudEndpoint], None]:
+    """Make what turns an honest cloud into one that lies."""
+
+    def tempt(cloud: CloudEndpoint) -> None:
+        cloud._loop = Liar(cloud._loop, lie)  # type: ignore[assignment]
+
+    return tempt
 
 
 class Liar:

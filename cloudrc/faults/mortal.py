@@ -62,7 +62,6 @@ class Mortal:
         tamper: What becomes of a datagram before it gets in; None leaves it alone.
         clock: Its own.
         lost: Datagrams that found no process.
-        heard: Datagrams that reached the process.
     """
 
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock, name: str = "world") -> None:
@@ -75,7 +74,7 @@ class Mortal:
         """
         self._build, self.clock, self._name = build, clock, name
         self.tamper: Tamper | None = None
-        self.lost = self.heard = 0
+        self.lost = 0
         self._frozen_until_ns = -1
         self._waiting: list[bytes] = []
         self._left: list[Record] = []
@@ -141,7 +140,6 @@ class Mortal:
             else:
                 self.lost += 1
         else:
-            self.heard += 1
             self.inner.receive_datagram(data, self.clock.at(now_ns))
 
     # The contract of an endpoint.

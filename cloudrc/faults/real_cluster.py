@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-
 from cloudrc.cluster.access import Release, connect
+from cloudrc.cluster.errors import ClusterError
 from cloudrc.cluster.fetch import fetch_metrics, fetch_recording
 from cloudrc.cluster.follow import logs
 from cloudrc.cluster.jobs import read_job, run_job
+from cloudrc.cluster.link import PROFILE, Place, read_link
 from cloudrc.cluster.pods import find_pod
 from cloudrc.cluster.tools import run as call
 from cloudrc.config.load import load_mission
 from cloudrc.errors import CloudrcError, TimedOutError
-from cloudrc.faults.family_real import AGE_MAX, PERIOD, pause
+from cloudrc.faults.held import AGE_MAX, age_at_hold
 from cloudrc.faults.scenario import Outcome
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 
 LIMIT = 150.0
 """For whatever is waited for [s]."""
+PERIOD = 0.2
+"""Between two looks at whether something has come about [s]."""
 ENDS = ("complete", "failed")
 place: dict[str, str] = {"namespace": "default", "release": "cloudrc"}
 """Where the release is; the command line puts it here."""
@@ -74,7 +78,7 @@ def until(text: str, condition: Callable[[], bool], limit: float = LIMIT) -> flo
     while not condition():
         if time.monotonic() - began > limit:
             raise TimedOutError(f"{text}: not within {limit:g} s")
-        pause(PERIOD)
+        time.sleep(PERIOD)
     return time.monotonic() - began
 
 
@@ -86,8 +90,12 @@ def guard(release: Release) -> GuardState:
     return GuardState.GROUND
 
 
-def finish(outcome: Outcome, release: Release, name: str) -> None:
-    """The Job has succeeded, each waypoint was reached once, no pipe was touched."""
+def finish(outcome: Outcome, release: Release, name: str) -> Recording:
+    """Check that the Job has succeeded, each waypoint was reached once, no pipe was touched.
+
+    Returns:
+        World's recording up to then.
+    """
     until("the mission's Job has ended", lambda: read_job(release, name).state in ENDS)
     status, lines = read_job(release, name), log(release, name)
     outcome.same("exit code of the Job", -1 if status.exit_code is None else status.exit_code, 0)
@@ -96,37 +104,17 @@ def finish(outcome: Outcome, release: Release, name: str) -> None:
     flown = recording(release, "world")
     bodies = flown["/contact"]["body"].tolist()
     outcome.same("pipe contacts", sum(body.startswith("pipe") for body in bodies), 0)
-    outcome.most("HOLD, if any, after", age_at_hold(flown), AGE_MAX + 1e-9, "s")
+    outcome.most("HOLD, if any, after", age_at_hold(flown), AGE_MAX, "s")
+    return flown
 
 
 def recording(release: Release, component: str) -> Recording:
     """Fetch the recording of an end as it is now."""
-    pause(1.0)  # the recorder's flush
+    time.sleep(1.0)  # the recorder's flush
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.mcap"
         fetch_recording(release, component, path)
         return Recording.read(path)
-
-
-def age_at_hold(recording: Recording) -> float:
-    """Find the largest age of the newest applied basis when the guard went to HOLD [s]."""
-    applied, guard = recording["/command_applied"], recording["/guard"]
-    held = (guard["state"] == GuardState.HOLD) & ["age" in cause for cause in guard["cause"]]
-    ages = [0.0]
-    for stamp_ns in guard["stamp_ns"][held].tolist():
-        before = applied["basis_stamp_ns"][applied["stamp_ns"] <= stamp_ns]
-        if len(before):
-            ages.append((stamp_ns - int(np.max(before))) * 1e-9)
-    return max(ages)
-
-
-def holds(recording: Recording) -> int:
-    """Count the HOLDs for want of fresh commands."""
-    guard = recording["/guard"]
-    return sum(
-        GuardState(int(state)) is GuardState.HOLD and "age" in cause
-        for state, cause in zip(guard["state"].tolist(), guard["cause"].tolist(), strict=True)
-    )
 
 
 def kubectl(release: Release, *words: str, given: str = "", timeout: float = 60.0) -> str:
@@ -139,6 +127,24 @@ def kubectl(release: Release, *words: str, given: str = "", timeout: float = 60.
         timeout: How long it may take [s].
     """
     return call("kubectl", [*release.flags, *words], timeout=timeout, given=given)
+
+
+@contextmanager
+def link_as_it_is(release: Release) -> Iterator[Path]:
+    """Keep the profile that is in force now, with its traces, in a file."""
+    link = read_link(Place(release.context, release.namespace, release.name))
+    if link is None:
+        raise ClusterError(f"release '{release.name}' has no link to change")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, text in link.files.items():
+            (Path(folder) / name).write_text(text, encoding="utf-8")
+        yield Path(folder) / PROFILE
+
+
+def set_link(release: Release, *words: str) -> None:
+    """Change the link in flight as its user does."""
+    command = ["-m", "cloudrc", "link", "set", *words, *release.cloudrc_flags]
+    call(sys.executable, command, timeout=60.0)
 
 
 def delete(release: Release, component: str, *flags: str) -> None:

@@ -8,16 +8,17 @@ import subprocess
 import sys
 import tempfile
 import time
-import urllib.request
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 
+from cloudrc.cloud.teleop.service_mission import ENDED, STATES
+from cloudrc.cluster.forward import DIRECTLY
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.drivers.epochs import replace_durably
+from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import TimedOutError
 from cloudrc.faults.options import SECRET
-from cloudrc.record.columns import Recording, Table
+from cloudrc.record.columns import Recording
 from cloudrc.record.recover import Recovery, recover
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.keys import write
@@ -49,7 +50,8 @@ class Processes:
         experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         (self.folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
         replace_durably(self.folder / "key", write(SECRET).encode())
-        self.ports = dict(zip(("world", "cloud", "metrics"), _free_ports(3), strict=True))
+        self.ports = dict(zip(("world", "cloud"), free_ports(2), strict=True))
+        (self.ports["metrics"],) = free_ports(1, socket.SOCK_STREAM)
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self._all: list[subprocess.Popen[bytes]] = []
         self._recordings = 0
@@ -134,8 +136,8 @@ class Processes:
 
     def over(self) -> None:
         """Wait until the mission has ended."""
-        ends = {"done", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped"}
-        self.until("the mission ended", lambda: bool(ends & set(self.events())), 2 * LIMIT)
+        ended = lambda: any(STATES.get(event) in ENDED for event in self.events())  # noqa: E731
+        self.until("the mission ended", ended, 2 * LIMIT)
 
     def recording(self, name: str, which: int = -1) -> tuple[Recording, Recovery]:
         """Recover a recording of a process and read it; by default the newest."""
@@ -145,10 +147,6 @@ class Processes:
         recovery = recover(paths[which], clean)
         return Recording.read(clean), recovery
 
-    def table(self, topic: str) -> Table:
-        """A topic of world's recording."""
-        return self.recording("world")[0][topic]
-
     def scrape(self, timeout: float = 5.0) -> dict[str, float]:
         """Read world's metrics [any unit].
 
@@ -156,7 +154,7 @@ class Processes:
             timeout: For the answer [s].
         """
         url = f"http://{LOOPBACK}:{self.ports['metrics']}/metrics"
-        with urllib.request.urlopen(url, timeout=timeout) as answer:
+        with DIRECTLY.open(url, timeout=timeout) as answer:
             lines = answer.read().decode().splitlines()
         samples = (line.rpartition(" ") for line in lines if not line.startswith("#"))
         return {name: float(value) for name, _, value in samples}
@@ -171,12 +169,7 @@ class Processes:
     def __enter__(self) -> Processes:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _last_words(self) -> str:
@@ -185,18 +178,6 @@ class Processes:
             lines = (self.folder / f"{name}.log").read_text(errors="replace").splitlines()
             words.append(f"{name}: {lines[-1] if lines else 'nothing'}")
         return "; ".join(words)
-
-
-def _free_ports(count: int) -> list[int]:
-    """Ports of the loopback that nobody uses now."""
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
-    try:
-        for each in sockets:
-            each.bind((LOOPBACK, 0))
-        return [each.getsockname()[1] for each in sockets]
-    finally:
-        for each in sockets:
-            each.close()
 
 
 FLOOD = """
@@ -243,6 +224,12 @@ def throttle(pid: int, share: float) -> Path | None:
             continue
         return group
     return None
+
+
+def throttled(group: Path) -> int:
+    """In how many periods a cgroup has used its quota up."""
+    lines = (group / "cpu.stat").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("nr_throttled "))
 
 
 def release(group: Path, pid: int) -> None:

@@ -8,12 +8,19 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 Mode: TypeAlias = Literal["virtual", "real", "cluster"]
 Relation: TypeAlias = Literal["<=", ">=", "=="]
 
 _COMPARE = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 YES = "yes"
 """Takes the place of a unit: the check is a question, its measure 1 for yes and 0 for no."""
+
+
+def generator(seed: int, use: int) -> np.random.Generator:
+    """Chance of one use."""
+    return np.random.Generator(np.random.PCG64([seed, use]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,36 +71,15 @@ class Outcome:
     skipped: str = ""
 
     def most(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that something is at most its limit.
-
-        Args:
-            text: What is checked.
-            measured: What came out [any unit].
-            limit: What was promised [any unit].
-            unit: Of both.
-        """
+        """Check that `measured` is at most its `limit`, both in `unit` [any unit]."""
         self.checks.append(Check(text, measured, "<=", limit, unit))
 
     def least(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that something is at least its limit.
-
-        Args:
-            text: What is checked.
-            measured: What came out [any unit].
-            limit: What was promised [any unit].
-            unit: Of both.
-        """
+        """Check that `measured` is at least its `limit`, both in `unit` [any unit]."""
         self.checks.append(Check(text, measured, ">=", limit, unit))
 
     def same(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that something is exactly what was promised.
-
-        Args:
-            text: What is checked.
-            measured: What came out [any unit].
-            limit: What was promised [any unit].
-            unit: Of both.
-        """
+        """Check that `measured` is exactly its `limit`, both in `unit` [any unit]."""
         self.checks.append(Check(text, measured, "==", limit, unit))
 
     def true(self, text: str, holds: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -115,26 +115,32 @@ class Schedule:
         return sorted((e for e in self.events if e.kind in kinds), key=lambda e: e.at)
 
 
-LinkEvents: TypeAlias = list[Event]
-
-
 def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> DirectionProfile:
-    """Put a schedule's faults of the link over the conditions of one direction."""
+    """Put a schedule's faults of the link over the conditions of one direction.
+
+    Raises:
+        BadInputError: If those change by themselves, and by a fault, too.
+    """
     mine = [event for event in schedule.events if event.way in ("both", way)]
     blackouts = [Blackout(e.at, e.duration) for e in mine if e.kind == "blackout"]
     waves = [e for e in mine if e.kind in ("delay", "jitter", "loss", "bursts")]
+    if waves and (profile.changes or profile.trace is not None):
+        raise BadInputError(
+            f"the link's profile {schedule.profile} has a time line, on which {waves[0].kind} "
+            "cannot be laid; choose a profile that does not change"
+        )
     edges = sorted({instant for event in waves for instant in (event.at, event.end)})
     changes = tuple(_change(profile, [e for e in waves if e.at <= t < e.end], t) for t in edges)
     return replace(
         profile,
         blackouts=(*profile.blackouts, *blackouts),
-        changes=(*profile.changes, *changes) if not profile.changes else profile.changes,
+        changes=changes or profile.changes,
         duplicate=max(profile.duplicate, schedule.duplicate),
         reorder=max(profile.reorder, schedule.reorder),
     )
 
 
-def _change(profile: DirectionProfile, active: LinkEvents, at: float) -> Change:
+def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change:
     """The conditions from an instant on, with all that is going on then."""
     delay, jitter, loss = profile.delay, profile.jitter, profile.loss
     for event in active:
@@ -154,7 +160,7 @@ def dump(schedule: Schedule, note: str = "") -> str:
     document: dict[str, Any] = {
         name: value
         for name, value in asdict(schedule).items()
-        if name not in ("events",) and value != getattr(Schedule(0), name)
+        if name != "events" and value != getattr(Schedule(0), name)
     }
     document["seed"] = schedule.seed
     document["events"] = [

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from cloudrc.drivers.recording import FLUSH
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
 
-FLUSH_NS = 250_000_000
-"""As `cloudrc.drivers.recording` does [ns]."""
 PAGE = 4096
 """What a disk writes at once [bytes]."""
 
@@ -110,7 +109,7 @@ class Scribe:
             return
         while self.recorder.drain():
             pass
-        if now_ns - self._flushed_ns >= FLUSH_NS:
+        if now_ns - self._flushed_ns >= FLUSH * 1e9:
             self._flushed_ns = now_ns
             self.recorder.flush()
             self._busy_until_ns = now_ns + round(self._owed() * 1e9)

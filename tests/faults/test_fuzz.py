@@ -15,9 +15,10 @@ from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.compose import CALM, calm, compose
 from cloudrc.faults.fuzz import Finding, fly, judged
 from cloudrc.faults.remains import Remains
-from cloudrc.faults.schedule import KINDS, Event, Schedule, dump, load
+from cloudrc.faults.schedule import KINDS, Event, Schedule, dump, load, shaped
 from cloudrc.faults.shrink import shrink
 from cloudrc.faults.watch import Breach, Watch
+from cloudrc.link.profile import Change, DirectionProfile
 from cloudrc.record.columns import Recording
 from cloudrc.record.recover import Recovery, recover
 
@@ -115,6 +116,14 @@ def test_a_schedule_that_names_what_there_is_not_is_bad_input(
     error = capsys.readouterr().err
     assert f"{path}: " in error
     assert "nope" in error
+
+
+def test_a_fault_of_the_link_is_not_lost_on_a_profile_with_a_time_line() -> None:
+    profile = DirectionProfile(changes=(Change(5.0, delay=0.1),))
+    silence, waves = Event("blackout", 1.0, 1.0), Event("loss", 1.0, 1.0, 0.5)
+    assert shaped(Schedule(1, events=(silence,)), profile, "up").changes == profile.changes
+    with pytest.raises(BadInputError, match="has a time line, on which loss cannot be laid"):
+        shaped(Schedule(1, events=(waves,)), profile, "up")
 
 
 def test_a_failing_schedule_is_shrunk_to_what_it_takes() -> None:

@@ -74,6 +74,7 @@ def test_a_fault_is_survived(name: str) -> None:
 def test_every_fault_is_survived(scenario: Scenario, seed: int) -> None:
     outcome = scenario.run(seed)
     assert [check.show() for check in outcome.checks if not check.passed] == []
+    assert outcome.checks
 
 
 @pytest.mark.promise("P-FAULT-5")
