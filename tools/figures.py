@@ -1,4 +1,4 @@
-"""The numbers of link and safety: tests note what they measured, this prints it beside what was asked.
+"""The numbers of link and safety: what tests have measured, printed beside what was asked.
 
 `make figures` prints what the tests have noted since `make clean`; the full numbers need
 `make nightly`, the slices of CI are noted by `make test` and `make process`.
@@ -12,6 +12,8 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
+
+from cloudrc.cli.output import table
 
 FOLDER = Path(__file__).resolve().parents[1] / "build" / "figures"
 ROUNDING = 1e-9
@@ -88,10 +90,7 @@ def main() -> int:
                 row["test"].partition("::")[0],
             )
         )
-    widths = [max(len(row[n]) for row in cells) for n in range(5)]
-    for line in cells:
-        texts = [text.ljust(width) for text, width in zip(line, widths, strict=True)]
-        print("  ".join(texts).rstrip())
+    print(table(cells))
     return 0 if all(map(holds, rows)) else 1
 
 

@@ -9,6 +9,7 @@ import stat
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
+from cloudrc.link.route import version
 from cloudrc.records import Fault
 from cloudrc.tunnel.keys import KeyRing, KeySet, parse
 
@@ -29,7 +30,7 @@ class KeyFile:
             BadInputError: If it is not there or holds no key.
         """
         self._path = path
-        self._seen = _identity(path)
+        self._seen = version(path)
         self._keys = read_keys(path)
         self._due_ns = now_ns
         self.ring = KeyRing(self._keys, now_ns)
@@ -43,7 +44,7 @@ class KeyFile:
         if now_ns < self._due_ns:
             return []
         self._due_ns = now_ns + PERIOD_NS
-        seen = _identity(self._path)
+        seen = version(self._path)
         if seen == self._seen or seen is None:  # a file that is gone for a moment changes nothing
             return []
         self._seen = seen
@@ -77,11 +78,3 @@ def read_keys(path: Path) -> KeySet:
 def is_exposed(path: Path) -> bool:
     """Whether every user of this machine can read a key file."""
     return bool(path.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH))
-
-
-def _identity(path: Path) -> tuple[int, int, int] | None:
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_mtime_ns, status.st_ino, status.st_size

@@ -8,11 +8,11 @@ in a file beside it, and noted every other second.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable
 from math import nan
 from pathlib import Path
 
+from cloudrc.link.route import version
 from cloudrc.link.state import RELEASED_SUFFIX, LinkState, from_text
 from cloudrc.records import (
     Counted,
@@ -83,15 +83,14 @@ class LinkNotes:
     def _look(self, now_ns: int) -> bool:
         """Read the file if it is another one; say whether the state has changed."""
         self._due_ns = now_ns + PERIOD_NS
+        seen = version(self._place)
+        if seen == self._seen:
+            return False
         try:
-            status = os.stat(self._place)
-            seen = (status.st_mtime_ns, status.st_ino, status.st_size)
-            if seen == self._seen:
-                return False
             state, before = from_text(self._path.read_text(encoding="utf-8")), self._state
-            self._seen, self._state = seen, state
         except (OSError, ValueError):
             return False
+        self._seen, self._state = seen, state
         return before is None or before.since_ns != state.since_ns
 
 

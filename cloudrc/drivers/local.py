@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import selectors
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -20,8 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from cloudrc.drivers import flights
-from cloudrc.drivers.epochs import replace_durably
 from cloudrc.drivers.feed import READY, from_line
+from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import InvalidRunError, TimedOutError
 from cloudrc.records import Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
@@ -108,7 +107,8 @@ class LocalRun:
             flights.announced(self._folder),
         ):
             self._key = Path(sockets) / "key"
-            replace_durably(self._key, write(KeySet(Key(os.urandom(KEY_SIZE)))).encode("ascii"))
+            self._key.touch(0o600)
+            self._key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
             self._fly(limit, sockets)
 
     def _fly(self, limit: float, sockets: str) -> None:
@@ -121,6 +121,7 @@ class LocalRun:
                 f"--world={world}",
                 f"--cloud={cloud}",
                 f"--link={self._folder / LINK_FOLDER}",
+                "--fifo",
             )
             self._start_end("world", world, from_world)
             self._start_teleop(sockets)
@@ -242,12 +243,5 @@ class LocalRun:
 
 
 def _free_addresses(count: int) -> list[str]:
-    """UDP addresses on 127.0.0.1 that nobody uses now."""
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
-    try:
-        for udp in sockets:
-            udp.bind((LOOPBACK, 0))
-        return [f"{LOOPBACK}:{udp.getsockname()[1]}" for udp in sockets]
-    finally:
-        for udp in sockets:
-            udp.close()
+    """UDP addresses on this machine that nobody uses now."""
+    return [f"{LOOPBACK}:{port}" for port in free_ports(count)]

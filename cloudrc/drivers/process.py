@@ -102,8 +102,8 @@ def run_end(
         True if it was done by itself, False if it was stopped.
     """
     feed, thread = Feed.on_stdout(watched=watched), RecordingThread(recorder)
-    taps = _Taps(end, recorder, feed, exporter, choose)
-    taps.watch = _Watch(end, link, check, keys, slip_ns)
+    watch = _Watch(end, link, check, keys, slip_ns)
+    taps = _Taps(end, recorder, feed, exporter, choose, watch)
     thread.start()
     feed.ready()
     try:
@@ -142,11 +142,7 @@ class _Watch:
 
 
 class _Taps:
-    """Where an end's records go: into its recording, to who watches, into its metrics.
-
-    Attributes:
-        watch: What adds to them.
-    """
+    """Where an end's records go: into its recording, to who watches, into its metrics."""
 
     def __init__(
         self,
@@ -155,17 +151,16 @@ class _Taps:
         feed: Feed,
         exporter: Exporter | None,
         choose: Callable[[list[Record]], list[Record]],
+        watch: _Watch,
     ) -> None:
         self._end, self._recorder, self._feed = end, recorder, feed
-        self._exporter, self._choose = exporter, choose
-        self.watch: _Watch | None = None
+        self._exporter, self._choose, self._watch = exporter, choose, watch
         self._trouble, self._dropped = "", 0
 
     def __call__(self, records: list[Record]) -> None:
         """Take records in; never waits."""
         recorder, exporter = self._recorder, self._exporter
-        if self.watch is not None:
-            records = records + self.watch.after(records)
+        records = records + self._watch.after(records)
         recorder.put(self._choose(records))
         self._feed.tell(records)
         if exporter is not None:

@@ -96,6 +96,18 @@ def bind(listen: tuple[str, int]) -> socket.socket:
     return udp
 
 
+def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[int]:
+    """Find ports on 127.0.0.1 that nobody uses now."""
+    sockets = [socket.socket(socket.AF_INET, kind) for _ in range(count)]
+    try:
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [int(one.getsockname()[1]) for one in sockets]
+    finally:
+        for one in sockets:
+            one.close()
+
+
 def serve(
     endpoint: Endpoint,
     peer: Peer,

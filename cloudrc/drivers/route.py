@@ -10,6 +10,8 @@ from __future__ import annotations
 from ipaddress import AddressValueError, IPv4Address
 from pathlib import Path
 
+from cloudrc.link.route import version
+
 Address = tuple[str, int]
 
 
@@ -28,8 +30,7 @@ class Route:
         A file that is gone, or half written, leaves the last address in place.
         """
         try:
-            status = self._path.stat()
-            seen = (status.st_mtime_ns, status.st_ino, status.st_size)
+            seen = version(self._path)
             if seen != self._seen:
                 self._address = parse(self._path.read_text(encoding="ascii"))
                 self._seen = seen

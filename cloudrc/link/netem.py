@@ -6,7 +6,7 @@
 
 The set-up is found again after a restart by its handles, changed in flight by `tc qdisc change`,
 which keeps what is queued, and removed by `close`. A root qdisc of somebody else is left alone.
-What others do to ours is seen within a second, put back, logged and counted.
+What others do to ours is seen within a second (its filter within ten), put back, logged, counted.
 
 Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8).
 """
@@ -109,6 +109,8 @@ class Netem:
             restart: Whether their time line counts from now; else from when the old one did.
         """
         check(profile)
+        if self._applied:  # what another hand has done is no reason to refuse
+            self._look(self._qdiscs())
         before = self._profile, self._origin_ns
         self._follow(profile, self._clock() if restart else self._origin_ns)
         try:
@@ -116,7 +118,7 @@ class Netem:
             self._confirm()
         except CloudrcError:
             self._follow(*before)
-            self._apply("change")
+            self._follow_time_line()
             raise
 
     def step(self, timeout: float) -> None:
@@ -239,7 +241,11 @@ class Netem:
 
     def _confirm(self) -> None:
         """Read back what is in force, and refuse what is not as it was asked for."""
-        listed = next(one for one in self._qdiscs() if one.get("handle") == LEAF)
+        listed = next((one for one in self._qdiscs() if one.get("handle") == LEAF), None)
+        if listed is None:
+            raise MissingPrerequisiteError(
+                f"the qdisc of {self._device} was removed by another hand meanwhile; find out whose"
+            )
         found = differences(self._applied, listed.get("options", {}))
         if found:
             raise BadInputError(

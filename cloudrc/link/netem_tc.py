@@ -79,7 +79,8 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
         return MissingPrerequisiteError(
             f"no program {program} (package iproute2); install it, or {_INSTEAD}"
         )
-    if "qdisc kind is unknown" in text or (kind and "No such file or directory" in text):
+    missing = kind and "change" not in words and "No such file or directory" in text
+    if missing or "qdisc kind is unknown" in text:
         return MissingPrerequisiteError(
             f"this kernel has no sch_{kind or 'netem'}; {_INSTEAD}, or use nodes whose kernel has "
             f"it ('modprobe sch_{kind or 'netem'}' there) and a namespace for privileged pods"

@@ -36,6 +36,19 @@ Loss: TypeAlias = float | GilbertElliott
 """Chance of an independent loss in [0, 1], or loss in bursts."""
 
 
+def bad_share(loss: GilbertElliott) -> float:
+    """Say which share of packets meets the bad state, in [0, 1]."""
+    return loss.bad_start / (loss.bad_start + loss.bad_end) if loss.bad_start else 0.0
+
+
+def mean_loss(loss: Loss) -> float:
+    """Say which share of packets is lost in the long run, in [0, 1]."""
+    if not isinstance(loss, GilbertElliott):
+        return loss
+    share = bad_share(loss)
+    return share * loss.loss_bad + (1.0 - share) * loss.loss_good
+
+
 @dataclass(frozen=True, slots=True)
 class Change:
     """From `at` on these values hold; None leaves a value as it is.

@@ -23,19 +23,17 @@ class ReleaseErrors:
 
     Attributes:
         early: How many left before they were due: none, unless this code is wrong.
-        total_ns: Sum of all errors [ns].
     """
 
-    __slots__ = ("_met", "early", "total_ns")
+    __slots__ = ("_met", "early")
 
     def __init__(self) -> None:
         """Begin empty."""
-        self.early = self.total_ns = 0
+        self.early = 0
         self._met: dict[int, int] = {}
 
     def observe(self, error_ns: int) -> None:
         """Count one datagram that left `error_ns` [ns] after it was due."""
-        self.total_ns += error_ns
         if error_ns < _LIMITS[0]:
             if error_ns < 0:
                 self.early += 1
@@ -58,7 +56,6 @@ class ReleaseErrors:
         whole, met = cls(), Counter[int]()
         for part in parts:
             whole.early += part.early
-            whole.total_ns += part.total_ns
             met.update(part._met)
         whole._met = dict(met)
         return whole
@@ -85,7 +82,6 @@ class ReleaseErrors:
         """Leave out what had been counted earlier."""
         rest, earlier = ReleaseErrors(), before._met.get
         rest.early = self.early - before.early
-        rest.total_ns = self.total_ns - before.total_ns
         rest._met = {
             bucket: count - earlier(bucket, 0)
             for bucket, count in self._met.items()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias
@@ -26,6 +27,8 @@ Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 """Makes a shaper from conditions and the instant [ns] that their time line counts from."""
 
 COUNT_PERIOD_NS = 1_000_000_000
+RELEASED_PERIOD_NS = 2_000_000_000
+"""Between two tellings of how late datagrams left [ns]: as often as an end notes it."""
 _WAIT = 0.05
 _STEP = 0.05
 """Longest time in which a change that was left here is not seen [s]."""
@@ -108,7 +111,8 @@ class Sidecar:
         self._reason = ""
         self._origin_ns: int | None = None
         self._state: LinkState | None = None
-        self._released = settings.state.with_suffix(RELEASED_SUFFIX)
+        self._told: LinkState | None = None
+        self._released, self._released_ns = settings.state.with_suffix(RELEASED_SUFFIX), 0
         self._seen = profile.change.number
 
     def run(
@@ -177,8 +181,12 @@ class Sidecar:
         """Tell how it goes: the metrics what became of datagrams, this pod's end how late."""
         if self._watcher:
             self._watcher.counted(now_ns, shaper.counts())
-        if released := shaper.released():
-            publish(self._released, json.dumps(released))
+        if self._told is not self._state:
+            self._publish()
+        if now_ns >= self._released_ns and (released := shaper.released()):
+            self._released_ns = now_ns + RELEASED_PERIOD_NS
+            with suppress(OSError):  # a full disk is no reason to stop shaping
+                publish(self._released, json.dumps(released))
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
         """Take the shaper of the mode, or find out which one works; say why."""
@@ -195,8 +203,6 @@ class Sidecar:
                     raise
                 self._reason = f"netem does not work here: {_cause(error)}"
             else:
-                for note in notes(profile.direction):
-                    machine.log(note)
                 return netem, route
         relay = machine.relay(profile.direction, self._origin_ns or 0)
         return relay, relay.follow_peer(peer)
@@ -233,6 +239,8 @@ class Sidecar:
     def _tell(self, shaper: Shaper, profile: Loaded) -> None:
         """Write for ends, users and reports what shapes the link from now on."""
         before, change, asked = self._state, self._change_of(profile), summary(profile.direction)
+        for note in notes(profile.direction) if shaper.name == "netem" else ():
+            self._machine.log(note)
         self._state = LinkState(
             shaper=shaper.name,
             reason=self._reason,
@@ -248,7 +256,7 @@ class Sidecar:
             origin_ns=self._origin_ns,
         )
         self._seen = profile.change.number
-        publish(self._settings.state, to_text(self._state))
+        self._publish()
         if self._watcher:
             self._watcher.asked(asked["delay"] or 0.0)
 
@@ -256,7 +264,14 @@ class Sidecar:
         """Write for users that their change did not take force."""
         if self._state is not None:
             self._state = replace(self._state, refused=profile.change.number, refusal=why)
-            publish(self._settings.state, to_text(self._state))
+            self._publish()
+
+    def _publish(self) -> None:
+        """Write the state for others; what a full disk does not take is written a second later."""
+        if self._state is not None:
+            with suppress(OSError):
+                publish(self._settings.state, to_text(self._state))
+                self._told = self._state
 
 
 def _cause(error: CloudrcError) -> str:

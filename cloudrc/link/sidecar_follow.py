@@ -6,13 +6,13 @@ server may be slow. Here they are plain objects: file and names in, changes out.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.route import version
 from cloudrc.link.state import CHANGE_FILE, Change, read_change
 
 if TYPE_CHECKING:
@@ -58,12 +58,12 @@ class ProfileFile:
 
     def first(self) -> Loaded:
         """Read the file; raises a BadInputError."""
-        self._seen = self._look()
+        self._seen = version(self._place)
         return self._read()
 
     def poll(self) -> Loaded | None:
         """Read the file if it has changed; None if not, or if it is refused, which is logged."""
-        seen = self._look()
+        seen = version(self._place)
         if seen == self._seen:
             return None
         self._seen = seen
@@ -80,14 +80,6 @@ class ProfileFile:
         except (OSError, UnicodeDecodeError):
             return loaded
         return loaded._replace(change=read_change(told))
-
-    def _look(self) -> object:
-        """Tell versions of the file apart; None while there is none."""
-        try:
-            state = os.stat(self._place)
-        except OSError:
-            return None
-        return state.st_mtime_ns, state.st_ino, state.st_size
 
 
 class PeerName:

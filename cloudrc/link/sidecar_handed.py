@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError
+from cloudrc.link.route import version
 from cloudrc.link.sidecar_follow import Load, Loaded, ProfileFile
 from cloudrc.link.state import Change, read_change
 
@@ -78,7 +79,7 @@ class HandedProfile:
 
     def first(self, change: Change) -> Loaded | None:
         """Read what an earlier process was handed, if the ConfigMap here is as it was before."""
-        self._seen = self._look()
+        self._seen = version(self._path, follow=False)
         if self._seen is None:
             return None
         handed = self._open()
@@ -86,19 +87,12 @@ class HandedProfile:
 
     def poll(self) -> Loaded | None:
         """Read the document if it is another one; None if not, or if it is refused: logged."""
-        seen = self._look()
+        seen = version(self._path, follow=False)
         if seen == self._seen or seen is None:
             return None
         self._seen = seen
         handed = self._open()
         return self._unpack(handed) if handed else None
-
-    def _look(self) -> object:
-        try:
-            state = os.lstat(self._path)
-        except OSError:
-            return None
-        return state.st_mtime_ns, state.st_ino, state.st_size
 
     def _open(self) -> Handed | None:
         try:

@@ -10,7 +10,7 @@ import json
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
+from cloudrc.link.profile import DirectionProfile, mean_loss
 from cloudrc.link.timeline import Timeline
 
 STATE_FILE = "link.json"
@@ -109,13 +109,3 @@ def summary(profile: DirectionProfile) -> dict[str, float | None]:
     loss = 1.0 if first.blackout else mean_loss(first.loss)
     delay = round(first.delay_ns * 1e-9, 9)
     return {"delay": delay, "jitter": first.jitter, "loss": loss, "rate": first.rate}
-
-
-def mean_loss(loss: Loss) -> float:
-    """Give the loss in the long run, in [0, 1]."""
-    if not isinstance(loss, GilbertElliott):
-        return loss
-    if not loss.bad_start:
-        return loss.loss_good
-    bad = loss.bad_start / (loss.bad_start + loss.bad_end)
-    return bad * loss.loss_bad + (1.0 - bad) * loss.loss_good

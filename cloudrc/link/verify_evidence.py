@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from cloudrc.link.netem_tables import STRETCH
+from cloudrc.link.netem_tables import stretch
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 from cloudrc.link.verify_causes import Evidence
 
@@ -129,7 +129,7 @@ def netem_profile(options: Mapping[str, Any], told: DirectionProfile) -> Directi
     return replace(
         told,
         delay=float(delay.get("delay", 0.0)),
-        jitter=float(delay.get("jitter", 0.0)) / STRETCH.get(told.distribution, 1),
+        jitter=float(delay.get("jitter", 0.0)) / stretch(told),
         loss=loss,
         duplicate=float(options.get("duplicate", {}).get("duplicate", 0.0)),
         reorder=float(options.get("reorder", {}).get("reorder", 0.0)),

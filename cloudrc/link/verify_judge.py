@@ -82,7 +82,7 @@ def judge(
     reordered = _delay_row(
         "reordered", asked.reordered, said.reordered if said else None, measured.reordered, count
     )
-    rows.append(reordered._replace(unit="1", low=max(0.0, reordered.low)))
+    rows.append(reordered._replace(unit="1"))
     rows += _marked_rows(plan, measured, applied)
     if trains is not None:
         rows.append(_rate_row(trains, measured, applied))

@@ -8,13 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import ceil, nan
 
-from cloudrc.link.profile import Loss
+from cloudrc.link.profile import Loss, mean_loss
 from cloudrc.link.verify_expect import share_margin
 from cloudrc.link.verify_judge import Row, Verdict
 from cloudrc.link.verify_loss import bounds, plausible
 from cloudrc.link.verify_plan import is_told
 from cloudrc.link.verify_quantity import ALARM, MISS
-from cloudrc.link.verify_reference import mean_loss
 
 _FIRST, _STEP = 500, 1.3
 

@@ -14,8 +14,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.link.profile import GilbertElliott, Loss
-from cloudrc.link.verify_reference import bad_share, mean_loss
+from cloudrc.link.profile import GilbertElliott, Loss, bad_share, mean_loss
 
 Stretch: TypeAlias = tuple[int, Loss]
 """So many packets under one loss; a blackout is a loss of 1."""

@@ -13,9 +13,7 @@ from functools import cache
 from math import ceil
 from typing import NamedTuple
 
-import numpy as np
-
-from cloudrc.link.profile import DirectionProfile, Loss
+from cloudrc.link.profile import DirectionProfile, Loss, mean_loss
 from cloudrc.link.timeline import Timeline
 from cloudrc.link.verify_expect import (
     JITTER_SHARES_TAILED,
@@ -38,7 +36,7 @@ from cloudrc.link.verify_loss import (
     total,
 )
 from cloudrc.link.verify_quantity import ALARM, MISS
-from cloudrc.link.verify_reference import WIRE_BYTES, instants, mean_loss
+from cloudrc.link.verify_reference import WIRE_BYTES, instants, pieces_of
 
 RATES = (100.0, 200.0, 500.0, 1000.0, 2000.0, 50.0, 20.0)
 """Probes per second that are tried, the tunnel's own first. Slower than that is for links that keep
@@ -75,7 +73,6 @@ class Plan:
         schedule: Of the probes.
         expects: What they should measure.
         stretches: Packets under each loss, in order.
-        lost: How many may be lost.
         needs: Probes after which every quantity is decided.
     """
 
@@ -83,7 +80,6 @@ class Plan:
     schedule: Schedule
     expects: Expectation
     stretches: tuple[Stretch, ...]
-    lost: Bounds
     needs: int
 
     @property
@@ -95,11 +91,6 @@ class Plan:
     def duration(self) -> float:
         """Time that it takes to send them [s]."""
         return self.schedule.period * self.schedule.count
-
-    @property
-    def loss(self) -> float:
-        """Share of the probes that a true link loses in the mean, in [0, 1]."""
-        return mean_of(self.stretches)
 
 
 def make_plan(
@@ -191,7 +182,7 @@ def _plan(profile: DirectionProfile, period: float, wish: _Wish) -> Plan:
     needs = expects.needs()
     if not enough:
         needs = max(count + 1, needed(profile, expects))
-    return Plan(profile, schedule, expects, stretches, lost, needs)
+    return Plan(profile, schedule, expects, stretches, needs)
 
 
 def _periods(profile: DirectionProfile, size: int) -> list[float]:
@@ -236,11 +227,6 @@ def is_told(asked: list[Stretch], allowed: Bounds) -> bool:
 
 def stretches_of(profile: DirectionProfile, schedule: Schedule) -> Iterator[Stretch]:
     """Cut the probes into stretches of one loss."""
-    timeline, count = Timeline(profile), schedule.count
-    sent = instants(count, schedule.period, schedule.begin)
-    cuts = np.searchsorted(sent, np.array(timeline.starts_ns[1:]) * 1e-9).tolist()
-    edges = [0, *cuts, count]
-    for begin_ns, start, stop in zip(timeline.starts_ns, edges, edges[1:], strict=False):
-        now = timeline.at(begin_ns)
-        if stop > start:
-            yield stop - start, 1.0 if now.blackout else now.loss
+    sent = instants(schedule.count, schedule.period, schedule.begin)
+    for part, now in pieces_of(profile, sent):
+        yield part.stop - part.start, 1.0 if now.blackout else now.loss

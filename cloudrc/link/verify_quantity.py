@@ -10,7 +10,7 @@ approach", J. Pharmacokin. Biopharm. 15, 1987.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, inf, sqrt
+from math import ceil, sqrt
 from statistics import NormalDist
 
 MISS = 1e-3
@@ -76,4 +76,4 @@ def _quantile(skew: float) -> float:
     if skew < 1e-3:
         return _Z_ALARM
     cube = max(0.0, 1.0 + skew * _Z_ALARM / 6.0 - skew**2 / 36.0) ** 3
-    return min(2.0 / skew * (cube - 1.0), inf)
+    return 2.0 / skew * (cube - 1.0)

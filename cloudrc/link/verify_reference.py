@@ -7,6 +7,7 @@ against what was asked, not against what our model made of it.
 
 from __future__ import annotations
 
+from functools import cache
 from math import sqrt
 from statistics import NormalDist
 from typing import Any, NamedTuple, TypeAlias
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, bad_share
 from cloudrc.link.timeline import Conditions, Timeline
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -24,7 +25,6 @@ WIRE_BYTES = 28
 """IPv4 and UDP headers [bytes]. Source: RFC 791, RFC 768."""
 
 _GRID: Floats = np.linspace(-7.0, 7.0, 14_001)
-_CDF: Floats = np.array([NormalDist().cdf(z) for z in _GRID.tolist()])
 _PARETO_EXPONENT, _PARETO_CUT = 3.0, 1e-3
 
 
@@ -58,7 +58,7 @@ def draw(
         runs: How many links.
         rng: Chance.
     """
-    pieces = _pieces(profile, sent)
+    pieces = pieces_of(profile, sent)
     shape = (runs, len(sent))
     lost, extra = _losses(pieces, shape, rng)
     delay = np.maximum(0.0, _bases(pieces) + extra + _jitters(profile, pieces, shape, rng))
@@ -113,7 +113,7 @@ def overtaken(arrival: Floats, lost: Flags) -> Flags:
     return result & ~lost
 
 
-def _pieces(profile: DirectionProfile, sent: Floats) -> list[tuple[slice, Conditions]]:
+def pieces_of(profile: DirectionProfile, sent: Floats) -> list[tuple[slice, Conditions]]:
     """Cut the probes into stretches in which the same conditions hold."""
     timeline = Timeline(profile)
     cuts = np.searchsorted(sent, np.array(timeline.starts_ns[1:]) * 1e-9).tolist()
@@ -163,19 +163,6 @@ def _bad(loss: GilbertElliott, shape: tuple[int, int], rng: np.random.Generator)
     return states
 
 
-def bad_share(loss: GilbertElliott) -> float:
-    """Say which share of packets meets the bad state, in [0, 1]."""
-    return loss.bad_start / (loss.bad_start + loss.bad_end) if loss.bad_start else 0.0
-
-
-def mean_loss(loss: Loss) -> float:
-    """Say which share of packets is lost in the long run, in [0, 1]."""
-    if not isinstance(loss, GilbertElliott):
-        return loss
-    share = bad_share(loss)
-    return share * loss.loss_bad + (1.0 - share) * loss.loss_good
-
-
 def _jitters(
     profile: DirectionProfile,
     pieces: list[tuple[slice, Conditions]],
@@ -199,7 +186,7 @@ def _jitters(
 
 def _shaped(profile: DirectionProfile, normal: Floats) -> Floats:
     """Turn normal variates into those of a profile's distribution, ranks kept."""
-    share = np.interp(normal, _GRID, _CDF)
+    share = np.interp(normal, _GRID, _cdf())
     if profile.distribution == "uniform":
         return 2.0 * share - 1.0
     if profile.distribution == "table":
@@ -209,6 +196,12 @@ def _shaped(profile: DirectionProfile, normal: Floats) -> Floats:
     survival = 1.0 - (1.0 - low) * share
     mean = _moment(power, low)
     return (survival**power - mean) / sqrt(_moment(2.0 * power, low) - mean**2)
+
+
+@cache
+def _cdf() -> Floats:
+    """Normal distribution at `_GRID`; takes too long for those who only import this."""
+    return np.array([NormalDist().cdf(z) for z in _GRID.tolist()])
 
 
 def _moment(power: float, low: float) -> float:

@@ -10,12 +10,10 @@ import numpy as np
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.verify_corrupt import refusing
 from cloudrc.link.verify_estimate import frame_of
-from cloudrc.link.verify_expect import Schedule, as_sent, expect, share_margin
+from cloudrc.link.verify_expect import Schedule, as_sent, expect
 from cloudrc.link.verify_judge import Row, judge
-from cloudrc.link.verify_loss import bounds, mean_of
 from cloudrc.link.verify_measure import Log, measure
 from cloudrc.link.verify_plan import Plan, stretches_of
-from cloudrc.link.verify_quantity import MISS
 from cloudrc.link.verify_twin_rows import Pairs
 
 _BATCHES = 384
@@ -35,8 +33,7 @@ def judge_story(profile: DirectionProfile, pairs: Pairs, size: int) -> list[Row]
     expects = expect(profile, schedule, batches=_BATCHES)
     expects = as_sent(expects, profile, np.maximum.accumulate(pairs.sent), size)
     stretches = tuple(stretches_of(profile, schedule))
-    lost = bounds(stretches, share_margin(mean_of(stretches)), MISS)
-    plan = Plan(profile, schedule, expects, stretches, lost, expects.needs())
+    plan = Plan(profile, schedule, expects, stretches, expects.needs())
     measured = measure(_log(pairs), expects.over_time, frame=frame_of(profile, pairs.sent))
     return [row for row in judge(plan, measured) if row.name != "corrupted"]
 

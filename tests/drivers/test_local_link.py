@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,9 @@ WITHIN = 0.005
 """Of a median one-way delay, where other tests run beside this one [s]."""
 
 
-def test_link_set_acts_within_a_second_and_is_in_the_recording(tmp_path: Path) -> None:
+def test_link_set_acts_within_a_second_and_is_in_the_recording(
+    tmp_path: Path, figure: Callable[..., None]
+) -> None:
     folder = tmp_path / "run"
     command = [sys.executable, "-m", "cloudrc"]
     fly = [*command, "run", "hover", "--mode", "local", "--out", str(folder), "--set"]
@@ -43,8 +46,10 @@ def test_link_set_acts_within_a_second_and_is_in_the_recording(tmp_path: Path) -
     assert "link: downlink 120 ms (downlink.delay_ms=120, downlink.jitter_ms=0)" in output
     assert not (folder / "link").exists()
     documents = [json.loads(one.stdout) for one in done]
-    print("in force after", [document["seconds"] for document in documents])
-    assert max(document["seconds"] for document in documents) < 2.0
+    took = [document["seconds"] for document in documents]
+    figure("link set, local: in force after", min(took), "<=", 1.0, "s")
+    assert min(took) <= 1.0
+    assert max(took) < 2.0, "on a busy machine"
 
     numbers = json.loads((folder / "report.json").read_text())["numbers"]
     for way in ("uplink", "downlink"):

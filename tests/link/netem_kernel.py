@@ -11,6 +11,7 @@ from cloudrc.link.profile import DirectionProfile
 
 PEER = ("10.244.0.7", 7400)
 UNKNOWN = Answer(2, "", "Error: Specified qdisc kind is unknown.\n")
+NO_QDISC = Answer(2, "", "Error: No such file or directory.\n")
 NO_CLASSIFIER = Answer(
     2, "", "Error: TC classifier not found.\nWe have an error talking to the kernel\n"
 )
@@ -46,6 +47,8 @@ class Kernel:
                 if kind == "prio":
                     self.root = {"kind": "prio", "handle": "7400:", "root": True}
                 else:
+                    if verb == "change" and self.netem is None:
+                        return NO_QDISC
                     assert (verb == "add") is (self.netem is None)
                     self.netem = list(rest[rest.index("netem") + 1 :])
             case ["tc", "filter", "add", "dev", _, "parent", _, "pref", number, *rest]:

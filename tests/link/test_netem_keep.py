@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 from netem_kernel import PEER, Clock, Kernel
 
-from cloudrc.errors import CloudrcError
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.netem import Netem
 from cloudrc.link.netem_keep import FILTER_LOOKS
+from cloudrc.link.netem_tc import Answer
 from cloudrc.link.profile import Change, DirectionProfile
 
 PROFILE = DirectionProfile(0.04, loss=0.1)
@@ -115,18 +116,39 @@ def test_a_qdisc_of_somebody_else_stays_and_that_is_said_once() -> None:
 def test_a_time_line_goes_on_over_a_qdisc_that_was_removed() -> None:
     bench = Bench(DirectionProfile(0.04, changes=(Change(2.3, delay=0.2),)))
     bench.kernel._clear()
-    add = bench.kernel.run
-
-    def change_needs_one(words):  # type: ignore[no-untyped-def]
-        if "change" in words and bench.kernel.netem is None:
-            raise CloudrcError("No such file or directory")
-        return add(words)
-
-    bench.netem._iproute2._run = change_needs_one
     bench.step(0.5)
     assert bench.kernel.netem is not None
     assert "200000.000us" in bench.kernel.netem
     assert bench.restored == 1
+
+
+@pytest.mark.parametrize("damage", [remove_all, remove_leaf])
+@pytest.mark.parametrize("profile", [PROFILE, DirectionProfile(0.07)])
+def test_a_profile_that_comes_after_it_was_removed_is_in_force_at_once(
+    damage: Callable[[Kernel], None], profile: DirectionProfile
+) -> None:
+    bench = Bench()
+    damage(bench.kernel)
+    bench.netem.follow_profile(profile)
+    assert f"{profile.delay * 1e6:.3f}us" in (bench.kernel.netem or [])
+    assert bench.state()[2] == bench.whole[2]
+    assert bench.restored == 1
+
+
+def test_a_profile_is_refused_in_words_where_the_qdisc_goes_while_it_is_read_back() -> None:
+    bench = Bench()
+    run = bench.kernel.run
+
+    def gone_once_it_is_changed(words: Sequence[str]) -> Answer:
+        answer = run(words)
+        if "change" in words and not bench.log:
+            bench.kernel._clear()
+        return answer
+
+    bench.netem._iproute2._run = gone_once_it_is_changed
+    with pytest.raises(MissingPrerequisiteError, match="eth0 was removed by another hand"):
+        bench.netem.follow_profile(DirectionProfile(0.07))
+    assert bench.state() == bench.whole
 
 
 def test_what_was_counted_before_is_kept() -> None:

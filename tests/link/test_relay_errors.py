@@ -36,7 +36,6 @@ def test_percentiles_are_those_of_the_sample_to_one_bucket(scale: float) -> None
         true = np.quantile(sample, share, method="inverted_cdf")
         width = 1 << (10 if true < 1 << 20 else 16 if true < 1 << 26 else 26)
         assert true <= said * 1e9 <= true + width, name
-    assert errors.total_ns == sample.sum()
 
 
 def test_nothing_is_said_before_the_first() -> None:
@@ -66,7 +65,7 @@ def test_two_lanes_are_added_up() -> None:
     for part, late_ns in zip(parts, (5_000, 400 * MS), strict=True):
         part.observe(late_ns)
     both = ReleaseErrors.together(parts)
-    assert both.total_ns == 400_005_000
+    assert both.count == 2
     assert both.quantiles()["release_error_p50"] < 6e-6
     assert 0.4 < both.quantiles()["release_error_p99"] < 0.47
 

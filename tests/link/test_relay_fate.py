@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from link_flows import SIZE
 
+from cloudrc.config.shipped import names
 from cloudrc.link.model import LinkDirection
+from cloudrc.link.trace_packets import write_trace
 from cloudrc.tunnel.codec import Kind
 from tools.bench_link.anchors import fifo_allowed
 from tools.bench_link.flow import EPOCH, Flow, run_flow
@@ -21,8 +23,7 @@ from tools.bench_link.profiles import (
     correlation,
     measure,
     profiles_of,
-    shipped,
-    write_trace,
+    random_walk,
 )
 from tools.bench_link.relays import ours
 
@@ -31,6 +32,10 @@ STEADY = ("lossy", "paper-p3")
 """Without queue, kept order or time line: the fate does not depend on the instant of sending."""
 PATIENCE = 5e-3
 """With a busy machine [s]; what the relay can do is measured by `make bench-link`."""
+AT_ONCE = 1e-3
+"""Where the machine lets the relay run first [s]."""
+SWAPPED = 0.01
+"""Share of neighbours that may come the other way round, where something is taken in late [1]."""
 LIVELY: dict[str, object] = {
     "profile": "ideal",
     "uplink": {"delay_ms": 20, "jitter_ms": 15, "duplicate": 0.2, "loss": 0.2, "reorder": 0.1},
@@ -69,11 +74,13 @@ def test_a_relay_run_draws_the_virtual_sequence(tmp_path: Path, name: str) -> No
 
 
 def check(folder: Path, links: Links, seconds: float, *, exact: bool) -> None:
-    for row in measure(folder, links, seconds, fifo=exact and fifo_allowed()):
+    fifo = fifo_allowed()
+    for row in measure(folder, links, seconds, fifo=fifo):
         judged, where = row.judged, f"{row.name} {row.direction}"
         assert judged.wrongly_lost == judged.wrongly_arrived == 0, where
         assert judged.errors.min() >= 0.0, where
-        assert np.median(judged.errors) < PATIENCE, where
+        assert np.median(judged.errors) < (AT_ONCE if fifo else PATIENCE), where
+        assert judged.swapped <= SWAPPED * judged.errors.size, where
         if exact:
             assert judged.swapped == 0, where
             assert judged.errors.mean() <= 0.3e-3, where
@@ -84,7 +91,7 @@ def check(folder: Path, links: Links, seconds: float, *, exact: bool) -> None:
 
 
 def replay(folder: Path) -> dict[str, object]:
-    write_trace(folder / "trace.csv", 60.0)
+    (folder / "trace.csv").write_text(write_trace(random_walk(60.0)))
     return {"profile": "ideal", "uplink": {"trace": str(folder / "trace.csv")}}
 
 
@@ -96,5 +103,5 @@ def test_a_slice_of_profiles_with_queue_and_kept_order(tmp_path: Path) -> None:
 
 @pytest.mark.full
 def test_every_shipped_profile_for_a_minute(tmp_path: Path) -> None:
-    links: Links = {name: {"profile": name} for name in shipped()}
+    links: Links = {name: {"profile": name} for name in names("profile")}
     check(tmp_path, links | {"trace": replay(tmp_path)}, 60.0, exact=True)

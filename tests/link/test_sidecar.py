@@ -2,131 +2,24 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+from errno import ENOSPC
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from sidecar_bench import PEER, REFUSED, Bench, told
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.link import sidecar
+from cloudrc.link.netem_text import notes
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.sidecar import Machine, Mode, Settings, Sidecar
+from cloudrc.link.route import publish
+from cloudrc.link.sidecar import Mode
 from cloudrc.link.sidecar_follow import Loaded
 from cloudrc.link.state import Change
 
-PEER, NEXT = ("10.244.0.7", 7400), ("10.244.0.9", 7400)
+NEXT = ("10.244.0.9", 7400)
 NO_NETEM = MissingPrerequisiteError("this kernel has no sch_netem; set link.mode=relay")
-REFUSED = BadInputError("netem cannot do delay_ms above 274000 (far); set link.mode=relay")
-
-
-class Shaper:
-    def __init__(self, bench: Bench, name: str, refuses: Exception | None = None) -> None:
-        self.name = name
-        self._bench = bench
-        self._refuses = refuses
-
-    def follow_peer(self, peer: tuple[str, int]) -> tuple[str, int]:
-        if self._refuses:
-            raise self._refuses
-        self._bench.did.append(f"{self.name} {peer[0]}")
-        return peer if self.name == "netem" else ("127.0.0.1", 7401)
-
-    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        if self.name == "netem" and profile.delay == 9.0:
-            raise REFUSED
-        again = " from now" if restart else ""
-        self._bench.did.append(f"{self.name} {profile.delay:g} s{again}")
-
-    def step(self, timeout: float) -> None:
-        assert timeout <= 0.1
-        self._bench.wait(timeout)
-
-    def counts(self) -> dict[str, int]:
-        return {"forwarded": len(self._bench.did)}
-
-    def released(self) -> dict[str, int]:
-        return {"released": 1, "overflow": 0} if self.name == "relay" else {}
-
-    def close(self) -> None:
-        self._bench.did.append(f"{self.name} closes")
-
-
-class Bench:
-    """A sidecar whose time passes in `wait`, where what is planned happens."""
-
-    def __init__(
-        self,
-        folder: Path,
-        mode: Mode,
-        refuses: Exception | None = None,
-        may_shape: bool = True,
-        profile: DirectionProfile | None = None,
-    ) -> None:
-        self.did: list[str] = []
-        self.log: list[str] = []
-        self.now_ns = 0
-        self.plan: list[tuple[float, Callable[[], None]]] = []
-        self.counted_ns: list[int] = []
-        self.origins_ns: list[int] = []
-        self.delays: list[float] = []
-        self.no_netem: Exception | None = None
-        self.route, self.state = folder / "route", folder / "link.json"
-        machine = Machine(
-            relay=lambda _, origin_ns: self.make("relay", origin_ns),
-            netem=lambda asked, origin_ns: self.make(
-                "netem", origin_ns, REFUSED if asked.delay == 9.0 else refuses
-            ),
-            may_shape=may_shape,
-            try_netem=self.try_netem,
-            clock=lambda: self.now_ns,
-            today=lambda: "2026-01-02T03:04:05+00:00",
-            wait=self.wait,
-            log=self.log.append,
-        )
-        settings = Settings(mode, "uplink", self.route, self.state)
-        loaded = Loaded(profile or DirectionProfile(), {"description": "nothing"})
-        self.sidecar = Sidecar(settings, machine, loaded, self)
-        self.sidecar.peer = PEER
-
-    def make(self, name: str, origin_ns: int, refuses: Exception | None = None) -> Shaper:
-        self.origins_ns.append(origin_ns)
-        return Shaper(self, name, refuses)
-
-    def try_netem(self) -> None:
-        if self.no_netem:
-            raise self.no_netem
-
-    def at(self, time: float, action: Callable[[], None]) -> None:
-        self.plan.append((time, action))
-
-    def wait(self, duration: float) -> None:
-        self.now_ns += round(duration * 1e9)
-        for entry in [one for one in self.plan if one[0] * 1e9 <= self.now_ns]:
-            self.plan.remove(entry)
-            entry[1]()
-
-    def run(self, until: float = 3.0) -> Bench:
-        self.sidecar.run(lambda: self.now_ns >= until * 1e9)
-        return self
-
-    def shapes(self, shaper: str) -> None:
-        self.did.append(f"metric {shaper}")
-
-    def asked(self, delay: float) -> None:
-        self.delays.append(delay)
-
-    def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
-        self.counted_ns.append(stamp_ns)
-
-    def replace(self, delay: float, change: Change = Change()) -> None:  # noqa: B008
-        values = {"description": f"{delay:g} s"}
-        self.sidecar.profile = Loaded(DirectionProfile(delay), values, change)
-
-
-def told(bench: Bench) -> dict[str, object]:
-    found: dict[str, object] = json.loads(bench.state.read_text())
-    return found
 
 
 def test_relay_touches_no_netem_and_leaves_no_route(tmp_path: Path) -> None:
@@ -287,6 +180,39 @@ def test_a_profile_that_netem_cannot_do_is_refused_or_takes_the_relay(tmp_path: 
         assert bench.run().did[-1] == did
         assert any("netem cannot do delay_ms" in line for line in bench.log)
         assert told(bench)["shaper"] == did.split()[0]
+
+
+@pytest.mark.parametrize("mode", ["netem", "relay"])
+def test_what_netem_does_otherwise_is_said_of_every_profile_it_shapes_by(
+    tmp_path: Path, mode: Mode
+) -> None:
+    first, later = DirectionProfile(corrupt=0.1), DirectionProfile(corrupt=0.2)
+    bench = Bench(tmp_path, mode, profile=first)
+    bench.at(1.0, lambda: setattr(bench.sidecar, "profile", Loaded(later, {})))
+    bench.run()
+    said = [line for line in bench.log if "corrupt" in line]
+    assert said == (notes(first) + notes(later) if mode == "netem" else [])
+
+
+def test_a_full_disk_ends_nothing_and_the_state_is_told_once_it_has_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path, "netem")
+    full = {"is": False}
+
+    def write(path: Path, text: str) -> None:
+        if full["is"]:
+            raise OSError(ENOSPC, "No space left on device")
+        publish(path, text)
+
+    monkeypatch.setattr(sidecar, "publish", write)
+    bench.at(1.0, lambda: full.update({"is": True}))
+    bench.at(1.1, lambda: bench.replace(0.5))
+    bench.at(2.5, lambda: bench.replace(9.0, Change("b2", "far")))
+    bench.at(5.0, lambda: full.update({"is": False}))
+    state = told(bench.run(until=7.0))
+    assert (state["changes"], state["refused"]) == (1, "b2")
+    assert state["profile"] == {"description": "0.5 s"}
 
 
 def test_it_counts_once_a_second(tmp_path: Path) -> None:

@@ -9,12 +9,11 @@ from virtual_probes import Asked, probe
 
 from cloudrc.cli.link_verify_notes import notes
 from cloudrc.cli.link_verify_probes import PROBE, TRAIN, Probes
-from cloudrc.link.profile import Change, DirectionProfile, GilbertElliott, Trace
+from cloudrc.link.profile import Change, DirectionProfile, GilbertElliott, Trace, mean_loss
 from cloudrc.link.verify_causes import find_causes
 from cloudrc.link.verify_corrupt import refusing
 from cloudrc.link.verify_expect import JITTER_SHARES
 from cloudrc.link.verify_plan import make_plan
-from cloudrc.link.verify_reference import mean_loss
 
 DAMAGING = DirectionProfile(0.02, 0.01, corrupt=0.1)
 

@@ -65,6 +65,12 @@ def test_bursts_and_rates_are_read_from_tc() -> None:
     assert netem_profile({"rate": {"rate": 12.5e9}}, DirectionProfile()).rate is None, "for order"
 
 
+def test_the_jitter_of_a_measured_table_is_told_without_its_stretch() -> None:
+    told = DirectionProfile(0.04, 0.01, distribution="table", table=(-1.0, 0.0, 5.0))
+    options = {"delay": {"delay": 0.04, "jitter": 0.02}}
+    assert netem_profile(options, told).jitter == pytest.approx(0.01)
+
+
 def test_metrics_tell_of_lateness_and_of_qdiscs_that_were_put_back() -> None:
     text = (
         'cloudrc_link_release_error_seconds{percentile="99"} 0.0021\n'

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 from link_flows import PERIOD_NS, flow
 
-from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
+from cloudrc.link.profile import (
+    Blackout,
+    Change,
+    DirectionProfile,
+    GilbertElliott,
+    Trace,
+    mean_loss,
+)
 from cloudrc.link.verify_loss import believed, bounds, chances, spread
-from cloudrc.link.verify_reference import Fates, draw, instants, mean_loss, overtaken
+from cloudrc.link.verify_reference import Fates, draw, instants, overtaken
 
 COUNT = 30_000
 BURSTS = GilbertElliott(0.02, 0.2, 0.7, 0.01, 0.030)

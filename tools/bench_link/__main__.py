@@ -16,12 +16,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from cloudrc.cli.output import table
+from cloudrc.config.shipped import names
 from cloudrc.errors import CloudrcError
+from cloudrc.link.trace_packets import write_trace
 from tools.bench_link import report
 from tools.bench_link.anchors import compile_anchors, fifo_allowed, wake_lateness
 from tools.bench_link.draws import measure_bursts
 from tools.bench_link.overload import measure_overload
-from tools.bench_link.profiles import Links, measure, shipped, write_trace
+from tools.bench_link.profiles import Links, measure, random_walk
 from tools.bench_link.release import measure_releases, measure_throughput
 from tools.bench_link.report import TRACE, Line
 
@@ -66,9 +68,9 @@ def _measure(
             lines += report.throughput(measure_throughput(folder, programs[1], *floods))
         elif stage == "profiles":
             seconds = 6.0 if quick else 60.0
-            write_trace(folder / "trace.csv", 60.0)
+            (folder / "trace.csv").write_text(write_trace(random_walk(60.0)))
             trace = {"trace": str(folder / "trace.csv")}
-            links: Links = {name: {"profile": name} for name in shipped()}
+            links: Links = {name: {"profile": name} for name in names("profile")}
             links[TRACE] = {"profile": "ideal", "uplink": trace, "downlink": trace}
             with ThreadPoolExecutor(1) as pool:  # what the machine does in the same minute
                 count = round(1000 * (seconds + STARTING))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -15,7 +14,7 @@ import numpy as np
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_experiment
-from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.profile import DirectionProfile, Trace
 from tools.bench_link.flow import Flow, Way, run_flow
 from tools.bench_link.judge import Judged, judge
 from tools.bench_link.relays import ours
@@ -63,14 +62,6 @@ class Task:
     begin: float
 
 
-def shipped() -> list[str]:
-    """Names of the profiles that ship."""
-    import cloudrc.link
-
-    folder = Path(cloudrc.link.__file__).parent / "profiles"
-    return sorted(path.stem for path in folder.glob("*.yaml"))
-
-
 def measure(
     folder: Path, links: Links, duration: float, rate: float = 100.0, *, fifo: bool = False
 ) -> list[Row]:
@@ -112,15 +103,13 @@ def profiles_of(folder: Path, link: dict[str, object]) -> tuple[DirectionProfile
     return link_profile(experiment.uplink), link_profile(experiment.downlink)
 
 
-def write_trace(path: Path, duration: float) -> None:
-    """Write a trace of delays: a random walk about 40 ms in steps of 0.1 s, seeded."""
-    generator, delay = np.random.default_rng(5), 40.0
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(("time_s", "delay_ms"))
-        for number in range(round(duration * 10)):
-            delay = min(max(delay + 4.0 * generator.standard_normal(), 5.0), 120.0)
-            rows.writerow((f"{number / 10:.1f}", f"{delay:.3f}"))
+def random_walk(duration: float) -> Trace:
+    """Make a trace of delays: a random walk about 40 ms in steps of 0.1 s, seeded."""
+    generator, delays = np.random.default_rng(5), [0.040]
+    for _ in range(round(duration * 10)):
+        delay = delays[-1] + 0.004 * generator.standard_normal()
+        delays.append(round(min(max(delay, 0.005), 0.120), 6))
+    return Trace(tuple(number / 10 for number in range(len(delays))), tuple(delays))
 
 
 def correlation(judged: Judged, trace: DirectionProfile) -> float:

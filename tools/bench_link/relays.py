@@ -6,11 +6,11 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
+from cloudrc.drivers.realtime import free_ports
 from tools.bench_link.flow import Address, Way
 
 HERE = Path(__file__).parent
@@ -21,13 +21,7 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 
 def free_addresses(count: int) -> list[Address]:
     """UDP addresses on 127.0.0.1 that nobody uses now."""
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
-    for one in sockets:
-        one.bind(("127.0.0.1", 0))
-    found = [("127.0.0.1", int(one.getsockname()[1])) for one in sockets]
-    for one in sockets:
-        one.close()
-    return found
+    return [("127.0.0.1", port) for port in free_ports(count)]
 
 
 class Process:
