@@ -54,10 +54,12 @@ faults: $(VENV)/dev ## bring every fault about, compose 200 at random; writes do
 	$(bin)/cloudrc faults fuzz --adversarial --seeds 200 --jobs $(JOBS) \
 		--document docs/safety/adversary.md $(STORE)
 
-figures: $(VENV)/dev ## print the numbers of link and safety that tests have measured: asked, measured, of how many
+figures: $(VENV)/dev ## print the numbers that tests have measured: asked, measured, of how many
 	$(bin)/python tools/figures.py
 
-nightly: $(VENV)/dev ## run every test, with the full numbers, and 500 hours of faults
+# The cluster comes last: without Docker, kind, helm and kubectl all else is done.
+nightly: $(VENV)/dev ## run all tests but netem's, 500 hours of faults, e2e-full (needs what e2e needs)
+	rm -rf build/figures
 	$(bin)/pytest -n auto -m 'not process and not e2e and not netem'
 	$(bin)/pytest -m process
 	$(bin)/cloudrc faults run --all --real
@@ -66,6 +68,7 @@ nightly: $(VENV)/dev ## run every test, with the full numbers, and 500 hours of 
 	$(bin)/cloudrc faults fuzz --seeds 30000 --jobs $(JOBS) $(STORE)
 	$(bin)/python tools/figures.py
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
+	$(MAKE) e2e-full
 
 lint: $(VENV)/dev ## check format and rules
 	$(bin)/ruff format --check .

@@ -32,7 +32,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "drivers": {"endpoint", "tunnel", "link", "metrics", "config", "exposition"},
     "record": {"endpoint"},
     "metrics": {"record", "config", "geometry", "plugins"},
-    "report": {"record", "metrics", "config", "geometry"},
+    "report": {"record", "metrics", "config", "geometry", "link"},
     "cluster": {"config"},
     "assembly": EVERYTHING,
     "faults": EVERYTHING,

@@ -87,3 +87,28 @@ def test_the_continuous_integration_calls_what_a_user_calls() -> None:
     assert called == steps.split()
     assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
     subprocess.run(["bash", "-n", str(ROOT / ".ci" / "run")], check=True)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob(".github/workflows/*"))],
+    ids=lambda p: p.name,
+)
+def test_the_targets_that_are_named_exist(path: Path) -> None:
+    targets = set(re.findall(r"^([a-z0-9-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    lines = re.findall(
+        r"^\W*(?:run: |sudo )*make ((?:[a-z0-9-]+ ?)+)", path.read_text(), re.MULTILINE
+    )
+    named = {target for line in lines for target in line.split()}
+    assert named
+    assert named <= targets
+
+
+def test_a_night_runs_every_mark_but_that_of_netem() -> None:
+    """It begins without the numbers of older commits, and ends with what needs a cluster."""
+    plan = subprocess.run(
+        ["make", "-n", "-C", str(ROOT), "nightly"], check=True, capture_output=True, text=True
+    ).stdout.splitlines()
+    words = [re.sub(r"\S*/bin/", "", line).strip() for line in plan]
+    assert words.index("rm -rf build/figures") < words.index("pytest -m process")
+    assert [w for w in words if w.startswith("pytest")][-1].startswith("pytest -m e2e ")

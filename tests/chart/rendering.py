@@ -158,13 +158,13 @@ def of_kind(objects: Iterable[Object], kind: str) -> dict[str, Object]:
 
 
 def pod_specs(objects: Iterable[Object]) -> dict[str, Object]:
-    """Pods of every object that makes one, by its component."""
+    """Pods of every object that makes one, by its component; one on its own by its container."""
     specs = {}
     for thing in objects:
         if thing["kind"] in ("Deployment", "Job"):
             specs[component(thing)] = thing["spec"]["template"]["spec"]
         elif thing["kind"] == "Pod":
-            specs[component(thing)] = thing["spec"]
+            specs[thing["spec"]["containers"][0]["name"]] = thing["spec"]
     return specs
 
 

@@ -30,7 +30,7 @@ def breaches(pod: Object) -> list[str]:
     for key in ("hostNetwork", "hostPID", "hostIPC"):
         if pod.get(key):
             found.append(f"pod: {key}")
-    for volume in pod["volumes"]:
+    for volume in pod.get("volumes", ()):
         if not VOLUMES & volume.keys():
             found.append(f"pod: volume {volume['name']}")
     for name, container in containers(pod).items():
@@ -52,7 +52,7 @@ def test_a_release_passes_restricted_with_the_relay(path: Path) -> None:
     values = {**values_of(path)}
     values["link"] = {**values.get("link", {}), "mode": "relay"}
     pods = pod_specs(render(values))
-    assert {"world", "cloud", "test"} <= pods.keys()
+    assert {"world", "cloud", "test", "test-link"} <= pods.keys()
     assert {name: breaches(pod) for name, pod in pods.items() if breaches(pod)} == {}
 
 
@@ -68,6 +68,7 @@ def test_netem_adds_one_capability_to_one_container(mode: str) -> None:
         "world": expected,
         "cloud": expected,
         "test": [],
+        "test-link": [],
     }
     link = containers(pods["world"])["link"]["securityContext"]
     assert link["capabilities"] == {"drop": ["ALL"], "add": ["NET_ADMIN"]}

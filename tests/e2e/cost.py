@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
 from kube import NAMESPACE, command, eventually, pod
 
@@ -47,9 +46,7 @@ def usage() -> Usage:
 
 def cost_between(before: Usage, after: Usage) -> Cost:
     """What was used per second from one reading to a later one."""
-    newest: dict[str, Any] = after
-    if any(newest[name][0] <= before[name][0] for name in before):
-        newest = eventually(lambda: _later(before), "the kubelet has measured again", 30.0)
+    newest = after if _is_later(after, before) else later(before)
     containers = {
         name: ((used - before[name][1]) / (at - before[name][0]), memory)
         for name, (at, used, memory) in newest.items()
@@ -59,9 +56,19 @@ def cost_between(before: Usage, after: Usage) -> Cost:
     return Cost(cpu, memory, containers)
 
 
-def _later(before: Usage) -> Usage | None:
-    now = usage()
-    return now if all(now[name][0] > before[name][0] for name in before) else None
+def later(before: Usage) -> Usage:
+    """Read the counters once the kubelet has measured all containers again."""
+
+    def look() -> Usage | None:
+        now = usage()
+        return now if _is_later(now, before) else None
+
+    found: Usage = eventually(look, "the kubelet has measured again", 30.0)
+    return found
+
+
+def _is_later(one: Usage, other: Usage) -> bool:
+    return all(one[name][0] > other[name][0] for name in other)
 
 
 def _address(node: str) -> str:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cost import Cost, cost_between, usage
 from kube import (
     CHART,
     EXAMPLES,
@@ -26,20 +25,12 @@ from kube import (
     missions,
     pod,
     pods,
-    read,
     scrapes,
     value,
 )
 from neighbours import MONITORING, Prometheus, install_prometheus, promtool, rules_tried, stranger
 
 MISSION = "paper-mission"
-ASKED_CPU = 0.200
-"""Of all containers of a release in flight, on an idle machine [cores]; printed beside the cost."""
-LIMIT_CPU = 0.400
-"""Above this something is wrong on any machine [cores]: the same release has cost from 89m to 220m
-on one and the same machine, by what a wake costs there at the time."""
-LIMIT_MEMORY = 320 * 2**20
-"""Likewise [bytes]."""
 LIMIT_TIME = 360.0
 """From `kind create cluster` to a Job that is Complete [s]."""
 
@@ -50,7 +41,6 @@ class FirstFlight:
 
     paper: JobEnd
     second: JobEnd
-    cost: Cost
     opened: list[str]
     knocks: float
     own_knocks: float
@@ -68,7 +58,6 @@ def prometheus(installed: None, prometheus_image: str) -> None:
 def first(prometheus: None) -> FirstFlight:
     kubectl("apply", f"--filename={EXAMPLES / 'mission-paper.yaml'}")
     eventually(lambda: "waypoint 1 of 7" in job_log(MISSION), "the mission flies", 60.0)
-    before = usage()
     fly("second", [{"position_m": [0.5, 0.0, 0.7]}])
     second = job_end("second", 30.0)
     doors = {
@@ -79,9 +68,8 @@ def first(prometheus: None) -> FirstFlight:
     knocks = malformed()
     paper = job_end(MISSION)
     seconds = time.monotonic() - TIMES["create"]
-    cost = cost_between(before, usage())
     knock_from_the_cloud_pod()
-    return FirstFlight(paper, second, cost, opened, knocks, malformed(), seconds)
+    return FirstFlight(paper, second, opened, knocks, malformed(), seconds)
 
 
 DOORS = {"world": (9100, 9102), "cloud": (8080, 9100, 9101, 9102)}
@@ -207,16 +195,3 @@ def test_prometheus_answers(asked: Ask, query: str, series: int, low: float, hig
     answers = [float(sample["value"][1]) for sample in asked(query)]
     assert len(answers) == series
     assert all(math.isfinite(a) and low <= a <= high for a in answers), answers
-
-
-def test_a_release_is_cheap(first: FirstFlight, note: Callable[[str], None]) -> None:
-    cost = first.cost
-    note(
-        f"one release in flight: {cost.cpu * 1000:.0f}m CPU, {cost.memory / 2**20:.0f} MiB"
-        f" (asked on an idle machine: {ASKED_CPU * 1000:.0f}m, {LIMIT_MEMORY / 2**20:.0f} MiB)"
-    )
-    for name, (cpu, memory) in sorted(cost.containers.items()):
-        note(f"  {name:<14} {cpu * 1000:4.0f}m CPU  {memory / 2**20:4.0f} MiB")
-    assert cost.cpu <= LIMIT_CPU
-    assert cost.memory <= LIMIT_MEMORY
-    assert read("pods")["items"]
