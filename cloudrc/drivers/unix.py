@@ -46,10 +46,6 @@ class UnixPeer:
             self._socket.close()
             raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
 
-    def fileno(self) -> int:
-        """For `select`."""
-        return self._socket.fileno()
-
     def receive(self) -> list[bytes]:
         """Everything that waits in the socket."""
         datagrams: list[bytes] = []

@@ -167,6 +167,23 @@ def test_what_is_asked_for_comes_before_what_has_arrived(peers):
     assert machine.seen == ["asked", POINT]
 
 
+def test_of_what_has_arrived_meanwhile_the_newest_counts(peers):
+    machine, stops = Machine(), iter([False, True])
+    newest = Setpoint((3.0, 2.0, 1.0))
+    for data in (encode(POINT), encode(newest), b"rubbish"):
+        peers[1].send(data)
+    serve_teleop(
+        machine,
+        peers[0],
+        encode,
+        decode,
+        calls=list,
+        tell=lambda told: None,
+        stop=lambda: next(stops),
+    )
+    assert (machine.seen, machine.deadlines) == ([newest], 1)
+
+
 def test_events_wait_for_a_cloud_that_is_away_and_keep_their_order(peers, service, tmp_path):
     _, cloud = peers
     cloud.close()
