@@ -23,10 +23,10 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio websockets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process e2e e2e-full test-netem faults figures nightly lint types bench bench-link pictures docs images kind-load lock chart-docs clean
+.PHONY: help demo test process e2e e2e-full test-netem test-netem-full faults figures nightly lint types bench bench-link pictures docs images kind-load lock chart-docs clean
 
 help: ## print this list
-	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(VENV)/all ## fly the paper's mission in real time and write its report
 	$(bin)/cloudrc run $(EXPERIMENT) --mode local
@@ -46,6 +46,9 @@ e2e-full: $(VENV)/dev ## the same with every fault of the cluster's suite, its S
 
 # Without root or sch_netem pytest exits with 3; make turns every failure into its own 2.
 test-netem: $(VENV)/dev ## run the tests of the kernel's netem; needs root and sch_netem
+	$(bin)/pytest -m 'netem and not full' -rP tests/link
+
+test-netem-full: $(VENV)/dev ## the same, and every shipped profile for a minute
 	$(bin)/pytest -m netem -rP tests/link
 
 faults: $(VENV)/dev ## bring every fault about, compose 200 at random; writes docs/safety/faults.md

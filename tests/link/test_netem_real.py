@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -12,17 +13,23 @@ from typing import Literal
 import netem_laboratory as lab
 import numpy as np
 import pytest
+from link_flows import SIZE
 from netem_laboratory import WITHIN, Flow, least, measure, told
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.link.model import LinkDirection
 from cloudrc.link.netem import Netem
 from cloudrc.link.netem_tables import STRETCH, table
 from cloudrc.link.netem_text import check
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
+from cloudrc.link.trace_sample import Numbers, Stream, numbers
+from cloudrc.tunnel.codec import Kind
 
+STEADY = [name for name in names("profile") if name not in ("lossy", "handover")]
+"""netem refuses the first; the second changes, which `test_netem_timeline_real` looks at."""
 Distribution = Literal["uniform", "normal", "pareto"]
 pytestmark = pytest.mark.netem
 
@@ -78,6 +85,51 @@ def test_losses_come_in_bursts(shaped: Netem) -> None:
     told("gemodel", loss=len(lost) / 2000, burst=len(lost) / bursts)
     assert len(lost) / 2000 == pytest.approx(1 / 6, abs=0.07)
     assert 2.5 < len(lost) / bursts < 6.5
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", STEADY)
+def test_a_shipped_profile_for_a_minute(
+    shaped: Netem, name: str, figure: Callable[..., None]
+) -> None:
+    """Mean, loss and order are those that the model draws for the same instants of sending."""
+    profile = link_profile(load_profile(name).uplink)
+    shaped.follow_profile(profile)
+    found: list[Flow] = []
+    drawn: list[Numbers] = []
+
+    def off() -> float:
+        tunnel, stranger = Flow(), Flow(port=7402)
+        tunnel.send(6000, 0.01, meanwhile=lambda: stranger.send(1, 0.0))
+        found[:] = [tunnel.settle()]
+        drawn[:] = [drawn_for(tunnel, profile, seed) for seed in range(20)]
+        beside, mean = stranger.settle().delays().mean(), tunnel.delays().mean()
+        asked = float(np.mean([each.mean for each in drawn]))
+        told(f"{name} for a minute", asked=asked, measured=mean, other_port=beside)
+        return float(abs(mean - beside - asked))
+
+    error = least(off, WITHIN)
+    figure("netem, a minute of a profile: mean off by", 1e3 * error, "<=", 1e3 * WITHIN, "ms")
+    assert error <= WITHIN
+    order = np.array(found[0].numbers())
+    loss = 1 - len(set(found[0].numbers())) / 6000
+    overtaken = float(np.mean(np.maximum.accumulate(order)[:-1] > order[1:]))
+    for what, measured in (("loss", loss), ("overtaken", overtaken)):
+        values = np.array([getattr(each, what) for each in drawn])
+        told(f"{name}: {what}", asked=values.mean(), measured=measured)
+        assert abs(measured - values.mean()) <= 5 * values.std() + 0.003, what
+
+
+def drawn_for(flow: Flow, profile: DirectionProfile, seed: int) -> Numbers:
+    """What the model does to packets that are sent when those of a flow were."""
+    sent_ns = [at_ns - flow.sent_ns[0] for at_ns in flow.sent_ns]
+    model = LinkDirection(profile, seed, True)
+    fates = [model.send(1, int(Kind.TELEMETRY), n, SIZE, at_ns) for n, at_ns in enumerate(sent_ns)]
+    delays = [
+        (min(f) - at_ns) * 1e-9 if f else np.nan for f, at_ns in zip(fates, sent_ns, strict=True)
+    ]
+    copies = np.array([len(fate) for fate in fates])
+    return numbers(Stream(np.array(sent_ns) * 1e-9, np.array(delays), copies))
 
 
 def test_a_change_in_flight_loses_nothing(shaped: Netem) -> None:
