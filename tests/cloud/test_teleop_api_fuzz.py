@@ -175,6 +175,8 @@ def fuzz(api, examples, check):
 def as_operator(api, client, examples):
     def check(method, path, body, header):
         status = client.ask(method, path, body, header, OPERATOR)
+        if status == 503:  # the machine is busy; that is what the answer asks for
+            status = client.ask(method, path, body, header, OPERATOR)
         assert not api.complaints, (method, path, body, api.complaints)
         assert 200 <= status < 500, (method, path, body, status)
         assert api.gate.counts["failed"] == 0

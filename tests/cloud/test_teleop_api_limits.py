@@ -141,6 +141,18 @@ def test_a_body_that_does_not_come_is_not_waited_for(monkeypatch):
         connection.close()
 
 
+def test_a_client_that_leaves_in_the_middle_of_its_body_is_no_fault_of_the_api():
+    with running() as one:
+        one.until(lambda: one.gate.counts["served"] == 1)  # `running` has asked once
+        connection = connect(one)
+        connection.sendall(head("POST", "/v1/missions", "Content-Length: 100") + b"{")
+        time.sleep(0.1)
+        connection.close()
+        one.until(lambda: one.gate.counts.total() == 2)
+        assert one.gate.counts["failed"] == 0
+        assert one.complaints == []
+
+
 @pytest.mark.promise("P-API-10")
 def test_a_body_that_says_it_is_too_long_is_not_read():
     with running() as one:

@@ -7,6 +7,7 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from starlette.requests import ClientDisconnect
 
 from cloudrc.cloud.teleop.api_check import RefusedError, as_json
 from cloudrc.cloud.teleop.api_models import Refusal
@@ -79,6 +80,10 @@ def handle_errors(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def fail(request: Request, error: Exception) -> JSONResponse:
         return JSONResponse({"detail": "the API failed; see teleop's log"}, 500)
+
+    @app.exception_handler(ClientDisconnect)
+    async def gone(request: Request, error: ClientDisconnect) -> JSONResponse:
+        return JSONResponse({"detail": "the client has left"}, 400)  # for the audit log alone
 
     @app.exception_handler(TimeoutError)
     async def too_late(request: Request, error: TimeoutError) -> JSONResponse:
