@@ -19,6 +19,8 @@ from cloudrc.records import Fault, MissionEvent
 
 PERIOD_NS = 20_000_000
 """Between two deadlines of teleop's machine [ns]."""
+TELL_NS = PERIOD_NS - 5_000_000
+"""Teleop is told what is seen no more often than this [ns]: every second telemetry."""
 SILENCE_NS = 1_000_000_000
 """Teleop speaks at 10 Hz; without a word for so long it is taken to be away [ns]."""
 EVENTS_KEPT = 256
@@ -59,12 +61,15 @@ class RemoteTeleop:
         """Join the socket; teleop has a second from `start_ns` [ns] to speak."""
         self._peer, self._encode, self._decode = peer, encode, decode
         self._heard_ns, self._silent = start_ns, False
+        self._tell_ns = start_ns
         self.outputs: list[Any] = []
         self.malformed = 0
 
     def see(self, seen: Any, now_ns: int) -> None:
-        """Tell teleop what is seen, if it listens."""
-        self._peer.send(self._encode(seen))
+        """Tell teleop what is seen, if it listens; as often as it looks."""
+        if now_ns >= self._tell_ns:
+            self._tell_ns = now_ns + TELL_NS
+            self._peer.send(self._encode(seen))
 
     def handle_deadline(self, now_ns: int) -> None:
         """Take in what teleop has said; once it has been silent for a second, say so."""

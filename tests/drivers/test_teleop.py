@@ -70,6 +70,14 @@ def test_cloud_says_once_that_teleop_is_silent_and_again_the_next_time(peers):
     assert [type(output) for output in teleop.take_outputs()] == [Setpoint, Fault]
 
 
+def test_teleop_is_told_of_every_second_telemetry(peers):
+    one, other = peers
+    teleop = remote(one)
+    for number in range(10):
+        teleop.see(POINT._replace(waypoint=number), 10_000_000 * number)
+    assert [decode(data).waypoint for data in other.receive()] == [0, 2, 4, 6, 8]
+
+
 def test_what_is_no_message_is_counted(peers):
     one, other = peers
     teleop = remote(one)
