@@ -123,7 +123,7 @@ def _counters(sender: Pod, way: str) -> _Counters:
 def _findings(found: Mapping[str, Any], way: str, before: _Counters, after: _Counters) -> Findings:
     """Join what one end heard with what the other's link container tells."""
     known = Evidence(shaper=shaper_of(after.link, way))
-    known = of_metrics(after.link, 0, known)
+    known = of_metrics(after.link, 0, known, before.link)
     earlier = of_metrics(before.link, 0, known).passed
     sent = after.sent - before.sent if after.sent and before.sent else 0
     passed = known.passed - earlier if known.passed and earlier else None

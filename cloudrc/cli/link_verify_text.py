@@ -177,5 +177,5 @@ def _evidence(found: Findings) -> dict[str, Any]:
         "unread",
         "late",
     )
-    values = {name: getattr(evidence, name) for name in (*names, "throttled")}
+    values = {name: getattr(evidence, name) for name in (*names, "throttled", "restored")}
     return {name: value for name, value in values.items() if value not in (None, "", ())}

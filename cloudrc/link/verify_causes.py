@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import isnan
+from math import isnan, sqrt
 from typing import NamedTuple
 
 from cloudrc.link.profile import DirectionProfile
@@ -21,6 +21,9 @@ PASSED_SHARE = 0.9
 """If the shaper has seen less than this share of what arrived, the rest goes another way."""
 UNREAD_SHARE = 0.003
 """If it has left more than this share of what was sent unread, it does not get its CPU."""
+THROTTLED_SHARE, CPU_PERIOD = 0.01, 0.1
+"""Stopped in so few periods [1], of so long each [s], a shaper is as good as never stopped; what is
+late is so by at most the root of the one times the other. Source: Linux, cpu.cfs_period_us."""
 _NOTHING = 0.15
 """Share of the delay asked for below which nothing shapes."""
 
@@ -159,10 +162,11 @@ def _of_machine(one: Findings) -> Iterator[tuple[str, str]]:
         yield "bypassed", f"{text}: the others took another way"
     if evidence.layers is not None and evidence.layers > 1:
         yield "shaped_twice", f"the flow passes {evidence.layers} shapers: remove all but one"
-    if evidence.throttled:
+    stopped = evidence.throttled or 0.0
+    if stopped > THROTTLED_SHARE and _may_be_lateness(rows, sqrt(stopped) * CPU_PERIOD):
         yield (
             "throttled",
-            f"the shaper was stopped by its CPU limit in {evidence.throttled:.0%} of the periods: "
+            f"the shaper was stopped by its CPU limit in {stopped:.0%} of the periods: "
             "raise link.resources.limits.cpu",
         )
     if evidence.late is not None and evidence.late > LATE and _may_be_lateness(rows, evidence.late):

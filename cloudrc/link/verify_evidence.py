@@ -39,14 +39,22 @@ def shaper_of(found: Samples, way: str) -> str:
     return ""
 
 
-def of_metrics(found: Samples, sent: int, evidence: Evidence) -> Evidence:
+def of_metrics(
+    found: Samples, sent: int, evidence: Evidence, before: Samples | None = None
+) -> Evidence:
     """Add to what is known what the link's metrics say.
 
     Args:
         found: After the last probe.
         sent: Datagrams that this end has sent.
         evidence: What is known so far.
+        before: Before the first probe, of a link that was there already: of stops and of
+            qdiscs put back only those since then tell of these probes.
     """
+
+    def since(name: str) -> float:
+        return found.get((name, ""), 0.0) - (before or {}).get((name, ""), 0.0)
+
     # The relay counts what came in; netem what it sent on and what it dropped.
     received = found.get(("cloudrc_link_datagrams_total", 'outcome="received"'))
     if evidence.shaper == "netem":
@@ -57,13 +65,12 @@ def of_metrics(found: Samples, sent: int, evidence: Evidence) -> Evidence:
         received = sum(count or 0.0 for count in counts)
     unread = found.get(("cloudrc_link_datagrams_total", 'outcome="unread"'))
     late = found.get(("cloudrc_link_release_error_seconds", 'percentile="99"'))
-    periods = found.get(("cloudrc_cpu_periods_total", ""))
-    stopped = found.get(("cloudrc_cpu_throttled_periods_total", ""))
-    share = stopped / periods if periods and stopped else None
+    periods = since("cloudrc_cpu_periods_total")
+    share = since("cloudrc_cpu_throttled_periods_total") / periods if periods > 0 else None
     passed = None if received is None else int(received)
     missed = None if unread is None else int(unread)
     known = replace(evidence, sent=sent, passed=passed, unread=missed)
-    restored = int(found.get(("cloudrc_link_restored_total", ""), 0.0))
+    restored = int(since("cloudrc_link_restored_total"))
     return replace(known, late=late, throttled=share, restored=restored)
 
 
@@ -109,6 +116,7 @@ def in_force(found: Evidence, listed: Qdiscs, told: Evidence) -> Evidence:
         applied=applied if qdiscs else None,
         sent=told.sent,
         throttled=told.throttled,
+        restored=told.restored,
     )
 
 

@@ -45,11 +45,11 @@ def test_two_in_a_row_are_two_layers() -> None:
 
 
 def test_what_the_kernel_says_stands_in_place_of_what_was_told() -> None:
-    told = Evidence("netem", why="asked", applied=DirectionProfile(0.09), sent=7)
+    told = Evidence("netem", why="asked", applied=DirectionProfile(0.09), sent=7, restored=1)
     listed = {"eth0": [PRIO, NETEM]}
     found = in_force(of_qdiscs(listed, "eth0"), listed, told)
     assert found.applied == DirectionProfile(0.045, 0.025, loss=0.05, duplicate=0.01, corrupt=0.02)
-    assert (found.why, found.sent) == ("asked", 7)
+    assert (found.why, found.sent, found.restored) == ("asked", 7, 1)
     bare = in_force(of_qdiscs({"eth0": [ROOM]}, "eth0"), {"eth0": [ROOM]}, told)
     assert bare.applied is None, "nothing is in force"
 
@@ -79,6 +79,19 @@ def test_metrics_tell_of_lateness_and_of_qdiscs_that_were_put_back() -> None:
     )
     found = of_metrics(samples(text), 600, Evidence("relay"))
     assert (found.late, found.restored, found.passed, found.sent) == (0.0021, 2, 500, 600)
+
+
+def test_what_befell_a_link_before_the_probes_tells_nothing_of_them() -> None:
+    before, after = (
+        samples(
+            f"cloudrc_cpu_periods_total {periods}\n"
+            f"cloudrc_cpu_throttled_periods_total {stopped}\n"
+            f"cloudrc_link_restored_total {restored}\n"
+        )
+        for periods, stopped, restored in ((1000, 40, 2), (1100, 45, 3))
+    )
+    found = of_metrics(after, 0, Evidence("relay"), before)
+    assert (found.throttled, found.restored) == (0.05, 1)
 
 
 class Relay:

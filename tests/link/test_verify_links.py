@@ -119,6 +119,12 @@ def test_a_relay_that_does_not_get_its_cpu_is_named() -> None:
     assert "40%" in find_causes(found)[0].text
 
 
+def test_a_shaper_that_was_hardly_ever_stopped_hides_no_other_cause() -> None:
+    evidence = told(applied=PAPER, throttled=0.02)
+    found = {"uplink": probe(asked(PAPER), replace(PAPER, delay=0.090), 1, evidence=evidence)}
+    assert [cause.code for cause in find_causes(found)] == ["doubled_delay"]
+
+
 @pytest.mark.parametrize(
     ("profile", "off"),
     [
