@@ -87,6 +87,7 @@ types: $(VENV)/dev ## check types
 bench: $(VENV)/all ## measure the closed loop against raw physics
 	$(bin)/cloudrc bench
 
+# Without a C compiler it exits with 3; make turns every failure into its own 2.
 bench-link: $(VENV)/all ## measure the relay against what was asked, and C anchors; needs cc
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 

@@ -19,6 +19,7 @@ from cloudrc.link.verify_causes import Cause, Evidence, Findings, find_causes
 PAPER = link_profile(load_profile("paper-p2").uplink)
 LOSING = DirectionProfile(0.045, 0.025, loss=0.05)
 NARROW = DirectionProfile(0.020, 0.002, rate=2e6, queue_packets=200, keep_order=True)
+NORMAL, HEAVY = replace(PAPER, distribution="normal"), replace(PAPER, loss=0.2)
 NOTHING = DirectionProfile()
 QUICK = ("ideal", "paper-p1", "paper-p2")
 
@@ -132,7 +133,11 @@ def test_a_shaper_that_was_hardly_ever_stopped_hides_no_other_cause() -> None:
         (PAPER, replace(PAPER, delay=PAPER.delay * 0.95)),
         (PAPER, replace(PAPER, jitter=PAPER.jitter * 1.1)),
         (PAPER, replace(PAPER, jitter=PAPER.jitter * 0.9)),
+        (NORMAL, replace(NORMAL, jitter=NORMAL.jitter * 1.1)),
+        (NORMAL, replace(NORMAL, jitter=NORMAL.jitter * 0.9)),
         (PAPER, replace(PAPER, loss=0.02)),
+        (HEAVY, replace(HEAVY, loss=0.15)),
+        (HEAVY, replace(HEAVY, loss=0.25)),
         (LOSING, replace(LOSING, loss=0.03)),
         (LOSING, replace(LOSING, loss=0.07)),
         (NARROW, replace(NARROW, rate=NARROW.rate and 1.25 * NARROW.rate)),

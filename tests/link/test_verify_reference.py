@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from link_flows import PERIOD_NS, flow
 
+from cloudrc.assembly import link_profile
+from cloudrc.config.load import load_profile
+from cloudrc.config.shipped import names
 from cloudrc.link.profile import (
     Blackout,
     Change,
@@ -72,6 +76,22 @@ def test_model_and_reference_agree_though_they_share_no_chance(name: str) -> Non
     for quantity, value in theirs.items():
         unit = 0.01 if quantity in ("loss", "overtaken", "doubled") else 3e-4
         assert ours[quantity] == pytest.approx(value, rel=0.06, abs=unit), quantity
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("way", ["uplink", "downlink"])
+@pytest.mark.parametrize("name", names("profile"))
+def test_a_million_draws_of_a_shipped_profile_match_it(
+    name: str, way: str, figure: Callable[..., None]
+) -> None:
+    count = 1_000_000
+    profile = link_profile(getattr(load_profile(name), way))
+    ours, theirs = summary(model(profile, count)), summary(reference(profile, 1, count))
+    off = 1e6 * abs(ours["mean"] - theirs["mean"])
+    figure("a million draws of a profile: mean off by", off, "<=", 200.0, "us", count)
+    for quantity, value in theirs.items():
+        unit = 1e-3 if quantity in ("loss", "overtaken", "doubled") else 2e-4
+        assert ours[quantity] == pytest.approx(value, rel=0.02, abs=unit), quantity
 
 
 def test_a_time_line_is_followed() -> None:
