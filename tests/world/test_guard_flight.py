@@ -169,3 +169,15 @@ def test_a_hostile_cloud_does_not_get_it_out_of_the_fence(simulator, seed):
 @pytest.mark.parametrize("seed", range(3, 203))
 def test_two_hundred_hostile_clouds_do_not_get_it_out_of_the_fence(simulator, seed):
     check_hostile(simulator, seed)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_stopped_at_any_instant_it_comes_to_lie_within_what_is_told(simulator, seed, figure):
+    """docs/safety/guard.md tells people how far to stay away: more than it has ever gone."""
+    flight = Flight(simulator)
+    flight.fly(1.0, UP)
+    flight.fly(Random(seed).uniform(1.0, 12.0), hostile(seed))
+    flight.guard.stop(flight.now_ns)
+    flight.fly(4.0, UP)
+    figure("stopped by a hostile cloud: outside the fence by", -flight.room, "<=", 1.5, "m")
+    assert flight.room > -1.5
