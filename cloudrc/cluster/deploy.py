@@ -10,7 +10,7 @@ from typing import Any
 
 from cloudrc.cluster.access import REQUEST_TIMEOUT, Release
 from cloudrc.cluster.errors import ClusterError, WaitedTooLongError, explained, insist
-from cloudrc.cluster.pods import is_ready, list_pods, trouble
+from cloudrc.cluster.pods import is_ready, list_pods, missing_secret, trouble
 from cloudrc.cluster.tools import run
 
 COMPONENTS = ("world", "cloud")
@@ -132,7 +132,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
         return refused, True
     pods = list_pods(release, component)
     for pod in pods:
-        why = trouble(pod)
+        why = trouble(pod) or missing_secret(release, pod)
         if why:
             return why, True
     status = deployment.status

@@ -10,7 +10,7 @@ from cloudrc.cluster import manifest
 from cloudrc.cluster.access import Release
 from cloudrc.cluster.errors import ClusterError, WaitedTooLongError, explained, insist
 from cloudrc.cluster.jobs import JobStatus, has_started, pod_of, read_job
-from cloudrc.cluster.pods import refusal, trouble
+from cloudrc.cluster.pods import missing_secret, refusal, trouble
 
 LOOK_PERIOD = 0.5
 """Between two looks at a Job [s]."""
@@ -93,7 +93,10 @@ def _log(release: Release, uid: str) -> list[str]:
 
 def _refuse_hopeless(release: Release, status: JobStatus) -> None:
     pod = pod_of(release, status.uid)
-    why = trouble(pod) if pod is not None else refusal(release, "Job", status.name)
+    if pod is None:
+        why = refusal(release, "Job", status.name)
+    else:
+        why = trouble(pod) or missing_secret(release, pod)
     if why:
         raise ClusterError(
             f"Job '{status.name}' cannot start: {why}; then delete it: "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
 from typing import Any
 
 from cloudrc.cluster.access import REQUEST_TIMEOUT, Release
@@ -19,6 +21,11 @@ FATAL = {
     "Error": "crash",
 }
 """Why a container does not run and never will by waiting -> what kind of mistake that is."""
+SECRETS = {
+    "secret": ("key", "head -c 32 /dev/urandom"),
+    "tokens": ("operator", "openssl rand -hex 32"),
+}
+"""Volume of the chart's pods -> file that its Secret has to have, and what makes one."""
 RESTARTS_MAX = 2
 """A container that ended more often than this is not about to settle."""
 
@@ -98,14 +105,47 @@ def trouble(pod: Any) -> str | None:
 
 def refusal(release: Release, kind: str, name: str) -> str | None:
     """Say why the cluster does not make an object's pod: Pod Security, a quota; None if it may."""
+    refused = _events(release, kind, name, "FailedCreate")
+    return refused[-1] if refused else None
+
+
+def missing_secret(release: Release, pod: Any) -> str | None:
+    """Say which Secret a pod waits for that is not there, and what makes it; None if for none."""
+    if any(status.state.running or status.state.terminated for status in _containers(pod)):
+        return None
+    said: list[str] = []
+    with suppress(ClusterError):  # who may not read events may still fly
+        said = _events(release, "Pod", pod.metadata.name, "FailedMount")
+    for words in said:
+        found = re.search(r'volume "(secret|tokens)".* secret "([^"]+)" not found', words)
+        if found and not _has_secret(release, found[2]):
+            file, content = SECRETS[found[1]]
+            return (
+                f"there is no Secret '{found[2]}'; make it: {content} >{file} && kubectl "
+                f"{' '.join(release.flags)} create secret generic {found[2]} --from-file={file}"
+            )
+    return None
+
+
+def _has_secret(release: Release, name: str) -> bool:
+    """Events outlive their cause: the kubelet looks again after up to two minutes."""
+    with suppress(ClusterError), explained("get secrets", release.where):
+        release.core.read_namespaced_secret(
+            name, release.namespace, _request_timeout=REQUEST_TIMEOUT
+        )
+        return True
+    return False
+
+
+def _events(release: Release, kind: str, name: str, reason: str) -> list[str]:
+    """What was told of an object for this reason."""
     with explained("list events", release.where):
         events = release.core.list_namespaced_event(
             release.namespace,
             field_selector=f"involvedObject.kind={kind},involvedObject.name={name}",
             _request_timeout=REQUEST_TIMEOUT,
         ).items
-    refused = [event.message for event in events if event.reason == "FailedCreate"]
-    return refused[-1] if refused else None
+    return [event.message for event in events if event.reason == reason]
 
 
 def _binds_soon(condition: Any) -> bool:

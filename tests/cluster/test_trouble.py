@@ -111,6 +111,42 @@ def test_a_pod_that_is_refused_ends_the_waiting_with_the_reason(
         wait_ready(release, timeout=60.0)
 
 
+def wait_for_secret(running: FakeApi, name: str) -> None:
+    """Let the world's pod wait for a Secret, as the kubelet tells it."""
+    state = waiting("ContainerCreating")
+    running.put("pods", "demo", pod("world-1", "world", ready=False, state=state))
+    said = f'MountVolume.SetUp failed for volume "secret" : secret "{name}" not found'
+    event = {"metadata": {"name": "world-1.1"}, "involvedObject": {}, "message": said}
+    running.put("events", "demo", {**event, "type": "Warning", "reason": "FailedMount"})
+
+
+def test_a_secret_that_is_missing_ends_the_waiting_with_what_makes_it(
+    running: FakeApi, release: Release
+) -> None:
+    wait_for_secret(running, "mine")
+    with pytest.raises(
+        ClusterError, match="the world pod cannot run: there is no Secret"
+    ) as caught:
+        wait_ready(release, timeout=5.0)
+    assert "kubectl --namespace=demo create secret generic mine --from-file=key" in str(
+        caught.value
+    )
+    assert caught.value.exit_code == 5
+
+
+def test_a_secret_that_came_later_is_missed_no_more(running: FakeApi, release: Release) -> None:
+    wait_for_secret(running, "cloudrc-tokens")
+    with pytest.raises(WaitedTooLongError, match="container world is not ready"):
+        wait_ready(release, timeout=0.03)
+
+
+def test_who_may_not_read_events_waits_as_before(running: FakeApi, release: Release) -> None:
+    wait_for_secret(running, "mine")
+    running.refuse["GET", "events"] = 403, "events is forbidden"
+    with pytest.raises(WaitedTooLongError, match="container world is not ready"):
+        wait_ready(release, timeout=0.03)
+
+
 def test_a_release_of_something_else_is_told(api: FakeApi, release: Release) -> None:
     with pytest.raises(ClusterError, match="no Deployment 'world'"):
         wait_ready(release, timeout=1.0)

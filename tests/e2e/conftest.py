@@ -16,6 +16,7 @@ from kube import (
     CHART,
     NAME,
     NAMESPACE,
+    NAMESPACES,
     RESTRICTED,
     ROOT,
     SUMMARY,
@@ -73,25 +74,30 @@ def cluster(request: pytest.FixtureRequest) -> Iterator[None]:
             shutil.rmtree(folder)
     command("make", "images", f"IMAGES={IMAGES}", timeout=1800)
     TIMES["create"] = time.monotonic()
-    if own:
-        os.environ["KUBECONFIG"] = str(BUILD / "kubeconfig")
-        _create(request)
-    _load()
-    _make_namespace()
-    TIMES["loaded"] = time.monotonic()
-    request.config.stash[UP] = True
-    yield
-    request.config.stash[UP] = False
-    if request.config.getoption("--keep", default=False):
-        return
+    try:
+        if own:
+            os.environ["KUBECONFIG"] = str(BUILD / "kubeconfig")
+            _create()
+        _load()
+        _make_namespace()
+        TIMES["loaded"] = time.monotonic()
+        request.config.stash[UP] = True
+        yield
+    finally:
+        request.config.stash[UP] = False
+        if not request.config.getoption("--keep", default=False):
+            _remove(own)
+
+
+def _remove(own: bool) -> None:
     if own:
         command("kind", "delete", "cluster", f"--name={CLUSTER}")
     else:
-        names = [f"{NAMESPACE}{suffix}" for suffix in ("", "-monitoring", "-bad")]
-        command("kubectl", "delete", "namespace", *names, "--ignore-not-found", "--wait=false")
+        words = ["delete", "namespace", *NAMESPACES, "--ignore-not-found", "--wait=false"]
+        command("kubectl", *words)
 
 
-def _create(request: pytest.FixtureRequest) -> None:
+def _create() -> None:
     if CLUSTER in command("kind", "get", "clusters").split():
         command("kind", "export", "kubeconfig", f"--name={CLUSTER}")
         return

@@ -25,6 +25,8 @@ ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "charts" / "cloudrc"
 EXAMPLES = CHART / "examples"
 NAMESPACE = "cloudrc-e2e"
+NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring", f"{NAMESPACE}-bad")
+"""All that these tests make."""
 NAME = "cloudrc"
 RESTRICTED = {"pod-security.kubernetes.io/enforce": "restricted"}
 SUMMARY: list[str] = []
@@ -203,24 +205,9 @@ def fly(name: str, waypoints: Sequence[Mapping[str, Any]], limit: float = 60.0) 
 
 
 def save(folder: Path) -> None:
-    """Keep what helps to understand a failure."""
-    folder.mkdir(parents=True, exist_ok=True)
-
-    def keep(name: str, *words: str) -> None:
-        try:
-            text = kubectl(*words, timeout=30.0)
-        except (CommandFailedError, subprocess.TimeoutExpired) as error:
-            text = str(error)
-        (folder / name).write_text(text)
-
-    keep("objects.txt", "get", "all,configmap,networkpolicy,pvc,secret", "--output=wide")
-    keep("events.txt", "get", "events", "--sort-by=.lastTimestamp")
-    keep("describe.txt", "describe", "pods,jobs")
-    for one in read("pods")["items"]:
-        name = one["metadata"]["name"]
-        keep(f"{name}.log", "logs", name, "--all-containers", "--prefix", "--timestamps")
-        if any(c["restartCount"] for c in one["status"].get("containerStatuses", [])):
-            keep(f"{name}.previous.log", "logs", name, "--all-containers", "--prefix", "--previous")
+    """Keep what helps to understand a failure: of each namespace in a folder of its own."""
+    for namespace in NAMESPACES:
+        _save_texts(folder / namespace, f"--namespace={namespace}")
     for component in ("world", "cloud"):
         for one in pods(component):
             name = one["metadata"]["name"]
@@ -234,3 +221,23 @@ def save(folder: Path) -> None:
             ]
             with (folder / f"{name}.mcap").open("wb") as file:
                 subprocess.run([*words, "--", "cat", path], stdout=file, stderr=-3, timeout=60)
+
+
+def _save_texts(folder: Path, where: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def keep(name: str, *words: str) -> None:
+        try:
+            text = kubectl(where, *words, timeout=30.0)
+        except (CommandFailedError, subprocess.TimeoutExpired) as error:
+            text = str(error)
+        (folder / name).write_text(text)
+
+    keep("objects.txt", "get", "all,configmap,networkpolicy,pvc,secret", "--output=wide")
+    keep("events.txt", "get", "events", "--sort-by=.lastTimestamp")
+    keep("describe.txt", "describe", "pods,jobs")
+    for one in read("pods", where)["items"]:
+        name = one["metadata"]["name"]
+        keep(f"{name}.log", "logs", name, "--all-containers", "--prefix", "--timestamps")
+        if any(c["restartCount"] for c in one["status"].get("containerStatuses", [])):
+            keep(f"{name}.previous.log", "logs", name, "--all-containers", "--prefix", "--previous")

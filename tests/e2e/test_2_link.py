@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -59,6 +60,8 @@ LONG = [
     {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
 ]
 """Up, and then waiting for longer than anything here takes."""
+ASIDE = (0.5, 0.5, 0.8)
+"""Where the operator sends the robot meanwhile [m]."""
 
 
 @pytest.fixture(scope="module")
@@ -174,6 +177,24 @@ def test_the_link_is_set_by_hand_and_read_back(flight: None, note: Callable[[str
     said = "link: downlink 45 ± 25 ms (profile paper-p2)"
     log = ("logs", pod("cloud")["metadata"]["name"], "-c", "cloud")
     eventually(lambda: said in kubectl(*log), "cloud has noted it for its recording", 5.0)
+
+
+def operate(*words: str) -> str:
+    """Give an order by hand; what is said of it."""
+    done = cloudrc("mission", *words, "-n", NAMESPACE, "--release", NAME)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_operator_holds_the_mission_moves_the_robot_and_lets_it_go_on(flight: None) -> None:
+    assert "(long): held" in operate("hold")
+    assert "(long): held" in operate("goto", *map(str, ASIDE))
+
+    def away() -> float:
+        return math.dist(json.loads(operate("status", "-o", "json"))["seen"]["position_m"], ASIDE)
+
+    eventually(lambda: away() < 0.15, "the held robot is where it was sent", 20.0)
+    assert "(long): flying" in operate("resume")
 
 
 def objects() -> dict[str, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +14,8 @@ from kube import CHART, NAMESPACE, ROOT, cloudrc, command
 from neighbours import apply_anywhere
 
 ELSEWHERE = f"{NAMESPACE}-bad"
+Refusal = Callable[..., tuple[int, str]]
+"""Release and settings of helm -> exit code and the line that says what is wrong."""
 
 
 @pytest.fixture(scope="module")
@@ -24,27 +26,36 @@ def namespace(cluster: None) -> Iterator[str]:
     command("kubectl", "delete", "namespace", ELSEWHERE, "--wait=false")
 
 
-def refusal(release: str, *settings: str) -> tuple[int, str]:
-    """Install with helm, then let our own command say what is wrong."""
-    command("helm", "install", release, CHART, f"-n={ELSEWHERE}", *settings)
-    line = ["run", "hover", "--mode", "cluster", "-n", ELSEWHERE, "--release", release]
-    try:
+@pytest.fixture
+def refusal(namespace: str) -> Iterator[Refusal]:
+    """Install with helm, then let our own command say what is wrong.
+
+    Uninstalled after the test's end: what helps to understand a failure is kept before that.
+    """
+    installed: list[str] = []
+
+    def refused(release: str, *settings: str) -> tuple[int, str]:
+        command("helm", "install", release, CHART, f"-n={namespace}", *settings)
+        installed.append(release)
+        line = ["run", "hover", "--mode", "cluster", "-n", namespace, "--release", release]
         done = cloudrc(*line, "--timeout", "60")
-    finally:
-        command("helm", "uninstall", release, f"-n={ELSEWHERE}")
-    (said,) = [each for each in done.stderr.splitlines() if each.startswith("cloudrc: error:")]
-    assert "Traceback" not in done.stderr
-    return done.returncode, said
+        (said,) = [each for each in done.stderr.splitlines() if each.startswith("cloudrc: error:")]
+        assert "Traceback" not in done.stderr
+        return done.returncode, said
+
+    yield refused
+    for release in installed:
+        command("helm", "uninstall", release, f"-n={namespace}")
 
 
-def test_an_image_that_is_not_loaded_is_named(namespace: str) -> None:
+def test_an_image_that_is_not_loaded_is_named(refusal: Refusal) -> None:
     code, line = refusal("no-image", "--set=image.tag=0.0.0-missing")
     assert code == 5
     assert "cloudrc/world:0.0.0-missing" in line or "cloudrc/cloud:0.0.0-missing" in line
     assert "make kind-load" in line
 
 
-def test_strict_netem_without_the_kernels_is_refused_with_both_ways_out(namespace: str) -> None:
+def test_strict_netem_without_the_kernels_is_refused_with_both_ways_out(refusal: Refusal) -> None:
     if has_netem():
         pytest.skip("this kernel has sch_netem")
     code, line = refusal("no-netem", "--set=link.mode=netem")

@@ -1,10 +1,22 @@
-"""`helm test` passes, and uninstalling leaves nothing but the Secret."""
+"""What helm prints works as printed, `helm test` passes, uninstalling leaves only the Secrets."""
 
 from __future__ import annotations
 
-from kube import EXAMPLES, NAME, eventually, helm, kubectl, read
+import shlex
+
+from kube import EXAMPLES, NAME, cloudrc, command, eventually, helm, kubectl, read
 
 KINDS = "deployment,service,configmap,networkpolicy,secret,serviceaccount,pvc,job,pod"
+
+
+def test_the_commands_of_the_notes_work_as_printed(installed: None) -> None:
+    """All three end by themselves; the second flies `pipes`, for half a minute."""
+    printed = [line for line in helm("get", "notes", NAME).splitlines() if line.startswith("  ")]
+    wait, mission, logs = (shlex.split(line) for line in printed)
+    assert "condition met" in command(*wait)
+    done = cloudrc(*mission[1:])
+    assert (mission[0], done.returncode) == ("cloudrc", 0), done.stdout + done.stderr
+    assert command(*logs).strip(), "the link says what it is"
 
 
 def test_helm_test_flies_and_passes(installed: None) -> None:
