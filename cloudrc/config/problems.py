@@ -85,9 +85,12 @@ def in_words(value: Any) -> str:
 
 
 def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: Path) -> Problem:
-    # Names of a union's members are tagged with <>: they are no keys.
-    path = tuple(str(key) for key in detail["loc"] if not str(key).startswith("<"))
     kind, value = detail["type"], in_words(detail["input"])
+    keys = tuple(map(str, detail["loc"]))
+    # Names of a union's members are tagged with <>: they are no keys. What nobody knows is one.
+    unknown = keys[-1:] if kind == "extra_forbidden" else ()
+    known = keys[: len(keys) - len(unknown)]
+    path = tuple(key for key in known if not key.startswith("<")) + unknown
     if kind == "extra_forbidden":
         return Problem(prefix + path, "", f"unknown key; {describe.nearest_key(model, path)}")
     if kind == "missing":

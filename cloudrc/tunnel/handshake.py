@@ -130,7 +130,6 @@ class Door:
         self._age_max_ns = age_max_ns
         self._fresh_until_ns = -1
         self._incumbent = Hello(b"", b"", b"", AES_256_GCM)
-        self._key = session.ring.current  # that the incumbent's session began with
         self._used: deque[bytes] = deque(maxlen=USED_MAX)
         self._challenged_ns = -CHALLENGE_NS
         self._answered_ns: deque[int] = deque(maxlen=ANSWERS_MAX)
@@ -180,8 +179,9 @@ class Door:
         answered.append(now_ns)
         self._remember(hello.nonce, counter)
         if hello.nonce == self._incumbent.nonce:
-            # Whichever key this hello has: cloud takes the answer's for the key of the session.
-            return Answer("hello", [self._session.greet(ACCEPT, self._accept(), self._key)])
+            # Whichever key this hello has: cloud takes the answer's for the key of the epoch.
+            session = self._session
+            return Answer("hello", [session.greet(ACCEPT, self._accept(), session.epoch_key)])
         if hello.nonce in self._used:
             return self._answer("hello", BUSY, encode_busy(Busy(hello.nonce, used=True)))
         if now_ns <= self._fresh_until_ns:
@@ -190,8 +190,7 @@ class Door:
         self._incumbent = hello
         self._fresh_until_ns = now_ns + max(GRACE_NS, self._age_max_ns)
         agreement = Agreement(hello.nonce, self._nonce, self._agreed())
-        self._key = self._session.greeting_key
-        self._begin(agreement, self._key)
+        self._begin(agreement, self._session.greeting_key)
         return self._answer("hello", ACCEPT, self._accept(), opened=True)
 
     def move_on(self) -> bytes:

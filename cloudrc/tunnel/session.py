@@ -93,7 +93,7 @@ class Session:
         self._sends, self._opens = int(sends), 1 - int(sends)
         self._counters = dict.fromkeys(map(int, Kind), 0)
         self._agreement: Agreement | None = None
-        self._key = ring.current
+        self._key = self.epoch_key = ring.current  # in use; that the epoch began with
         self._generation = self._generation_byte = 0
         self._rekey_ns: int | None = None
         self._rekey_total = 0
@@ -115,7 +115,7 @@ class Session:
             kind: count if kind in TIMELESS else 0 for kind, count in self._counters.items()
         }
         self._agreement = agreement or self._agreement
-        self._key = key or self._key
+        self._key = self.epoch_key = key or self._key
         self._generation = self._generation_byte = 0
         self._rekey_ns = None
         self._rekey_total = self._sent() + REKEY_DATAGRAMS

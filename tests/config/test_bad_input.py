@@ -196,6 +196,8 @@ def test_an_index_behind_the_end() -> None:
         ("uplink: {keep_order: yes}", "must be true or false"),
         ("uplink: {trace: nowhere.csv}", "uplink.trace: trace "),
         ("delay_ms: 3", "delay_ms: unknown key; did you mean uplink.delay_ms?"),
+        ('"<": 3', "<: unknown key; known here: "),
+        ('uplink: {"<chance>": 3}', "uplink.<chance>: unknown key; "),
     ],
 )
 def test_bad_profiles(mine: Path, text: str, reason: str) -> None:

@@ -152,6 +152,25 @@ def test_whichever_acceptance_comes_first_names_the_key_of_the_session():
     assert step.world._key == old
 
 
+def test_an_acceptance_that_is_repeated_names_the_key_that_its_epoch_began_with():
+    """World moved on, its acceptance was lost, and the key is no more that of the first hello."""
+    step = Doorstep()
+    step.knock(cookie=step.cookie())
+    keys = KeySet(new := Key(b"n" * 32))
+    step.world.ring.replace(keys, step.now_ns)
+    step.now_ns += round(keys.overlap * 1e9) + SECOND_NS
+    step.world.tend(step.now_ns)
+    step.door.move_on()
+    for hello_key in (new, KEY):
+        step.world.accepted = (new, KEY)
+        hello = bytes(codec.BODY_SIZES[Kind.HELLO])
+        step.world.open(step.cloud.greet(Kind.HELLO, hello, hello_key))
+        (data,) = step.knock(cookie=step.door._cookie(step.now_ns)).datagrams
+        assert codec.peek(data)[:2] == (Kind.ACCEPT, 2)
+        assert new.verifies(data[:-16], data[-16:])
+        assert step.world._openers[0][1] == new
+
+
 def test_answers_are_never_longer_than_the_hello(step):
     hello = codec.SIZES[Kind.HELLO]
     answers = [step.knock(), step.knock(cookie=step.cookie()), step.knock(b"m" * 16, step.cookie())]
