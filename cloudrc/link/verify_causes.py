@@ -84,7 +84,11 @@ def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
         findings: By direction.
     """
     found = {way: _first(way, one) for way, one in findings.items() if _off(one.rows)}
-    silent = [way for way, cause in found.items() if cause.code in _UNSHAPED]
+    silent = [
+        way
+        for way, cause in found.items()  # what was put back shapes again
+        if cause.code in _UNSHAPED and not findings[way].evidence.restored
+    ]
     shaped = [way for way in findings if way not in silent]
     if len(silent) == 1 and shaped:
         way, other = silent[0], shaped[0]

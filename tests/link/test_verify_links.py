@@ -120,6 +120,16 @@ def test_a_relay_that_does_not_get_its_cpu_is_named() -> None:
     assert "40%" in find_causes(found)[0].text
 
 
+def test_a_qdisc_that_was_put_back_is_not_told_as_one_direction() -> None:
+    """For a while everything of one way went straight through."""
+    back = told(applied=PAPER, restored=1)
+    found = {
+        "uplink": probe(asked(PAPER), NOTHING, 1, evidence=back),
+        "downlink": probe(asked(PAPER), PAPER, 2, evidence=told(applied=PAPER)),
+    }
+    assert [(cause.code, cause.way) for cause in find_causes(found)] == [("no_qdisc", "uplink")]
+
+
 def test_a_shaper_that_was_hardly_ever_stopped_hides_no_other_cause() -> None:
     evidence = told(applied=PAPER, throttled=0.02)
     found = {"uplink": probe(asked(PAPER), replace(PAPER, delay=0.090), 1, evidence=evidence)}
