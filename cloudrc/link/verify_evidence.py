@@ -53,7 +53,8 @@ def of_metrics(
     """
 
     def since(name: str) -> float:
-        return found.get((name, ""), 0.0) - (before or {}).get((name, ""), 0.0)
+        now, then = found.get((name, ""), 0.0), (before or {}).get((name, ""), 0.0)
+        return now - then if now >= then else now  # a link that was restarted counts from 0
 
     # The relay counts what came in; netem what it sent on and what it dropped.
     received = found.get(("cloudrc_link_datagrams_total", 'outcome="received"'))

@@ -92,6 +92,8 @@ def test_what_befell_a_link_before_the_probes_tells_nothing_of_them() -> None:
     )
     found = of_metrics(after, 0, Evidence("relay"), before)
     assert (found.throttled, found.restored) == (0.05, 1)
+    restarted = of_metrics(before, 0, Evidence("relay"), after)
+    assert (restarted.throttled, restarted.restored) == (0.04, 2), "it counts from 0 again"
 
 
 class Relay:

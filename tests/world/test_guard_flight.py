@@ -171,8 +171,7 @@ def test_two_hundred_hostile_clouds_do_not_get_it_out_of_the_fence(simulator, se
     check_hostile(simulator, seed)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_stopped_at_any_instant_it_comes_to_lie_within_what_is_told(simulator, seed, figure):
+def check_stopped(simulator, seed, figure):
     """docs/safety/guard.md tells people how far to stay away: more than it has ever gone."""
     flight = Flight(simulator)
     flight.fly(1.0, UP)
@@ -181,3 +180,14 @@ def test_stopped_at_any_instant_it_comes_to_lie_within_what_is_told(simulator, s
     flight.fly(4.0, UP)
     figure("stopped by a hostile cloud: outside the fence by", -flight.room, "<=", 1.5, "m")
     assert flight.room > -1.5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_stopped_at_any_instant_it_comes_to_lie_within_what_is_told(simulator, seed, figure):
+    check_stopped(simulator, seed, figure)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(5, 400))
+def test_stopped_at_four_hundred_instants_likewise(simulator, seed, figure):
+    check_stopped(simulator, seed, figure)
