@@ -65,6 +65,9 @@ def execute(options: argparse.Namespace) -> int:
     stop, exporter = StopSignal(), open_exporter(options, "link")
     experiment = load_experiment(str(options.config))
     uplink, downlink = assembly.build_links(experiment)
+    settle()
+    if options.fifo:  # before the relay is made, which looks whether it has it
+        _run_first()
     relay = Relay(
         uplink,
         downlink,
@@ -74,9 +77,6 @@ def execute(options: argparse.Namespace) -> int:
         world_peer=options.world,
         cloud_peer=options.cloud,
     )
-    settle()
-    if options.fifo:
-        _run_first()
     ask: Callable[[], bool] = stop
     if options.link:
         from cloudrc.cli.relay_control import controlled

@@ -15,6 +15,7 @@ from time import monotonic_ns, sleep
 from cloudrc.link.relay_errors import Recent, ReleaseErrors
 from cloudrc.link.relay_lane import Lane
 from cloudrc.link.relay_lead import Lead
+from cloudrc.link.relay_priority import runs_first
 from cloudrc.link.relay_wait import Wait, best_wait
 
 _DEFER_NS = 60_000
@@ -46,7 +47,7 @@ class Lanes:
         self._lanes = tuple(lanes)
         self._sources = tuple(lane.source.socket.fileno() for lane in self._lanes)
         self._looked_ns = self._watched_ns = 0
-        self._lead = Lead()
+        self._lead = Lead(first=runs_first())
         self._recent = Recent()
         self._wait: Wait = best_wait([lane.source.socket for lane in self._lanes])
         self._origin_known = False

@@ -40,3 +40,10 @@ def ask_for_fifo() -> str:
     except OSError as error:
         return f"{error.strerror}; it takes CAP_SYS_NICE or a limit on rtprio"
     return ""
+
+
+def runs_first() -> bool:
+    """Say whether the calling thread runs before every ordinary one."""
+    if not hasattr(os, "SCHED_FIFO"):
+        return False
+    return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
