@@ -21,6 +21,8 @@ again. HOLD before the robot has left the ground is GROUND: its rotors stop, the
 A command is fresh while its *basis*, the odometry it was computed from, is at most
 `command_age_max` old. HOLD after a mission's end lasts as long as the operator likes: there a robot
 waits for the next one. HOLD within a mission does not: who should end it may be gone.
+Deviation: DESIGN, section 5 has one tiny module; these are five, so that rules, rest, hits and
+limits are proven and tested without the states.
 """
 
 from __future__ import annotations
@@ -73,7 +75,7 @@ class Guard:
         self._low, self._high = limits.inside()
         self._floor = self._low[2]
         self._rest = Rest(self._low, self._high, 0.5 * limits.speed_max)
-        self._hits, self._take_off = Hits(), TakeOff()
+        self._hits, self._take_off = Hits(), TakeOff(limits.fence_low, limits.fence_high)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
         self.state = GROUND
@@ -196,8 +198,9 @@ class Guard:
             self._acceleration = min(rules.BRAKE, self._acceleration)
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Whether TRACK, and the HOLD that may follow, keep their distance from the last ones."""
-        return min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns) >= SETTLE_NS
+        """Whether TRACK may be, and it and the next HOLD keep their distance from the last ones."""
+        apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
+        return self._take_off.allowed and apart_ns >= SETTLE_NS
 
     def _note_invalid(self, now_ns: int) -> None:
         """An honest cloud never says that: one that goes on saying it is not flown any more."""
@@ -280,8 +283,7 @@ class Guard:
             self._rest.forget()
         self.state, self._flies = state, state is not GROUND and state is not ESTOP
         self._track_until_ns = self._steady_until_ns = NEVER_NS
-        x, y, _ = self._low
-        self._low = (x, y, -inf if state is LAND else self._floor)
+        self._low = (*self._low[:2], -inf if state is LAND else self._floor)
         if state is TRACK:
             self._tracked_ns = now_ns
             self._acceleration = self._limits.acceleration_max
@@ -294,5 +296,5 @@ class Guard:
             if state is not LAND:
                 self.reference = ZERO
                 self._hits.forget()
-                self._take_off.forget()
+                self._take_off.forget(stopped=state is ESTOP)
         self.changes.append(GuardChange(now_ns, state, cause))

@@ -8,6 +8,7 @@ rule builds on, BRAKE after REACTION, is kept with room to spare.
 from __future__ import annotations
 
 from math import hypot, nan
+from operator import le
 
 from cloudrc.messages import Vector
 from cloudrc.world.guard_rules import BRAKE, shortened, towards, within
@@ -21,6 +22,8 @@ LEAD, LEAST_SHARE = 1.0, 0.2
 """By so much [m/s] the reference begins ahead of the robot, but not below this share of it."""
 STILL = 0.1
 """Slower than this the robot counts as come to rest [m/s]."""
+STILL_TICKS = 200
+"""So many at rest, 0.4 s: what is thrown up stands still for less than that."""
 PULL = 0.8
 """Of the position hold: velocity per distance [1/s]."""
 DAMPING = 1.6
@@ -113,19 +116,30 @@ def brake_rate(speed: float) -> float:
 class TakeOff:
     """Tells a robot that has not left the ground yet from one that flies.
 
-    Held in the air so near to the ground it would scrape along.
+    Held in the air so near to the ground it would scrape along. One whose rotors were stopped may
+    still be falling, or lie outside the fence, when it is acknowledged: it takes off once it has
+    come to rest, and that inside.
 
     Attributes:
         over: Whether the robot has left the ground.
+        allowed: Whether it may.
     """
 
-    def __init__(self) -> None:
-        """Begin on the ground."""
+    def __init__(self, low: Vector, high: Vector) -> None:
+        """Begin on the ground.
+
+        Args:
+            low: Corner of the fence [m], shape (3,).
+            high: The opposite one.
+        """
+        self._low, self._high = low, high
+        self.allowed = True
         self.forget()
 
-    def forget(self) -> None:
+    def forget(self, *, stopped: bool = False) -> None:
         """The robot stands, or will; the next take-off is another one."""
-        self.over, self._height = False, nan
+        self.over, self._height, self._still = False, nan, 0
+        self.allowed = self.allowed and not stopped
 
     def look(self, readings: Readings, flies: bool) -> None:
         """Note where the robot stands, or see whether it has left.
@@ -139,6 +153,15 @@ class TakeOff:
             self.over = not abs(height - self._height) < HOP
         else:
             self._height = height
+            if not self.allowed:
+                self._await_rest(readings)
+
+    def _await_rest(self, readings: Readings) -> None:
+        low, position, high = self._low, readings.position, self._high
+        inside = all(map(le, low, position)) and all(map(le, position, high))
+        at_rest = inside and hypot(*readings.velocity) < STILL
+        self._still = self._still + 1 if at_rest else 0
+        self.allowed = self._still >= STILL_TICKS
 
     def may_end(self, readings: Readings) -> bool:
         """Say whether the rotors may stop here."""

@@ -1,5 +1,6 @@
 """The guard with a robot under it: it brakes, holds, lands, stops, and meets a hostile cloud."""
 
+from dataclasses import replace
 from math import dist, hypot, nan
 from random import Random
 
@@ -121,6 +122,33 @@ def test_after_an_acknowledged_stop_it_takes_off_again_from_where_it_is(flight):
     flight.fly(1.5, UP)
     assert flight.readings.position[2] > 0.8
     assert flight.guard.state is GuardState.TRACK
+
+
+@pytest.mark.promise("P-GUARD-3")
+def test_acknowledged_in_its_fall_it_does_not_take_off_before_it_lies(flight):
+    flight.guard.stop(flight.now_ns)
+    flight.fly(0.1)
+    flight.guard.acknowledge(flight.now_ns)
+    flight.guard.start_mission(flight.now_ns)
+    began_ns, still_ns = flight.now_ns, flight.now_ns
+    while flight.guard.state is GuardState.GROUND:
+        flight.fly(0.01, UP)
+        still_ns = flight.now_ns if flight.speed > 0.1 else still_ns
+        assert flight.now_ns - began_ns < 5 * SECOND
+    assert flight.guard.state is GuardState.TRACK
+    assert flight.readings.position[2] < 0.3
+    assert flight.now_ns - still_ns >= 400 * MS
+
+
+@pytest.mark.promise("P-GUARD-3")
+def test_where_it_was_stopped_outside_the_fence_it_does_not_take_off(simulator):
+    flight = Flight(simulator)
+    _, y, z = LIMITS.fence_low
+    flight.guard = flight.robot.guard = Guard(replace(LIMITS, fence_low=(0.1, y, z)))
+    flight.guard.stop(flight.now_ns)
+    flight.guard.acknowledge(flight.now_ns)
+    flight.guard.start_mission(flight.now_ns)
+    assert flight.fly(3.0, UP).guard.state is GuardState.GROUND
 
 
 # A cloud that does its worst. The robot is at most 6 m/s fast, and its base stays in the box.

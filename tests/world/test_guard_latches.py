@@ -190,6 +190,7 @@ def test_an_acknowledged_stop_is_on_the_ground_and_arms_nothing():
     guard.acknowledge(1 * SECOND)
     assert (guard.state, guard.armed, guard.latched) == (GROUND, False, False)
     feed(guard, 1 * SECOND, 20)
+    run(guard, 1 * SECOND, 2 * SECOND)
     assert guard.state is GROUND
     guard.start_mission(2 * SECOND)
     feed(guard, 2 * SECOND, 1)

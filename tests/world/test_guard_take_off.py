@@ -21,13 +21,14 @@ from guard_play import (
 from cloudrc.messages import ZERO, Command, GuardState
 from cloudrc.world.guard import Guard
 from cloudrc.world.guard_limits import FLOOR_MARGIN
-from cloudrc.world.guard_rest import HOP, HOP_SPEED, TakeOff
+from cloudrc.world.guard_rest import HOP, HOP_SPEED, STILL, STILL_TICKS, TakeOff
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.robot import Robot
 from cloudrc.world.simulator import Simulator
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 STANDS = (0.0, 0.0, 0.1)
+FENCE = (LIMITS.fence_low, LIMITS.fence_high)
 NOT_YET = "not off the ground yet, rotors stopped"
 
 
@@ -59,7 +60,7 @@ def taking_off(height=0.0, now_ns=0):
     ("height", "over"), [(0.0, False), (HOP - 1e-6, False), (HOP, True), (-HOP, True), (nan, True)]
 )
 def test_so_far_from_where_it_stood_the_take_off_is_over(height, over):
-    take_off = TakeOff()
+    take_off = TakeOff(*FENCE)
     take_off.look(sensed((0.0, 0.0, 0.0)), flies=False)
     take_off.look(sensed((9.0, 0.0, height)), flies=True)
     assert take_off.over == over
@@ -67,7 +68,7 @@ def test_so_far_from_where_it_stood_the_take_off_is_over(height, over):
 
 
 def test_where_it_stands_is_where_it_stood_last():
-    take_off = TakeOff()
+    take_off = TakeOff(*FENCE)
     for height in (3.0, 1.0, 0.5):
         take_off.look(sensed((0.0, 0.0, height)), flies=False)
     take_off.look(sensed((0.0, 0.0, 0.5)), flies=True)
@@ -75,7 +76,7 @@ def test_where_it_stands_is_where_it_stood_last():
 
 
 def test_a_robot_that_was_never_seen_to_stand_flies():
-    take_off = TakeOff()
+    take_off = TakeOff(*FENCE)
     take_off.look(sensed(STANDS), flies=True)
     assert take_off.over
     take_off.forget()
@@ -89,7 +90,57 @@ def test_a_robot_that_was_never_seen_to_stand_flies():
 def test_at_speed_the_rotors_do_not_stop(axis, speed, may):
     velocity = [0.0, 0.0, 0.0]
     velocity[axis] = speed
-    assert TakeOff().may_end(sensed(STANDS, tuple(velocity))) == may
+    assert TakeOff(*FENCE).may_end(sensed(STANDS, tuple(velocity))) == may
+
+
+# Stopped by the operator or by a hit
+
+
+def stopped():
+    take_off = TakeOff(*FENCE)
+    take_off.forget(stopped=True)
+    return take_off
+
+
+def lie(take_off, ticks, position=STANDS, velocity=ZERO):
+    """Let it lie there for so many ticks; say whether it may take off then."""
+    for _ in range(ticks):
+        take_off.look(sensed(position, velocity), flies=False)
+    return take_off.allowed
+
+
+def test_stopped_it_may_take_off_once_it_has_been_at_rest():
+    take_off = stopped()
+    assert not lie(take_off, STILL_TICKS - 1)
+    take_off.forget()  # acknowledged
+    assert not lie(take_off, STILL_TICKS - 1)
+    assert lie(take_off, 1)
+    assert lie(take_off, 1, velocity=(1.0, 0.0, 0.0))
+    take_off.forget(stopped=True)
+    assert not lie(take_off, STILL_TICKS - 1)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("speed", [STILL, nan])
+def test_a_tick_in_motion_begins_the_rest_anew(axis, speed):
+    take_off, velocity = stopped(), [0.0, 0.0, 0.0]
+    velocity[axis] = speed
+    lie(take_off, STILL_TICKS - 1)
+    assert not lie(take_off, STILL_TICKS, velocity=tuple(velocity))
+    assert not lie(take_off, STILL_TICKS - 1)
+    velocity[axis] = 0.99 * STILL
+    assert lie(take_off, 1, velocity=tuple(velocity))
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("face", [0, 1])
+def test_outside_the_fence_it_stays_where_it_lies(axis, face):
+    position = list(STANDS)
+    position[axis] = FENCE[face][axis]
+    assert lie(stopped(), STILL_TICKS, tuple(position))
+    for outside in (FENCE[face][axis] + (2 * face - 1) * 1e-6, nan):
+        position[axis] = outside
+        assert not lie(stopped(), 2 * STILL_TICKS, tuple(position))
 
 
 # On the ground
@@ -161,6 +212,7 @@ def test_a_robot_that_is_fast_brakes_before_its_rotors_stop():
     assert states(guard) == [GROUND]
 
 
+@pytest.mark.promise("P-GUARD-5")
 def test_a_robot_that_has_left_the_ground_stays_up_and_climbs_clear_of_it():
     guard = taking_off(1.1 * HOP)
     flown = run(guard, 10 * MS, 3 * SECOND, above(1.1 * HOP))
@@ -169,6 +221,7 @@ def test_a_robot_that_has_left_the_ground_stays_up_and_climbs_clear_of_it():
     assert flown[-1][2] == pytest.approx(0.8 * (FLOOR_MARGIN - STANDS[2] - 1.1 * HOP))
 
 
+@pytest.mark.promise("P-GUARD-5")
 def test_a_robot_that_has_flown_never_stops_its_rotors_where_it_once_stood():
     """It may have taken off from a roof, and be beside it."""
     guard = taking_off(1.0)
@@ -184,7 +237,7 @@ def test_the_next_take_off_is_another_one():
     guard.stop(10 * MS)
     guard.acknowledge(1 * SECOND)
     guard.start_mission(1 * SECOND)
-    run(guard, 1 * SECOND, 1 * SECOND + TICK, HERE)
+    run(guard, 1 * SECOND, 2 * SECOND, HERE)
     feed(guard, 2 * SECOND, 1, position=HERE)
     guard.take_changes()
     run(guard, 3 * SECOND, 4 * SECOND, HERE)
