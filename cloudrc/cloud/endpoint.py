@@ -241,7 +241,7 @@ class CloudEndpoint:
                 self._take_from_teleop()
 
     def _seen(self, telemetry: Telemetry, epoch: int) -> Seen:
-        return Seen(
+        known = (
             epoch,
             telemetry.odometry.position,
             telemetry.guard,
@@ -254,6 +254,7 @@ class CloudEndpoint:
             telemetry.mission_id,
             telemetry.reached,
         )
+        return _new(Seen, known)
 
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():

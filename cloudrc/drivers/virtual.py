@@ -113,10 +113,12 @@ class VirtualRun:
                     cloud.handle_deadline(deadline_ns + offset_ns)
             if to_world:
                 world_ns = world.next_deadline_ns()
-                self._send(world.take_datagrams(), self._uplink, to_world=False)
+                if datagrams := world.take_datagrams():
+                    self._send(datagrams, self._uplink, to_world=False)
             else:
                 cloud_ns = cloud.next_deadline_ns() - offset_ns
-                self._send(cloud.take_datagrams(), self._downlink, to_world=True)
+                if datagrams := cloud.take_datagrams():
+                    self._send(datagrams, self._downlink, to_world=True)
         self.now_ns = end_ns
 
     def _send(self, datagrams: list[bytes], link: Link, *, to_world: bool) -> None:

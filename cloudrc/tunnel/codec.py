@@ -114,8 +114,7 @@ class Busy(NamedTuple):
 
 _HEADER = struct.Struct("<BBIBBQ")
 _TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIdIQHB")
-_STAMP = struct.Struct("<q")
-_SLIP_OFFSET = struct.calcsize("<q3d4d3d3ddqq")
+_STAMPS = struct.Struct(f"<q{struct.calcsize('<3d4d3d3ddqq')}xq")
 _COMMAND = struct.Struct("<qqq3dd")
 _OPERATOR = struct.Struct("<IBBQH")
 _HELLO = struct.Struct("<16s16s16sB")
@@ -219,8 +218,7 @@ def decode_telemetry(body: bytes) -> Telemetry:
 
 def decode_stamps(body: bytes) -> tuple[int, int]:
     """Read only stamp and slip [ns] of a TELEMETRY datagram: enough for one that is not used."""
-    (stamp_ns,) = _STAMP.unpack_from(body)
-    (slip_ns,) = _STAMP.unpack_from(body, _SLIP_OFFSET)
+    stamp_ns, slip_ns = _STAMPS.unpack_from(body)
     return stamp_ns, slip_ns
 
 

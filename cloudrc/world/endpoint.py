@@ -143,13 +143,12 @@ class WorldEndpoint:
 
     def _follow(self, now_ns: int) -> int:
         """World time at a wake; remembers a wake after a stall, whose datagrams have waited."""
-        behind_ns = now_ns - self._clock.slip_ns - self._clock.tick_ns
+        world_ns = now_ns - self._clock.slip_ns
+        behind_ns = world_ns - self._clock.tick_ns
         if behind_ns > self._command_age_max_ns:
             self._stalled_wake_ns = now_ns
             self._counts["stalls"] += 1
-        if behind_ns > CATCH_UP_NS:
-            return self._clock.follow(now_ns)
-        return now_ns - self._clock.slip_ns
+        return self._clock.follow(now_ns) if behind_ns > CATCH_UP_NS else world_ns
 
     def _advance(self, until_ns: int) -> None:
         """Run all ticks before `until_ns` [world's clock]."""
@@ -186,7 +185,7 @@ class WorldEndpoint:
                 records.append(Contact(now_ns, **touch._asdict()))
                 self._touches.note(touch)
         if epoch := self._session.epoch:
-            telemetry = Telemetry(
+            known = (
                 now_ns,
                 self._sensors.measure(truth),
                 tip_force,
@@ -199,6 +198,7 @@ class WorldEndpoint:
                 self._touches.speed,
                 *self._progress,
             )
+            telemetry = _new(Telemetry, known)
             counter = self._session.next_counter(TELEMETRY)
             self._send(TELEMETRY, codec.encode_telemetry(telemetry))
             records.append(_new(TelemetrySent, (now_ns, epoch, counter, telemetry)))
