@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 def run(options: argparse.Namespace) -> int:
     """Shape one direction of the link until SIGTERM."""
     stop = StopSignal()  # first: the first process of a container ignores SIGTERM until then
+    from cloudrc.cli.link_told import Teller
     from cloudrc.cli.tc_session import runner
     from cloudrc.link.netem_tables import write_tables
     from cloudrc.link.sidecar import Settings, Sidecar
@@ -46,8 +47,10 @@ def run(options: argparse.Namespace) -> int:
         programs = runner(tables)
         machine = _machine(options, programs, Path(tables))
         sidecar = Sidecar(settings, machine, profile, watcher)
+        if exporter:
+            exporter.tells(Teller(sidecar).text)
         try:
-            sidecar.run(stop, lambda: _follow(sidecar, file, options))
+            sidecar.run(stop, lambda: _follow(sidecar, file, options, watcher))
         finally:
             programs.close()
     return 0
@@ -125,7 +128,9 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
     )
 
 
-def _follow(sidecar: Sidecar, file: Profiles, options: argparse.Namespace) -> None:
+def _follow(
+    sidecar: Sidecar, file: Profiles, options: argparse.Namespace, watcher: Metrics | None
+) -> None:
     """Let threads of their own look after the profile's file and the peer's name."""
     from cloudrc.link.sidecar_follow import PEER_PERIOD, PROFILE_PERIOD, PeerName
 
@@ -136,6 +141,8 @@ def _follow(sidecar: Sidecar, file: Profiles, options: argparse.Namespace) -> No
 
     def ask() -> None:
         sidecar.peer = name.poll() or sidecar.peer
+        if watcher is not None:
+            watcher.unresolved(name.failures)
 
     for action, period in ((look, PROFILE_PERIOD), (ask, PEER_PERIOD)):
         threading.Thread(target=_every, args=(period, action), daemon=True).start()
@@ -164,6 +171,10 @@ class Metrics:
     def asked(self, delay: float) -> None:
         """Show the mean delay that is asked for [s]."""
         self._exporter.asked(self._direction, delay)
+
+    def unresolved(self, count: int) -> None:
+        """Show how often the peer's name could not be resolved."""
+        self._exporter.unresolved(count)
 
     def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
         """Show what became of the datagrams."""

@@ -21,14 +21,15 @@ examples:
   cloudrc link show lossy
   cloudrc link show my.yaml --seconds 120 -o my.svg
   cloudrc link show trace.csv
+  cloudrc link show ./my.yaml --packets 300000 --rate 200
 
-The model of the link itself is asked, packet by packet at 100 Hz, so a flight
-with the same seed meets these delays. Of a link that does not change, the
-numbers are of 100000 packets. All delays are one way."""
-RATE_HZ = 100
+The model of the link itself is asked, packet by packet, so a flight with the
+same seed meets these delays. All delays are one way."""
+RATE_HZ = 100.0
 WAYS = ("uplink", "downlink")
 STEADY = 100_000
 """Packets for the numbers of a link that does not change."""
+PACKETS_MAX, RATE_MAX = 10_000_000, 10_000.0
 SECONDS = 30.0
 """Time that the picture shows at least [s]."""
 KINDS = ("png", "svg", "pdf")
@@ -46,6 +47,16 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=float, metavar="S", help="to show (default: 30, or until all has changed)"
     )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default: 1")
+    parser.add_argument(
+        "--rate", type=float, default=RATE_HZ, metavar="HZ", help="packets a second (default: 100)"
+    )
+    parser.add_argument(
+        "--packets",
+        type=int,
+        default=STEADY,
+        metavar="N",
+        help=f"for the numbers of a link that does not change (default: {STEADY})",
+    )
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -54,24 +65,32 @@ def execute(options: argparse.Namespace) -> int:
     output = options.output or Path(f"{Path(options.profile).stem}.png")
     if output.suffix[1:] not in KINDS:
         raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
-    if options.seconds is not None and not 0.0 < options.seconds <= 86_400.0:
-        raise BadInputError(f"--seconds {options.seconds:g}: give a number above 0, at most 86400")
-    if options.seed < 0:
-        raise BadInputError(f"--seed {options.seed}: give a whole number that is not negative")
+    _check(options)
     from cloudrc.report.figures.link import picture
 
     profile = _profile(options.profile)
     ways: dict[str, Way] = {}
     counted: dict[str, Numbers] = {}
     for name in ("uplink",) if _is_trace(options.profile) else WAYS:
-        asked = getattr(profile, name)
-        ways[name], counted[name] = _way(asked, name, options.seed, options.seconds)
+        ways[name], counted[name] = _way(getattr(profile, name), name, options)
     title = ": ".join(filter(None, (Path(options.profile).stem, profile.description)))
     output.write_bytes(picture(title, ways["uplink"], ways.get("downlink"), output.suffix[1:]))
     print(title)
     print(_table(counted))
     print(output)
     return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse numbers that make no sense."""
+    if options.seconds is not None and not 0.0 < options.seconds <= 86_400.0:
+        raise BadInputError(f"--seconds {options.seconds:g}: give a number above 0, at most 86400")
+    if options.seed < 0:
+        raise BadInputError(f"--seed {options.seed}: give a whole number that is not negative")
+    if not 1.0 <= options.rate <= RATE_MAX:
+        raise BadInputError(f"--rate {options.rate:g}: give a number from 1 to {RATE_MAX:g}")
+    if not 1 <= options.packets <= PACKETS_MAX:
+        raise BadInputError(f"--packets {options.packets}: give a number from 1 to {PACKETS_MAX}")
 
 
 def _is_trace(name: str) -> bool:
@@ -90,7 +109,7 @@ def _profile(name: str) -> Profile:
     return load_profile(name)
 
 
-def _way(asked: Direction, name: str, seed: int, seconds: float | None) -> tuple[Way, Numbers]:
+def _way(asked: Direction, name: str, options: argparse.Namespace) -> tuple[Way, Numbers]:
     """Send a stream one way, and for the numbers of a steady link a longer one."""
     from cloudrc.assembly import link_profile
     from cloudrc.link.timeline import Timeline
@@ -99,15 +118,28 @@ def _way(asked: Direction, name: str, seed: int, seconds: float | None) -> tuple
 
     profile = link_profile(asked)
     starts_ns = Timeline(profile).starts_ns
-    last = starts_ns[-1] * 1e-9
-    duration = seconds or (last if profile.trace and last else max(SECONDS, 1.1 * last))
-    stream = _stream(profile, name, seed, round(duration * RATE_HZ))
-    many = _stream(profile, name, seed, STEADY) if len(starts_ns) == 1 else stream
+    last, seed, rate = starts_ns[-1] * 1e-9, options.seed, options.rate
+    default = last if profile.trace and last else max(SECONDS, 1.1 * last)
+    count = round((options.seconds or default) * rate)
+    shown = stream(profile, name, seed, count, rate)
+    steady = len(starts_ns) == 1
+    many = stream(profile, name, seed, options.packets, rate) if steady else shown
     counted = numbers(many)
-    return Way(asked, stream.sent, stream.delays, many.delays, counted.runs), counted
+    return Way(asked, shown.sent, shown.delays, many.delays, counted.runs), counted
 
 
-def _stream(profile: DirectionProfile, name: str, seed: int, count: int) -> Stream:
+def stream(
+    profile: DirectionProfile, name: str, seed: int, count: int, rate: float = RATE_HZ
+) -> Stream:
+    """Send packets of a flight's kind and size one way.
+
+    Args:
+        profile: Conditions.
+        name: Of the way.
+        seed: Of the experiment.
+        count: Packets.
+        rate: At which they are sent [1/s].
+    """
     from cloudrc.link.model import LinkDirection
     from cloudrc.link.trace_sample import sample
     from cloudrc.tunnel.codec import SIZES, Kind
@@ -115,7 +147,7 @@ def _stream(profile: DirectionProfile, name: str, seed: int, count: int) -> Stre
     uplink = name == "uplink"
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     link = LinkDirection(profile, seed, uplink)
-    return sample(link, kind, max(count, 1), 1_000_000_000 // RATE_HZ, SIZES[kind])
+    return sample(link, kind, max(count, 1), round(1e9 / rate), SIZES[kind])
 
 
 def _table(counted: dict[str, Numbers]) -> str:

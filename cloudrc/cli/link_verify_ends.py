@@ -1,8 +1,8 @@
 """The link of a release in flight: both ends are asked what they hear; a verdict goes out.
 
 The tunnel's own datagrams are the probes, so that nothing but the shaped flow is measured. Each end
-judges the direction that it hears and serves the rows at /link.json of its metrics port; the link
-containers' metrics say who shapes, and what has passed there.
+judges the direction that it hears and serves the rows at /link.json of its metrics port; there the
+link containers say who shapes, by what, and which qdiscs are near, in metrics what has passed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from math import nan
+from math import inf, nan
 from typing import Any, NamedTuple
 
 from cloudrc.cli.link_verify_notes import on_jitter
@@ -19,17 +19,24 @@ from cloudrc.cli.link_verify_text import NOT_JUDGED, Said
 from cloudrc.cluster.fetch import METRICS
 from cloudrc.cluster.forward import DIRECTLY
 from cloudrc.errors import TimedOutError
+from cloudrc.link.sidecar_told import Told, read_told
+from cloudrc.link.verify_applied import shown
 from cloudrc.link.verify_causes import Evidence, Findings, find_causes
-from cloudrc.link.verify_evidence import Samples, of_metrics, samples, shaper_of
+from cloudrc.link.verify_evidence import Samples, of_metrics, of_told, samples, shaper_of
 from cloudrc.link.verify_judge import Row
 from cloudrc.link.verify_standing import PERIOD, WINDOW_MAX
+from cloudrc.link.verify_words import kbit
+from cloudrc.tunnel.codec import SIZES, Kind
 
 END_PORT, LINK_PORT = METRICS["world"]["world"], METRICS["world"]["link"]
 LOOK_PERIOD = 2.0
 """Between two questions [s]."""
+OTHER_LIMIT = 30.0
+"""Once one direction is off, what the other is may tell why, and is waited for so long [s]."""
 _PATIENCE = 3.0
 _SENT_MIN = 1500
 _SHARES = ("loss", "reordered", "duplicated")
+_FLIES = {"uplink": Kind.TELEMETRY, "downlink": Kind.COMMAND}
 
 Tell = Callable[[str], None]
 
@@ -65,6 +72,8 @@ def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -
         verdicts = {way: found["verdict"] for way, found in seen.items()}
         if len(seen) == len(hears) and "open" not in verdicts.values():
             break
+        if len(seen) == len(hears) and "off" in verdicts.values():
+            until = min(until, time.monotonic() + OTHER_LIMIT)
         if time.monotonic() > until:
             break
     tell("")
@@ -74,8 +83,8 @@ def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -
             f"{' and '.join(silent)} could not be asked within {limit:g} s: are the pods ready?"
         )
     findings = {
-        way: _findings(seen[way], way, before[way], _counters(pods[sends[way]], way))
-        for way in hears
+        way: _findings(seen[way], way, before[way], _counters(pods[end], way), _told(pods[end]))
+        for way, end in sends.items()
     }
     names = sorted({one.evidence.shaper or "nobody knows" for one in findings.values()})
     return Said(
@@ -83,7 +92,7 @@ def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -
         shaper=f"shaped by {' and '.join(names)}",
         findings=findings,
         probes={way: _describe(seen[way]) for way in hears},
-        notes=[note for way in hears for note in _notes(way, seen[way])],
+        notes=[note for way in hears for note in _notes(way, seen[way], findings[way].evidence)],
         causes=find_causes(findings),
         more="too few datagrams yet: the ends go on judging, ask again (above: when)",
     )
@@ -120,9 +129,19 @@ def _counters(sender: Pod, way: str) -> _Counters:
     return _Counters(None if sent is None else int(sent), link)
 
 
-def _findings(found: Mapping[str, Any], way: str, before: _Counters, after: _Counters) -> Findings:
+def _told(sender: Pod) -> Told | None:
+    """Ask the link of a pod what it says of itself; None if it does not."""
+    try:
+        return read_told(_get(f"{sender.link}/link.json"))
+    except (OSError, ValueError):
+        return None
+
+
+def _findings(
+    found: Mapping[str, Any], way: str, before: _Counters, after: _Counters, told: Told | None
+) -> Findings:
     """Join what one end heard with what the other's link container tells."""
-    known = Evidence(shaper=shaper_of(after.link, way))
+    known = of_told(told) if told else Evidence(shaper=shaper_of(after.link, way))
     known = of_metrics(after.link, 0, known, before.link)
     earlier = of_metrics(before.link, 0, known).passed
     sent = after.sent - before.sent if after.sent and before.sent else 0
@@ -135,11 +154,11 @@ def _findings(found: Mapping[str, Any], way: str, before: _Counters, after: _Cou
         passed=passed if enough else None,
         unread=None,  # since it began: long ago
     )
-    delay = after.link.get(("cloudrc_link_delay_seconds", f'direction="{way}"'), nan)
-    return Findings(_rows(found, delay), known)
+    applied = shown(known.applied, SIZES[_FLIES[way]]) if known.applied else {}
+    return Findings(_rows(found, applied), known)
 
 
-def _rows(found: Mapping[str, Any], delay: float) -> list[Row]:
+def _rows(found: Mapping[str, Any], applied: Mapping[str, float]) -> list[Row]:
     rows = []
     for row in found["rows"]:
         if row["verdict"] == "told":
@@ -147,8 +166,8 @@ def _rows(found: Mapping[str, Any], delay: float) -> list[Row]:
         name = str(row["quantity"])
         values = [float(row.get(key, nan)) for key in ("asked", "measured", "low", "high")]
         asked, measured, low, high = values
-        unit, applied = "1" if name in _SHARES else "s", delay if name == "mean" else nan
-        rows.append(Row(name, unit, asked, applied, measured, low, high, row["verdict"]))
+        unit, says = "1" if name in _SHARES else "s", applied.get(name, nan)
+        rows.append(Row(name, unit, asked, says, measured, low, high, row["verdict"]))
     return rows
 
 
@@ -157,7 +176,7 @@ def _describe(found: Mapping[str, Any]) -> str:
     return f"{max(counts, default=0)} of the tunnel's own datagrams"
 
 
-def _notes(way: str, found: Mapping[str, Any]) -> list[str]:
+def _notes(way: str, found: Mapping[str, Any], evidence: Evidence) -> list[str]:
     if not found["rows"]:
         what = "commands" if way == "downlink" else "telemetry"
         hint = "fly a mission first" if way == "downlink" else "is the other end ready?"
@@ -169,8 +188,9 @@ def _notes(way: str, found: Mapping[str, Any]) -> list[str]:
     elif "mean" not in rows and "loss" in rows:
         notes.append(f"{way}: delays {NOT_JUDGED}: the ends do not share a clock")
     if "rate" in rows:
-        rate = float(rows["rate"]["asked"]) * 1e-3
-        notes.append(f"{way}: rate of {rate:.0f} kbit/s {NOT_JUDGED}: its datagrams come alone")
+        rate = kbit(float(rows["rate"]["asked"]))
+        says = f" (applied: {kbit(evidence.applied.rate or inf)})" if evidence.applied else ""
+        notes.append(f"{way}: rate of {rate}{says} {NOT_JUDGED}: its datagrams come alone")
     if "jitter_share" in rows:
         notes += on_jitter(way, float(rows["jitter_share"]["measured"]))
     if "time_line" in rows and (share := float(rows["time_line"]["measured"])) < _WATCHED:

@@ -9,17 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import json
 import os
 import socket
 import subprocess
 from collections.abc import Iterator
 
-from cloudrc.cli.link_processes import LOOPBACK, WAYS, Place, Shaping
+from cloudrc.cli.link_processes import LOOPBACK, WAYS, Place
 from cloudrc.cli.link_verify_run import Bank
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.link.verify_causes import Evidence
-from cloudrc.link.verify_evidence import in_force, of_qdiscs
 
 DEVICE = "tunnel"
 PORT, METRICS_PORT = 7400, 9102
@@ -55,22 +52,6 @@ def banks_of_namespaces() -> Iterator[dict[str, Bank]]:
         for name in names.values():
             with contextlib.suppress(MissingPrerequisiteError):
                 _ip("netns", "del", name)
-
-
-def read_back(one: Shaping, told: Evidence) -> Evidence:
-    """Ask the kernel what shapes a direction, and how.
-
-    Args:
-        one: The direction's process.
-        told: What it says itself.
-    """
-    inside = one.place.inside
-    listed = json.loads(_run(*inside, "tc", "-s", "-j", "qdisc", "show") or "[]")
-    route = json.loads(_run(*inside, "ip", "-j", "route", "get", one.place.peer[0]))
-    by_device: dict[str, list[dict[str, object]]] = {}
-    for qdisc in listed:
-        by_device.setdefault(str(qdisc.get("dev", "")), []).append(qdisc)
-    return in_force(of_qdiscs(by_device, str(route[0]["dev"])), by_device, told)
 
 
 def _place(way: str, name: str) -> Place:

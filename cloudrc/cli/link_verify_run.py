@@ -14,6 +14,7 @@ import numpy as np
 
 from cloudrc.assembly import link_profile
 from cloudrc.cli.link_processes import LOOPBACK, WAYS, Place, Shaping, shaping
+from cloudrc.cli.link_told import look
 from cloudrc.cli.link_verify_late import LateWatch
 from cloudrc.cli.link_verify_notes import describe, notes, shaper_in_words
 from cloudrc.cli.link_verify_probes import PROBE, TRAIN, Probes
@@ -26,7 +27,7 @@ from cloudrc.drivers.sounder import Shore, Volley, sound
 from cloudrc.link.verify_causes import Evidence, Findings, find_causes
 from cloudrc.link.verify_corrupt import refusing
 from cloudrc.link.verify_estimate import frame_of
-from cloudrc.link.verify_evidence import of_metrics, samples
+from cloudrc.link.verify_evidence import of_metrics, samples, with_near
 from cloudrc.link.verify_expect import as_sent
 from cloudrc.link.verify_judge import judge
 from cloudrc.link.verify_measure import measure
@@ -242,11 +243,9 @@ def _read_back(one: Shaping, sent: int) -> Evidence:
     applied = link_profile(getattr(in_force, state.direction))
     known = Evidence(shaper=state.shaper, why=state.reason, layers=1, applied=applied)
     told = of_metrics(samples(one.metrics()), sent, known)
+    found = with_near(told, look(one.place.peer[0], one.place.inside))
     if state.shaper != "netem":
-        return told
-    from cloudrc.cli.link_verify_netem import read_back
-
-    found = read_back(one, told)
+        return found
     return replace(found, applied=found.applied and refusing(found.applied))
 
 

@@ -11,7 +11,7 @@ What `see` takes in is kept in plain numbers; Prometheus' text is made of them w
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
@@ -20,13 +20,14 @@ from prometheus_client.metrics_core import Metric as Family
 from cloudrc import __version__
 from cloudrc.drivers.cgroup import read_throttling
 from cloudrc.drivers.probes import Answer, ProbeServer
+from cloudrc.drivers.wall_clock import WallClock
 from cloudrc.exposition.histogram import Histogram
-from cloudrc.exposition.labels import Labels
+from cloudrc.exposition.labels import ENDS, Labels
 from cloudrc.exposition.live import Live
 from cloudrc.exposition.metric import Kind, Metric
 from cloudrc.exposition.part import Readings, plain
 from cloudrc.exposition.table import of_role
-from cloudrc.records import Record
+from cloudrc.records import Counted, Record
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 """What `generate_latest` writes."""
@@ -38,14 +39,17 @@ STILL_MAX = 5.0
 class Exporter:
     """The metrics of one process."""
 
-    def __init__(self, role: str) -> None:
+    def __init__(self, role: str, *, missions: bool = True) -> None:
         """Begin with nothing seen, served or ready.
 
         Args:
             role: "world", "cloud", "teleop" or "link".
+            missions: Whether they are told here; False in a cloud whose teleop tells them.
         """
         self._role, self._metrics = role, of_role(role)
-        self._live = Live(role)
+        self._live = Live(role, missions=missions)
+        self._wall = WallClock()
+        self._sync_age: Callable[[], float | None] = lambda: None
         self._said_ready = False
         self._seen_at: float | None = None  # no loop is alive or dead before it has begun
         self._server: ProbeServer | None = None
@@ -79,6 +83,19 @@ class Exporter:
         assert self._live.link is not None, "only a link is shaped"
         self._live.link.asked(direction, delay)
 
+    def unresolved(self, count: int) -> None:
+        """Say how often the peer's name could not be resolved so far, from any thread."""
+        self._live.see([Counted(0, "link", "unresolved", count)])
+
+    def recording(self, sync_age: Callable[[], float | None]) -> None:
+        """Say who knows how old the recording on the disk is [s]; None while there is none."""
+        self._sync_age = sync_age
+
+    def tells(self, tell: Callable[[], str]) -> None:
+        """Answer /link.json with this JSON from now on; only with the role "link"."""
+        assert self._live.link is not None, "an end tells of its check"
+        self._live.link.tell = tell
+
     @property
     def is_ready(self) -> bool:
         """Whether this process has said so, or as an end of the tunnel hears the other end."""
@@ -97,9 +114,11 @@ class Exporter:
             host, _, port = address.rpartition(":")
             address = host, int(port)
         pages = {"/metrics": self._page, "/healthz": self._liveness, "/readyz": self._readiness}
-        end = self._live.end
+        end, link = self._live.end, self._live.link
         if end is not None:
             pages["/link.json"] = lambda: Answer(200, end.check.text().encode(), JSON)
+        if link is not None:
+            pages["/link.json"] = lambda: Answer(200, link.tell().encode(), JSON)
         self._server = ProbeServer(address, pages)
         return int(self._server.server_address[1])
 
@@ -122,6 +141,10 @@ class Exporter:
             "cloudrc_build_info": {(__version__, self._role): 1.0},
             "cloudrc_ready": plain(self.is_ready),
         }
+        if self._role in ENDS:
+            readings["cloudrc_clock_steps_total"] = plain(self._wall.steps())
+        if (age := self._sync_age()) is not None:
+            readings["cloudrc_recorder_sync_age_seconds"] = plain(age)
         throttling = read_throttling()
         if throttling is not None:
             readings["cloudrc_cpu_periods_total"] = plain(throttling.periods)

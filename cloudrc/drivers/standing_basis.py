@@ -11,11 +11,12 @@ from math import nan
 from typing import NamedTuple
 
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.timeline import settled
 from cloudrc.link.verify_block import Block
 from cloudrc.link.verify_expect import JITTER_SHARES, has_jitter
 from cloudrc.link.verify_judge import Row
 from cloudrc.link.verify_origin import LATER, length
-from cloudrc.link.verify_standing import RECENT, Standing, excused, make_standing, settled
+from cloudrc.link.verify_standing import RECENT, Standing, excused, make_standing
 from cloudrc.link.verify_story import judge_story
 from cloudrc.link.verify_twin import SAME_SHARE, Compared, Heard, Stream, Twin
 

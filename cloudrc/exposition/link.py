@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from cloudrc.exposition.labels import (
     DIRECTIONS,
@@ -18,10 +18,15 @@ from cloudrc.records import Counted
 
 
 class Link:
-    """One process that shapes one direction or both."""
+    """One process that shapes one direction or both.
+
+    Attributes:
+        tell: Says as JSON what its metrics have no words for.
+    """
 
     def __init__(self) -> None:
         """Begin before anything is shaped."""
+        self.tell: Callable[[], str] = lambda: "{}\n"
         self._shapers: dict[str, Labels] = {}
         self._delays: dict[str, float] = {}
         self._counts: dict[str, int] = {}
@@ -57,6 +62,7 @@ class Link:
             "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
             "cloudrc_link_delay_seconds": by(dict(self._delays)),
             "cloudrc_link_datagrams_total": by(chosen(LINK_OUTCOMES, self._counts)),
+            "cloudrc_dns_errors_total": plain(self._counts.get("unresolved", 0)),
             "cloudrc_link_release_error_seconds": self._late("release_error", RELEASE_PERCENTILES),
             "cloudrc_link_step_lateness_seconds": self._late("step_lateness", STEP_PERCENTILES),
         } | self._restored()

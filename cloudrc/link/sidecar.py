@@ -20,6 +20,7 @@ from cloudrc.link.relay_lane import Address
 from cloudrc.link.route import publish, publish_route, withdraw
 from cloudrc.link.shaper import Shaper
 from cloudrc.link.sidecar_follow import Loaded
+from cloudrc.link.sidecar_told import Told, in_force_now
 from cloudrc.link.state import RELEASED_SUFFIX, Change, LinkState, summary, to_text
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
@@ -111,7 +112,8 @@ class Sidecar:
         self._reason = ""
         self._origin_ns: int | None = None
         self._state: LinkState | None = None
-        self._told: LinkState | None = None
+        self._published: LinkState | None = None
+        self._in_force: tuple[LinkState, DirectionProfile] | None = None
         self._released, self._released_ns = settings.state.with_suffix(RELEASED_SUFFIX), 0
         self._seen = profile.change.number
 
@@ -142,6 +144,14 @@ class Sidecar:
         finally:
             withdraw(self._settings.route)
             withdraw(self._released)
+
+    def told(self) -> Told | None:
+        """Say who shapes, and what is in force; None before that. Other threads may ask."""
+        if self._in_force is None:
+            return None
+        state, profile = self._in_force
+        elapsed_ns = self._machine.clock() - (state.origin_ns or 0)
+        return Told(state.shaper, state.reason, in_force_now(profile, elapsed_ns))
 
     def _insist(self) -> None:
         """Find out whether netem will do, before anybody is waited for."""
@@ -181,7 +191,7 @@ class Sidecar:
         """Tell how it goes: the metrics what became of datagrams, this pod's end how late."""
         if self._watcher:
             self._watcher.counted(now_ns, shaper.counts())
-        if self._told is not self._state:
+        if self._published is not self._state:
             self._publish()
         if now_ns >= self._released_ns and (released := shaper.released()):
             self._released_ns = now_ns + RELEASED_PERIOD_NS
@@ -255,6 +265,7 @@ class Sidecar:
             asked=asked,
             origin_ns=self._origin_ns,
         )
+        self._in_force = self._state, profile.direction
         self._seen = profile.change.number
         self._publish()
         if self._watcher:
@@ -271,7 +282,7 @@ class Sidecar:
         if self._state is not None:
             with suppress(OSError):
                 publish(self._settings.state, to_text(self._state))
-                self._told = self._state
+                self._published = self._state
 
 
 def _cause(error: CloudrcError) -> str:

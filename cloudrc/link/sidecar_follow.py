@@ -87,6 +87,9 @@ class PeerName:
 
     While an old and a new pod overlap a headless Service names both: the one that came later is the
     one that flies on.
+
+    Attributes:
+        failures: How often it could not be resolved.
     """
 
     def __init__(
@@ -107,6 +110,7 @@ class PeerName:
         self._log = log
         self._known: list[str] = []
         self._said = ""
+        self.failures = 0
 
     def poll(self) -> Address | None:
         """Resolve the name once; None if that fails and never succeeded before."""
@@ -114,6 +118,7 @@ class PeerName:
         try:
             addresses = sorted(self._resolve(self._name))
         except OSError as error:
+            self.failures += 1
             keeps = f"keeps {before[0]}" if before else "waits for it"
             self._say(f"{self._name} cannot be resolved ({error.strerror or error}); {keeps}")
         else:

@@ -6,6 +6,7 @@ The model asks it for each packet, with the time since the link came up.
 from __future__ import annotations
 
 from bisect import bisect_right
+from dataclasses import replace
 from typing import NamedTuple
 
 from cloudrc.link.profile import DirectionProfile, Loss
@@ -63,6 +64,22 @@ class Timeline:
     def only(self) -> Conditions | None:
         """Say what always holds; None if that changes over time."""
         return self._pieces[0] if len(self._pieces) == 1 else None
+
+
+def settled(profile: DirectionProfile) -> DirectionProfile:
+    """Give the conditions that hold for ever once a time line is over."""
+    timeline = Timeline(profile)
+    last = timeline.at(timeline.starts_ns[-1])
+    return replace(
+        profile,
+        delay=last.delay_ns * 1e-9,
+        jitter=last.jitter,
+        loss=1.0 if last.blackout else last.loss,
+        rate=last.rate,
+        changes=(),
+        trace=None,
+        blackouts=(),
+    )
 
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:

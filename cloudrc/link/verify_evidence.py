@@ -12,6 +12,7 @@ from typing import Any
 
 from cloudrc.link.netem_tables import stretch
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
+from cloudrc.link.sidecar_told import Near, Told
 from cloudrc.link.verify_causes import Evidence
 
 _IN_ORDER = 50e9
@@ -119,6 +120,27 @@ def in_force(found: Evidence, listed: Qdiscs, told: Evidence) -> Evidence:
         throttled=told.throttled,
         restored=told.restored,
     )
+
+
+def of_told(told: Told) -> Evidence:
+    """Say what a link's process tells, of itself and of the kernel."""
+    known = Evidence(told.shaper, told.why, layers=1, applied=told.applied)
+    return with_near(known, told.near)
+
+
+def with_near(told: Evidence, near: Near | None) -> Evidence:
+    """Add to what a shaper tells of itself which netems are on the flow's way, if that is known."""
+    if near is None:
+        return told
+    if told.shaper == "netem":
+        return in_force(of_qdiscs(near.netems, near.interface), near.netems, told)
+    way = {_TO_RELAY, near.interface}
+    others = sum(len(near.netems.get(name, ())) for name in way)
+    return replace(told, interface=near.interface, layers=1 + others)
+
+
+_TO_RELAY = "lo"
+"""Over which an end reaches the relay of its pod."""
 
 
 def netem_profile(options: Mapping[str, Any], told: DirectionProfile) -> DirectionProfile:

@@ -114,7 +114,7 @@ def expect(
         share: By which the jitter may be off, in [0, 1]; None for the strictest.
         batches: How many to draw of a steady link: fewer are quick, and know scatter less well.
     """
-    true = _draw(profile, schedule, batches)
+    true = draw_batches(profile, schedule, batches)
     over_time = None if is_steady(profile) else true.over_time()
     found = true.estimates(over_time)
     share = jitter_shares(profile)[0] if share is None else share
@@ -206,7 +206,7 @@ def _shifts(
     # A third of the batches: of the same chances in all three, differences hardly scatter.
     frame = _frame(profile, schedule)
     low, true, high = (
-        _draw(scaled(profile, factor), schedule, batches, frame).estimates(over_time)
+        draw_batches(scaled(profile, factor), schedule, batches, frame).estimates(over_time)
         for factor in (1.0 - share, 1.0, 1.0 + share)
     )
 
@@ -222,7 +222,7 @@ def _frame(profile: DirectionProfile, schedule: Schedule) -> Frame:
     return frame_of(profile, instants(number, schedule.period, schedule.begin))
 
 
-def _draw(
+def draw_batches(
     profile: DirectionProfile, schedule: Schedule, batches: int, frame: Frame | None = None
 ) -> Drawn:
     """Draw batches of one long flow, or the same story over and over if conditions change."""

@@ -14,7 +14,6 @@ from math import hypot, nan
 import numpy as np
 
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.timeline import Timeline
 from cloudrc.link.verify_block import Block
 from cloudrc.link.verify_corrupt import refusing
 from cloudrc.link.verify_estimate import REACHES
@@ -50,7 +49,7 @@ RECENT = 3000
 """What is off by far is told by so many newest ones, however many decide that all is well."""
 _PATIENCE = 12_000
 """A jitter with a long tail that takes more is judged more loosely, which is said."""
-_BATCHES = 96
+BATCHES = 96
 _SEED = 20250522
 _RUNS, _COUNT, _BURN_IN = 48, 1000, 200
 
@@ -141,14 +140,14 @@ def make_standing(
         other: What is asked of the way back, if this end measures round trips.
 
     Raises:
-        ValueError: If its conditions change: see `settled` for how they end.
+        ValueError: If its conditions change: see `timeline.settled` for how they end.
     """
     if not is_steady(profile):
         raise ValueError("conditions change")
     profile = refusing(profile)
     schedule, most = Schedule(PERIOD, 0, size), WINDOW_MAX
     for share in JITTER_SHARES_TAILED:
-        expects = _with_ends(expect(profile, schedule, share, batches=_BATCHES))
+        expects = _with_ends(expect(profile, schedule, share, batches=BATCHES))
         if expects.needs() <= _PATIENCE or not (has_jitter(profile) and is_tailed(profile)):
             break
     losses, copies = (needed_losses(one, 8 * most) for one in (profile.loss, profile.duplicate))
@@ -165,22 +164,6 @@ def make_standing(
         min(needs, WINDOW_MAX),
         needs,
         trip,
-    )
-
-
-def settled(profile: DirectionProfile) -> DirectionProfile:
-    """Give the conditions that hold for ever once a time line is over."""
-    timeline = Timeline(profile)
-    last = timeline.at(timeline.starts_ns[-1])
-    return replace(
-        profile,
-        delay=last.delay_ns * 1e-9,
-        jitter=last.jitter,
-        loss=1.0 if last.blackout else last.loss,
-        rate=last.rate,
-        changes=(),
-        trace=None,
-        blackouts=(),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
@@ -16,9 +17,12 @@ from cloudrc.cli.link_verify_ends import Pod, verify_ends
 from cloudrc.cli.link_verify_text import as_text
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.errors import TimedOutError
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.sidecar_told import Near, Told, write_told
 from cloudrc.records import Counted, LinkChecked
 
 SENT_PER_LOOK = 2000
+APPLIED = DirectionProfile(0.045, loss=0.02, duplicate=0.01, rate=3e6)
 
 
 @dataclass
@@ -66,7 +70,7 @@ def release(monkeypatch: pytest.MonkeyPatch) -> Iterator[Release]:
         (up, at_up), (down, at_down) = served("link"), served("link")
         for link, way in ((up, "uplink"), (down, "downlink")):
             link.shaped("relay", way, "auto")
-            link.asked(way, 0.045)
+            link.tells(lambda: write_told(Told("relay", "", APPLIED, Near("eth0", {}))))
         pods = {"world": Pod(at_world, at_up), "cloud": Pod(at_cloud, at_down)}
         made = Release(world, cloud, {"uplink": up, "downlink": down}, pods)
         made.count(0.0)
@@ -106,7 +110,9 @@ def test_a_release_is_believed_once_both_ends_do(release: Release) -> None:
     said = ask(release)
     assert said.verdict == "believed"
     assert said.shaper == "shaped by relay"
-    assert said.findings["uplink"].rows[0].applied == 0.045
+    mean, loss = said.findings["uplink"].rows
+    assert mean.applied == pytest.approx(0.0456, abs=1e-4), "with its time at the rate"
+    assert loss.applied == 0.02
     assert said.findings["uplink"].evidence.passed == said.findings["uplink"].evidence.sent
     assert as_text(said).splitlines()[-1].startswith("BELIEVED")
 
@@ -126,6 +132,55 @@ def test_counters_at_both_ends_show_a_bypass(release: Release) -> None:
     release.looks = 1
     said = ask(release)
     assert {cause.code for cause in said.causes} == {"bypassed"}
+
+
+@pytest.mark.parametrize(
+    ("shaper", "leaves", "code"),
+    [("relay", "eth0", "shaped_twice"), ("netem", "eth1", "wrong_interface")],
+)
+def test_what_the_links_find_on_the_way_is_named(
+    release: Release, shaper: str, leaves: str, code: str
+) -> None:
+    near = Near(leaves, {"eth0": [{"kind": "netem"}]})
+    for link in release.links.values():
+        link.tells(lambda: write_told(Told(shaper, "", APPLIED, near)))
+    release.hears("world", "off")
+    release.hears("cloud", "off")
+    assert [(cause.code, cause.way) for cause in ask(release).causes] == [(code, "both")]
+
+
+@pytest.mark.parametrize(("applied", "told_so"), [(0.090, True), (0.0452, False)])
+def test_a_shaper_that_was_told_otherwise_is_told_from_one_that_does_otherwise(
+    release: Release, applied: float, told_so: bool
+) -> None:
+    said = write_told(Told("relay", "", DirectionProfile(applied)))
+    release.links["downlink"].tells(lambda: said)
+    release.hears("world", "off")
+    release.hears("cloud", "ok")
+    (cause,) = ask(release).causes
+    assert cause.code == "doubled_delay"
+    assert f"the shaper says {applied * 1e3:.2f} ms" in cause.text
+    assert ("it was told so" in cause.text) is told_so
+
+
+def test_once_one_direction_is_off_the_other_is_not_waited_for_in_full(
+    release: Release, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link_verify_ends, "OTHER_LIMIT", 0.0)
+    release.hears("world", "off")
+    release.hears("cloud", "open")
+    assert ask(release, limit=5.0).verdict == "not believed"
+    assert release.looks <= 3, "once at the start, once it is off"
+
+
+def test_a_link_that_does_not_tell_leaves_what_is_applied_open(release: Release) -> None:
+    release.links["uplink"].tells(lambda: "{}")
+    release.hears("world", "ok")
+    release.hears("cloud", "ok")
+    said = ask(release)
+    assert said.verdict == "believed"
+    assert said.shaper == "shaped by relay", "its metrics say so"
+    assert all(math.isnan(row.applied) for row in said.findings["uplink"].rows)
 
 
 def test_without_commands_it_says_to_fly_first(release: Release) -> None:
@@ -152,7 +207,7 @@ def test_what_the_ends_cannot_judge_is_said_and_no_blank_belief(release: Release
     said = ask(release)
     text = as_text(said)
     assert said.verdict == "believed"
-    assert "rate of 2000 kbit/s NOT JUDGED" in text
+    assert "rate of 2000 kbit/s (applied: 3000 kbit/s) NOT JUDGED" in text
     assert "0% was watched" in text
     assert "within 25% only" in text
     assert text.splitlines()[-1].endswith("but for what is NOT JUDGED (above)")

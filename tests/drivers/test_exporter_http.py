@@ -59,7 +59,7 @@ def test_a_loop_that_stands_still_is_not_alive(
 
 
 def test_another_path_says_which_there_are(served: tuple[Exporter, int]) -> None:
-    assert get(served[1], "/") == (404, "there are /metrics, /healthz, /readyz\n")
+    assert get(served[1], "/") == (404, "there are /metrics, /healthz, /readyz, /link.json\n")
 
 
 def test_the_text_is_what_it_says_it_is(served: tuple[Exporter, int]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -11,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from cost import Usage, cost_between, later, usage
 from kube import (
     CHART,
     NAME,
     NAMESPACE,
+    CommandFailedError,
     cloudrc,
     eventually,
     fly,
@@ -29,6 +32,9 @@ from kube import (
     read,
     value,
 )
+
+from cloudrc.cluster.link import PROFILE, Place, hand_over
+from cloudrc.link.sidecar_handed import Handed, write_handed
 
 SET_WITHIN = 1.0
 """For `link set` to be in force, from its start [s]: the quickest of three, on a machine that has a
@@ -60,6 +66,8 @@ LONG = [
     {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
 ]
 """Up, and then waiting for longer than anything here takes."""
+LINK_TEST = f"{NAME}-test-link"
+"""Pod of `helm test` that asks both ends; kept where it failed."""
 ASIDE = (0.5, 0.5, 0.8)
 """Where the operator sends the robot meanwhile [m]."""
 
@@ -177,6 +185,39 @@ def test_the_link_is_set_by_hand_and_read_back(flight: None, note: Callable[[str
     said = "link: downlink 45 ± 25 ms (profile paper-p2)"
     log = ("logs", pod("cloud")["metadata"]["name"], "-c", "cloud")
     eventually(lambda: said in kubectl(*log), "cloud has noted it for its recording", 5.0)
+
+
+def hand_behind_its_back(component: str, profile: dict[str, Any]) -> None:
+    """Hand a profile to one pod's link container alone; `link set` hands it to both."""
+    change = {"number": str(time.time_ns()), "cause": "a seeded fault", "restart": False}
+    handed = Handed(json.dumps(change), "", {PROFILE: yaml.safe_dump(profile)})
+    where, name = Place(None, NAMESPACE, NAME), str(pod(component)["metadata"]["name"])
+    told = json.loads(hand_over(where, name, write_handed(handed)))
+    assert told["change"] == change["number"], told
+
+
+def test_helm_test_refuses_a_link_that_was_doubled_behind_its_back(
+    flight: None, note: Callable[[str], None]
+) -> None:
+    """Cloud's pod alone is told: the other end goes on asking for what the release asks for."""
+    began = time.monotonic()
+    try:
+        told = set_link("downlink.delay_ms=46")  # a change: what was heard before is not judged
+        profile = told["links"]["downlink"]["profile"]
+        profile["downlink"]["delay_ms"] = 92
+        hand_behind_its_back("cloud", profile)
+        with pytest.raises(CommandFailedError):
+            helm("test", NAME, f"--filter=name={LINK_TEST}", "--timeout=300s", timeout=320.0)
+        said = kubectl("logs", LINK_TEST)
+    finally:
+        set_link("--profile", "paper-p2")
+        kubectl("delete", "pod", LINK_TEST, "--ignore-not-found", "--wait=false")
+    note(f"helm test, a doubled downlink: refused within {time.monotonic() - began:.0f} s")
+    assert "NOT BELIEVED" in said
+    (cause,) = re.findall(
+        r"^  (\w+): the mean is .*: it was told so  \[(\w+)\]$", said, re.MULTILINE
+    )
+    assert cause == ("downlink", "doubled_delay"), said
 
 
 def operate(*words: str) -> str:

@@ -1,0 +1,24 @@
+"""What datagrams show on the link that a shaper says it makes: a profile in, numbers out."""
+
+from __future__ import annotations
+
+from cloudrc.link.profile import DirectionProfile, mean_loss
+from cloudrc.link.verify_corrupt import refusing
+from cloudrc.link.verify_expect import Schedule, draw_batches
+from cloudrc.link.verify_standing import BATCHES, PERIOD
+
+
+def shown(applied: DirectionProfile, size: int) -> dict[str, float]:
+    """Work out what the tunnel's own datagrams show, as the standing check does; takes 50 ms.
+
+    Args:
+        applied: What is in force, for ever.
+        size: Of each datagram, UDP payload [bytes].
+
+    Returns:
+        By the name of the row: [s] or [1].
+    """
+    profile = refusing(applied)
+    found = draw_batches(profile, Schedule(PERIOD, 0, size), BATCHES).estimates(None)
+    shares = {"loss": mean_loss(profile.loss), "duplicated": profile.duplicate}
+    return {name: one.value for name, one in found._asdict().items()} | shares
