@@ -130,6 +130,8 @@ def test_what_cannot_be_used_is_refused_in_one_line(
         ("show ideal --seconds 0", "--seconds 0: give a number above 0"),
         ("show ideal --seconds nan", "--seconds nan: give a number above 0"),
         ("show ideal --seed=-1", "--seed -1"),
+        ("show ideal --rate 0", "--rate 0: give a number from 1 to 10000"),
+        ("show ideal --packets 0", "--packets 0: give a number from 1 to 10000000"),
         ("show nowhere.csv", "No such file"),
         ("verify --seconds 0.5", "--seconds 0.5: give a number from 1 to 3600"),
         ("verify --seconds nan", "--seconds nan: give a number from 1 to 3600"),
@@ -174,6 +176,19 @@ def test_a_profile_is_drawn_and_put_into_numbers(
     first = (here / f"a.{kind}").read_bytes()
     assert main(line) == 0
     assert (here / f"a.{kind}").read_bytes() == first, "the same link gives the same picture"
+
+
+def test_rate_and_number_of_packets_are_as_asked(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "mine.yaml").write_text("uplink: {delay_ms: 70, jitter_ms: 25}\n")
+    overtaken = {}
+    for rate in (50, 200):
+        line = f"link show ./mine.yaml --seconds 1 --packets 4000 --rate {rate}"
+        assert main(line.split()) == 0
+        rows = capsys.readouterr().out.splitlines()
+        overtaken[rate] = float(next(row for row in rows if "overtaken" in row).split()[-3])
+    assert overtaken == pytest.approx({50: 19.0, 200: 59.0}, abs=3.0)
 
 
 def test_a_trace_has_one_way(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

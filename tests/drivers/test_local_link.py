@@ -8,15 +8,22 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cloudrc.record.columns import Recording
 
 pytestmark = pytest.mark.process
 WITHIN = 0.005
 """Of a median one-way delay, where other tests run beside this one [s]."""
+LEGS = (0.5, 8.9), (9.2, 9.95), (10.2, 12.0)
+"""Of the profile `handover`: before its first cell fades, meanwhile, and in the next one [s]."""
+EDGE = 0.01
+"""A time line counts from the next datagram, and its instant is known about so well [s]."""
+Floats: TypeAlias = NDArray[np.float64]
 
 
 def test_link_set_acts_within_a_second_and_is_in_the_recording(
@@ -26,7 +33,7 @@ def test_link_set_acts_within_a_second_and_is_in_the_recording(
     command = [sys.executable, "-m", "cloudrc"]
     fly = [*command, "run", "hover", "--mode", "local", "--out", str(folder), "--set"]
     run = subprocess.Popen(
-        [*fly, "mission.waypoints.0.dwell_s=14"], stdout=subprocess.PIPE, text=True
+        [*fly, "mission.waypoints.0.dwell_s=18"], stdout=subprocess.PIPE, text=True
     )
     assert run.stdout is not None
     said = next(line for line in run.stdout if "mission started" in line)
@@ -38,7 +45,7 @@ def test_link_set_acts_within_a_second_and_is_in_the_recording(
             capture_output=True,
             text=True,
         )
-        for words in (["downlink.delay_ms=120", "downlink.jitter_ms=0"], ["--profile", "paper-p1"])
+        for words in (["downlink.delay_ms=120", "downlink.jitter_ms=0"], ["--profile", "handover"])
         if not time.sleep(2.0)
     ]
     output, _ = run.communicate(timeout=60)
@@ -65,12 +72,27 @@ def test_link_set_acts_within_a_second_and_is_in_the_recording(
     told = {cause: stamp - age * 1e9 for cause, stamp, age, uplink in
             zip(link["cause"], link["stamp_ns"], link["age"], link["uplink"], strict=True)
             if not uplink}  # fmt: skip
-    first, second = told["downlink.delay_ms=120, downlink.jitter_ms=0"], told["profile paper-p1"]
-    stamps, delays = arrivals["stamp_ns"], arrivals["delay"]
-    between = (stamps > first + 2e8) & (stamps < second)
-    after = stamps > second + 3e8
-    assert np.median(delays[stamps < first]) == pytest.approx(0.045, abs=WITHIN)
+    first, second = told["downlink.delay_ms=120, downlink.jitter_ms=0"], told["profile handover"]
+    delays = arrivals["delay"]
+    sent_ns = arrivals["stamp_ns"] - delays * 1e9
+    assert np.median(delays[sent_ns < first]) == pytest.approx(0.045, abs=WITHIN)
+    between = (sent_ns > first + 1e8) & (sent_ns < second)
     assert np.median(delays[between]) == pytest.approx(0.120, abs=WITHIN)
-    assert np.median(delays[after]) == pytest.approx(0.020, abs=WITHIN)
+    follows_handover((sent_ns - second) * 1e-9, delays)
     page = (folder / "report.html").read_text()
     assert "Triangles: the link was set in flight (1: downlink.delay_ms=120" in page
+
+
+def follows_handover(sent: Floats, delays: Floats) -> None:
+    """Say whether delays [s] are on the time line that began when the profile took force."""
+
+    def median(begin: float, end: float) -> float:
+        return float(np.median(delays[(sent > begin) & (sent < end)]))
+
+    print({f"{a:g}-{b:g} s": round(1e3 * median(a, b), 1) for a, b in LEGS})
+    steady, fading, after = (median(*leg) for leg in LEGS)
+    assert steady == pytest.approx(0.025, abs=WITHIN)
+    assert 0.045 < fading < 0.080, "50 ms, and more to keep the order"
+    assert after == pytest.approx(0.035, abs=WITHIN)
+    dark = (sent > 10.0 + EDGE) & (sent < 10.05 - EDGE)
+    assert not dark.any(), "what was sent while the robot was handed over never arrives"

@@ -15,8 +15,9 @@ from cloudrc.tunnel.codec import Kind
 from tools.bench_link.draws import measure_bursts
 from tools.bench_link.flow import EPOCH, SIZE, Flow
 from tools.bench_link.judge import judge
+from tools.bench_link.overload import Overloaded, Served
 from tools.bench_link.release import OF_ASYNCIO, OF_C, OURS, WAKE, Releases
-from tools.bench_link.report import bursts, releases
+from tools.bench_link.report import bursts, overload, releases
 
 ROOT = Path(__file__).resolve().parents[2]
 MS = 1_000_000
@@ -71,6 +72,23 @@ def test_release_errors_are_judged_against_the_anchors_of_the_run(
     else:
         assert len(wrong) == len(missed)
         assert all(any(word in what for what in wrong) for word in missed)
+
+
+@pytest.mark.parametrize(
+    ("after", "held"),
+    [
+        (Served(0, 90e-6, 500e-6), True),
+        (Served(1, 50e-6, 300e-6), False),
+        (Served(0, 110e-6, 300e-6), False),
+        (Served(0, 50e-6, 700e-6), False),
+    ],
+)
+def test_service_after_a_flood_is_held_against_that_before_it(after: Served, held: bool) -> None:
+    counts = {"received": 1_001_200.0, "unread": 0.0, "overflow": 0.0, "unsent": 0.0}
+    counts["forwarded"] = counts["received"]
+    before = Served(0, 50e-6, 300e-6)
+    found = Overloaded(1_000_000, 1e5, counts, (57 << 20, 59 << 20), before, after)
+    assert [line.held for line in overload(found)] == [True, True, held]
 
 
 def test_bursts_are_as_asked_in_200_000_packets() -> None:

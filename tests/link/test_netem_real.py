@@ -30,6 +30,13 @@ from cloudrc.tunnel.codec import Kind
 
 STEADY = [name for name in names("profile") if name not in ("lossy", "handover")]
 """netem refuses the first; the second changes, which `test_netem_timeline_real` looks at."""
+MINUTES = [
+    (name, way)
+    for name in STEADY
+    for way in ("uplink", "downlink")
+    if way == "uplink" or load_profile(name).downlink != load_profile(name).uplink
+]
+"""Every direction that ships, once: most profiles have the same both ways."""
 Distribution = Literal["uniform", "normal", "pareto"]
 pytestmark = pytest.mark.netem
 
@@ -88,12 +95,12 @@ def test_losses_come_in_bursts(shaped: Netem) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", STEADY)
+@pytest.mark.parametrize(("name", "way"), MINUTES)
 def test_a_shipped_profile_for_a_minute(
-    shaped: Netem, name: str, figure: Callable[..., None]
+    shaped: Netem, name: str, way: str, figure: Callable[..., None]
 ) -> None:
     """Mean, loss and order are those that the model draws for the same instants of sending."""
-    profile = link_profile(load_profile(name).uplink)
+    profile = link_profile(getattr(load_profile(name), way))
     shaped.follow_profile(profile)
     found: list[Flow] = []
     drawn: list[Numbers] = []
@@ -105,7 +112,7 @@ def test_a_shipped_profile_for_a_minute(
         drawn[:] = [drawn_for(tunnel, profile, seed) for seed in range(20)]
         beside, mean = stranger.settle().delays().mean(), tunnel.delays().mean()
         asked = float(np.mean([each.mean for each in drawn]))
-        told(f"{name} for a minute", asked=asked, measured=mean, other_port=beside)
+        told(f"{name}, {way}, for a minute", asked=asked, measured=mean, other_port=beside)
         return float(abs(mean - beside - asked))
 
     error = least(off, WITHIN)
@@ -116,7 +123,7 @@ def test_a_shipped_profile_for_a_minute(
     overtaken = float(np.mean(np.maximum.accumulate(order)[:-1] > order[1:]))
     for what, measured in (("loss", loss), ("overtaken", overtaken)):
         values = np.array([getattr(each, what) for each in drawn])
-        told(f"{name}: {what}", asked=values.mean(), measured=measured)
+        told(f"{name}, {way}: {what}", asked=values.mean(), measured=measured)
         assert abs(measured - values.mean()) <= 5 * values.std() + 0.003, what
 
 

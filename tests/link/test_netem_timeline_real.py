@@ -5,16 +5,23 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import netem_laboratory as lab
 import numpy as np
 import pytest
 from netem_laboratory import WITHIN, Flow, least, told
 
+from cloudrc.link.netem_steps import LATE_NS, Steps
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, Trace
 
 LATE = 0.1
 """How late a step may be where the machine now and then stands still [s]."""
+LATE_SHARE = 0.1
+"""Which share of the steps that are due every 20 ms may come later than that, or not at all. Each
+one waits for tc's answer, some ms in an emulated machine, and where that stands still for 0.1 s,
+the five that were due meanwhile are late or passed over: room for eight such stops in 8 s. Yet who
+stepped every 22 ms instead would pass over as many."""
 pytestmark = pytest.mark.netem
 
 
@@ -30,6 +37,8 @@ def test_a_time_line_is_stepped(tables: Path) -> None:
         flow.send(1, 0.01, meanwhile=lambda: netem.step(0.0))
     netem.close()
     flow.settle()
+    assert (netem.steps.applied, netem.steps.passed_over) == (3, 0)
+    assert netem.steps.lateness_ns()[1] * 1e-9 < LATE, "by its own account"
     since = {n: (at_ns - begun_ns) * 1e-9 for n, at_ns in enumerate(flow.sent_ns)}
     delays = dict(zip(flow.numbers(), flow.delays(), strict=True))
     before = [delays[n] for n in delays if since[n] < 2.45]
@@ -42,8 +51,21 @@ def test_a_time_line_is_stepped(tables: Path) -> None:
     assert max(lost) == pytest.approx(3.8, abs=LATE)
 
 
-def follow(tables: Path, trace: Trace) -> tuple[float, float]:
-    """Measure how a trace is followed: correlation with it, and the median error [s]."""
+def late_share(steps: Steps) -> float:
+    """Give the share of steps that were late, or were over before their turn came."""
+    return (steps.late + steps.passed_over) / (steps.applied + steps.passed_over)
+
+
+class Followed(NamedTuple):
+    """How a trace was followed: correlation with it, the median error [s], and its steps."""
+
+    correlation: float
+    error: float
+    steps: Steps
+
+
+def follow(tables: Path, trace: Trace) -> Followed:
+    """Let netem follow a trace, and measure."""
     profile = DirectionProfile(trace=trace)
     origin_ns = time.monotonic_ns() + 3_000_000_000  # by then it is set up
     begun_ns = origin_ns + time.time_ns() - time.monotonic_ns()
@@ -65,7 +87,7 @@ def follow(tables: Path, trace: Trace) -> tuple[float, float]:
     told(netem.steps.in_words(), correlation=correlation, median_error=error)
     assert netem.steps.applied + netem.steps.passed_over == len(times) - 1
     assert len(flow.arrived) == 600, "steps lose nothing"
-    return correlation, error
+    return Followed(correlation, error, netem.steps)
 
 
 def test_a_trace_is_followed(tables: Path) -> None:
@@ -73,12 +95,13 @@ def test_a_trace_is_followed(tables: Path) -> None:
     times = 0.02 * np.arange(400)
     delays = 0.1 + 0.04 * np.sin(0.5 * np.pi * times)
     trace = Trace(tuple(times.tolist()), tuple(delays.tolist()))
-    errors: list[float] = []
+    found: list[Followed] = []
 
     def off() -> float:
-        correlation, error = follow(tables, trace)
-        errors.append(abs(error))
-        return 1.0 - correlation
+        found.append(follow(tables, trace))
+        correlation, _, steps = found[-1]
+        return max((1.0 - correlation) / 0.02, late_share(steps) / LATE_SHARE)
 
-    assert least(off, 0.02) < 0.02
-    assert min(errors) < 3 * WITHIN, "its clock is slow, and steps are late there, too"
+    assert least(off, 1.0) < 1.0, "correlation or lateness, in units of what is allowed"
+    assert found[-1].steps.lateness_ns()[0] < LATE_NS, "in the median, by its own account"
+    assert min(abs(one.error) for one in found) < 3 * WITHIN, "its clock is slow"

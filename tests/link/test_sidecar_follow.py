@@ -122,6 +122,7 @@ def test_the_last_address_stays_while_there_is_no_answer() -> None:
     assert [peer.poll(), peer.poll()] == [("10.244.0.7", 7400)] * 2
     names.answer = ["10.244.0.9"]
     assert peer.poll() == ("10.244.0.9", 7400)
+    assert peer.failures == 4
     assert log == [
         "demo-cloud cannot be resolved (Name or service not known); waits for it",
         "demo-cloud is 10.244.0.7",

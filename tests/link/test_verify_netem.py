@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 
 from cloudrc.cli import link_processes
 from cloudrc.cli import link_verify_run as run
-from cloudrc.cli.link_processes import Shaping, shaping
+from cloudrc.cli.link_processes import WAYS, Shaping, shaping
 from cloudrc.cli.link_verify import find
 from cloudrc.cli.link_verify_netem import DEVICE
 from cloudrc.cli.link_verify_run import Asked, Bank, banks
@@ -29,6 +30,8 @@ SETTINGS = [
 PROFILE = "uplink: &both {delay_ms: 400, jitter_ms: 80}\ndownlink: *both\n"
 SECONDS = 17.0
 """At 100 probes a second, which a slow machine can send [s]."""
+LOSING_SECONDS = 28.0
+"""Likewise where 30 % of them are lost [s]."""
 
 
 class Link:
@@ -46,6 +49,11 @@ class Link:
         )
         print(as_text(said))
         return said
+
+    def stop(self) -> None:
+        """Let the link's processes stand still, so that they put nothing back."""
+        for one in self.ways.values():
+            one.process.send_signal(signal.SIGSTOP)
 
     def tc(self, way: str, *words: str) -> None:
         """Meddle with the kernel behind the back of the link's process."""
@@ -112,3 +120,48 @@ def test_a_link_that_delays_one_direction_only_is_named(plan: dict[str, Asked]) 
     bare = PROFILE.replace("downlink: *both", "downlink: {}")
     with up(plan, bare) as link:
         assert [(c.code, c.way) for c in link.verify().causes] == [("one_direction", "downlink")]
+
+
+LEAF = f"qdisc change dev {DEVICE} parent 7400:4 handle 7401: netem limit 10000"
+# What is asked for beside the delay, and what is done to the kernel, both ways.
+FAULTS: dict[str, tuple[list[str], list[str]]] = {
+    "no_qdisc": ([], [f"qdisc del dev {DEVICE} root"]),
+    "wrong_interface": (
+        [],
+        [f"qdisc del dev {DEVICE} root", "qdisc add dev lo root netem delay 400ms 80ms"],
+    ),
+    "shaped_twice": ([], [f"qdisc add dev {DEVICE} parent 7401:1 netem delay 400ms 80ms"]),
+    "bypassed": ([], [f"filter del dev {DEVICE} parent 7400:"]),
+    "halved_delay": ([], [f"{LEAF} delay 200ms 40ms"]),
+    "wrong_jitter": ([], [f"{LEAF} delay 400ms 120ms"]),
+    "order_kept": ([], [f"{LEAF} delay 400ms 80ms rate 100gbit"]),
+    "no_loss": (["loss=0.3"], [f"{LEAF} delay 400ms 80ms"]),
+    "more_loss": (["loss=0.3"], [f"{LEAF} delay 400ms 80ms loss random 90%"]),
+    "rate_ignored": (
+        ["rate_kbit=2000", "jitter_ms=0", "keep_order=true"],
+        [f"{LEAF} delay 400ms 0ms"],
+    ),
+}
+QUICK = ("no_qdisc", "wrong_interface", "shaped_twice", "bypassed")
+"""What only a kernel can get wrong; the others are tried in `make test-netem-full`."""
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [pytest.param(name, marks=[] if name in QUICK else pytest.mark.full) for name in FAULTS],
+)
+def test_what_is_wrong_in_the_kernel_is_named(
+    plan: dict[str, Asked], fault: str, figure: Callable[..., None]
+) -> None:
+    more, commands = FAULTS[fault]
+    if more:
+        settings = [f"link.{way}.{one}" for way in WAYS for one in more]
+        plan = run.plan(find("ideal", [*SETTINGS, *settings]), LOSING_SECONDS)
+    with up(plan) as link:
+        link.stop()
+        for way in WAYS:
+            for command in commands:
+                link.tc(way, *command.split())
+        found = codes(link.verify())
+    figure("seeded faults in the kernel's netem: not named", int(found != {fault}), "==", 0)
+    assert found == {fault}
