@@ -33,6 +33,15 @@ INVARIANTS = {
 }
 PROMISES = {"random": "P-FAULT-2", "adversarial": "P-FAULT-3", "clean": "P-FAULT-4"}
 """Ids in `docs/safety/promises.md`."""
+NOTES = {
+    "adversarial": (
+        "",
+        "The cloud holds valid keys. Every second one flies amid faults of all kinds, every tenth",
+        "speaks in its operator's place. A robot that this has stopped may come to lie outside the",
+        "fence, a [known limit](guard.md): it is told below the table, and a breach beyond 1.5 m.",
+    )
+}
+"""What else is to be said, by kind."""
 PROGRESS_PERIOD = 10.0
 """Between two lines of progress [s]."""
 
@@ -115,6 +124,7 @@ def _brief(finding: Finding) -> dict[str, Any]:
         "speed": finding.speed,
         "holds": finding.holds,
         "missions": finding.missions,
+        "fallen": finding.fallen,
         "duration": finding.schedule.duration,
     }
 
@@ -166,6 +176,8 @@ def _document(
         "largest_speed_mps": max(each["speed"] for each in findings),
         "holds": sum(each["holds"] for each in findings),
         "missions_done": sum(each["missions"] for each in findings),
+        "fallen": sum(each["fallen"] > 0.0 for each in findings),
+        "fallen_m": max(each["fallen"] for each in findings),
         "failures": failures,
     }
 
@@ -195,12 +207,16 @@ def _rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def _summary(document: dict[str, Any]) -> str:
+    fallen = (
+        f"; {document['fallen']} stopped by the operator's word came to lie outside of it, at most "
+        f"by {document['fallen_m']:.2f} m"
+    )
     return (
         f"{document['hours']:.2f} virtual hours of {document['kind']} schedules from seed "
         f"{document['first']} on in {document['seconds']:.0f} s: "
         f"{document['missions_done']} missions done, {document['holds']} HOLDs, "
         f"nearest to the fence {document['smallest_margin_m']:.3f} m, "
-        f"fastest {document['largest_speed_mps']:.2f} m/s"
+        f"fastest {document['largest_speed_mps']:.2f} m/s" + (fallen if document["fallen"] else "")
     )
 
 
@@ -216,6 +232,7 @@ def _markdown(document: dict[str, Any]) -> str:
         "invariant is looked at: under a cloud that means no good a contact is no breach, and",
         "only where nothing goes wrong a HOLD is a false alarm. The promise is "
         f"[{PROMISES[document['kind']]}].",
+        *NOTES.get(document["kind"], ()),
         "",
         f"| {' | '.join(head)} |",
         "|---|---|---|---|",

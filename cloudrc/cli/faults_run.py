@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
     if options.junit is not None:
         options.junit.write_text(document.as_junit(results, options.seed), encoding="utf-8")
     if options.document is not None:
-        text = document.as_markdown(results, options.seed)
+        text = document.as_markdown(results, options.seed, mode)
         options.document.write_text(text, encoding="utf-8")
     if options.output != "table":
         print(written(document.as_json(results, options.seed), options.output))

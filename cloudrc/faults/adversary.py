@@ -2,12 +2,14 @@
 
 Every policy sees what an honest cloud sees (the newest odometry and its own estimate of the delay)
 and sends any command it likes, sealed as it should be. Some also lie about what a command was
-computed from, fall silent to time the guard's transitions, or speak in the operator's name.
+computed from, fall silent to time the guard's transitions, or speak in the operator's name. Every
+second one has an honest link; to the others befalls all that befalls an honest cloud.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import cos, inf, nan, pi, sin
 from typing import TypeAlias
 
@@ -15,9 +17,11 @@ import numpy as np
 
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.errors import BadInputError
+from cloudrc.faults.compose import DURATION, PAPER, compose
 from cloudrc.faults.liar import Lie, tempting
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Schedule
+from cloudrc.faults.voice import at_bad_moments
 from cloudrc.geometry.fence import HIGH, LOW
 from cloudrc.messages import ZERO, Command, Vector
 from cloudrc.records import Control
@@ -39,15 +43,19 @@ def temptation(schedule: Schedule) -> Callable[[CloudEndpoint], None]:
     if schedule.policy not in POLICIES:
         names = ", ".join(POLICIES)
         raise BadInputError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
-    return tempting(POLICIES[schedule.policy](generator(schedule.seed, 666)))
+    lie = POLICIES[schedule.policy](generator(schedule.seed, 666))
+    if schedule.policy == SPEAKS:
+        return tempting(lie, at_bad_moments(generator(schedule.seed, 667)))
+    return tempting(lie)
 
 
 def choose(seed: int) -> Schedule:
-    """Give the adversary of a seed, on a link of its own choice."""
+    """Give the adversary of a seed: on a link of its own choice, or amid faults of every kind."""
     rng = generator(seed, 665)
     names = sorted(POLICIES)
-    profile = ("ideal", "paper-p1", "paper-p2", "paper-p3")[int(rng.integers(4))]
-    return Schedule(seed, profile, policy=names[seed % len(names)])
+    profile = ("ideal", *PAPER)[int(rng.integers(4))]
+    calm = Schedule(seed, profile, duration=DURATION)
+    return replace(calm if rng.random() < 0.5 else compose(seed), policy=names[seed % len(names)])
 
 
 def _towards_a_face(rng: Generator) -> Lie:
@@ -186,16 +194,24 @@ def _stop_and_go(rng: Generator) -> Lie:
     return lie
 
 
+def _operators_voice(rng: Generator) -> Lie:
+    """Flies by another policy; what it says beside that is in `at_bad_moments`."""
+    return FAST[int(rng.integers(len(FAST)))](rng)
+
+
 def _vector(values: list[float]) -> Vector:
     x, y, z = values
     return (x, y, z)
 
 
+FAST: tuple[Policy, ...] = (_towards_a_face, _face_after_face, _greedy, _on_the_limit, _random)
+SPEAKS = "operators-voice"
 POLICIES: dict[str, Policy] = {
     "face-after-face": _face_after_face,
     "false-basis": _false_basis,
     "greedy": _greedy,
     "on-the-limit": _on_the_limit,
+    SPEAKS: _operators_voice,
     "random": _random,
     "shaking": _shaking,
     "stop-and-go": _stop_and_go,

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-from cloudrc.faults.catalogue import scenarios
 from cloudrc.faults.scenario import Mode, Outcome, Scenario
 
 
@@ -94,50 +93,47 @@ def as_junit(results: Sequence[Result], seed: int) -> str:
     return Xml.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
 
 
-HEAD = """\
+HEADS: dict[Mode, str] = {
+    "virtual": """\
 # Faults: what is done, what has to follow, what was measured
 
 Written by `make faults` (`cloudrc faults run --all --document docs/safety/faults.md`); do not edit.
-Seed {seed}: {passed} of {count} scenarios passed. Each is one command: `cloudrc faults run F13`.
+{result} Each is one command: `cloudrc faults run F13`.
 These run in virtual time, with the ends, the driver, the keys and the journal of production. Of a
 promise that is checked several times, the worst value is shown. A metric that is named has to read
-otherwise within 5 s. What makes sense with real processes and in a cluster is listed below. All
-faults together, at random: [search](search.md), and with a cloud that wants a breach:
+otherwise within 5 s. What makes sense elsewhere is brought about there, too:
+[with real processes](faults-real.md), [in a Kubernetes cluster](faults-cluster.md). All faults
+together, at random: [search](search.md), and with a cloud that wants a breach:
 [adversary](adversary.md). Promises: [P-FAULT-1] that all pass, [P-FAULT-5] that a seed is a run.
+""",
+    "real": """\
+# Faults with real processes, signals and sockets
 
+Written by `make nightly` (`cloudrc faults run --all --real --document docs/safety/faults-real.md`);
+do not edit. {result} Each is one command: `cloudrc faults run F13 --real`.
+Times are those of the machine that it ran on. Some are run before every change lands, too. The
+others, in virtual time: [faults](faults.md).
+""",
+    "cluster": """\
+# Faults in a Kubernetes cluster
+
+Written by `make e2e-full` (`cloudrc faults run --all --cluster --document
+docs/safety/faults-cluster.md`); do not edit. {result}
+Each is one command, beside a release that flies nothing: `cloudrc faults run F13 --cluster`. Times
+are those of the machine that it ran on. The others, in virtual time: [faults](faults.md).
+""",
+}
+COLUMNS = """
 | fault | what is done | what has to follow | what is lost | what the user sees | checks |
 |---|---|---|---|---|---|
 """
-ELSEWHERE: dict[Mode, str] = {
-    "real": """
-## With real processes, signals and sockets
-
-`cloudrc faults run --all --real`; some before every change lands, all by `make nightly`.
-
-""",
-    "cluster": """
-## In a Kubernetes cluster
-
-`cloudrc faults run --all --cluster`, beside a release that flies nothing.
-
-""",
-}
-COLUMNS = """\
-| fault | what is done | what has to follow | what is lost | what the user sees |
-|---|---|---|---|---|
-"""
 
 
-def as_markdown(results: Sequence[Result], seed: int) -> str:
-    """The table of the documentation."""
+def as_markdown(results: Sequence[Result], seed: int, mode: Mode = "virtual") -> str:
+    """The page of the documentation on the faults of a mode."""
     passed = sum(result.passed for result in results)
-    lines = [HEAD.format(seed=seed, passed=passed, count=len(results))]
-    for scenario, outcome, *_ in results:
-        good = sum(check.passed for check in outcome.checks)
-        lines.append(_row(scenario, outcome.skipped or f"{good} of {len(outcome.checks)} passed"))
-    for mode, head in ELSEWHERE.items():
-        lines += [head, COLUMNS, *map(_row, scenarios(mode))]
-    lines.append("\n## Measured\n")
+    told = f"Seed {seed}: {passed} of {len(results)} scenarios passed."
+    lines = [HEADS[mode].format(result=told), COLUMNS, *map(_row, results), "\n## Measured\n"]
     for result in results:
         lines.append(f"\n### {result.scenario.id} {result.scenario.name}: {result.word}\n\n")
         if result.outcome.sha256:
@@ -146,10 +142,13 @@ def as_markdown(results: Sequence[Result], seed: int) -> str:
     return "".join(lines)
 
 
-def _row(scenario: Scenario, *more: str) -> str:
-    """A row of a table."""
+def _row(result: Result) -> str:
+    """A row of the table."""
+    scenario, outcome = result.scenario, result.outcome
+    good = sum(check.passed for check in outcome.checks)
+    checks = outcome.skipped or f"{good} of {len(outcome.checks)} passed"
     name = f"{scenario.id} {scenario.name}"
-    cells = (name, scenario.injects, scenario.expects, scenario.loses, scenario.shows, *more)
+    cells = (name, scenario.injects, scenario.expects, scenario.loses, scenario.shows, checks)
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 
@@ -168,4 +167,4 @@ def _measured(result: Result) -> list[str]:
     return [
         line + (f", {counts[text]} times" if counts[text] > 1 else "")
         for text, line in lines.items()
-    ] + ([result.error] if result.error else [])
+    ] + [text for text in (result.error, result.outcome.skipped) if text]

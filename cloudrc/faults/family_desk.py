@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import tempfile
-from contextlib import suppress
 from math import nan
 from pathlib import Path
-from typing import Any
 
 from cloudrc import assembly
 from cloudrc.cloud.teleop.api_bridge import Bridge
-from cloudrc.cloud.teleop.api_gate import Gate, Receive, Scope, Send
+from cloudrc.cloud.teleop.api_gate import Receive, Scope, Send
 from cloudrc.cloud.teleop.service_book import LOGGED, UnavailableError
 from cloudrc.cloud.teleop.service_mission import Order
-from cloudrc.faults import asks, meters
+from cloudrc.faults import asks, gate, meters
 from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario
@@ -59,15 +57,7 @@ def _at_the_gate(count: int) -> int:
     async def application(scope: Scope, receive: Receive, send: Send) -> None:
         return
 
-    async def nothing(message: Any = None) -> Any:
-        return {}
-
-    gate = Gate(application, tokens=None)
-    for _ in range(count):
-        asking = gate({"method": "GET", "path": "/v1/state", "headers": []}, nothing, nothing)
-        with suppress(StopIteration):  # nothing in it waits for anybody
-            asking.send(None)
-    return gate.counts["busy"]
+    return gate.counted(application, "GET", "/v1/state", count)["busy"]
 
 
 def _slow_reader(seed: int) -> Outcome:
@@ -77,11 +67,18 @@ def _slow_reader(seed: int) -> Outcome:
     assert service is not None
     newest = service.book.events_after(0)[-1]["id"]
     plan = assembly.build_plan(flight.experiment)
+    followed = [newest]
     for n in range(LOGGED):
         service.create(Order(plan, f"{n}"), n)
         service.cancel(service.book.open()[0].id, n)
+        followed += [event["id"] for event in service.book.events_after(followed[-1])]
+    outcome.same("events dropped for a reader that reads", service.book.dropped, 0)
+    outcome.true("its events have no gap, though another one does not read", _gapless(followed))
+    outcome.least("it has all of them", len(followed) - 1, 2 * LOGGED)
     waiting = service.book.events_after(newest)
     outcome.most("events kept for a reader that does not read", len(waiting), LOGGED)
+    dropped = service.book.dropped
+    meters.counts(outcome, "teleop", "api_events_dropped", dropped, "stream_dropped_events_total")
     outcome.true("the newest are kept", waiting[-1]["id"] > newest + LOGGED)
     outcome.true("those kept have no gap", _gapless([event["id"] for event in waiting]))
     asks.safe(outcome, flight)
@@ -131,7 +128,7 @@ SCENARIOS = (
         "a reader of the event stream does not read for 5,000 events",
         "the oldest are dropped for that reader alone; memory stays bounded",
         "its events",
-        "a gap in the numbers of its events; no metric",
+        "a gap in the numbers of its events; cloudrc_stream_dropped_events_total",
         _slow_reader,
     ),
     Scenario(

@@ -9,11 +9,11 @@ from math import nan
 from pathlib import Path
 
 from cloudrc.faults import asks, meters
-from cloudrc.faults.family_intruder import Generator
 from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario, generator
 from cloudrc.faults.scribe import ForgetfulWriter, FullDisk, Scribe, SlowWriter
+from cloudrc.faults.toll import Generator
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
@@ -24,6 +24,8 @@ SYNC = 0.1
 """That the disk takes for it [s]."""
 LOSS_MAX = 0.5
 """Of a recording, when its process is killed [s]."""
+UNTOLD_MAX = 0.05
+"""Of what a power cut takes: what the metric does not tell before [s]."""
 
 
 def _bad_disks(seed: int) -> Outcome:
@@ -113,7 +115,7 @@ def _recorder_killed(seed: int) -> Outcome:
     """Kill the recorder at 20 instants of one flight, by SIGKILL and by cuts of the power."""
     outcome, rng = Outcome(), generator(seed, 30)
     instants = sorted(rng.uniform(1.0, 30.0, 20).tolist())
-    copies: list[tuple[str, float, bytes]] = []
+    copies, ages = list[tuple[str, float, bytes]](), dict[float, float]()
     with tempfile.TemporaryDirectory() as name:
         path, writers = Path(name) / "world.mcap", list[ForgetfulWriter]()
 
@@ -128,6 +130,7 @@ def _recorder_killed(seed: int) -> Outcome:
             while instants and instants[0] * 1e9 <= now_ns:
                 at, there = instants.pop(0), path.read_bytes()
                 copies.append(("SIGKILL", at, there))
+                ages[at] = writers[0].sync_age(round(at * 1e9)) or nan
                 for how, chance in (("power cut", None), ("power cut, torn pages", rng)):
                     left = writers[0].after_power_cut(round(at * 1e9), chance)
                     if left != there:
@@ -139,25 +142,32 @@ def _recorder_killed(seed: int) -> Outcome:
         flight.listeners.append(hear)
         flight.fly_mission()
         recorder.close()
-        _judge_remains(outcome, path, copies)
+        _judge_remains(outcome, path, copies, ages)
     asks.safe(outcome, flight)
     asks.done(outcome, flight)
     return outcome
 
 
-def _judge_remains(outcome: Outcome, path: Path, copies: list[tuple[str, float, bytes]]) -> None:
+def _judge_remains(
+    outcome: Outcome, path: Path, copies: list[tuple[str, float, bytes]], ages: dict[float, float]
+) -> None:
     """What is left of a recording holds nothing wrong, and all but its last half second."""
     whole = Recording.read(path)["/ground_truth"]["stamp_ns"].tolist()
     torn, mended = path.with_name("torn.mcap"), path.with_name("mended.mcap")
-    losses, wrong = dict[str, float](), 0
+    losses, wrong, untold = dict[str, float](), 0, list[float]()
     for how, at, data in copies:
         torn.write_bytes(data)
         recover(torn, mended)
         stamps = Recording.read(mended)["/ground_truth"]["stamp_ns"].tolist()
         wrong += stamps != whole[: len(stamps)]
-        losses[how] = max(losses.get(how, 0.0), at - stamps[-1] * 1e-9)
+        lost = at - stamps[-1] * 1e-9
+        losses[how] = max(losses.get(how, 0.0), lost)
+        if how == "power cut":
+            untold.append(abs(lost - ages[at]))
     for how, lost in losses.items():
         outcome.most(f"{how}: longest stretch lost", lost, LOSS_MAX, "s")
+    text = "metric recorder_sync_age_seconds differs from what a power cut took by"
+    outcome.most(text, max(untold, default=nan), UNTOLD_MAX, "s")
     outcome.same("recoveries that differ from what was recorded", wrong, 0)
     outcome.least("of them after a power cut that has forgotten something", len(copies) - 20, 4)
 
@@ -221,7 +231,8 @@ SCENARIOS = (
         "SIGKILL, and a power cut that forgets what was not synced, at 20 instants of a flight",
         "the flight is unaffected; the rest recovers with right checksums",
         "at most 0.5 s of the recording",
-        "cloudrc recover: kept 99 %; no metric, its process is gone",
+        "cloudrc recover: kept 99 %; before, what a power cut would take: "
+        "cloudrc_recorder_sync_age_seconds",
         _recorder_killed,
     ),
     Scenario(

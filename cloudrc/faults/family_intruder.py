@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from itertools import islice
 from math import inf, nan
-
-import numpy as np
 
 from cloudrc.faults import asks, meters
 from cloudrc.faults.family_link import instant
@@ -15,17 +11,11 @@ from cloudrc.faults.held import AGE_MAX
 from cloudrc.faults.liar import Lie, tempting
 from cloudrc.faults.mortal import Mortal, Tamper
 from cloudrc.faults.scenario import Outcome, Scenario, generator
+from cloudrc.faults.toll import Generator, Toll, unharmed
 from cloudrc.messages import Command, GuardState
 from cloudrc.records import Control
 from cloudrc.tunnel import codec
 
-Generator = np.random.Generator
-REFUSED = ("tag", "malformed", "version", "direction", "old_epoch", "repeated")
-"""What a hostile datagram is counted under."""
-GREETED = ("hello", "unanswered")
-"""What a captured greeting is counted under: a challenge is all it gets, if anything."""
-SETTLED = 2.0
-"""When the session of a new flight stands [s]; a greeting that is answered could hasten it."""
 FLOOD = 100
 """Datagrams of garbage per honest one: 10,000 in a second."""
 
@@ -66,58 +56,8 @@ def _corruption(seed: int) -> Outcome:
     return outcome
 
 
-class Toll:
-    """Counts hostile datagrams, and those of them that were not refused for what they are."""
-
-    def __init__(self) -> None:
-        self.given = self.taken = 0
-
-    def give(self, mortal: Mortal, data: bytes, now_ns: int) -> None:
-        """Hand one to an end."""
-        before = _refused(mortal)
-        mortal.receive_now(data, now_ns)
-        self.given += 1
-        self.taken += _refused(mortal) != before + 1
-
-
-def _refused(mortal: Mortal) -> int:
-    counts = mortal.inner._counts  # type: ignore[union-attr]
-    return sum(counts.get(name, 0) for name in (*REFUSED, *GREETED))
-
-
-def _unharmed(
-    seed: int,
-    hostile: Callable[[Flight, bytes, Generator], list[bytes]],
-    *refusals: str,
-    since: float = 0.0,
-) -> Outcome:
-    """Fly with hostile datagrams beside the honest ones: nothing may be any different."""
-    outcome, rng, toll = Outcome(), generator(seed, 20), Toll()
-    clean, flight = Flight(seed=seed).fly_mission(), Flight(seed=seed)
-
-    def tamper(data: bytes, now_ns: int) -> list[bytes]:
-        for strange in hostile(flight, data, rng):
-            toll.give(flight.world, strange, now_ns)
-        return [data]
-
-    flight.world.tamper = tamper
-    flight.fly_mission()
-    asks.safe(outcome, flight)
-    asks.done(outcome, flight)
-    outcome.true("the same path, bit by bit", asks.same_path(clean, flight))
-    for refusal in refusals:
-        labels = ("downlink", refusal)
-        meters.moves(outcome, flight, "world", "datagrams_total", *labels, since=since)
-    seen = [asks.metric(flight, "world", "datagrams_total", "downlink", each) for each in REFUSED]
-    outcome.least("metric datagrams_total, refused", sum(n for n in seen if n == n), 900)
-    outcome.least("hostile datagrams", toll.given, 1000)
-    outcome.same("of them taken", toll.taken, 0)
-    outcome.true("they opened no session", asks.epochs(clean) == asks.epochs(flight))
-    return outcome
-
-
 def _flood(seed: int) -> Outcome:
-    def garbage(flight: Flight, data: bytes, rng: Generator) -> list[bytes]:
+    def garbage(end: Mortal, data: bytes, rng: Generator) -> list[bytes]:
         size = len(data)
         block = rng.bytes(FLOOD * size)
         pieces = [block[at : at + size] for at in range(0, len(block), size)]
@@ -128,46 +68,27 @@ def _flood(seed: int) -> Outcome:
             for n, piece in enumerate(pieces)
         ]
 
-    return _unharmed(seed, garbage, "malformed", "tag")
-
-
-def _old_session(seed: int) -> Outcome:
-    """Record a whole flight; play it to a world and a cloud that have both been started anew."""
-    captured: list[bytes] = []
-    first = Flight(seed=seed, life=7)
-
-    def record(data: bytes, now_ns: int) -> list[bytes]:
-        captured.append(data)
-        return [data]
-
-    first.world.tamper = first.cloud.tamper = record
-    first.fly_mission()
-    tape = iter(captured)
-
-    def replayed(flight: Flight, data: bytes, rng: Generator) -> list[bytes]:
-        return [] if flight.now < SETTLED else list(islice(tape, 6))
-
-    return _unharmed(seed, replayed, "tag", since=SETTLED)
+    return unharmed(seed, garbage, "malformed", "tag")
 
 
 def _forgery(seed: int) -> Outcome:
     """Every honest datagram is preceded by copies of it with one bit, or its counter, changed."""
 
-    def forged(flight: Flight, data: bytes, rng: Generator) -> list[bytes]:
+    def forged(end: Mortal, data: bytes, rng: Generator) -> list[bytes]:
         ahead = data[:8] + (2**63).to_bytes(8, "little") + data[16:]
         return [flipped(data, rng, 1), flipped(data, rng, 2), ahead]
 
-    return _unharmed(seed, forged, "tag")
+    return unharmed(seed, forged, "tag")
 
 
 def _malformed(seed: int) -> Outcome:
-    def strange(flight: Flight, data: bytes, rng: Generator) -> list[bytes]:
+    def strange(end: Mortal, data: bytes, rng: Generator) -> list[bytes]:
         longer = codec.DATAGRAM_MAX + 1
         cut = int(rng.integers(0, len(data)))
         other = bytes([data[0] + 1]) + data[1:]
         return [b"", data[:cut], data + b"\0", bytes(longer), data[:1] * 2048, other]
 
-    return _unharmed(seed, strange, "malformed", "version")
+    return unharmed(seed, strange, "malformed", "version")
 
 
 LIES: dict[str, Lie] = {
@@ -245,15 +166,6 @@ SCENARIOS = (
         "none",
         "cloudrc_datagrams_total{outcome=malformed}, {outcome=tag}",
         _flood,
-    ),
-    Scenario(
-        21,
-        "old-session",
-        "a captured flight is played to both ends after their restart",
-        "no effect: the same path, bit by bit",
-        "none",
-        "cloudrc_datagrams_total{outcome=tag}",
-        _old_session,
     ),
     Scenario(
         22,

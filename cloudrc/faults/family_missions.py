@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable
 from math import inf, nan
 from typing import Any
@@ -9,21 +11,27 @@ from typing import Any
 import numpy as np
 
 from cloudrc import assembly
+from cloudrc.cloud.teleop.api_check import read_mission
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.service_book import ConflictError
 from cloudrc.cloud.teleop.service_mission import Mission, Order
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Mission as MissionSchema
-from cloudrc.faults import asks, meters
+from cloudrc.faults import asks, gate, meters
 from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.liar import tempting
-from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.scenario import Outcome, Scenario, generator
+from cloudrc.geometry import fence
 from cloudrc.geometry.placement import overlapped_pipe
 from cloudrc.geometry.scene import Scene, load_scene
-from cloudrc.messages import ZERO, Command, GuardState
+from cloudrc.messages import ZERO, Command, GuardState, Vector
 from cloudrc.records import Control
+
+NEARER = 0.05
+"""What the search for the nearest legal point, along some lines, may overlook [m]."""
+LOOKED_AT = 2_000
 
 
 def _impossible(seed: int) -> Outcome:
@@ -31,6 +39,7 @@ def _impossible(seed: int) -> Outcome:
     wall = _wall_of(scene)
     cases: dict[str, tuple[Any, str]] = {
         "outside the fence": ((100.0, 0.0, 1.0), "nearest legal point"),
+        "1 m behind a wall of the fence": ((fence.HIGH[0] + 1.0, 0.0, 1.0), "beyond the fence"),
         "in a pipe's wall": (wall, "overlaps the wall"),
         "far below the floor": ((0.0, 0.0, -5.0), "beyond the fence"),
     }
@@ -41,12 +50,44 @@ def _impossible(seed: int) -> Outcome:
         problems = check_mission(mission, scene)
         outcome.true(f"{name}: refused, with the reason", word in _text(problems))
         outcome.true(f"{name}: names the waypoint's index", "1" in _paths(problems))
+        told = all(f"{value:g}" in problems[0].value for value in position)
+        outcome.true(f"{name}: names what was asked for", told)
+        _judge_way_out(outcome, name, problems[0], scene, position)
     for name, value in (("NaN", nan), ("infinite", inf), ("a word", "high")):
         outcome.true(f"{name}: refused", _refused({"position_m": (0.0, 0.0, value)}))
     outcome.true("none at all: refused", bool(check_mission(MissionSchema(), scene)))
     many = {"waypoints": ({"position_m": (0.0, 0.0, 1.0)},) * 10_001}
     outcome.true("10,001 waypoints: refused", _refuses(many))
+    body = b'{"waypoints": [{"position_m": [100, 0, 1]}]}'
+    refused = gate.ordered(lambda: read_mission(body, scene))["order_invalid"]
+    meters.counts(
+        outcome, "teleop", "api_order_invalid", refused, "missions_refused_total", "invalid"
+    )
     return outcome
+
+
+def _judge_way_out(
+    outcome: Outcome, name: str, problem: Problem, scene: Scene, position: Vector
+) -> None:
+    """Check that the point which is offered instead can be flown to, and that none is nearer."""
+    found = re.search(r"nearest legal point found: \[(.*)\]", problem.reason)
+    outcome.true(f"{name}: names the nearest legal point", found is not None)
+    if found is None:
+        return
+    near = np.array([float(each) for each in found[1].split(", ")])
+    offered = {"waypoints": ({"position_m": tuple(near.tolist())},)}
+    legal = not check_mission(MissionSchema.model_validate(offered), scene)
+    outcome.true(f"{name}: it is legal", legal)
+    start = np.array(fence.clamp(position))
+    rng = generator(27, 0)
+    reach = float(np.linalg.norm(near - start)) - NEARER
+    around = rng.normal(size=(LOOKED_AT, 3))
+    around *= rng.uniform(0.0, max(reach, 0.0), (LOOKED_AT, 1)) / np.linalg.norm(
+        around, axis=1, keepdims=True
+    )
+    points = np.array([fence.clamp((x, y, z)) for x, y, z in (start + around).tolist()])
+    nearer = (overlapped_pipe(scene, points, np.zeros(LOOKED_AT)) < 0) & (reach > 0.0)
+    outcome.same(f"{name}: legal points nearer than it by more than 5 cm", int(nearer.sum()), 0)
 
 
 def _wall_of(scene: Scene) -> tuple[float, float, float]:
@@ -105,18 +146,24 @@ def _unreachable(seed: int) -> Outcome:
 def _rival_mission(seed: int) -> Outcome:
     outcome, at, named = Outcome(), instant(seed), [""]
     clean, flight = Flight(seed=seed).fly_mission(), Flight(seed=seed)
+    refused = Counter[str]()
 
-    def post(now_ns: int) -> None:
+    def order(now_ns: int) -> None:
         try:
             flight.order(now_ns)
         except ConflictError as error:
             named[0] = error.mission
+            raise
 
-    flight.cloud.at(at, post)
+    flight.cloud.at(at, lambda now_ns: refused.update(gate.ordered(lambda: order(now_ns))))
     flight.fly_mission()
     asks.safe(outcome, flight)
     asks.done(outcome, flight)
     outcome.true("the second is refused, naming the first", named[0] == flight.mission.id)
+    total = refused["order_conflict"]
+    meters.counts(
+        outcome, "teleop", "api_order_conflict", total, "missions_refused_total", "conflict"
+    )
     outcome.true("the same path, bit by bit", asks.same_path(clean, flight))
     return outcome
 
@@ -149,7 +196,7 @@ SCENARIOS = (
         "waypoints of NaN, in a wall, beyond the fence, 10,001 of them",
         "refused as a whole, before anything is flown",
         "nothing",
-        "index, value, reason and the nearest legal point; no metric",
+        "index, value, reason and the nearest legal point; cloudrc_missions_refused_total",
         _impossible,
     ),
     Scenario(
@@ -167,7 +214,7 @@ SCENARIOS = (
         "another mission is ordered while one is flown",
         "refused with the id of the one under way, which flies the same path, bit by bit",
         "none",
-        "409 with the mission's id; no metric",
+        "409 with the mission's id; cloudrc_missions_refused_total",
         _rival_mission,
     ),
     Scenario(

@@ -8,11 +8,11 @@ from math import nan
 
 import numpy as np
 
-from cloudrc.faults.family_intruder import REFUSED
 from cloudrc.faults.family_real import REAL, WORKING, finish
 from cloudrc.faults.held import holds
 from cloudrc.faults.real_processes import LOOPBACK, Processes, flood
 from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.toll import REFUSED
 
 
 def _garbage(seed: int) -> Outcome:
@@ -45,13 +45,16 @@ def _recorder_killed(seed: int) -> Outcome:
     outcome = Outcome()
     with Processes(seed=seed) as run:
         run.reached(WORKING)
-        slip = run.scrape()["cloudrc_world_slip_seconds_total"]
+        shown = run.scrape()
+        slip = shown["cloudrc_world_slip_seconds_total"]
         before_ns = time.monotonic_ns()
         run.kill("world")
         recording, recovery = run.recording("world")
         # World's clock follows the machine's monotonic one, and lags it by its slip.
         last_ns = int(recording["/ground_truth"]["stamp_ns"][-1])
         outcome.most("stretch lost", (before_ns - last_ns) * 1e-9 - slip, 0.5, "s")
+        age = shown["cloudrc_recorder_sync_age_seconds"]
+        outcome.most("metric recorder_sync_age_seconds before", age, 1.0, "s")
         outcome.least("kept, share of the bytes", recovery.share, 0.99)
         outcome.same("damaged chunks", recovery.dropped.get("chunks", 0), 0)
     return outcome
@@ -102,7 +105,7 @@ SCENARIOS = (
         "SIGKILL of the world process, which records",
         "the rest of the recording recovers",
         "at most 0.5 s",
-        "cloudrc recover",
+        "cloudrc recover; before, cloudrc_recorder_sync_age_seconds",
         _recorder_killed,
         REAL,
     ),

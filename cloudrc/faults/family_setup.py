@@ -1,8 +1,13 @@
-"""Faults of the surroundings: clocks, names, configuration, keys, and a second cloud."""
+"""Faults of the surroundings: clocks, configuration, keys, and a second cloud."""
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
+
 from cloudrc.config.load import load_experiment
+from cloudrc.drivers.exporter import Exporter
+from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile
 from cloudrc.errors import BadInputError
 from cloudrc.faults import asks, meters
 from cloudrc.faults.crowd import Crowd
@@ -12,11 +17,10 @@ from cloudrc.faults.held import AGE_MAX
 from cloudrc.faults.mortal import Clock
 from cloudrc.faults.options import SECRET
 from cloudrc.faults.scenario import Outcome, Scenario
-from cloudrc.faults.walls import jumping_wall_clock
-from cloudrc.link.sidecar_follow import PeerName
+from cloudrc.faults.walls import jumping_wall_clock, steppable_wall_clock
 from cloudrc.messages import GuardState
 from cloudrc.records import Fault
-from cloudrc.tunnel.keys import Key, KeySet
+from cloudrc.tunnel.keys import Key, KeySet, write
 
 BAD_KEYS = (
     ("guard.command_age_max_ms=0", "guard.command_age_max_ms"),
@@ -44,6 +48,12 @@ def _wall_clocks(seed: int) -> Outcome:
     for role in ("world", "cloud"):
         shown = [meters.shown(each, role) for each in (clean, flight)]
         outcome.true(f"every reading of {role} is the same", shown[0] == shown[1])
+    with steppable_wall_clock() as wall:
+        exporter = Exporter("world")
+        before = _clock_steps(exporter)
+        wall.step(-3600.0)
+        moved = _clock_steps(exporter) - before
+    outcome.same("metric clock_steps_total rises at the next scrape by", moved, 1)
     for hours in (-1, 1):
         apart = Flight(seed=seed, cloud_clock=Clock((48 + hours) * HOUR_NS)).fly_mission()
         text = f"cloud's clock {48 + hours} h ahead: the same path, bit by bit"
@@ -56,27 +66,10 @@ def _wall_clocks(seed: int) -> Outcome:
     return outcome
 
 
-def _names(seed: int) -> Outcome:
-    """The peer's name stops to be resolved, then has another address."""
-    outcome, said, fails = Outcome(), list[str](), [False]
-    addresses = [["10.0.0.7"]]
-
-    def resolve(name: str) -> list[str]:
-        if fails[0]:
-            raise OSError(-3, "Temporary failure in name resolution")
-        return addresses[0]
-
-    peer = PeerName(("cloud", 7400), resolve, said.append)
-    first = peer.poll()
-    fails[0] = True
-    kept = [peer.poll() for _ in range(30)]
-    outcome.true("keeps the peer while DNS fails", set(kept) == {first})
-    outcome.same("lines in the log about it", len(said) - 1, 1)
-    outcome.true("it says so", "cannot be resolved" in said[-1])
-    fails[0], addresses[0] = False, ["10.0.0.9"]
-    outcome.true("follows the new address", peer.poll() == ("10.0.0.9", 7400))
-    outcome.true("it says that too", "was 10.0.0.7" in said[-1])
-    return outcome
+def _clock_steps(exporter: Exporter) -> float:
+    """Scrape how often the wall clock has been set."""
+    found = [family for family in exporter.collect() if family.name == "cloudrc_clock_steps"]
+    return float(found[0].samples[0].value)
 
 
 def _two_clouds(seed: int) -> Outcome:
@@ -133,7 +126,35 @@ def _secrets(seed: int) -> Outcome:
     outcome.checks += _rotated(seed, new, gap=8.0, holds=0).checks
     late = new._replace(overlap=2.0)
     outcome.checks += _rotated(seed, late, gap=8.0, holds=1).checks
+    _missing(outcome, seed)
     return outcome
+
+
+def _missing(outcome: Outcome, seed: int) -> None:
+    """No process starts without the Secret; one that has read it keeps what it knows."""
+    with tempfile.TemporaryDirectory() as folder:
+        path, said = Path(folder) / "key", ""
+        try:
+            KeyFile(path, 0)
+        except BadInputError as error:
+            said = str(error)
+        told = str(path) in said and "cloudrc key new" in said
+        outcome.true("missing key: refused, with the file and what to do", told)
+        path.write_text(write(SECRET), encoding="utf-8")
+        keys = KeyFile(path, 0)
+        before = keys.ring.accepted(0)
+        path.unlink()
+        told = bool(keys.follow(PERIOD_NS)) or keys.ring.accepted(PERIOD_NS) != before
+        outcome.true("gone in flight: the keys stay as they are", not told)
+    flight = Flight(seed=seed)
+    flight.cloud.kill(0)  # its pod waits for the Secret
+    flight.cloud.at(5.0, flight.cloud.start)
+    flight.fly(5.0)
+    outcome.same("missing key: sessions", len(asks.epochs(flight)), 0)
+    outcome.same("missing key: changes of the guard", len(flight.changes), 0)
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
 
 
 def _rotated(seed: int, new: KeySet, gap: float, holds: int) -> Outcome:
@@ -163,17 +184,8 @@ SCENARIOS = (
         "apart, one drifts by 500 ppm",
         "the same flight, bit by bit; drift is flown in TRACK",
         "none",
-        "nothing, no metric moves: no wall clock reaches the loop",
+        "cloudrc_clock_steps_total; nothing else: no wall clock reaches the loop",
         _wall_clocks,
-    ),
-    Scenario(
-        19,
-        "dns-failure",
-        "the peer's name is not resolved for 30 s, then has a new address",
-        "keeps the last peer, follows the new one",
-        "none",
-        "one line in the log of the link; no metric",
-        _names,
     ),
     Scenario(
         25,
@@ -197,7 +209,7 @@ SCENARIOS = (
     Scenario(
         38,
         "secret-wrong-or-rotated",
-        "another key in cloud; a rotation within and beyond the overlap",
+        "no key, or another one, in cloud; a rotation within and beyond the overlap",
         "no session, GROUND; within the overlap no HOLD; beyond it HOLD until both "
         "have the new key",
         "none",

@@ -42,6 +42,7 @@ class Finding:
         speed: Largest speed that was let through [m/s].
         holds: How often the guard held although the mission was on.
         missions: How many missions were done.
+        fallen: How far outside the fence it came, its rotors stopped by the operator's word [m].
     """
 
     schedule: Schedule
@@ -51,6 +52,7 @@ class Finding:
     speed: float
     holds: int
     missions: int
+    fallen: float = 0.0
 
     @property
     def kinds(self) -> set[str]:
@@ -105,6 +107,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         watch.speed,
         len(holds),
         sum(event.event == "done" for event in flight.desk.events),
+        watch.fallen,
     )
 
 

@@ -7,18 +7,35 @@ from typing import Any, TypeAlias
 
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.messages import Command, Setpoint
+from cloudrc.messages import Command, GuardState, OperatorRequest, Setpoint
 from cloudrc.records import Control
 
 Lie: TypeAlias = Callable[[Command, Control], Command]
 """What is sent in place of a command; what cloud knew when it made it stands in the record."""
 
+Words: TypeAlias = Callable[[Control, GuardState], OperatorRequest | None]
+"""What is said with it in the operator's name, if anything, to a robot whose guard was last seen
+in that state; cloud gives it its number."""
 
-def tempting(lie: Lie) -> Callable[[CloudEndpoint], None]:
-    """Make what turns an honest cloud into one that lies."""
+
+def drop(request: OperatorRequest) -> None:
+    """What the operator says is not passed on."""
+
+
+def tempting(lie: Lie, words: Words | None = None) -> Callable[[CloudEndpoint], None]:
+    """Make what turns an honest cloud into one that lies, and speaks in its operator's place."""
 
     def tempt(cloud: CloudEndpoint) -> None:
-        cloud._loop = Liar(cloud._loop, lie)  # type: ignore[assignment]
+        relay = cloud._relay
+
+        def speak(control: Control) -> None:
+            if words is None:
+                return
+            cloud._relay = drop  # type: ignore[method-assign]
+            if (said := words(control, cloud.guard)) is not None:
+                relay(said._replace(number=cloud._asked + 1))
+
+        cloud._loop = Liar(cloud._loop, lie, speak)  # type: ignore[assignment]
 
     return tempt
 
@@ -26,8 +43,8 @@ def tempting(lie: Lie) -> Callable[[CloudEndpoint], None]:
 class Liar:
     """Stands in the place of a control loop, and asks it for everything else."""
 
-    def __init__(self, loop: ControlLoop, lie: Lie) -> None:
-        self._honest, self._lie = loop, lie
+    def __init__(self, loop: ControlLoop, lie: Lie, speak: Callable[[Control], None]) -> None:
+        self._honest, self._lie, self._speak = loop, lie, speak
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._honest, name)
@@ -45,4 +62,5 @@ class Liar:
             counter: That the command will carry.
         """
         command, control = self._honest.command(setpoint, now_ns, dt, epoch, counter)
+        self._speak(control)
         return self._lie(command, control), control

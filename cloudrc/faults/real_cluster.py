@@ -84,10 +84,15 @@ def until(text: str, condition: Callable[[], bool], limit: float = LIMIT) -> flo
 
 def guard(release: Release) -> GuardState:
     """Look at the guard's state in world's own metrics."""
-    for line in fetch_metrics(release, "world")["world"].splitlines():
-        if line.startswith("cloudrc_guard_state "):
-            return GuardState(int(float(line.split()[1])))
-    return GuardState.GROUND
+    return GuardState(int(reading(release, "world", "guard_state")))
+
+
+def reading(release: Release, component: str, name: str) -> float:
+    """Read a metric without labels of an end's own container [any unit]; 0 if it is not there."""
+    for line in fetch_metrics(release, component)[component].splitlines():
+        if line.startswith(f"cloudrc_{name} "):
+            return float(line.split()[1])
+    return 0.0
 
 
 def finish(outcome: Outcome, release: Release, name: str) -> Recording:

@@ -159,6 +159,10 @@ class Processes:
         samples = (line.rpartition(" ") for line in lines if not line.startswith("#"))
         return {name: float(value) for name, _, value in samples}
 
+    def slip(self) -> float:
+        """By how much world's clock lags the machine's monotonic one, by its metric [s]."""
+        return self.scrape()["cloudrc_world_slip_seconds_total"]
+
     def close(self) -> None:
         """End everything and forget the folder."""
         for process in self._all:

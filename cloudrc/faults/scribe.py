@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.drivers.recording import FLUSH
+from cloudrc.drivers.recording import FLUSH, SyncAge
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
@@ -67,14 +67,22 @@ class ForgetfulWriter(McapWriter):
         """
         super().__init__(path, clock="world")
         self._path, self._delay_ns = path, round(delay * 1e9)
-        self.now_ns = self._done_ns = 0
+        self.now_ns = self._began_ns = self._done_ns = 0
         self._before = self._after = 0
+        self._age = SyncAge()
 
     def sync(self) -> None:
         """What was written until now is safe once the disk is done."""
+        self.sync_age(self.now_ns)
         super().sync()
         self._before, self._after = self._after, self._path.stat().st_size
-        self._done_ns = self.now_ns + self._delay_ns
+        self._began_ns, self._done_ns = self.now_ns, self.now_ns + self._delay_ns
+
+    def sync_age(self, at_ns: int) -> float | None:
+        """What the recording thread would show at an instant [ns] as its metric [s]."""
+        if at_ns >= self._done_ns:
+            self._age.done(self._began_ns * 1e-9)
+        return self._age.read(at_ns * 1e-9)
 
     def after_power_cut(self, at_ns: int, rng: np.random.Generator | None) -> bytes:
         """Give the file as a machine finds it that was without power.

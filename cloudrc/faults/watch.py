@@ -1,9 +1,11 @@
 """The invariants, looked at in every step of the physics, by nobody who could be wrong with them.
 
-No fence breach: the base stays inside the fence, with its rotors stopped, too; what is flown stays
-below the caps and can be stopped in time, before the floor, too, unless the robot lands. No motion
-on stale commands: in TRACK the newest accepted command's basis is never older than its limit. No
-collision, under an honest cloud: nothing but the arm's tip touches anything, and that the board.
+No fence breach: the base stays inside the fence, with its rotors stopped by a hit, too; where the
+operator's word has stopped them, it may fall out of it, but not as far as people have to stay away.
+What is flown stays below the caps and can be stopped in time, before the floor, too, unless the
+robot lands. No motion on stale commands: in TRACK the newest accepted command's basis is never
+older than its limit. No collision, under an honest cloud: nothing but the arm's tip touches
+anything, and that the board.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ FLOWN = (GuardState.TRACK, GuardState.HOLD, GuardState.LAND)
 ABOVE_GROUND = (GuardState.TRACK, GuardState.HOLD)
 REPORTED = 5
 """Of each kind."""
+FALL_MAX = 1.5
+"""How far outside the fence people are told to stay [m]. Source: docs/safety/guard.md."""
 
 
 class Breach(NamedTuple):
@@ -49,6 +53,8 @@ class Watch:
         counts: Of all of them, by kind.
         margin: Smallest distance of the base to a face of the fence other than the floor [m].
         speed: Largest speed flown [m/s].
+        fallen: How far outside the fence the base came with its rotors stopped by the operator's
+            word [m]; 0 if it did not.
     """
 
     def __init__(self, speed_max: float, acceleration_max: float, age_max_ns: int) -> None:
@@ -66,15 +72,15 @@ class Watch:
         self._age_max_ns = age_max_ns
         self.breaches: list[Breach] = []
         self.counts: Counter[str] = Counter()
-        self.margin, self.speed = 9.0, 0.0
+        self.margin, self.speed, self.fallen = 9.0, 0.0, 0.0
         self._hit: tuple[int, str] | None = None
 
     def attach(self, world: Any, start_ns: int) -> None:
         """Look at every step of a world that begins now, and at every command that it accepts."""
         robot = world.robot
         simulator, guard = robot.simulator, robot.guard
-        step, offer = simulator.step, guard.offer
-        now_ns, basis_ns, before = start_ns, -1, ZERO
+        step, offer, stop = simulator.step, guard.offer, guard.stop
+        now_ns, basis_ns, before, falls = start_ns, -1, ZERO, False
         age_max_ns, flown = self._age_max_ns, FLOWN
         tracking, landing = GuardState.TRACK, GuardState.LAND
 
@@ -85,11 +91,17 @@ class Watch:
                 basis_ns = command.basis_stamp_ns
             return refusal
 
+        def watched_stop(when_ns: int) -> None:
+            nonlocal falls
+            falls = falls or guard.state in flown
+            stop(when_ns)
+
         def watched_step(rotor_speeds: Any) -> None:
-            nonlocal now_ns, before
+            nonlocal now_ns, before, falls
             state, reference = guard.state, guard.reference
             position = simulator.readings.position
-            self._look_at_fence(position, now_ns)
+            falls = falls and state not in flown
+            self._look_at_fence(position, falls, now_ns)
             if state in flown:
                 self._look_at_stop(position, reference, state is landing, now_ns)
                 if reference is not before:
@@ -101,15 +113,19 @@ class Watch:
             step(rotor_speeds)
             now_ns += TICK_NS
 
-        simulator.step, guard.offer = watched_step, watched_offer
+        simulator.step, guard.offer, guard.stop = watched_step, watched_offer, watched_stop
 
-    def _look_at_fence(self, position: Vector, now_ns: int) -> None:
+    def _look_at_fence(self, position: Vector, falls: bool, now_ns: int) -> None:
         x, y, z = position
         (xl, yl, zl), (xh, yh, zh) = LOW, HIGH
         margin = min(x - xl, xh - x, y - yl, yh - y, zh - z)
         if z < zl:
             self.note(now_ns, "fence", f"base at ({x:.2f}, {y:.2f}, {z:.2f}), below the floor")
-        if margin < self.margin:
+        if falls:
+            self.fallen = max(self.fallen, -margin)
+            if margin < -FALL_MAX:
+                self.note(now_ns, "fence", f"base fell to ({x:.2f}, {y:.2f}, {z:.2f})")
+        elif margin < self.margin:
             self.margin = margin
             if margin < 0.0:
                 text = f"base at ({x:.2f}, {y:.2f}, {z:.2f})"

@@ -6,10 +6,11 @@ import json
 from collections.abc import Callable
 
 import pytest
-from kube import NAME, NAMESPACE, cloudrc
+from kube import NAME, NAMESPACE, ROOT, cloudrc
 
 from cloudrc.faults.catalogue import scenarios
 
+PAGE = ROOT / "docs" / "safety" / "faults-cluster.md"
 WHERE = ("--cluster", "-n", NAMESPACE, "--release", NAME, "-o", "json")
 
 
@@ -37,4 +38,4 @@ def test_a_partition_is_survived(installed: None, note: Callable[[str], None]) -
 @pytest.mark.full
 def test_every_fault_is_survived(installed: None, note: Callable[[str], None]) -> None:
     names = {each.name for each in scenarios("cluster")}
-    assert survived(note, "--all", timeout=2400.0) == names
+    assert survived(note, "--all", f"--document={PAGE}", timeout=2400.0) == names

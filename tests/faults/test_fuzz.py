@@ -19,8 +19,10 @@ from cloudrc.faults.schedule import KINDS, Event, Schedule, dump, load, shaped
 from cloudrc.faults.shrink import shrink
 from cloudrc.faults.watch import Breach, Watch
 from cloudrc.link.profile import Change, DirectionProfile
+from cloudrc.messages import OperatorRequest, Request
 from cloudrc.record.columns import Recording
 from cloudrc.record.recover import Recovery, recover
+from cloudrc.world.endpoint import WorldEndpoint
 
 REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))
 
@@ -55,6 +57,50 @@ def test_a_thousand_random_schedules_break_no_invariant(first: int) -> None:
 def test_two_hundred_hostile_clouds_cause_no_breach(first: int) -> None:
     failed = [seed for seed in range(first, first + 25) if fly(choose(seed)).breaches]
     assert failed == []
+
+
+def test_an_adversary_flies_alone_or_amid_every_kind_of_fault() -> None:
+    chosen = [choose(seed) for seed in range(400)]
+    alone = [schedule for schedule in chosen if not schedule.events]
+    assert 150 < len(alone) < 250
+    assert {event.kind for schedule in chosen for event in schedule.events} == set(KINDS)
+    for policy in POLICIES:
+        mine = [bool(schedule.events) for schedule in chosen if schedule.policy == policy]
+        assert set(mine) == {True, False}
+
+
+def test_the_operators_voice_says_every_word_and_the_operator_is_not_heard(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    heard: list[OperatorRequest] = []
+    receive = WorldEndpoint._receive_operator
+
+    def hear(world: WorldEndpoint, request: OperatorRequest) -> None:
+        heard.append(request)
+        receive(world, request)
+
+    monkeypatch.setattr(WorldEndpoint, "_receive_operator", hear)
+    for seed in (27, 38):
+        assert fly(Schedule(seed, policy="operators-voice", duration=20.0)).breaches == ()
+    said = [request for request in heard if request.mission_id < 3]
+    assert {request.request for request in said} == set(Request)
+    of_operator = [request for request in heard if request not in said]
+    assert {request.request for request in of_operator} == {Request.START}, "before it was muted"
+
+
+def test_what_falls_out_of_the_fence_by_the_operators_word_is_told_and_fails_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def falling(schedule: Schedule, keep: bool = False) -> Finding:
+        return Finding(schedule, (), "", 1.0, 2.0, 0, 1, 0.4 * (schedule.seed % 2))
+
+    monkeypatch.setattr("cloudrc.faults.fuzz.fly", falling)
+    page = tmp_path / "adversary.md"
+    assert main(["faults", "fuzz", "--adversarial", "--seeds", "4", f"--document={page}"]) == 0
+    told = "2 stopped by the operator's word came to lie outside of it, at most by 0.40 m"
+    assert told in page.read_text()
+    assert "a [known limit](guard.md)" in page.read_text()
+    assert told in capsys.readouterr().out
 
 
 def test_one_seed_is_one_flight() -> None:
@@ -182,7 +228,9 @@ def test_a_stored_schedule_is_flown_again(
 
 
 def test_no_zero_is_told_of_what_was_not_looked_at(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["faults", "fuzz", "--adversarial", "--seeds", "1", "-o", "json"]) == 0
+    alone = next(seed for seed in range(20) if not choose(seed).events)
+    flags = ["--adversarial", "--first", str(alone), "--seeds", "1"]
+    assert main(["faults", "fuzz", *flags, "-o", "json"]) == 0
     document = json.loads(capsys.readouterr().out)
     for kind, told in document["invariants"].items():
         if kind in ("collision", "stuck", "alarm", "recording"):

@@ -14,12 +14,18 @@ from cloudrc.errors import BadInputError
 from cloudrc.faults import document
 from cloudrc.faults.catalogue import find, scenarios
 from cloudrc.faults.document import Result
-from cloudrc.faults.scenario import Check, Outcome, Scenario
+from cloudrc.faults.scenario import Check, Mode, Outcome, Scenario
 
 FAULTS = range(1, 41)
 QUICK = ("short-blackout", "cloud-killed", "forged-command", "bad-configuration")
 SHARED = scenarios("virtual")
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "safety" / "faults.md"
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "safety"
+PAGE = DOCS / "faults.md"
+PAGES: dict[Mode, Path] = {
+    "virtual": PAGE,
+    "real": DOCS / "faults-real.md",
+    "cluster": DOCS / "faults-cluster.md",
+}
 
 
 @pytest.mark.promise("P-FAULT-1")
@@ -30,17 +36,20 @@ def test_every_fault_of_the_table_has_a_scenario() -> None:
 
 
 @pytest.mark.promise("P-FAULT-1")
-def test_the_page_is_of_these_faults_and_every_check_on_it_has_passed() -> None:
-    """`make faults`, which CI runs, writes it, and fails where a check does."""
-    page = PAGE.read_text(encoding="utf-8")
-    table, _, measured = page.partition("\n## Measured\n")
+@pytest.mark.parametrize(("mode", "page"), PAGES.items())
+def test_a_page_is_of_its_mode_s_faults_and_no_check_on_it_has_failed(
+    mode: Mode, page: Path
+) -> None:
+    """`make faults`, which CI runs, `make nightly` and `make e2e-full` write them."""
+    table, _, measured = page.read_text(encoding="utf-8").partition("\n## Measured\n")
     rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| F")]
-    named = [(each.id, each.name, each.injects, each.expects) for each in scenarios()]
+    named = [(each.id, each.name, each.injects, each.expects) for each in scenarios(mode)]
     told = [(*row[0].removeprefix("| ").split(" ", 1), row[1], row[2]) for row in rows]
-    assert sorted(told) == sorted(named), "run make faults"
-    assert {int(name[1:]) for name, *_ in told} == set(FAULTS)
+    assert told == named, "run them anew"
     passed = re.findall(r"\| (\d+) of (\d+) passed \|", table)
-    assert len(passed) == len(SHARED)
+    skipped = re.findall(r"^### .*: skipped$", measured, re.MULTILINE)
+    assert len(passed) + len(skipped) == len(rows)
+    assert mode != "virtual" or not skipped
     assert [pair for pair in passed if pair[0] != pair[1] or pair[0] == "0"] == []
     assert "FAILED" not in measured
     assert ": NO" not in measured
@@ -105,15 +114,20 @@ def test_what_is_not_measured_has_not_passed(check: Check, passed: bool) -> None
     assert check.passed is passed
 
 
+def good() -> Outcome:
+    outcome = Outcome(sha256="ab" * 32)
+    outcome.most("HOLD after", 0.252, 0.252, "s")
+    outcome.most("HOLD after", 0.1, 0.252, "s")
+    outcome.true("mission done", True)
+    return outcome
+
+
 def results() -> list[Result]:
-    good, bad, none = Outcome(sha256="ab" * 32), Outcome(), Outcome(skipped="not here")
-    good.most("HOLD after", 0.252, 0.252, "s")
-    good.most("HOLD after", 0.1, 0.252, "s")
-    good.true("mission done", True)
+    bad, none = Outcome(), Outcome(skipped="not here")
     bad.same("collisions", 2, 0)
     scenario = find("F13", "virtual")
     return [
-        Result(scenario, good, 1.0),
+        Result(scenario, good(), 1.0),
         Result(scenario, bad, 2.0),
         Result(scenario, none, 0.0),
         Result(scenario, Outcome(), 0.0, "ValueError: broken"),
@@ -134,6 +148,28 @@ def test_results_as_a_table_show_the_worst_of_each_promise() -> None:
     assert "HOLD after: 0.252 s (<= 0.252), 2 times" in text
     assert "mission done: yes" in text
     assert "1 of 4 scenarios passed" in text
+    assert [line.rsplit(" | ", 1)[1] for line in text.splitlines() if line.startswith("| F13")] == [
+        "3 of 3 passed |",
+        "0 of 1 passed |",
+        "not here |",
+        "0 of 0 passed |",
+    ]
+
+
+@pytest.mark.parametrize(("flag", "title"), [("--real", "with real"), ("--cluster", "Kubernetes")])
+def test_each_mode_writes_a_page_of_its_own(
+    flag: str, title: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from cloudrc.cli import faults_run
+
+    monkeypatch.setattr(faults_run, "_look_for_release", lambda options: None)
+    monkeypatch.setattr(faults_run, "_run", lambda which: Result(find(*which[:2]), good(), 1.0))
+    page = tmp_path / "page.md"
+    assert main(["faults", "run", "--all", flag, f"--document={page}"]) == 0
+    text, names = page.read_text(), [f"{s.id} {s.name}" for s in scenarios(flag[2:])]  # type: ignore[arg-type]
+    assert title in text.splitlines()[0]
+    assert f"{len(names)} of {len(names)} scenarios passed" in text
+    assert [row.split(" | ")[0][2:] for row in text.splitlines() if row.startswith("| F")] == names
 
 
 def test_the_command_prints_json_and_exits_by_the_checks(

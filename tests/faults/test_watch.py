@@ -21,7 +21,9 @@ class World:
         self.state, self.reference, self.steps = TRACK, ZERO, 0
         self.watch = Watch(6.0, 12.0, 250 * MS)
         self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
-        self.guard = SimpleNamespace(state=TRACK, reference=ZERO, offer=lambda command, now: None)
+        self.guard = SimpleNamespace(state=TRACK, reference=ZERO)
+        self.guard.offer = lambda command, now: None
+        self.guard.stop = lambda now: None
         self.robot = SimpleNamespace(simulator=self.simulator, guard=self.guard)
         self.watch.attach(self, 0)
         self.guard.offer(Command(0, 0, 0, ZERO, 0.0), 0)
@@ -43,6 +45,30 @@ class World:
 def test_the_base_may_not_be_outside_in_any_state_rotors_stopped_or_not(state):
     assert World().tick(ZERO, state=state) == set()
     assert World().tick(ZERO, state=state, position=OUTSIDE) == {"fence"}
+
+
+@pytest.mark.promise("P-GUARD-3")
+def test_stopped_by_the_operators_word_it_may_fall_out_but_not_far_nor_fly_there():
+    world, far = World(), (9.2 + 1.51, 1.0, 1.0)
+    world.guard.stop(0)
+    assert world.tick(ZERO, state=ESTOP, position=OUTSIDE) == set()
+    assert world.watch.fallen == pytest.approx(0.1)
+    assert world.tick(ZERO, state=GROUND, position=OUTSIDE) == set(), "acknowledged where it lies"
+    assert world.tick(ZERO, state=TRACK, position=OUTSIDE) == {"fence"}
+    world = World()
+    world.guard.stop(0)
+    assert world.tick(ZERO, state=ESTOP, position=far) == {"fence"}
+
+
+@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.parametrize("state", [GROUND, LAND, ESTOP])
+def test_a_word_that_stops_no_rotors_excuses_no_fall(state):
+    """Stopped by a hit, it falls; what is said to it later has not brought that about."""
+    world = World()
+    world.guard.state = ESTOP
+    world.guard.stop(0)
+    assert world.tick(ZERO, state=state, position=OUTSIDE) == {"fence"}
+    assert world.watch.fallen == 0.0
 
 
 def test_a_breach_says_how_long_before_something_was_hit():

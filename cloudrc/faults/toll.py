@@ -1,0 +1,99 @@
+"""Hostile datagrams beside honest ones: each is counted, and nothing else may come of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from cloudrc.faults import asks, meters
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.mortal import Mortal, Tamper
+from cloudrc.faults.scenario import Outcome, generator
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.channel import USED
+
+Generator: TypeAlias = np.random.Generator
+REFUSED = ("tag", "malformed", "version", "direction", "old_epoch", "repeated")
+"""What a hostile datagram is counted under."""
+GREETED = ("hello", "unanswered", "accept_ignored")
+"""What a captured greeting is counted under: a challenge is all it gets, if anything."""
+
+
+class Toll:
+    """Counts hostile datagrams, and those of them that were not refused for what they are."""
+
+    def __init__(self) -> None:
+        self.given = self.taken = 0
+
+    def give(self, mortal: Mortal, data: bytes, now_ns: int) -> None:
+        """Hand one to an end."""
+        before, state = _refused(mortal), _state(mortal)
+        mortal.receive_now(data, now_ns)
+        self.given += 1
+        # A challenge that nobody has asked for is not counted, nor answered.
+        ignored = kind_of(data) == codec.Kind.CHALLENGE and _state(mortal) == state
+        self.taken += not ignored and _refused(mortal) != before + 1
+
+
+def _refused(mortal: Mortal) -> int:
+    counts = mortal.inner._counts  # type: ignore[union-attr]
+    return sum(counts.get(name, 0) for name in (*REFUSED, *GREETED))
+
+
+def kind_of(data: bytes) -> int:
+    """What a datagram says that it carries; 0 if it is too short for that."""
+    return codec.peek(data)[0] if len(data) >= codec.HEADER_SIZE else 0
+
+
+def _state(mortal: Mortal) -> tuple[int, int, int]:
+    """What a datagram could change: the session, what is let through, what is answered."""
+    inner: Any = mortal.inner
+    return inner._session.epoch, inner._counts.get(USED, 0), len(inner._datagrams)
+
+
+def unharmed(
+    seed: int,
+    hostile: Callable[[Mortal, bytes, Generator], list[bytes]],
+    *refusals: str,
+    since: float = 0.0,
+    both: bool = False,
+) -> Outcome:
+    """Fly with hostile datagrams beside the honest ones: nothing may be any different.
+
+    Args:
+        seed: Of the flight.
+        hostile: Gives those that come to an end before an honest one.
+        refusals: What world has to count them under.
+        since: From when on they come [s].
+        both: Whether they come to cloud, too.
+    """
+    outcome, rng, toll = Outcome(), generator(seed, 20), Toll()
+    clean, flight = Flight(seed=seed).fly_mission(), Flight(seed=seed)
+
+    def tamper(mortal: Mortal) -> Tamper:
+        def tampered(data: bytes, now_ns: int) -> list[bytes]:
+            if now_ns * 1e-9 >= since:
+                for strange in hostile(mortal, data, rng):
+                    toll.give(mortal, strange, now_ns)
+            return [data]
+
+        return tampered
+
+    flight.world.tamper = tamper(flight.world)
+    if both:
+        flight.cloud.tamper = tamper(flight.cloud)
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    outcome.true("the same path, bit by bit", asks.same_path(clean, flight))
+    for refusal in refusals:
+        labels = ("downlink", refusal)
+        meters.moves(outcome, flight, "world", "datagrams_total", *labels, since=since)
+    seen = [asks.metric(flight, "world", "datagrams_total", "downlink", each) for each in REFUSED]
+    outcome.least("metric datagrams_total, refused", sum(n for n in seen if n == n), 900)
+    outcome.least("hostile datagrams", toll.given, 1000)
+    outcome.same("of them taken", toll.taken, 0)
+    outcome.true("they opened no session", asks.epochs(clean) == asks.epochs(flight))
+    return outcome

@@ -1,0 +1,48 @@
+"""`make nightly` reaches every long number of the promises: each is in it by name."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+_, _, REST = (ROOT / "Makefile").read_text(encoding="utf-8").partition("# The long numbers,")
+LIST, _, RECIPE = REST.partition("\nnightly:")
+RECIPE = RECIPE.partition("\n\n")[0]
+TESTS = re.findall(r"^#   .+?  (test_\w+)$", LIST, re.MULTILINE)
+NUMBERS = (
+    "10^7 hostile datagrams",
+    "10^6 commands and readings of the guard",
+    "every bit of 1,000 datagrams",
+    "every sequence of 6 of 16 counters",
+    "depth 10",
+    "1,000 requests a second for 20 s",
+)
+LINES = (
+    "-n auto -m 'not process and not e2e and not netem'",
+    "pytest -m process",
+    "faults run --all --real --document docs/safety/faults-real.md",
+    "faults fuzz --clean --seeds 600 ",
+    "faults fuzz --adversarial --seeds 5000 ",
+    "faults fuzz --seeds 30000 ",
+    "$(MAKE) e2e-full",
+)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_a_long_number_is_named(number: str) -> None:
+    assert number in LIST
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_what_runs_it_is_a_line_of_it(line: str) -> None:
+    assert line in RECIPE
+
+
+def test_every_test_that_it_names_is_there_once() -> None:
+    assert len(TESTS) >= len(NUMBERS)
+    texts = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")]
+    there = [name for text in texts for name in re.findall(r"^def (test_\w+)", text, re.MULTILINE)]
+    assert {name: there.count(name) for name in TESTS} == dict.fromkeys(TESTS, 1)
