@@ -13,6 +13,10 @@ SCRIPTS := .ci/run
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 # What the search finds is shrunk and becomes a test, until it is mended a failing one.
 STORE := --store tests/faults/regressions
+# What tests guard, tunnel and journal in seconds.
+SLOW := %_any_input.py %_flight.py %_machine.py %_proof.py %_hostile.py
+CORE := $(filter-out $(SLOW),$(wildcard \
+	tests/world/test_guard*.py tests/tunnel/test_*.py tests/cloud/test_teleop_journal*.py))
 BUILD_ARGS := --build-arg VERSION=$(VERSION) \
 	--build-arg SOURCE=$(or $(filter https://%,$(shell git config remote.origin.url)),unpublished) \
 	--build-arg REVISION=$(or $(shell git rev-parse HEAD 2>/dev/null),unknown)
@@ -23,7 +27,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio websockets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process e2e e2e-full test-netem test-netem-full faults figures nightly lint types bench bench-link pictures docs images kind-load lock chart-docs clean
+.PHONY: help demo test process e2e e2e-full test-netem test-netem-full faults figures coverage mutants nightly lint types bench bench-link pictures docs images kind-load lock chart-docs clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -60,12 +64,35 @@ faults: $(VENV)/dev ## bring every fault about, compose 200 at random; writes do
 figures: $(VENV)/dev ## print the numbers that tests have measured: asked, measured, of how many
 	$(bin)/python tools/figures.py
 
+coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and journal is tested
+	$(bin)/coverage run -m pytest --hypothesis-seed=0 $(CORE)
+	$(bin)/coverage report
+
+# mutmut writes where it runs; docs/safety/mutants.md says why each of those that survive may.
+mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways; print what no test notices
+	rm -rf build/mutants && mkdir -p build/mutants
+	cp -r cloudrc tests tools pyproject.toml build/mutants
+	find build/mutants/tests -name 'test_*.py' -delete && cp --parents $(CORE) build/mutants
+	cd build/mutants && $(abspath $(bin))/mutmut run $(MUTANTS)
+	cd build/mutants && $(abspath $(bin))/mutmut results
+
+# The long numbers, and the tests that reach them; the seeds and the real floods are lines below.
+#   10^7 hostile datagrams, coverage-guided    test_coverage_guided_ones
+#   10^6 hostile datagrams, by chance          test_a_million_hostile_datagrams
+#   every bit of 1,000 datagrams flipped       test_no_bit_of_a_thousand_datagrams_can_be_flipped
+#   every sequence of 6 of 16 counters         test_every_sequence_of_six_agrees_with_a_set
+#   two clouds, interleaved to depth 10        test_no_interleaving_of_ten_takes_a_command_back
+#   10^6 commands and readings of the guard    test_a_million_commands_and_readings_stay_inside_the_caps
+#   killed at 200 instants, 1.5 m/s            test_without_its_cloud_the_robot_stops_at_any_instant
+#   killed at 200 instants, uncapped           test_uncapped_it_takes_a_little_longer_at_any_instant
+#   blackouts at 24 instants, each way         test_a_silence_anywhere_touches_nothing
+#   1,000 requests a second for 20 s           test_a_thousand_requests_a_second_do_not_disturb_the_control_loop
 # The cluster comes last: without Docker, kind, helm and kubectl all else is done.
 nightly: $(VENV)/dev ## run all tests but netem's, 500 hours of faults, e2e-full (needs what e2e needs)
 	rm -rf build/figures
 	$(bin)/pytest -n auto -m 'not process and not e2e and not netem'
 	$(bin)/pytest -m process
-	$(bin)/cloudrc faults run --all --real
+	$(bin)/cloudrc faults run --all --real --document docs/safety/faults-real.md
 	$(bin)/cloudrc faults fuzz --clean --seeds 600 --jobs $(JOBS) $(STORE)
 	$(bin)/cloudrc faults fuzz --adversarial --seeds 5000 --jobs $(JOBS) $(STORE)
 	$(bin)/cloudrc faults fuzz --seeds 30000 --jobs $(JOBS) $(STORE)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+import re
+import sys
+import tomllib
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -76,6 +79,13 @@ RESERVED: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("random", "secrets", "uuid"), ("drivers/", "cluster/", "cli/")),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
 }
+# Package that is imported -> the one by which pyproject.toml asks for it.
+ASKED_AS = {
+    "yaml": "pyyaml",
+    **dict.fromkeys(("pydantic_core", "annotated_types"), "pydantic"),
+    "starlette": "fastapi",
+    "urllib3": "kubernetes",
+}
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__"}
 
 
@@ -144,6 +154,22 @@ def test_a_file_imports_only_what_its_part_may() -> None:
 )
 def test_a_breach_is_found(place: str, code: str) -> None:
     assert violations(place, ast.parse(code))
+
+
+def foreign(trees: Iterable[ast.AST]) -> set[str]:
+    """What from outside is imported, as pyproject.toml asks for it."""
+    found = {name.partition(".")[0] for tree in trees for name in imports(tree)}
+    return {ASKED_AS.get(name, name) for name in found - sys.stdlib_module_names - {"cloudrc"}}
+
+
+def test_what_is_imported_is_what_is_declared_and_nothing_else() -> None:
+    """So a package of another's name cannot slip in (threat T23)."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [lines for name, lines in project["optional-dependencies"].items() if name != "dev"]
+    lines = sum(extras, project["dependencies"])
+    declared = {re.split(r"[<>=\[; ]", line)[0].replace("-", "_") for line in lines} - {"cloudrc"}
+    assert foreign(TREES.values()) == declared
+    assert foreign([ast.parse("def f():\n    from polaris.client import get")]) == {"polaris"}
 
 
 def test_no_file_is_longer_than_300_lines() -> None:

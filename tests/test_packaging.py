@@ -83,7 +83,7 @@ def test_the_continuous_integration_calls_what_a_user_calls() -> None:
     assert script.startswith("#!/usr/bin/env bash\n")
     assert "set -euo pipefail" in script
     called = re.findall(r"^(?:\S+netem-vm )?(?:make|once_more) ([a-z0-9-]+)", script, re.MULTILINE)
-    steps = "lint types demo process test faults e2e test-netem figures"
+    steps = "lint types demo process test coverage faults e2e test-netem figures"
     assert called == steps.split()
     assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
     subprocess.run(["bash", "-n", str(ROOT / ".ci" / "run")], check=True)

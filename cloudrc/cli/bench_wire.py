@@ -1,7 +1,8 @@
 """What a datagram costs: layout and seal of telemetry, against the paper's pickled ROS message.
 
-Nothing of cloudrc may import pickle. The yardstick therefore runs in a child process of its own:
-classes as ROS 1 generates them, an Odometry of the same numbers, as large as a real one (1 kB).
+Nothing of cloudrc may import pickle. The one exception is the yardstick, a program for a process of
+its own, which unpickles nothing but the constants that it has just pickled itself.
+Classes as ROS 1 generates them, an Odometry of the same numbers, as large as a real one (1 kB).
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from bare_world import Bare, BareCloud, ring
 from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
-from cloudrc.tunnel.complaints import Complaints
+from cloudrc.tunnel.complaints import KEY, Complaints
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
 OTHER = KeyRing(KeySet(Key(b"x" * 32)))
@@ -50,9 +50,18 @@ def test_what_anybody_may_send_is_not_worth_a_word(outcome):
     assert Complaints().about(outcome, bytes(16), 0) == []
 
 
-def test_a_tag_of_no_greeting_is_not_worth_a_word():
-    data = codec.encode_header(Kind.COMMAND, 1, 1, 1)
-    assert Complaints().about("tag", data, 0) == []
+@pytest.mark.parametrize("kind", Kind)
+def test_a_tag_is_worth_a_word_if_it_is_a_greetings(kind):
+    data = codec.encode_header(kind, 1, 1, 1)
+    said = [Fault(7, "key", KEY)] if kind <= Kind.BUSY else []
+    assert Complaints().about("tag", data, 7) == said
+
+
+def test_of_another_version_both_are_named():
+    complaints = Complaints()
+    text = "peer speaks v9, we speak v2: run the same version of cloudrc at both ends"
+    assert complaints.about("version", bytes([9, 1, 2]), 7) == [Fault(7, "version", text)]
+    assert complaints.about("version", bytes([9, 1, 2]), 8) == []
 
 
 def test_after_a_session_it_is_said_again():

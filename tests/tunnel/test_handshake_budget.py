@@ -41,7 +41,7 @@ def test_a_challenge_is_never_further_than_a_tenth_of_a_second(step):
     for _ in range(50):
         assert step.knock().datagrams
         step.now_ns += CHALLENGE_NS - 1
-        assert step.knock().outcome == "unanswered"
+        assert step.knock()[:2] == ("unanswered", [])
         step.now_ns += 1  # to the nanosecond
 
 
@@ -89,3 +89,11 @@ def test_the_counter_that_was_answered_last_is_forgotten_last(step):
         for nonce in (NONCE, b"%016d" % number):
             step.knock(nonce, step.door._cookie(step.now_ns))
     assert NONCE in step.door._counters
+
+
+def test_whoever_is_answered_last_is_forgotten_last(step):
+    first, second, *others = (b"%16d" % number for number in range(USED_MAX + 1))
+    for nonce in (first, second, *others[:-1], first, others[-1]):
+        step.door._remember(nonce, 0)
+    assert second not in step.door._counters
+    assert first in step.door._counters

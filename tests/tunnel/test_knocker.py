@@ -87,6 +87,7 @@ def test_another_process_of_world_may_begin_again_from_one(knocker):
     assert knocker.accepted(1, accept(world=b"v" * 16), 3)
 
 
+@pytest.mark.promise("P-LINK-2")
 def test_a_world_that_is_gone_does_not_come_back(knocker):
     knocker.accepted(3, accept(), 0)
     knocker.accepted(4, accept(world=b"v" * 16), 3)

@@ -65,6 +65,7 @@ def test_counters_go_on_through_a_rekey():
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[3] == 1
 
 
+@pytest.mark.promise("P-LINK-8")
 def test_the_keys_of_two_generations_differ():
     _, cloud = pair()
     first = cloud.seal(Kind.ALIVE, b"")

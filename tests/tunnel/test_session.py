@@ -128,6 +128,7 @@ def test_each_direction_has_its_own_key():
     assert cloud.seal(Kind.ALIVE, b"")[16:] != world.seal(Kind.ALIVE, b"")[16:]
 
 
+@pytest.mark.promise("P-LINK-8")
 def test_no_nonce_is_used_twice_in_an_epoch():
     _, cloud = pair()
     kinds = [Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE]
@@ -228,14 +229,6 @@ def flip_every_bit(made):
 
 
 @pytest.mark.promise("P-LINK-1")
-def test_no_datagram_with_a_flipped_bit_is_accepted_or_changes_anything(figure):
-    accepted, flips = flip_every_bit(datagrams(20))
-    figure("bit flips of 40 datagrams: accepted", accepted, "==", 0, count=flips)
-    assert accepted == 0
-    assert flips > 20_000
-
-
-@pytest.mark.full
 def test_no_bit_of_a_thousand_datagrams_can_be_flipped(figure):
     accepted, flips = flip_every_bit(datagrams(500))
     figure("bit flips of 1,000 datagrams: accepted", accepted, "==", 0, count=flips)

@@ -2,13 +2,15 @@
 
 A `Symbol` stands for any float. Where the code under test compares, the run forks: each run takes
 one way, and what was found true on it is its path. Comparisons, sums, products and negation are
-those of IEEE 754, bit for bit. Division and square root take z3 minutes; they are replaced by what
-correct rounding promises of them, which is enough for bounds.
+those of IEEE 754, bit for bit, and so is division by a power of two. Other divisions and square
+roots take z3 minutes; they are replaced by what correct rounding promises of them, which is enough
+for bounds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import frexp
 
 import z3
 
@@ -47,7 +49,12 @@ class Symbol:
     __rmul__ = __mul__
 
     def __truediv__(self, other):
-        """Of n >= 0 by d > 0: a float >= 0, not NaN; finite if n is finite and d at least 0.1."""
+        """Of n >= 0 by d > 0: a float >= 0, not NaN; finite if n is finite and d at least 0.1.
+
+        By a power of two it is the multiplication by its inverse, of any n.
+        """
+        if isinstance(other, float) and frexp(other)[0] == 0.5:
+            return self * (1.0 / other)
         n, d, q = self.term, self._with(other), self.run.fresh("quotient").term
         self.run.prove(z3.And(n >= 0.0, d >= 0.1, z3.Not(z3.fpIsInf(n)), z3.Not(z3.fpIsInf(d))))
         bound = z3.FPVal(1e300, DOUBLE)

@@ -65,6 +65,13 @@ def test_shortened_is_short_and_points_the_same_way(length_max):
             assert b is a
 
 
+def test_what_is_just_as_long_as_allowed_is_not_shortened():
+    """Else it would count as limited; what is a hair longer must not be taken for no number."""
+    allowed, longer = (1.0, 0.0, 0.0), (1.0, 2.0**-26, 0.0)
+    assert rules.shortened(allowed, 1.0) is allowed
+    assert rules.shortened(longer, 1.0) == longer  # its length is 1.0 again, once rounded
+
+
 @pytest.mark.parametrize("step", [1e-9, 0.024, 3.0])
 def test_towards_goes_a_step_and_not_beyond(step):
     assert rules.towards((0.0, 0.0, 0.0), (3.0, 0.0, 4.0), step)[2] == pytest.approx(0.8 * step)
