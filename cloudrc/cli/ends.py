@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
 
 Address = tuple[str, int]
+LOOPBACK_NAMES = ("localhost", "::1", "[::1]")
 EPILOG = """\
 'cloudrc run --mode local' starts this process with the flags that it needs.
 It ends on SIGTERM, on Ctrl-C, and when the process that started it is gone."""
@@ -101,7 +102,7 @@ def size(text: str) -> float:
 
 def warn_if_exposed(listen: Address) -> None:
     """Say so if others than this machine can send to an address."""
-    if not listen[0].startswith("127."):
+    if not listen[0].startswith("127.") and listen[0] not in LOOPBACK_NAMES:
         print(f"cloudrc: warning: {listen[0]} can be reached from outside", file=sys.stderr)
 
 
@@ -112,7 +113,8 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
     from cloudrc.drivers.exporter import Exporter
 
     warn_if_exposed(options.metrics)
-    exporter = Exporter(role)
+    elsewhere = getattr(options, "teleop", None) is not None
+    exporter = Exporter(role, missions=not elsewhere)
     exporter.serve(options.metrics)
     return exporter
 

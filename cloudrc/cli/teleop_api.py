@@ -33,6 +33,7 @@ class ServedApi:
 
     def __init__(self, bridge: Bridge, server: ApiServer, audit: Audit) -> None:
         self.bridge, self._server, self._audit = bridge, server, audit
+        self._service: MissionService | None = None
         self._counted_ns = 0
 
     def open(self, service: MissionService, alarm: Callable[[], object]) -> None:
@@ -42,7 +43,7 @@ class ServedApi:
             service: Of them.
             alarm: Sends an emergency stop past the service; called from any thread.
         """
-        self.bridge.alarm = alarm
+        self.bridge.alarm, self._service = alarm, service
         self.bridge.open(service)
 
     def counted(self) -> list[Counted]:
@@ -56,6 +57,8 @@ class ServedApi:
             return []
         self._counted_ns = now_ns
         counts = {**self._server.counts, "audit_dropped": self._audit.dropped}
+        if self._service is not None:
+            counts["events_dropped"] = self._service.book.dropped
         return [Counted(now_ns, "teleop", f"api_{name}", n) for name, n in sorted(counts.items())]
 
     def stop(self) -> None:

@@ -104,6 +104,8 @@ def run_end(
     feed, thread = Feed.on_stdout(watched=watched), RecordingThread(recorder)
     watch = _Watch(end, link, check, keys, slip_ns)
     taps = _Taps(end, recorder, feed, exporter, choose, watch)
+    if exporter is not None:
+        exporter.recording(thread.sync_age)
     thread.start()
     feed.ready()
     try:

@@ -46,8 +46,8 @@ class Recorder(Protocol):
     def flush(self, *, sync: bool = ...) -> None:
         """Hand what was written to the operating system."""
 
-    def sync(self) -> None:
-        """Have what was flushed survive the machine; may take seconds."""
+    def sync(self) -> bool:
+        """Have what was flushed survive the machine; may take seconds. Say whether it does."""
 
     def close(self) -> None:
         """Write out the rest and end the file."""
@@ -81,6 +81,22 @@ class FlightsOnly:
         return [record for record in records if not isinstance(record, PERIODIC)]
 
 
+class SyncAge:
+    """What a power cut would take of a recording: all since the newest sync that is done began."""
+
+    def __init__(self) -> None:
+        """Begin with nothing that would be left."""
+        self._safe: float | None = None
+
+    def done(self, began: float) -> None:
+        """Note that a sync which `began` then [s] is done."""
+        self._safe = began
+
+    def read(self, now: float) -> float | None:
+        """Say how much is at risk `now` [s]; None if nothing is safe yet."""
+        return None if self._safe is None else now - self._safe
+
+
 class RecordingThread:
     """Runs a recorder in the background from `start` to `stop`."""
 
@@ -95,12 +111,17 @@ class RecordingThread:
         # A daemon, so that a disk that hangs cannot keep the process from ending.
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._flushed, self._over = threading.Event(), False
+        self._age = SyncAge()
         self._syncing = threading.Thread(target=self._sync, name="recording-sync", daemon=True)
 
     def start(self) -> None:
         """Begin to write."""
         self._thread.start()
         self._syncing.start()
+
+    def sync_age(self) -> float | None:
+        """Say for how long what is recorded is not safe yet [s]; None if nothing is."""
+        return self._age.read(time.monotonic())
 
     def stop(self, timeout: float = 1.5) -> bool:
         """Write out the rest, end the file and wait for that.
@@ -135,4 +156,6 @@ class RecordingThread:
             self._flushed.clear()
             if self._over:
                 return
-            self._recorder.sync()
+            began = time.monotonic()
+            if self._recorder.sync():
+                self._age.done(began)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cloudrc.exposition.labels import API_REFUSALS
+from cloudrc.exposition.labels import API_REFUSALS, ORDER_REFUSALS
 from cloudrc.exposition.part import Handlers, Readings, by, chosen, plain
 from cloudrc.records import Counted
 
@@ -27,6 +27,10 @@ class Api:
         return {
             "cloudrc_api_requests_total": plain(of_api.get("served", 0)),
             "cloudrc_api_rejected_total": by(chosen(API_REFUSALS, of_api)),
+            "cloudrc_missions_refused_total": by(
+                {reason: of_api.get(f"order_{reason}", 0) for reason in ORDER_REFUSALS}
+            ),
+            "cloudrc_stream_dropped_events_total": plain(of_api.get("events_dropped", 0)),
             "cloudrc_audit_dropped_total": plain(of_api.get("audit_dropped", 0)),
             "cloudrc_journal_repaired_total": plain(of_api.get("journal_repaired", 0)),
         }

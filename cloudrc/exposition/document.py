@@ -18,7 +18,8 @@ Every process serves `/metrics` for Prometheus, `/healthz` (200 while its own lo
 `/readyz` (200 once it hears its peer) where `--metrics HOST:PORT` says; in the cluster that is
 port 9100 of `world` and `cloud`, 9101 of `teleop` and 9102 of `link`. All values are in base
 units, all labels have closed sets of values, and a value that cannot be known is absent, never
-zero. Beside these there are the usual `process_*` metrics: CPU, memory, file descriptors.
+zero [P-METRIC-1]. Beside these there are the usual `process_*` metrics: CPU, memory, file
+descriptors.
 """
 
 QUERIES = {

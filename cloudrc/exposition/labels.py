@@ -53,6 +53,8 @@ MISSION_OUTCOMES = (
 API_REFUSALS = ("token", "role", "busy", "slow")
 """Why the API does not serve: no valid token, a reader's token, too many requests or connections,
 a client that dawdles."""
+ORDER_REFUSALS = ("invalid", "conflict")
+"""Why an order is not flown: a value that cannot be used, a mission in the way."""
 BODIES = ("pipe", "board", "floor", "other")
 """Kinds of bodies: `pipe_2` is a "pipe", and what else a scene may have is "other"."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")

@@ -8,7 +8,7 @@ from typing import Any
 from cloudrc.exposition.api import Api
 from cloudrc.exposition.cloud import CloudEnd
 from cloudrc.exposition.end import End
-from cloudrc.exposition.labels import CLOUD, LINK, TELEOP, WORLD
+from cloudrc.exposition.labels import CLOUD, LINK, MISSION, TELEOP, WORLD
 from cloudrc.exposition.link import Link
 from cloudrc.exposition.mission import Mission
 from cloudrc.exposition.part import Part, Readings
@@ -24,15 +24,16 @@ class Live:
         link: The emulated link; None in a process that is none.
     """
 
-    def __init__(self, role: str) -> None:
+    def __init__(self, role: str, *, missions: bool = True) -> None:
         """Begin with nothing seen.
 
         Args:
             role: "world", "cloud", "teleop" or "link".
+            missions: Whether they are told here; False in a cloud whose teleop tells them.
         """
         self.end: End | None = {WORLD: WorldEnd, CLOUD: CloudEnd}.get(role, lambda: None)()
         self.link = Link() if role == LINK else None
-        mission = Mission(always=role == TELEOP) if role in (CLOUD, TELEOP) else None
+        mission = Mission(always=role == TELEOP) if missions and role in MISSION else None
         api = Api() if role == TELEOP else None
         parts: tuple[Part | None, ...] = (self.end, self.link, mission, api)
         self._parts = [part for part in parts if part is not None]

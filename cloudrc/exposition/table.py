@@ -18,21 +18,16 @@ from cloudrc.exposition.labels import (
     GUARD_STATES,
     LATENESS_BUCKETS,
     LIMITS,
-    LINK,
-    LINK_MODES,
-    LINK_OUTCOMES,
     OUTCOMES,
     PERIOD_BUCKETS,
     PLUGINS,
-    RELEASE_PERCENTILES,
     ROLES,
-    SHAPERS,
-    STEP_PERCENTILES,
     TERMS,
     WORLD,
 )
 from cloudrc.exposition.metric import Kind, Metric, counter, delay, gauge, numbered
 from cloudrc.exposition.table_check import CHECK
+from cloudrc.exposition.table_link import LINKS
 from cloudrc.exposition.table_mission import MISSIONS
 
 _ENTRIES = (
@@ -61,6 +56,11 @@ _ENTRIES = (
     # Both ends: session and link.
     gauge("cloudrc_session_epoch", "Number of the session under way.", ENDS),
     counter("cloudrc_sessions_opened_total", "Sessions opened since this process began.", ENDS),
+    counter(
+        "cloudrc_clouds_admitted_total",
+        "Clouds that were given a session: the first one, a restarted one, another one.",
+        (WORLD,),
+    ),
     counter(
         "cloudrc_sessions_refused_total",
         "Requests for a session that were refused because another cloud has authority.",
@@ -245,44 +245,20 @@ _ENTRIES = (
         "Records that did not reach the recording.",
         ENDS,
     ),
+    gauge(
+        "cloudrc_recorder_sync_age_seconds",
+        "What a power cut would take of the recording: the time since the newest sync that is done"
+        " began; absent without a recording.",
+        ENDS,
+    ),
+    counter(
+        "cloudrc_clock_steps_total",
+        "Times that the wall clock was found to have been set since the scrape before; nothing that"
+        " flies looks at it.",
+        ENDS,
+    ),
     *MISSIONS,
-    # Link.
-    Metric(
-        "cloudrc_link_info",
-        Kind.GAUGE,
-        "1; its labels say who shapes a direction of the link, and which mode was asked for.",
-        (LINK,),
-        {"shaper": SHAPERS, "direction": DIRECTIONS, "mode": LINK_MODES},
-    ),
-    gauge(
-        "cloudrc_link_delay_seconds",
-        "Mean one-way delay that the profile in force asks for.",
-        (LINK,),
-        direction=DIRECTIONS,
-    ),
-    gauge(
-        "cloudrc_link_step_lateness_seconds",
-        "How late netem's qdisc took the last 10,000 steps of its time line; absent without steps.",
-        (LINK,),
-        percentile=tuple(STEP_PERCENTILES),
-    ),
-    counter(
-        "cloudrc_link_datagrams_total",
-        "Datagrams at the shaper by what became of them.",
-        (LINK,),
-        outcome=LINK_OUTCOMES,
-    ),
-    counter(
-        "cloudrc_link_restored_total",
-        "How often another hand had removed or changed netem's qdisc, and it was put back.",
-        (LINK,),
-    ),
-    gauge(
-        "cloudrc_link_release_error_seconds",
-        "How late datagrams left the relay in the last 10 s; absent with netem.",
-        (LINK,),
-        percentile=tuple(RELEASE_PERCENTILES),
-    ),
+    *LINKS,
 )
 
 METRICS: Mapping[str, Metric] = MappingProxyType({metric.name: metric for metric in _ENTRIES})

@@ -7,6 +7,7 @@ from cloudrc.exposition.labels import (
     MISSION,
     MISSION_OUTCOMES,
     MISSION_STATES,
+    ORDER_REFUSALS,
     TELEOP,
 )
 from cloudrc.exposition.metric import counter, gauge, numbered
@@ -24,6 +25,17 @@ MISSIONS = (
         "Requests refused and connections cut off by the API.",
         (TELEOP,),
         reason=API_REFUSALS,
+    ),
+    counter(
+        "cloudrc_missions_refused_total",
+        "Orders that the API refused: of what cannot be flown, or while a mission is in the way.",
+        (TELEOP,),
+        reason=ORDER_REFUSALS,
+    ),
+    counter(
+        "cloudrc_stream_dropped_events_total",
+        "Events that were forgotten before a reader of the stream, who was too slow, had them.",
+        (TELEOP,),
     ),
     counter(
         "cloudrc_audit_dropped_total",

@@ -8,11 +8,20 @@ from cloudrc.exposition.end import End
 from cloudrc.exposition.labels import BODIES, DIRECTIONS, GUARD_STATES, LIMITS
 from cloudrc.exposition.part import Handlers, Readings, by, per_axis, plain
 from cloudrc.messages import NEVER_NS, GuardState
-from cloudrc.records import Contact, GroundTruth, GuardChange, Lateness, TelemetrySent
+from cloudrc.records import (
+    Contact,
+    GroundTruth,
+    GuardChange,
+    Lateness,
+    SessionOpened,
+    TelemetrySent,
+)
 
 STEP_NS = 1_000_000_000
 STEPS = 10
 """The real-time factor is that of the last 10 s, or of what there is."""
+ADMITTED = "cloud said hello"
+"""Why a session is opened for a cloud that had none; see `cloudrc.records.SessionOpened`."""
 
 
 class WorldEnd(End):
@@ -26,7 +35,7 @@ class WorldEnd(End):
         self._guard = GuardState.GROUND
         self._changes = dict.fromkeys(GUARD_STATES, 0)
         self._contacts = dict.fromkeys(BODIES, 0)
-        self._slip_ns = 0
+        self._slip_ns = self._admitted = 0
         # Instants of world's clock and of the machine's [ns].
         self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
         self._instant_ns = NEVER_NS
@@ -45,6 +54,10 @@ class WorldEnd(End):
     def has_peer(self) -> bool:
         """As of any end; a cloud that has nothing to command yet is heard once, at its hello."""
         return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
+
+    def _see_session(self, record: SessionOpened) -> None:
+        super()._see_session(record)
+        self._admitted += record.cause == ADMITTED
 
     def _see_truth(self, record: GroundTruth) -> None:
         self._truth = record
@@ -73,6 +86,7 @@ class WorldEnd(End):
         """See `Part`."""
         readings = super().read()
         readings |= {
+            "cloudrc_clouds_admitted_total": plain(self._admitted),
             "cloudrc_sessions_refused_total": plain(self._counts.get("busy", 0)),
             "cloudrc_guard_state": plain(self._guard),
             "cloudrc_guard_transitions_total": by(self._changes),

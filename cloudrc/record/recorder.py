@@ -133,16 +133,22 @@ class Recorder:
             except OSError as error:
                 self._stop(error)
 
-    def sync(self) -> None:
-        """Have what was flushed survive the machine, however long that takes; never raises."""
+    def sync(self) -> bool:
+        """Have what was flushed survive the machine, however long that takes; never raises.
+
+        Returns:
+            Whether it does: False if that failed, or if nothing is recorded into a file.
+        """
         sink = self._sink
         if sink is not None and not self._ended:
             try:
                 sink.sync()
+                return self._path.is_file()
             except OSError as error:  # whoever drains gives the file up, at the next flush
                 self._refused = error
             except ValueError:  # it was closed meanwhile
                 pass
+        return False
 
     def close(self) -> None:
         """Write out the rest and end the file; never raises."""

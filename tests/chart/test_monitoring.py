@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 import yaml
-from rendering import CHART, Object, containers, of_kind, pod_specs, render
+from rendering import CHART, ROOT, Object, containers, of_kind, pod_specs, render
 
+from cloudrc.exposition.metric import Kind
 from cloudrc.exposition.table import METRICS
 
 OPERATOR = "monitoring.coreos.com/v1"
@@ -69,6 +71,9 @@ def rules() -> list[Object]:
 
 def test_the_rules_ask_for_metrics_that_exist() -> None:
     known = set(METRICS) | {rule["record"] for rule in rules() if "record" in rule}
+    for name, metric in METRICS.items():
+        if metric.kind is Kind.HISTOGRAM:
+            known |= {f"{name}_{part}" for part in ("bucket", "sum", "count")}
     for rule in rules():
         asked = re.findall(r"(?:\w+:)?cloudrc_\w+(?::\w+)?", rule["expr"])
         assert asked
@@ -86,7 +91,19 @@ def test_alerts_say_how_bad_what_and_what_to_do() -> None:
         assert f"### {rule['annotations']['runbook'].partition('#')[2]}\n" in readme
 
 
-def test_promtool_accepts_the_rules() -> None:
+def promtool(*words: object) -> str:
     if shutil.which("promtool") is None:
         pytest.skip("no promtool here (Debian package prometheus)")
-    subprocess.run(["promtool", "check", "rules", RULES], check=True, capture_output=True)
+    done = subprocess.run(["promtool", *map(str, words)], capture_output=True, text=True)
+    return done.stdout + done.stderr
+
+
+def test_promtool_accepts_the_rules() -> None:
+    assert "SUCCESS" in promtool("check", "rules", RULES)
+
+
+def test_the_alerts_fire_when_they_should_and_only_then(tmp_path: Path) -> None:
+    shutil.copy(RULES, tmp_path)
+    shutil.copy(ROOT / "tests" / "e2e" / "alerts.yaml", tmp_path)
+    said = promtool("test", "rules", tmp_path / "alerts.yaml")
+    assert "SUCCESS" in said, said

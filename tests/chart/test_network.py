@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from rendering import Object, containers, of_kind, pod_specs, render
 
 TUNNEL, DNS, API = {("UDP", 7400)}, {("UDP", 53), ("TCP", 53)}, {("TCP", 8080)}
@@ -47,6 +48,7 @@ def test_every_pod_is_selected_both_ways() -> None:
         assert labels["app.kubernetes.io/instance"] == "demo"
 
 
+@pytest.mark.promise("P-CHART-2")
 def test_only_the_tunnel_and_the_api_come_in() -> None:
     found = policies()
     test = (["test"], LINK_TEST)
@@ -75,6 +77,7 @@ def test_only_the_tunnel_names_and_the_api_go_out() -> None:
     ]
 
 
+@pytest.mark.promise("P-CHART-2")
 def test_scraping_is_admitted_by_name_and_to_all_metrics_ports() -> None:
     found = policies({"metrics": {"allowFrom": [PROMETHEUS]}})
     for end in ("world", "cloud"):

@@ -14,9 +14,10 @@ from typing import Any
 import pytest
 
 from cloudrc import assembly
-from cloudrc.cli.ends import size
+from cloudrc.cli.ends import open_exporter, size
 from cloudrc.cli.main import main
 from cloudrc.config.shipped import FOLDERS
+from cloudrc.records import MissionEvent
 
 CONFIG = ["--config", str(FOLDERS["experiment"] / "hover.yaml")]
 FREE = "127.0.0.1:9"
@@ -34,6 +35,18 @@ def taken() -> Iterator[str]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
         holder.bind(("127.0.0.1", 0))
         yield f"127.0.0.1:{holder.getsockname()[1]}"
+
+
+@pytest.mark.parametrize("elsewhere", [None, Path("sockets")])
+def test_a_cloud_whose_teleop_is_elsewhere_has_no_metrics_of_missions(
+    elsewhere: Path | None,
+) -> None:
+    options = argparse.Namespace(metrics=("127.0.0.1", 0), teleop=elsewhere)
+    exporter = open_exporter(options, "cloud")
+    assert exporter is not None
+    exporter.see([MissionEvent(0, "started", 0, "")])
+    assert ("cloudrc_mission_state" in exporter.text()) is (elsewhere is None)
+    exporter.close()
 
 
 # The socket that could not be bound is closed by the end of the process, which here goes on.

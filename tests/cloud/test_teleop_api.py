@@ -5,14 +5,17 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections import deque
 
 import pytest
 from api_harness import running
 from service_harness import A, B, C
 
+from cloudrc.cli.teleop_api import ServedApi
 from cloudrc.cloud.teleop import api_models as models
 from cloudrc.cloud.teleop.api_server import ApiServer
 from cloudrc.errors import BadInputError
+from cloudrc.exposition.live import Live
 
 LEG = {"dwell_s": 0.0, "tolerance_m": 0.3}
 MISSION = {"name": "round", "waypoints": [{"position_m": p, **LEG} for p in (A, B, C)]}
@@ -72,6 +75,29 @@ def test_a_second_one_is_refused_with_the_id_of_the_first(api):
     assert (status, queued["state"]) == (201, "queued")
     status, ended = api.post(f"/v1/missions/{queued['id']}/cancel")
     assert (status, ended["verdict"]["exit_code"]) == (200, 130)
+
+
+def test_what_is_refused_and_what_a_slow_reader_misses_become_metrics(api, monkeypatch):
+    served, live = ServedApi(api.bridge, api.server, api.audit), Live("teleop")
+    served.open(api.flight.teleop, lambda: None)
+    fly(api)
+    far = {"position_m": [100.0, 0.0, 1.0]}
+    refused = [("/v1/missions", {"waypoints": [far]}), ("/v1/goto", far), ("/v1/missions", b"{")]
+    assert [api.post(*order)[0] for order in refused] == [422, 422, 422]
+    assert api.post("/v1/missions", MISSION)[0] == 409
+    assert api.post("/v1/acknowledge")[0] == 409, "a state that does not allow it is no order"
+    book = api.flight.teleop.book
+    log = deque(book.events_after(0), maxlen=2)
+    log.extend({"id": number} for number in range(10, 14))
+    monkeypatch.setattr(book, "_log", log)
+    book.events_after(0)  # whoever is new has missed nothing
+    monkeypatch.setattr(book, "_events", 13)
+    assert [event["id"] for event in book.events_after(8)] == [12, 13]
+    live.see(served.counted())
+    readings = live.read()
+    counts = {("invalid",): 3, ("conflict",): 1}
+    assert readings["cloudrc_missions_refused_total"] == counts
+    assert readings["cloudrc_stream_dropped_events_total"] == {(): 3}
 
 
 def test_the_operators_hand(api):

@@ -1,8 +1,10 @@
 """Who may do what over the API: everybody else may do nothing, and nothing gives a token away."""
 
+import argparse
 import concurrent.futures
 import json
 import os
+import socket
 import stat
 import urllib.request
 
@@ -11,9 +13,11 @@ from api_harness import OPERATOR, READER, connect, running
 from service_harness import PLAN
 
 from cloudrc.cli.mission_http import Api, UnreachableError
+from cloudrc.cli.teleop_api import api_address, serve_api
 from cloudrc.cloud.teleop.api_server import ApiServer
 from cloudrc.cloud.teleop.api_tokens import LOCAL
 from cloudrc.cloud.teleop.service_mission import Order
+from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
@@ -114,9 +118,40 @@ def test_the_description_names_the_scheme_at_every_route(idle):
             assert {"401", "403", "429"} <= set(operation["responses"])
 
 
+@pytest.mark.promise("P-API-13")
 def test_a_network_address_is_not_served_without_tokens():
     with running(unix=True) as api, pytest.raises(BadInputError, match="needs --tokens DIR"):
         ApiServer(api.gate, api.bridge, ("127.0.0.1", 0))
+
+
+@pytest.mark.promise("P-API-13")
+@pytest.mark.parametrize("port", ["0", "18080"])
+def test_a_port_without_a_host_is_served_on_this_machine_alone(port):
+    host, number = api_address(port)
+    assert number == int(port)
+    with running() as api:
+        server = ApiServer(api.gate, api.bridge, (host, 0))
+        server.start()
+        url, port = server.url.rpartition(":")[::2]
+        assert url == "http://127.0.0.1"
+        socket.create_connection(("127.0.0.1", int(port)), timeout=5.0).close()
+        with pytest.raises(ConnectionRefusedError):  # all of Linux' 127/8 is this machine
+            socket.create_connection(("127.0.0.2", int(port)), timeout=5.0)
+        server.stop()
+
+
+@pytest.mark.promise("P-API-13")
+@pytest.mark.parametrize(
+    ("where", "told"),
+    [("0", False), ("127.0.0.1:0", False), ("localhost:0", False), ("0.0.0.0:0", True)],
+)
+def test_an_address_that_others_reach_is_warned_of_and_asks_for_tokens(
+    where, told, tmp_path, capsys
+):
+    options = argparse.Namespace(api=api_address(where), tokens=None, audit=None, api_file=None)
+    with pytest.raises(BadInputError, match="needs --tokens DIR"):
+        serve_api(options, load_experiment("hover"))
+    assert ("can be reached from outside" in capsys.readouterr().err) is told
 
 
 @pytest.mark.promise("P-API-5")

@@ -70,9 +70,11 @@ def flight() -> Flight:
     return seen
 
 
-def exporter(role: str, flight: Flight) -> Exporter:
-    made = Exporter(role)
+def exporter(role: str, flight: Flight, *, missions: bool = True) -> Exporter:
+    made = Exporter(role, missions=missions)
     made.see(flight[role])
+    if role in ENDS:
+        made.recording(lambda: 0.3)
     if role == "link":
         made.shaped("relay", "uplink", "auto")
         made.shaped("relay", "downlink", "auto")
@@ -117,10 +119,36 @@ def test_labels_keep_to_their_sets(role: str, flight: Flight) -> None:
                     assert value in (metric.labels[name] or (__version__,))
 
 
+@pytest.mark.promise("P-METRIC-1")
 @pytest.mark.parametrize("pod", [("world", "link"), ("cloud", "teleop", "link")])
 def test_a_pod_has_less_than_200_series(pod: tuple[str, ...], flight: Flight) -> None:
-    count = sum(len(series(exporter(role, flight).text())) for role in pod)
-    assert count < 200
+    """Of its metrics of missions there are one set: teleop's."""
+    made = [exporter(role, flight, missions=role != "cloud") for role in pod]
+    assert sum(len(series(one.text())) for one in made) < 200
+
+
+def test_a_cloud_whose_missions_are_teleops_tells_of_none(flight: Flight) -> None:
+    shown = {alone: exporter("cloud", flight, missions=alone).text() for alone in (True, False)}
+    assert ["cloudrc_mission_state" in text for text in shown.values()] == [True, False]
+    assert "cloudrc_rtt_seconds_count" in shown[False]
+
+
+@pytest.mark.promise("P-METRIC-1")
+def test_how_old_the_recording_on_the_disk_is_is_absent_until_it_is_known() -> None:
+    ages: list[float | None] = [None, 0.25]
+    world = Exporter("world")
+    assert "sync_age" not in world.text()
+    world.recording(lambda: ages.pop(0))
+    assert "sync_age" not in world.text()
+    assert "cloudrc_recorder_sync_age_seconds 0.25" in world.text()
+
+
+def test_names_that_are_not_resolved_are_counted_and_are_no_sign_of_life() -> None:
+    link = Exporter("link")
+    assert "cloudrc_dns_errors_total 0.0" in link.text()
+    link.unresolved(7)
+    assert "cloudrc_dns_errors_total 7.0" in link.text()
+    assert link._seen_at is None
 
 
 @pytest.mark.parametrize("role", ROLES)

@@ -78,6 +78,8 @@ class Pods:
         command += ["--listen", f"127.0.0.1:{self.tunnel[end]}"]
         command += ["--route", str(self.folder / f"{end}.route")]
         command += ["--metrics", f"127.0.0.1:{self.metrics[end]}"]
+        if end == "world":
+            command += ["--record", str(self.folder / "world.mcap")]
         with (self.folder / f"{end}.log").open("wb") as log:
             return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
 
@@ -130,12 +132,36 @@ def test_ends_wait_for_their_route_follow_it_and_lose_readiness_without_a_peer(p
     for end in pods.processes:
         pods.wait(end, "/readyz")
     pods.wait("world", "/metrics", "cloudrc_guard_state 1.0", "cloudrc_real_time_factor ")
+    pods.wait("world", "/metrics", "cloudrc_recorder_sync_age_seconds ")
+    assert "sync_age" not in pods.get("cloud", "/metrics")[1], "it records nothing"
     pods.wait("cloud", "/metrics", "cloudrc_mission_state 2.0", 'cloudrc_pid_output{axis="x"')
     pods.route("world", 9)  # discard: cloud hears nothing any more, world still does
     pods.wait("cloud", "/readyz", status=503)
     assert pods.get("cloud", "/healthz")[0] == 200
     pods.route("world", pods.tunnel["cloud"])
     pods.wait("cloud", "/readyz")
+
+
+@pytest.mark.process
+def test_a_link_counts_that_it_cannot_resolve_its_peer_before_it_shapes(tmp_path: Path) -> None:
+    (tmp_path / "profile.yaml").write_text("uplink: {delay_ms: 1}\n")
+    listen, metrics = free_ports(2)
+    command = [sys.executable, "-m", "cloudrc", "link", "run", "--config", "hover"]
+    command += ["--profile", str(tmp_path / "profile.yaml"), "--direction", "uplink"]
+    command += ["--mode", "relay", "--peer", "no..name:7400", "--route", str(tmp_path / "route")]
+    command += ["--listen", f"127.0.0.1:{listen}", "--metrics", f"127.0.0.1:{metrics}"]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as link:
+        try:
+            until, errors = time.monotonic() + 15, 0.0
+            while errors < 1:
+                assert time.monotonic() < until
+                time.sleep(0.05)
+                with suppress(OSError):
+                    url = f"http://127.0.0.1:{metrics}/metrics"
+                    page = urllib.request.urlopen(url, timeout=5).read().decode()
+                    errors = float(page.partition("\ncloudrc_dns_errors_total ")[2].split()[0])
+        finally:
+            link.terminate()
 
 
 @pytest.mark.process

@@ -68,6 +68,7 @@ def test_one_way_delays_are_those_that_arrived(flight: Flight, role: str, index:
     assert min(delays) < age.total / age.cumulative()[-1] < 2 * max(delays)
 
 
+@pytest.mark.promise("P-METRIC-1")
 def test_without_a_shared_clock_one_way_delays_are_absent() -> None:
     experiment = load_experiment("hover", ["link.profile=paper-p1"])
     both = records(experiment, offset_ns=7_000_000_000)
@@ -181,6 +182,13 @@ def test_an_end_has_a_peer_while_it_hears_it(role: str) -> None:
 def test_world_waits_for_the_first_command_of_a_cloud_that_has_none_yet() -> None:
     assert heard("world", SessionOpened(0, "world", 1, ""), wake(60_000))
     assert not heard("cloud", SessionOpened(0, "cloud", 1, ""), wake(60_000))
+
+
+def test_a_mission_that_starts_from_spawn_opens_a_session_and_admits_nobody(flight: Flight) -> None:
+    live = Live("world")
+    live.see(flight[0])
+    assert value(live, "cloudrc_sessions_opened_total") == 2
+    assert value(live, "cloudrc_clouds_admitted_total") == 1
 
 
 def test_the_mission_is_told_by_its_events() -> None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import errno
 import threading
+import time
 from collections.abc import Iterable
 from pathlib import Path
+
+import pytest
 
 from cloudrc.drivers.recording import RecordingThread
 from cloudrc.record.columns import Recording
@@ -71,6 +74,47 @@ def test_a_disk_that_hangs_in_a_sync_keeps_nothing_from_the_operating_system() -
     assert len(shelf.records) == 3
     assert thread.stop(timeout=5.0)
     release.set()
+
+
+def test_what_a_power_cut_would_take_is_told(tmp_path: Path) -> None:
+    """By a thread whose disk takes two syncs and hangs in the third."""
+    begun, release, began = threading.Semaphore(0), threading.Event(), list[float]()
+
+    class Hanging(Shelf):
+        def sync(self) -> None:
+            began.append(time.monotonic())
+            begun.release()
+            if len(began) == 3:
+                release.wait(10.0)
+
+    path = tmp_path / "w.mcap"
+    path.touch()
+    thread = RecordingThread(Recorder(path, lambda path: Hanging()))
+    assert thread.sync_age() is None
+    thread.start()
+    for _ in range(3):
+        assert begun.acquire(timeout=5.0)
+    ages = [thread.sync_age(), thread.sync_age()]
+    assert all(age is not None and age >= began[2] - began[1] for age in ages)
+    assert ages[0] < ages[1], "it rises while the disk hangs"
+    release.set()
+    assert thread.stop(timeout=5.0)
+
+
+@pytest.mark.parametrize("name", ["gone.mcap", "refused.mcap"])
+def test_what_is_in_no_file_is_never_safe(tmp_path: Path, name: str) -> None:
+    class Refusing(Shelf):
+        def sync(self) -> None:
+            raise OSError(errno.EIO, "Input/output error")
+
+    (tmp_path / "refused.mcap").touch()
+    sink = Refusing() if name == "refused.mcap" else Shelf()
+    recorder = Recorder(tmp_path / name, lambda path: sink)
+    recorder.put(counted(1))
+    recorder.drain()
+    assert not recorder.sync()
+    (tmp_path / name).touch()
+    assert recorder.sync() is (name == "gone.mcap")
 
 
 def test_what_a_sync_in_the_background_refuses_stops_the_recording() -> None:

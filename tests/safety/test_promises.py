@@ -62,6 +62,57 @@ def test_every_mention_has_a_promise_and_no_promise_is_given_twice() -> None:
     assert len(set(promised())) == len(promised()) > 10
 
 
+PROMISING = re.compile(
+    r"\b(never|always|whatever|guarantees?|nobody may|nothing (?:can|that|under way)"
+    r"|no (?:command|datagram|waypoint|key|token|port) is)\b",
+    re.IGNORECASE,
+)
+"""Words that promise."""
+NOT_OURS = (
+    "whatever the network does",  # of the published controller
+    "exact whatever the correlation",  # of a formula
+    "what was sent and never arrived",
+    "meets some rows twice or never",
+    "nothing that flies looks at it",  # P-LINK-7, in the table of metrics
+    "Packets never overtake each other",  # what a key asks for
+)
+"""Where such words promise nothing, or nothing of their own."""
+ABOUT_TESTS = re.compile(r"faults|search|adversary|mutants|promises")
+"""Pages of results, and the promises themselves."""
+
+
+def unheld(text: str) -> list[str]:
+    """Paragraphs, items and rows of a page that promise something and name no promise."""
+    for phrase in NOT_OURS:
+        text = re.sub(r"\s+".join(map(re.escape, phrase.split())), "", text)
+    text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    blocks = re.split(r"\n\s*\n|\n(?=[-*|] )", text)
+    return [each for each in blocks if PROMISING.search(each) and not PROMISE.search(each)]
+
+
+def test_whatever_the_docs_promise_has_an_id() -> None:
+    pages = [path for path in DOCUMENTS if not ABOUT_TESTS.search(path.name)]
+    assert len(pages) >= 8
+    assert {path.name: found for path in pages if (found := unheld(path.read_text("utf-8")))} == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("No command is lost.", 1),
+        ("It never stops [P-A-1].", 0),
+        ("It never stops [P-A-1].\n\nIt always flies.", 1),
+        ("- it never stops [P-A-1]\n- whatever happens, it flies", 1),
+        ("| a | never |\n| b | always [P-A-1] |", 1),
+        ("```\nnever\n```", 0),
+        ("It flies.", 0),
+        ("what was sent and\nnever arrived", 0),
+    ],
+)
+def test_a_promise_without_an_id_is_found(text: str, count: int) -> None:
+    assert len(unheld(text)) == count
+
+
 SKIPS = re.compile(r"\b(pytest\.)?(mark\.)?(skip|skipif|xfail|importorskip|exit)\b")
 
 

@@ -26,6 +26,10 @@ App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
 ESTOP = "/v1/estop"
 EVENTS = "/v1/events"
 LOOKING = ("GET", "HEAD")
+ORDERS = ("/v1/missions", "/v1/goto")
+"""Where missions are ordered, and points to fly to."""
+REFUSED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
+"""What the application refuses of them, by status."""
 ANSWER_MAX = 4_096
 """How much of a streamed answer is kept for the audit log [bytes]."""
 
@@ -146,6 +150,8 @@ class Gate:
         try:
             await self._app(scope, receive, answer.send)
             self._count("served")
+            if scope["path"] in ORDERS and answer.status in REFUSED:
+                self._count(REFUSED[answer.status])
         except Exception as error:  # a client must not be able to fill a log with tracebacks
             if not self._count("failed"):
                 self._complain(f"the API failed at {scope['path']}: {error!r}")

@@ -56,6 +56,7 @@ class MissionBook:
     Attributes:
         missions: By id.
         trouble: Why the disk has refused the last entry; "" if it has not.
+        dropped: Events that were asked for by somebody who had some, and are forgotten.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class MissionBook:
         self._numbered = self._events = 0
         self.missions: dict[str, Mission] = {}
         self.trouble, self._told, self._keep_ns = "", "", 0
+        self.dropped = 0
         self._log: deque[dict[str, Any]] = deque(maxlen=LOGGED)
         for entry in entries:
             self._apply(entry)
@@ -147,6 +149,8 @@ class MissionBook:
         """Give the events of all missions that came after the one of this number."""
         if number > self._events:  # of a journal that is gone
             number = 0
+        if number and self._log:  # without a number nobody has missed anything
+            self.dropped += max(0, self._log[0]["id"] - number - 1)
         return list(takewhile(lambda event: event["id"] > number, reversed(self._log)))[::-1]
 
     def _try(self, write: Callable[[], None]) -> None:
