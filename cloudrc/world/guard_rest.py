@@ -130,7 +130,7 @@ class TakeOff:
 
         Args:
             low: Corner of the fence [m], shape (3,).
-            high: The opposite one.
+            high: The opposite one [m], shape (3,).
         """
         self._low, self._high = low, high
         self.allowed = True
