@@ -79,7 +79,8 @@ class Netem:
 
     def _follow(self, profile: DirectionProfile, origin_ns: int) -> None:
         self._profile, self._timeline = profile, Timeline(profile)
-        self._origin_ns, self._room, self._piece = origin_ns, limit(profile), -1
+        self._origin_ns, self._piece = origin_ns, -1
+        self._room = self._least_room = limit(profile)
         if self._tables is not None:
             write_measured(self._tables, profile)
 
@@ -109,10 +110,12 @@ class Netem:
             restart: Whether their time line counts from now; else from when the old one did.
         """
         check(profile)
-        if self._applied:  # what another hand has done is no reason to refuse
-            self._look(self._qdiscs())
-        before = self._profile, self._origin_ns
+        qdiscs = self._qdiscs() if self._applied else []
+        self._look(qdiscs)  # what another hand has done is no reason to refuse
+        before, room = (self._profile, self._origin_ns), self._room
         self._follow(profile, self._clock() if restart else self._origin_ns)
+        if self._room < room:  # netem takes nothing in while it holds more than its limit
+            self._room += counters(qdiscs).get("held", 0)
         try:
             self._apply("change")
             self._confirm()
@@ -125,7 +128,8 @@ class Netem:
         """Put into force what the time line says, as it says it, for `timeout` [s]."""
         until_ns = self._clock() + round(timeout * 1e9)
         if self._kept.due(self._clock()):
-            self._look(self._qdiscs())
+            self._look(qdiscs := self._qdiscs())
+            self._take_back_room(qdiscs)
         while True:
             self._follow_time_line()
             due_ns = self._next_ns()
@@ -210,6 +214,11 @@ class Netem:
             self._look(self._qdiscs())
             if self._kept.restored == before:
                 raise
+
+    def _take_back_room(self, qdiscs: list[dict[str, Any]]) -> None:
+        """Let the limit be as asked, once what was under way at a change in flight has left."""
+        if self._least_room < self._room and counters(qdiscs).get("held", 0) < self._least_room:
+            self._room, self._piece = self._least_room, -1  # the next step puts it in force
 
     def _apply(self, verb: str) -> None:
         """Let what holds now be in force, unless it is."""

@@ -28,8 +28,12 @@ _IN_ORDER = "100gbit"
 """netem lets no packet leave before the one before it as soon as it has a rate, whichever."""
 _ETHERNET_BYTES = 14
 """netem counts the Ethernet header, the model does not."""
-_PACKET_BITS = 8 * 200
-"""The smaller of our datagrams with its headers, roughly: more of them fit into a delay."""
+_PACKET_BITS = 8 * 116
+"""A command, the smaller of our datagrams, with its headers: more of them fit into a delay."""
+_PACKETS = 1_000
+"""More than a tunnel sends in a second, or a probe, where no rate says how many pass [1/s]."""
+_TABLE_END = 4.0
+"""Longest draw of a table, in units of the jitter that tc is given."""
 
 
 def check(profile: DirectionProfile) -> None:
@@ -102,10 +106,15 @@ def limit(profile: DirectionProfile) -> int:
     because those of the longer one are still under way.
     """
     pieces = list(_pieces(profile))
-    if any(piece.rate is None for piece in pieces):
+    if all(piece.rate is None for piece in pieces):
         return LIMIT
-    under_way = max(p.delay_ns * (p.rate or 0.0) for p in pieces) / (1e9 * _PACKET_BITS)
-    return ceil(profile.queue_packets + under_way)
+    return ceil(profile.queue_packets + max(_under_way(profile, piece) for piece in pieces))
+
+
+def _under_way(profile: DirectionProfile, piece: Conditions) -> float:
+    """Say how many packets behind the bottleneck are under way at once, at most."""
+    longest = piece.delay_ns * 1e-9 + piece.jitter * stretch(profile) * _TABLE_END
+    return longest * (_PACKETS if piece.rate is None else piece.rate / _PACKET_BITS)
 
 
 def _pieces(profile: DirectionProfile) -> Iterator[Conditions]:

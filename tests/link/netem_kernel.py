@@ -22,6 +22,7 @@ class Kernel:
 
     def __init__(self, *lacks: str) -> None:
         self.lacks = lacks
+        self.held = 4
         self.said: list[str] = []
         self.clamps: dict[str, object] = {}
         self._clear()
@@ -61,7 +62,8 @@ class Kernel:
         return Answer(0, "", "")
 
     def qdiscs(self) -> list[dict[str, object]]:
-        leaf = {"kind": "netem", "handle": "7401:", "packets": 90, "drops": 10, "qlen": 4}
+        leaf = {"kind": "netem", "handle": "7401:", "packets": 90, "drops": 10}
+        leaf["qlen"] = self.held
         leaf["options"] = {**listing(self.netem or []), **self.clamps}
         return [self.root, *([leaf] if self.netem is not None else [])]
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 
 import pytest
-from netem_kernel import PEER, Kernel, netem
+from netem_kernel import PEER, Clock, Kernel, netem
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.netem_keep import counters
 from cloudrc.link.netem_tc import Answer, explain, may_shape, try_netem
+from cloudrc.link.netem_text import limit
 from cloudrc.link.profile import DirectionProfile, Trace
 
 
@@ -46,6 +47,22 @@ def test_a_new_address_gets_its_filter_before_the_old_one_goes() -> None:
         (match,) = kernel.filters.values()
         assert f"10.244.0.{last}/32" in match
     assert [line.split()[1] for line in kernel.said[3:5]] == ["add", "del"]
+
+
+def test_what_is_under_way_has_room_until_it_has_left() -> None:
+    kernel, clock = Kernel(), Clock()
+    shaper = netem(kernel, DirectionProfile(1.0, rate=1e6, queue_packets=10), clock)
+    shaper.follow_peer(PEER)
+    kernel.held = 100
+    small = DirectionProfile(0.02, rate=1e6, queue_packets=10)
+    shaper.follow_profile(small)
+    assert f"limit {limit(small) + 100} " in kernel.said[-1]
+    shaper.step(1.5)
+    assert f"limit {limit(small) + 100} " in kernel.said[-1]
+    kernel.held = 3
+    for _ in range(2):
+        shaper.step(1.0)
+    assert f"limit {limit(small)} " in kernel.said[-1]
 
 
 def test_a_change_is_a_change_and_the_same_again_is_nothing() -> None:

@@ -62,7 +62,7 @@ def test_bursts_are_tcs_gemodel() -> None:
 
 def test_the_limit_holds_the_queue_and_what_is_under_way() -> None:
     profile = DirectionProfile(delay=0.3, rate=2e6, queue_packets=100)
-    assert text(profile).startswith("limit 475 ")  # 100 + 0.3 s * 2 Mbit/s / 1600 bit
+    assert text(profile).startswith("limit 747 ")  # 100 + 0.3 s * 2 Mbit/s / (8 * 116 bit)
     assert text(profile).endswith("rate 2000000bit -14")
 
 
@@ -122,9 +122,21 @@ def test_what_netem_does_otherwise_is_said() -> None:
 
 def test_the_limit_is_that_of_the_longest_delay_on_the_time_line() -> None:
     profile = DirectionProfile(delay=0.01, rate=2e6, queue_packets=100)
-    assert limit(replace(profile, changes=(Change(1.0, delay=0.3),))) == 475
-    assert limit(replace(profile, trace=Trace((0.0, 1.0), (0.3, 0.01)))) == 475
+    assert limit(replace(profile, changes=(Change(1.0, delay=0.3),))) == 747
+    assert limit(replace(profile, trace=Trace((0.0, 1.0), (0.3, 0.01)))) == 747
     assert limit(replace(profile, changes=(Change(1.0, delay=0.3),), rate=None)) == 10_000
+
+
+def test_the_limit_has_room_for_commands_in_the_longest_jitter() -> None:
+    slow = DirectionProfile(delay=0.5, rate=1e5, queue_packets=5)
+    assert limit(slow) >= 5 + 50  # 100 commands a second
+    late = replace(slow, delay=0.1, jitter=0.1, distribution="pareto", keep_order=True)
+    assert limit(late) >= 5 + 100 * (0.1 + 0.1 * 12.1)
+
+
+def test_a_rate_that_begins_later_has_its_own_queue() -> None:
+    profile = DirectionProfile(delay=0.04, queue_packets=20, changes=(Change(10.0, rate=5e4),))
+    assert 20 + 100 * 0.04 <= limit(profile) <= 20 + 1000 * 0.04
 
 
 def test_a_measured_distribution_becomes_a_table_of_its_own(tmp_path: Path) -> None:
