@@ -65,16 +65,16 @@ figures: $(VENV)/dev ## print the numbers that tests have measured: asked, measu
 	$(bin)/python tools/figures.py
 
 coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and journal is tested
-	$(bin)/coverage run -m pytest --hypothesis-seed=0 $(CORE)
-	$(bin)/coverage report
+	$(bin)/python -m coverage run -m pytest --hypothesis-seed=0 $(CORE)
+	$(bin)/python -m coverage report
 
 # mutmut writes where it runs; docs/safety/mutants.md says why each of those that survive may.
 mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways; print what no test notices
 	rm -rf build/mutants && mkdir -p build/mutants
 	cp -r cloudrc tests tools pyproject.toml build/mutants
 	find build/mutants/tests -name 'test_*.py' -delete && cp --parents $(CORE) build/mutants
-	cd build/mutants && $(abspath $(bin))/mutmut run $(MUTANTS)
-	cd build/mutants && $(abspath $(bin))/mutmut results
+	cd build/mutants && $(abspath $(bin))/python -m mutmut run $(MUTANTS)
+	cd build/mutants && $(abspath $(bin))/python -m mutmut results
 
 # The long numbers, and the tests that reach them; the seeds and the real floods are lines below.
 #   10^7 hostile datagrams, coverage-guided    test_coverage_guided_ones
@@ -93,9 +93,12 @@ nightly: $(VENV)/dev ## run all tests but netem's, 500 hours of faults, e2e-full
 	$(bin)/pytest -n auto -m 'not process and not e2e and not netem'
 	$(bin)/pytest -m process
 	$(bin)/cloudrc faults run --all --real --document docs/safety/faults-real.md
-	$(bin)/cloudrc faults fuzz --clean --seeds 600 --jobs $(JOBS) $(STORE)
-	$(bin)/cloudrc faults fuzz --adversarial --seeds 5000 --jobs $(JOBS) $(STORE)
-	$(bin)/cloudrc faults fuzz --seeds 30000 --jobs $(JOBS) $(STORE)
+	$(bin)/cloudrc faults fuzz --clean --seeds 600 --jobs $(JOBS) \
+		--document docs/safety/clean.md $(STORE)
+	$(bin)/cloudrc faults fuzz --adversarial --seeds 5000 --jobs $(JOBS) \
+		--document docs/safety/adversary.md $(STORE)
+	$(bin)/cloudrc faults fuzz --seeds 30000 --jobs $(JOBS) \
+		--document docs/safety/search.md $(STORE)
 	$(bin)/python tools/figures.py
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 	$(MAKE) e2e-full

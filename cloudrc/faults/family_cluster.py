@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -46,17 +47,19 @@ while time.monotonic() < end: pass
 child and os.waitpid(child, 0)
 """
 THROTTLED = "cpu_throttled_periods_total"
+LAST_WORD = "INTERRUPTED"
 
 
 def _pod_killed(seed: int) -> Outcome:
     """Deleted by force: its processes get SIGKILL at once."""
     outcome, release = Outcome(), release_there()
-    name = flying(release, 2)
+    before, name = holds(recording(release, "world")), flying(release, 2)
     delete(release, "cloud", "--force", "--grace-period=0")
     until("the robot holds", lambda: guard(release) is GuardState.HOLD, 15.0)
     back = until("the new cloud flies it", lambda: guard(release) is GuardState.TRACK)
     outcome.most("flown again after", back, 60.0, "s")
-    finish(outcome, release, name)
+    flown = finish(outcome, release, name)
+    outcome.least("HOLDs for want of commands", holds(flown) - before, 1)
     return outcome
 
 
@@ -150,7 +153,12 @@ def _operator_lost(seed: int) -> Outcome:
     """The Job's pod is deleted in flight: with its last word it cancels the mission."""
     outcome, release = Outcome(), release_there()
     name = flying(release, 2)
-    kubectl(release, "delete", "pod", f"--selector=batch.kubernetes.io/job-name={name}")
+    with ThreadPoolExecutor(1) as pool:  # once the pod is gone, so is its log
+        said = pool.submit(kubectl, release, "logs", "--follow", f"job/{name}")
+        time.sleep(2.0)  # it is being read by then
+        kubectl(release, "delete", "pod", f"--selector=batch.kubernetes.io/job-name={name}")
+    last = said.result().splitlines()[-1:]
+    outcome.true(f"the Job ends with {LAST_WORD}", bool(last) and last[0].startswith(LAST_WORD))
     until("the mission is cancelled", lambda: _events(release)[-1:] == ["cancelled"], 60.0)
     outcome.true("the robot holds", guard(release) is GuardState.HOLD)
     finish(outcome, release, flying(release, 1))

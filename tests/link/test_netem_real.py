@@ -141,6 +141,7 @@ def drawn_for(flow: Flow, profile: DirectionProfile, seed: int) -> Numbers:
 
 def test_a_change_in_flight_loses_nothing(shaped: Netem) -> None:
     asked = [DirectionProfile(delay) for delay in (0.3, 0.02, 0.15, 0.05, 0.2)]
+    asked[1] = replace(asked[1], rate=1e6, queue_packets=5)  # less room than what is under way
     asked[2] = replace(asked[2], jitter=0.02, distribution="normal")
     asked[3] = replace(asked[3], rate=2e6)
     flow = Flow()

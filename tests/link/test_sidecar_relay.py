@@ -190,8 +190,8 @@ def test_a_profile_that_is_wrong_changes_nothing(pod: Callable[..., Pod]) -> Non
 def test_it_is_ready_counts_and_ends_in_half_a_second(pod: Callable[..., Pod]) -> None:
     link = pod("uplink: {loss: 1.0}\n").ready()
     assert link.page("/readyz") == "ready\n"
-    link.send(10)
     link.end.sendto(b"short", link.listen)
+    link.send(10)
     until(lambda: 'outcome="lost"} 10.0' in link.page("/metrics"))
     page = link.page("/metrics")
     assert 'cloudrc_link_info{direction="uplink",mode="relay",shaper="relay"} 1.0' in page
