@@ -1,20 +1,20 @@
 """The invariants, looked at in every step of the physics, by nobody who could be wrong with them.
 
 No fence breach: the base stays inside the fence, with its rotors stopped by a hit, too; where the
-operator's word has stopped them, it may fall out of it, but not as far as people have to stay away.
-What is flown stays below the caps and can be stopped in time, before the floor, too, unless the
-robot lands. No motion on stale commands: in TRACK the newest accepted command's basis is never
-older than its limit. No collision, under an honest cloud: nothing but the arm's tip touches
-anything, and that the board.
+operator's word has stopped them, it may fall out of it, but not as far as people have to stay away,
+and they turn again only where the robot lies still, inside the fence. What is flown stays below the
+caps and can be stopped in time, before the floor, too, unless the robot lands. No motion on stale
+commands: in TRACK the newest accepted command's basis is never older than its limit. No collision,
+under an honest cloud: nothing but the arm's tip touches anything, and that the board.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from math import sqrt
+from math import hypot, sqrt
 from typing import Any, NamedTuple
 
-from cloudrc.geometry.fence import HIGH, LOW
+from cloudrc.geometry.fence import HIGH, LOW, inside
 from cloudrc.messages import ZERO, Command, GuardState, Vector
 from cloudrc.records import Contact
 
@@ -26,6 +26,8 @@ FLOWN = (GuardState.TRACK, GuardState.HOLD, GuardState.LAND)
 ABOVE_GROUND = (GuardState.TRACK, GuardState.HOLD)
 REPORTED = 5
 """Of each kind."""
+STILL = 0.12
+"""Slower than this a robot lies [m/s]: the guard's 0.1, and what a fall adds in a tick."""
 FALL_MAX = 1.5
 """How far outside the fence people are told to stay [m]. Source: docs/safety/guard.md."""
 
@@ -100,7 +102,9 @@ class Watch:
             nonlocal now_ns, before, falls
             state, reference = guard.state, guard.reference
             position = simulator.readings.position
-            falls = falls and state not in flown
+            if falls and state in flown:
+                falls = False
+                self._look_at_take_off(position, simulator.readings.velocity, now_ns)
             self._look_at_fence(position, falls, now_ns)
             if state in flown:
                 self._look_at_stop(position, reference, state is landing, now_ns)
@@ -114,6 +118,13 @@ class Watch:
             now_ns += TICK_NS
 
         simulator.step, guard.offer, guard.stop = watched_step, watched_offer, watched_stop
+
+    def _look_at_take_off(self, position: Vector, velocity: Vector, now_ns: int) -> None:
+        """After a stop the rotors turn again only where the robot lies still inside the fence."""
+        if hypot(*velocity) > STILL or not inside(position):
+            x, y, z = position
+            text = f"base at ({x:.2f}, {y:.2f}, {z:.2f}) at {hypot(*velocity):.2f} m/s"
+            self.note(now_ns, "fence", f"took off after a stop, {text}")
 
     def _look_at_fence(self, position: Vector, falls: bool, now_ns: int) -> None:
         x, y, z = position

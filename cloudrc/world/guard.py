@@ -263,8 +263,7 @@ class Guard:
         if state is TRACK:
             age = (now_ns - self._track_until_ns + limits.command_age_max_ns) * 1e-9
             cause = f"command age {age:.3f} s above {limits.command_age_max_ns * 1e-9:.3f} s"
-            new = self._track_until_ns == NEVER_NS
-            self._enter(HOLD, now_ns, "new session" if new else cause)
+            self._enter(HOLD, now_ns, "new session" if self._track_until_ns == NEVER_NS else cause)
         elif state is HOLD and self.armed and now_ns - self._alone_ns > limits.hold_max_ns:
             self._enter(LAND, now_ns, f"held for {limits.hold_max_ns * 1e-9:g} s without the cloud")
         elif state is LAND and self._flies:
@@ -274,6 +273,7 @@ class Guard:
             elif now_ns - self._moved_ns >= TOUCH_DOWN_NS:
                 self._enter(LAND, now_ns, "touched down, rotors stopped")
                 self._flies, self.reference = False, ZERO
+                self._take_off.forget(stopped=True)  # on a pipe, perhaps, from which it slides off
         if self.state is HOLD and self._take_off.may_end(readings):
             self._enter(GROUND, now_ns, "not off the ground yet, rotors stopped", self.armed)
 

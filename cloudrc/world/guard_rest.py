@@ -117,12 +117,11 @@ class TakeOff:
     """Tells a robot that has not left the ground yet from one that flies.
 
     Held in the air so near to the ground it would scrape along. One whose rotors were stopped may
-    still be falling, or lie outside the fence, when it is acknowledged: it takes off once it has
-    come to rest, and that inside.
+    still be falling, or lie outside the fence, when it is acknowledged: it takes off while it is
+    at rest, and that inside.
 
     Attributes:
         over: Whether the robot has left the ground.
-        allowed: Whether it may.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
@@ -133,13 +132,22 @@ class TakeOff:
             high: The opposite one [m], shape (3,).
         """
         self._low, self._high = low, high
-        self.allowed = True
+        self._stopped = False
         self.forget()
 
+    @property
+    def allowed(self) -> bool:
+        """Whether it may leave the ground."""
+        return not self._stopped or self._still >= STILL_TICKS
+
     def forget(self, *, stopped: bool = False) -> None:
-        """The robot stands, or will; the next take-off is another one."""
+        """The robot stands, or will; the next take-off is another one.
+
+        Args:
+            stopped: Whether its rotors were stopped elsewhere than on the ground, perhaps.
+        """
         self.over, self._height, self._still = False, nan, 0
-        self.allowed = self.allowed and not stopped
+        self._stopped = self._stopped or stopped
 
     def look(self, readings: Readings, flies: bool) -> None:
         """Note where the robot stands, or see whether it has left.
@@ -150,18 +158,17 @@ class TakeOff:
         """
         height = readings.position[2]
         if flies:
-            self.over = not abs(height - self._height) < HOP
+            self.over, self._stopped = not abs(height - self._height) < HOP, False
         else:
             self._height = height
-            if not self.allowed:
-                self._await_rest(readings)
+            if self._stopped:
+                self._count_rest(readings)
 
-    def _await_rest(self, readings: Readings) -> None:
+    def _count_rest(self, readings: Readings) -> None:
         low, position, high = self._low, readings.position, self._high
         inside = all(map(le, low, position)) and all(map(le, position, high))
         at_rest = inside and hypot(*readings.velocity) < STILL
         self._still = self._still + 1 if at_rest else 0
-        self.allowed = self._still >= STILL_TICKS
 
     def may_end(self, readings: Readings) -> bool:
         """Say whether the rotors may stop here."""

@@ -17,7 +17,7 @@ class World:
     """A robot that is wherever a test puts it."""
 
     def __init__(self):
-        self.readings = SimpleNamespace(position=INSIDE)
+        self.readings = SimpleNamespace(position=INSIDE, velocity=ZERO)
         self.state, self.reference, self.steps = TRACK, ZERO, 0
         self.watch = Watch(6.0, 12.0, 250 * MS)
         self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
@@ -58,6 +58,18 @@ def test_stopped_by_the_operators_word_it_may_fall_out_but_not_far_nor_fly_there
     world = World()
     world.guard.stop(0)
     assert world.tick(ZERO, state=ESTOP, position=far) == {"fence"}
+
+
+@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.parametrize(("speed", "kinds"), [(0.11, set()), (0.13, {"fence"})])
+def test_stopped_by_the_operators_word_it_may_not_take_off_in_its_fall(speed, kinds):
+    world = World()
+    world.guard.stop(0)
+    world.readings.velocity = (0.0, 0.0, -speed)
+    assert world.tick(ZERO, state=ESTOP) == set()
+    assert world.tick(ZERO, state=TRACK) == kinds
+    world.readings.velocity = (0.0, 0.0, 1.0)
+    assert world.tick(ZERO, state=TRACK) == kinds
 
 
 @pytest.mark.promise("P-GUARD-3")

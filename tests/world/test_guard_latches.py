@@ -105,6 +105,21 @@ def test_land_goes_down_slowly_and_stops_the_rotors_once_it_stands():
     assert guard.take_changes()[-1] == (4398 * MS, LAND, "touched down, rotors stopped")
 
 
+@pytest.mark.promise("P-GUARD-3")
+def test_what_it_has_landed_on_it_may_slide_off():
+    guard = landing()
+    run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 0.6), (0.0, 0.0, -0.5))
+    run(guard, 4 * SECOND, 5 * SECOND, (1.0, 2.0, 0.5))
+    run(guard, 5 * SECOND, 6 * SECOND, (1.0, 2.0, 0.3), (0.0, 0.0, -1.0))
+    guard.acknowledge(6 * SECOND)
+    guard.start_mission(6 * SECOND)
+    feed(guard, 6 * SECOND, 1, position=(1.0, 2.0, 0.3))
+    assert guard.state is GROUND
+    run(guard, 7 * SECOND, 8 * SECOND, (1.0, 2.0, 0.1))
+    feed(guard, 8 * SECOND, 1, position=(1.0, 2.0, 0.1))
+    assert guard.state is TRACK
+
+
 def test_a_robot_that_is_pressed_down_when_it_is_landed_touches_down():
     guard = tracking((0.0, 0.0, -2.0))
     assert run(guard, 0, 100 * MS, (1.0, 2.0, 1.0))[-1][2] == pytest.approx(-LAND_SPEED)
