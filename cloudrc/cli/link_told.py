@@ -50,12 +50,16 @@ class Teller:
         self._guard, self._text, self._until = threading.Lock(), NOTHING, -PERIOD
 
     def text(self) -> str:
-        """Say all there is to know now, as JSON."""
-        with self._guard:
+        """Say all there is to know now, as JSON; the last answer where tools hang."""
+        if not self._guard.acquire(timeout=PERIOD):
+            return self._text
+        try:
             if self._clock() >= self._until:
                 self._text = self._ask()
                 self._until = self._clock() + PERIOD
             return self._text
+        finally:
+            self._guard.release()
 
     def _ask(self) -> str:
         told, peer = self._sidecar.told(), self._sidecar.peer

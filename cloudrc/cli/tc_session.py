@@ -74,6 +74,8 @@ class Programs:
             )
         except FileNotFoundError:
             return Answer(NOT_FOUND, "", "")
+        except OSError as error:  # no leave to run it, or no process left
+            return Answer(1, "", error.strerror or str(error))
         except subprocess.TimeoutExpired:
             return Answer(1, "", f"no answer within {PATIENCE:g} s")
         return Answer(done.returncode, done.stdout, done.stderr)

@@ -248,7 +248,7 @@ _ENTRIES = (
     gauge(
         "cloudrc_recorder_sync_age_seconds",
         "What a power cut would take of the recording: the time since the newest sync that is done"
-        " began; absent without a recording.",
+        " began; absent without a recording, rising for good once it was given up.",
         ENDS,
     ),
     counter(

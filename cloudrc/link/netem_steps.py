@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from math import ceil
 
 from cloudrc.link.netem_text import STEP_NS
 
@@ -39,7 +40,7 @@ class Steps:
     def lateness_ns(self) -> tuple[int, int]:
         """Give median and 99th percentile of the last 10,000 latenesses [ns]; 0 without any."""
         ordered = sorted(self._lateness_ns) or [0]
-        return ordered[(len(ordered) - 1) // 2], ordered[int(0.99 * (len(ordered) - 1))]
+        return ordered[(len(ordered) - 1) // 2], ordered[ceil(0.99 * (len(ordered) - 1))]
 
     def counts(self) -> dict[str, int]:
         """Say how many steps there were and how late they were; empty before the first."""

@@ -77,3 +77,10 @@ def test_one_that_died_is_replaced(programs: Programs) -> None:
     assert programs(SHOW).output == '[{"kind":"netem"}]'
     programs.close()
     programs.close()
+
+
+def test_a_tool_that_may_not_be_run_is_an_error_like_others(tmp_path: Path) -> None:
+    (tmp_path / "ip").mkdir()  # no program: EACCES for everybody
+    code, _, error = Programs({"PATH": str(tmp_path)})(("ip", "route"))
+    assert code
+    assert "denied" in error

@@ -75,7 +75,9 @@ def test_a_slow_machine_tells_its_own_lateness() -> None:
     _, steps = follow(DirectionProfile(changes=changes), 1.5, slow_ms=30)
     assert (steps.applied, steps.late) == (10, 10)
     assert steps.lateness_ns() == (30_000_000, 30_000_000)
-    assert "10 steps of the time line, late by 30.00 ms in the median" in steps.in_words()
+    steps.note(40_000_000, 0)
+    assert steps.lateness_ns() == (30_000_000, 40_000_000)
+    assert "11 steps of the time line, late by 30.00 ms in the median" in steps.in_words()
 
 
 def test_a_new_time_line_may_count_from_now_or_go_on() -> None:
