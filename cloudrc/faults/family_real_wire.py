@@ -53,7 +53,7 @@ def _recorder_killed(seed: int) -> Outcome:
         # World's clock follows the machine's monotonic one, and lags it by its slip.
         last_ns = int(recording["/ground_truth"]["stamp_ns"][-1])
         outcome.most("stretch lost", (before_ns - last_ns) * 1e-9 - slip, 0.5, "s")
-        age = shown["cloudrc_recorder_sync_age_seconds"]
+        age = shown.get("cloudrc_recorder_sync_age_seconds", nan)
         outcome.most("metric recorder_sync_age_seconds before", age, 1.0, "s")
         outcome.least("kept, share of the bytes", recovery.share, 0.99)
         outcome.same("damaged chunks", recovery.dropped.get("chunks", 0), 0)
