@@ -62,7 +62,7 @@ def fuzz(options: argparse.Namespace) -> int:
     seconds = time.monotonic() - began
     document = _document(findings, failures, options, seconds)
     if options.document is not None:
-        options.document.write_text(_markdown(document), encoding="utf-8")
+        options.document.write_text(_markdown(document, _command(options)), encoding="utf-8")
     if say:
         print("\n" + table(_rows(document), right=(1, 2)))
         print(f"\n{_summary(document)}")
@@ -220,13 +220,22 @@ def _summary(document: dict[str, Any]) -> str:
     )
 
 
-def _markdown(document: dict[str, Any]) -> str:
+def _command(options: argparse.Namespace) -> str:
+    """The command that flies the same once more; where it keeps what it finds changes nothing."""
+    kind = _kind(options)
+    words = ["cloudrc faults fuzz", *([f"--{kind}"] if kind != "random" else [])]
+    words += [f"--first {options.first}"] if options.first != 1 else []
+    return " ".join([*words, f"--seeds {options.seeds}", f"--document {options.document}"])
+
+
+def _markdown(document: dict[str, Any], command: str) -> str:
     """For the documentation."""
     head, *rows = _rows(document)
     lines = [
         f"# The search for faults: {document['kind']} schedules",
         "",
-        "Written by `make faults`; do not edit. Each schedule is one minute of flight; the",
+        f"Written by `{command}`;",
+        "do not edit. Each schedule is one minute of flight; the",
         "invariants are looked at in every step of 2 ms. The bound is by the rule of three:",
         "0 events in N runs, p < 3/N with 95 % confidence. N counts the schedules in which an",
         "invariant is looked at: under a cloud that means no good a contact is no breach, and",

@@ -135,7 +135,9 @@ def as_markdown(results: Sequence[Result], seed: int, mode: Mode = "virtual") ->
     skipped = sum(bool(result.outcome.skipped) for result in results)
     told = f"Seed {seed}: {passed} of {len(results)} scenarios passed."
     if skipped:
-        told = f"Seed {seed}: {passed} of {len(results) - skipped} run passed, {skipped} not run yet."
+        told = (
+            f"Seed {seed}: {passed} of {len(results) - skipped} run passed, {skipped} not run yet."
+        )
     lines = [HEADS[mode].format(result=told), COLUMNS, *map(_row, results), "\n## Measured\n"]
     for result in results:
         lines.append(f"\n### {result.scenario.id} {result.scenario.name}: {result.word}\n\n")

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import base64
 import json
+import subprocess
 import time
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from cloudrc.cluster.access import Release
 from cloudrc.cluster.deploy import wait_ready
 from cloudrc.cluster.jobs import read_job
 from cloudrc.cluster.pods import find_pod, list_pods
+from cloudrc.cluster.tools import program
 from cloudrc.faults.held import holds
 from cloudrc.faults.real_cluster import (
     ENDS,
@@ -153,11 +154,12 @@ def _operator_lost(seed: int) -> Outcome:
     """The Job's pod is deleted in flight: with its last word it cancels the mission."""
     outcome, release = Outcome(), release_there()
     name = flying(release, 2)
-    with ThreadPoolExecutor(1) as pool:  # once the pod is gone, so is its log
-        said = pool.submit(kubectl, release, "logs", "--follow", f"job/{name}")
-        time.sleep(2.0)  # it is being read by then
+    command = [program("kubectl"), *release.flags, "logs", "--follow", f"job/{name}"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
+        assert reader.stdout is not None
+        reader.stdout.readline()  # from here on it is read: once the pod is gone, so is its log
         kubectl(release, "delete", "pod", f"--selector=batch.kubernetes.io/job-name={name}")
-    last = said.result().splitlines()[-1:]
+        last = reader.stdout.read().splitlines()[-1:]
     outcome.true(f"the Job ends with {LAST_WORD}", bool(last) and last[0].startswith(LAST_WORD))
     until("the mission is cancelled", lambda: _events(release)[-1:] == ["cancelled"], 60.0)
     outcome.true("the robot holds", guard(release) is GuardState.HOLD)

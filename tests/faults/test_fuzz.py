@@ -100,6 +100,8 @@ def test_what_falls_out_of_the_fence_by_the_operators_word_is_told_and_fails_not
     told = "2 stopped by the operator's word came to lie outside of it, at most by 0.40 m"
     assert told in page.read_text()
     assert "a [known limit](guard.md)" in page.read_text()
+    command = f"cloudrc faults fuzz --adversarial --seeds 4 --document {page}"
+    assert f"Written by `{command}`" in page.read_text()
     assert told in capsys.readouterr().out
 
 

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 _, _, REST = (ROOT / "Makefile").read_text(encoding="utf-8").partition("# The long numbers,")
 LIST, _, RECIPE = REST.partition("\nnightly:")
-RECIPE = RECIPE.partition("\n\n")[0]
+RECIPE = RECIPE.partition("\n\n")[0].replace("\\\n\t\t", "")
 TESTS = re.findall(r"^#   .+?  (test_\w+)$", LIST, re.MULTILINE)
 NUMBERS = (
     "10^7 hostile datagrams",
@@ -24,9 +24,9 @@ LINES = (
     "-n auto -m 'not process and not e2e and not netem'",
     "pytest -m process",
     "faults run --all --real --document docs/safety/faults-real.md",
-    "faults fuzz --clean --seeds 600 ",
-    "faults fuzz --adversarial --seeds 5000 ",
-    "faults fuzz --seeds 30000 ",
+    "faults fuzz --clean --seeds 600 --jobs $(JOBS) --document docs/safety/clean.md ",
+    "faults fuzz --adversarial --seeds 5000 --jobs $(JOBS) --document docs/safety/adversary.md ",
+    "faults fuzz --seeds 30000 --jobs $(JOBS) --document docs/safety/search.md ",
     "$(MAKE) e2e-full",
 )
 

@@ -5,11 +5,16 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from cloudrc.faults.catalogue import scenarios
+from cloudrc.faults import family_cluster
+from cloudrc.faults.catalogue import find, scenarios
 from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.messages import GuardState
 
 REAL = scenarios("real")
 QUICK = ("cloud-killed", "recorder-killed", "slow-scrapers")
@@ -51,3 +56,39 @@ def test_what_is_listed_for_a_mode_can_be_run_there() -> None:
         listed = document["faults"]
         assert [each["name"] for each in listed] == [each.name for each in scenarios(mode)]  # type: ignore[arg-type]
         assert {each["mode"] for each in listed} == {mode}
+
+
+KUBECTL = """#!/bin/sh
+case "$*" in
+*logs*) echo waypoint 2 of 7 reached; while [ ! -e {gone} ]; do sleep 0.02; done; echo "{word}" ;;
+*delete*) touch {gone} ;;
+esac
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("word", "heard"), [("INTERRUPTED: the Job was stopped", True), ("waypoint 3 of 7", False)]
+)
+def test_the_last_word_of_a_job_is_heard_while_its_pod_goes(
+    word: str, heard: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a kubectl that says it once the pod is deleted, and never again."""
+    kubectl = tmp_path / "kubectl"
+    kubectl.write_text(KUBECTL.format(gone=tmp_path / "gone", word=word))
+    kubectl.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    there: dict[str, Any] = {
+        "release_there": lambda: SimpleNamespace(flags=["--namespace=x"]),
+        "flying": lambda release, number: "job",
+        "until": lambda text, condition, limit: 0.0,
+        "guard": lambda release: GuardState.HOLD,
+        "finish": lambda outcome, release, name: None,
+        "list_pods": lambda release, component: ["world"],
+    }
+    for name, stand_in in there.items():
+        monkeypatch.setattr(family_cluster, name, stand_in)
+    outcome = find("F33", "cluster").run(1)
+    assert [check.show() for check in outcome.checks if not check.passed] == (
+        [] if heard else ["the Job ends with INTERRUPTED: NO"]
+    )

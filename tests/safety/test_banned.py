@@ -17,6 +17,9 @@ YARDSTICK = ROOT / "cloudrc" / "cli" / "bench_wire.py"
 MODULES = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "jsonpickle"}
 CALLS = {"eval", "exec", "__import__"}
 LOADERS = {"load", "load_all", "full_load", "full_load_all", "unsafe_load", "unsafe_load_all"}
+SHELLS = {"os": {"system", "popen"}, "subprocess": {"getoutput", "getstatusoutput"}}
+NAMES = {"builtins": CALLS, "yaml": LOADERS, **SHELLS}
+"""What is banned of modules that are not; by module."""
 SAFE_LOADERS = {"SafeLoader", "CSafeLoader"}
 
 
@@ -30,10 +33,21 @@ def breaches(tree: ast.Module) -> Iterator[str]:
             for module in modules:
                 if module.split(".")[0] in MODULES:
                     yield f"{node.lineno}: imports {module}"
+            yield from _of_names(node)
         elif isinstance(node, ast.Call):
             yield from _of_call(node, safe)
     for program in programs(tree):
         yield from (f"in a program: {breach}" for breach in breaches(program))
+
+
+def _of_names(node: ast.Import | ast.ImportFrom) -> Iterator[str]:
+    """What would be called under a name that does not show whose it is."""
+    for alias in node.names:
+        if isinstance(node, ast.ImportFrom) and node.module in NAMES:
+            if alias.name in NAMES[node.module] | {"*"}:
+                yield f"{node.lineno}: imports {alias.name} from {node.module}"
+        elif isinstance(node, ast.Import) and alias.name in NAMES and alias.asname is not None:
+            yield f"{node.lineno}: imports {alias.name} as {alias.asname}"
 
 
 def programs(tree: ast.Module) -> Iterator[ast.Module]:
@@ -55,9 +69,9 @@ def _of_call(node: ast.Call, safe: set[str]) -> Iterator[str]:
             yield f"{node.lineno}: shell={ast.unparse(keyword.value)}"
         if keyword.arg == "allow_pickle" and not off:
             yield f"{node.lineno}: allow_pickle"
-    if name in ("os.system", "os.popen"):
-        yield f"{node.lineno}: calls {name}"
     module, _, called = name.rpartition(".")
+    if called in SHELLS.get(module, ()):
+        yield f"{node.lineno}: calls {name}"
     if module == "yaml" and called in LOADERS:
         given = [*node.args[1:2], *(k.value for k in node.keywords if k.arg == "Loader")]
         if not given or not all(_is_safe(loader, safe) for loader in given):
@@ -113,13 +127,9 @@ def test_the_bench_unpickles_only_what_it_has_just_pickled_itself() -> None:
 
 
 def test_nor_does_a_test() -> None:
-    """Tests may time what the paper's tunnel did, and name what is banned."""
-    allowed = {"tests/safety/test_banned.py"}
-    found = {place: what for place, what in found_in(TESTS).items() if place not in allowed}
-    found = {
-        place: [one for one in what if "imports pickle" not in one] for place, what in found.items()
-    }
-    assert {place: what for place, what in found.items() if what} == {}
+    """But for those that name what is banned, to see that it is found."""
+    found = found_in([path for path in TESTS if path != Path(__file__).resolve()])
+    assert found == {"tests/test_architecture.py": ["in a program: 1: imports pickle"]}
 
 
 @pytest.mark.parametrize(
@@ -142,6 +152,15 @@ def test_nor_does_a_test() -> None:
         "subprocess.run(command, shell=True)",
         "subprocess.run(command, shell=is_shell)",
         "os.system(command)",
+        "subprocess.getoutput(command)",
+        "from os import system",
+        "from os import path, popen as run",
+        "from os import *",
+        "from subprocess import getoutput",
+        "from yaml import load",
+        "from yaml import SafeLoader, unsafe_load as load",
+        "from builtins import eval as value",
+        "import yaml as y\ny.load(text)",
         "numpy.load(path, allow_pickle=True)",
         "run([sys.executable, '-c', 'import marshal'])",
     ],
@@ -158,6 +177,7 @@ def test_a_breach_is_found(code: str) -> None:
         "class Mine(yaml.SafeLoader): ...\nyaml.load(text, Loader=Mine)",
         "subprocess.run(command, shell=False)",
         "model.eval()",
+        "from os import path\nfrom yaml import safe_load, CSafeLoader",
         "json.load(file)",
     ],
 )

@@ -17,6 +17,8 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 
+FULL = re.compile(r"pytest\.mark\.full\b")
+
 
 def promised() -> list[str]:
     """Every id that the docs define: in bold at the beginning of a line or of a table's row."""
@@ -51,6 +53,28 @@ def all_held() -> set[str]:
 
 def test_every_promise_has_a_test() -> None:
     assert sorted(set(promised()) - all_held()) == []
+
+
+def held_daily(source: str) -> set[str]:
+    """Ids on the tests of a file that are more than the full numbers of the night."""
+    tree = ast.parse(source)
+    tests = [each for each in tree.body if isinstance(each, ast.FunctionDef)]
+    rest = ast.unparse(ast.Module([each for each in tree.body if each not in tests], []))
+    if FULL.search(rest):
+        return set()
+    daily = [
+        test
+        for test in tests
+        if test.name.startswith("test")
+        and not any(FULL.fullmatch(ast.unparse(mark)) for mark in test.decorator_list)
+    ]
+    return {name for test in daily for name in [*held(ast.unparse(test)), *held(rest)]}
+
+
+def test_every_promise_has_a_test_that_does_not_wait_for_the_night() -> None:
+    files = (ROOT / "tests").rglob("test_*.py")
+    daily = {name for path in files for name in held_daily(path.read_text(encoding="utf-8"))}
+    assert sorted(set(promised()) - daily) == []
 
 
 def test_every_mark_has_a_promise() -> None:
@@ -186,3 +210,19 @@ def test_every_way_to_skip_a_promise_is_found(source: str, found: list[str]) -> 
 )  # fmt: skip
 def test_a_mark_is_read_from_the_code_alone(source: str, found: list[str]) -> None:
     assert held(source) == found
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        (f"{MARK}\ndef test_a(): ...", {"P-A-1"}),
+        (f"@pytest.mark.process\n{MARK}\ndef test_a(): ...", {"P-A-1"}),
+        (f"@pytest.mark.full\n{MARK}\ndef test_a(): ...", set()),
+        (f"pytestmark = [pytest.mark.full]\n{MARK}\ndef test_a(): ...", set()),
+        ("pytestmark = pytest.mark.promise('P-A-1')\n@pytest.mark.full\ndef test_a(): ...", set()),
+        (f"{MARK}\n@pytest.mark.parametrize('a', [1, pytest.param(2, marks=pytest.mark.full)])\n"
+         "def test_a(a): ...", {"P-A-1"}),
+    ],
+)  # fmt: skip
+def test_a_test_of_the_night_alone_holds_nothing_by_day(source: str, found: set[str]) -> None:
+    assert held_daily(source) == found

@@ -52,21 +52,25 @@ def test_the_check_notices_what_is_let_through() -> None:
 
 @pytest.mark.process
 def test_a_million_hostile_datagrams(target: Target, figure: Callable[..., None]) -> None:
+    tried = target.tried
     flood(target, 100_000, seed=2)
     before = memory()
-    flood(target, 900_000, seed=3)
-    grown = memory() - before
-    figure("hostile datagrams by chance: accepted", 0, "==", 0, count=target.tried)
+    flood(target, 902_000, seed=3)  # a few are frames that both ends know, and are not tried
+    grown, tried = memory() - before, target.tried - tried
+    assert tried >= 1_000_000
+    figure("hostile datagrams by chance: accepted", 0, "==", 0, count=tried)
     figure("hostile datagrams by chance: memory grown", grown, "<=", 2.0, "MiB")
     assert grown < 2.0
 
 
 @pytest.mark.process
 @pytest.mark.parametrize(
-    "runs",
-    [pytest.param(200_000), pytest.param(10_000_000, marks=pytest.mark.full)],
+    ("runs", "least"),  # some of what the fuzzer makes are frames that both ends know
+    [(200_000, 140_000), pytest.param(11_500_000, 10_000_000, marks=pytest.mark.full)],
 )
-def test_coverage_guided_ones(runs: int, tmp_path: Path, figure: Callable[..., None]) -> None:
+def test_coverage_guided_ones(
+    runs: int, least: int, tmp_path: Path, figure: Callable[..., None]
+) -> None:
     if (sys.platform, platform.machine()) != ("linux", "x86_64"):
         pytest.skip("atheris has wheels for Linux on x86_64 alone")
     command = [sys.executable, str(Path(__file__).with_name("hostile.py"))]
@@ -80,5 +84,5 @@ def test_coverage_guided_ones(runs: int, tmp_path: Path, figure: Callable[..., N
     figure("hostile datagrams by coverage: accepted", 0, "==", 0, count=int(said.group(1)))
     grown = float(said.group(2))
     figure("hostile datagrams by coverage: memory grown", grown, "<=", 20.0, "MiB")
-    assert int(said.group(1)) > 0.7 * runs
+    assert int(said.group(1)) >= least
     assert float(said.group(2)) < 20.0
