@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 from cloudrc.cli.link_verify_text import NOT_JUDGED
 from cloudrc.link.verify_causes import Findings
-from cloudrc.link.verify_expect import JITTER_SHARES, has_jitter
+from cloudrc.link.verify_expect import DEVIATION_FLOOR, JITTER_SHARES, has_jitter
 from cloudrc.link.verify_plan import LONGEST, Plan
 from cloudrc.link.verify_rate import SIZE, Trains
 
@@ -36,6 +36,9 @@ def notes(way: str, plan: Plan, trains: Trains | None) -> Iterator[str]:
         )
     if has_jitter(plan.profile):
         yield from on_jitter(way, plan.expects.share)
+        expects = plan.expects
+        if expects.share and expects.variation is None and expects.middle is None:
+            yield from on_deviation(way, expects.deviation.expected)
     if trains and not trains.judges:
         yield f"{way}: rate {NOT_JUDGED}: it is too high to be told from none"
 
@@ -47,3 +50,18 @@ def on_jitter(way: str, share: float) -> Iterator[str]:
         yield f"{way}: jitter {NOT_JUDGED}: too little of its delays' scatter is jitter"
     elif share > usual:
         yield f"{way}: jitter judged within {share:.0%} only: its tail hides {usual:.0%}"
+
+
+def on_deviation(way: str, asked: float) -> Iterator[str]:
+    """Say that a standard deviation which alone judges the jitter is too small for a tenth.
+
+    Args:
+        way: The direction.
+        asked: That deviation [s].
+    """
+    if 0.0 < asked < 2.0 * DEVIATION_FLOOR:
+        yield (
+            f"{way}: standard deviation, and so its jitter, judged within "
+            f"{DEVIATION_FLOOR * 1e3:g} ms only: below {2e3 * DEVIATION_FLOOR:g} ms machines make "
+            "as much"
+        )

@@ -1,9 +1,10 @@
 """Logs of ping and irtt: their lines or JSON go in, packets come out.
 
     ping -D -i 0.2 -O HOST > ping.log
-    irtt client -i 10ms -l 172 -d 1m -o irtt.json HOST
+    irtt client -i 10ms -l 203 -d 1m -o irtt.json HOST
 
-ping knows round trips alone. irtt knows both ways if the clocks of both hosts agree.
+203 bytes are a datagram of telemetry; of commands, 88. ping knows round trips alone. irtt knows
+both ways if the clocks of both hosts agree.
 """
 
 from __future__ import annotations

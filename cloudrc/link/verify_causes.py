@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.verify_judge import Row
+from cloudrc.link.verify_starved import SHARE_KEPT, are_off, beyond, may_be_lateness
 from cloudrc.link.verify_words import kbit, ms, said, times
 
 LATE = 1.5e-3
@@ -83,7 +84,7 @@ def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
     Args:
         findings: By direction.
     """
-    found = {way: _first(way, one) for way, one in findings.items() if _off(one.rows)}
+    found = {way: _first(way, one) for way, one in findings.items() if are_off(one.rows)}
     silent = [
         way
         for way, cause in found.items()  # what was put back shapes again
@@ -95,7 +96,7 @@ def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
         detail = found[way].text
         text = f"only the {other} is shaped: {detail}"
         found[way] = Cause("one_direction", way, text)
-    # What a shaper without its CPU does to losses is known: what is off beyond that is told, too.
+    # What a shaper without its CPU does is known: what is off beyond that is told, too.
     also = [_beyond(way, findings[way]) for way, one in found.items() if one.code == "throttled"]
     return _merged(found) + [cause for cause in also if cause is not None]
 
@@ -112,14 +113,15 @@ def _merged(found: Mapping[str, Cause]) -> list[Cause]:
     return causes
 
 
-def _off(rows: Sequence[Row]) -> dict[str, Row]:
-    return {row.name: row for row in rows if row.verdict == "off"}
-
-
 def _first(way: str, one: Findings) -> Cause:
     """Take the first explanation that holds."""
-    off = _off(one.rows)
-    explanations = (_of_machine(one), _of_order(off), _of_delay(one), _of_chance(off))
+    off = are_off(one.rows)
+    explanations = (
+        _of_machine(one),
+        _of_order(off),
+        _of_delay(off, one.evidence.applied),
+        _of_chance(off),
+    )
     for explanation in explanations:
         for code, text in explanation:
             return Cause(code, way, text)
@@ -128,16 +130,14 @@ def _first(way: str, one: Findings) -> Cause:
 
 
 def _beyond(way: str, one: Findings) -> Cause | None:
-    """Explain losses but for what a shaper had no time to read."""
-    evidence, row = one.evidence, _off(one.rows).get("loss")
-    if row is None:
-        return None
+    """Explain what a shaper that does not get its CPU leaves unexplained."""
+    evidence = one.evidence
     unread = (evidence.unread or 0) / evidence.sent if evidence.sent else 0.0
-    measured = max(0.0, row.measured - unread)
-    if row.low <= measured <= row.high:
-        return None
-    code, text = next(_of_chance({"loss": row._replace(measured=measured)}))
-    return Cause(code, way, text)
+    off = beyond(one.rows, unread)
+    for explanation in (_of_order(off), _of_delay(off, evidence.applied), _of_chance(off)):
+        for code, text in explanation:
+            return Cause(code, way, text)
+    return None
 
 
 def _of_machine(one: Findings) -> Iterator[tuple[str, str]]:
@@ -167,13 +167,13 @@ def _of_machine(one: Findings) -> Iterator[tuple[str, str]]:
     if evidence.layers is not None and evidence.layers > 1:
         yield "shaped_twice", f"the flow passes {evidence.layers} shapers: remove all but one"
     stopped = evidence.throttled or 0.0
-    if stopped > THROTTLED_SHARE and _may_be_lateness(rows, sqrt(stopped) * CPU_PERIOD):
+    if stopped > THROTTLED_SHARE and may_be_lateness(rows, sqrt(stopped) * CPU_PERIOD):
         yield (
             "throttled",
             f"the shaper was stopped by its CPU limit in {stopped:.0%} of the periods: "
             "raise link.resources.limits.cpu",
         )
-    if evidence.late is not None and evidence.late > LATE and _may_be_lateness(rows, evidence.late):
+    if evidence.late is not None and evidence.late > LATE and may_be_lateness(rows, evidence.late):
         yield (
             "throttled",
             f"the shaper releases late, 1 % by more than {evidence.late * 1e3:.1f} ms: it does not "
@@ -183,23 +183,6 @@ def _of_machine(one: Findings) -> Iterator[tuple[str, str]]:
 
 def _lost_share(rows: Sequence[Row]) -> float:
     return next((row.measured for row in rows if row.name == "loss"), 0.0)
-
-
-def _may_be_lateness(rows: Sequence[Row], late: float) -> bool:
-    """Say whether releases so late [s] may explain what is off: delays, and not by more."""
-    off, found = _off(rows), {row.name: row for row in rows}
-    if not {"mean", "deviation"} <= found.keys():
-        return False
-    mean, deviation = found["mean"], found["deviation"]
-    by = mean.measured - mean.asked
-    if by > late or ("mean" in off and by < 0.0):
-        return False
-    if "rate" in off and off["rate"].measured > off["rate"].asked:
-        return False
-    spread = deviation.measured**2 - deviation.asked**2
-    if spread > late**2 or ("deviation" in off and spread < 0.0):
-        return False
-    return any(name in off for name in ("mean", "rate", *_SCATTER))
 
 
 def _wrong_interface(evidence: Evidence) -> str:
@@ -212,7 +195,7 @@ def _of_order(off: Mapping[str, Row]) -> Iterator[tuple[str, str]]:
     row = off.get("reordered")
     if row is None:
         return
-    if row.measured < 0.2 * row.asked and not _unshaped(off):
+    if row.measured < SHARE_KEPT * row.asked and not _unshaped(off):
         yield (
             "order_kept",
             f"{row.asked:.1%} of the packets should be overtaken, {row.measured:.1%} are: order is "
@@ -227,9 +210,10 @@ def _unshaped(off: Mapping[str, Row]) -> bool:
     return mean is not None and mean.measured < _NOTHING * mean.asked
 
 
-def _of_delay(one: Findings) -> Iterator[tuple[str, str]]:
+def _of_delay(
+    off: Mapping[str, Row], applied: DirectionProfile | None
+) -> Iterator[tuple[str, str]]:
     """Conclude from the delays."""
-    off, applied = _off(one.rows), one.evidence.applied
     mean = off.get("mean")
     if mean is not None and not isnan(mean.measured):
         told = said(mean, applied)
@@ -262,11 +246,13 @@ _SCATTER = {
 
 def _of_rate(off: Mapping[str, Row]) -> Iterator[tuple[str, str]]:
     row = off["rate"]
-    if row.measured > row.asked:
-        text = f"{kbit(row.measured)} instead of {kbit(row.asked)}: the rate is ignored"
-        yield "rate_ignored", text
+    told = isnan(row.measured)
+    rate = row.applied if told else row.measured
+    text = f"{'the shaper says ' if told else ''}{kbit(rate)} instead of {kbit(row.asked)}"
+    if rate > row.asked:
+        yield "rate_ignored", f"{text}: the rate is ignored"
     else:
-        yield "slow", f"{kbit(row.measured)} instead of {kbit(row.asked)}: something is slower"
+        yield "slow", f"{text}: something is slower"
 
 
 def _of_chance(off: Mapping[str, Row]) -> Iterator[tuple[str, str]]:

@@ -55,17 +55,27 @@ def test_what_is_lost_invented_or_swapped_is_found() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ours_us", "missed"), [(20.0, set()), (80.0, {"p50", "p99", "asyncio"}), (-5.0, {"early"})]
+    ("fifo", "ours_us", "missed"),
+    [
+        (True, 20.0, set()),
+        (True, 55.0, {"p99"}),
+        (True, 80.0, {"p50", "p99", "asyncio"}),
+        (True, -5.0, {"early"}),
+        (False, 55.0, set()),
+        (False, 80.0, {"p50", "p99"}),
+        (False, -5.0, {"early"}),
+    ],
 )
 def test_release_errors_are_judged_against_the_anchors_of_the_run(
-    ours_us: float, missed: set[str]
+    fifo: bool, ours_us: float, missed: set[str]
 ) -> None:
-    sizes = {OURS: ours_us, OF_C: 40.0, OF_ASYNCIO: 1100.0, WAKE: 30.0}
+    """Without SCHED_FIFO: the p99 is at most 1.5 times the C relay's, not a waking's."""
+    sizes = {OURS: ours_us, OF_C: 40.0, OF_ASYNCIO: 1150.0, WAKE: 30.0}
     found = Releases(
         {name: [np.full(1000, us * 1e-6)] for name, us in sizes.items()},
         {name: [0.05] for name in (OURS, OF_C, OF_ASYNCIO)},
     )
-    lines = releases(found, fifo=True)
+    lines = releases(found, fifo=fifo)
     wrong = [line.what for line in lines if not line.held]
     if missed == {"early"}:
         assert "released early" in wrong

@@ -103,5 +103,8 @@ def test_what_is_judged_more_loosely_than_usual_is_said() -> None:
     assert list(notes("uplink", plan, None)) == []
     loose = replace(plan, expects=replace(plan.expects, share=0.25))
     assert "within 25%" in "".join(notes("uplink", loose, None))
+    little = make_plan(DirectionProfile(0.02, 0.001), 200)
+    assert "jitter, judged within 0.5 ms only" in "".join(notes("uplink", little, None))
+    assert list(notes("uplink", make_plan(DirectionProfile(0.02), 200), None)) == []
     never = replace(plan, expects=replace(plan.expects, share=0.0))
     assert "jitter NOT JUDGED" in "".join(notes("uplink", never, None))

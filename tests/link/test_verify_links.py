@@ -122,6 +122,17 @@ def test_a_relay_that_does_not_get_its_cpu_is_named() -> None:
     assert "40%" in find_causes(found)[0].text
 
 
+@pytest.mark.parametrize("fault", ["order_kept", "rate_ignored", "halved_delay", "no_loss"])
+def test_a_relay_that_does_not_get_its_cpu_hides_nothing_that_this_cannot_cause(fault: str) -> None:
+    """It adds delay, scatter and losses; it never makes a link quicker, or more orderly."""
+    profile, real, _, evidence = FAULTS[fault]
+    deaf = replace(evidence, shaper="relay", sent=2000, unread=99)
+    codes = [cause.code for cause in find_causes({"uplink": probe(asked(profile), real, 1)})]
+    assert codes == [fault]
+    found = {"uplink": probe(asked(profile), real, 1, evidence=deaf)}
+    assert [cause.code for cause in find_causes(found)] == ["throttled", fault]
+
+
 def test_a_qdisc_that_was_put_back_is_not_told_as_one_direction() -> None:
     """For a while everything of one way went straight through."""
     back = told(applied=PAPER, restored=1)
