@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 from math import inf, nan
 from typing import Any, NamedTuple
 
-from cloudrc.cli.link_verify_notes import on_jitter
+from cloudrc.cli.link_verify_notes import on_deviation, on_jitter
 from cloudrc.cli.link_verify_text import NOT_JUDGED, Said
 from cloudrc.cluster.fetch import METRICS
 from cloudrc.cluster.forward import DIRECTLY
 from cloudrc.errors import TimedOutError
 from cloudrc.link.sidecar_told import Told, read_told
-from cloudrc.link.verify_applied import shown
+from cloudrc.link.verify_applied import rate_in_force, shown
 from cloudrc.link.verify_causes import Evidence, Findings, find_causes
 from cloudrc.link.verify_evidence import Samples, of_metrics, of_told, samples, shaper_of
 from cloudrc.link.verify_judge import Row
@@ -63,7 +63,7 @@ def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -
     """
     hears = {"uplink": "cloud", "downlink": "world"}
     sends = {"uplink": "world", "downlink": "cloud"}
-    until, seen = time.monotonic() + limit, dict[str, dict[str, Any]]()
+    until, off_until, seen = time.monotonic() + limit, inf, dict[str, dict[str, Any]]()
     before = {way: _counters(pods[end], way) for way, end in sends.items()}
     while True:
         tell(", ".join(_progress(way, seen.get(way, {})) for way in hears))
@@ -72,9 +72,9 @@ def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -
         verdicts = {way: found["verdict"] for way, found in seen.items()}
         if len(seen) == len(hears) and "open" not in verdicts.values():
             break
-        if len(seen) == len(hears) and "off" in verdicts.values():
-            until = min(until, time.monotonic() + OTHER_LIMIT)
-        if time.monotonic() > until:
+        off = len(seen) == len(hears) and "off" in verdicts.values()
+        off_until = min(off_until, time.monotonic() + OTHER_LIMIT) if off else inf
+        if time.monotonic() > min(until, off_until):
             break
     tell("")
     silent = [end for way, end in hears.items() if way not in seen]
@@ -92,7 +92,7 @@ def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -
         shaper=f"shaped by {' and '.join(names)}",
         findings=findings,
         probes={way: _describe(seen[way]) for way in hears},
-        notes=[note for way in hears for note in _notes(way, seen[way], findings[way].evidence)],
+        notes=[note for way in hears for note in _notes(way, seen[way], findings[way])],
         causes=find_causes(findings),
         more="too few datagrams yet: the ends go on judging, ask again (above: when)",
     )
@@ -155,7 +155,11 @@ def _findings(
         unread=None,  # since it began: long ago
     )
     applied = shown(known.applied, SIZES[_FLIES[way]]) if known.applied else {}
-    return Findings(_rows(found, applied), known)
+    rows = _rows(found, applied)
+    told_of = {row["quantity"] for row in found["rows"]}  # a time line may have had other rates
+    if (asked := _rate_asked(found)) and known.applied and "time_line" not in told_of:
+        rows += rate_in_force(asked, known.applied.rate or inf)
+    return Findings(rows, known)
 
 
 def _rows(found: Mapping[str, Any], applied: Mapping[str, float]) -> list[Row]:
@@ -171,12 +175,18 @@ def _rows(found: Mapping[str, Any], applied: Mapping[str, float]) -> list[Row]:
     return rows
 
 
+def _rate_asked(found: Mapping[str, Any]) -> float | None:
+    """Look up what an end asks of the bottleneck [bit/s]; None without one."""
+    rates = (float(row["asked"]) for row in found["rows"] if row["quantity"] == "rate")
+    return next(rates, None)
+
+
 def _describe(found: Mapping[str, Any]) -> str:
     counts = [int(row["datagrams"]) for row in found["rows"]]
     return f"{max(counts, default=0)} of the tunnel's own datagrams"
 
 
-def _notes(way: str, found: Mapping[str, Any], evidence: Evidence) -> list[str]:
+def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> list[str]:
     if not found["rows"]:
         what = "commands" if way == "downlink" else "telemetry"
         hint = "fly a mission first" if way == "downlink" else "is the other end ready?"
@@ -187,10 +197,13 @@ def _notes(way: str, found: Mapping[str, Any], evidence: Evidence) -> list[str]:
         notes.append(f"{way}: the ends do not share a clock: round trips are judged, not one way")
     elif "mean" not in rows and "loss" in rows:
         notes.append(f"{way}: delays {NOT_JUDGED}: the ends do not share a clock")
-    if "rate" in rows:
-        rate = kbit(float(rows["rate"]["asked"]))
-        says = f" (applied: {kbit(evidence.applied.rate or inf)})" if evidence.applied else ""
-        notes.append(f"{way}: rate of {rate}{says} {NOT_JUDGED}: its datagrams come alone")
+    asked, judged = _rate_asked(found), any(row.name == "rate" for row in finding.rows)
+    if asked and not judged:
+        applied = finding.evidence.applied
+        says = f" (applied: {kbit(applied.rate or inf)})" if applied else ""
+        notes.append(f"{way}: rate of {kbit(asked)}{says} {NOT_JUDGED}: its datagrams come alone")
+    if "deviation" in rows and not {"variation", "middle"} & rows.keys():
+        notes += on_deviation(way, float(rows["deviation"]["asked"]))
     if "jitter_share" in rows:
         notes += on_jitter(way, float(rows["jitter_share"]["measured"]))
     if "time_line" in rows and (share := float(rows["time_line"]["measured"])) < _WATCHED:

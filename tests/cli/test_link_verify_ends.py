@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -35,16 +36,19 @@ class Release:
     pods: dict[str, Pod]
     bypassed: bool = False
     looks: int = 0
+    verdicts: int = 0
 
     def hears(self, end: str, mean: str, *, trip: bool = False) -> None:
         """Let an end come to a verdict on the direction that it hears."""
         exporter, uplink = (self.cloud, True) if end == "cloud" else (self.world, False)
         measured = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}[mean]
         name = "round_trip" if trip else "mean"
+        self.verdicts += 1
+        now = self.verdicts
         exporter.see(
             [
-                LinkChecked(5, uplink, name, 0.045, measured, 0.043, 0.047, mean, 3300),
-                LinkChecked(5, uplink, "loss", 0.0, 0.0, 0.0, 0.02, "ok", 3300),
+                LinkChecked(now, uplink, name, 0.045, measured, 0.043, 0.047, mean, 3300),
+                LinkChecked(now, uplink, "loss", 0.0, 0.0, 0.0, 0.02, "ok", 3300),
             ]
         )
 
@@ -173,6 +177,25 @@ def test_once_one_direction_is_off_the_other_is_not_waited_for_in_full(
     assert release.looks <= 3, "once at the start, once it is off"
 
 
+def test_what_was_off_for_a_moment_does_not_cut_the_wait_short(
+    release: Release, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link_verify_ends, "OTHER_LIMIT", 0.05)
+    release.hears("world", "off")
+    release.hears("cloud", "open")
+    began = time.monotonic()
+
+    def goes_on(seconds: float) -> None:
+        release.count(seconds)
+        if release.looks > 2:
+            release.hears("world", "ok")
+        if time.monotonic() - began > 0.2:
+            release.hears("cloud", "ok")
+
+    monkeypatch.setattr(link_verify_ends.time, "sleep", goes_on)
+    assert ask(release).verdict == "believed"
+
+
 def test_a_link_that_does_not_tell_leaves_what_is_applied_open(release: Release) -> None:
     release.links["uplink"].tells(lambda: "{}")
     release.hears("world", "ok")
@@ -201,6 +224,7 @@ def test_what_the_ends_cannot_judge_is_said_and_no_blank_belief(release: Release
     release.hears("cloud", "ok")
     for name, asked, measured in (
         ("rate", 2e6, float("nan")), ("time_line", 1.0, 0.0), ("jitter_share", 0.1, 0.25),
+        ("deviation", 0.0006, 0.0007),
     ):  # fmt: skip
         row = LinkChecked(5, True, name, asked, measured, measured, measured, "told", 3300)
         release.cloud.see([row])
@@ -209,8 +233,30 @@ def test_what_the_ends_cannot_judge_is_said_and_no_blank_belief(release: Release
     assert said.verdict == "believed"
     assert "rate of 2000 kbit/s (applied: 3000 kbit/s) NOT JUDGED" in text
     assert "0% was watched" in text
+    assert "jitter, judged within 0.5 ms only" in text
     assert "within 25% only" in text
     assert text.splitlines()[-1].endswith("but for what is NOT JUDGED (above)")
+
+
+@pytest.mark.parametrize(
+    ("asked", "applied", "code"),
+    [(2e6, 3e6, "rate_ignored"), (2e6, None, "rate_ignored"), (5e6, 3e6, "slow")],
+)
+def test_a_shaper_that_tells_of_another_rate_is_not_believed(
+    release: Release, asked: float, applied: float | None, code: str
+) -> None:
+    """Its datagrams come alone, and are as long under way at any rate."""
+    said_so = write_told(Told("relay", "", DirectionProfile(0.045, rate=applied)))
+    release.links["uplink"].tells(lambda: said_so)
+    release.hears("world", "ok")
+    release.hears("cloud", "ok")
+    release.cloud.see([LinkChecked(5, True, "rate", asked, math.nan, 0.0, 0.0, "told", 3300)])
+    said = ask(release)
+    assert said.verdict == "not believed"
+    assert [(cause.code, cause.way) for cause in said.causes] == [(code, "uplink")]
+    applied_text = f"{applied * 1e-3:.0f} kbit/s" if applied else "no limit"
+    assert f"the shaper says {applied_text} instead of" in said.causes[0].text
+    assert "NOT JUDGED" not in as_text(said)
 
 
 def test_what_is_undecided_says_how_long_it_takes(release: Release) -> None:
