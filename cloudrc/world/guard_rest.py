@@ -132,7 +132,7 @@ class TakeOff:
             high: The opposite one [m], shape (3,).
         """
         self._low, self._high = low, high
-        self._stopped = False
+        self._stopped, self._still = False, 0
         self.forget()
 
     @property
@@ -146,8 +146,9 @@ class TakeOff:
         Args:
             stopped: Whether its rotors were stopped elsewhere than on the ground, perhaps.
         """
-        self.over, self._height, self._still = False, nan, 0
-        self._stopped = self._stopped or stopped
+        self.over, self._height = False, nan
+        if stopped:
+            self._stopped, self._still = True, 0
 
     def look(self, readings: Readings, flies: bool) -> None:
         """Note where the robot stands, or see whether it has left.
