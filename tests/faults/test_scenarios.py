@@ -50,6 +50,7 @@ def test_a_page_is_of_its_mode_s_faults_and_no_check_on_it_has_failed(
     skipped = re.findall(r"^### .*: skipped$", measured, re.MULTILINE)
     assert len(passed) + len(skipped) == len(rows)
     assert mode != "virtual" or not skipped
+    assert "not run yet" not in measured
     assert [pair for pair in passed if pair[0] != pair[1] or pair[0] == "0"] == []
     assert "FAILED" not in measured
     assert ": NO" not in measured
