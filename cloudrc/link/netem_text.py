@@ -108,12 +108,18 @@ def limit(profile: DirectionProfile) -> int:
     pieces = list(_pieces(profile))
     if all(piece.rate is None for piece in pieces):
         return LIMIT
-    return ceil(profile.queue_packets + max(_under_way(profile, piece) for piece in pieces))
+    reach = stretch(profile) * _TABLE_END  # once: a trace has many pieces, a table many entries
+    return ceil(profile.queue_packets + max(_under_way(piece, reach) for piece in pieces))
 
 
-def _under_way(profile: DirectionProfile, piece: Conditions) -> float:
-    """Say how many packets behind the bottleneck are under way at once, at most."""
-    longest = piece.delay_ns * 1e-9 + piece.jitter * stretch(profile) * _TABLE_END
+def _under_way(piece: Conditions, reach: float) -> float:
+    """Say how many packets behind the bottleneck are under way at once, at most.
+
+    Args:
+        piece: Of the time line.
+        reach: Longest draw, in units of the jitter [1].
+    """
+    longest = piece.delay_ns * 1e-9 + piece.jitter * reach
     return longest * (_PACKETS if piece.rate is None else piece.rate / _PACKET_BITS)
 
 
