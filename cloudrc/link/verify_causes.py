@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.verify_judge import Row
-from cloudrc.link.verify_starved import SHARE_KEPT, are_off, beyond, may_be_lateness
+from cloudrc.link.verify_starved import SCATTER, SHARE_KEPT, are_off, beyond, may_be_lateness
 from cloudrc.link.verify_words import kbit, ms, said, times
 
 LATE = 1.5e-3
@@ -232,16 +232,9 @@ def _of_delay(
         yield from _of_rate(off)
     row = off.get("deviation") or off.get("variation") or off.get("middle")
     if row is not None:
-        word = _SCATTER[row.name]
+        word = SCATTER[row.name]
         text = f"{word} {ms(row.measured)} instead of {ms(row.asked)}: another jitter"
         yield "wrong_jitter", text
-
-
-_SCATTER = {
-    "deviation": "standard deviation",
-    "variation": "variation",
-    "middle": "deviation in the middle",
-}
 
 
 def _of_rate(off: Mapping[str, Row]) -> Iterator[tuple[str, str]]:

@@ -6,6 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from cloudrc.link.verify_judge import Row
 
+SCATTER = {
+    "deviation": "standard deviation",
+    "variation": "variation",
+    "middle": "deviation in the middle",
+}
+"""Rows that tell of the jitter, in words."""
 SHARE_KEPT = 0.2
 """If less than this share of what should be overtaken is, order is kept."""
 _RATE_TIMES = 4.0
@@ -32,7 +38,7 @@ def may_be_lateness(rows: Sequence[Row], late: float) -> bool:
     spread = deviation.measured**2 - deviation.asked**2
     if spread > late**2 or ("deviation" in off and spread < 0.0):
         return False
-    return any(name in off for name in ("mean", "rate", "deviation", "variation", "middle"))
+    return any(name in off for name in ("mean", "rate", *SCATTER))
 
 
 def beyond(rows: Sequence[Row], unread: float) -> Mapping[str, Row]:
