@@ -79,7 +79,7 @@ class Netem:
 
     def _follow(self, profile: DirectionProfile, origin_ns: int) -> None:
         self._profile, self._timeline = profile, Timeline(profile)
-        self._origin_ns, self._piece = origin_ns, -1
+        self._origin_ns, self._piece, self._piece_room = origin_ns, -1, 0
         self._room = self._least_room = limit(profile)
         if self._tables is not None:
             write_measured(self._tables, profile)
@@ -218,14 +218,14 @@ class Netem:
     def _take_back_room(self, qdiscs: list[dict[str, Any]]) -> None:
         """Let the limit be as asked, once what was under way at a change in flight has left."""
         if self._least_room < self._room and counters(qdiscs).get("held", 0) < self._least_room:
-            self._room, self._piece = self._least_room, -1  # the next step puts it in force
+            self._room = self._least_room  # the next step puts it in force
 
     def _apply(self, verb: str) -> None:
         """Let what holds now be in force, unless it is."""
         elapsed_ns = self._clock() - self._origin_ns
         starts_ns = self._timeline.starts_ns
         piece = max(bisect_right(starts_ns, elapsed_ns) - 1, 0)
-        if piece == self._piece and self._applied:
+        if (piece, self._room) == (self._piece, self._piece_room) and self._applied:
             return
         wanted = options(self._profile, self._timeline.at(elapsed_ns), self._room)
         if wanted != self._applied:
@@ -239,7 +239,7 @@ class Netem:
             self.steps.note(done_ns - due_ns, piece - self._piece - 1)
             if piece == len(starts_ns) - 1:
                 self._log(self.steps.in_words())
-        self._piece = piece
+        self._piece, self._piece_room = piece, self._room
 
     def _next_ns(self) -> int | None:
         """Say when to look at the time line again [ns]; None if nothing more will happen."""

@@ -11,7 +11,7 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.netem_keep import counters
 from cloudrc.link.netem_tc import Answer, explain, may_shape, try_netem
 from cloudrc.link.netem_text import limit
-from cloudrc.link.profile import DirectionProfile, Trace
+from cloudrc.link.profile import Change, DirectionProfile, Trace
 
 
 def test_only_the_tunnels_flow_to_the_peer_is_sent_to_netem() -> None:
@@ -63,6 +63,19 @@ def test_what_is_under_way_has_room_until_it_has_left() -> None:
     for _ in range(2):
         shaper.step(1.0)
     assert f"limit {limit(small)} " in kernel.said[-1]
+
+
+def test_a_step_that_is_due_as_room_is_taken_back_is_counted() -> None:
+    kernel, clock = Kernel(), Clock()
+    shaper = netem(kernel, DirectionProfile(1.0, rate=1e6, queue_packets=10), clock)
+    shaper.follow_peer(PEER)
+    kernel.held = 100
+    small = DirectionProfile(0.02, rate=1e6, queue_packets=10, changes=(Change(1.0, delay=0.05),))
+    shaper.follow_profile(small)
+    kernel.held, clock.now_ns = 3, 1_500_000_000
+    shaper.step(0.1)
+    assert f"limit {limit(small)} delay 50000.000us" in kernel.said[-1]
+    assert shaper.steps.applied == 1
 
 
 def test_a_change_is_a_change_and_the_same_again_is_nothing() -> None:
