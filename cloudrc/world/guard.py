@@ -137,7 +137,7 @@ class Guard:
     def acknowledge(self, now_ns: int) -> None:
         """The operator knows why the robot lands or was stopped; no mission is on."""
         if self.latched and not self._flies:
-            self._enter(GROUND, now_ns, "acknowledged")
+            self._enter(GROUND, now_ns, f"acknowledged{self._take_off.condition}")
         elif self.state is LAND:
             self._enter(HOLD, now_ns, "acknowledged before touch-down")
 

@@ -140,6 +140,11 @@ class TakeOff:
         """Whether it may leave the ground."""
         return not self._stopped or self._still >= STILL_TICKS
 
+    @property
+    def condition(self) -> str:
+        """What has yet to come before it may, in words; "" if nothing."""
+        return "" if self.allowed else ", takes off once it has been still inside the fence"
+
     def forget(self, *, stopped: bool = False) -> None:
         """The robot stands, or will; the next take-off is another one.
 

@@ -13,7 +13,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.tunnel.codec import Kind
 from tools.bench_link.draws import measure_bursts
-from tools.bench_link.flow import EPOCH, SIZE, Flow
+from tools.bench_link.flow import EPOCH, SIZE, Flow, since_first_ns
 from tools.bench_link.judge import judge
 from tools.bench_link.overload import Overloaded, Served
 from tools.bench_link.release import OF_ASYNCIO, OF_C, OURS, WAKE, Releases
@@ -52,6 +52,19 @@ def test_what_is_lost_invented_or_swapped_is_found() -> None:
     found.arrived[100], found.arrived[101] = found.arrived[101], found.arrived[100]
     judged = judge(found, PROFILE, 1, START)
     assert (judged.wrongly_lost, judged.wrongly_arrived, judged.swapped) == (1, 1, 1)
+
+
+@pytest.mark.parametrize("ways", [1, 2])
+def test_no_datagram_leaves_while_a_row_of_a_trace_may_begin(ways: int) -> None:
+    """One that is stamped before a change, and arrives after it, would be judged by the wrong row.
+
+    It would be seen "early" by the difference of the two rows, some milliseconds.
+    """
+    period_ns = 10 * MS
+    sent = [since_first_ns(n, turn, ways, period_ns) for n in range(20) for turn in range(ways)]
+    assert sent[0] == 0
+    assert sent == sorted(sent)
+    assert min(min(at % period_ns, -at % period_ns) for at in sent[1:]) == period_ns // 4
 
 
 @pytest.mark.parametrize(

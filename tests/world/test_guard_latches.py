@@ -212,6 +212,21 @@ def test_an_acknowledged_stop_is_on_the_ground_and_arms_nothing():
     assert guard.state is TRACK
 
 
+@pytest.mark.parametrize(
+    ("position", "velocity", "condition"),
+    [
+        ((1.0, 2.0, 0.1), ZERO, ""),
+        ((1.0, 2.0, 0.1), (0.0, 0.0, -0.5), ", takes off once it has been still inside the fence"),
+        ((9e9, 2.0, 0.1), ZERO, ", takes off once it has been still inside the fence"),
+    ],
+)
+def test_an_acknowledgement_says_what_a_take_off_still_waits_for(position, velocity, condition):
+    guard = stopped(tracking())
+    run(guard, 1 * SECOND, 2 * SECOND, position, velocity)
+    guard.acknowledge(2 * SECOND)
+    assert guard.take_changes()[-1] == (2 * SECOND, GROUND, f"acknowledged{condition}")
+
+
 def test_a_landing_that_is_acknowledged_in_the_air_holds():
     guard = landing()
     run(guard, 2 * SECOND, 3 * SECOND, velocity=(0.0, 0.0, -0.5))

@@ -92,6 +92,8 @@ def profiles(
     swapped = sum(row.judged.swapped for row in rows)
     early = sum(int((row.judged.errors < 0).sum()) for row in rows)
     count = sum(row.judged.errors.size for row in rows)
+    least = min(float(row.judged.errors.min()) for row in rows)
+    by = f", by {-least * MS:.4f} ms" if early else ""
     replayed = min(
         correlation(row.judged, profile)
         for row, profile in zip(
@@ -110,7 +112,7 @@ def profiles(
              f"{WAKE} {woke[2]:.1f} ms", True),
         Line("lost or arrived, not as drawn", "0", f"{wrong} of {count}", "", wrong == 0),
         Line("out of the order drawn (by > 5 us)", "0", f"{swapped} of {count}", "", swapped == 0),
-        Line("released early, profiles", "0", f"{early} of {count}", "", early == 0),
+        Line("released early, profiles", "0", f"{early} of {count}{by}", "", early == 0),
         Line("replayed trace, correlation", ">= 0.98", f"{replayed:.4f}", "", replayed >= 0.98),
     ]  # fmt: skip
     return lines, [_detail(row) for row in rows]
