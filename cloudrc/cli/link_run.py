@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import random
 import socket
 import sys
 import threading
@@ -132,7 +133,7 @@ def _follow(
     sidecar: Sidecar, file: Profiles, options: argparse.Namespace, watcher: Metrics | None
 ) -> None:
     """Let threads of their own look after the profile's file and the peer's name."""
-    from cloudrc.link.sidecar_follow import PEER_PERIOD, PROFILE_PERIOD, PeerName
+    from cloudrc.link.sidecar_follow import PEER_PAUSE, PROFILE_PERIOD, PeerName
 
     name = PeerName(options.peer, resolve, log)
 
@@ -144,15 +145,15 @@ def _follow(
         if watcher is not None:
             watcher.unresolved(name.failures)
 
-    for action, period in ((look, PROFILE_PERIOD), (ask, PEER_PERIOD)):
-        threading.Thread(target=_every, args=(period, action), daemon=True).start()
+    for action, pause in ((look, (PROFILE_PERIOD, PROFILE_PERIOD)), (ask, PEER_PAUSE)):
+        threading.Thread(target=_again_and_again, args=(pause, action), daemon=True).start()
 
 
-def _every(period: float, action: Callable[[], None]) -> None:
-    """Act for ever, with so long a pause between [s]."""
+def _again_and_again(pause: tuple[float, float], action: Callable[[], None]) -> None:
+    """Act for ever, with a pause between that is drawn from a range [s]."""
     while True:
         action()
-        time.sleep(period)
+        time.sleep(random.uniform(*pause))
 
 
 class Metrics:

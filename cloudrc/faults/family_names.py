@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from cloudrc.faults import asks, meters
 from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import Outcome, Scenario
-from cloudrc.link.sidecar_follow import PEER_PERIOD, PeerName
+from cloudrc.faults.scenario import Outcome, Scenario, generator
+from cloudrc.link.sidecar_follow import PEER_PAUSE, PeerName
 
 
 def _names(seed: int) -> Outcome:
@@ -32,8 +34,8 @@ def _names(seed: int) -> Outcome:
     fails[0], addresses[0] = False, ["10.0.0.9"]
     outcome.true("follows the new address", peer.poll() == ("10.0.0.9", 7400))
     outcome.true("it says that too", "was 10.0.0.7" in said[-1])
-    outcome.least("it asks again not sooner than after", PEER_PERIOD, 0.1, "s")
-    outcome.most("it asks again after", PEER_PERIOD, 5.0, "s")
+    outcome.least("it asks again not sooner than after", PEER_PAUSE[0], 0.1, "s")
+    outcome.most("it asks again after", PEER_PAUSE[1], 5.0, "s")
     _flown_without_names(outcome, seed)
     return outcome
 
@@ -56,7 +58,7 @@ def _flown_without_names(outcome: Outcome, seed: int) -> None:
     asks.done(outcome, flight)
     outcome.least("cloud moves meanwhile: HOLDs", len(asks.held(flight)), 1)
     resumed = asks.resumed_after(flight, back)
-    outcome.most("flown again after the name is", resumed, PEER_PERIOD + 1.0, "s")
+    outcome.most("flown again after the name is", resumed, PEER_PAUSE[1] + 1.0, "s")
 
 
 def _follow(flight: Flight, at_home: Callable[[float], str], since: float, until: float) -> None:
@@ -83,8 +85,8 @@ def _follow(flight: Flight, at_home: Callable[[float], str], since: float, until
         return [data] if goes[0] == at_home(now_ns * 1e-9) else []
 
     ask(0)
-    for n in range(1, round(120.0 / PEER_PERIOD)):
-        flight.world.at(n * PEER_PERIOD, ask)
+    for at in np.cumsum(generator(flight.experiment.seed, 78).uniform(*PEER_PAUSE, 240)):
+        flight.world.at(float(at), ask)
     flight.cloud.tamper = deliver
 
 

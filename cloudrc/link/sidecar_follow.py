@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 PROFILE_PERIOD = 0.05
 """How often the profile's file is looked at [s]."""
-PEER_PERIOD = 1.0
-"""How often the peer's name is resolved [s]."""
+PEER_PAUSE = (0.5, 1.0)
+"""After so long the peer's name is resolved again [s]: by chance, so that the links of many
+releases do not ask their name server at once. Source: fault F19."""
 
 
 class Loaded(NamedTuple):
