@@ -64,9 +64,14 @@ class LinkContainer(Values):
     )
     traces: Texts = Field(
         {},
-        description="CSV files (name: text) that a profile written here names as its trace",
+        description="CSV files (name: text) that a profile written here, or the experiment's own "
+        "link, names as trace or table",
         json_schema_extra={
-            "propertyNames": {"pattern": r"^[-._a-zA-Z0-9]+$", "not": {"const": "profile.yaml"}}
+            "propertyNames": {
+                "pattern": r"^[-._a-zA-Z0-9]+$",
+                # They lie beside these.
+                "not": {"enum": ["profile.yaml", "change.json", "experiment.yaml"]},
+            }
         },
     )
     resources: Resources = resources("20m", "40Mi", "1", "96Mi")

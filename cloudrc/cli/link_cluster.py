@@ -8,26 +8,26 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
+from cloudrc.cli.link_cluster_hand import (
+    Given,
+    StrangeStateError,
+    hand_to_both,
+    needed,
+    take_back,
+)
 from cloudrc.cli.link_edit import DIRECTIONS, Edit, edit
 from cloudrc.cluster.errors import ClusterError
-from cloudrc.cluster.link import (
-    COMPONENTS,
-    PROFILE,
-    LinkParts,
-    Place,
-    hand_over,
-    write_files,
-)
+from cloudrc.cluster.link import COMPONENTS, PROFILE, LinkParts, Place, write_files
 from cloudrc.config import document, yaml_text
 from cloudrc.config.load import FILES
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.link.sidecar_handed import Handed, write_handed
-from cloudrc.link.state import CHANGE_FILE, read_change
+from cloudrc.link.sidecar_handed import Handed
+from cloudrc.link.state import CHANGE_FILE, LinkState, read_change
 
 SIZE_MAX = 1_000_000
 """What a ConfigMap takes in all, a little less than its 1 MiB [bytes]."""
@@ -41,11 +41,14 @@ class HandedOver(NamedTuple):
         edit: What was changed.
         told: What uplink and downlink tell of themselves then.
         keep: Writes it into the ConfigMap, so that it lasts; raises a ClusterError.
+        take_back: Hands the files of before over again, and says what holds then; "" if that is
+            just what held before.
     """
 
     edit: Edit
-    told: list[str]
+    told: list[LinkState]
     keep: Callable[[], None]
+    take_back: Callable[[], str]
 
 
 def hand_profile(
@@ -55,7 +58,7 @@ def hand_profile(
     settings: Sequence[str],
     change: Callable[[Edit], str],
 ) -> HandedOver:
-    """Change the profile of a release, and wait until both directions have taken it over.
+    """Change the profile of a release, and wait until both directions have decided.
 
     Args:
         place: Where the release is.
@@ -69,31 +72,52 @@ def hand_profile(
     """
     made, files = with_files(link.files, profile, settings)
     files[CHANGE_FILE] = change(made)
-    named = {str(one[key]) for one in made.values.values() if isinstance(one, dict)
-             for key in FILES if key in one}  # fmt: skip
-    whole = {key: text for key, text in {**link.files, **files}.items() if key in named}
+    whole = needed(made.values, {**link.files, **files})
     before = read_change(link.files.get(CHANGE_FILE, "")).number
-    handed = Handed(files[CHANGE_FILE], before, {PROFILE: files[PROFILE], **whole})
-    text = write_handed(handed)
-    with ThreadPoolExecutor(len(COMPONENTS)) as pool:
-        told = [pool.submit(hand_over, place, link.pods[part], text) for part in COMPONENTS]
-    refused = [error for one in told if isinstance(error := one.exception(), CloudrcError)]
+    handed = Handed(files[CHANGE_FILE], before, whole)
+    answers = hand_to_both(place, link, dict.fromkeys(COMPONENTS, handed))
+    given = Given(read_change(files[CHANGE_FILE]), answers)
+    keep = partial(write_files, place, link.name, files)
+    back = partial(take_back, place, link, given)
+    if failed := [one for one in answers.values() if isinstance(one, CloudrcError)]:
+        _keep_or_take_back(failed, given, keep, back)
+    told = [one for one in answers.values() if isinstance(one, LinkState)]
+    return HandedOver(made, told, partial(_keep_all, keep), back)
 
-    def keep() -> None:
-        try:
-            write_files(place, link.name, files)
-        except CloudrcError as error:
-            if len(refused) == len(told):
-                raise
-            text = f"{error}; the link changes, until its containers start again"
-            raise ClusterError(text) from None
 
-    if refused:
+def _keep_all(keep: Callable[[], None]) -> None:
+    """Make a change last that both directions have in force."""
+    try:
         keep()
-        raise ClusterError(
-            f"{refused[0]}; the ConfigMap has the change, and the pods follow it within 2 minutes"
-        )
-    return HandedOver(made, [one.result() for one in told], keep)
+    except CloudrcError as error:
+        raise ClusterError(f"{error}; the link changes, until its pods are replaced") from None
+
+
+def _keep_or_take_back(
+    failed: Sequence[CloudrcError],
+    given: Given,
+    keep: Callable[[], None],
+    back: Callable[[], str],
+) -> NoReturn:
+    """Let the change reach by the ConfigMap whom it did not reach straight, or nobody.
+
+    Raises:
+        ClusterError: Always; it says what holds.
+    """
+    error: CloudrcError = failed[0]
+    strange = any(isinstance(one, StrangeStateError) for one in failed)
+    if not strange and not any(map(given.refused, COMPONENTS)):
+        try:
+            keep()
+        except CloudrcError as refusal:
+            if not any(map(given.took, COMPONENTS)):
+                raise
+            error = refusal
+        else:
+            raise ClusterError(
+                f"{error}; the ConfigMap has the change, and the pods follow it within 2 minutes"
+            )
+    raise ClusterError("; ".join(filter(None, [str(error), back()])))
 
 
 def with_files(

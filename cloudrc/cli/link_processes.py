@@ -16,11 +16,24 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from cloudrc.assembly import link_profile
 from cloudrc.cluster.forward import DIRECTLY
 from cloudrc.drivers.route import parse
-from cloudrc.errors import MissingPrerequisiteError, TimedOutError
+from cloudrc.errors import (
+    BadInputError,
+    CloudrcError,
+    InvalidRunError,
+    MissingPrerequisiteError,
+    TimedOutError,
+)
+from cloudrc.link.netem_text import check
 from cloudrc.link.state import STATE_FILE, LinkState, from_text
+
+if TYPE_CHECKING:
+    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.schema import Profile
 
 LOOPBACK = "127.0.0.1"
 WAYS = ("uplink", "downlink")
@@ -29,6 +42,10 @@ START_LIMIT = 90.0
 STOP_LIMIT = 2.0
 _LOOK = 0.02
 _PATIENCE = 3.0
+_KINDS = {kind.exit_code: kind for kind in (BadInputError, MissingPrerequisiteError, TimedOutError)}
+"""Exit codes of a link's process that say whose fault its end is."""
+_CHART_ADVICE, _ADVICE = "set link.mode=relay", "use --shaper relay"
+"""What a link's process advises is a value of the chart; here it is a flag."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +117,23 @@ class Shaping:
         return lines[-1] if lines else "it left no message"
 
 
+def refuse_impossible(asked: Profile | ResolvedExperiment, mode: str) -> None:
+    """Refuse what a shaper cannot be, before anything is planned or started for it.
+
+    Args:
+        asked: Has what is asked of both directions.
+        mode: "relay", "netem" or "auto".
+
+    Raises:
+        BadInputError: Names the direction and what of it netem cannot do.
+    """
+    for way in WAYS if mode == "netem" else ():
+        try:
+            check(link_profile(getattr(asked, way)))
+        except BadInputError as error:
+            raise BadInputError(f"{way}: {error}".replace(_CHART_ADVICE, _ADVICE)) from None
+
+
 @contextlib.contextmanager
 def shaping(
     places: Mapping[str, Place], config: str, profile: str, mode: str
@@ -113,7 +147,7 @@ def shaping(
         mode: "relay", "netem" or "auto".
 
     Raises:
-        MissingPrerequisiteError: If one cannot shape; it says why.
+        CloudrcError: If one cannot shape: it says why, and its exit code is the error's.
         TimedOutError: If one does not begin to.
     """
     running: dict[str, Shaping] = {}
@@ -162,11 +196,19 @@ def _wait(running: Mapping[str, Shaping]) -> None:
         for way, one in running.items():
             code = one.process.poll()
             if code is not None:
-                words = one.last_words().removeprefix("cloudrc: error: ")
-                raise MissingPrerequisiteError(f"the {way} is not shaped: {words}")
+                raise _ended(way, code, one.last_words())
         if time.monotonic() > until:
             raise TimedOutError(f"the link was not up within {START_LIMIT:g} s; try again")
         time.sleep(_LOOK)
+
+
+def _ended(way: str, code: int, words: str) -> CloudrcError:
+    """Say why a direction's process has ended, with its own exit code where that says why."""
+    words = words.removeprefix("cloudrc: error: ").replace(_CHART_ADVICE, _ADVICE)
+    kind = _KINDS.get(code)
+    if kind is None:
+        return InvalidRunError(f"the {way} is not shaped: its process ended with {code}: {words}")
+    return kind(f"the {way} is not shaped: {words}")
 
 
 def _stop(processes: Sequence[subprocess.Popen[bytes]]) -> None:

@@ -18,6 +18,7 @@ from cloudrc.cluster.errors import ClusterError
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
 
 if TYPE_CHECKING:
+    from cloudrc.cli.link_cluster import HandedOver
     from cloudrc.cli.link_edit import Edit
     from cloudrc.cluster.link import LinkParts, Place
     from cloudrc.link.state import LinkState
@@ -74,13 +75,10 @@ def execute(options: argparse.Namespace) -> int:
         states = _await(look, number, LOCAL_PATIENCE, late)
         took = monotonic() - began
     else:
-        edit, look, keep = _set_in_cluster(options, number)
-        from cloudrc.cli.link_inside import PATIENCE
-
-        late = f"within {PATIENCE:g} s; see the logs of the link containers"
-        states = _await(look, number, 0.0, late)  # the containers have waited
+        handed = _set_in_cluster(options, number)
+        edit, states = handed.edit, _whole_or_not_at_all(handed, number)
         took = monotonic() - began
-        keep()  # what a link cannot be is not kept either
+        handed.keep()
     for note in edit.notes:
         print(f"cloudrc: note: {note}", file=sys.stderr)
     if options.output != "table":
@@ -114,10 +112,8 @@ def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[E
     return made, look
 
 
-def _set_in_cluster(
-    options: argparse.Namespace, number: str
-) -> tuple[Edit, Look, Callable[[], None]]:
-    """Hand a new profile to both link containers; what is left to do is to make it last."""
+def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
+    """Hand a new profile to both link containers."""
     from concurrent.futures import ThreadPoolExecutor
 
     from cloudrc.cluster.access import DEFAULT_RELEASE
@@ -129,23 +125,28 @@ def _set_in_cluster(
         # Meanwhile, since it takes as long: a change is to be in force within a second.
         from cloudrc.cli.link_cluster import hand_profile
         from cloudrc.cli.link_edit import check
-        from cloudrc.link.state import from_text
 
         if looking.exception() is not None:
             check(options.profile, options.settings)  # what is wrong here comes first
         link = looking.result()
-    made, told, keep = hand_profile(
+    return hand_profile(
         where,
         link,
         options.profile,
         options.settings,
         lambda edit: _change(edit, number),
     )
+
+
+def _whole_or_not_at_all(handed: HandedOver, number: str) -> list[LinkState]:
+    """See that both directions have a change; what one cannot be the other does not stay."""
+    from cloudrc.cli.link_inside import PATIENCE
+
+    late = f"within {PATIENCE:g} s; see the logs of the link containers"
     try:
-        states = [from_text(text) for text in told]
-    except ValueError as error:
-        raise ClusterError(f"a link container is of another version: {error}") from error
-    return made, lambda: states, keep
+        return _await(lambda: handed.told, number, 0.0, late)  # the containers have waited
+    except CloudrcError as error:
+        raise type(error)("; ".join(filter(None, [str(error), handed.take_back()]))) from None
 
 
 def _link_of(options: argparse.Namespace, where: Place) -> LinkParts:

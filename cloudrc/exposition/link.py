@@ -16,6 +16,12 @@ from cloudrc.exposition.labels import (
 from cloudrc.exposition.part import Handlers, Readings, by, chosen, plain
 from cloudrc.records import Counted
 
+_OF_ONE_SHAPER = {
+    "cloudrc_link_restored_total": "restored",
+    "cloudrc_link_released_early_total": "released_early",
+}
+"""Metric -> what the one shaper that knows it calls the count."""
+
 
 class Link:
     """One process that shapes one direction or both.
@@ -65,12 +71,12 @@ class Link:
             "cloudrc_dns_errors_total": plain(self._counts.get("unresolved", 0)),
             "cloudrc_link_release_error_seconds": self._late("release_error", RELEASE_PERCENTILES),
             "cloudrc_link_step_lateness_seconds": self._late("step_lateness", STEP_PERCENTILES),
-        } | self._restored()
+        } | self._of_one_shaper()
 
-    def _restored(self) -> Readings:
-        """Say how often netem was put back; empty if no netem has told."""
-        restored = self._counts.get("restored")
-        return {} if restored is None else {"cloudrc_link_restored_total": plain(restored)}
+    def _of_one_shaper(self) -> Readings:
+        """Count what netem or the relay alone can tell; what nobody has told is not there."""
+        counts = dict(self._counts)  # copied at once: the other thread may go on
+        return {name: plain(counts[one]) for name, one in _OF_ONE_SHAPER.items() if one in counts}
 
     def _late(self, what: str, percentiles: Mapping[str, str]) -> dict[Labels, float]:
         """Say how late a relay was, or a qdisc was stepped [s]; empty if nobody has told."""

@@ -51,6 +51,12 @@ LINKS = (
         percentile=tuple(RELEASE_PERCENTILES),
     ),
     counter(
+        "cloudrc_link_released_early_total",
+        "Datagrams that left the relay before they were due: none, unless its code is wrong; absent"
+        " with netem.",
+        (LINK,),
+    ),
+    counter(
         "cloudrc_dns_errors_total",
         "Times that the peer's name could not be resolved; the last address known is kept.",
         (LINK,),

@@ -9,8 +9,22 @@ import pytest
 import yaml
 from rendering import Object, containers, of_kind, pod_specs, render
 
-from cloudrc.config.load import dump, load_experiment, load_profile
+from cloudrc.config.load import FILES, dump, load_experiment, load_profile
 from cloudrc.config.shipped import names
+
+MEASURED = {"drive.csv": "time_s,delay_ms\n0,30\n1,40\n2,35\n"}
+NAMING: dict[str, Object] = {
+    "trace": {"uplink": {"trace": "drive.csv"}},
+    "table": {
+        "uplink": {
+            "delay_ms": 35,
+            "jitter_ms": 4,
+            "distribution": "table",
+            "table": "drive.csv",
+        }
+    },
+}
+"""Profiles by the key with which they name a file of `MEASURED`."""
 
 
 def config(objects: list[Object], name: str, folder: Path) -> Path:
@@ -76,12 +90,33 @@ def test_a_profile_stands_in_place_of_the_experiments_link(tmp_path: Path) -> No
     assert (made.uplink.delay_ms, made.downlink.delay_ms) == (0, 5)
 
 
-def test_a_trace_lies_beside_its_profile(tmp_path: Path) -> None:
-    link = {
-        "profile": {"uplink": {"trace": "drive.csv"}},
-        "traces": {"drive.csv": "time_s,delay_ms\n0,30\n"},
+@pytest.mark.parametrize("key", FILES)
+def test_a_file_lies_beside_the_profile_that_names_it(key: str, tmp_path: Path) -> None:
+    made = profile({"link": {"profile": NAMING[key], "traces": MEASURED}}, tmp_path)
+    assert getattr(made.uplink, key) == str(tmp_path / "drive.csv")
+
+
+@pytest.mark.parametrize("key", FILES)
+def test_a_file_lies_beside_the_experiment_that_names_it(key: str, tmp_path: Path) -> None:
+    """Every process loads the experiment whole, also where a profile stands in its link's place."""
+    for link in ({"traces": MEASURED}, {"traces": MEASURED, "profile": "wifi"}):
+        values = {"experiment": {"link": NAMING[key]}, "link": link}
+        folder = config(render(values), "experiment", tmp_path)
+        loaded = load_experiment(folder / "experiment.yaml")
+        assert getattr(loaded.uplink, key) == str(tmp_path / "drive.csv")
+
+
+@pytest.mark.parametrize("key", FILES)
+def test_a_file_lies_beside_the_experiments_own_link(key: str, tmp_path: Path) -> None:
+    made = profile({"experiment": {"link": NAMING[key]}, "link": {"traces": MEASURED}}, tmp_path)
+    assert getattr(made.uplink, key) == str(tmp_path / "drive.csv")
+
+
+def test_the_experiment_has_the_files_that_it_names_and_no_others() -> None:
+    link = {"profile": NAMING["trace"], "traces": MEASURED}
+    assert set(of_kind(render({"link": link}), "ConfigMap")["experiment"]["data"]) == {
+        "experiment.yaml"
     }
-    assert profile({"link": link}, tmp_path).uplink.trace == str(tmp_path / "drive.csv")
 
 
 @pytest.mark.parametrize(
@@ -146,17 +181,23 @@ def test_the_profile_is_a_directory_of_its_own() -> None:
             {"experiment": {"cloud": {"controller": {"name": "a/b.py"}}}},
             "cloud.controller: 'a/b.py'",
         ),
-        ({"link": {"profile": {"downlink": {"trace": "t.csv"}}}}, "downlink.trace names 't.csv'"),
+        *(
+            (
+                {"link": {"profile": {"downlink": {key: "t.csv"}}}},
+                f"link.profile: downlink.{key} names 't.csv', and link.traces has no such",
+            )
+            for key in FILES
+        ),
+        *(
+            (
+                {"link": {"profile": over}, "experiment": {"link": {"uplink": {key: "/my/t.csv"}}}},
+                f"experiment.link: uplink.{key} names '/my/t.csv', and link.traces has no",
+            )
+            for key in FILES
+            for over in ("wifi", None)
+        ),
     ],
 )
 def test_what_the_pods_could_not_find_is_refused_at_once(values: Object, said: str) -> None:
     with pytest.raises(Exception, match=said):
         render(values)
-
-
-def test_a_trace_that_is_written_out_is_found() -> None:
-    link = {
-        "profile": {"uplink": {"trace": "t.csv"}},
-        "traces": {"t.csv": "time_s,delay_ms\n0,1\n"},
-    }
-    assert "t.csv" in of_kind(render({"link": link}), "ConfigMap")["link"]["data"]

@@ -61,7 +61,7 @@ def test_the_objects_are_valid(path: Path, version: str) -> None:
         kubernetes_validate.validate(thing, version, strict=True)
 
 
-@pytest.mark.parametrize("name", ["mission-job", "mission-paper"])
+@pytest.mark.parametrize("name", ["link-set-role", "mission-job", "mission-paper"])
 @pytest.mark.parametrize("version", sorted({OLDEST, NEWEST}))
 def test_an_example_is_valid(name: str, version: str) -> None:
     text = (CHART / "examples" / f"{name}.yaml").read_text()

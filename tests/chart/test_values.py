@@ -99,6 +99,8 @@ def test_the_files_that_ship_are_valid(path: Any) -> None:
         ({"world": {"resources": {"limits": {"cpu": -1}}}}, "-1"),
         ({"world": {"podLabels": {"app.kubernetes.io/name": "x"}}}, "app.kubernetes.io/name"),
         ({"link": {"traces": {"profile.yaml": ""}}}, "profile.yaml"),
+        ({"link": {"traces": {"change.json": ""}}}, "change.json"),
+        ({"link": {"traces": {"experiment.yaml": ""}}}, "experiment.yaml"),
         ({"link": {"traces": {"a b": ""}}}, "a b"),
         ({"experiment": {"seed": 2**53}}, "9007199254740992"),
         ({"fullnameOverride": "1abc"}, "1abc"),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from fake_api import FakeApi, deployment, kubeconfig, pod
+from link_pods import Cluster, pretended
 
 from cloudrc.cluster import deploy, errors, follow
 from cloudrc.cluster.access import Release, connect
@@ -66,3 +67,9 @@ def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         return path
 
     return make
+
+
+@pytest.fixture
+def cluster(tmp_path: Path, pretend: Callable[[str, str], Path]) -> Cluster:
+    """A release whose link flies, and a kubectl that knows it."""
+    return pretended(tmp_path, pretend)

@@ -118,6 +118,17 @@ def test_counts_become_datagrams_of_their_direction() -> None:
     assert value(live, "cloudrc_guard_held_seconds_total") == 4
 
 
+def test_what_one_shaper_alone_knows_is_absent_with_the_other() -> None:
+    relay, netem = Live("link"), Live("link")
+    relay.see([Counted(0, "link", "released_early", 3)])
+    netem.see([Counted(0, "link", "restored", 2)])
+    early, restored = "cloudrc_link_released_early_total", "cloudrc_link_restored_total"
+    assert value(relay, early) == 3
+    assert value(netem, restored) == 2
+    assert early not in netem.read()
+    assert restored not in relay.read()
+
+
 def test_guard_and_contacts_are_counted() -> None:
     live = Live("world")
     assert value(live, "cloudrc_guard_state") == GuardState.GROUND

@@ -67,6 +67,24 @@ auto
 {{ $text | trimSuffix "\n" }}
 {{- end }}
 
+{{/* The files that a profile names, as a mapping of name to text. One that is not there would be
+     refused by the containers when they start. */}}
+{{- define "cloudrc.linkFiles" -}}
+{{- $found := dict -}}
+{{- range $way := list "uplink" "downlink" -}}
+{{- range $kind := list "trace" "table" -}}
+{{- $name := get (get $.profile $way | default dict) $kind -}}
+{{- if $name -}}
+{{- if not (hasKey $.root.Values.link.traces $name) -}}
+{{- fail (printf "%s: %s.%s names '%s', and link.traces has no such file; put its text there, under a name without folders" $.key $way $kind $name) -}}
+{{- end -}}
+{{- $_ := set $found $name (get $.root.Values.link.traces $name) -}}
+{{- end -}}
+{{- end -}}
+{{- end -}}
+{{ toYaml $found }}
+{{- end }}
+
 {{/* A native sidecar: it starts before the ends and stops after them. The only container that may
      have NET_ADMIN, and then uid 0, since an added capability is not effective for another. */}}
 {{- define "cloudrc.linkContainer" -}}
