@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
+
+if TYPE_CHECKING:
+    from cloudrc.tunnel.keys import KeySet
 
 EPILOG = """\
 Both ends of the tunnel read the same key file ('--key FILE', in the cluster
 a Secret) and follow it while they fly. 'new' on a file that is there already
 rotates: the old key stays valid beside the new one for the overlap, counted
 by each process from the moment it reads the file, so that nothing is lost
-while the file is on its way. In the cluster:
+while the file is on its way. A process that starts later accepts the old key
+only until the instant that the file holds. 'retire' takes the old key out of
+the file: who follows it refuses that key within a second. In the cluster,
+after either:
   kubectl create secret generic NAME --from-file=key=FILE \\
     --dry-run=client -o yaml | kubectl apply -f -"""
 
@@ -29,29 +37,57 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="how long the old key stays valid after a rotation (default: 300)",
     )
+    retire = verbs.add_parser("retire", help="drop the old key of a rotation before its time")
+    retire.add_argument("file", type=Path, metavar="FILE", help="made by 'new'")
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Make the key."""
-    import os
+    """Make the key, or leave one alone in its file."""
+    return _retire(options.file) if options.verb == "retire" else _make(options)
 
-    from cloudrc.drivers.epochs import replace_durably
+
+def _make(options: argparse.Namespace) -> int:
+    import os
+    import time
+
     from cloudrc.drivers.keyfile import read_keys
-    from cloudrc.tunnel.keys import KEY_SIZE, OVERLAP, Key, KeySet, write
+    from cloudrc.tunnel.keys import KEY_SIZE, OVERLAP, Key, KeySet
 
     path: Path = options.file
     previous = read_keys(path).current if path.exists() else None
     if previous is None and options.overlap is not None:
         raise BadInputError(f"--overlap: {path} is not there, so there is no old key to keep")
-    keys = KeySet(Key(os.urandom(KEY_SIZE)), previous, options.overlap or OVERLAP)
+    overlap = options.overlap or OVERLAP
+    until = None if previous is None else float(math.ceil(time.time() + overlap))
+    keys = KeySet(Key(os.urandom(KEY_SIZE)), previous, overlap, until)
+    _replace(path, keys)
+    before = f", beside {previous.name} for {keys.overlap:g} s" if previous else ""
+    print(f"key {keys.current.name}{before}: {path}")
+    return 0
+
+
+def _retire(path: Path) -> int:
+    from cloudrc.drivers.keyfile import read_keys
+    from cloudrc.tunnel.keys import KeySet
+
+    keys = read_keys(path)
+    if keys.previous is None:
+        print(f"key {keys.current.name} was alone already: {path}")
+        return 0
+    _replace(path, KeySet(keys.current))
+    print(f"key {keys.current.name} alone, {keys.previous.name} is dropped: {path}")
+    return 0
+
+
+def _replace(path: Path, keys: KeySet) -> None:
+    from cloudrc.drivers.epochs import replace_durably
+    from cloudrc.tunnel.keys import write
+
     try:
         replace_durably(path, write(keys).encode("ascii"))
     except OSError as error:
         remedy = "name a file in a folder that is there and that you may write in"
         raise BadInputError(f"{path}: {error.strerror or error}; {remedy}") from None
-    before = f", beside {previous.name} for {keys.overlap:g} s" if previous else ""
-    print(f"key {keys.current.name}{before}: {path}")
-    return 0
 
 
 def _seconds(text: str) -> float:

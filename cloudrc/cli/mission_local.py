@@ -17,6 +17,9 @@ from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, CloudrcError
 
 INTERRUPTED = 130
+CAUSED = ("HOLD", "LAND", "ESTOP")
+"""States of the guard that one wants to know the cause of."""
+CAUSE_TOLD = "world's log ('guard: ...'), the screen of 'cloudrc run', the recording ('/guard')"
 
 
 def read_mission(name: str) -> dict[str, Any]:
@@ -111,13 +114,7 @@ def _status(options: argparse.Namespace, api: Api) -> int:
         print("no mission is under way")
     if state["queue"]:
         print(f"waiting: {', '.join(state['queue'])}")
-    seen = state["seen"]
-    if seen is None:
-        print("the robot has not been seen yet; is the link up?")
-        return 0
-    where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
-    rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
-    print(f"robot at ({where}) m, guard {seen['guard']}, seen {seen['age_s']:.2f} s ago{rtt}")
+    _say_seen(state["seen"])
     return 0
 
 
@@ -174,6 +171,10 @@ def _estop(options: argparse.Namespace, api: Api) -> int:
 def _acknowledge(options: argparse.Namespace, api: Api) -> int:
     api.post("/v1/acknowledge")
     print("acknowledged: the next mission may fly")
+    print(
+        "where it was stopped or has touched down, the robot takes off only once it has been "
+        "still inside the fence"
+    )
     return 0
 
 
@@ -197,6 +198,20 @@ def _say(mission: dict[str, Any]) -> None:
     name = f" ({mission['name']})" if mission["name"] else ""
     verdict = f"; {in_words(mission['verdict'])}" if mission["verdict"] else ""
     print(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
+
+
+def _say_seen(seen: dict[str, Any] | None) -> None:
+    """Say where the robot is, how, since when, and what comes next."""
+    if seen is None:
+        print("the robot has not been seen yet; is the link up?")
+        return
+    where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
+    rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
+    guard = f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s"
+    print(f"robot at ({where}) m, {guard}, seen {seen['age_s']:.2f} s ago{rtt}")
+    if seen["guard"] in CAUSED:
+        print(f"why: {CAUSE_TOLD}")
+    print(f"next: {seen['next_step']}")
 
 
 def _print_events(events: list[dict[str, Any]]) -> None:

@@ -103,7 +103,8 @@ def _open_keys(options: argparse.Namespace) -> KeyFile:
 
     from cloudrc.drivers.keyfile import KeyFile, is_exposed
 
-    keys = KeyFile(options.key, time.monotonic_ns())
+    # Asked once, before anything flies, and for this alone: how old is a key that was replaced?
+    keys = KeyFile(options.key, time.monotonic_ns(), time.time())
     if is_exposed(options.key):
         print(f"cloudrc: warning: everybody can read {options.key}: chmod 600", file=sys.stderr)
     return keys

@@ -23,8 +23,14 @@ MAKE = "make one: cloudrc key new FILE"
 class KeyFile:
     """The keys of one end; `ring` always holds those that are valid."""
 
-    def __init__(self, path: Path, now_ns: int) -> None:
-        """Read the file for the first time [ns, monotonic clock].
+    def __init__(self, path: Path, now_ns: int, wall: float | None = None) -> None:
+        """Read the file for the first time.
+
+        Args:
+            path: Of the file.
+            now_ns: Monotonic clock [ns].
+            wall: What the wall clock says [s since 1970], to find a previous key whose time is
+                over; None to go without.
 
         Raises:
             BadInputError: If it is not there or holds no key.
@@ -33,17 +39,23 @@ class KeyFile:
         self._seen = version(path)
         self._keys = read_keys(path)
         self._due_ns = now_ns
-        self.ring = KeyRing(self._keys, now_ns)
+        self.ring = KeyRing(self._keys, now_ns, wall)
+        self._caution = "" if wall is None else self._keys.caution(wall)
 
     def follow(self, now_ns: int) -> list[Fault]:
         """Look whether the file has changed, if that is due [ns, monotonic clock].
 
         Returns:
-            What is to be told: a new key, or why the old ones stay.
+            What is to be told: a new key, why the old ones stay, and at first what is wrong with
+            the key before.
         """
         if now_ns < self._due_ns:
             return []
         self._due_ns = now_ns + PERIOD_NS
+        told, self._caution = self._caution, ""
+        return [Fault(now_ns, "key", told)] if told else self._look(now_ns)
+
+    def _look(self, now_ns: int) -> list[Fault]:
         seen = version(self._path)
         if seen == self._seen or seen is None:  # a file that is gone for a moment changes nothing
             return []
@@ -54,9 +66,15 @@ class KeyFile:
             return [Fault(now_ns, "key", f"the keys stay as they were: {error}")]
         if keys == self._keys:
             return []
-        self._keys = keys
+        before, self._keys = self.ring.current, keys
         self.ring.replace(keys, now_ns)
-        text = f"new key {keys.current.name}; the one before is valid for {keys.overlap:g} s more"
+        name = keys.current.name
+        if keys.current != before:
+            text = f"new key {name}; the one before is valid for {keys.overlap:g} s more"
+        elif keys.previous is None:
+            text = f"key {name} alone; the one before is not valid any more"
+        else:
+            text = f"key {name} as before; what is said of the one before changed"
         return [Fault(now_ns, "key", text)]
 
 

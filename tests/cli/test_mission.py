@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -186,7 +187,9 @@ def test_list_status_and_logs(
     document = json.loads(capsys.readouterr().out)
     assert (document["schemaVersion"], document["missions"][0]["id"]) == (1, "m1")
     assert mission("status") == 0
-    assert "robot at (0.00, 0.00, 0.10) m, guard TRACK" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "robot at (0.00, 0.00, 0.10) m, guard TRACK for 0." in said
+    assert said.splitlines()[-1] == "next: the robot flies its mission"
     assert mission("status", "m1", "-o", "json") == 0
     assert json.loads(capsys.readouterr().out)["events"][1]["event"] == "started"
     for words in (["logs"], ["logs", "m1"]):
@@ -221,9 +224,18 @@ def test_emergency_stop_and_acknowledgement(
     api.until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
     assert mission("run", "two.yaml") == 5
     assert "cloudrc mission acknowledge" in capsys.readouterr().err
+    assert mission("status") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert re.search(r", guard ESTOP for \d+\.\d s, seen 0\.\d\d s ago$", said[-3])
+    assert said[-2].startswith("why: world's log ('guard: ...')")
+    assert said[-1] == "next: the rotors are stopped; see why, then: cloudrc mission acknowledge"
     assert mission("acknowledge") == 0
     api.until(lambda: api.get("/v1/state")["seen"]["guard"] == "GROUND")
-    assert "acknowledged" in capsys.readouterr().out
+    assert capsys.readouterr().out.splitlines() == [
+        "acknowledged: the next mission may fly",
+        "where it was stopped or has touched down, the robot takes off only once it has been "
+        "still inside the fence",
+    ]
 
 
 def test_the_token_comes_from_a_file_of_the_flag_or_the_environment(

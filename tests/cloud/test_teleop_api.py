@@ -120,6 +120,8 @@ def test_the_state_is_told_and_unknown_numbers_are_null(idle):
     assert state["mission"] is None
     assert state["seen"]["guard"] == "GROUND"
     assert state["seen"]["rtt_s"] is None
+    assert state["seen"]["guard_for_s"] >= 0.0
+    assert "waits for a mission" in state["seen"]["next_step"]
 
 
 @pytest.mark.promise("P-MISSION-5")

@@ -1,4 +1,8 @@
-"""Each role has room of its own in the API: readers cannot take an operator's."""
+"""Each role has room of its own in the API: readers cannot take an operator's.
+
+The lane of the emergency stop is an operator's POST and nothing else; what is refused is counted as
+well as what is served.
+"""
 
 import contextvars
 import threading
@@ -10,6 +14,15 @@ from cloudrc.cloud.teleop import api_events
 from cloudrc.cloud.teleop.api_bridge import LANE, WAITING_MAX, Bridge
 from cloudrc.cloud.teleop.api_gate import Limits
 from cloudrc.cloud.teleop.service_book import UnavailableError
+
+STRANGER = "no-token-that-is-known"
+TIGHT = Limits(rate_hz=0.001, burst=5, in_flight=2, streams=1)
+
+
+def statuses(one, count, path, token, method, data=b""):
+    """What so many requests, one after the other, are answered with."""
+    sent = data if method == "POST" else None
+    return [one.send(one.request(path, sent, token, method))[0] for _ in range(count)]
 
 
 @pytest.mark.promise("P-API-7")
@@ -65,3 +78,50 @@ def test_each_role_waits_in_a_lane_of_its_own_and_operators_first():
             call(0)
     others = [number for number in range(WAITING_MAX + 1) if number != 5]
     assert made == [("operator", 0), *(("reader", number) for number in others)]
+
+
+@pytest.mark.promise("P-API-7")
+@pytest.mark.parametrize("method", ["GET", "PUT", "DELETE", "OPTIONS"])
+@pytest.mark.parametrize(("token", "left"), [(READER, 5), (OPERATOR, 4), (STRANGER, 5)])
+def test_the_path_of_the_emergency_stop_is_no_way_round_the_limits(method, token, left):
+    """`running` has asked once as the operator."""
+    with running(limits=TIGHT) as one:
+        codes = statuses(one, 9, "/v1/estop", token, method)
+        refused = {READER: 403, OPERATOR: 405, STRANGER: 401}[token]
+        good = 405 if method == "GET" and token != STRANGER else refused
+        assert codes == [good] * left + [429] * (9 - left)
+        assert one.alarms == []
+
+
+@pytest.mark.promise("P-API-7")
+def test_neither_is_its_head():
+    with running(limits=TIGHT) as one:
+        connection = connect(one)
+        for _ in range(9):
+            connection.sendall(head("HEAD", "/v1/estop", token=READER))
+            assert connection.recv(4096)
+        connection.close()
+        assert one.gate.counts["busy"] == 4
+
+
+@pytest.mark.promise("P-API-7")
+@pytest.mark.parametrize("path", ["/v1/estop", "/v1/hold", "/v1/missions", "/nowhere"])
+@pytest.mark.parametrize(("token", "refused"), [(READER, 403), (STRANGER, 401)])
+def test_a_flood_of_what_is_not_allowed_is_refused_as_a_flood_and_not_written_down(
+    path, token, refused
+):
+    with running(limits=TIGHT) as one:
+        assert statuses(one, 9, path, token, "POST") == [refused] * 5 + [429] * 4
+        assert one.alarms == []
+        assert len(one.audited()) == (5 if token == READER else 0)
+
+
+@pytest.mark.promise("P-API-8")
+def test_an_operators_stop_is_served_while_others_flood_its_path():
+    with running(limits=TIGHT) as one:
+        for token in (READER, STRANGER):
+            for method in ("GET", "POST"):
+                assert 429 in statuses(one, 9, "/v1/estop", token, method)
+        assert statuses(one, 20, "/v1/estop", OPERATOR, "POST") == [200] * 20
+        assert len(one.alarms) == 20
+        assert one.get("/v1/state")["seen"], "stops take none of the operator's room"

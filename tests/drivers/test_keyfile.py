@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import stat
+import time
 from pathlib import Path
 
 import pytest
 
 from cloudrc.cli.main import main
+from cloudrc.cli.opened import _open_keys
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile, is_exposed, read_keys
 from cloudrc.errors import BadInputError
 from cloudrc.tunnel.keys import Key, KeySet, parse, write
@@ -147,6 +150,8 @@ def test_the_command_rotates_a_key(tmp_path: Path, capsys: pytest.CaptureFixture
         (["new", "{}/key", "--overlap", "soon"], "not above 0"),
         (["new", "{}/wrong"], "neither 32 bytes"),
         (["new", "{}/no/key"], "No such file"),
+        (["retire", "{}/none"], "No such file"),
+        (["retire", "{}/wrong"], "neither 32 bytes"),
     ],
 )
 def test_what_the_command_cannot_do_it_says_in_a_line(
@@ -159,6 +164,85 @@ def test_what_the_command_cannot_do_it_says_in_a_line(
     assert len(error.splitlines()) == 1
     assert path.read_bytes() == FIRST
     assert sorted(p.name for p in path.parent.iterdir()) == ["key", "wrong"]
+
+
+def test_a_rotation_says_until_when_the_key_before_is_valid(path: Path) -> None:
+    before = time.time()
+    assert main(["key", "new", str(path), "--overlap", "60"]) == 0
+    until = read_keys(path).until
+    assert until is not None
+    assert before + 60.0 <= until <= time.time() + 61.0
+
+
+@pytest.mark.promise("P-LINK-9")
+@pytest.mark.parametrize("later", [60.0, 61.0, 1e6])
+def test_a_process_that_starts_after_the_overlap_refuses_the_key_before_and_says_so(
+    path: Path, later: float
+) -> None:
+    assert main(["key", "new", str(path), "--overlap", "60"]) == 0
+    keys = read_keys(path)
+    assert keys.until is not None
+    made = keys.until - 60.0
+    fresh = KeyFile(path, 0, made + 59.0)
+    assert fresh.ring.accepted(0) == (keys.current, Key(FIRST))
+    assert fresh.ring.accepted(1_000_000_000) == (keys.current,)
+    assert fresh.follow(0) == []
+    late = KeyFile(path, 0, made + later)
+    assert late.ring.accepted(0) == (keys.current,)
+    (said,) = late.follow(0)
+    assert f"key {Key(FIRST).name}, the one before, is refused" in said.text
+    assert late.follow(PERIOD_NS) == []
+
+
+def test_what_is_wrong_at_the_start_hides_no_new_key(path: Path) -> None:
+    put(path, write(KeySet(Key(SECOND), Key(FIRST), 10.0)).encode())
+    keys = KeyFile(path, 0, 1e9)
+    put(path, FIRST)
+    (said,) = keys.follow(0)
+    assert "does not say until when" in said.text
+    (said,) = keys.follow(PERIOD_NS)
+    assert said.text.startswith(f"new key {Key(FIRST).name}")
+
+
+@pytest.mark.promise("P-LINK-9")
+def test_an_end_asks_the_wall_clock_as_it_reads_its_key(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["key", "new", str(path), "--overlap", "60"]) == 0
+    options = argparse.Namespace(key=path)
+    assert len(_open_keys(options).ring.accepted(time.monotonic_ns())) == 2
+    later = time.time() + 62.0
+    monkeypatch.setattr(time, "time", lambda: later)
+    assert len(_open_keys(options).ring.accepted(time.monotonic_ns())) == 1
+
+
+def test_a_key_that_is_retired_is_gone_from_the_file_and_from_who_follows_it(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["key", "retire", str(path)]) == 0
+    assert "was alone already" in capsys.readouterr().out
+    assert path.read_bytes() == FIRST
+    assert main(["key", "new", str(path)]) == 0
+    follower, made = KeyFile(path, 0, time.time()), read_keys(path)
+    assert len(follower.ring.accepted(0)) == 2
+    capsys.readouterr()
+    assert main(["key", "retire", str(path)]) == 0
+    said = f"key {made.current.name} alone, {Key(FIRST).name} is dropped: {path}\n"
+    assert capsys.readouterr().out == said
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert read_keys(path) == KeySet(made.current)
+    (told,) = follower.follow(PERIOD_NS)
+    assert told.text == f"key {made.current.name} alone; the one before is not valid any more"
+    assert follower.ring.accepted(PERIOD_NS) == (made.current,)
+
+
+def test_other_words_about_the_key_before_are_no_new_key(path: Path) -> None:
+    put(path, write(KeySet(Key(SECOND), Key(FIRST), 10.0)).encode())
+    keys = KeyFile(path, 0)
+    put(path, write(KeySet(Key(SECOND), Key(FIRST), 60.0)).encode())
+    (said,) = keys.follow(PERIOD_NS)
+    assert said.text == f"key {Key(SECOND).name} as before; what is said of the one before changed"
+    assert keys.ring.accepted(10_000_000_000) == (Key(SECOND),)
 
 
 def test_a_huge_file_is_not_read_whole(tmp_path: Path) -> None:

@@ -36,6 +36,7 @@ def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
     names = [event["event"] for event in view["events"]]
     assert names.count("started") == 1
     assert names.count("resumed") == ("teleop" in killed)
+    assert ("new_session" in names) == (killed == ("cloud",))  # a new teleop knows no other one
 
 
 def test_a_world_that_is_killed_ends_the_job_with_world_restarted(release):

@@ -173,6 +173,7 @@ def test_an_acceptance_that_is_repeated_names_the_key_that_its_epoch_began_with(
     assert step.world._openers[0][1] == new
 
 
+@pytest.mark.promise("P-LINK-4")
 def test_answers_are_never_longer_than_the_hello(step):
     hello = codec.SIZES[Kind.HELLO]
     answers = [step.knock(), step.knock(cookie=step.cookie()), step.knock(b"m" * 16, step.cookie())]

@@ -11,6 +11,8 @@ from cloudrc.tunnel.keys import OVERLAP, Key, KeyRing, KeySet, parse, write
 SECRET = bytes(range(32))
 A, B, C = (Key(letter * 32) for letter in (b"a", b"b", b"c"))
 SECOND_NS = 1_000_000_000
+MADE = 1_795_000_000.0  # when a key file was made [s since 1970]
+ROTATED = KeySet(B, A, 300.0, MADE + 300.0)
 
 
 @pytest.mark.parametrize("size", [0, 31, 33, 64])
@@ -67,7 +69,11 @@ def test_what_is_derived_depends_on_salt_and_use():
 
 
 @pytest.mark.parametrize(
-    "keys", [KeySet(A), KeySet(A, B, 60.0), KeySet(A, B, 0.5), KeySet(A, B, 86_400.0)]
+    "keys",
+    [
+        *(KeySet(A), KeySet(A, B, 60.0), KeySet(A, B, 0.5), KeySet(A, B, 86_400.0), ROTATED),
+        *(ROTATED._replace(until=until) for until in (0.0, 253_402_300_799.0)),
+    ],
 )
 def test_a_file_holds_what_was_written(keys):
     assert parse(write(keys).encode()) == keys
@@ -89,7 +95,10 @@ HEX = SECRET.hex()
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "^its lines are 'current', and perhaps 'previous' and 'overlap_s'$"),
+        (
+            "",
+            "^its lines are 'current', and perhaps 'previous', 'overlap_s' and 'previous_until_s'$",
+        ),
         ("# only a comment", "its lines are"),
         (f"previous {HEX}", "its lines are"),
         (f"current {HEX}\nnext {HEX}", "its lines are"),
@@ -102,6 +111,10 @@ HEX = SECRET.hex()
         *(
             (f"current {HEX}\noverlap_s {wrong}", "overlap_s is above 0")
             for wrong in ("0", "-1", "nan", "inf", "86401", "soon")
+        ),
+        *(
+            (f"current {HEX}\nprevious_until_s {wrong}", "seconds since 1970")
+            for wrong in ("-1", "nan", "inf", "253402300800", "soon")
         ),
     ],
 )
@@ -141,3 +154,102 @@ def test_the_same_key_again_makes_no_previous_one():
     ring = KeyRing(KeySet(A))
     ring.replace(KeySet(A), 0)
     assert ring.accepted(0) == (A,)
+
+
+def test_what_is_written_is_whole_seconds_since_1970():
+    assert write(ROTATED).splitlines()[-1] == "previous_until_s 1795000300"
+    assert "until" not in write(ROTATED._replace(until=None))
+
+
+@pytest.mark.promise("P-LINK-9")
+@pytest.mark.parametrize(
+    ("wall", "left"),
+    [
+        (MADE, 300.0),
+        (MADE + 100.0, 200.0),
+        (MADE + 299.0, 1.0),
+        (MADE + 300.0, 0.0),
+        (MADE + 1e9, 0.0),
+        (MADE - 1.0, 300.0),  # two clocks are never quite the same
+        (MADE - 60.0, 300.0),
+        (MADE - 61.0, 0.0),
+        (0.0, 0.0),
+        (None, 300.0),
+    ],
+)
+def test_a_process_that_starts_later_accepts_the_previous_key_for_what_is_left(wall, left):
+    began_ns = 5 * SECOND_NS
+    ring = KeyRing(ROTATED, began_ns, wall)
+    end_ns = began_ns + round(left * SECOND_NS)
+    assert ring.accepted(end_ns) == (B,)
+    assert ring.accepted(max(began_ns, end_ns - 1)) == ((B, A) if left else (B,))
+
+
+@pytest.mark.parametrize("wall", [MADE, 0.0, MADE + 1e9])
+def test_of_a_file_that_does_not_say_until_when_the_overlap_counts_from_each_start(wall):
+    ring = KeyRing(ROTATED._replace(until=None), now_ns=0, wall=wall)
+    assert ring.accepted(300 * SECOND_NS - 1) == (B, A)
+    assert ring.accepted(300 * SECOND_NS) == (B,)
+
+
+@pytest.mark.promise("P-LINK-9")
+def test_a_clock_that_is_set_back_gives_no_more_than_the_overlap():
+    """It is asked at the start alone: whatever it says then, the process counts by itself."""
+    for wall in range(round(MADE) - 400, round(MADE) + 400, 7):
+        assert ROTATED.left(float(wall)) <= 300.0
+
+
+@pytest.mark.parametrize(
+    ("keys", "wall", "said"),
+    [
+        (
+            ROTATED,
+            MADE + 300.0,
+            "refused: valid until 2026-11-18T11:11:40+00:00; drop it: cloudrc key retire FILE",
+        ),
+        (
+            ROTATED,
+            0.0,
+            "refused: by this machine's clock (1970-01-01T00:00:00+00:00) the key file is not made "
+            "yet; set the clock",
+        ),
+        (
+            KeySet(B, A),
+            MADE,
+            "accepted for 300 s from every start on, for the key file does not say until when; "
+            "drop it: cloudrc key retire FILE",
+        ),
+    ],
+)
+def test_what_is_doubtful_about_the_previous_key_is_told(keys, wall, said):
+    assert keys.caution(wall) == f"key {A.name}, the one before, is {said}"
+
+
+@pytest.mark.parametrize("keys", [KeySet(B), ROTATED])
+def test_otherwise_nothing_is(keys):
+    assert keys.caution(MADE + 299.0) == ""
+
+
+@pytest.mark.promise("P-LINK-9")
+def test_what_is_written_anew_beside_a_previous_key_makes_its_time_no_longer():
+    ring = KeyRing(ROTATED, now_ns=0, wall=MADE + 300.0)  # it is over
+    ring.replace(KeySet(B, A, 600.0), 10 * SECOND_NS)
+    assert ring.accepted(10 * SECOND_NS) == (B,)
+    ring = KeyRing(KeySet(B, A, 20.0))
+    ring.replace(KeySet(C, A, 600.0), 10 * SECOND_NS)
+    assert ring.accepted(20 * SECOND_NS - 1) == (C, A)
+    assert ring.accepted(20 * SECOND_NS) == (C,)
+    ring.replace(KeySet(C, A, 5.0), 10 * SECOND_NS)
+    assert ring.accepted(15 * SECOND_NS) == (C,)
+
+
+def test_a_previous_key_that_is_taken_out_of_the_file_is_refused_at_once():
+    ring = KeyRing(KeySet(B, A, 20.0))
+    ring.replace(KeySet(B), SECOND_NS)
+    assert ring.accepted(SECOND_NS) == (B,)
+
+
+def test_a_key_may_come_back_by_a_rotation_of_its_own():
+    ring = KeyRing(ROTATED, now_ns=0, wall=MADE + 300.0)
+    ring.replace(KeySet(A, B, 10.0), SECOND_NS)
+    assert ring.accepted(SECOND_NS) == (A, B)

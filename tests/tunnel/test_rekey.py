@@ -47,6 +47,7 @@ def generation(data):
     return data[GENERATION]
 
 
+@pytest.mark.promise("P-LINK-5")
 def test_after_two_minutes_the_keys_are_new_and_every_datagram_is_opened():
     ends = Ends()
     assert ends.pass_time(119) == 0
@@ -204,6 +205,7 @@ def test_a_flood_of_forged_generations_derives_each_key_once(monkeypatch):
     assert len(derived) == 1
 
 
+@pytest.mark.promise("P-LINK-9")
 def test_after_the_overlap_the_old_key_opens_nothing():
     ends = Ends(overlap=10.0)
     ends.rotate("world")

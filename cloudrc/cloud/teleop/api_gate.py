@@ -1,8 +1,9 @@
 """The gate before the API: every request comes in; those of known callers, and few enough, go on.
 
 Denied by default: whatever the path, without a valid token it is 401, and with a reader's token
-everything but looking is 403. A flood is answered with 429 and reaches nothing. Behind the gate are
-the routes; the lane of the emergency stop asks for an operator's token and for nothing else.
+everything but looking is 403. A flood of either is answered with 429 and reaches nothing. Behind
+the gate are the routes. An operator's emergency stop has a lane of its own: it alone, by path and
+method, is never counted against anybody's room.
 """
 
 from __future__ import annotations
@@ -131,20 +132,21 @@ class Gate:
             if not self._buckets[None].take():
                 return busy
             return "token", 401, "a valid token is needed: Authorization: Bearer TOKEN"
+        if _stops(caller, scope):
+            return None
+        # What is refused takes room, too: to say no, and to write it down, is work.
+        kind = _kind(caller, scope)
+        room = self._limits.streams if kind[1] == "stream" else self._limits.in_flight
+        if self._in_flight[kind] >= room or not self._buckets[caller.role].take():
+            return busy
         if scope["method"] not in LOOKING and caller.role != OPERATOR:
             return "role", 403, "this token may look, not command: an operator's is needed"
-        if scope["path"] == ESTOP:
-            return None
-        stream = scope["path"] == EVENTS
-        full = self._in_flight[caller.role, "stream" if stream else "request"] >= (
-            self._limits.streams if stream else self._limits.in_flight
-        )
-        return busy if full or not self._buckets[caller.role].take() else None
+        return None
 
     async def _serve(
         self, caller: Caller, scope: Scope, receive: Receive, answer: Answer
     ) -> None:  # fmt: skip
-        kind = caller.role, "stream" if scope["path"] == EVENTS else "request"
+        kind = _kind(caller, scope)
         self._in_flight[kind] += 1
         LANE.set(caller.role)
         try:
@@ -179,6 +181,19 @@ class Gate:
             status=answer.status,
             outcome=said.get("detail") or said.get("state") or "",
         )
+
+
+def _stops(caller: Caller, scope: Scope) -> bool:
+    """Whether this is an operator's emergency stop; to look at its path is a request like any."""
+    stop = scope["method"] == "POST" and scope["path"] == ESTOP
+    return stop and caller.role == OPERATOR
+
+
+def _kind(caller: Caller, scope: Scope) -> tuple[str, str]:
+    """Whose room a request takes, and which: that of stops is not counted."""
+    if _stops(caller, scope):
+        return caller.role, "stop"
+    return caller.role, "stream" if scope["path"] == EVENTS else "request"
 
 
 class Answer:

@@ -89,7 +89,7 @@ class Event(_Answer):
     mission: str = Field(description="Whose")
     event: str = Field(
         description="queued, starting, started, reached, held, resumed, goto, restarted, "
-        "board_touched, pipe_touched, paused; at the end done, cancelled, timed_out, "
+        "new_session, board_touched, pipe_touched, paused; at the end done, cancelled, timed_out, "
         "leg_timed_out, world_restarted, guard_stopped, emergency_stopped, taken_over or "
         "end_lost"
     )
@@ -133,8 +133,11 @@ class Seen(_Answer):
     world: str = Field(description="Names world's process")
     position_m: list[float | None] = Field(description="Of the base, measured [m], world frame")
     guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = Field(
-        description="State of the guard on board"
+        description="State of the guard on board; why it is in it tell world's log, the screen of "
+        "`cloudrc run` and the recording (`/guard`)"
     )
+    guard_for_s: float = Field(description="For how long it has been seen in this state [s]")
+    next_step: str = Field(description="What comes next, or what the operator has to do for it")
     pipe_contacts: int = Field(description="How often a pipe has been touched so far")
     touch_speed_mps: float | None = Field(description="Of the tip at the board [m/s]")
     horizon_s: float | None = Field(description="How far cloud looks ahead [s]")
@@ -160,7 +163,10 @@ class Stopped(_Answer):
 class Acknowledged(_Answer):
     """An acknowledgement on its way."""
 
-    state: Literal["acknowledged"] = Field(description="The robot may fly again")
+    state: Literal["acknowledged"] = Field(
+        description="The next mission may fly; after a stop or a touch-down the robot takes off "
+        "only once it has been still inside the fence"
+    )
 
 
 class Problem(_Answer):

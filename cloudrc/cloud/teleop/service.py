@@ -31,17 +31,17 @@ from cloudrc.cloud.teleop.messages import (
 from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook
-from cloudrc.cloud.teleop.service_mission import Mission, Order, show_seen
+from cloudrc.cloud.teleop.service_mission import Mission, Order
+from cloudrc.cloud.teleop.sight import LATCHED as LATCHED  # faults import it from here
+from cloudrc.cloud.teleop.sight import Sight
 from cloudrc.cloud.teleop.verdict import Criteria, Failure, Verdict, Witness, judge
 from cloudrc.errors import BadInputError
-from cloudrc.messages import GuardState, Setpoint, Start, Vector
+from cloudrc.messages import Setpoint, Start, Vector
 from cloudrc.records import Fault, MissionEvent
 
 SETPOINT_PERIOD_NS = 100_000_000
 """Time between two copies of the setpoint [ns], so that either process may restart."""
 QUEUE_MAX = 16
-LATCHED = (GuardState.LAND, GuardState.ESTOP)
-"""States of the guard that only the operator's acknowledgement leads out of."""
 
 
 class MissionService:
@@ -66,8 +66,7 @@ class MissionService:
         self._contact_speed_max = contact_speed_max
         self._teleop = Teleop()
         self._outputs: list[Output | Fault] = []
-        self._seen: Seen | None = None
-        self._seen_ns = 0
+        self._sight = Sight()
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
@@ -81,7 +80,7 @@ class MissionService:
     @property
     def seen(self) -> bool:
         """Whether the robot has been in sight."""
-        return self._seen is not None
+        return self._sight.seen is not None
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
         """Take an order; it is started at once or waits.
@@ -186,10 +185,11 @@ class MissionService:
 
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry."""
-        self._seen, self._seen_ns = seen, now_ns
-        mission = self._current
+        mission, anew = self._current, self._sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
             self._watch(mission, seen, now_ns)
+            if anew:
+                self._note(mission, "new_session", mission.in_new_session(), now_ns)
         self._teleop.see(seen, now_ns)
         self._collect(now_ns)
 
@@ -212,11 +212,11 @@ class MissionService:
 
     def state(self, now_ns: int) -> dict[str, Any]:
         """Say how things are, as the API shows it."""
-        seen, mission = self._seen, self._current
+        mission = self._current
         return {
             "mission": mission.summary() if mission is not None else None,
             "queue": [waits.id for waits in self.book.open() if waits is not mission],
-            "seen": None if seen is None else show_seen(seen, (now_ns - self._seen_ns) * 1e-9),
+            "seen": self._sight.show(now_ns, None if mission is None else mission.state),
         }
 
     @property
@@ -224,7 +224,7 @@ class MissionService:
         """Why nothing can fly before the operator acknowledges it; "" if it can."""
         if self._teleop.requests.stopping:
             return "an emergency stop is on its way to the robot"
-        guard = GuardState.GROUND if self._seen is None else self._seen.guard
+        guard = self._sight.guard
         return f"the guard is in {guard.name} and lets nothing fly" if guard in LATCHED else ""
 
     def _refuse_if_stopped(self) -> None:
@@ -268,7 +268,7 @@ class MissionService:
             self._outputs.append(output)
 
     def _follow(self, event: MissionEvent, now_ns: int) -> None:
-        mission, seen = self._current, self._seen
+        mission, seen = self._current, self._sight.seen
         assert mission is not None, "events are of missions only"
         changed: dict[str, Any] = {}
         if event.waypoint >= 0:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import asdict, dataclass, field
-from math import isfinite
 from typing import Any
 
 from cloudrc.cloud.teleop.journal_format import Entry
-from cloudrc.cloud.teleop.messages import Continue, Seen, StartMission
+from cloudrc.cloud.teleop.messages import Continue, StartMission
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.cloud.teleop.verdict import Failure, Verdict, Witness
 from cloudrc.messages import Start
@@ -105,6 +104,12 @@ class Mission:
         if entry["event"] == "reached" and entry["waypoint"] == len(self.reached):
             self.reached.append({"waypoint": entry["waypoint"], "time_s": entry["time_s"]})
 
+    def in_new_session(self) -> str:
+        """What to say when the controller has another session with the same robot."""
+        where = f"waypoint {self.waypoint + 1} of {len(self.order.plan.legs)}"
+        goes_on = f"is held on the way to {where}" if self.state == HELD else f"goes on to {where}"
+        return f"the controller has a new session, as after a restart; the mission {goes_on}"
+
     def forsake(self) -> None:
         """A later mission has begun: this one is over, although nothing kept says how it ended."""
         text = "how it ended was not kept: the journal was damaged or could not be written"
@@ -189,24 +194,3 @@ def first_verb(mission: Mission) -> StartMission | Continue:
         return StartMission(plan, number)
     held = mission.state == HELD
     return Continue(plan, mission.waypoint, mission.elapsed, mission.world, held, number)
-
-
-def show_seen(seen: Seen, age: float) -> dict[str, Any]:
-    """What the API shows of telemetry of some `age` [s]."""
-    return {
-        "age_s": age,
-        "epoch": seen.epoch,
-        "world": seen.world,
-        "position_m": [_known(value) for value in seen.position],
-        "guard": seen.guard.name,
-        "pipe_contacts": seen.pipe_contacts,
-        "touch_speed_mps": _known(seen.touch_speed),
-        "horizon_s": _known(seen.horizon),
-        "rtt_s": _known(seen.rtt),
-        "loop_delay_s": _known(seen.loop_delay),
-    }
-
-
-def _known(value: float) -> float | None:
-    """JSON knows no NaN."""
-    return value if isfinite(value) else None
