@@ -55,11 +55,13 @@ test-netem: $(VENV)/dev ## run the tests of the kernel's netem; needs root and s
 test-netem-full: $(VENV)/dev ## the same, and every shipped profile for a minute
 	$(bin)/pytest -m netem -rP tests/link
 
+# What the search shows in short goes below build/: the pages in docs/ are of make nightly's seeds.
 faults: $(VENV)/dev ## bring every fault about, compose 200 at random; writes docs/safety/faults.md
 	$(bin)/cloudrc faults run --all --jobs $(JOBS) --document docs/safety/faults.md
-	$(bin)/cloudrc faults fuzz --seeds 200 --jobs $(JOBS) --document docs/safety/search.md $(STORE)
+	mkdir -p build
+	$(bin)/cloudrc faults fuzz --seeds 200 --jobs $(JOBS) --document build/search.md $(STORE)
 	$(bin)/cloudrc faults fuzz --adversarial --seeds 200 --jobs $(JOBS) \
-		--document docs/safety/adversary.md $(STORE)
+		--document build/adversary.md $(STORE)
 
 figures: $(VENV)/dev ## print the numbers that tests have measured: asked, measured, of how many
 	$(bin)/python tools/figures.py
@@ -87,6 +89,11 @@ mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways; print wh
 #   killed at 200 instants, uncapped           test_uncapped_it_takes_a_little_longer_at_any_instant
 #   blackouts at 24 instants, each way         test_a_silence_anywhere_touches_nothing
 #   1,000 requests a second for 20 s           test_a_thousand_requests_a_second_do_not_disturb_the_control_loop
+# The search takes hours: told to stop (Ctrl-C, SIGTERM) it keeps what was flown as a slice, and
+# says how to go on. Slices of one search, flown by the same sources, make the page as well:
+#   cloudrc faults fuzz --first 1 --seeds 15000 --slice build/a.json
+#   cloudrc faults fuzz --first 15001 --seeds 15000 --slice build/b.json
+#   cloudrc faults merge build/a.json build/b.json --document docs/safety/search.md
 # The cluster comes last: without Docker, kind, helm and kubectl all else is done.
 nightly: $(VENV)/dev ## run all tests but netem's, 500 hours of faults, e2e-full (needs what e2e needs)
 	rm -rf build/figures

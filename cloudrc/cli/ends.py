@@ -114,7 +114,11 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
 
     warn_if_exposed(options.metrics)
     elsewhere = getattr(options, "teleop", None) is not None
-    exporter = Exporter(role, missions=not elsewhere)
+
+    def say(line: str) -> None:
+        print(f"cloudrc {role}: {line}", file=sys.stderr, flush=True)
+
+    exporter = Exporter(role, missions=not elsewhere, say=say)
     exporter.serve(options.metrics)
     return exporter
 

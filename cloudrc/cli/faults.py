@@ -19,15 +19,18 @@ examples:
   cloudrc faults run --all --real            with processes, signals and sockets
   cloudrc faults fuzz --seeds 200 --jobs 2   random compositions, invariants
   cloudrc faults fuzz --seeds 200 --adversarial
+  cloudrc faults fuzz --first 201 --seeds 200 --slice b.json
+  cloudrc faults merge a.json b.json         two slices as one search
 
 exit codes: 0 every check passed, 1 one did not, 2 no such fault,
-  3 or 5 no cluster or no release there (--cluster)"""
+  3 or 5 no cluster or no release there (--cluster), 130 interrupted"""
 SEED_MAX = 2**63 - 1 - COUNT_MAX
 """Of the first one: those counted from it fit into 64 bits, too."""
 ACTIONS = {
     "list": "all faults, what is done and what has to follow",
     "run": "bring faults about and check what follows",
     "fuzz": "compose faults at random, look at the invariants in every step",
+    "merge": "add slices of a search up: their seeds follow each other without a gap",
     "replay": "fly a stored schedule again",
 }
 
@@ -43,6 +46,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     _modes(parsers["list"])
     _run_arguments(parsers["run"])
     _fuzz_arguments(parsers["fuzz"])
+    merge = parsers["merge"]
+    merge.add_argument("slices", type=Path, nargs="+", metavar="SLICE", help="of fuzz --slice")
+    text = "write the result as text"
+    merge.add_argument("--document", type=written_to, metavar="FILE", help=text)
     parsers["replay"].add_argument("file", type=Path, metavar="FILE", help="a schedule (.yaml)")
 
 
@@ -98,6 +105,8 @@ def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:
     )
     text = "write the result as text"
     parser.add_argument("--document", type=written_to, metavar="FILE", help=text)
+    text = "keep the totals, for 'faults merge'; every 10 s, and when it is told to stop"
+    parser.add_argument("--slice", type=written_to, metavar="FILE", help=text)
     parser.add_argument(
         "--store",
         type=Path,
@@ -118,6 +127,7 @@ def execute(options: argparse.Namespace) -> int:
         "list": faults_run.show,
         "run": faults_run.run,
         "fuzz": faults_fuzz.fuzz,
+        "merge": faults_fuzz.merge,
         "replay": faults_fuzz.replay,
     }
     return actions[options.action](options)

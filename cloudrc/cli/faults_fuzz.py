@@ -1,15 +1,23 @@
-"""`cloudrc faults fuzz` and `replay`: random schedules of faults, and stored ones."""
+"""`cloudrc faults fuzz`, `merge` and `replay`: random schedules of faults, and stored ones."""
 
 from __future__ import annotations
 
 import argparse
+import signal
+import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from cloudrc.cli import faults_page as page
+from cloudrc.cli import faults_slices as slices
+from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import paint, table, written
 from cloudrc.errors import BadInputError
 
@@ -18,57 +26,132 @@ if TYPE_CHECKING:
     from cloudrc.faults.schedule import Schedule
 
 FAILED = 1
-CHUNK = 4
-"""Schedules given to a process at a time."""
-INVARIANTS = {
-    "collision": "collisions",
-    "fence": "fence breaches",
-    "cap": "cap breaches",
-    "stop": "too fast towards the fence",
-    "stale": "motion on stale commands",
-    "stuck": "stuck states",
-    "alarm": "false alarms",
-    "recording": "recordings that do not hold what happened",
-    "error": "errors in an end",
-}
-PROMISES = {"random": "P-FAULT-2", "adversarial": "P-FAULT-3", "clean": "P-FAULT-4"}
-"""Ids in `docs/safety/promises.md`."""
-NOTES = {
-    "adversarial": (
-        "",
-        "The cloud holds valid keys. Every second one flies amid faults of all kinds, every tenth",
-        "speaks in its operator's place. A robot that this has stopped may come to lie outside the",
-        "fence, a [known limit](guard.md): it is told below the table, and a breach beyond 1.5 m.",
-    )
-}
-"""What else is to be said, by kind."""
+INTERRUPTED = 130
+SLICE = "slice-{kind}-{first}-{count}.json"
+"""What was flown until it was told to stop, if no other name was given."""
 PROGRESS_PERIOD = 10.0
 """Between two lines of progress [s]."""
 
 
 def fuzz(options: argparse.Namespace) -> int:
-    """Fly many random schedules; 1 if an invariant broke."""
-    began, findings = time.monotonic(), list[Any]()
-    seeds = range(options.first, options.first + options.seeds)
+    """Fly many random schedules; 1 if an invariant broke, 130 if it was told to stop."""
     say = options.output == "table"
-    told, failures = began, list[Any]()
-    for finding in _findings(seeds, options):
-        findings.append(_brief(finding))
-        if finding.breaches:
-            failures.append(_report(finding, options.store, say))
-        if say and time.monotonic() - told > PROGRESS_PERIOD:
-            told = time.monotonic()
-            print(f"{len(findings)} of {options.seeds} flown, {len(failures)} failed", flush=True)
-    seconds = time.monotonic() - began
-    document = _document(findings, failures, options, seconds)
+    search = Search(options, sources())
+    with stopping() as stop:
+        try:
+            _fly_all(search, say, stop)
+        except BrokenProcessPool:
+            if not stop():
+                raise
+    document, cut = search.document(), len(search.findings) < options.seeds
+    if cut and not search.findings:
+        print("cloudrc: stopped before the first schedule was flown", file=sys.stderr)
+        return INTERRUPTED
+    if path := options.slice or (options.store / SLICE.format(**document) if cut else None):
+        slices.keep(document, path)
+    if options.document is not None and not cut:
+        by = f"{page.command(document)} --document {options.document}"
+        options.document.write_text(page.markdown(document, by), encoding="utf-8")
+    if cut:
+        then = page.command(document | _rest(document, options))
+        told = f"stopped after {document['count']} of {options.seeds}: kept in {path}"
+        print(f"cloudrc: {told}; go on with '{then}'", file=sys.stderr)
+    _print(document, options)
+    return INTERRUPTED if cut else FAILED if search.failures else 0
+
+
+def merge(options: argparse.Namespace) -> int:
+    """Add slices of a search up; 1 if an invariant broke in one of them."""
+    document, parts = slices.merged(options.slices)
     if options.document is not None:
-        options.document.write_text(_markdown(document, _command(options)), encoding="utf-8")
-    if say:
-        print("\n" + table(_rows(document), right=(1, 2)))
-        print(f"\n{_summary(document)}")
+        names = " ".join(path.name for path, _ in parts)
+        by = f"cloudrc faults merge {names} --document {options.document}"
+        flown = [f"{page.command(part)} --slice {path.name}" for path, part in parts]
+        options.document.write_text(page.markdown(document, by, flown), encoding="utf-8")
+    _print(document, options)
+    return FAILED if document["failures"] else 0
+
+
+def _print(document: dict[str, Any], options: argparse.Namespace) -> None:
+    if options.output == "table":
+        print("\n" + table(page.rows(document), right=(1, 2)))
+        print(f"\n{page.summary(document)}")
     else:
         print(written(document, options.output))
-    return FAILED if failures else 0
+
+
+def _rest(document: dict[str, Any], options: argparse.Namespace) -> dict[str, int]:
+    """The seeds that were not flown."""
+    count = document["count"]
+    return {"first": options.first + count, "count": options.seeds - count}
+
+
+def _fly_all(search: Search, say: bool, stop: Callable[[], bool]) -> None:
+    """Fly what is to be flown, in the order of the seeds, until it is done or told to stop."""
+    options, told = search.options, time.monotonic()
+    seeds = range(options.first, options.first + options.seeds)
+    for finding in _findings(seeds, options):
+        search.take(finding, say, stop)
+        if time.monotonic() - told > PROGRESS_PERIOD:
+            told = time.monotonic()
+            if options.slice is not None:
+                slices.keep(search.document(), options.slice)
+            if say:
+                flown, failed = len(search.findings), len(search.failures)
+                print(f"{flown} of {options.seeds} flown, {failed} failed", flush=True)
+        if stop():
+            return
+
+
+class Search:
+    """What was flown so far: always all seeds from the first one on, without a gap."""
+
+    def __init__(self, options: argparse.Namespace, of: str) -> None:
+        """Begin.
+
+        Args:
+            options: Of the command.
+            of: Hash of the sources that fly.
+        """
+        self.options, self._sources, self._began = options, of, time.monotonic()
+        self.findings: list[dict[str, Any]] = []
+        self.failures: list[dict[str, Any]] = []
+
+    def take(self, finding: Finding, say: bool, stop: Callable[[], bool]) -> None:
+        """Add the flight of the next seed; one that failed is shrunk unless there is no time."""
+        if finding.breaches:
+            self.failures.append(_report(finding, self.options.store, say, stop))
+        self.findings.append(_brief(finding))
+
+    def document(self) -> dict[str, Any]:
+        """Tell all of it."""
+        return slices.document(
+            self.findings,
+            self.failures,
+            kind=_kind(self.options),
+            first=self.options.first,
+            seconds=time.monotonic() - self._began,
+            sources=self._sources,
+        )
+
+
+@contextmanager
+def stopping() -> Iterator[Callable[[], bool]]:
+    """Take SIGINT and SIGTERM for a wish to stop after the flight under way, the second at once."""
+    asked: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        asked.append(number)
+        for each in numbers:
+            signal.signal(each, signal.default_int_handler)
+
+    before = [signal.signal(number, ask) for number in numbers]
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def replay(options: argparse.Namespace) -> int:
@@ -97,8 +180,17 @@ def _findings(seeds: Iterable[int], options: argparse.Namespace) -> Iterator[Fin
     if options.jobs == 1:
         yield from map(_fly, work)
         return
-    with ProcessPoolExecutor(options.jobs) as pool:
-        yield from pool.map(_fly, work, chunksize=CHUNK)
+    pool = ProcessPoolExecutor(options.jobs, initializer=_leave_ctrl_c_to_the_first)
+    try:
+        yield from pool.map(_fly, work)  # one by one: so it soon ends when it is told to
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _leave_ctrl_c_to_the_first() -> None:
+    """A terminal's Ctrl-C reaches all processes: the first one says when the others end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _kind(options: argparse.Namespace) -> str:
@@ -129,8 +221,8 @@ def _brief(finding: Finding) -> dict[str, Any]:
     }
 
 
-def _report(finding: Finding, store: Path, say: bool) -> dict[str, Any]:
-    """Shrink a failing schedule, print it, and keep it."""
+def _report(finding: Finding, store: Path, say: bool, stop: Callable[[], bool]) -> dict[str, Any]:
+    """Shrink a failing schedule, print it, and keep it; as it is when there is a wish to stop."""
     from cloudrc.faults.fuzz import fly
     from cloudrc.faults.schedule import dump
     from cloudrc.faults.shrink import shrink
@@ -138,7 +230,7 @@ def _report(finding: Finding, store: Path, say: bool) -> dict[str, Any]:
     kinds = finding.kinds
 
     def fails(schedule: Schedule) -> bool:
-        return bool(fly(schedule).kinds & kinds)
+        return not stop() and bool(fly(schedule).kinds & kinds)
 
     smallest = shrink(finding.schedule, fails)
     breaches = fly(smallest).breaches
@@ -155,99 +247,3 @@ def _report(finding: Finding, store: Path, say: bool) -> dict[str, Any]:
         "schedule": asdict(smallest),
         "file": str(path),
     }
-
-
-def _document(
-    findings: list[dict[str, Any]],
-    failures: list[dict[str, Any]],
-    options: argparse.Namespace,
-    seconds: float,
-) -> dict[str, Any]:
-    count = len(findings)
-    return {
-        "schemaVersion": 1,
-        "kind": _kind(options),
-        "first": options.first,
-        "count": count,
-        "hours": sum(each["duration"] for each in findings) / 3600.0,
-        "seconds": seconds,
-        "invariants": {kind: _judge(kind, findings) for kind in INVARIANTS},
-        "smallest_margin_m": min(each["margin"] for each in findings),
-        "largest_speed_mps": max(each["speed"] for each in findings),
-        "holds": sum(each["holds"] for each in findings),
-        "missions_done": sum(each["missions"] for each in findings),
-        "fallen": sum(each["fallen"] > 0.0 for each in findings),
-        "fallen_m": max(each["fallen"] for each in findings),
-        "failures": failures,
-    }
-
-
-def _judge(kind: str, findings: list[dict[str, Any]]) -> dict[str, Any]:
-    """One invariant: in how many flights it was looked at, and in how many it broke."""
-    looked_at = sum(kind in each["judged"] for each in findings)
-    broken = sum(kind in each["kinds"] for each in findings)
-    # Source: the rule of three: 0 events in N runs, p < 3/N with 95 % confidence.
-    bound = min(3.0 / looked_at, 1.0) if looked_at and not broken else None
-    return {"judged": looked_at, "broken": broken if looked_at else None, "bound": bound}
-
-
-def _rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Each invariant with its bound."""
-    rows: list[tuple[str, ...]]
-    rows = [("invariant", "broken in", "of N", "95 % bound")]
-    for kind, words in INVARIANTS.items():
-        broken, judged, bound = (
-            document["invariants"][kind][name] for name in ("broken", "judged", "bound")
-        )
-        if not judged:
-            rows.append((words, "-", "0", "not judged"))
-            continue
-        rows.append((words, str(broken), str(judged), "-" if broken else f"p < {bound:.2g}"))
-    return rows
-
-
-def _summary(document: dict[str, Any]) -> str:
-    fallen = (
-        f"; {document['fallen']} stopped by the operator's word came to lie outside of it, at most "
-        f"by {document['fallen_m']:.2f} m"
-    )
-    return (
-        f"{document['hours']:.2f} virtual hours of {document['kind']} schedules from seed "
-        f"{document['first']} on in {document['seconds']:.0f} s: "
-        f"{document['missions_done']} missions done, {document['holds']} HOLDs, "
-        f"nearest to the fence {document['smallest_margin_m']:.3f} m, "
-        f"fastest {document['largest_speed_mps']:.2f} m/s" + (fallen if document["fallen"] else "")
-    )
-
-
-def _command(options: argparse.Namespace) -> str:
-    """The command that flies the same once more; where it keeps what it finds changes nothing."""
-    kind = _kind(options)
-    words = ["cloudrc faults fuzz", *([f"--{kind}"] if kind != "random" else [])]
-    words += [f"--first {options.first}"] if options.first != 1 else []
-    return " ".join([*words, f"--seeds {options.seeds}", f"--document {options.document}"])
-
-
-def _markdown(document: dict[str, Any], command: str) -> str:
-    """For the documentation."""
-    head, *rows = _rows(document)
-    lines = [
-        f"# The search for faults: {document['kind']} schedules",
-        "",
-        f"Written by `{command}`;",
-        "do not edit. Each schedule is one minute of flight; the",
-        "invariants are looked at in every step of 2 ms. The bound is by the rule of three:",
-        "0 events in N runs, p < 3/N with 95 % confidence. N counts the schedules in which an",
-        "invariant is looked at: under a cloud that means no good a contact is no breach, and",
-        "only where nothing goes wrong a HOLD is a false alarm. The promise is "
-        f"[{PROMISES[document['kind']]}].",
-        *NOTES.get(document["kind"], ()),
-        "",
-        f"| {' | '.join(head)} |",
-        "|---|---|---|---|",
-        *(f"| {' | '.join(row)} |" for row in rows),
-        "",
-        _summary(document) + ".",
-        "",
-    ]
-    return "\n".join(lines)

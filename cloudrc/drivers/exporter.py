@@ -39,16 +39,23 @@ STILL_MAX = 5.0
 class Exporter:
     """The metrics of one process."""
 
-    def __init__(self, role: str, *, missions: bool = True) -> None:
+    def __init__(
+        self,
+        role: str,
+        *,
+        missions: bool = True,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
         """Begin with nothing seen, served or ready.
 
         Args:
             role: "world", "cloud", "teleop" or "link".
             missions: Whether they are told here; False in a cloud whose teleop tells them.
+            say: Gets a line for people when a scrape finds that the wall clock was set.
         """
         self._role, self._metrics = role, of_role(role)
         self._live = Live(role, missions=missions)
-        self._wall = WallClock()
+        self._wall = WallClock(say)
         self._sync_age: Callable[[], float | None] = lambda: None
         self._said_ready = False
         self._seen_at: float | None = None  # no loop is alive or dead before it has begun

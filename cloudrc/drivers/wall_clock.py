@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 
 STEP = 0.1
 """A smaller difference between two looks is no step [s]."""
@@ -17,10 +18,15 @@ _SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # the forme
 
 
 class WallClock:
-    """Counts how often the wall clock was found to have been set."""
+    """Counts how often the wall clock was found to have been set, and says so each time."""
 
-    def __init__(self) -> None:
-        """Take it as it is now."""
+    def __init__(self, say: Callable[[str], None] = lambda line: None) -> None:
+        """Take it as it is now.
+
+        Args:
+            say: Gets one line for each step, from the thread that looks.
+        """
+        self._say = say
         self._lock = threading.Lock()  # two may scrape at once
         self._wall, self._boot = _now()
         self._steps = 0
@@ -32,6 +38,10 @@ class WallClock:
             passed, seemed = boot - self._boot, wall - self._wall
             if abs(seemed - passed) > STEP + DRIFT_MAX * passed:
                 self._steps += 1
+                self._say(
+                    f"wall clock stepped by {seemed - passed:+.1f} s: the flight does not notice;"
+                    " times of day before and after it do not compare"
+                )
             self._wall, self._boot = wall, boot
             return self._steps
 

@@ -18,6 +18,10 @@ STANDS = 0.05
 """Below this speed the robot counts as standing [m/s]."""
 WINDOW_NS = 1_000_000_000
 """In which transitions are counted [ns]."""
+ALONE = "held for 60 s without the cloud"
+"""The cause of a LAND that ends a long HOLD."""
+ENDED = "mission ended"
+"""The cause of a HOLD that the operator's end has asked for."""
 
 
 def changes_into(flight: Flight, state: GuardState, before: float = inf) -> list[float]:
@@ -28,25 +32,57 @@ def changes_into(flight: Flight, state: GuardState, before: float = inf) -> list
         state: Of the guard.
         before: Only up to this instant [s].
     """
-    changes = [c for c in flight.changes if c.state is state and c.cause != "mission ended"]
+    changes = [c for c in flight.changes if c.state is state and c.cause != ENDED]
     return [at for change in changes if (at := change.stamp_ns * 1e-9) < before]
 
 
 def held(flight: Flight) -> list[GuardChange]:
     """HOLDs that are not a mission's end."""
     held = [change for change in flight.changes if change.state is GuardState.HOLD]
-    return [change for change in held if change.cause != "mission ended"]
+    return [change for change in held if change.cause != ENDED]
 
 
 def basis_age_at_hold(flight: Flight) -> float:
     """Largest age [s] that the newest applied command's basis had when the guard went to HOLD."""
+    return max((age for _, age in _ages_at_hold(flight) if age == age), default=nan)
+
+
+def _ages_at_hold(flight: Flight) -> list[tuple[GuardChange, float]]:
+    """Every HOLD in a mission with that age [s]; NaN before the first command."""
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
-    ages_ns = []
+    ages = []
     for change in held(flight):
         before = [r.basis_stamp_ns for r in applied if r.stamp_ns <= change.stamp_ns]
-        if before:
-            ages_ns.append(change.stamp_ns - max(before))
-    return max(ages_ns, default=nan) * 1e-9
+        age = (change.stamp_ns - max(before)) * 1e-9 if before else nan
+        ages.append((change, age))
+    return ages
+
+
+def causes_told(outcome: Outcome, flight: Flight, what: str = "") -> None:
+    """Check that the guard's changes tell why: how old the command was, and what ended the HOLD.
+
+    Args:
+        outcome: Of the scenario.
+        flight: Which; it has to have held and gone on.
+        what: Tells this flight of a scenario from its others.
+    """
+    ages, limit = _ages_at_hold(flight), flight.experiment.guard.command_age_max_ms * 1e-3
+    told = [(c.cause, f"command age {age:.3f} s above {limit:.3f} s") for c, age in ages]
+    text = f"{what}: " if what else ""
+    right = bool(told) and all(cause == true for cause, true in told)
+    outcome.true(f"{text}each HOLD tells the age of its command, to 1 ms", right)
+    after = [c for c in flight.changes if ages and c.stamp_ns > ages[0][0].stamp_ns]
+    causes = [change.cause for change in after if change.state is GuardState.TRACK]
+    right = bool(causes) and all("fresh commands within" in cause for cause in causes)
+    outcome.true(f"{text}each TRACK after it tells of fresh commands", right)
+
+
+def landing_told(outcome: Outcome, flight: Flight) -> None:
+    """Check that guard and mission tell why the robot has landed: the cloud stayed away."""
+    causes = [change.cause for change in flight.changes if change.state is GuardState.LAND]
+    outcome.true(f"LAND tells why: {ALONE}", causes[:1] == [ALONE])
+    failed, verdict = flight.mission.state == "failed", str(flight.mission.verdict)
+    outcome.true("the mission says why it failed", failed and "guard went to LAND" in verdict)
 
 
 def stopping_time(flight: Flight, since: float) -> float:

@@ -9,10 +9,16 @@ from cloudrc.records import Record
 
 
 class Crowd:
-    """Endpoints that share a socket, each awake from its own instant on; an `Endpoint` itself."""
+    """Endpoints that share a socket, each awake from its own instant on; an `Endpoint` itself.
+
+    Attributes:
+        members: Those that are there; the first one's story is what the recording tells.
+        others: What the others have noted down, oldest first.
+    """
 
     def __init__(self, members: Sequence[Endpoint]) -> None:
         self.members = members
+        self.others: list[Record] = []
 
     @property
     def sealed(self) -> bool:
@@ -39,7 +45,8 @@ class Crowd:
         return [data for member in self.members for data in member.take_datagrams()]
 
     def take_records(self) -> list[Record]:
-        """See `Endpoint`; only those of the first, whose story the recording tells."""
+        """See `Endpoint`; only those of the first."""
         first, *others = (member.take_records() for member in self.members)
-        del others
+        for records in others:
+            self.others += records
         return first

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import Any, NamedTuple
 
 from cloudrc.faults.scenario import Mode, Outcome, Scenario
+from cloudrc.report.document import environment_document
 
 
 class Result(NamedTuple):
@@ -100,11 +101,16 @@ HEADS: dict[Mode, str] = {
 Written by `make faults` (`cloudrc faults run --all --document docs/safety/faults.md`); do not edit.
 {result} Each is one command: `cloudrc faults run F13`.
 These run in virtual time, with the ends, the driver, the keys and the journal of production. Of a
-promise that is checked several times, the worst value is shown. A metric that is named has to read
-otherwise within 5 s. What makes sense elsewhere is brought about there, too:
+promise that is checked several times, the worst value is shown. Of every metric that is named it is
+said below how it was looked at: that it moves within 5 s of the fault, or of its end where who
+stands still shows nothing before; or what it reads. What teleop's API and journal refuse and mend
+is no part of a flight: there the count was looked at, not when it shows. What makes sense elsewhere
+is brought about there, too:
 [with real processes](faults-real.md), [in a Kubernetes cluster](faults-cluster.md). All faults
 together, at random: [search](search.md), and with a cloud that wants a breach:
 [adversary](adversary.md). Promises: [P-FAULT-1] that all pass, [P-FAULT-5] that a seed is a run.
+The hashes of the records are those of
+{built}: others may round otherwise.
 """,
     "real": """\
 # Faults with real processes, signals and sockets
@@ -129,6 +135,13 @@ COLUMNS = """
 """
 
 
+def built() -> str:
+    """What the records of a seed depend on beside cloudrc: what computes their numbers."""
+    here = environment_document()
+    versions = " and ".join(f"{name} {here['packages'][name]}" for name in ("mujoco", "numpy"))
+    return f"{versions} on {here['processor']}, {here['architecture']}"
+
+
 def as_markdown(results: Sequence[Result], seed: int, mode: Mode = "virtual") -> str:
     """The page of the documentation on the faults of a mode."""
     passed = sum(result.passed for result in results)
@@ -138,7 +151,8 @@ def as_markdown(results: Sequence[Result], seed: int, mode: Mode = "virtual") ->
         told = (
             f"Seed {seed}: {passed} of {len(results) - skipped} run passed, {skipped} not run yet."
         )
-    lines = [HEADS[mode].format(result=told), COLUMNS, *map(_row, results), "\n## Measured\n"]
+    head = HEADS[mode].format(result=told, built=built())
+    lines = [head, COLUMNS, *map(_row, results), "\n## Measured\n"]
     for result in results:
         lines.append(f"\n### {result.scenario.id} {result.scenario.name}: {result.word}\n\n")
         if result.outcome.sha256:

@@ -26,12 +26,8 @@ def _disorder(seed: int) -> Outcome:
     asks.safe(outcome, flight)
     asks.done(outcome, flight)
     outcome.true("commands applied in order, none twice", asks.applied_in_order(flight))
-    outcome.least(
-        "metric datagrams_reordered_total downlink",
-        asks.metric(flight, "world", "datagrams_reordered_total", "downlink"),
-        100,
-    )
-    meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "late", since=0.0)
+    for name, labels in (("datagrams_reordered_total", ()), ("datagrams_total", ("late",))):
+        meters.moves(outcome, flight, "world", name, "downlink", *labels, since=0.0)
     outcome.least("late commands dropped", flight.count("late"), 100)
     return outcome
 
@@ -45,11 +41,7 @@ def _copies(seed: int) -> Outcome:
     asks.safe(outcome, flight)
     asks.done(outcome, flight)
     outcome.true("the same path, bit by bit", asks.same_path(clean, flight))
-    outcome.least(
-        "metric datagrams_total repeated",
-        asks.metric(flight, "world", "datagrams_total", "downlink", "repeated"),
-        1000,
-    )
+    meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "repeated", since=0.0)
     outcome.least("copies dropped", flight.count("repeated"), 1000)
     return outcome
 

@@ -154,18 +154,21 @@ def _judge_remains(
     """What is left of a recording holds nothing wrong, and all but its last half second."""
     whole = Recording.read(path)["/ground_truth"]["stamp_ns"].tolist()
     torn, mended = path.with_name("torn.mcap"), path.with_name("mended.mcap")
-    losses, wrong, untold = dict[str, float](), 0, list[float]()
+    losses, wrong, untold, shares = dict[str, float](), 0, list[float](), list[float]()
     for how, at, data in copies:
         torn.write_bytes(data)
-        recover(torn, mended)
+        recovery = recover(torn, mended)
         stamps = Recording.read(mended)["/ground_truth"]["stamp_ns"].tolist()
         wrong += stamps != whole[: len(stamps)]
         lost = at - stamps[-1] * 1e-9
         losses[how] = max(losses.get(how, 0.0), lost)
+        if how == "SIGKILL":
+            shares.append(recovery.share)
         if how == "power cut":
             untold.append(abs(lost - ages[at]))
     for how, lost in losses.items():
         outcome.most(f"{how}: longest stretch lost", lost, LOSS_MAX, "s")
+    outcome.least("SIGKILL: kept, the share that is told", min(shares, default=nan), 0.99)
     text = "metric recorder_sync_age_seconds differs from what a power cut took by"
     outcome.most(text, max(untold, default=nan), UNTOLD_MAX, "s")
     outcome.same("recoveries that differ from what was recorded", wrong, 0)
@@ -231,7 +234,7 @@ SCENARIOS = (
         "SIGKILL, and a power cut that forgets what was not synced, at 20 instants of a flight",
         "the flight is unaffected; the rest recovers with right checksums",
         "at most 0.5 s of the recording",
-        "cloudrc recover: kept 99 %; before, what a power cut would take: "
+        "cloudrc recover: kept 99 % after SIGKILL; before, what a power cut would take: "
         "cloudrc_recorder_sync_age_seconds",
         _recorder_killed,
     ),

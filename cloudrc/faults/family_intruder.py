@@ -13,7 +13,7 @@ from cloudrc.faults.mortal import Mortal, Tamper
 from cloudrc.faults.scenario import Outcome, Scenario, generator
 from cloudrc.faults.toll import Generator, Toll, unharmed
 from cloudrc.messages import Command, GuardState
-from cloudrc.records import Control
+from cloudrc.records import Control, Fault
 from cloudrc.tunnel import codec
 
 FLOOD = 100
@@ -88,7 +88,27 @@ def _malformed(seed: int) -> Outcome:
         other = bytes([data[0] + 1]) + data[1:]
         return [b"", data[:cut], data + b"\0", bytes(longer), data[:1] * 2048, other]
 
-    return unharmed(seed, strange, "malformed", "version")
+    outcome = unharmed(seed, strange, "malformed", "version")
+    _another_version(outcome, seed)
+    return outcome
+
+
+def _another_version(outcome: Outcome, seed: int) -> None:
+    """A cloud of the next version is there for 2 s, then one of ours."""
+    flight, newer = Flight(seed=seed), codec.VERSION + 1
+
+    def tamper(data: bytes, now_ns: int) -> list[bytes]:
+        return [bytes([newer]) + data[1:]] if now_ns * 1e-9 < 2.0 else [data]
+
+    flight.world.tamper = tamper
+    flight.fly(2.0)
+    outcome.same("a cloud of another version: sessions", len(asks.epochs(flight)), 0)
+    flight.fly_mission()
+    asks.safe(outcome, flight)
+    asks.done(outcome, flight)
+    told = [r.text for r in flight.of_world if isinstance(r, Fault) and r.code == "version"]
+    text = f"peer speaks v{newer}, we speak v{codec.VERSION}"
+    outcome.true(f"it is told once: {text}", len(told) == 1 and told[0].startswith(text))
 
 
 LIES: dict[str, Lie] = {
@@ -189,10 +209,12 @@ SCENARIOS = (
     Scenario(
         24,
         "malformed",
-        "empty, truncated, oversized datagrams and those of another version",
-        "dropped before any cryptography: the same path, bit by bit",
+        "empty, truncated, oversized datagrams and those of another version; a cloud of another "
+        "version for 2 s",
+        "dropped before any cryptography: the same path, bit by bit; no session with the other",
         "those",
-        "cloudrc_datagrams_total{outcome=malformed}, {outcome=version}",
+        "fault 'version' with both numbers, cloudrc_datagrams_total{outcome=malformed}, "
+        "{outcome=version}",
         _malformed,
     ),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import hypot
+from math import hypot, nan
 
 from cloudrc.faults import asks, meters
 from cloudrc.faults.flight import Flight
@@ -56,6 +56,7 @@ def _silence(seed: int) -> Outcome:
         began = next(iter(asks.changes_into(flight, GuardState.HOLD)), at)
         what = f"{duration:g} s of silence"
         outcome.most(f"{what}: HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
+        asks.causes_told(outcome, flight, what)
         back = at + duration
         if duration >= 3.0:
             outcome.most(
@@ -77,11 +78,11 @@ def _long_silence(seed: int) -> Outcome:
     asks.safe(outcome, flight)
     held = next(iter(asks.changes_into(flight, GuardState.HOLD)), -1.0)
     lands = asks.changes_into(flight, GuardState.LAND)
-    landed = lands[0] if lands else float("nan")
+    landed = lands[0] if lands else nan
     outcome.most("LAND after HOLD", landed - held, 60.01, "s")
     outcome.least("LAND not before", landed - held, 59.99, "s")
     path = [r for r in flight.trajectory() if r.stamp_ns * 1e-9 >= landed]
-    fastest = max((-r.odometry.velocity[2] for r in path), default=float("nan"))
+    fastest = max((-r.odometry.velocity[2] for r in path), default=nan)
     outcome.most("descent", fastest, 0.55, "m/s")
     outcome.least("descent not slower than", fastest, 0.45, "m/s")
     _lies(outcome, flight)
@@ -89,7 +90,7 @@ def _long_silence(seed: int) -> Outcome:
         "it stays down until the operator acknowledges",
         not [t for t in asks.changes_into(flight, GuardState.TRACK) if t > landed],
     )
-    outcome.true("the mission says why", "guard" in str(flight.mission.verdict))
+    asks.landing_told(outcome, flight)
     meters.moves(outcome, flight, "world", "guard_state", since=at)
     outcome.least("metric guard_state at the end", asks.metric(flight, "world", "guard_state"), 3)
     return outcome
@@ -119,11 +120,10 @@ def _loss(seed: int) -> Outcome:
         clean, "tracking_rms_measured"
     )
     outcome.most("tracking error over that without loss", ratio, 1.5)
-    outcome.least(
-        "metric datagrams_lost_total downlink",
-        asks.metric(flight, "world", "datagrams_lost_total", "downlink"),
-        500,
-    )
+    lost = "datagrams_lost_total"
+    for role, way in (("world", "downlink"), ("cloud", "uplink")):
+        meters.moves(outcome, flight, role, lost, way, since=0.0)
+        outcome.least(f"metric {lost} {way}", asks.metric(flight, role, lost, way), 500)
     outcome.least("loss shown", asks.number(flight, "loss_uplink"), 0.25)
     return outcome
 
@@ -140,8 +140,9 @@ def _bursts(seed: int) -> Outcome:
         if packets < 50:  # else it hardly ever rests on the board for 4 s, and a leg may time out
             asks.done(outcome, flight)
         outcome.true("the mission has ended", flight.mission.ended)
-        moved = asks.metric(flight, "world", "guard_transitions_total", "hold")
-        outcome.least("metric guard_transitions_total hold", moved, 1)
+        # Most bursts do nothing: the fault is the first one that is too long.
+        since = next(iter(asks.changes_into(flight, GuardState.HOLD)), nan) - AGE_MAX
+        meters.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=since)
         text = f"bursts of {packets * 10} ms: changes of the guard in any second"
         outcome.most(text, asks.busiest_second(flight), 2)
     return outcome

@@ -11,6 +11,7 @@ from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario, generator
 from cloudrc.link.sidecar_follow import PEER_PAUSE, PeerName
+from cloudrc.records import Counted, Record
 
 
 def _names(seed: int) -> Outcome:
@@ -30,7 +31,6 @@ def _names(seed: int) -> Outcome:
     outcome.true("keeps the peer while DNS fails", set(kept) == {first})
     outcome.same("lines in the log about it", len(said) - 1, 1)
     outcome.true("it says so", "cannot be resolved" in said[-1])
-    meters.counts(outcome, "link", "unresolved", peer.failures, "dns_errors_total")
     fails[0], addresses[0] = False, ["10.0.0.9"]
     outcome.true("follows the new address", peer.poll() == ("10.0.0.9", 7400))
     outcome.true("it says that too", "was 10.0.0.7" in said[-1])
@@ -44,10 +44,11 @@ def _flown_without_names(outcome: Outcome, seed: int) -> None:
     """Fly while no name is resolved; then the cloud moves, and only its name tells where to."""
     at = instant(seed, 2.0, 4.0)
     clean, flight = Flight(seed=seed).fly_mission(), Flight(seed=seed)
-    _follow(flight, lambda now: "10.0.0.7", at, at + 30.0)
+    told = _follow(flight, lambda now: "10.0.0.7", at, at + 30.0)
     flight.fly_mission()
     asks.safe(outcome, flight)
     asks.done(outcome, flight)
+    meters.moves_among(outcome, "link", told, "dns_errors_total", since=at)
     text = "no name is resolved for 30 s of flight: the same path, bit by bit"
     outcome.true(text, asks.same_path(clean, flight))
     moved, back = at + 5.0, at + 10.0
@@ -61,7 +62,9 @@ def _flown_without_names(outcome: Outcome, seed: int) -> None:
     outcome.most("flown again after the name is", resumed, PEER_PAUSE[1] + 1.0, "s")
 
 
-def _follow(flight: Flight, at_home: Callable[[float], str], since: float, until: float) -> None:
+def _follow(
+    flight: Flight, at_home: Callable[[float], str], since: float, until: float
+) -> list[Record]:
     """What is sent to cloud goes where its name led to when it was resolved last.
 
     Args:
@@ -69,6 +72,9 @@ def _follow(flight: Flight, at_home: Callable[[float], str], since: float, until
         at_home: Address of cloud at an instant [s].
         since: From when on no name is resolved [s].
         until: Until when [s].
+
+    Returns:
+        What the link tells its metrics of it; more is added while the flight goes on.
     """
 
     def resolve(name: str) -> list[str]:
@@ -77,9 +83,11 @@ def _follow(flight: Flight, at_home: Callable[[float], str], since: float, until
         return [at_home(flight.now)]
 
     peer, goes = PeerName(("cloud", 7400), resolve, lambda line: None), [""]
+    told: list[Record] = []
 
     def ask(now_ns: int) -> None:
         goes[0] = (peer.poll() or ("", 0))[0]
+        told.append(Counted(now_ns, "link", "unresolved", peer.failures))
 
     def deliver(data: bytes, now_ns: int) -> list[bytes]:
         return [data] if goes[0] == at_home(now_ns * 1e-9) else []
@@ -88,6 +96,7 @@ def _follow(flight: Flight, at_home: Callable[[float], str], since: float, until
     for at in np.cumsum(generator(flight.experiment.seed, 78).uniform(*PEER_PAUSE, 240)):
         flight.world.at(float(at), ask)
     flight.cloud.tamper = deliver
+    return told
 
 
 SCENARIOS = (

@@ -115,7 +115,8 @@ SCENARIOS = (
         "40 clients that never end their request, at the metrics of the world",
         "a scrape is answered in < 1 s; no HOLD",
         "none",
-        "-",
+        "nothing: every scrape is answered; if none were for two minutes, alert CloudrcAbsent "
+        "(tests/e2e/alerts.yaml tries it)",
         _slow_scrapers,
         REAL,
     ),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
+from math import nan
 from pathlib import Path
 
 from cloudrc.config.load import load_experiment
@@ -20,6 +22,7 @@ from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.faults.walls import jumping_wall_clock, steppable_wall_clock
 from cloudrc.messages import GuardState
 from cloudrc.records import Fault
+from cloudrc.tunnel.complaints import BUSY
 from cloudrc.tunnel.keys import Key, KeySet, write
 
 BAD_KEYS = (
@@ -48,12 +51,7 @@ def _wall_clocks(seed: int) -> Outcome:
     for role in ("world", "cloud"):
         shown = [meters.shown(each, role) for each in (clean, flight)]
         outcome.true(f"every reading of {role} is the same", shown[0] == shown[1])
-    with steppable_wall_clock() as wall:
-        exporter = Exporter("world")
-        before = _clock_steps(exporter)
-        wall.step(-3600.0)
-        moved = _clock_steps(exporter) - before
-    outcome.same("metric clock_steps_total rises at the next scrape by", moved, 1)
+    _stepped(outcome)
     for hours in (-1, 1):
         apart = Flight(seed=seed, cloud_clock=Clock((48 + hours) * HOUR_NS)).fly_mission()
         text = f"cloud's clock {48 + hours} h ahead: the same path, bit by bit"
@@ -64,6 +62,23 @@ def _wall_clocks(seed: int) -> Outcome:
         asks.done(outcome, drifting)
         outcome.same(f"drift of {ppm} ppm: HOLDs", len(asks.held(drifting)), 0)
     return outcome
+
+
+def _stepped(outcome: Outcome) -> None:
+    """Set the wall clock of a process whose metrics are scraped before and after it."""
+    said: list[str] = []
+    with steppable_wall_clock() as wall:
+        exporter = Exporter("world", say=said.append)
+        before = _clock_steps(exporter)
+        wall.step(-3600.0)
+        moved = _clock_steps(exporter) - before
+        again = _clock_steps(exporter) - before
+    outcome.same("metric clock_steps_total rises at the next scrape by", moved, 1)
+    outcome.same("and at the one after that by", again - moved, 0)
+    told = [re.match(r"wall clock stepped by (\S+) s", line) for line in said]
+    outcome.same("lines in the log: wall clock stepped", len(told), 1)
+    by = min((float(match[1]) for match in told if match), default=nan)
+    outcome.most("what it says differs from what it was set by", abs(by + 3600.0), 1.0, "s")
 
 
 def _clock_steps(exporter: Exporter) -> float:
@@ -92,6 +107,12 @@ def _two_clouds(seed: int) -> Outcome:
     meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "busy", since=at)
     meters.moves(outcome, flight, "world", "sessions_refused_total", since=at)
     outcome.least("the second is refused", flight.world.inner._counts["busy"], 1)  # type: ignore[union-attr]
+    told = [r for r in crowd.others if isinstance(r, Fault) and r.code == "busy"]
+    outcome.true("the second says why it waits, once", [r.text for r in told] == [BUSY])
+    said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
+    outcome.most("it says so after", said - at, 1.0, "s")
+    by_first = [r for r in meters.seen_by(flight, "cloud", at + 6.0) if isinstance(r, Fault)]
+    outcome.same("faults that the first tells of", len(by_first), 0)
     outcome.most("HOLD once the first is gone", asks.basis_age_at_hold(flight), AGE_MAX, "s")
     later = [epoch for epoch in asks.epochs(flight) if epoch > 2]
     outcome.true("then the second gets a higher epoch", bool(later))
@@ -114,13 +135,18 @@ def _configuration(seed: int) -> Outcome:
 
 def _secrets(seed: int) -> Outcome:
     outcome, wrong = Outcome(), KeySet(Key(bytes(31) + b"\1"))
-    flight = Flight(seed=seed, secrets={"world": SECRET, "cloud": wrong}).fly(5.0)
+    flight = Flight(seed=seed, secrets={"world": SECRET, "cloud": wrong}).fly(6.0)
     asks.safe(outcome, flight)
     outcome.same("wrong key: sessions", len(asks.epochs(flight)), 0)
     outcome.same("wrong key: changes of the guard", len(flight.changes), 0)
     meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "tag", since=0.0)
-    told = [r.text for r in (*flight.of_world, *flight.of_cloud) if isinstance(r, Fault)]
-    outcome.true("wrong key: it is told", any("key" in text for text in told))
+    for end, code, records in (
+        ("world", "key", flight.of_world),
+        ("cloud", "no_session", flight.of_cloud),
+    ):
+        told = [r.text for r in records if isinstance(r, Fault) and r.code == code]
+        right = len(told) == 1 and "same key" in told[0]
+        outcome.true(f"wrong key: {end} tells once to look at the keys", right)
 
     new = KeySet(Key(b"the next key of the fault suite!"), SECRET.current, 20.0)
     outcome.checks += _rotated(seed, new, gap=8.0, holds=0).checks
@@ -184,7 +210,7 @@ SCENARIOS = (
         "apart, one drifts by 500 ppm",
         "the same flight, bit by bit; drift is flown in TRACK",
         "none",
-        "cloudrc_clock_steps_total; nothing else: no wall clock reaches the loop",
+        "one line in the log at the next scrape: wall clock stepped; cloudrc_clock_steps_total",
         _wall_clocks,
     ),
     Scenario(
@@ -194,6 +220,7 @@ SCENARIOS = (
         "the first keeps authority while fresh; after HOLD the second gets a higher epoch; "
         "commands never interleave",
         "none",
+        "fault 'busy' in the second: another cloud controls the robot; "
         "cloudrc_datagrams_total{outcome=busy}, cloudrc_sessions_refused_total",
         _two_clouds,
     ),
@@ -213,7 +240,8 @@ SCENARIOS = (
         "no session, GROUND; within the overlap no HOLD; beyond it HOLD until both "
         "have the new key",
         "none",
-        "fault 'key' at both ends, cloudrc_datagrams_total{outcome=tag}",
+        "fault 'key' in world, 'no_session' in cloud after 5 s, "
+        "cloudrc_datagrams_total{outcome=tag}",
         _secrets,
     ),
 )

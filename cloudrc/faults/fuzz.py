@@ -6,14 +6,18 @@ is acknowledged. In the calm at the end the robot must be flying again, or it is
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.teleop.service import LATCHED
 from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
 from cloudrc.faults.adversary import temptation
 from cloudrc.faults.asks import held
+from cloudrc.faults.bug import BUGS, buggy
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.inject import inject
+from cloudrc.faults.liar import tempting
 from cloudrc.faults.mortal import Clock
 from cloudrc.faults.remains import Remains
 from cloudrc.faults.schedule import Schedule, shaped
@@ -69,17 +73,16 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
     """
     second = schedule.of("second_cloud")
     offset = schedule.cloud_offset or schedule.cloud_drift
+    clock = Clock(round((schedule.cloud_offset + 1e6) * 1e9), schedule.cloud_drift)
     flight = Flight(
         f"link.profile={schedule.profile}",
         seed=schedule.seed,
-        cloud_clock=Clock(round((schedule.cloud_offset + 1e6) * 1e9), schedule.cloud_drift)
-        if offset
-        else None,
+        cloud_clock=clock if offset else None,
         uplink=lambda profile: shaped(schedule, profile, "up"),
         downlink=lambda profile: shaped(schedule, profile, "down"),
         honest=not schedule.policy,
         keep=keep,
-        tempt=temptation(schedule) if schedule.policy else None,
+        tempt=_tempt(schedule, clock if offset else Clock()),
         second=second[0].at if second else None,
     )
     operator = Operator(flight)
@@ -109,6 +112,19 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         sum(event.event == "done" for event in flight.desk.events),
         watch.fallen,
     )
+
+
+def _tempt(schedule: Schedule, clock: Clock) -> Callable[[CloudEndpoint], None]:
+    """Make what turns a new cloud into that of a schedule: one that lies, or has a bug, or both."""
+    changes = [temptation(schedule)] if schedule.policy else []
+    if schedule.of(*BUGS):
+        changes.append(tempting(buggy(schedule, clock)))
+
+    def tempt(cloud: CloudEndpoint) -> None:
+        for change in changes:
+            change(cloud)
+
+    return tempt
 
 
 class Operator:

@@ -1,28 +1,21 @@
-"""The faults of a schedule are brought about: of the ends, the desk, the disks, the datagrams."""
+"""The faults of a schedule are brought about: of the ends, their keys, the desk, its journal."""
 
 from __future__ import annotations
-
-from collections import deque
-from itertools import islice
-
-import numpy as np
 
 from cloudrc import assembly
 from cloudrc.cloud.teleop.api_bridge import Bridge, Call
 from cloudrc.cloud.teleop.journal_format import MAGIC, parse, to_bytes
 from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
 from cloudrc.cloud.teleop.service_mission import Order
-from cloudrc.faults.family_intruder import flipped
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.mortal import Mortal, Tamper
+from cloudrc.faults.inject_way import waylay
 from cloudrc.faults.options import SECRET
-from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.faults.walls import Wall
 from cloudrc.tunnel.keys import Key, KeySet
 
 NEXT_KEY = KeySet(Key(b"the next key of a fuzzed flight!"), SECRET.current, 30.0)
-CAPTURED = 2_000
+WRONG_KEY = Key(b"a key that world has never read!")
 FLOOD_PERIOD = 0.1
 """Between two bunches of requests [s]."""
 
@@ -38,7 +31,7 @@ def inject(flight: Flight, schedule: Schedule, wall: Wall) -> None:
     for event in schedule.events:
         if not _at_an_end(flight, event) and not _at_the_desk(flight, event):
             _around(flight, event, wall)
-    _intrude(flight, schedule)
+    waylay(flight, schedule)
 
 
 def _at_an_end(flight: Flight, event: Event) -> bool:
@@ -71,6 +64,11 @@ def _around(flight: Flight, event: Event, wall: Wall) -> None:
     elif event.kind == "key_rotated":
         world.at(event.at, lambda now_ns: flight.rotate("world", NEXT_KEY, now_ns))
         cloud.at(event.end, lambda now_ns: flight.rotate("cloud", NEXT_KEY, now_ns))
+    elif event.kind == "key_wrong":
+        wrong = KeySet(WRONG_KEY, None, event.value)
+        cloud.at(event.at, lambda now_ns: flight.rotate("cloud", wrong, now_ns))
+        # The right one is the one that world has read by then.
+        cloud.at(event.end, lambda now_ns: flight.rotate("cloud", flight.secrets["world"], now_ns))
     elif event.kind == "wall_clock":
         world.at(event.at, lambda _: wall.step(event.value))
 
@@ -81,6 +79,8 @@ def _at_the_desk(flight: Flight, event: Event) -> bool:
     if event.kind == "teleop_killed":
         cloud.at(event.at, lambda _: desk.kill())
         cloud.at(event.end, lambda _: desk.start())
+    elif event.kind in ("teleop_shut_down", "pod_shut_down"):
+        _shut_down(flight, event)
     elif event.kind == "journal_full":
         cloud.at(event.at, lambda _: setattr(desk, "refuse", _refuse))
         cloud.at(event.end, lambda _: setattr(desk, "refuse", None))
@@ -97,6 +97,22 @@ def _at_the_desk(flight: Flight, event: Event) -> bool:
     else:
         return False
     return True
+
+
+def _shut_down(flight: Flight, event: Event) -> None:
+    """SIGTERM: teleop holds what is flown and writes it down; a while later it is gone."""
+    cloud, gone = flight.cloud, event.at + event.value * event.duration
+
+    def ask(now_ns: int) -> None:
+        if flight.desk.service is not None:
+            flight.desk.service.pause(cloud.clock.at(now_ns))
+
+    cloud.at(event.at, ask)
+    if event.kind == "pod_shut_down":
+        cloud.at(gone, lambda now_ns: flight.kill_cloud_pod(now_ns, event.end - gone))
+    else:
+        cloud.at(gone, lambda _: flight.desk.kill())
+        cloud.at(event.end, lambda _: flight.desk.start())
 
 
 def _refuse() -> None:
@@ -149,36 +165,3 @@ def _flood(flight: Flight, event: Event, now_ns: int) -> None:
             break
     for call in bridge.take():
         call(flight.cloud.clock.at(now_ns))
-
-
-def _intrude(flight: Flight, schedule: Schedule) -> None:
-    """Damage, forge and replay datagrams on their way."""
-    events = schedule.of("corruption", "garbage", "replay")
-    if events:
-        rng = generator(schedule.seed, 41)
-        for way, end in (("down", flight.world), ("up", flight.cloud)):
-            mine = [event for event in events if event.way in ("both", way)]
-            if mine:
-                end.tamper = _tamper(end, mine, rng)
-
-
-def _tamper(end: Mortal, events: list[Event], rng: np.random.Generator) -> Tamper:
-    captured: deque[bytes] = deque(maxlen=CAPTURED)
-
-    def tamper(data: bytes, now_ns: int) -> list[bytes]:
-        captured.append(data)
-        now, strange = now_ns * 1e-9, list[bytes]()
-        for event in events:
-            if not event.at <= now < event.end:
-                continue
-            if event.kind == "corruption":
-                if rng.random() < event.value:
-                    data = flipped(data, rng, int(rng.integers(1, 9)))
-            elif event.kind == "garbage":
-                strange += [rng.bytes(int(rng.integers(0, 200))) for _ in range(int(event.value))]
-            else:
-                start = int(rng.integers(0, len(captured)))
-                strange += islice(captured, start, start + int(event.value))
-        return [*strange, data]
-
-    return tamper

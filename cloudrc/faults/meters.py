@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import nan
 
 from cloudrc.exposition.histogram import Histogram
@@ -61,7 +61,13 @@ def seen_by(flight: Flight, role: str, until: float) -> list[Record]:
 
 
 def moves(
-    outcome: Outcome, flight: Flight, role: str, name: str, *labels: str, since: float
+    outcome: Outcome,
+    flight: Flight,
+    role: str,
+    name: str,
+    *labels: str,
+    since: float,
+    over: float | None = None,
 ) -> None:
     """Check that a metric reads otherwise within 5 s of a fault.
 
@@ -72,18 +78,49 @@ def moves(
         name: Of the metric, without its prefix.
         labels: Values of its labels.
         since: When the fault begins [s].
+        over: When it ends [s], if that is what counts: who stands still shows nothing, and what is
+            lost is known to be when newer things arrive.
     """
-    before, after = (
-        reading(role, seen_by(flight, role, until), name, *labels)
-        for until in (since, since + SOON)
-    )
+    last = since if over is None else over
+    sights = [seen_by(flight, role, until) for until in (since, last + SOON)]
+    _judge(outcome, role, sights, (name, *labels), "" if over is None else " of its end")
+
+
+def moves_among(
+    outcome: Outcome, role: str, records: Sequence[Record], name: str, *labels: str, since: float
+) -> None:
+    """Likewise of a process that is no end of the flight.
+
+    Args:
+        outcome: Of the scenario.
+        role: Of the process that shows the metric.
+        records: What it has told its metrics, stamped in virtual time.
+        name: Of the metric, without its prefix.
+        labels: Values of its labels.
+        since: When the fault begins [s].
+    """
+    ends_ns = [round(until * 1e9) for until in (since, since + SOON)]
+    sights = [[each for each in records if each.stamp_ns <= end_ns] for end_ns in ends_ns]
+    _judge(outcome, role, sights, (name, *labels))
+
+
+def _judge(
+    outcome: Outcome,
+    role: str,
+    sights: Sequence[Sequence[Record]],
+    metric: Sequence[str],
+    end: str = "",
+) -> None:
+    """Compare a metric, its name and labels, after two lists of records, one longer than before."""
+    before, after = (reading(role, seen, *metric) for seen in sights)
     moved = after == after and before != after  # absent before is as good as another value
-    shown = " ".join((name, *labels))
-    outcome.true(f"metric {shown} moves within {SOON:g} s", moved)
+    outcome.true(f"metric {' '.join(metric)} moves within {SOON:g} s{end}", moved)
 
 
 def counts(outcome: Outcome, role: str, counted: str, total: int, name: str, *labels: str) -> None:
-    """Check that what a process has counted shows in its metric, and is not zero.
+    """Check that what teleop's API or journal has counted shows in a metric, and is not zero.
+
+    They are no part of a flight: its records do not tell of them, nor when they are told.
 
     Args:
         outcome: Of the scenario.
@@ -94,4 +131,4 @@ def counts(outcome: Outcome, role: str, counted: str, total: int, name: str, *la
         labels: Values of its labels.
     """
     value = reading(role, [Counted(0, role, counted, total)], name, *labels)
-    outcome.least(f"metric {' '.join((name, *labels))}", value, 1)
+    outcome.least(f"metric {' '.join((name, *labels))} shows what was counted", value, 1)

@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import ClassVar
 
 from cloudrc.errors import CloudrcError
+from cloudrc.faults.family_disk import LOSS_MAX, SYNC
 from cloudrc.faults.flight import Flight
+from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Event, Schedule
-from cloudrc.faults.scribe import FullDisk, Scribe, SlowWriter
+from cloudrc.faults.scribe import ForgetfulWriter, FullDisk, Scribe, SlowWriter
+from cloudrc.faults.toll import Generator
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
@@ -17,17 +20,23 @@ from cloudrc.records import GroundTruth, Record
 
 ROOM = 1 << 30
 """Of a disk that is not full [bytes]."""
+KILLED = ("recorder_killed", "power_cut")
+"""Kinds that leave a file without its end."""
 
 
 class Remains:
     """Records what happens in the while of each fault of the recording's disk, and reads it."""
 
-    KINDS: ClassVar[tuple[str, ...]] = ("recorder_full", "recorder_slow")
+    KINDS: ClassVar[tuple[str, ...]] = ("recorder_full", "recorder_slow", *KILLED)
 
     def __init__(self, flight: Flight, schedule: Schedule) -> None:
         """Listen to the flight if the schedule has such a fault."""
         self._flight = flight
-        self._tapes = [Tape(event) for event in schedule.of(*self.KINDS)]
+        rng = generator(schedule.seed, 44)
+        self._tapes: list[Tape | CutTape] = [
+            CutTape(event, rng) if event.kind in KILLED else Tape(event)
+            for event in schedule.of(*self.KINDS)
+        ]
         flight.listeners += [tape.hear for tape in self._tapes]
 
     def judge(self) -> None:
@@ -86,3 +95,61 @@ class Tape:
 
     def _owed(self) -> float:
         return self._writer.pay() if self._writer is not None else 0.0
+
+
+class CutTape:
+    """One recording whose process is killed, or whose machine loses its power."""
+
+    def __init__(self, event: Event, rng: Generator) -> None:
+        self._from_ns, self._until_ns = round(event.at * 1e9), round(event.end * 1e9)
+        self._power, self._rng = event.kind == "power_cut", rng
+        self._folder = tempfile.TemporaryDirectory()
+        self._path = Path(self._folder.name) / "world.mcap"
+        self._writer: ForgetfulWriter | None = None
+        self._recorder = Recorder(self._path, self._open)
+        self._scribe = Scribe(self._recorder)
+        self._truths: list[int] = []
+        self._left: bytes | None = None
+
+    def hear(self, records: list[Record], now_ns: int) -> None:
+        """Record what happens in its while [ns], and come to an end in the middle of it."""
+        if self._left is not None or now_ns < self._from_ns:
+            return
+        stamps = [r.stamp_ns for r in records if isinstance(r, GroundTruth)]
+        self._truths += [stamp for stamp in stamps if stamp <= self._until_ns]
+        if now_ns >= self._until_ns:
+            self._left = self._cut()
+            return
+        if self._writer is not None:
+            self._writer.now_ns = now_ns
+        self._scribe.hear(records, now_ns)
+
+    def wrong(self) -> str:
+        """Recover what is left as a user would; say what is wrong, "" if nothing is."""
+        left = self._left if self._left is not None else self._cut()
+        self._recorder.close()
+        torn, mended = self._path.with_name("torn.mcap"), self._path.with_name("mended.mcap")
+        torn.write_bytes(left)
+        try:
+            recover(torn, mended)
+            stamps = Recording.read(mended)["/ground_truth"]["stamp_ns"].tolist()
+        except CloudrcError:
+            stamps = []  # nothing has reached the disk yet: how much that was is asked below
+        finally:
+            self._folder.cleanup()
+        if stamps != self._truths[: len(stamps)]:
+            return "what was recovered has not happened so"
+        began = stamps[-1] if stamps else min(self._truths, default=0)
+        lost = (max(self._truths, default=0) - began) * 1e-9
+        return f"its last {lost:.2f} s are lost" if lost > LOSS_MAX else ""
+
+    def _cut(self) -> bytes:
+        if self._writer is None:
+            return b""
+        if self._power:
+            return self._writer.after_power_cut(self._until_ns, self._rng)
+        return self._path.read_bytes()
+
+    def _open(self, path: Path) -> ForgetfulWriter:
+        self._writer = ForgetfulWriter(path, SYNC)
+        return self._writer

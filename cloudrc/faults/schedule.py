@@ -24,6 +24,8 @@ KINDS: dict[str, str] = {
     "cloud_killed": "the cloud process is away",
     "pod_killed": "the cloud pod, teleop with it, is away",
     "teleop_killed": "teleop is away",
+    "teleop_shut_down": "teleop is asked to end, and away after a share of value of the duration",
+    "pod_shut_down": "the cloud pod is asked to end, and away after a share of value",
     "cloud_paused": "the cloud process stands still",
     "cloud_throttled": "the cloud process runs for a share of value of each 100 ms",
     "world_paused": "the world process stands still",
@@ -36,14 +38,23 @@ KINDS: dict[str, str] = {
     "api_flood": "value requests to teleop in every 100 ms",
     "recorder_full": "world's recording has room for value bytes more",
     "recorder_slow": "every fsync of world's recording takes value [s]",
+    "recorder_killed": "world's recorder is killed at the end",
+    "power_cut": "world's disk forgets at the end, by chance, what was not synced",
+    "names_lost": "no peer's name is resolved, after a share of value the peer moves",
     "second_cloud": "another cloud with the same key joins",
     "key_rotated": "world reads a new key, cloud after the duration",
+    "key_wrong": "cloud reads a wrong key, that before stays valid for value [s]",
+    "values_invalid": "value commands a second of an honest cloud hold NaN or infinity",
+    "values_huge": "value commands a second of an honest cloud are 1e308 m/s",
     "second_order": "another mission is ordered",
     "held": "the operator holds the mission, resumes it after the duration",
 }
 """Every kind of fault."""
 WAYS = ("both", "up", "down")
-SHARES = ("loss", "corruption", "cloud_throttled", "world_throttled", "journal_rotten")
+SHARES = (
+    *("loss", "corruption", "cloud_throttled", "world_throttled", "journal_rotten"),
+    *("teleop_shut_down", "pod_shut_down", "names_lost"),
+)
 """Kinds whose value is a share, in [0, 1]."""
 VALUE_MAX = 1e9
 DURATION_MAX = 86_400.0

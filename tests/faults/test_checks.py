@@ -7,12 +7,18 @@ from typing import Any
 
 import pytest
 
+from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.service_book import MissionBook
 from cloudrc.drivers.keyfile import KeyFile
+from cloudrc.drivers.wall_clock import WallClock
+from cloudrc.exposition.live import Live
+from cloudrc.faults import meters
 from cloudrc.faults.catalogue import find
+from cloudrc.faults.mortal import Mortal
 from cloudrc.link.sidecar_follow import PeerName
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.records import Fault
+from cloudrc.records import Counted, Fault
+from cloudrc.tunnel.complaints import Complaints
 from cloudrc.world.guard import Guard
 
 
@@ -56,20 +62,96 @@ def stops_its_rotors_above_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Guard, "_look_after_itself", hasty)
 
 
-@pytest.mark.full
+def tells_no_cause(monkeypatch: pytest.MonkeyPatch) -> None:
+    enter = Guard._enter
+
+    def silent(guard: Guard, state: GuardState, now_ns: int, cause: str, *armed: bool) -> None:
+        enter(guard, state, now_ns, cause if cause == "mission ended" else "", *armed)
+
+    monkeypatch.setattr(Guard, "_enter", silent)
+
+
+def never_complains(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Complaints, "say", lambda complaints, code, text, now_ns: [])
+
+
+def ends_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MissionService, "pause", lambda service, now_ns: None)
+
+
+def never_freezes(name: str) -> Callable[[pytest.MonkeyPatch], None]:
+    freeze = Mortal.freeze
+
+    def unfrozen(mortal: Mortal, now_ns: int, duration: float) -> None:
+        freeze(mortal, now_ns, 0.0 if mortal._name == name else duration)
+
+    return lambda monkeypatch: monkeypatch.setattr(Mortal, "freeze", unfrozen)
+
+
+def says_nothing_of_the_wall_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    init = WallClock.__init__
+    monkeypatch.setattr(WallClock, "__init__", lambda clock, say: init(clock))
+
+
+def shows_it_10_s_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = meters.seen_by
+    late: Any = lambda flight, role, until: seen(flight, role, until - 10.0)  # noqa: E731
+    monkeypatch.setattr(meters, "seen_by", late)
+
+
+def counts_the_tenth_failure_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    init = PeerName.__init__
+
+    def late(peer: PeerName, *given: Any) -> None:
+        init(peer, *given)
+        peer.failures = -9
+
+    monkeypatch.setattr(PeerName, "__init__", late)
+    see = Live.see
+
+    def seen(live: Live, records: Any) -> None:
+        see(live, [r._replace(total=max(0, r.total)) if type(r) is Counted else r for r in records])
+
+    monkeypatch.setattr(Live, "see", seen)
+
+
+Broken = Callable[[pytest.MonkeyPatch], None]
+BROKEN: list[tuple[str, Broken, str]] = [
+    ("F2", tells_no_cause, "each HOLD tells the age of its command"),
+    ("F3", stops_its_rotors_above_the_ground, "descent"),
+    ("F3", tells_no_cause, "LAND tells why"),
+    ("F4", shows_it_10_s_later, "metric datagrams_lost_total uplink moves"),
+    ("F5", shows_it_10_s_later, "metric guard_transitions_total hold moves"),
+    ("F6", shows_it_10_s_later, "metric datagrams_reordered_total downlink moves"),
+    ("F7", shows_it_10_s_later, "metric datagrams_total downlink repeated moves"),
+    ("F9", says_nothing_of_the_wall_clock, "lines in the log: wall clock stepped"),
+    ("F14", tells_no_cause, "LAND tells why"),
+    ("F15", tells_no_cause, "each HOLD tells the age of its command"),
+    ("F15", tells_no_cause, "each TRACK after it tells of fresh commands"),
+    ("F19", counts_the_tenth_failure_first, "metric dns_errors_total moves"),
+    ("F19", forgets_the_peer, "no name is resolved for 30 s of flight: the same path"),
+    ("F24", never_complains, "it is told once: peer speaks v"),
+    ("F25", never_complains, "the second says why it waits"),
+    ("F27", offers_a_point_that_is_not_the_nearest, "legal points nearer than it"),
+    ("F32", loses_an_event_of_a_reader, "its events have no gap"),
+    ("F33", ends_without_a_word, "HOLD after"),
+    ("F33", ends_without_a_word, "they say: paused by shutdown"),
+    ("F38", never_complains, "wrong key: cloud tells once"),
+    ("F38", takes_a_missing_file_for_a_new_key, "gone in flight: the keys stay"),
+    ("F40", tells_no_cause, "each HOLD tells the age of its command"),
+    ("F40", never_freezes("cloud"), "metric loop_missed_periods_total moves"),
+    ("F40", never_freezes("world"), "metric world_slip_seconds_total moves"),
+]
+QUICK = ("F15", "F25", "F33", "F40")
+
+
 @pytest.mark.parametrize(
     ("name", "broken", "said"),
-    [
-        ("F3", stops_its_rotors_above_the_ground, "descent"),
-        ("F19", forgets_the_peer, "no name is resolved for 30 s of flight: the same path"),
-        ("F27", offers_a_point_that_is_not_the_nearest, "legal points nearer than it"),
-        ("F32", loses_an_event_of_a_reader, "its events have no gap"),
-        ("F38", takes_a_missing_file_for_a_new_key, "gone in flight: the keys stay"),
-    ],
+    [pytest.param(*each, marks=[] if each[0] in QUICK else pytest.mark.full) for each in BROKEN],
 )
 def test_a_broken_promise_is_noticed(
     name: str,
-    broken: Callable[[pytest.MonkeyPatch], None],
+    broken: Broken,
     said: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import faults_fuzz
 from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.compose import CALM, calm, compose
 from cloudrc.faults.fuzz import Finding, fly, judged
-from cloudrc.faults.remains import Remains
+from cloudrc.faults.remains import KILLED, Remains
 from cloudrc.faults.schedule import KINDS, Event, Schedule, dump, load, shaped
 from cloudrc.faults.shrink import shrink
 from cloudrc.faults.watch import Breach, Watch
@@ -226,7 +225,6 @@ def test_a_stored_schedule_is_flown_again(
     path.write_text(dump(Schedule(1, events=(Event("blackout", 2.0, 0.5),), duration=6.0)))
     assert main(["faults", "replay", str(path)]) == 0
     assert "passed" in capsys.readouterr().out
-    assert faults_fuzz.INVARIANTS
 
 
 def test_no_zero_is_told_of_what_was_not_looked_at(capsys: pytest.CaptureFixture[str]) -> None:
@@ -247,7 +245,7 @@ def test_a_flight_that_leaves_no_time_to_find_back_is_not_judged_for_being_stuck
     assert "stuck" not in judged(replace(late, duration=61.0))
 
 
-@pytest.mark.parametrize("kind", Remains.KINDS)
+@pytest.mark.parametrize("kind", sorted(set(Remains.KINDS) - set(KILLED)))
 def test_what_a_bad_disk_leaves_of_a_recording_is_judged(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

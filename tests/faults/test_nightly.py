@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-_, _, REST = (ROOT / "Makefile").read_text(encoding="utf-8").partition("# The long numbers,")
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
+_, _, REST = MAKEFILE.partition("# The long numbers,")
 LIST, _, RECIPE = REST.partition("\nnightly:")
 RECIPE = RECIPE.partition("\n\n")[0].replace("\\\n\t\t", "")
 TESTS = re.findall(r"^#   .+?  (test_\w+)$", LIST, re.MULTILINE)
@@ -46,3 +47,20 @@ def test_every_test_that_it_names_is_there_once() -> None:
     texts = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")]
     there = [name for text in texts for name in re.findall(r"^def (test_\w+)", text, re.MULTILINE)]
     assert {name: there.count(name) for name in TESTS} == dict.fromkeys(TESTS, 1)
+
+
+def test_a_short_search_does_not_overwrite_what_a_long_one_has_shown() -> None:
+    short = MAKEFILE.partition("\nfaults:")[2].partition("\n\n")[0].replace("\\\n\t\t", "")
+    searches = [line for line in short.splitlines() if "faults fuzz" in line]
+    assert len(searches) == 2
+    assert all("--document build/" in line for line in searches)
+    assert "docs/safety/faults.md" in short
+    ci = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    assert "faults fuzz" not in ci, "it searches by make faults alone"
+
+
+def test_the_slices_that_it_tells_of_are_the_whole_search() -> None:
+    flown = re.findall(r"^#   cloudrc faults fuzz --first (\d+) --seeds (\d+)", LIST, re.MULTILINE)
+    ends = [int(first) + int(count) for first, count in flown]
+    assert [int(first) for first, _ in flown] == [1, *ends[:-1]]
+    assert f"faults fuzz --seeds {ends[-1] - 1} " in RECIPE

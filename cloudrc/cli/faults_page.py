@@ -1,0 +1,105 @@
+"""The result of a search for faults: as a table, in a sentence, as a page of the documentation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+INVARIANTS = {
+    "collision": "collisions",
+    "fence": "fence breaches",
+    "cap": "cap breaches",
+    "stop": "too fast towards the fence",
+    "stale": "motion on stale commands",
+    "stuck": "stuck states",
+    "alarm": "false alarms",
+    "recording": "recordings that do not hold what happened",
+    "error": "errors in an end",
+}
+PROMISES = {"random": "P-FAULT-2", "adversarial": "P-FAULT-3", "clean": "P-FAULT-4"}
+"""Ids in `docs/safety/promises.md`."""
+NOTES = {
+    "adversarial": (
+        "",
+        "The cloud holds valid keys. Every second one flies amid faults of all kinds, every tenth",
+        "speaks in its operator's place. A robot that this has stopped may come to lie outside the",
+        "fence, a [known limit](guard.md): it is told below the table, and a breach beyond 1.5 m.",
+    )
+}
+"""What else is to be said, by kind."""
+
+
+def rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Each invariant with its bound."""
+    lines: list[tuple[str, ...]]
+    lines = [("invariant", "broken in", "of N", "95 % bound")]
+    for kind, words in INVARIANTS.items():
+        broken, judged, bound = (
+            document["invariants"][kind][name] for name in ("broken", "judged", "bound")
+        )
+        if not judged:
+            lines.append((words, "-", "0", "not judged"))
+            continue
+        lines.append((words, str(broken), str(judged), "-" if broken else f"p < {bound:.2g}"))
+    return lines
+
+
+def summary(document: dict[str, Any]) -> str:
+    """How much was flown, and the extremes."""
+    fallen = (
+        f"; {document['fallen']} stopped by the operator's word came to lie outside of it, at most "
+        f"by {document['fallen_m']:.2f} m"
+    )
+    return (
+        f"{document['hours']:.2f} virtual hours of {document['kind']} schedules from seed "
+        f"{document['first']} on in {document['seconds']:.0f} s: "
+        f"{document['missions_done']} missions done, {document['holds']} HOLDs, "
+        f"nearest to the fence {document['smallest_margin_m']:.3f} m, "
+        f"fastest {document['largest_speed_mps']:.2f} m/s" + (fallen if document["fallen"] else "")
+    )
+
+
+def command(document: dict[str, Any]) -> str:
+    """The command that flies the same once more; where it keeps what it finds changes nothing."""
+    kind, first = document["kind"], document["first"]
+    words = ["cloudrc faults fuzz", *([f"--{kind}"] if kind != "random" else [])]
+    words += [f"--first {first}"] if first != 1 else []
+    return " ".join([*words, f"--seeds {document['count']}"])
+
+
+def markdown(document: dict[str, Any], written_by: str, slices: Sequence[str] = ()) -> str:
+    """Lay out a page of the documentation.
+
+    Args:
+        document: The result.
+        written_by: The command that writes the page.
+        slices: The commands that fly the parts it was added up from; none if it was flown at once.
+    """
+    head, *lines = rows(document)
+    flown = ["Flown in slices, one after the other:", "", *(f"- `{each}`" for each in slices), ""]
+    kind = document["kind"]
+    return "\n".join(
+        [
+            f"# The search for faults: {kind} schedules",
+            "",
+            f"Written by `{written_by}`;",
+            "do not edit. Each schedule is one minute of flight; the",
+            "invariants are looked at in every step of 2 ms. The bound is by the rule of three:",
+            "0 events in N runs, p < 3/N with 95 % confidence. N counts the schedules in which an",
+            "invariant is looked at: under a cloud that means no good a contact is no breach, and",
+            "only where nothing goes wrong a HOLD is a false alarm. The promise is "
+            f"[{PROMISES[kind]}].",
+            *NOTES.get(kind, ()),
+            "",
+            f"| {' | '.join(head)} |",
+            "|---|---|---|---|",
+            *(f"| {' | '.join(line)} |" for line in lines),
+            "",
+            summary(document) + ".",
+            "",
+            *(flown if slices else ()),
+            f"Flown by cloudrc {document['version']}; SHA-256 of its sources: "
+            f"`{document['sources'][:16]}`.",
+            "",
+        ]
+    )

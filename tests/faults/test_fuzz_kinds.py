@@ -1,0 +1,178 @@
+"""Shutdowns, lost names, keys, killed recorders and a controller's bugs in a random search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cloud.teleop.service import MissionService
+from cloudrc.faults import fuzz
+from cloudrc.faults.compose import RANGES, compose
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.fuzz import fly, judged
+from cloudrc.faults.inject import inject
+from cloudrc.faults.remains import KILLED
+from cloudrc.faults.schedule import KINDS, Event, Schedule, dump, load
+from cloudrc.faults.shrink import shrink
+from cloudrc.faults.walls import Wall
+from cloudrc.link.sidecar_follow import PeerName
+from cloudrc.messages import GuardState
+from cloudrc.record.recover import Recovery, recover
+from cloudrc.tunnel.keys import KeyRing, KeySet
+
+Patch = pytest.MonkeyPatch
+NEW = (
+    *("teleop_shut_down", "pod_shut_down", "names_lost", "key_wrong"),
+    *("values_invalid", "values_huge", *KILLED),
+)
+
+
+def _flown(*events: Event, until: float = 25.0) -> set[str]:
+    return fly(Schedule(3, events=events, duration=until)).kinds
+
+
+@pytest.mark.parametrize("kind", NEW)
+def test_it_is_drawn_kept_in_a_file_and_flown(kind: str, tmp_path: Path) -> None:
+    assert any(event.kind == kind for seed in range(100) for event in compose(seed).events)
+    longest, low, high = RANGES[kind]
+    events = (Event(kind, 8.0, longest / 2, (low + high) / 2), Event(kind, 14.0, 0.3, high))
+    schedule = Schedule(3, events=events, duration=26.0)
+    path = tmp_path / "schedule.yaml"
+    path.write_text(dump(schedule))
+    assert load(path) == schedule
+    assert "stuck" in judged(schedule)
+    assert fly(schedule).breaches == ()
+
+
+@pytest.mark.parametrize("kind", NEW)
+def test_it_is_left_alone_when_the_rest_is_taken_out(kind: str) -> None:
+    noise = tuple(Event(each, 1.0 + n, 1.0, 0.5) for n, each in enumerate(sorted(KINDS)))
+    smallest = shrink(Schedule(5, events=noise), lambda schedule: bool(schedule.of(kind)))
+    assert [(event.kind, event.value) for event in smallest.events] == [(kind, 0.5)]
+
+
+@pytest.mark.parametrize("kind", ["teleop_shut_down", "pod_shut_down"])
+def test_teleop_that_is_asked_to_end_pauses_and_its_successor_goes_on(kind: str) -> None:
+    flight = Flight(seed=3)
+    event = Event(kind, 8.0, 4.0, 0.25)
+    inject(flight, Schedule(3, events=(event,)), Wall())
+    flight.fly(8.5)
+    assert [each.event for each in flight.desk.events][-1] == "paused"
+    assert flight.state_at(flight.run.now_ns) is GuardState.HOLD
+    flight.fly(9.5)
+    assert flight.desk.service is None, "after a quarter of the duration"
+    assert (flight.cloud.inner is None) == (kind == "pod_shut_down")
+    flight.fly_mission()
+    assert flight.mission.state == "done"
+
+
+@pytest.mark.parametrize("kind", ["teleop_shut_down", "pod_shut_down"])
+def test_a_shutdown_that_fails_is_found(kind: str, monkeypatch: Patch) -> None:
+    def fail(service: MissionService, now_ns: int) -> None:
+        raise OSError("no way to end")
+
+    monkeypatch.setattr(MissionService, "pause", fail)
+    assert _flown(Event(kind, 8.0, 4.0, 0.25)) == {"error"}
+
+
+def test_a_peer_that_is_not_followed_is_found(monkeypatch: Patch) -> None:
+    lost = Event("names_lost", 8.0, 4.0, 0.5)
+    assert _flown(lost) == set()
+    poll = PeerName.poll
+
+    def once(peer: PeerName) -> tuple[str, int] | None:
+        return (peer._known[-1], 7400) if peer._known else poll(peer)
+
+    monkeypatch.setattr(PeerName, "poll", once)
+    assert _flown(lost) == {"stuck"}
+
+
+@pytest.mark.parametrize("way", ["up", "down"])
+def test_names_that_are_lost_while_nobody_moves_change_nothing(way: str) -> None:
+    lost = Event("names_lost", 8.0, 4.0, 1.0, way)
+    assert fly(Schedule(3, events=(lost,), duration=11.9)).holds == 0
+    moved = Event("names_lost", 8.0, 4.0, 0.5, way)
+    assert fly(Schedule(3, events=(moved,), duration=11.9)).holds == 1
+
+
+def test_the_right_key_that_is_not_read_is_found(monkeypatch: Patch) -> None:
+    wrong = Event("key_wrong", 8.0, 4.0, 0.5)
+    assert _flown(wrong) == set()
+    replace, read = KeyRing.replace, set[int]()
+
+    def once(ring: KeyRing, keys: KeySet, now_ns: int) -> None:
+        if id(ring) not in read:
+            replace(ring, keys, now_ns)
+        read.add(id(ring))
+
+    monkeypatch.setattr(KeyRing, "replace", once)
+    assert _flown(wrong) == {"stuck"}
+
+
+def test_a_rotation_amid_a_wrong_key_ends_with_the_key_of_world() -> None:
+    rotated = Event("key_rotated", 9.0, 1.0)
+    assert _flown(Event("key_wrong", 8.0, 4.0, 0.5), rotated, until=30.0) == set()
+
+
+def test_a_few_impossible_numbers_do_not_land_it_many_do_until_it_is_acknowledged(
+    monkeypatch: Patch,
+) -> None:
+    few, many = (Event("values_invalid", 8.0, 4.0, value) for value in (3.0, 8.0))
+    assert _flown(few) == _flown(many) == set()
+    monkeypatch.setattr(MissionService, "acknowledge", lambda service, now_ns: None)
+    assert _flown(few) == set()
+    assert _flown(many) == {"stuck"}
+    schedule = Schedule(3, "wifi", (Event("loss", 3.0, 1.0, 0.1), few, many), duration=25.0)
+    smallest = shrink(schedule, lambda each: "stuck" in fly(each).kinds)
+    assert [(event.kind, event.value) for event in smallest.events] == [("values_invalid", 8.0)]
+    assert smallest.profile == "paper-p2"
+
+
+def test_huge_numbers_that_pass_the_guard_are_found(monkeypatch: Patch) -> None:
+    huge = Event("values_huge", 8.0, 4.0, 4.0)
+    assert _flown(huge) == set()
+    monkeypatch.setattr("cloudrc.world.guard.rules.towards", lambda start, end, step: end)
+    assert "cap" in _flown(huge)
+
+
+def _says_the_same(source: Path, target: Path) -> Recovery:
+    """Has a copy of the recording that was made before the newest flight began."""
+    recovery = recover(source, target)
+    target.write_bytes(OTHER[0])
+    return recovery
+
+
+OTHER = [b""]
+
+
+@pytest.mark.parametrize("kind", KILLED)
+def test_a_recording_that_has_not_happened_so_is_found(kind: str, monkeypatch: Patch) -> None:
+    kept: list[Callable[[Path, Path], Recovery]] = [_keeps]
+    monkeypatch.setattr("cloudrc.faults.remains.recover", lambda *paths: kept[0](*paths))
+    assert _flown(Event(kind, 1.0, 2.0), until=3.5) == set()
+    assert OTHER[0]
+    kept[0] = _says_the_same
+    assert _flown(Event(kind, 4.0, 2.0), until=6.5) == {"recording"}
+
+
+def _keeps(source: Path, target: Path) -> Recovery:
+    recovery = recover(source, target)
+    OTHER[0] = target.read_bytes()
+    return recovery
+
+
+@pytest.mark.parametrize("kind", KILLED)
+def test_a_recorder_that_writes_too_seldom_is_found(kind: str, monkeypatch: Patch) -> None:
+    monkeypatch.setattr("cloudrc.faults.scribe.FLUSH", 5.0)
+    monkeypatch.setattr("cloudrc.record.writer.CHUNK_NS", 5_000_000_000)
+    finding = fly(Schedule(3, events=(Event(kind, 2.0, 3.0),), duration=6.0))
+    assert finding.kinds == {"recording"}
+    assert "are lost" in finding.breaches[0].text
+
+
+def test_an_adversary_may_have_a_bug_as_well() -> None:
+    bug = Event("values_invalid", 3.0, 4.0, 3.0)
+    schedule = Schedule(4, policy="random", events=(bug,), duration=10.0)
+    assert fuzz.fly(schedule).breaches == ()
