@@ -139,7 +139,7 @@ class OperatorRequest(NamedTuple):
     """What the operator asks of the robot itself; repeated until telemetry shows its number.
 
     Attributes:
-        number: Rises by one with every request of a session's operator, from 1.
+        number: Rises with every request of an operator, above what the robot has acted on.
         request: What is asked.
         start: Where the mission starts from; only read with Request.START.
         mission_id: Names the mission, below 2^63.

@@ -50,12 +50,15 @@ def summary(document: dict[str, Any]) -> str:
         f"; {document['fallen']} stopped by the operator's word came to lie outside of it, at most "
         f"by {document['fallen_m']:.2f} m"
     )
+    landed = f"; {document['landed_on']} landed on something other than the floor"
     return (
         f"{document['hours']:.2f} virtual hours of {document['kind']} schedules from seed "
         f"{document['first']} on in {document['seconds']:.0f} s: "
         f"{document['missions_done']} missions done, {document['holds']} HOLDs, "
         f"nearest to the fence {document['smallest_margin_m']:.3f} m, "
-        f"fastest {document['largest_speed_mps']:.2f} m/s" + (fallen if document["fallen"] else "")
+        f"fastest {document['largest_speed_mps']:.2f} m/s"
+        + (fallen if document["fallen"] else "")
+        + (landed if document["landed_on"] else "")
     )
 
 

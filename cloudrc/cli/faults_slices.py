@@ -18,7 +18,7 @@ READ = (".py", ".xml", ".yaml")
 """Endings of what a flight may depend on."""
 WRITES_ONLY = ("cli", "_chart")
 """Folders of the package that no flight depends on."""
-ADDED = ("count", "hours", "seconds", "holds", "missions_done", "fallen", "failures")
+ADDED = ("count", "hours", "seconds", "holds", "missions_done", "fallen", "landed_on", "failures")
 WORST = {"smallest_margin_m": min, "largest_speed_mps": max, "fallen_m": max}
 SAME = ("schemaVersion", "kind", "version", "sources")
 
@@ -65,6 +65,7 @@ def document(findings: Sequence[Document], failures: Sequence[Document], **what:
         "holds": sum(each["holds"] for each in findings),
         "missions_done": sum(each["missions"] for each in findings),
         "fallen": sum(each["fallen"] > 0.0 for each in findings),
+        "landed_on": sum(each["landed_on"] for each in findings),
         "fallen_m": max((each["fallen"] for each in findings), default=0.0),
         "failures": list(failures),
     }

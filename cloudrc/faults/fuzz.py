@@ -47,6 +47,7 @@ class Finding:
         holds: How often the guard held although the mission was on.
         missions: How many missions were done.
         fallen: How far outside the fence it came, its rotors stopped by the operator's word [m].
+        landed_on: What it touched when it landed, the floor left out.
     """
 
     schedule: Schedule
@@ -57,6 +58,7 @@ class Finding:
     holds: int
     missions: int
     fallen: float = 0.0
+    landed_on: frozenset[str] = frozenset()
 
     @property
     def kinds(self) -> set[str]:
@@ -111,6 +113,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         len(holds),
         sum(event.event == "done" for event in flight.desk.events),
         watch.fallen,
+        frozenset(watch.landed_on),
     )
 
 

@@ -5,7 +5,9 @@ operator's word has stopped them, it may fall out of it, but not as far as peopl
 and they turn again only where the robot lies still, inside the fence. What is flown stays below the
 caps and can be stopped in time, before the floor, too, unless the robot lands. No motion on stale
 commands: in TRACK the newest accepted command's basis is never older than its limit. No collision,
-under an honest cloud: nothing but the arm's tip touches anything, and that the board.
+under an honest cloud: nothing but the arm's tip touches anything, and that the board. A robot that
+lands, since its cloud is gone for good or says what no honest one does, sinks where it is: the
+guard knows the fence, and not what lies below. What it comes down on is told, and no collision.
 """
 
 from __future__ import annotations
@@ -57,6 +59,8 @@ class Watch:
         speed: Largest speed flown [m/s].
         fallen: How far outside the fence the base came with its rotors stopped by the operator's
             word [m]; 0 if it did not.
+        landed_on: What was touched by a robot that landed, the floor left out, and until it flew
+            again.
     """
 
     def __init__(self, speed_max: float, acceleration_max: float, age_max_ns: int) -> None:
@@ -75,7 +79,9 @@ class Watch:
         self.breaches: list[Breach] = []
         self.counts: Counter[str] = Counter()
         self.margin, self.speed, self.fallen = 9.0, 0.0, 0.0
+        self.landed_on: set[str] = set()
         self._hit: tuple[int, str] | None = None
+        self._lands = False
 
     def attach(self, world: Any, start_ns: int) -> None:
         """Look at every step of a world that begins now, and at every command that it accepts."""
@@ -107,6 +113,7 @@ class Watch:
                 self._look_at_take_off(position, simulator.readings.velocity, now_ns)
             self._look_at_fence(position, falls, now_ns)
             if state in flown:
+                self._lands = state is landing
                 self._look_at_stop(position, reference, state is landing, now_ns)
                 if reference is not before:
                     self._look_at_caps(before, reference, state is tracking, now_ns)
@@ -174,9 +181,12 @@ class Watch:
         self._hit = (contact.stamp_ns, body)
         if not honest:
             return
-        landing = guard not in ABOVE_GROUND
-        allowed = (body == "board" and contact.tip) or (landing and body == "floor")
-        if not allowed:
+        low = guard not in ABOVE_GROUND
+        if (body == "board" and contact.tip) or (low and body == "floor"):
+            return
+        if low and (self._lands or guard is GuardState.LAND):
+            self.landed_on.add(body)
+        else:
             part = "tip" if contact.tip else "body"
             self.note(contact.stamp_ns, "collision", f"{part} touched {body} in {guard.name}")
 

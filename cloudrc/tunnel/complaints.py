@@ -34,8 +34,11 @@ class Complaints:
         return []
 
     def say(self, code: str, text: str, now_ns: int) -> list[Fault]:
-        """Say something unless it has been said [ns, own clock]."""
-        if code in self._said:
+        """Say something unless these words have been said [ns, own clock].
+
+        Anybody may send a datagram of another version: it does not hide what the peer's is.
+        """
+        if text in self._said:
             return []
-        self._said.add(code)
+        self._said.add(text)
         return [Fault(now_ns, code, text)]

@@ -5,8 +5,9 @@ from itertools import pairwise
 import pytest
 from teleop_harness import AWAY, PLAN, A, B, Flight, flying
 
-from cloudrc.cloud.teleop.messages import Cancel, GoTo, Hold, Resume, StartMission
+from cloudrc.cloud.teleop.messages import Cancel, GoTo, Hold, Resume, Seen, StartMission
 from cloudrc.cloud.teleop.plan import Leg, Plan
+from cloudrc.cloud.teleop.request import PREDECESSORS, Repeater
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Request, Setpoint, Start
 
@@ -124,7 +125,7 @@ def test_a_request_is_repeated_at_10_hz_until_it_is_acknowledged_and_never_after
     ]
     assert len(times) == 10
     assert all(later - earlier == 100_000_000 for earlier, later in pairwise(times))
-    assert {request.number for request in flight.requests} == {1}
+    assert {request.number for request in flight.requests} == {PREDECESSORS}
     flight.downlink = True
     flight.step(seconds=0.15)
     assert flight.state == "FLYING"
@@ -139,7 +140,8 @@ def test_a_lost_acknowledgement_lets_the_request_go_on():
     flight.operate(StartMission(PLAN))
     flight.uplink = False
     flight.step(seconds=0.5)
-    assert (flight.state, flight.mission, len(flight.requests)) == ("STARTING", 1, 5)
+    assert (flight.state, len(flight.requests)) == ("STARTING", 5)
+    assert flight.mission == PREDECESSORS
     flight.uplink = True
     flight.step()
     assert flight.state == "FLYING"
@@ -161,17 +163,28 @@ def test_the_end_is_asked_for_although_nothing_is_seen():
     flight.uplink = False
     flight.operate(Cancel())
     flight.step()
-    assert (flight.requests[-1].number, flight.requests[-1].request) == (2, Request.END)
+    last = flight.requests[-1]
+    assert (last.number, last.request) == (PREDECESSORS + 1, Request.END)
 
 
-def test_numbers_go_on_from_what_the_robot_shows():
+def test_numbers_go_on_well_above_what_the_robot_shows():
     flight = Flight()
     flight.mission = 41  # a cloud that has been restarted since has asked for these
     flight.step()
     flight.operate(GoTo(B))
     flight.step(seconds=0.05)
-    assert flight.requests[0].number == 42
+    assert flight.requests[0].number == 41 + PREDECESSORS
     assert flight.state == "FLYING"
+
+
+def test_what_a_predecessor_asked_last_is_not_taken_for_ones_own_start():
+    """It asked for the mission's end, was gone at once, and the robot shows that only now."""
+    repeater, seen = Repeater(), Seen(1, A, GuardState.TRACK, 41)
+    repeater.see(seen)
+    repeater.ask(Request.START, Start.HERE)
+    own = repeater.due(0).number
+    assert repeater.see(seen._replace(mission=42)) is None
+    assert repeater.see(seen._replace(mission=own)) is Request.START
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from teleop_harness import AWAY, A, B, C, Flight
 from cloudrc.cloud.teleop.journal import Journal
 from cloudrc.cloud.teleop.messages import Continue, Hold, Seen, StartMission
 from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.cloud.teleop.request import Repeater
+from cloudrc.cloud.teleop.request import PREDECESSORS, Repeater
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.service_mission import Order, number_of
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
@@ -119,7 +119,7 @@ def test_progress_waits_for_what_is_asked():
     repeater.ask(Request.END)
     assert repeater.due(0).request is Request.END
     assert repeater.due(50_000_000) is None
-    repeater.see(seen._replace(mission=5))
+    repeater.see(seen._replace(mission=4 + PREDECESSORS))
     assert repeater.due(99_999_999) is None
     assert repeater.due(100_000_000) == OperatorRequest(0, Request.PROGRESS, Start.SPAWN, ID, 2)
 

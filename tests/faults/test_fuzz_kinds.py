@@ -37,7 +37,7 @@ def _flown(*events: Event, until: float = 25.0) -> set[str]:
 def test_it_is_drawn_kept_in_a_file_and_flown(kind: str, tmp_path: Path) -> None:
     assert any(event.kind == kind for seed in range(100) for event in compose(seed).events)
     longest, low, high = RANGES[kind]
-    events = (Event(kind, 8.0, longest / 2, (low + high) / 2), Event(kind, 14.0, 0.3, high))
+    events = (Event(kind, 8.0, longest / 2, (low + high) / 2), Event(kind, 14.0, 0.02, high))
     schedule = Schedule(3, events=events, duration=26.0)
     path = tmp_path / "schedule.yaml"
     path.write_text(dump(schedule))

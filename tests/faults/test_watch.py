@@ -160,3 +160,22 @@ def test_under_an_honest_cloud_nothing_but_the_tip_touches_and_that_the_board(
         watch = Watch(6.0, 12.0, 250 * MS)
         watch.see(Contact(0, body, INSIDE, ZERO, ZERO, tip), state, honest)
         assert set(watch.counts) == found
+
+
+def test_a_robot_that_lands_touches_what_lies_below_and_one_that_flies_again_may_not():
+    world = World()
+    pipe = Contact(0, "pipe_3", INSIDE, ZERO, ZERO, False)
+    world.tick(ZERO, state=ESTOP)
+    world.watch.see(pipe, ESTOP, honest=True)
+    assert (set(world.watch.counts), world.watch.landed_on) == ({"collision"}, set())
+    world = World()
+    world.tick((0.0, 0.0, -0.5), state=LAND)
+    for state in (LAND, ESTOP, GROUND):  # and if it hits it hard, or slides off
+        world.tick(ZERO, state=state)
+        world.watch.see(pipe, state, honest=True)
+    assert (set(world.watch.counts), world.watch.landed_on) == (set(), {"pipe_3"})
+    world.tick(ZERO, state=TRACK)
+    for state in (TRACK, HOLD, ESTOP):
+        world.watch.counts.clear()
+        world.watch.see(pipe, state, honest=True)
+        assert set(world.watch.counts) == {"collision"}

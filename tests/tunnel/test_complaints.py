@@ -64,6 +64,13 @@ def test_of_another_version_both_are_named():
     assert complaints.about("version", bytes([9, 1, 2]), 8) == []
 
 
+def test_garbage_does_not_hide_that_the_peer_speaks_another_version():
+    complaints = Complaints()
+    assert len(complaints.about("version", bytes(16), 7)) == 1
+    (fault,) = complaints.about("version", bytes([3]) + bytes(15), 8)
+    assert fault.text.startswith("peer speaks v3, ")
+
+
 def test_after_a_session_it_is_said_again():
     complaints = Complaints()
     assert complaints.say("x", "text", 7) == [Fault(7, "x", "text")]

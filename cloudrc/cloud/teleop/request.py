@@ -9,6 +9,9 @@ REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""
 UNNUMBERED = 0
 NO_EPOCH = -1
+PREDECESSORS = 1_000
+"""So many numbers are left to a process before this one: it may have asked what the robot does not
+show yet, and a request of this one must not be taken for that."""
 
 
 class Repeater:
@@ -16,8 +19,8 @@ class Repeater:
 
     A request supersedes the one before it, acknowledged or not: its number is higher, and the
     robot acts on rising numbers only; but an emergency stop is superseded by nothing. Numbers go on
-    from what the robot shows, so that a restarted cloud counts on where its predecessor stopped;
-    until the robot is in sight nothing is sent.
+    from what the robot shows, well above what a predecessor may have asked; until the robot is in
+    sight nothing is sent.
 
     When nothing is asked, the robot is told how far the mission is until it shows that it knows.
     """
@@ -100,7 +103,8 @@ class Repeater:
             return self._progress_due(seen, now_ns)
         # A higher number than ours was acted on: an emergency stop has passed us by.
         if pending.number == UNNUMBERED or seen.mission > pending.number:
-            self._number = max(self._number, seen.mission) + 1
+            rise = 1 if self._number else PREDECESSORS
+            self._number = max(self._number, seen.mission) + rise
             pending = self._pending = pending._replace(number=self._number)
             self._asked_epoch = seen.epoch
         elif now_ns < self._due_ns:
