@@ -29,10 +29,10 @@ thousand times, a true one is refused once in a hundred thousand.
 
 With --mode cluster a release that flies is judged by the tunnel's own
 datagrams: those of 15 to 30 s where a relay shapes, whose draws are known; of
-1 to 4 min where netem does. What cannot be judged is said.
+20 s to 4 min where netem does. What cannot be judged is said.
 
 exit codes: 0 believed, 1 not, or undecided, 2 bad input,
-3 missing prerequisite, 4 no answer in time, 5 cluster"""
+3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
 DEFAULT = "paper"
 SHAPERS = ("relay", "netem")
 ENDS_LIMIT = 270.0
@@ -60,7 +60,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds",
         type=float,
         metavar="S",
-        help="how long to probe (default: as long as it takes, at most 600)",
+        help="how long to probe (default: as long as it takes, at most 600; of a release: how long "
+        "to wait for a verdict, default 270)",
     )
     parser.add_argument(
         "--shaper",

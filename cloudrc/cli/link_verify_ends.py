@@ -14,17 +14,23 @@ from dataclasses import dataclass, replace
 from math import inf, nan
 from typing import Any, NamedTuple
 
-from cloudrc.cli.link_verify_notes import on_deviation, on_jitter
+from cloudrc.cli.link_verify_notes import (
+    on_correlation,
+    on_deviation,
+    on_jitter,
+    on_patience,
+)
 from cloudrc.cli.link_verify_text import NOT_JUDGED, Said
 from cloudrc.cluster.fetch import METRICS
 from cloudrc.cluster.forward import DIRECTLY
+from cloudrc.drivers.standing_basis import TAKES
 from cloudrc.errors import TimedOutError
 from cloudrc.link.sidecar_told import Told, read_told
 from cloudrc.link.verify_applied import rate_in_force, shown
 from cloudrc.link.verify_causes import Evidence, Findings, find_causes
+from cloudrc.link.verify_ends import PERIOD
 from cloudrc.link.verify_evidence import Samples, of_metrics, of_told, samples, shaper_of
 from cloudrc.link.verify_judge import Row
-from cloudrc.link.verify_standing import PERIOD, WINDOW_MAX
 from cloudrc.link.verify_words import kbit
 from cloudrc.tunnel.codec import SIZES, Kind
 
@@ -154,7 +160,7 @@ def _findings(
         passed=passed if enough else None,
         unread=None,  # since it began: long ago
     )
-    applied = shown(known.applied, SIZES[_FLIES[way]]) if known.applied else {}
+    applied = shown(known.applied, SIZES[_FLIES[way]], known.shaper) if known.applied else {}
     rows = _rows(found, applied)
     told_of = {row["quantity"] for row in found["rows"]}  # a time line may have had other rates
     if (asked := _rate_asked(found)) and known.applied and "time_line" not in told_of:
@@ -193,7 +199,7 @@ def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> list[str]:
         return [f"{way}: no {what} to judge it by, or its profile changes by itself; {hint}"]
     rows = {str(row["quantity"]): row for row in found["rows"]}
     notes = []
-    if "round_trip" in rows:
+    if rows.get("round_trip", _TOLD)["verdict"] != "told":
         notes.append(f"{way}: the ends do not share a clock: round trips are judged, not one way")
     elif "mean" not in rows and "loss" in rows:
         notes.append(f"{way}: delays {NOT_JUDGED}: the ends do not share a clock")
@@ -206,6 +212,12 @@ def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> list[str]:
         notes += on_deviation(way, float(rows["deviation"]["asked"]))
     if "jitter_share" in rows:
         notes += on_jitter(way, float(rows["jitter_share"]["measured"]))
+    if "correlation" in rows:
+        notes += on_correlation(way, float(rows["correlation"]["asked"]))
+    for name in rows:
+        if name.endswith(TAKES):
+            needs = float(rows[name].get("asked", inf))
+            notes += on_patience(way, name.removesuffix(TAKES), needs)
     if "time_line" in rows and (share := float(rows["time_line"]["measured"])) < _WATCHED:
         notes.append(
             f"{way}: of its time line {share:.0%} was watched and as asked, the rest {NOT_JUDGED}; "
@@ -214,6 +226,7 @@ def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> list[str]:
     return notes + _needed(way, found)
 
 
+_TOLD: Mapping[str, str] = {"verdict": "told"}
 _WATCHED = 0.85
 """A time line of which so much was seen is as good as seen: a session takes 2 s to settle."""
 
@@ -230,8 +243,5 @@ def _needed(way: str, found: Mapping[str, Any]) -> list[str]:
     if found.get("verdict") != "open" or "datagrams" not in rows:
         return []
     needs, there = int(rows["datagrams"]["asked"]), int(rows["datagrams"]["measured"])
-    if needs > WINDOW_MAX:
-        names = ", ".join(str(name) for name, row in rows.items() if row["verdict"] == "open")
-        return [f"{way}: {names} {NOT_JUDGED}: takes {needs} datagrams, more than are kept"]
     seconds = max(0, needs - there) * PERIOD
     return [f"{way}: {there} of {needs} datagrams, {seconds:.0f} s more"]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from math import isfinite
 
-from cloudrc.cli.link_verify_text import NOT_JUDGED
+from cloudrc.cli.link_verify_text import NAMES, NOT_JUDGED
 from cloudrc.link.verify_causes import Findings
+from cloudrc.link.verify_ends import PERIOD
 from cloudrc.link.verify_expect import DEVIATION_FLOOR, JITTER_SHARES, has_jitter
 from cloudrc.link.verify_plan import LONGEST, Plan
 from cloudrc.link.verify_rate import SIZE, Trains
@@ -50,6 +52,26 @@ def on_jitter(way: str, share: float) -> Iterator[str]:
         yield f"{way}: jitter {NOT_JUDGED}: too little of its delays' scatter is jitter"
     elif share > usual:
         yield f"{way}: jitter judged within {share:.0%} only: its tail hides {usual:.0%}"
+
+
+def on_correlation(way: str, asked: float) -> Iterator[str]:
+    """Say that netem makes nothing of a correlation [1], unless none was asked for."""
+    if asked:
+        yield f"{way}: correlation {asked:g} {NOT_JUDGED}: netem realises next to none of it"
+
+
+def on_patience(way: str, name: str, needs: float) -> Iterator[str]:
+    """Say that a quantity takes more datagrams than are kept.
+
+    Args:
+        way: The direction.
+        name: Of the row.
+        needs: Datagrams [1]; infinite if it cannot be told from what the ends add.
+    """
+    why = "what the ends may add hides it, however many datagrams there are"
+    if isfinite(needs):
+        why = f"takes {needs:.0f} datagrams, {needs * PERIOD:.0f} s of a flight"
+    yield f"{way}: {NAMES.get(name, name)} {NOT_JUDGED}: {why}"
 
 
 def on_deviation(way: str, asked: float) -> Iterator[str]:

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cloudrc.assembly import link_profile
-from cloudrc.cli.link_processes import LOOPBACK, WAYS, Place, Shaping, shaping
+from cloudrc.cli.link_processes import LOOPBACK, WAYS, Place, Shaping, refuse_impossible, shaping
 from cloudrc.cli.link_told import look
 from cloudrc.cli.link_verify_late import LateWatch
-from cloudrc.cli.link_verify_notes import describe, notes, shaper_in_words
+from cloudrc.cli.link_verify_notes import describe, notes, on_correlation, shaper_in_words
 from cloudrc.cli.link_verify_probes import PROBE, TRAIN, Probes
 from cloudrc.cli.link_verify_text import Said
 from cloudrc.config import yaml_text
@@ -25,12 +25,12 @@ from cloudrc.config.schema import Profile
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.sounder import Shore, Volley, sound
 from cloudrc.link.verify_causes import Evidence, Findings, find_causes
-from cloudrc.link.verify_corrupt import refusing
 from cloudrc.link.verify_estimate import frame_of
 from cloudrc.link.verify_evidence import of_metrics, samples, with_near
-from cloudrc.link.verify_expect import as_sent
+from cloudrc.link.verify_expect import as_sent, has_jitter
 from cloudrc.link.verify_judge import judge
 from cloudrc.link.verify_measure import measure
+from cloudrc.link.verify_netem import netem_makes
 from cloudrc.link.verify_plan import Plan, make_plan
 from cloudrc.link.verify_rate import SIZE, Trains, plan_trains, spans
 from cloudrc.tunnel import codec
@@ -86,7 +86,11 @@ def verify(
         applied: Profile in force in place of what is asked; here begin faults for tests.
         meddle: Is shown the link's processes before the first probe.
         routes: Where to send instead of where the link says, by direction.
+
+    Raises:
+        BadInputError: If the shaper cannot be what is asked.
     """
+    refuse_impossible(experiment, shaper)
     tell("plans the probes")
     asked = plan(experiment, seconds, shaper)
     profile = applied or Profile(uplink=experiment.uplink, downlink=experiment.downlink)
@@ -104,9 +108,19 @@ def verify(
         shaper=shaper_in_words(findings),
         findings=findings,
         probes={way: describe(one.plan, one.trains) for way, one in asked.items()},
-        notes=[note for way, one in asked.items() for note in notes(way, one.plan, one.trains)],
+        notes=_notes(experiment, asked, shaper),
         causes=find_causes(findings),
     )
+
+
+def _notes(experiment: ResolvedExperiment, asked: Mapping[str, Asked], shaper: str) -> list[str]:
+    """Say what is not judged, or more loosely."""
+    said = [note for way, one in asked.items() for note in notes(way, one.plan, one.trains)]
+    if shaper == "netem":
+        for way in asked:
+            profile = link_profile(getattr(experiment, way))
+            said += on_correlation(way, profile.correlation if has_jitter(profile) else 0.0)
+    return said
 
 
 def plan(
@@ -117,13 +131,13 @@ def plan(
     Args:
         experiment: Says what is asked.
         seconds: How long to probe [s]; None for as long as it takes.
-        shaper: "relay" or "netem", whose damage the kernel refuses by its checksums.
+        shaper: "relay"; or "netem", which is judged by what it makes of a profile.
     """
     kinds = {"uplink": Kind.TELEMETRY, "downlink": Kind.COMMAND}
     plans: dict[str, Plan] = {}
     for way, kind in kinds.items():
         profile = link_profile(getattr(experiment, way))
-        profile = refusing(profile) if shaper == "netem" else profile
+        profile = netem_makes(profile) if shaper == "netem" else profile
         size = codec.SIZES[kind]
         before = plans.get("uplink")
         if before and before.profile == profile and not _has_rate(before):
@@ -246,7 +260,7 @@ def _read_back(one: Shaping, sent: int) -> Evidence:
     found = with_near(told, look(one.place.peer[0], one.place.inside))
     if state.shaper != "netem":
         return found
-    return replace(found, applied=found.applied and refusing(found.applied))
+    return replace(found, applied=found.applied and netem_makes(found.applied))
 
 
 def _json(values: object) -> str:

@@ -65,14 +65,21 @@ class StandingCheck:
         self._jobs: queue.SimpleQueue[Callable[[], None]] | None = None
         self._breathe: Callable[[], None] = lambda: None
 
-    def follow(self, asked: Asked) -> None:
-        """Judge by this from now on; takes a second, so not on the loop's thread in flight."""
-        if asked == self._asked:
+    def follow(self, asked: Asked, shaper: str = "") -> None:
+        """Judge by this from now on; takes a second, so not on the loop's thread in flight.
+
+        Args:
+            asked: Of uplink and downlink.
+            shaper: Of what this end sends: "relay" or "netem"; "" if that is not known.
+        """
+        if asked == self._asked and self._basis is not None:
+            self._basis.by_netem = shaper == "netem"
             return
         own, other = asked if self._uplink else reversed(asked)
         basis = Basis(own, other if self._uplink else None, self._stream, self._breathe)
+        basis.by_netem = shaper == "netem"
         self._asked, self._basis = asked, basis
-        self._tally.place = basis.standing.place
+        self._tally.place = basis.place
         self._quiet_ns = -1  # set anew by the loop's thread
 
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
@@ -160,8 +167,9 @@ class StandingCheck:
     def _judged(self, basis: Basis, changing: bool) -> Judged:
         """Sum up what is judged together, newest first, and forget what is older."""
         whole, recent, blocks = Block(), Block(), self._blocks
+        window = basis.window(timed=any(block.timed for block in blocks))
         for block in reversed(list(blocks)):
-            if whole.sent >= basis.standing.window:
+            if whole.sent >= window:
                 blocks.popleft()
                 continue
             whole.add(block)
@@ -204,7 +212,8 @@ def _follow(
             text = path.read_text(encoding="utf-8") if path is not None else seen
             if text != seen:
                 seen = text
-                check.follow(load(from_text(text).profile))
+                state = from_text(text)
+                check.follow(load(state.profile), state.shaper)
         except (OSError, ValueError, CloudrcError):
             pass  # not there yet, or half written: what was asked before still holds
         with contextlib.suppress(queue.Empty):

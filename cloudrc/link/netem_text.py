@@ -89,7 +89,9 @@ def options(profile: DirectionProfile, conditions: Conditions, room: int) -> lis
         words += [_microseconds(conditions.jitter * 1e9 * stretch(profile))]
         words += [_percent(profile.correlation), "distribution", distribution_name(profile)]
     words += ["loss", *_loss(1.0 if conditions.blackout else conditions.loss)]
-    words += ["duplicate", _percent(profile.duplicate), "corrupt", _percent(profile.corrupt)]
+    # Of a packet that is doubled and lost one copy arrives: in a blackout none may.
+    copied = 0.0 if conditions.blackout else profile.duplicate
+    words += ["duplicate", _percent(copied), "corrupt", _percent(profile.corrupt)]
     # tc refuses it without a delay, where nothing is there to be overtaken.
     if profile.reorder and conditions.delay_ns and not profile.keep_order:
         words += ["reorder", _percent(profile.reorder)]

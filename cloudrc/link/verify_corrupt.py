@@ -5,9 +5,10 @@ The tunnel refuses a datagram whose tag does not fit, and the kernel one whose c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss, mean_loss
 
 
 def refusing(profile: DirectionProfile) -> DirectionProfile:
@@ -26,12 +27,16 @@ def refusing(profile: DirectionProfile) -> DirectionProfile:
             return replace(loss, loss_bad=bad, loss_good=good)
         return 1.0 - (1.0 - loss) * whole
 
+    return replace(each_loss(profile, joined), corrupt=0.0)
+
+
+def each_loss(profile: DirectionProfile, made: Callable[[Loss], Loss]) -> DirectionProfile:
+    """Put another loss in place of each that a profile asks for, at any time."""
     changes = tuple(
-        replace(change, loss=None if change.loss is None else joined(change.loss))
+        replace(change, loss=None if change.loss is None else made(change.loss))
         for change in profile.changes
     )
     trace = profile.trace
     if trace is not None and trace.losses is not None:
-        losses = tuple(1.0 - (1.0 - loss) * whole for loss in trace.losses)
-        trace = replace(trace, losses=losses)
-    return replace(profile, corrupt=0.0, loss=joined(profile.loss), changes=changes, trace=trace)
+        trace = replace(trace, losses=tuple(mean_loss(made(loss)) for loss in trace.losses))
+    return replace(profile, loss=made(profile.loss), changes=changes, trace=trace)

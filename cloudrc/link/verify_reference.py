@@ -7,10 +7,11 @@ against what was asked, not against what our model made of it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from math import sqrt
 from statistics import NormalDist
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,14 @@ WIRE_BYTES = 28
 
 _GRID: Floats = np.linspace(-7.0, 7.0, 14_001)
 _PARETO_EXPONENT, _PARETO_CUT = 3.0, 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class NetemProfile(DirectionProfile):
+    """A profile whose bottleneck is behind its delay, and keeps the order: netem's.
+
+    What a slow packet has held up comes one by one then, as the wire lets it through.
+    """
 
 
 class Fates(NamedTuple):
@@ -63,7 +72,8 @@ def draw(
     lost, extra = _losses(pieces, shape, rng)
     delay = np.maximum(0.0, _bases(pieces) + extra + _jitters(profile, pieces, shape, rng))
     overtakes = rng.random(shape) < profile.reorder
-    queued = _queue(pieces, sent, size, lost | overtakes)
+    behind = isinstance(profile, NetemProfile)
+    queued = 0.0 if behind else _queue(pieces, sent, size, lost | overtakes)
     arrival = sent + np.where(overtakes, 0.0, queued + delay)
     arrival[lost] = -np.inf
     doubled = ~lost & (rng.random(shape) < profile.duplicate)
@@ -72,7 +82,9 @@ def draw(
         later = _bases(pieces) + extra * ~overtakes
         later = np.maximum(0.0, later + _jitters(profile, pieces, shape, rng, copies=True))
         copy = np.where(doubled, sent + queued + later, copy)
-    if profile.keep_order:
+    if behind:
+        arrival = np.where(lost, arrival, _one_by_one(arrival, copy, _wires(pieces, size)))
+    elif profile.keep_order:
         arrival = np.where(lost, arrival, _in_order(arrival, copy))
     else:
         arrival = np.where(doubled, np.minimum(arrival, copy), arrival)
@@ -90,6 +102,27 @@ def _in_order(arrival: Floats, copy: Floats) -> Floats:
     both = np.stack((arrival, copy), axis=2).reshape(arrival.shape[0], -1)
     kept: Floats = np.maximum.accumulate(both, axis=1)[:, ::2]
     return kept
+
+
+def _one_by_one(arrival: Floats, copy: Floats, wire: Floats) -> Floats:
+    """Let all wait for the wire in the order of sending; a copy is sent right before its original.
+
+    A recursion as in `_queue`, with instants of arrival at the wire in place of those of sending.
+
+    Args:
+        arrival: Of the originals at the wire [s], shape (runs, n); -infinity where there is none.
+        copy: Of the copies [s], likewise.
+        wire: What each takes [s], shape (n,).
+
+    Returns:
+        When the first of both is through [s], shape (runs, n).
+    """
+    both = np.stack((copy, arrival), axis=2).reshape(arrival.shape[0], -1)
+    service = np.where(np.isfinite(both), np.repeat(wire, 2), 0.0)
+    done = np.cumsum(service, axis=1)
+    through = done + np.maximum.accumulate(both - done + service, axis=1)
+    first: Floats = np.where(np.isfinite(copy), through[:, ::2], through[:, 1::2])
+    return first
 
 
 def instants(count: int, period: float, begin: float = 0.0) -> Floats:
@@ -219,14 +252,18 @@ def _queue(
     """
     if all(now.rate is None for _, now in pieces):
         return 0.0
+    service = np.where(absent, 0.0, _wires(pieces, size))
+    done = np.cumsum(service, axis=1)
+    waits: Floats = done + np.maximum.accumulate(sent - done + service, axis=1) - sent
+    return np.where(absent, 0.0, waits)
+
+
+def _wires(pieces: list[tuple[slice, Conditions]], size: int) -> Floats:
+    """Say how long each takes at the bottleneck [s], shape (n,)."""
     bits = (size + WIRE_BYTES) * 8.0
-    wire: Any = np.concatenate(
+    return np.concatenate(
         [
             np.full(part.stop - part.start, bits / now.rate if now.rate else 0.0)
             for part, now in pieces
         ]
     )
-    service = np.where(absent, 0.0, wire)
-    done = np.cumsum(service, axis=1)
-    waits: Floats = done + np.maximum.accumulate(sent - done + service, axis=1) - sent
-    return np.where(absent, 0.0, waits)

@@ -1,28 +1,26 @@
 """The link judged in flight by the tunnel's own datagrams: sums over blocks in, rows out.
 
 Telemetry and commands are probes already: numbered, stamped, 100 a second each way. One-way delays
-are known where both ends share a clock; else the round trips that cloud measures are judged, of
-which newest-wins passes on the faster ones: what they should be comes from the reference, too.
+are known where both ends share a clock; else the round trips that cloud measures are judged.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from math import hypot, nan
-
-import numpy as np
+from math import ceil, inf, isnan, nan
+from typing import NamedTuple
 
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.verify_block import Block
 from cloudrc.link.verify_corrupt import refusing
+from cloudrc.link.verify_ends import PERIOD, added, allowing, excused, scattered
 from cloudrc.link.verify_estimate import REACHES
 from cloudrc.link.verify_expect import (
     JITTER_SHARES_TAILED,
-    MEAN_FLOOR,
-    MEAN_SHARE,
     Expectation,
     Schedule,
+    draw_batches,
     expect,
     has_jitter,
     is_steady,
@@ -32,26 +30,24 @@ from cloudrc.link.verify_judge import Row, judge_quantity
 from cloudrc.link.verify_ladder import Ladder
 from cloudrc.link.verify_plan import needed_losses
 from cloudrc.link.verify_quantity import Quantity
-from cloudrc.link.verify_reference import Floats, draw, instants
+from cloudrc.link.verify_trips import Trips, round_trips
 
-PERIOD = 0.01
-"""Of telemetry and of commands [s]."""
-ENDS = 1e-3
-"""What the ends themselves add to a delay, at most: a command's own computation, two wakes [s].
-Allowed for by more datagrams, not by a wider margin."""
-ENDS_SCATTER = 3e-4
-"""How that scatters [s]."""
-LATE_FACTOR = 2.0
-"""The other end, whose lateness this one does not know, is taken to be as late."""
-WINDOW_MAX = 25_000
-"""Datagrams that are judged together at most: those of 250 s."""
+WINDOW_MAX = 26_000
+"""Datagrams that are judged together at most: those of 260 s."""
 RECENT = 3000
 """What is off by far is told by so many newest ones, however many decide that all is well."""
+BATCHES = 96
 _PATIENCE = 12_000
 """A jitter with a long tail that takes more is judged more loosely, which is said."""
-BATCHES = 96
-_SEED = 20250522
-_RUNS, _COUNT, _BURN_IN = 48, 1000, 200
+_ENDLESS = 1_000_000
+"""A number of datagrams that is as good as none [1]."""
+
+
+class Needed(NamedTuple):
+    """How many datagrams [1] decide a quantity; infinite if none do."""
+
+    name: str
+    datagrams: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,21 +56,23 @@ class Standing:
 
     Attributes:
         profile: What is asked, as an end meets it that refuses what is damaged.
-        expects: What the datagrams should measure.
+        expects: What the datagrams should measure, whatever the ends add but for its scatter.
         loss: Judges how many are lost.
         copies: Judges how many arrive twice.
-        window: Datagrams that are judged together: they decide every quantity, if so many can.
-        needs: How many decide; more than the window if that cannot.
-        trip: What round trips should be in the mean [s]; None where nobody measures them.
+        losses_need: Datagrams that decide how many are lost.
+        copies_need: Likewise how many arrive twice.
+        trips: What round trips should be; None where nobody measures them.
+        roughness: How far the delays of neighbours should differ, in standard deviations [1].
     """
 
     profile: DirectionProfile
     expects: Expectation
     loss: Ladder
     copies: Ladder
-    window: int
-    needs: int
-    trip: Quantity | None
+    losses_need: int
+    copies_need: int
+    trips: Trips | None
+    roughness: float
 
     def place(self, delay: float) -> float:
         """Say where in the middle a delay [s] is, in units of jitter; NaN if it is not there."""
@@ -85,48 +83,100 @@ class Standing:
         place = (delay - self.profile.delay) / jitter
         return place if -below <= place <= above else nan
 
+    def window(self, *, timed: bool) -> int:
+        """Say how many datagrams are judged together: they decide every quantity that they can.
+
+        Args:
+            timed: Whether their delays are known.
+        """
+        needed = self.needed(Block(timed=int(timed), trip_count=int(not timed)))
+        return int(min(WINDOW_MAX, max(one.datagrams for one in needed)))
+
     def rows(self, block: Block) -> list[Row]:
         """Judge what has arrived."""
-        measured, asked = block.measured(self.profile.jitter), self.expects
-        rows, count = list[Row](), max(1, measured.sent)
-        if block.timed:
-            for name in ("mean", "deviation", "variation", "middle"):
-                quantity: Quantity | None = getattr(asked, name)
-                if quantity is not None:
-                    rows.append(judge_quantity(name, quantity, getattr(measured, name), count))
-            rows[0] = _as_asked(rows[0], asked.mean)
-        elif self.trip is not None and block.trip_count:
-            trip = block.trips / block.trip_count
-            row = judge_quantity("round_trip", self.trip, trip, block.trip_count)
-            rows.append(_as_asked(row, self.trip))
+        measured, count = block.measured(self.profile.jitter), max(1, block.sent)
+        rows = [
+            judge_quantity(name, asked, getattr(measured, name), count)
+            for name, asked in self._delays(block)
+        ]
+        trip = self._trip(block)
+        if trip is not None:
+            mean = block.trips / block.trip_count
+            rows.append(judge_quantity("round_trip", trip, mean, block.trip_count))
+        rows = [_as_asked(row, self._mean(block), trip) for row in rows]
         rows.append(self.loss.row(measured.lost, measured.sent))
-        late = judge_quantity("reordered", asked.reordered, measured.reordered, count)
+        late = judge_quantity("reordered", self.expects.reordered, measured.reordered, count)
         rows.append(late._replace(unit="1"))
         rows.append(self.copies.row(measured.doubled, measured.arrived))
-        return [excused(row, block) for row in rows]
+        hopeless = {one.name for one in self.hopeless(block)}
+        return [excused(_settled(row, hopeless), block) for row in rows]
+
+    def needed(self, block: Block) -> list[Needed]:
+        """Say how many datagrams decide each quantity that is judged.
+
+        Args:
+            block: What has arrived: tells which are known, and how late the ends are.
+        """
+        quantities = [*self._delays(block), ("reordered", self.expects.reordered)]
+        found = [Needed(name, _finite(one.needs())) for name, one in quantities]
+        found += [Needed("loss", self.losses_need), Needed("duplicated", self.copies_need)]
+        trip = self._trip(block)
+        if trip is not None and self.trips is not None:
+            found.append(Needed("round_trip", _finite(trip.needs() / self.trips.share)))
+        return found
+
+    def hopeless(self, block: Block) -> list[Needed]:
+        """Choose the quantities that take more datagrams than are kept: they are not waited for."""
+        return [one for one in self.needed(block) if one.datagrams > WINDOW_MAX]
+
+    def unlike(self, block: Block) -> float:
+        """Say how far what has arrived is from what is asked in what is no matter of scale [1].
+
+        By how rough it is, and by its copies: who shapes otherwise shows there, while a link that
+        is off in delay or jitter does not.
+        """
+        measured, far = block.measured(self.profile.jitter), 0.0
+        if self.roughness and measured.deviation > 0.0 and not isnan(measured.variation):
+            far += abs(measured.variation / measured.deviation / self.roughness - 1.0)
+        if self.profile.duplicate:
+            far += abs(measured.doubled / max(1, measured.arrived) / self.profile.duplicate - 1.0)
+        return far
+
+    def _mean(self, block: Block) -> Quantity:
+        return allowing(self.expects.mean, added(block, 1))
+
+    def _trip(self, block: Block) -> Quantity | None:
+        """Give what is expected of round trips; None where delays are known, or no trip is."""
+        if self.trips is None or block.timed or not block.trip_count:
+            return None
+        return allowing(self.trips.mean, self.trips.rounding + added(block, 2))
+
+    def _delays(self, block: Block) -> Iterator[tuple[str, Quantity]]:
+        """Give what is expected of delays, if they are known."""
+        if not block.timed:
+            return
+        yield "mean", self._mean(block)
+        for name in ("deviation", "variation", "middle"):
+            quantity: Quantity | None = getattr(self.expects, name)
+            if quantity is not None:
+                yield name, quantity
 
 
-def _as_asked(row: Row, expected: Quantity) -> Row:
+def _finite(number: float) -> float:
+    return float(ceil(number)) if number < _ENDLESS else inf
+
+
+def _as_asked(row: Row, mean: Quantity, trip: Quantity | None) -> Row:
     """Tell what the link was asked for, not what is expected with what the ends add."""
-    return row._replace(asked=row.asked - expected.blur)
+    expected = {"mean": mean, "round_trip": trip}.get(row.name)
+    return row if expected is None else row._replace(asked=row.asked - expected.blur)
 
 
-def excused(row: Row, block: Block) -> Row:
-    """Do not blame the link for delays that ends which wake so late may have added.
-
-    In a wake that is late by L, L / PERIOD datagrams have waited for L / 2 in the mean: a long one
-    weighs more than many short ones.
-    """
-    if row.verdict != "off" or not block.wakes or row.measured < row.low:
-        return row
-    wakes, most = block.wakes, row.high
-    if row.name in ("mean", "round_trip"):
-        waited = max(block.lateness, block.late_squares / (2.0 * PERIOD))
-        most += LATE_FACTOR * waited / wakes
-    elif row.name in ("deviation", "variation", "middle"):
-        waited = max(block.late_squares, block.late_cubes / (3.0 * PERIOD))
-        most = hypot(most, LATE_FACTOR * (waited / wakes) ** 0.5)
-    return row._replace(verdict="open") if row.measured <= most else row
+def _settled(row: Row, hopeless: set[str]) -> Row:
+    """Leave nothing open that is never decided: what is not far off is told."""
+    if row.verdict == "open" and row.name in hopeless:
+        return row._replace(verdict="told")
+    return row
 
 
 def make_standing(
@@ -145,93 +195,50 @@ def make_standing(
     if not is_steady(profile):
         raise ValueError("conditions change")
     profile = refusing(profile)
-    schedule, most = Schedule(PERIOD, 0, size), WINDOW_MAX
+    schedule = Schedule(PERIOD, 0, size)
     for share in JITTER_SHARES_TAILED:
-        expects = _with_ends(expect(profile, schedule, share, batches=BATCHES))
-        if expects.needs() <= _PATIENCE or not (has_jitter(profile) and is_tailed(profile)):
+        expects = _with_scatter(expect(profile, schedule, share, batches=BATCHES))
+        if _jitter_needs(expects) <= _PATIENCE or not (has_jitter(profile) and is_tailed(profile)):
             break
-    losses, copies = (needed_losses(one, 8 * most) for one in (profile.loss, profile.duplicate))
-    needs = max(expects.needs(), losses, copies)
-    trip = None
-    if other is not None and is_steady(other):
-        trip = _round_trip(profile, refusing(other), size)
-        needs = max(needs, trip.needs())
+    most = 8 * WINDOW_MAX
+    losses, copies = (needed_losses(one, most) for one in (profile.loss, profile.duplicate))
+    steady = other is not None and is_steady(other)
     return Standing(
         profile,
         expects,
-        Ladder("loss", profile.loss, min(losses, most)),
-        Ladder("duplicated", profile.duplicate, min(copies, most)),
-        min(needs, WINDOW_MAX),
-        needs,
-        trip,
+        Ladder("loss", profile.loss, min(losses, WINDOW_MAX)),
+        Ladder("duplicated", profile.duplicate, min(copies, WINDOW_MAX)),
+        losses,
+        copies,
+        round_trips(profile, refusing(other), size) if other is not None and steady else None,
+        _roughness(profile, schedule),
     )
 
 
-def _with_ends(asked: Expectation) -> Expectation:
-    """Allow for what the ends add: half of ENDS is expected, and as much to either side of it."""
-    mean, half = asked.mean, ENDS / 2.0
-    # Margins stay where they were: what is off by one has to be told whatever the ends add.
-    mean = replace(mean, expected=mean.expected + half, margin=mean.margin - half, blur=half)
-
-    def scattered(one: Quantity | None) -> Quantity | None:
-        if one is None:
-            return None
-        return replace(one, blur=hypot(one.expected, ENDS_SCATTER) - one.expected)
-
-    deviation = scattered(asked.deviation) or asked.deviation
+def _with_scatter(asked: Expectation) -> Expectation:
+    """Allow for the scatter of what the ends add."""
+    variation, middle = asked.variation, asked.middle
     return replace(
         asked,
-        mean=mean,
-        deviation=deviation,
-        variation=scattered(asked.variation),
-        middle=scattered(asked.middle),
+        deviation=scattered(asked.deviation),
+        variation=variation and scattered(variation),
+        middle=middle and scattered(middle),
     )
 
 
-def _round_trip(up: DirectionProfile, down: DirectionProfile, size: int) -> Quantity:
-    """Expect of round trips: that of the newest command applied, echoed by the newest odometry."""
-    rng = np.random.default_rng(_SEED)
-    sent = instants(_COUNT, PERIOD)
-    there = draw(up, sent, size, _RUNS, rng)
-    back = draw(down, sent, size, _RUNS, rng)
-    trips = [
-        _trips(
-            np.where(there.arrived[run], sent + there.delay[run], np.inf),
-            np.where(back.arrived[run], sent + back.delay[run], np.inf),
-            sent,
-        )
-        for run in range(_RUNS)
-    ]
-    every = np.concatenate(trips)
-    means = np.array([one.mean() for one in trips if len(one)])
-    mean, batch = float(every.mean()), max(1, round(len(every) / _RUNS))
-    spread = float(means.std()) * batch**0.5
-    margin = max(MEAN_FLOOR, MEAN_SHARE * mean) - ENDS
-    return Quantity(mean + ENDS, spread, 0.0, batch, margin, blur=ENDS)
+def _jitter_needs(expects: Expectation) -> int:
+    """Count the datagrams that decide the quantities which tell of the jitter."""
+    telling = (expects.deviation, expects.variation, expects.middle)
+    return max(one.needs() for one in telling if one is not None)
 
 
-def _trips(up: Floats, down: Floats, sent: Floats) -> Floats:
-    """Give the round trips [s] that one flight measures.
-
-    Args:
-        up: When each odometry arrives at cloud [s], shape (n,); infinite if it is lost.
-        down: When each command arrives at world [s], likewise.
-        sent: When each leaves its end [s], shape (n,).
-    """
-    echoed = _newest(down, sent)  # by each odometry
-    used = up < np.minimum.accumulate(np.append(up[1:], np.inf)[::-1])[::-1]
-    chosen = np.flatnonzero(used & (echoed >= 0) & (np.arange(len(sent)) >= _BURN_IN))
-    fresh = chosen[np.append(True, np.diff(echoed[chosen]) > 0)] if len(chosen) else chosen
-    trips: Floats = (up[fresh] - sent[fresh]) + (down - sent)[echoed[fresh]]
-    return trips
-
-
-def _newest(arrival: Floats, at: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """Say which is the newest that has arrived at each instant [s]; -1 if none has."""
-    order = np.argsort(arrival)
-    newest = np.maximum.accumulate(order)
-    place = np.searchsorted(arrival[order], at, side="right") - 1
-    return np.where(place >= 0, newest[np.maximum(place, 0)], -1)
+def _roughness(profile: DirectionProfile, schedule: Schedule) -> float:
+    """See `Standing`; 0 without jitter."""
+    if not has_jitter(profile):
+        return 0.0
+    found = draw_batches(profile, schedule, BATCHES).estimates(None)
+    deviation = found.deviation.value
+    return found.variation.value / deviation if deviation else 0.0
 
 
 def verdict_of(rows: Iterable[Row]) -> str:

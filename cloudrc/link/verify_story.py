@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.verify_corrupt import refusing
 from cloudrc.link.verify_estimate import frame_of
 from cloudrc.link.verify_expect import Schedule, as_sent, expect
 from cloudrc.link.verify_judge import Row, judge
 from cloudrc.link.verify_measure import Log, measure
+from cloudrc.link.verify_netem import netem_makes
 from cloudrc.link.verify_plan import Plan, stretches_of
 from cloudrc.link.verify_twin_rows import Pairs
 
@@ -20,14 +20,14 @@ _BATCHES = 384
 
 
 def judge_story(profile: DirectionProfile, pairs: Pairs, size: int) -> list[Row]:
-    """Judge datagrams of a link that changes; takes some 100 ms.
+    """Judge datagrams of a link that changes, as netem makes it; takes some 100 ms.
 
     Args:
         profile: What is asked, with its time line.
         pairs: What was heard, and when since the time line began it was sent.
         size: Of each, UDP payload [bytes].
     """
-    profile, count = refusing(profile), len(pairs.sent)
+    profile, count = netem_makes(profile), len(pairs.sent)
     period = float(pairs.sent[-1] - pairs.sent[0]) / (count - 1)
     schedule = Schedule(period, count, size, float(pairs.sent[0]))
     expects = expect(profile, schedule, batches=_BATCHES)

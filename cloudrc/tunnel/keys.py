@@ -83,7 +83,7 @@ class KeySet(NamedTuple):
         current: The key to use.
         previous: One that is still accepted; None if there is none.
         overlap: For how long, from the moment a process reads this [s].
-        until: When it ends for processes that start later [s since 1970, wall clock]; None if the
+        until: When it ends for processes that start later [s], wall clock, since 1970; None if the
             file does not say.
     """
 

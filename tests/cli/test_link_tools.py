@@ -136,6 +136,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(
         ("verify --seconds 0.5", "--seconds 0.5: give a number from 1 to 3600"),
         ("verify --seconds nan", "--seconds nan: give a number from 1 to 3600"),
         ("verify --ends world", "--ends world: give two hosts, WORLD,CLOUD"),
+        ("verify lossy --shaper netem", "uplink: netem cannot do loss.delay_bad_ms"),
         ("verify --ends world,", "--ends world,: give two hosts, WORLD,CLOUD"),
     ],
 )

@@ -264,7 +264,34 @@ def test_what_is_undecided_says_how_long_it_takes(release: Release) -> None:
     assert said.verdict == "undecided"
     assert "uplink: 3300 of 8800 datagrams, 55 s more" in said.notes
     assert "ask again" in as_text(said).splitlines()[-1]
-    release.cloud.see([LinkChecked(5, True, "datagrams", 115_000, 25_000, 0.0, 0.0, "told", 3300)])
+
+
+@pytest.mark.parametrize(
+    ("needs", "why"),
+    [(115_000.0, "takes 115000 datagrams, 1150 s"), (math.inf, "the ends may add")],
+)
+def test_what_can_never_be_decided_is_said_and_keeps_nobody_waiting(
+    release: Release, needs: float, why: str
+) -> None:
+    release.hears("world", "ok")
+    release.hears("cloud", "ok")
+    for name, asked in (("round_trip", 0.09), ("round_trip_takes", needs), ("correlation", 0.9)):
+        release.cloud.see([LinkChecked(5, True, name, asked, 0.0, 0.0, 0.0, "told", 3300)])
+    said = ask(release)
+    assert said.verdict == "believed"
+    assert [one for one in said.notes if "round trip, mean NOT JUDGED: " in one and why in one]
+    assert "uplink: correlation 0.9 NOT JUDGED: netem realises next to none of it" in said.notes
+    assert "round trips are judged" not in as_text(said)
+    assert as_text(said).splitlines()[-1].endswith("but for what is NOT JUDGED (above)")
+
+
+def test_what_netem_applies_is_told_as_netem_makes_it(release: Release) -> None:
+    applied = DirectionProfile(0.045, loss=0.2, duplicate=0.3)
+    release.links["uplink"].tells(lambda: write_told(Told("netem", "", applied)))
+    release.hears("world", "ok")
+    release.hears("cloud", "ok")
+    loss = ask(release).findings["uplink"].rows[1]
+    assert (loss.name, loss.applied) == ("loss", pytest.approx(0.14))
 
 
 def test_ends_that_do_not_answer_are_a_timeout(release: Release) -> None:

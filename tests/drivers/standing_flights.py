@@ -4,41 +4,60 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from virtual_netem import VirtualNetem
+
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.drivers.standing_check import StandingCheck
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.verify_twin import Stream
-from cloudrc.records import Arrival, Fault, LinkChecked, Record
+from cloudrc.records import Arrival, Fault, Lateness, LinkChecked, Record
 
 PERIOD_NS = 10_000_000
 COMMAND, SIZE = 4, 88
+TELEMETRY, TELEMETRY_SIZE = 3, 203
 PAPER = link_profile(load_profile("paper-p2").downlink)
 P1 = link_profile(load_profile("paper-p1").downlink)
 LOSSY = link_profile(load_profile("lossy").downlink)
 SATELLITE = link_profile(load_profile("satellite").downlink)
 HANDOVER = link_profile(load_profile("handover").downlink)
-WHOLE = bytes(SIZE)
 ZERO = (0.0, 0.0, 0.0)
 DRAWS = Stream(1, False, COMMAND, SIZE)
 """Seed 1 is the experiment's; links of another seed draw otherwise, as netem does."""
 
 
 def arrivals(
-    profile: DirectionProfile, seconds: float = 60.0, *, seed: int = 1, overhead: float = 5e-4
+    profile: DirectionProfile,
+    seconds: float = 60.0,
+    *,
+    seed: int = 1,
+    overhead: float = 5e-4,
+    uplink: bool = False,
+    netem: bool = False,
 ) -> list[Arrival]:
-    """What world notes of a minute of commands over a link; NaN overhead: no shared clock."""
-    link = LinkDirection(profile, seed, uplink=False)
-    found = []
+    """What an end notes of a minute of datagrams over a link.
+
+    Args:
+        profile: Of the link.
+        seconds: How long [s].
+        seed: Of its chance.
+        overhead: What the ends add [s]; NaN: they share no clock.
+        uplink: Whether cloud hears telemetry; else world hears commands.
+        netem: Whether netem shapes, which draws as the kernel does.
+    """
+    model = LinkDirection(profile, seed, uplink=uplink)
+    link = VirtualNetem(profile, seed) if netem else model
+    kind, size = (TELEMETRY, TELEMETRY_SIZE) if uplink else (COMMAND, SIZE)
+    found, whole = [], bytes(size)
     for n in range(round(seconds * 100)):
         sent_ns = n * PERIOD_NS
-        fate = link.send(1, COMMAND, n, SIZE, sent_ns)
-        if fate and link.corrupts and link.corrupted(1, COMMAND, n, WHOLE) != WHOLE:
+        fate = link.send(1, kind, n, size, sent_ns)
+        if link is model and model.corrupts and model.corrupted(1, kind, n, whole) != whole:
             continue  # its tag does not fit: refused
         for at_ns in fate:
             delay = (at_ns - sent_ns) * 1e-9 + overhead
-            found.append(Arrival(at_ns, False, 1, n, delay, True))
+            found.append(Arrival(at_ns, uplink, 1, n, delay, True))
     return sorted(found)
 
 
@@ -56,7 +75,21 @@ def checked(
 
 
 def downlink(asked: DirectionProfile) -> StandingCheck:
-    check = StandingCheck(uplink=False, stream=DRAWS)
+    return hearing(asked, uplink=False)
+
+
+def punctual(arrivals: Iterable[Arrival], late: float = 1e-4, busy: float = 1e-4) -> list[Record]:
+    """Add what an end tells of its wakes, one per arrival: how late, and how long busy [s]."""
+    heard: list[Record] = []
+    for arrival in arrivals:
+        heard += [arrival, Lateness(arrival.stamp_ns, "cloud", late, busy, 0)]
+    return heard
+
+
+def hearing(asked: DirectionProfile, uplink: bool) -> StandingCheck:
+    """The check of the end that hears this direction."""
+    draws = Stream(1, True, TELEMETRY, TELEMETRY_SIZE) if uplink else DRAWS
+    check = StandingCheck(uplink=uplink, stream=draws)
     check.follow((asked, asked))
     return check
 

@@ -84,17 +84,17 @@ def control(stamp_ns: int, rtt: float) -> Control:
 
 @pytest.mark.parametrize(("slower", "verdict"), [(0.0, "ok"), (0.030, "off")])
 def test_cloud_judges_round_trips_then(slower: float, verdict: str) -> None:
-    """20 ms and 40 ms without jitter: every round trip takes 60 ms."""
-    asked = (DirectionProfile(0.020), DirectionProfile(0.040))
+    """40 ms and 80 ms without jitter: every round trip takes 120 ms."""
+    asked = (DirectionProfile(0.040), DirectionProfile(0.080))
     check = StandingCheck(uplink=True, stream=DRAWS._replace(uplink=True))
     check.follow(asked)
     heard: list[Record] = []
     for arrival in arrivals(asked[0], overhead=nan):
         heard.append(arrival._replace(uplink=True))
-        heard.append(control(arrival.stamp_ns, 0.060 + slower + arrival.counter * 1e-9))
+        heard.append(control(arrival.stamp_ns, 0.121 + slower + arrival.counter * 1e-9))
     records, _ = checked(check, heard)
     trip = newest(records)["round_trip"]
-    assert trip.asked == pytest.approx(0.060, abs=1e-4)
+    assert trip.asked == pytest.approx(0.120, abs=1e-4)
     assert trip.verdict == verdict
 
 
@@ -119,8 +119,8 @@ def test_the_profile_is_followed_in_the_state_of_the_link(tmp_path: Path) -> Non
     check, slow = downlink(PAPER), DirectionProfile(0.070)
     follow = check.follow
 
-    def watched(asked: tuple[DirectionProfile, DirectionProfile]) -> None:
-        follow(asked)
+    def watched(asked: tuple[DirectionProfile, DirectionProfile], shaper: str = "") -> None:
+        follow(asked, shaper)
         if asked[1] == slow:
             seen.set()
 

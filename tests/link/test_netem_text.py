@@ -76,6 +76,15 @@ def test_reorder_without_a_delay_is_left_out_since_tc_refuses_it() -> None:
     assert "reorder" not in text(DirectionProfile(reorder=0.2))
 
 
+def test_in_a_blackout_no_copy_of_what_is_lost_arrives() -> None:
+    profile = DirectionProfile(duplicate=0.1, blackouts=(Blackout(2.0, 0.3),))
+    before, within = (
+        options(profile, Timeline(profile).at(round(at * 1e9)), 10) for at in (1.0, 2.1)
+    )
+    assert before[before.index("duplicate") + 1] == "10%"
+    assert within[within.index("duplicate") + 1] == "0%"
+
+
 def test_changes_and_blackouts_are_steps() -> None:
     profile = DirectionProfile(
         delay=0.02, changes=(Change(1.0, delay=0.1, loss=0.5),), blackouts=(Blackout(2.0, 0.3),)

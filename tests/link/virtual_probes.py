@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from virtual_netem import VirtualNetem
 
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
@@ -43,13 +44,15 @@ def probe(
     stall: float = 0.0,
     evidence: Evidence | None = None,
     overhead_ns: int = OVERHEAD_NS,
+    link: VirtualNetem | None = None,
 ) -> Findings:
     """Send what was planned over a link of `applied`; a stalled relay holds 30 % of it up [s]."""
     rng = np.random.default_rng(seed)
-    direction = LinkDirection(applied, seed, True)
-    period_ns = round(asked.plan.schedule.period * 1e9)
-    log = Log([n * period_ns for n in range(asked.plan.schedule.count)])
-    log.arrivals = flow(direction, PROBE, log.sent_ns, PROBE_SIZE)
+    direction = link or LinkDirection(applied, seed, True)
+    schedule = asked.plan.schedule
+    first_ns, period_ns = round(schedule.begin * 1e9), round(schedule.period * 1e9)
+    log = Log([first_ns + n * period_ns for n in range(schedule.count)])
+    log.arrivals = flow(direction, PROBE, log.sent_ns, schedule.size)
     damaged = {number for number, _ in log.arrivals if is_damaged(direction, PROBE, number)}
     log.arrivals = [
         (number, at_ns + overhead_ns + round(stall * 1e9 * rng.random()) * (rng.random() < 0.3))
@@ -74,7 +77,7 @@ def probe(
 
 
 def flow(
-    direction: LinkDirection, kind: int, sent_ns: list[int], size: int
+    direction: LinkDirection | VirtualNetem, kind: int, sent_ns: list[int], size: int
 ) -> list[tuple[int, int]]:
     """Put datagrams on a link: number and instant of each arrival."""
     return [
@@ -84,9 +87,11 @@ def flow(
     ]
 
 
-def is_damaged(direction: LinkDirection, kind: int, number: int) -> bool:
+def is_damaged(direction: LinkDirection | VirtualNetem, kind: int, number: int) -> bool:
     """Whether a datagram that arrives is not as it was sent."""
     whole = bytes(PROBE_SIZE)
+    if isinstance(direction, VirtualNetem):
+        return False  # that never arrives
     return direction.corrupts and direction.corrupted(1, kind, number, whole) != whole
 
 
