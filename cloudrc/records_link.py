@@ -49,7 +49,9 @@ class LinkChecked(NamedTuple):
         quantity: "mean", "deviation", "variation", "middle", "round_trip", "loss", "reordered" or
             "duplicated". And what is only told: "datagrams" (needed, there), "time_line" (share
             of it that was watched and as asked), "rate" (not measured by datagrams that come
-            alone), "jitter_share" (usual, and by which share the jitter may be off here).
+            alone), "jitter_share" (usual, and by which share the jitter may be off here),
+            "correlation" (asked of netem, which realises none), and "mean_takes" and the like (so
+            many datagrams as there never are would decide it).
         asked: What a true link shows: delays [s], shares in [0, 1].
         measured: Likewise.
         low: Least that is believed, likewise.
