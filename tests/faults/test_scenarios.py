@@ -87,15 +87,12 @@ def test_a_fault_is_survived(name: str) -> None:
 @pytest.mark.promise("P-FAULT-5")
 @pytest.mark.parametrize("name", QUICK)
 def test_the_page_is_of_what_is_flown_now(name: str) -> None:
-    """Hashes are compared where the page was written by the same libraries and processor."""
+    """Its checks are; hashes are not compared: processors of one name may round otherwise."""
     outcome, page = flown(name), PAGE.read_text(encoding="utf-8")
     scenario = find(name, "virtual")
     section = page.partition(f"### {scenario.id} {name}: ")[2].partition("\n### ")[0]
     told = re.findall(r"^- (.*?): (?:yes|NO|-?[\d.]+)", section, re.MULTILINE)
     assert told == list(dict.fromkeys(check.text for check in outcome.checks)), f"{PAGE}: {MEND}"
-    if document.built() in page:
-        hashes = re.findall(r"SHA-256: `(\w+)`", section)
-        assert hashes == [outcome.sha256[:16]] * bool(outcome.sha256), f"{PAGE}: {MEND}"
 
 
 @pytest.mark.full
