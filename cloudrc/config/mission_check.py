@@ -1,6 +1,7 @@
 """Whether a mission can be flown: mission and scene go in, what is wrong comes out.
 
-Checked are the fence and, with the base's box and the arm, the walls of the pipes. The board is
+Checked are the fence and, with the base's box and the arm, the walls of the pipes, and that no
+straight way from one waypoint to the next leads through a wall. The board is
 exempt: the paper's last waypoint lies behind it. The rotors are too: they have no say in where the
 base can be asked to go, only in how near the flight comes, which the metrics judge.
 """
@@ -12,7 +13,13 @@ import numpy as np
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import MAX_WAYPOINTS, Mission, Steps
 from cloudrc.geometry import fence
-from cloudrc.geometry.placement import nearest_legal, outside_fence, overlapped_pipe
+from cloudrc.geometry.placement import (
+    crossed_pipe,
+    nearest_legal,
+    outside_fence,
+    overlapped_pipe,
+)
+from cloudrc.geometry.robot import Array
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 
@@ -68,6 +75,22 @@ def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
     if len(wrong) > _REPORTED:
         rest = f"{len(wrong) - _REPORTED} more waypoints are beyond the fence or in a pipe's wall"
         problems.append(Problem(("waypoints",), "", rest))
+    return problems if len(wrong) else problems + _check_ways(positions, scene)
+
+
+def _check_ways(positions: Array, scene: Scene) -> list[Problem]:
+    """Each straight way between waypoints that can be flown to [m], shape (n, 3)."""
+    through = crossed_pipe(scene, positions[:-1], positions[1:])
+    problems = []
+    for index in np.flatnonzero(through >= 0)[:_REPORTED]:
+        x, y, z = positions[index + 1].tolist()
+        name = scene.pipes[through[index]].name
+        reason = (
+            f"the straight way there from waypoint {index} leads through the wall of {name}; "
+            "go round it, or through the bore, by waypoints in between"
+        )
+        path = ("waypoints", str(index + 1), "position_m")
+        problems.append(Problem(path, _point((x, y, z)), reason))
     return problems
 
 

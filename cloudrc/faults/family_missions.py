@@ -55,6 +55,11 @@ def _impossible(seed: int) -> Outcome:
         _judge_way_out(outcome, name, problems[0], scene, position)
     for name, value in (("NaN", nan), ("infinite", inf), ("a word", "high")):
         outcome.true(f"{name}: refused", _refused({"position_m": (0.0, 0.0, value)}))
+    bore, beside = {"position_m": scene.pipes[0].centre}, {"position_m": (0.5, 0.0, 0.8)}
+    for way in ((bore, beside), (beside, bore)):
+        (problem,) = check_mission(MissionSchema.model_validate({"waypoints": way}), scene)
+        outcome.true("behind a wall: its index is named", problem.path[1] == "1")
+        outcome.true("behind a wall: the wall is named", scene.pipes[0].name in problem.reason)
     outcome.true("none at all: refused", bool(check_mission(MissionSchema(), scene)))
     many = {"waypoints": ({"position_m": (0.0, 0.0, 1.0)},) * 10_001}
     outcome.true("10,001 waypoints: refused", _refuses(many))
@@ -193,7 +198,7 @@ SCENARIOS = (
     Scenario(
         27,
         "impossible-mission",
-        "waypoints of NaN, in a wall, beyond the fence, 10,001 of them",
+        "waypoints of NaN, in a wall, behind one, beyond the fence, 10,001 of them",
         "refused as a whole, before anything is flown",
         "nothing",
         "index, value, reason and the nearest legal point; cloudrc_missions_refused_total",

@@ -46,6 +46,36 @@ def overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.i
     return result
 
 
+def crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
+    """Say through which pipe's wall a straight way of the base's middle leads.
+
+    Where robot and wall only graze each other is not said: how straight it flies nobody knows yet.
+
+    Args:
+        scene: Where the robot is; its board does not count.
+        starts: Of the ways [m], world frame, not far beyond the fence, shape (n, 3).
+        ends: Likewise.
+
+    Returns:
+        Index of the pipe, the last one if there are several; -1 where there is none; shape (n,).
+    """
+    result = np.full(len(starts), -1, dtype=np.int64)
+    for index, pipe in enumerate(scene.pipes):
+        axis = np.asarray(pipe.axis)
+        from_centre, along = starts - np.asarray(pipe.centre), ends - starts
+        depth, deeper = from_centre @ axis, along @ axis
+        away, farther = from_centre - depth[:, None] * axis, along - deeper[:, None] * axis
+        # Where it meets the middle of the wall: |away + t farther| = radius.
+        a, b = np.sum(farther**2, axis=1), 2 * np.sum(away * farther, axis=1)
+        c = np.sum(away**2, axis=1) - ((pipe.inner + pipe.outer) / 2) ** 2
+        with np.errstate(invalid="ignore", divide="ignore"):  # never, or along the axis
+            root = np.sqrt(b**2 - 4 * a * c)
+            for t in ((-b - root) / (2 * a), (-b + root) / (2 * a)):
+                meets = (t >= 0) & (t <= 1) & (np.abs(depth + t * deeper) <= pipe.length / 2)
+                result[meets] = index
+    return result
+
+
 def nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | None:
     """Look for a legal point near by, along the axes and towards and away from the pipes' axes.
 

@@ -12,7 +12,12 @@ from hypothesis import strategies as st
 from cloudrc.config.load import load_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.schema import Mission, Steps, Waypoint
-from cloudrc.geometry.placement import nearest_legal, outside_fence, overlapped_pipe
+from cloudrc.geometry.placement import (
+    crossed_pipe,
+    nearest_legal,
+    outside_fence,
+    overlapped_pipe,
+)
 from cloudrc.geometry.scene import Scene, load_scene
 from cloudrc.messages import Vector
 
@@ -78,6 +83,59 @@ def test_every_bad_waypoint_is_named_up_to_a_number() -> None:
     assert len(problems) == 21
     assert str(problems[0]).startswith("waypoints.1.position_m: [-1, 0, 0.15]: base box or arm")
     assert str(problems[-1]).startswith("waypoints: 10 more waypoints")
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "pipe"),
+    [
+        ((-1.0, 0.0, 0.8), (0.5, 0.0, 0.8), 0),  # out of the bore, sideways
+        ((0.5, 0.0, 0.8), (-1.0, 0.0, 0.8), 0),
+        ((0.5, 0.0, 0.8), (-2.5, 0.0, 0.8), 0),  # right through
+        ((-1.0, 0.0, 0.8), (-1.0, 0.0, 2.0), 0),
+        ((-1.0, 3.6, 0.7), (-1.0, 0.0, 0.7), -1),  # into the bore, by its mouth
+        ((-1.0, 0.0, 0.8), (-1.0, 0.0, 0.8), -1),
+        ((-1.0, -1.0, 0.8), (-1.0, 1.0, 0.8), -1),  # along the axis
+        ((0.5, -2.0, 0.8), (0.5, 2.0, 0.8), -1),  # past it
+        ((-2.5, 2.7, 0.8), (0.5, 2.7, 0.8), -1),  # across, in front of its mouth
+        ((-2.5, 0.0, 1.6), (0.5, 0.0, 1.6), -1),  # over it
+        ((-1.0, -2.0, 0.8), (5.66, -6.42, 0.8), 2),  # out of one bore, into another
+    ],
+)
+def test_a_straight_way_through_a_wall_is_found(start: Vector, end: Vector, pipe: int) -> None:
+    assert crossed_pipe(PIPES, np.array([start]), np.array([end]))[0] == pipe
+
+
+@settings(max_examples=50, deadline=None)
+@given(*[st.tuples(st.floats(-3, 9), st.floats(-8, 5), st.floats(0, 2))] * 2)
+def test_a_way_is_through_a_wall_if_some_of_it_is_within_and_some_without(
+    start: Vector, end: Vector
+) -> None:
+    """Of ways that are cut into short pieces: a piece that changes sides does so in the wall."""
+    points = np.linspace(start, end, 2_000)
+    found = set(crossed_pipe(PIPES, np.array([start]), np.array([end])).tolist())
+    for pipe in PIPES.pipes:
+        relative = points - np.array(pipe.centre)
+        depth = relative @ np.array(pipe.axis)
+        radius = np.linalg.norm(relative - depth[:, None] * np.array(pipe.axis), axis=1)
+        within = radius < (pipe.inner + pipe.outer) / 2
+        beside = np.abs(depth) < pipe.length / 2 - 0.02
+        if np.any((within[1:] != within[:-1]) & beside[1:] & beside[:-1]):
+            assert found != {-1}, pipe.name
+    if found != {-1}:
+        pipe = PIPES.pipes[found.pop()]
+        relative = points - np.array(pipe.centre)
+        depth = relative @ np.array(pipe.axis)
+        radius = np.linalg.norm(relative - depth[:, None] * np.array(pipe.axis), axis=1)
+        near = np.abs(radius - (pipe.inner + pipe.outer) / 2) < 0.02
+        assert np.any(near & (np.abs(depth) < pipe.length / 2 + 0.02))
+
+
+def test_a_waypoint_behind_a_wall_is_refused_and_its_way_is_named() -> None:
+    inside, outside = Waypoint(position_m=(-1.0, 0.0, 0.7)), Waypoint(position_m=(0.5, 0.0, 0.7))
+    (problem,) = check_mission(Mission(waypoints=(inside, outside)), PIPES)
+    assert str(problem).startswith("waypoints.1.position_m: [0.5, 0, 0.7]: the straight way there")
+    assert "from waypoint 0 leads through the wall of pipe_1" in problem.reason
+    assert check_mission(Mission(waypoints=(outside, outside)), PIPES) == []
 
 
 def test_none_and_both_are_refused() -> None:
