@@ -105,14 +105,17 @@ def test_of_netem_the_kernel_says_what_is_applied() -> None:
 
 def test_what_is_applied_has_a_number_for_every_row() -> None:
     profile = DirectionProfile(0.04, 0.01, "normal", loss=0.1, duplicate=0.02, corrupt=0.5)
-    found = shown(profile, 200)
+    found = shown(profile, 200, "relay")
     assert found["mean"] == pytest.approx(0.04, rel=0.01)
     assert found["deviation"] == pytest.approx(0.01, rel=0.01)
     assert found["loss"] == pytest.approx(0.55), "what is damaged is refused"
     assert found["duplicated"] == 0.02
     assert found["reordered"] > 0.1
     assert found["middle"] > 0.0
-    assert shown(DirectionProfile(0.04, keep_order=True), 200)["reordered"] == 0.0
+    assert shown(DirectionProfile(0.04, keep_order=True), 200, "relay")["reordered"] == 0.0
+    doubled = shown(DirectionProfile(0.04, loss=0.2, duplicate=0.3), 200, "netem")
+    assert doubled["loss"] == pytest.approx(0.14), "of what is doubled and lost one copy arrives"
+    assert doubled["duplicated"] == pytest.approx(0.22, abs=0.005)
 
 
 def tells(bench: Bench, *at: float) -> list[Told | None]:
