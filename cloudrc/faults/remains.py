@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
 
@@ -139,8 +140,9 @@ class CutTape:
             self._folder.cleanup()
         if stamps != self._truths[: len(stamps)]:
             return "what was recovered has not happened so"
-        began = stamps[-1] if stamps else min(self._truths, default=0)
-        lost = (max(self._truths, default=0) - began) * 1e-9
+        # What was flown and is lost: while world is dead or frozen nothing is, and nobody records.
+        period_ns = min((after - before for before, after in pairwise(self._truths)), default=0)
+        lost = (len(self._truths) - len(stamps)) * period_ns * 1e-9
         return f"its last {lost:.2f} s are lost" if lost > LOSS_MAX else ""
 
     def _cut(self) -> bytes:
