@@ -153,13 +153,14 @@ def _link_of(options: argparse.Namespace, where: Place) -> LinkParts:
     """Look at the release's link; if it is not there find out why."""
     from cloudrc.cluster.link import read_link
 
+    failed: CloudrcError
     try:
         found = read_link(where)
         failed = ClusterError(
             f"release '{where.name}' has no link to change; is it a release of cloudrc? see: "
             "helm list --all-namespaces"
         )
-    except ClusterError as error:
+    except (ClusterError, MissingPrerequisiteError) as error:  # that kubectl is missing, too
         found, failed = None, error
     if found is not None:
         return found

@@ -133,9 +133,16 @@ def test_a_link_is_set_on_the_only_run_that_flies(tmp_path: Path, capsys: Printe
             assert f"--run {tmp_path / name}" in line
 
 
+@pytest.mark.parametrize("kubectl", ["perhaps there", "missing"])
 def test_the_link_of_a_run_that_was_killed_is_not_set(
-    tmp_path: Path, elsewhere: Path, capsys: Printed
+    tmp_path: Path,
+    elsewhere: Path,
+    capsys: Printed,
+    monkeypatch: pytest.MonkeyPatch,
+    kubectl: str,
 ) -> None:
+    if kubectl == "missing":
+        monkeypatch.setenv("PATH", str(elsewhere))
     dead = with_link(elsewhere / "runs" / "latest", killed=True)
     assert main(SET) == 3
     assert "no run flies here (start one: cloudrc run; or name one: --run)" in (
