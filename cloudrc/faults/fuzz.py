@@ -152,8 +152,10 @@ class Operator:
             return
         self._next_ns = now_ns + PATIENCE_NS
         try:
-            if state in LATCHED:
-                service.acknowledge(flight.cloud.clock.at(now_ns))
+            # What the operator sees: a world that was restarted is in GROUND, and changes nothing.
+            own_ns = flight.cloud.clock.at(now_ns)
+            if service.state(own_ns)["seen"]["guard"] in [each.name for each in LATCHED]:
+                service.acknowledge(own_ns)
             else:
                 flight.order(now_ns)
         except (ConflictError, UnavailableError):
