@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from cloudrc.cloud.endpoint import CloudEndpoint
-from cloudrc.cloud.teleop.service import LATCHED
 from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
+from cloudrc.cloud.teleop.sight import LATCHED
 from cloudrc.faults.adversary import temptation
 from cloudrc.faults.asks import held
 from cloudrc.faults.bug import BUGS, buggy

@@ -18,7 +18,8 @@ from cloudrc.geometry.placement import (
     outside_fence,
     overlapped_pipe,
 )
-from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.geometry.robot import Array
+from cloudrc.geometry.scene import Pipe, Scene, load_scene
 from cloudrc.messages import Vector
 
 PIPES = load_scene("pipes")
@@ -105,6 +106,13 @@ def test_a_straight_way_through_a_wall_is_found(start: Vector, end: Vector, pipe
     assert crossed_pipe(PIPES, np.array([start]), np.array([end]))[0] == pipe
 
 
+def in_pipe(points: Array, pipe: Pipe) -> tuple[Array, Array]:
+    """Depth along its axis from its centre, and distance from the axis [m], shapes (n,)."""
+    relative = points - np.array(pipe.centre)
+    depth = relative @ np.array(pipe.axis)
+    return depth, np.linalg.norm(relative - depth[:, None] * np.array(pipe.axis), axis=1)
+
+
 @settings(max_examples=50, deadline=None)
 @given(*[st.tuples(st.floats(-3, 9), st.floats(-8, 5), st.floats(0, 2))] * 2)
 def test_a_way_is_through_a_wall_if_some_of_it_is_within_and_some_without(
@@ -112,20 +120,16 @@ def test_a_way_is_through_a_wall_if_some_of_it_is_within_and_some_without(
 ) -> None:
     """Of ways that are cut into short pieces: a piece that changes sides does so in the wall."""
     points = np.linspace(start, end, 2_000)
-    found = set(crossed_pipe(PIPES, np.array([start]), np.array([end])).tolist())
+    (found,) = crossed_pipe(PIPES, np.array([start]), np.array([end])).tolist()
     for pipe in PIPES.pipes:
-        relative = points - np.array(pipe.centre)
-        depth = relative @ np.array(pipe.axis)
-        radius = np.linalg.norm(relative - depth[:, None] * np.array(pipe.axis), axis=1)
+        depth, radius = in_pipe(points, pipe)
         within = radius < (pipe.inner + pipe.outer) / 2
         beside = np.abs(depth) < pipe.length / 2 - 0.02
         if np.any((within[1:] != within[:-1]) & beside[1:] & beside[:-1]):
-            assert found != {-1}, pipe.name
-    if found != {-1}:
-        pipe = PIPES.pipes[found.pop()]
-        relative = points - np.array(pipe.centre)
-        depth = relative @ np.array(pipe.axis)
-        radius = np.linalg.norm(relative - depth[:, None] * np.array(pipe.axis), axis=1)
+            assert found != -1, pipe.name
+    if found != -1:
+        pipe = PIPES.pipes[found]
+        depth, radius = in_pipe(points, pipe)
         near = np.abs(radius - (pipe.inner + pipe.outer) / 2) < 0.02
         assert np.any(near & (np.abs(depth) < pipe.length / 2 + 0.02))
 

@@ -32,8 +32,7 @@ from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook
 from cloudrc.cloud.teleop.service_mission import Mission, Order
-from cloudrc.cloud.teleop.sight import LATCHED as LATCHED  # faults import it from here
-from cloudrc.cloud.teleop.sight import Sight
+from cloudrc.cloud.teleop.sight import LATCHED, Sight
 from cloudrc.cloud.teleop.verdict import Criteria, Failure, Verdict, Witness, judge
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Setpoint, Start, Vector
