@@ -8,7 +8,7 @@ import urllib.request
 from collections import deque
 
 import pytest
-from api_harness import running
+from api_harness import DIRECT, running
 from service_harness import A, B, C
 
 from cloudrc.cli.teleop_api import ServedApi
@@ -195,7 +195,7 @@ def test_until_the_journal_is_free_it_is_unavailable():
 def read_events(api, count, headers=None, path="/v1/events"):
     request = api.request(path, headers=headers)
     events, numbers = [], []
-    with urllib.request.urlopen(request, timeout=5.0) as stream:
+    with DIRECT.open(request, timeout=5.0) as stream:
         for line in stream:
             key, _, value = line.decode().strip().partition(": ")
             if key == "id":
@@ -231,7 +231,7 @@ def test_an_event_arrives_while_it_happens(api):
 
 def test_an_open_stream_does_not_keep_the_server_from_ending():
     with running() as api:
-        stream = urllib.request.urlopen(api.request("/v1/events"), timeout=5.0)
+        stream = DIRECT.open(api.request("/v1/events"), timeout=5.0)
         began = time.monotonic()
         api.stop()
         assert time.monotonic() - began < 1.5

@@ -8,7 +8,7 @@ import urllib.request
 from collections.abc import Iterator
 
 import pytest
-from api_harness import OPERATOR, Running, running
+from api_harness import DIRECT, OPERATOR, Running, running
 
 from cloudrc.cloud.teleop import api_models as models
 
@@ -26,7 +26,7 @@ def asked(url: str) -> urllib.request.Request:
 @pytest.mark.parametrize("value", ["x", "1.5", ""])
 def test_a_query_that_cannot_be_used_is_refused_like_a_body(idle: Running, value: str) -> None:
     with pytest.raises(urllib.error.HTTPError) as caught:
-        urllib.request.urlopen(asked(f"{idle.url}/v1/events?after={value}"), timeout=5.0)
+        DIRECT.open(asked(f"{idle.url}/v1/events?after={value}"), timeout=5.0)
     refusal = json.loads(caught.value.read())
     models.Refusal.model_validate(refusal)
     assert caught.value.code == 422
