@@ -28,9 +28,18 @@ GLIMPSE, GLIMPSE_NS = 0.25, 10_000_000
 """The robot moves by less than this [m] in so long [ns]: it is never faster than 25 m/s."""
 COME_BACK, COME_BACK_MAX = 1.0, 0.5
 """Beyond the margin the robot has to fly back: velocity per distance [1/s], at most [m/s]."""
-ASIDE, ASIDE_MARGIN = 0.5, 0.5
-"""With this share of the speed [1] the robot has to stop so far [m] from a wall, whichever way it
-flies: what it hits turns it aside. Off the board's edge at 2.7 m/s it goes on across at 1.2."""
+ASIDE = 0.44
+"""What the robot hits turns it aside: so much of its speed [1] may become speed towards a wall. Off
+the board's edge at 2.7 m/s it goes on across at 1.2."""
+SLIDE, TUMBLE = 0.4, 0.3
+"""A hit stops the rotors: the robot falls, goes on along the floor for so long [s], and then lies so
+much [m] farther. Few get beyond that: `pytest -m "" -k after_a_fall tests/world`."""
+LATE = 0.3
+"""The robot follows a braking reference so late [s]."""
+CREEP = 0.5
+"""No faster than this [m/s], the robot may fly anywhere: it hits nothing hard."""
+HEIGHT_MAX, GRAVITY = 5.0, 9.81
+"""A fall from higher than this [m] counts as one from there. [m/s^2]"""
 FLOOR_MARGIN = 0.35
 """Takes the place of MARGIN at the floor, which parts of a tilted robot reach first [m]; there
 REACTION is enough, since the robot climbs readily."""
@@ -86,10 +95,12 @@ def is_far(velocity: Vector, position: Vector, low: Vector, high: Vector) -> boo
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     speed = sqrt(vx * vx + vy * vy + vz * vz)
-    if speed > LOW_SPEED:
-        aside = ASIDE * speed
-        side = GLIMPSE - MARGIN + ASIDE_MARGIN + aside * (REACTION + aside * SIXTH)
-        if not (ax + side <= x <= bx - side and ay + side <= y <= by - side):
+    if speed > CREEP:
+        fall = fall_time(z + GLIMPSE - az) + SLIDE
+        aside, straight, spare = ASIDE * speed * fall, fall + LATE, MARGIN - TUMBLE - GLIMPSE
+        dx = max(aside, abs(vx) * straight) - spare
+        dy = max(aside, abs(vy) * straight) - spare
+        if not (ax + dx <= x <= bx - dx and ay + dy <= y <= by - dy):
             return False
     if vx > 0.0:
         bx -= vx * (CAUTION + vx * SIXTH)
@@ -114,7 +125,8 @@ def fenced(velocity: Vector, position: Vector, low: Vector, high: Vector) -> Vec
     """Slow a reference, axis by axis, until the robot can stop before the faces of the fence.
 
     Near the floor it is slowed sideways, too: a rotor that touches at speed turns the robot over.
-    And near the walls in every direction: what it hits there may throw it against them.
+    And near the walls in every direction: should it hit something there, it has to come to lie
+    before them, though nothing steers it any more.
 
     Args:
         velocity: Finite [m/s], world frame, shape (3,).
@@ -131,8 +143,42 @@ def fenced(velocity: Vector, position: Vector, low: Vector, high: Vector) -> Vec
         # Whoever stands on the floor is not asked to take off.
         within(vz, min(0.0, -approach(z - az, REACTION)), approach(bz - z)),
     )
-    reach = min(x - ax, bx - x, y - ay, by - y) + MARGIN - ASIDE_MARGIN
-    return shortened(inside, max(approach(reach, REACTION) / ASIDE, LOW_SPEED))
+    return shortened(inside, max(hit_speed(inside, position, low, high), CREEP))
+
+
+def hit_speed(velocity: Vector, position: Vector, low: Vector, high: Vector) -> float:
+    """Say how fast [m/s] the robot may fly this way to come to lie before the walls after a hit.
+
+    Args:
+        velocity: Finite [m/s], world frame, shape (3,).
+        position: Of the base [m], world frame, shape (3,).
+        low: Corner of the fence [m], margins taken off, shape (3,).
+        high: The opposite corner [m], shape (3,).
+    """
+    (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, _) = velocity, position, low, high
+    speed = sqrt(vx * vx + vy * vy + vz * vz)
+    if speed <= CREEP:
+        return CREEP
+    fall = fall_time(z - az) + SLIDE
+    aside, straight, spare = ASIDE * speed * fall, fall + LATE, MARGIN - TUMBLE
+    share = min(
+        (x - ax + spare) / max(aside, -vx * straight),
+        (bx - x + spare) / max(aside, vx * straight),
+        (y - ay + spare) / max(aside, -vy * straight),
+        (by - y + spare) / max(aside, vy * straight),
+    )
+    return speed * share
+
+
+def fall_time(height: float) -> float:
+    """Say how long the robot falls [s] from a `height` above the margin of the floor [m].
+
+    In LAND, where the floor is no face, from HEIGHT_MAX.
+    """
+    height += FLOOR_MARGIN
+    if not height < HEIGHT_MAX:
+        height = HEIGHT_MAX
+    return sqrt(2.0 / GRAVITY * max(height, 0.0))
 
 
 def shortened(a: Vector, length_max: float) -> Vector:

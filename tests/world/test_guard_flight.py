@@ -10,6 +10,7 @@ from guard_play import LIMITS, MS, SECOND
 from cloudrc.geometry import fence
 from cloudrc.messages import Command, GuardState
 from cloudrc.world.guard import Guard
+from cloudrc.world.guard_rules import CREEP, FLOOR_MARGIN, SLIDE, TUMBLE, fall_time
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.robot import Robot
 from cloudrc.world.simulator import Simulator
@@ -219,3 +220,48 @@ def test_stopped_at_any_instant_it_comes_to_lie_within_what_is_told(simulator, s
 @pytest.mark.parametrize("seed", range(5, 400))
 def test_stopped_at_four_hundred_instants_likewise(simulator, seed, figure):
     check_stopped(simulator, seed, figure)
+
+
+# What the fence counts on where a hit stops the rotors: `hit_speed` in guard_rules.py.
+
+
+def beyond(simulator, seed):
+    """How far a robot that is stopped lies beyond what the fence counts on, towards each side [m].
+
+    Only sides that it flies towards faster than it may creep anywhere.
+    """
+    flight = Flight(simulator)
+    flight.fly(1.0, UP)
+    flight.fly(Random(seed).uniform(0.3, 5.0), hostile(seed))
+    (x, y, z), (vx, vy, _) = flight.readings.position, flight.readings.velocity
+    flight.guard.stop(flight.now_ns)
+    falls = fall_time(z - FLOOR_MARGIN) + SLIDE
+    speeds = (vx, -vx, vy, -vy)
+    ways = [0.0] * 4
+    for _ in range(30):
+        flight.fly(0.1)
+        xn, yn, _ = flight.readings.position
+        ways = list(map(max, ways, (xn - x, x - xn, yn - y, y - yn)))
+    return [
+        way - speed * falls - TUMBLE
+        for way, speed in zip(ways, speeds, strict=True)
+        if speed > CREEP
+    ]
+
+
+def check_falls(simulator, seeds, figure, share_max, farthest_max):
+    excess = [side for seed in seeds for side in beyond(simulator, seed)]
+    share = sum(side > 0.0 for side in excess) / len(excess)
+    figure("after a fall, beyond what the fence counts on", share, "<=", share_max, "")
+    figure("after a fall, farther than that by", max(excess), "<=", farthest_max, "m")
+    assert share <= share_max
+    assert max(excess) <= farthest_max
+
+
+def test_after_a_fall_it_seldom_lies_farther_than_the_fence_counts_on(simulator, figure):
+    check_falls(simulator, range(40), figure, 0.15, 1.5)
+
+
+@pytest.mark.full
+def test_after_a_fall_it_seldom_lies_farther_in_two_thousand_falls(simulator, figure):
+    check_falls(simulator, range(2000), figure, 0.10, 1.5)
