@@ -217,6 +217,7 @@ def _brief(finding: Finding) -> dict[str, Any]:
         "holds": finding.holds,
         "missions": finding.missions,
         "fallen": finding.fallen,
+        "thrown": finding.thrown,
         "landed_on": bool(finding.landed_on),
         "duration": finding.schedule.duration,
     }

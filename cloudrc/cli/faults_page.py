@@ -22,8 +22,9 @@ NOTES = {
     "adversarial": (
         "",
         "The cloud holds valid keys. Every second one flies amid faults of all kinds, every tenth",
-        "speaks in its operator's place. A robot that this has stopped may come to lie outside the",
-        "fence, a [known limit](guard.md): it is told below the table, and a breach beyond 1.5 m.",
+        "speaks in its operator's place. A robot that this, or a hit, has stopped may come to lie",
+        "outside the fence, a [known limit](guard.md): it is told below the table, and a breach",
+        "beyond 1.5 m.",
     )
 }
 """What else is to be said, by kind."""
@@ -46,9 +47,10 @@ def rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def summary(document: dict[str, Any]) -> str:
     """How much was flown, and the extremes."""
-    fallen = (
-        f"; {document['fallen']} stopped by the operator's word came to lie outside of it, at most "
-        f"by {document['fallen_m']:.2f} m"
+    fallen, thrown = (
+        f"; {document[key]} stopped by {cause} came to lie outside of it, at most "
+        f"by {document[f'{key}_m']:.2f} m"
+        for key, cause in (("fallen", "the operator's word"), ("thrown", "a hit"))
     )
     landed = f"; {document['landed_on']} landed on something other than the floor"
     return (
@@ -58,6 +60,7 @@ def summary(document: dict[str, Any]) -> str:
         f"nearest to the fence {document['smallest_margin_m']:.3f} m, "
         f"fastest {document['largest_speed_mps']:.2f} m/s"
         + (fallen if document["fallen"] else "")
+        + (thrown if document["thrown"] else "")
         + (landed if document["landed_on"] else "")
     )
 

@@ -18,8 +18,9 @@ READ = (".py", ".xml", ".yaml")
 """Endings of what a flight may depend on."""
 WRITES_ONLY = ("cli", "_chart")
 """Folders of the package that no flight depends on."""
-ADDED = ("count", "hours", "seconds", "holds", "missions_done", "fallen", "landed_on", "failures")
-WORST = {"smallest_margin_m": min, "largest_speed_mps": max, "fallen_m": max}
+SUMS = ("count", "hours", "seconds", "holds", "missions_done", "fallen", "thrown", "landed_on")
+ADDED = (*SUMS, "failures")
+WORST = {"smallest_margin_m": min, "largest_speed_mps": max, "fallen_m": max, "thrown_m": max}
 SAME = ("schemaVersion", "kind", "version", "sources")
 
 Document = dict[str, Any]
@@ -65,8 +66,10 @@ def document(findings: Sequence[Document], failures: Sequence[Document], **what:
         "holds": sum(each["holds"] for each in findings),
         "missions_done": sum(each["missions"] for each in findings),
         "fallen": sum(each["fallen"] > 0.0 for each in findings),
+        "thrown": sum(each["thrown"] > 0.0 for each in findings),
         "landed_on": sum(each["landed_on"] for each in findings),
         "fallen_m": max((each["fallen"] for each in findings), default=0.0),
+        "thrown_m": max((each["thrown"] for each in findings), default=0.0),
         "failures": list(failures),
     }
 
@@ -126,7 +129,7 @@ def _load(path: Path) -> Document:
 
 def _is_slice(told: Document) -> bool:
     """Whether everything is there, and of its type, that is added up."""
-    numbers = (*ADDED[:-1], *WORST, "first")
+    numbers = (*SUMS, *WORST, "first")
     judged = told.get("invariants")
     return (
         all(_is_number(told.get(name)) for name in numbers)

@@ -173,7 +173,7 @@ def _acknowledge(options: argparse.Namespace, api: Api) -> int:
     print("acknowledged: the next mission may fly")
     print(
         "where it was stopped or has touched down, the robot takes off only once it has been "
-        "still inside the fence"
+        "still, 0.5 m inside the fence"
     )
     return 0
 

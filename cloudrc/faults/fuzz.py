@@ -47,6 +47,7 @@ class Finding:
         holds: How often the guard held although the mission was on.
         missions: How many missions were done.
         fallen: How far outside the fence it came, its rotors stopped by the operator's word [m].
+        thrown: Likewise, its rotors stopped by a hit [m].
         landed_on: What it touched when it landed, the floor left out.
     """
 
@@ -58,6 +59,7 @@ class Finding:
     holds: int
     missions: int
     fallen: float = 0.0
+    thrown: float = 0.0
     landed_on: frozenset[str] = frozenset()
 
     @property
@@ -113,6 +115,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         len(holds),
         sum(event.event == "done" for event in flight.desk.events),
         watch.fallen,
+        watch.thrown,
         frozenset(watch.landed_on),
     )
 

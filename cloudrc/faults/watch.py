@@ -1,13 +1,14 @@
 """The invariants, looked at in every step of the physics, by nobody who could be wrong with them.
 
-No fence breach: the base stays inside the fence, with its rotors stopped by a hit, too; where the
-operator's word has stopped them, it may fall out of it, but not as far as people have to stay away,
-and they turn again only where the robot lies still, inside the fence. What is flown stays below the
-caps and can be stopped in time, before the floor, too, unless the robot lands. No motion on stale
-commands: in TRACK the newest accepted command's basis is never older than its limit. No collision,
-under an honest cloud: nothing but the arm's tip touches anything, and that the board. A robot that
-lands, since its cloud is gone for good or says what no honest one does, sinks where it is: the
-guard knows the fence, and not what lies below. What it comes down on is told, and no collision.
+No fence breach: the base stays inside the fence as long as its rotors turn; where the operator's
+word or a hit has stopped them, it may fall out of it, which is told, but not as far as people have
+to stay away, and they turn again only where the robot lies still, inside the fence. What is flown
+stays below the caps and can be stopped in time, before the floor, too, unless the robot lands. No
+motion on stale commands: in TRACK the newest accepted command's basis is never older than its
+limit. No collision, under an honest cloud: nothing but the arm's tip touches anything, and that the
+board. A robot that lands, since its cloud is gone for good or says what no honest one does, sinks
+where it is: the guard knows the fence, and not what lies below. What it comes down on is told, and
+no collision.
 """
 
 from __future__ import annotations
@@ -59,6 +60,7 @@ class Watch:
         speed: Largest speed flown [m/s].
         fallen: How far outside the fence the base came with its rotors stopped by the operator's
             word [m]; 0 if it did not.
+        thrown: Likewise, its rotors stopped by a hit [m].
         landed_on: What was touched by a robot that landed, the floor left out, and until it flew
             again.
     """
@@ -78,7 +80,8 @@ class Watch:
         self._age_max_ns = age_max_ns
         self.breaches: list[Breach] = []
         self.counts: Counter[str] = Counter()
-        self.margin, self.speed, self.fallen = 9.0, 0.0, 0.0
+        self.margin, self.speed = 9.0, 0.0
+        self.fallen = self.thrown = 0.0
         self.landed_on: set[str] = set()
         self._hit: tuple[int, str] | None = None
         self._lands = False
@@ -88,9 +91,10 @@ class Watch:
         robot = world.robot
         simulator, guard = robot.simulator, robot.guard
         step, offer, stop = simulator.step, guard.offer, guard.stop
-        now_ns, basis_ns, before, falls = start_ns, -1, ZERO, False
+        now_ns, basis_ns, before = start_ns, -1, ZERO
+        flew = falls = hit = False
         age_max_ns, flown = self._age_max_ns, FLOWN
-        tracking, landing = GuardState.TRACK, GuardState.LAND
+        tracking, landing, stopped = GuardState.TRACK, GuardState.LAND, GuardState.ESTOP
 
         def watched_offer(command: Command, when_ns: int) -> Any:
             nonlocal basis_ns
@@ -105,14 +109,17 @@ class Watch:
             stop(when_ns)
 
         def watched_step(rotor_speeds: Any) -> None:
-            nonlocal now_ns, before, falls
+            nonlocal now_ns, before, flew, falls, hit
             state, reference = guard.state, guard.reference
             position = simulator.readings.position
-            if falls and state in flown:
-                falls = False
+            flies = state in flown
+            hit = hit or (flew and state is stopped and not falls)
+            if flies and (falls or hit):
+                falls = hit = False
                 self._look_at_take_off(position, simulator.readings.velocity, now_ns)
-            self._look_at_fence(position, falls, now_ns)
-            if state in flown:
+            self._look_at_fence(position, falls, hit, now_ns)
+            flew = flies
+            if flies:
                 self._lands = state is landing
                 self._look_at_stop(position, reference, state is landing, now_ns)
                 if reference is not before:
@@ -133,14 +140,17 @@ class Watch:
             text = f"base at ({x:.2f}, {y:.2f}, {z:.2f}) at {hypot(*velocity):.2f} m/s"
             self.note(now_ns, "fence", f"took off after a stop, {text}")
 
-    def _look_at_fence(self, position: Vector, falls: bool, now_ns: int) -> None:
+    def _look_at_fence(self, position: Vector, falls: bool, hit: bool, now_ns: int) -> None:
         x, y, z = position
         (xl, yl, zl), (xh, yh, zh) = LOW, HIGH
         margin = min(x - xl, xh - x, y - yl, yh - y, zh - z)
         if z < zl:
             self.note(now_ns, "fence", f"base at ({x:.2f}, {y:.2f}, {z:.2f}), below the floor")
-        if falls:
-            self.fallen = max(self.fallen, -margin)
+        if falls or hit:
+            if falls:
+                self.fallen = max(self.fallen, -margin)
+            else:
+                self.thrown = max(self.thrown, -margin)
             if margin < -FALL_MAX:
                 self.note(now_ns, "fence", f"base fell to ({x:.2f}, {y:.2f}, {z:.2f})")
         elif margin < self.margin:

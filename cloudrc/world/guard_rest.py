@@ -30,6 +30,9 @@ DAMPING = 1.6
 """Of the position hold: velocity taken back per velocity [1]."""
 PULL_MAX = 0.5
 """Of the position hold [m/s]."""
+TAKE_OFF_MARGIN = 0.5
+"""So far from the walls [m] a robot that was stopped has to lie to take off: tilted, it scrapes
+along the floor before it rises, by 0.35 m at most: `pytest -m "" -k scrapes tests/world`."""
 HOP, HOP_SPEED = 0.02, 0.2
 """A robot that has not been this far [m] above or below where it stood stands there still, if it is
 slower than this [m/s]: it drops from no higher, and hits nothing at speed."""
@@ -118,7 +121,7 @@ class TakeOff:
 
     Held in the air so near to the ground it would scrape along. One whose rotors were stopped may
     still be falling, or lie outside the fence, when it is acknowledged: it takes off while it is
-    at rest, and that inside.
+    at rest, and that inside, by TAKE_OFF_MARGIN.
 
     Attributes:
         over: Whether the robot has left the ground.
@@ -131,7 +134,9 @@ class TakeOff:
             low: Corner of the fence [m], shape (3,).
             high: The opposite one [m], shape (3,).
         """
-        self._low, self._high = low, high
+        (ax, ay, az), (bx, by, bz) = low, high
+        self._low = (ax + TAKE_OFF_MARGIN, ay + TAKE_OFF_MARGIN, az)
+        self._high = (bx - TAKE_OFF_MARGIN, by - TAKE_OFF_MARGIN, bz)
         self._stopped, self._still = False, 0
         self.forget()
 
@@ -143,7 +148,7 @@ class TakeOff:
     @property
     def condition(self) -> str:
         """What has yet to come before it may, in words; "" if nothing."""
-        return "" if self.allowed else ", takes off once it has been still inside the fence"
+        return "" if self.allowed else ", takes off once it has been still, 0.5 m inside the fence"
 
     def forget(self, *, stopped: bool = False) -> None:
         """The robot stands, or will; the next take-off is another one.

@@ -32,8 +32,8 @@ ASIDE = 0.44
 """What the robot hits turns it aside: so much of its speed [1] may become speed towards a wall. Off
 the board's edge at 2.7 m/s it goes on across at 1.2."""
 SLIDE, TUMBLE = 0.4, 0.3
-"""A hit stops the rotors: the robot falls, goes on along the floor for so long [s], and then lies so
-much [m] farther. Few get beyond that: `pytest -m "" -k after_a_fall tests/world`."""
+"""A hit stops the rotors: the robot falls, goes on along the floor for so long [s], and then lies
+so much [m] farther. Few get beyond that: `pytest -m "" -k after_a_fall tests/world`."""
 LATE = 0.3
 """The robot follows a braking reference so late [s]."""
 CREEP = 0.5

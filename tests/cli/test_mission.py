@@ -234,7 +234,7 @@ def test_emergency_stop_and_acknowledgement(
     assert capsys.readouterr().out.splitlines() == [
         "acknowledged: the next mission may fly",
         "where it was stopped or has touched down, the robot takes off only once it has been "
-        "still inside the fence",
+        "still, 0.5 m inside the fence",
     ]
 
 

@@ -83,6 +83,20 @@ def test_a_word_that_stops_no_rotors_excuses_no_fall(state):
     assert world.watch.fallen == 0.0
 
 
+@pytest.mark.promise("P-GUARD-3")
+def test_stopped_by_a_hit_it_may_fall_out_but_not_far_nor_fly_there():
+    world, far = World(), (9.2 + 1.51, 1.0, 1.0)
+    assert world.tick(ZERO, state=TRACK) == set()
+    assert world.tick(ZERO, state=ESTOP, position=OUTSIDE) == set()
+    world.guard.stop(0)  # what is said to it now has not brought that about
+    assert world.tick(ZERO, state=GROUND, position=OUTSIDE) == set(), "acknowledged where it lies"
+    assert (world.watch.thrown, world.watch.fallen) == (pytest.approx(0.1), 0.0)
+    assert world.tick(ZERO, state=TRACK, position=OUTSIDE) == {"fence"}
+    world = World()
+    assert world.tick(ZERO, state=TRACK) == set()
+    assert world.tick(ZERO, state=ESTOP, position=far) == {"fence"}
+
+
 def test_a_breach_says_how_long_before_something_was_hit():
     world = World()
     contact = Contact(0, "board", INSIDE, ZERO, ZERO, False)

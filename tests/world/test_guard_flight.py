@@ -10,6 +10,7 @@ from guard_play import LIMITS, MS, SECOND
 from cloudrc.geometry import fence
 from cloudrc.messages import Command, GuardState
 from cloudrc.world.guard import Guard
+from cloudrc.world.guard_rest import TAKE_OFF_MARGIN
 from cloudrc.world.guard_rules import CREEP, FLOOR_MARGIN, SLIDE, TUMBLE, fall_time
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.robot import Robot
@@ -150,6 +151,60 @@ def test_where_it_was_stopped_outside_the_fence_it_does_not_take_off(simulator):
     flight.guard.acknowledge(flight.now_ns)
     flight.guard.start_mission(flight.now_ns)
     assert flight.fly(3.0, UP).guard.state is GuardState.GROUND
+
+
+def scrapes(simulator, seed, room):
+    """How near it comes to a wall so far away when it takes off from where it came to lie [m]."""
+    rng, flight = Random(seed), Flight(simulator)
+    flight.fly(1.0, UP)
+    flight.fly(rng.uniform(0.3, 5.0), hostile(seed))
+    flight.guard.stop(flight.now_ns)
+    flight.fly(4.0)
+    lies, axis, sign = flight.readings.position, rng.randrange(2), rng.choice((-1, 1))
+    faces = {1: list(LIMITS.fence_high), -1: list(LIMITS.fence_low)}
+    faces[sign][axis] = lies[axis] + sign * room
+    faces[-sign][axis] = lies[axis] - sign * 5.0
+    low, high = tuple(faces[-1]), tuple(faces[1])
+    flight.guard = flight.robot.guard = Guard(replace(LIMITS, fence_low=low, fence_high=high))
+    flight.guard.start_mission(flight.now_ns)
+    outwards = [0.0, 0.0, rng.choice((-6.0, -0.3, 0.0, 0.2))]
+    outwards[axis], outwards[1 - axis] = sign * rng.choice((0.1, 0.5, 6.0)), rng.choice((0, -3, 3))
+    nearest = room
+    for _ in range(60):
+        flight.fly(0.05, tuple(outwards))
+        nearest = min(nearest, sign * (faces[sign][axis] - flight.readings.position[axis]))
+    return nearest
+
+
+@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.parametrize("seed", [48, 86, 90, 101])
+def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence(simulator, seed):
+    """Those of 400 that get farthest: lying tilted, it is pushed along before it rises."""
+    assert scrapes(simulator, seed, TAKE_OFF_MARGIN) > 0.02
+
+
+@pytest.mark.full
+def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence_in_four_hundred(
+    simulator, figure
+):
+    nearest = min(scrapes(simulator, seed, TAKE_OFF_MARGIN) for seed in range(400))
+    figure("taken off 0.5 m from the fence: nearest to it", nearest, ">=", 0.02, "m")
+    assert nearest > 0.02
+
+
+@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.parametrize("nearer", [0.01, -0.01])
+def test_stopped_near_a_wall_it_takes_off_only_so_far_from_it(simulator, nearer):
+    flight = Flight(simulator)
+    _, y, z = LIMITS.fence_low
+    far = replace(LIMITS, fence_low=(-TAKE_OFF_MARGIN + nearer, y, z))
+    flight.guard = flight.robot.guard = Guard(far)
+    flight.guard.stop(flight.now_ns)
+    flight.fly(1.0)
+    flight.guard.acknowledge(flight.now_ns)
+    flight.guard.start_mission(flight.now_ns)
+    flight.fly(0.1, UP)
+    assert flight.guard.state is (GuardState.GROUND if nearer > 0 else GuardState.TRACK)
 
 
 # A cloud that does its worst. The robot is at most 6 m/s fast, and its base stays in the box.

@@ -216,8 +216,12 @@ def test_an_acknowledged_stop_is_on_the_ground_and_arms_nothing():
     ("position", "velocity", "condition"),
     [
         ((1.0, 2.0, 0.1), ZERO, ""),
-        ((1.0, 2.0, 0.1), (0.0, 0.0, -0.5), ", takes off once it has been still inside the fence"),
-        ((9e9, 2.0, 0.1), ZERO, ", takes off once it has been still inside the fence"),
+        (
+            (1.0, 2.0, 0.1),
+            (0.0, 0.0, -0.5),
+            ", takes off once it has been still, 0.5 m inside the fence",
+        ),
+        ((9e9, 2.0, 0.1), ZERO, ", takes off once it has been still, 0.5 m inside the fence"),
     ],
 )
 def test_an_acknowledgement_says_what_a_take_off_still_waits_for(position, velocity, condition):

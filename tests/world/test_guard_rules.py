@@ -283,6 +283,17 @@ def test_along_a_wall_it_is_far_up_to_where_it_would_come_to_lie(axis, sign):
         assert rules.is_far(along(axis, 3.0), place, LOW, HIGH) == far
 
 
+@pytest.mark.parametrize(("axis", "sign"), WALLS)
+def test_towards_a_wall_it_is_far_up_to_where_it_would_come_to_lie(axis, sign):
+    height, velocity = 1.3, [0.0, 0.0, 0.0]
+    velocity[axis] = 1.5 * sign
+    falls = sqrt(2 * (height + rules.GLIMPSE) / 9.81)
+    reach = 1.5 * (falls + 0.4 + 0.3) + 0.3 + rules.GLIMPSE
+    for beyond, far in ((-1e-9, False), (1e-9, True)):
+        place = by_the_wall(axis, sign, reach + beyond, height)
+        assert rules.is_far(tuple(velocity), place, LOW, HIGH) == far
+
+
 def test_the_higher_it_flies_the_slower_it_is_beside_a_wall():
     speeds = [
         hypot(*rules.fenced((6.0, 0.0, 0.0), by_the_wall(1, -1, 1.5, 0.01 * k), LOW, HIGH))

@@ -165,7 +165,7 @@ class Acknowledged(_Answer):
 
     state: Literal["acknowledged"] = Field(
         description="The next mission may fly; after a stop or a touch-down the robot takes off "
-        "only once it has been still inside the fence"
+        "only once it has been still, 0.5 m inside the fence"
     )
 
 

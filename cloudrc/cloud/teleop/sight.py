@@ -17,7 +17,7 @@ LATCHED = (LAND, ESTOP)
 """States of the guard that only the operator's acknowledgement leads out of."""
 SILENCE = 1.0
 """Telemetry that is older tells no more how the robot is [s]."""
-REST = "after a stop or a touch-down only once it has been still inside the fence"
+REST = "after a stop or a touch-down only once it has been still, 0.5 m inside the fence"
 NOT_HEARD = (
     "the robot is not heard: look at the link and at world; without commands it holds where it "
     "flies, then lands, by itself"
