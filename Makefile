@@ -14,7 +14,7 @@ JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 # What the search finds is shrunk and becomes a test, until it is mended a failing one.
 STORE := --store tests/faults/regressions
 # What tests guard, tunnel and journal in seconds.
-SLOW := %_any_input.py %_flight.py %_machine.py %_proof.py %_hostile.py
+SLOW := %_any_input.py %_falls.py %_flight.py %_machine.py %_proof.py %_hostile.py
 CORE := $(filter-out $(SLOW),$(wildcard \
 	tests/world/test_guard*.py tests/tunnel/test_*.py tests/cloud/test_teleop_journal*.py))
 BUILD_ARGS := --build-arg VERSION=$(VERSION) \
