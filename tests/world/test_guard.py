@@ -23,6 +23,7 @@ from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard import Guard
 from cloudrc.world.guard_limits import Limits
 from cloudrc.world.guard_rest import HARDEST, PULL_MAX
+from cloudrc.world.guard_rules import CREEP
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -76,6 +77,7 @@ def test_what_the_fence_changes_is_within_the_acceleration_cap():
         before = after
     assert before[0] > 0.2
     assert before[1] > 0.3
+    assert hypot(*before) == pytest.approx(CREEP)
 
 
 def test_put_on_the_ground_nothing_is_armed_or_remembered():

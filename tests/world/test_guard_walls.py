@@ -112,3 +112,13 @@ def test_the_papers_flight_is_not_slowed_by_its_walls():
         ((2.0, -2.0, 0.0), (0.9, -4.6, 0.7)),
     ):
         assert rules.fenced(velocity, position, LOW, HIGH) == velocity
+
+
+def test_where_the_robot_is_slowed_along_a_wall_it_is_not_far():
+    for speed in (0.4, 0.6, 0.9, 1.1, 2.0, 3.0, 4.4):
+        for k in range(300):
+            velocity, position = (0.0, speed, 0.0), (-3.0 + 0.01 * k, -3.0, 1.3)
+            if rules.is_far(velocity, position, LOW, HIGH):
+                assert rules.fenced(velocity, position, LOW, HIGH) == pytest.approx(velocity)
+    assert rules.is_far((0.0, 0.4, 0.0), (-3.0 + 0.46, -3.0, 1.3), LOW, HIGH)
+    assert rules.fenced((0.0, -4.4, 0.0), (-1.0, 0.0, 0.7), LOW, HIGH) == (0.0, -4.4, 0.0)
