@@ -50,6 +50,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     merge.add_argument("slices", type=Path, nargs="+", metavar="SLICE", help="of fuzz --slice")
     text = "write the result as text"
     merge.add_argument("--document", type=written_to, metavar="FILE", help=text)
+    text = "keep the sum as a slice, to which further ones can be added"
+    merge.add_argument("--slice", type=written_to, metavar="FILE", help=text)
     parsers["replay"].add_argument("file", type=Path, metavar="FILE", help="a schedule (.yaml)")
 
 

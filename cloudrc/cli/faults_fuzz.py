@@ -63,11 +63,12 @@ def fuzz(options: argparse.Namespace) -> int:
 def merge(options: argparse.Namespace) -> int:
     """Add slices of a search up; 1 if an invariant broke in one of them."""
     document, parts = slices.merged(options.slices)
+    if options.slice is not None:
+        slices.keep(document, options.slice)
     if options.document is not None:
-        names = " ".join(path.name for path, _ in parts)
-        by = f"cloudrc faults merge {names} --document {options.document}"
-        flown = [f"{page.command(part)} --slice {path.name}" for path, part in parts]
-        options.document.write_text(page.markdown(document, by, flown), encoding="utf-8")
+        by = f"cloudrc faults merge SLICE... --document {options.document}"
+        text = page.markdown(document, by, [(path.name, part) for path, part in parts])
+        options.document.write_text(text, encoding="utf-8")
     _print(document, options)
     return FAILED if document["failures"] else 0
 

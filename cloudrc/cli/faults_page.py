@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Any
 
 INVARIANTS = {
@@ -28,6 +29,9 @@ NOTES = {
     )
 }
 """What else is to be said, by kind."""
+
+Slice = tuple[str, dict[str, Any]]
+"""Name of a file, and what it holds."""
 
 
 def rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -73,16 +77,28 @@ def command(document: dict[str, Any]) -> str:
     return " ".join([*words, f"--seeds {document['count']}"])
 
 
-def markdown(document: dict[str, Any], written_by: str, slices: Sequence[str] = ()) -> str:
+def _flown(slices: Sequence[Slice]) -> list[str]:
+    """Which commands fly the slices: a line for as many of one length as follow each other."""
+    lines = ["Flown in slices:", ""]
+    for count, each in groupby(slices, key=lambda part: part[1]["count"]):
+        (name, first), *others = each
+        line = f"- `{command(first)} --slice {name}`"
+        if others:
+            name, last = others[-1]
+            line += f" to `{command(last)} --slice {name}`: {len(others) + 1} of {count} each"
+        lines.append(line)
+    return [*lines, ""]
+
+
+def markdown(document: dict[str, Any], written_by: str, slices: Sequence[Slice] = ()) -> str:
     """Lay out a page of the documentation.
 
     Args:
         document: The result.
         written_by: The command that writes the page.
-        slices: The commands that fly the parts it was added up from; none if it was flown at once.
+        slices: The parts it was added up from, by their seeds; none if it was flown at once.
     """
     head, *lines = rows(document)
-    flown = ["Flown in slices, one after the other:", "", *(f"- `{each}`" for each in slices), ""]
     kind = document["kind"]
     return "\n".join(
         [
@@ -103,7 +119,7 @@ def markdown(document: dict[str, Any], written_by: str, slices: Sequence[str] = 
             "",
             summary(document) + ".",
             "",
-            *(flown if slices else ()),
+            *(_flown(slices) if slices else ()),
             f"Flown by cloudrc {document['version']}; SHA-256 of its sources: "
             f"`{document['sources'][:16]}`.",
             "",

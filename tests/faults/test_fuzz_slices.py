@@ -60,10 +60,37 @@ def test_slices_are_added_up_to_what_one_search_has_shown(
     assert added == {name: whole[name] for name in added}
     assert added["invariants"]["stuck"]["broken"] == 1
     page = Path("search.md").read_text()
-    assert "Written by `cloudrc faults merge a.json b.json c.json --document search.md`" in page
-    assert "- `cloudrc faults fuzz --first 4 --seeds 6 --slice b.json`" in page
+    assert "Written by `cloudrc faults merge SLICE... --document search.md`" in page
+    assert "- `cloudrc faults fuzz --first 4 --seeds 6 --slice b.json`\n" in page
     assert "| collisions | 0 | 12 | p < 0.25 |" in page
     assert f"`{sources()[:16]}`" in page
+
+
+def test_a_sum_of_slices_is_a_slice(fuzz: Fuzz, capsys: pytest.CaptureFixture[str]) -> None:
+    """Who has hundreds keeps one, and goes on from there."""
+    for name, first in (("a.json", 1), ("b.json", 4), ("c.json", 7)):
+        fuzz(name, first, 3, code=int(first == BAD))
+    assert main("faults merge a.json b.json --slice sum.json".split()) == 0
+    capsys.readouterr()
+    assert main("faults merge sum.json c.json -o json".split()) == 1
+    of_two = json.loads(capsys.readouterr().out)
+    assert main("faults merge a.json b.json c.json -o json".split()) == 1
+    of_three = json.loads(capsys.readouterr().out)
+    assert of_two == {**of_three, "seconds": pytest.approx(of_three["seconds"])}
+
+
+def test_a_page_tells_slices_of_one_length_in_a_line(fuzz: Fuzz) -> None:
+    for first, seeds in ((1, 1), (2, 2), (4, 2), (6, 1)):
+        fuzz(f"{first}.json", first, seeds)
+    line = "faults merge 1.json 2.json 4.json 6.json --document search.md"
+    assert main(line.split()) == 0
+    flown = [line for line in Path("search.md").read_text().splitlines() if "--slice" in line]
+    assert flown == [
+        "- `cloudrc faults fuzz --seeds 1 --slice 1.json`",
+        "- `cloudrc faults fuzz --first 2 --seeds 2 --slice 2.json` to "
+        "`cloudrc faults fuzz --first 4 --seeds 2 --slice 4.json`: 2 of 2 each",
+        "- `cloudrc faults fuzz --first 6 --seeds 1 --slice 6.json`",
+    ]
 
 
 def test_what_is_printed_as_json_is_a_slice(fuzz: Fuzz, capsys: pytest.CaptureFixture[str]) -> None:
