@@ -46,7 +46,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 ALWAYS = {"errors", "messages", "records", "records_link", "__version__"}
 
 # Faults with real processes and sockets, and a wall clock that is made to jump.
-REAL = ("faults/real_", "faults/family_real", "faults/family_cluster", "faults/walls")
+REAL = ("faults/real/", "faults/cluster/", "faults/walls")
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it.
 RESERVED: dict[str, tuple[str, ...]] = {

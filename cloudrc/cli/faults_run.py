@@ -66,7 +66,7 @@ def _look_for_release(options: argparse.Namespace) -> None:
     """Say it once, and not with every fault, if there is no cluster or no release in it."""
     require("faults in a cluster", ("kube",))
     from cloudrc.cluster.pods import find_pod
-    from cloudrc.faults.real_cluster import place, release_there
+    from cloudrc.faults.cluster.release import place, release_there
 
     place.update(namespace=options.namespace, release=options.release)
     find_pod(release_there(), "world")

@@ -9,7 +9,7 @@ import cloudrc.faults
 from cloudrc.errors import BadInputError
 from cloudrc.faults.scenario import Mode, Scenario
 
-PREFIX = "family_"
+FAMILY = ".family_"
 
 
 def scenarios(mode: Mode | None = None) -> list[Scenario]:
@@ -19,10 +19,9 @@ def scenarios(mode: Mode | None = None) -> list[Scenario]:
         mode: Only those that run there; None for all.
     """
     found: list[Scenario] = []
-    for module in pkgutil.iter_modules(cloudrc.faults.__path__):
-        if module.name.startswith(PREFIX):
-            family = importlib.import_module(f"cloudrc.faults.{module.name}")
-            found += family.SCENARIOS
+    for module in pkgutil.walk_packages(cloudrc.faults.__path__, "cloudrc.faults."):
+        if FAMILY in module.name:
+            found += importlib.import_module(module.name).SCENARIOS
     chosen = [each for each in found if mode is None or each.mode == mode]
     return sorted(chosen, key=lambda each: (each.number, each.mode))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.faults.held import age_at_hold, holds
-from cloudrc.faults.real_processes import throttled
+from cloudrc.faults.real.processes import throttled
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.records import CommandApplied, GuardChange

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from cloudrc.faults import family_cluster
 from cloudrc.faults.catalogue import find, scenarios
+from cloudrc.faults.cluster import family_pods
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.messages import GuardState
 
@@ -87,7 +87,7 @@ def test_the_last_word_of_a_job_is_heard_while_its_pod_goes(
         "list_pods": lambda release, component: ["world"],
     }
     for name, stand_in in there.items():
-        monkeypatch.setattr(family_cluster, name, stand_in)
+        monkeypatch.setattr(family_pods, name, stand_in)
     outcome = find("F33", "cluster").run(1)
     assert [check.show() for check in outcome.checks if not check.passed] == (
         [] if heard else ["the Job ends with INTERRUPTED: NO"]

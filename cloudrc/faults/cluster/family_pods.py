@@ -17,8 +17,7 @@ from cloudrc.cluster.deploy import wait_ready
 from cloudrc.cluster.jobs import read_job
 from cloudrc.cluster.pods import find_pod, list_pods
 from cloudrc.cluster.tools import program
-from cloudrc.faults.held import holds
-from cloudrc.faults.real_cluster import (
+from cloudrc.faults.cluster.release import (
     ENDS,
     LIMIT,
     delete,
@@ -33,6 +32,7 @@ from cloudrc.faults.real_cluster import (
     set_link,
     until,
 )
+from cloudrc.faults.held import holds
 from cloudrc.faults.scenario import Mode, Outcome, Scenario
 from cloudrc.messages import GuardState
 from cloudrc.tunnel.keys import Key, KeySet, parse, write

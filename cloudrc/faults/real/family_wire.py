@@ -8,9 +8,9 @@ from math import nan
 
 import numpy as np
 
-from cloudrc.faults.family_real import REAL, WORKING, finish
 from cloudrc.faults.held import holds
-from cloudrc.faults.real_processes import LOOPBACK, Processes, flood
+from cloudrc.faults.real.family_processes import REAL, WORKING, finish
+from cloudrc.faults.real.processes import LOOPBACK, Processes, flood
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.faults.toll import REFUSED
 

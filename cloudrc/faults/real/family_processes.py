@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 
 from cloudrc.faults.held import AGE_MAX, age_at_hold, holds
-from cloudrc.faults.real_processes import Processes, release, throttle, throttled
+from cloudrc.faults.real.processes import Processes, release, throttle, throttled
 from cloudrc.faults.scenario import Mode, Outcome, Scenario
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
