@@ -96,8 +96,8 @@ def is_far(velocity: Vector, position: Vector, low: Vector, high: Vector) -> boo
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     speed = sqrt(vx * vx + vy * vy + vz * vz)
     if speed > CREEP:
-        fall = fall_time(z + GLIMPSE - az) + SLIDE
-        aside, straight, spare = ASIDE * speed * fall, fall + LATE, MARGIN - TUMBLE - GLIMPSE
+        aside, straight = thrown(speed, z + GLIMPSE - az)
+        spare = MARGIN - TUMBLE - GLIMPSE
         dx = max(aside, abs(vx) * straight) - spare
         dy = max(aside, abs(vy) * straight) - spare
         if not (ax + dx <= x <= bx - dx and ay + dy <= y <= by - dy):
@@ -159,8 +159,8 @@ def hit_speed(velocity: Vector, position: Vector, low: Vector, high: Vector) -> 
     speed = sqrt(vx * vx + vy * vy + vz * vz)
     if speed <= CREEP:
         return CREEP
-    fall = fall_time(z - az) + SLIDE
-    aside, straight, spare = ASIDE * speed * fall, fall + LATE, MARGIN - TUMBLE
+    aside, straight = thrown(speed, z - az)
+    spare = MARGIN - TUMBLE
     share = min(
         (x - ax + spare) / max(aside, -vx * straight),
         (bx - x + spare) / max(aside, vx * straight),
@@ -168,6 +168,20 @@ def hit_speed(velocity: Vector, position: Vector, low: Vector, high: Vector) -> 
         (by - y + spare) / max(aside, vy * straight),
     )
     return speed * share
+
+
+def thrown(speed: float, height: float) -> tuple[float, float]:
+    """Say how far a hit may throw the robot before it lies: TUMBLE comes to that.
+
+    Args:
+        speed: At the hit [m/s].
+        height: Above the margin of the floor [m].
+
+    Returns:
+        How far to any side [m], and for how long it goes straight on [s].
+    """
+    fall = fall_time(height) + SLIDE
+    return ASIDE * speed * fall, fall + LATE
 
 
 def fall_time(height: float) -> float:
