@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,14 +53,15 @@ def _make(options: argparse.Namespace) -> int:
     from cloudrc.tunnel.keys import KEY_SIZE, OVERLAP, Key, KeySet
 
     path: Path = options.file
-    previous = read_keys(path).current if path.exists() else None
-    if previous is None and options.overlap is not None:
+    there, secret = path.exists(), os.urandom(KEY_SIZE)
+    if not there and options.overlap is not None:
         raise BadInputError(f"--overlap: {path} is not there, so there is no old key to keep")
-    overlap = options.overlap or OVERLAP
-    until = None if previous is None else float(math.ceil(time.time() + overlap))
-    keys = KeySet(Key(os.urandom(KEY_SIZE)), previous, overlap, until)
+    if there:
+        keys = read_keys(path).rotated(secret, time.time(), options.overlap or OVERLAP)
+    else:
+        keys = KeySet(Key(secret))
     _replace(path, keys)
-    before = f", beside {previous.name} for {keys.overlap:g} s" if previous else ""
+    before = f", beside {keys.previous.name} for {keys.overlap:g} s" if keys.previous else ""
     print(f"key {keys.current.name}{before}: {path}")
     return 0
 

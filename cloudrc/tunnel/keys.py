@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import math
 from datetime import UTC, datetime
 from typing import NamedTuple, NoReturn
 
@@ -91,6 +92,16 @@ class KeySet(NamedTuple):
     previous: Key | None = None
     overlap: float = OVERLAP
     until: float | None = None
+
+    def rotated(self, secret: bytes, wall: float, overlap: float = OVERLAP) -> KeySet:
+        """Put a new key in front of the current one.
+
+        Args:
+            secret: The new key, 32 bytes that nobody can guess.
+            wall: What the wall clock says [s since 1970].
+            overlap: For how long the current one stays valid [s].
+        """
+        return KeySet(Key(secret), self.current, overlap, float(math.ceil(wall + overlap)))
 
     def left(self, wall: float | None) -> float:
         """For how long a process that starts now accepts the previous key [s]; 0 for not at all.

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import subprocess
 import time
-
-import numpy as np
 
 from cloudrc.cluster.access import Release
 from cloudrc.cluster.deploy import wait_ready
@@ -35,7 +34,7 @@ from cloudrc.faults.cluster.release import (
 from cloudrc.faults.held import holds
 from cloudrc.faults.scenario import Mode, Outcome, Scenario
 from cloudrc.messages import GuardState
-from cloudrc.tunnel.keys import Key, KeySet, parse, write
+from cloudrc.tunnel.keys import KEY_SIZE, parse, write
 
 CLUSTER: Mode = "cluster"
 KEY_FOLDER = "/etc/cloudrc-secret"
@@ -120,12 +119,15 @@ def _loaded(seed: int) -> Outcome:
 
 
 def _rotated(seed: int) -> Outcome:
-    """The Secret gets a new key beside the old one; both pods read it when their kubelet does."""
+    """The key in the Secret is rotated; both pods read it when their kubelet does.
+
+    The new key stays: nobody can guess it, not from the seed either, as none may who does not have
+    the Secret.
+    """
     outcome, release = Outcome(), release_there()
     secret = _key_secret(release)
     found = json.loads(kubectl(release, "get", "secret", secret, "--output=json"))
-    old = parse(base64.b64decode(found["data"]["key"])).current
-    new = KeySet(Key(np.random.default_rng(seed).bytes(32)), old)
+    new = parse(base64.b64decode(found["data"]["key"])).rotated(os.urandom(KEY_SIZE), time.time())
     encoded = base64.b64encode(write(new).encode()).decode()
     kubectl(release, "patch", "secret", secret, f"--patch={json.dumps({'data': {'key': encoded}})}")
     before = holds(recording(release, "world"))
