@@ -13,7 +13,7 @@ from cloudrc.errors import BadInputError
 
 EPILOG = """\
 examples:
-  cloudrc faults list
+  cloudrc faults list                        of all three modes
   cloudrc faults run cloud-killed            or its number: F13
   cloudrc faults run --all --seed 2 --junit faults.xml
   cloudrc faults run --all --real            with processes, signals and sockets
@@ -22,7 +22,7 @@ examples:
   cloudrc faults fuzz --first 201 --seeds 200 --slice b.json
   cloudrc faults merge a.json b.json         two slices as one search
 
-exit codes: 0 every check passed, 1 one did not, 2 no such fault,
+exit codes: 0 no check failed, 1 one did, 2 bad input,
   3 or 5 no cluster or no release there (--cluster), 130 interrupted"""
 SEED_MAX = 2**63 - 1 - COUNT_MAX
 """Of the first one: those counted from it fit into 64 bits, too."""
@@ -74,7 +74,7 @@ def _modes(parser: argparse.ArgumentParser) -> None:
     mode = parser.add_mutually_exclusive_group()
     text = "with real processes, signals and sockets on this machine"
     mode.add_argument("--real", action="store_true", help=text)
-    text = "in the Kubernetes cluster of the current context; needs a release"
+    text = "on a release in the cluster of the current context; F38 rotates its key"
     mode.add_argument("--cluster", action="store_true", help=text)
 
 

@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
+from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import paint, table, written
 
 if TYPE_CHECKING:
@@ -23,14 +24,14 @@ def show(options: argparse.Namespace) -> int:
     """List the faults."""
     from cloudrc.faults.catalogue import scenarios
 
-    found = scenarios(_mode(options))
+    found = scenarios(_mode(options) if options.real or options.cluster else None)
     if options.output != "table":
         names = ("id", "name", "mode", "injects", "expects", "loses", "shows")
         faults = [{n: getattr(each, n) for n in names} for each in found]
         print(written({"schemaVersion": 1, "faults": faults}, options.output))
         return 0
-    rows = [("fault", "name", "what is done", "what has to follow")]
-    rows += [(each.id, each.name, each.injects, each.expects) for each in found]
+    rows = [("fault", "name", "mode", "what is done", "what has to follow")]
+    rows += [(each.id, each.name, each.mode, each.injects, each.expects) for each in found]
     print(table(rows))
     return 0
 
@@ -52,7 +53,8 @@ def run(options: argparse.Namespace) -> int:
     if options.junit is not None:
         options.junit.write_text(document.as_junit(results, options.seed), encoding="utf-8")
     if options.document is not None:
-        text = document.as_markdown(results, options.seed, mode)
+        of = sources() if mode == "virtual" else sources(apart=())
+        text = document.as_markdown(results, options.seed, mode, of)
         options.document.write_text(text, encoding="utf-8")
     if options.output != "table":
         print(written(document.as_json(results, options.seed), options.output))

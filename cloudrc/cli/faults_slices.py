@@ -16,8 +16,8 @@ from cloudrc.errors import BadInputError
 PACKAGE = Path(__file__).resolve().parents[1]
 READ = (".py", ".xml", ".yaml")
 """Endings of what a flight may depend on."""
-WRITES_ONLY = ("cli", "_chart")
-"""Folders of the package that no flight depends on."""
+NOT_FLOWN = ("cli/", "_chart/", "cluster/", "faults/cluster/", "faults/real/")
+"""Folders of the package that no flight in virtual time depends on."""
 SUMS = ("count", "hours", "seconds", "holds", "missions_done", "fallen", "thrown", "landed_on")
 ADDED = (*SUMS, "failures")
 WORST = {"smallest_margin_m": min, "largest_speed_mps": max, "fallen_m": max, "thrown_m": max}
@@ -26,14 +26,19 @@ SAME = ("schemaVersion", "kind", "version", "sources")
 Document = dict[str, Any]
 
 
-def sources(package: Path = PACKAGE) -> str:
-    """Hash all that a flight may depend on in this package: SHA-256, in hexadecimal digits."""
+def sources(package: Path = PACKAGE, apart: tuple[str, ...] = NOT_FLOWN) -> str:
+    """Hash this package: SHA-256, in hexadecimal digits.
+
+    Args:
+        package: Its folder.
+        apart: What is left out; unless told, all that no flight in virtual time depends on.
+    """
     digest = hashlib.sha256()
     for path in sorted(package.rglob("*")):
-        name = path.relative_to(package)
-        if path.suffix in READ and name.parts[0] not in WRITES_ONLY:
+        name = path.relative_to(package).as_posix()
+        if path.suffix in READ and not name.startswith(apart):
             data = path.read_bytes()
-            digest.update(b"%s %d " % (name.as_posix().encode(), len(data)) + data)
+            digest.update(b"%s %d " % (name.encode(), len(data)) + data)
     return digest.hexdigest()
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from typing import get_args
 
 import cloudrc.faults
 from cloudrc.errors import BadInputError
 from cloudrc.faults.scenario import Mode, Scenario
 
 FAMILY = ".family_"
+MODES = get_args(Mode)
 
 
 def scenarios(mode: Mode | None = None) -> list[Scenario]:
@@ -23,7 +25,7 @@ def scenarios(mode: Mode | None = None) -> list[Scenario]:
         if FAMILY in module.name:
             found += importlib.import_module(module.name).SCENARIOS
     chosen = [each for each in found if mode is None or each.mode == mode]
-    return sorted(chosen, key=lambda each: (each.number, each.mode))
+    return sorted(chosen, key=lambda each: (each.number, MODES.index(each.mode)))
 
 
 def find(name: str, mode: Mode) -> Scenario:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
+from cloudrc import __version__
 from cloudrc.faults.scenario import Mode, Outcome, Scenario
 from cloudrc.report.document import environment_document
 
@@ -105,10 +106,10 @@ promise that is checked several times, the worst value is shown. Of every metric
 said below how it was looked at: that it moves within 5 s of the fault, or of its end where who
 stands still shows nothing before; or what it reads. What teleop's API and journal refuse and mend
 is no part of a flight: there the count was looked at, not when it shows. What makes sense elsewhere
-is brought about there, too:
-[with real processes](faults-real.md), [in a Kubernetes cluster](faults-cluster.md). All faults
-together, at random: [search](search.md), and with a cloud that wants a breach:
-[adversary](adversary.md). Promises: [P-FAULT-1] that all pass, [P-FAULT-5] that a seed is a run.
+is brought about there, too: [with real processes](faults-real.md), where F31 is, which takes
+sockets, and [in a Kubernetes cluster](faults-cluster.md). All faults together, at random:
+[search](search.md), and with a cloud that wants a breach: [adversary](adversary.md). Promises:
+[P-FAULT-1] that all pass, [P-FAULT-5] that a seed is a run.
 The hashes of the records are those of
 {built}: others may round otherwise.
 """,
@@ -142,8 +143,15 @@ def built() -> str:
     return f"{versions} on {here['processor']}, {here['architecture']}"
 
 
-def as_markdown(results: Sequence[Result], seed: int, mode: Mode = "virtual") -> str:
-    """The page of the documentation on the faults of a mode."""
+def as_markdown(results: Sequence[Result], seed: int, mode: Mode, sources: str) -> str:
+    """The page of the documentation on the faults of a mode.
+
+    Args:
+        results: Of the run.
+        seed: Of the run.
+        mode: Of all of them.
+        sources: Hash of what was run.
+    """
     passed = sum(result.passed for result in results)
     skipped = sum(bool(result.outcome.skipped) for result in results)
     told = f"Seed {seed}: {passed} of {len(results)} scenarios passed."
@@ -158,6 +166,7 @@ def as_markdown(results: Sequence[Result], seed: int, mode: Mode = "virtual") ->
         if result.outcome.sha256:
             lines.append(f"Records, SHA-256: `{result.outcome.sha256[:16]}`\n\n")
         lines += [f"- {line}\n" for line in _measured(result)]
+    lines.append(f"\nRun by cloudrc {__version__}; SHA-256 of its sources: `{sources[:16]}`.\n")
     return "".join(lines)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -201,18 +203,38 @@ def test_what_was_flown_is_kept_every_while(fuzz: Fuzz, monkeypatch: pytest.Monk
 
 
 def test_the_sources_are_all_that_a_flight_depends_on(tmp_path: Path) -> None:
-    for name in ("world/guard.py", "world/scene.xml", "cli/main.py", "world/notes.txt"):
+    apart = ("cli/main.py", "faults/real/processes.py", "world/notes.txt")
+    names = (*apart, "world/scene.xml", "world/guard.py", "faults/realm.py")
+    for name in names:
         path = tmp_path / name
-        path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(name)
     seen = [sources(tmp_path)]
-    for name in ("cli/main.py", "world/notes.txt", "world/scene.xml", "world/guard.py"):
+    for name in names:
         (tmp_path / name).write_text("other")
         seen.append(sources(tmp_path))
-    assert seen[0] == seen[1] == seen[2]
-    assert len(set(seen)) == 3
+    assert len({*seen[: len(apart) + 1]}) == 1
+    assert len({*seen[len(apart) :]}) == 4
     (tmp_path / "world/guard.py").rename(tmp_path / "world/other.py")
     assert sources(tmp_path) not in seen
+
+
+FLIGHTS = """
+import sys
+from cloudrc.faults import adversary, compose, fuzz
+
+for seed in (1, 2):
+    for schedule in (compose.compose(seed), compose.calm(seed), adversary.choose(seed)):
+        fuzz.fly(schedule)
+print(*sys.modules)
+"""
+
+
+def test_a_flight_of_a_search_imports_nothing_that_its_hash_leaves_out() -> None:
+    done = subprocess.run([sys.executable, "-c", FLIGHTS], capture_output=True, text=True)
+    names = {f"{name.removeprefix('cloudrc.').replace('.', '/')}/" for name in done.stdout.split()}
+    assert "world/guard/" in names, done.stderr
+    assert [name for name in names if name.startswith(faults_slices.NOT_FLOWN)] == []
 
 
 def test_several_processes_stop_together_and_leave_a_slice_without_a_gap(
