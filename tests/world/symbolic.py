@@ -9,12 +9,14 @@ for bounds.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from math import frexp
+from math import frexp, sqrt
 
 import z3
 
 DOUBLE, ROUND = z3.Float64(), z3.RNE()
+LARGEST = sys.float_info.max
 
 
 class Symbol:
@@ -115,11 +117,17 @@ class Run:
         return solver.check() != z3.unsat
 
 
-def root(x: Symbol) -> Symbol:
-    """Of x >= 0, finite: a float >= 0, finite."""
+def root(x: Symbol | float, top: float = LARGEST) -> Symbol | float:
+    """Of x >= 0, finite: a float >= 0, finite; up to `top` no more than the root of `top`.
+
+    Rounding keeps what is in order in order: correctly rounded, a root never falls as x grows.
+    """
+    if isinstance(x, float):
+        return sqrt(x)
     x.run.prove(z3.And(x.term >= 0.0, z3.Not(z3.fpIsInf(x.term))))
     r = x.run.fresh("root")
     x.run.learn(z3.And(r.term >= 0.0, r.term <= 1.5e154))
+    x.run.learn(z3.Implies(x.term <= top, r.term <= sqrt(top)))
     return r
 
 

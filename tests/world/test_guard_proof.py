@@ -1,11 +1,17 @@
 """The guard's comparisons and clamps, proven for all 64-bit floats, NaN and infinities included."""
 
+from functools import partial
+
 import pytest
 import z3
 from symbolic import everywhere, root
 
 from cloudrc.world import guard_rest
 from cloudrc.world import guard_rules as rules
+from cloudrc.world.guard_limits import AGE_MAX_NS
+
+LATEST = AGE_MAX_NS * 1e-9 + rules.REACTION
+"""After which the robot brakes [s], at the largest age of a command that may be flown."""
 
 
 @pytest.fixture(autouse=True)
@@ -84,6 +90,47 @@ def test_the_rate_of_braking_is_inside_its_range_whatever_comes_in():
         run.prove(z3.And(rate >= guard_rest.GENTLEST, rate <= guard_rest.HARDEST))
 
     everywhere(check)
+
+
+def test_a_fall_lasts_no_longer_than_one_from_the_largest_height_whatever_comes_in(monkeypatch):
+    top = 2.0 / rules.GRAVITY * rules.HEIGHT_MAX
+    monkeypatch.setattr(rules, "sqrt", partial(root, top=top))
+    longest = rules.fall_time(rules.HEIGHT_MAX)
+    assert 1.0 < longest < 1.01
+
+    def check(run):
+        time = lift(run, rules.fall_time(run.fresh("height"))).term
+        run.prove(z3.And(time >= 0.0, time <= longest))
+
+    # From the largest height; from none; from between.
+    assert everywhere(check) == 3
+
+
+def any_speed_and_reaction(run):
+    """What `Limits` asks of: a speed >= 0, and what it may take to react, both finite."""
+    speed, reaction = run.fresh("speed"), run.fresh("reaction")
+    run.learn(z3.And(speed.term >= 0.0, is_finite(speed.term)))
+    run.learn(z3.And(reaction.term >= rules.REACTION, reaction.term <= LATEST))
+    return speed, reaction
+
+
+def test_a_way_to_rest_is_never_negative_and_always_a_number():
+    def check(run):
+        way = rules.stopping_distance(*any_speed_and_reaction(run)).term
+        run.prove(way >= 0.0)
+
+    assert everywhere(check) == 1
+
+
+def test_from_above_seven_metres_a_second_no_way_to_rest_is_allowed():
+    """Up to the largest float: a way that overflows is infinite, and that is too long as well."""
+
+    def check(run):
+        speed, reaction = any_speed_and_reaction(run)
+        run.learn(speed.term >= 7.0)
+        run.prove(rules.stopping_distance(speed, reaction).term > rules.STOPPING_DISTANCE + 1e-4)
+
+    assert everywhere(check) == 1
 
 
 def lift(run, value):
