@@ -18,6 +18,11 @@ PATIENCE = (
     *(f"mission.waypoints.{k}.time_limit_s=200" for k in range(7)),
 )
 """So that no limit of time ends a mission that waits for its link."""
+SLOW = ("cloud.controller.speed_max=1.5",)
+FLIGHT_S = 27.0
+"""Until shortly before the board is touched; there the robot presses on it."""
+INSTANTS = [round(1.5 + k * (FLIGHT_S - 1.5) / 199, 3) for k in range(200)]
+"""At which the cloud falls silent, or is killed [s]."""
 
 
 class Instant(NamedTuple):

@@ -2,21 +2,20 @@
 
 import pytest
 from flying import fly, join, numbers
-from silence import BOTH, PATIENCE, fly_through
+from silence import BOTH, INSTANTS, PATIENCE, SLOW, fly_through
 
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState
 from cloudrc.records import Control, GuardChange, MissionEvent
 
-SLOW = ("cloud.controller.speed_max=1.5",)
 LONG = ("guard.hold_max_s=100",)
-FLIGHT_S = 27.0
-"""Until shortly before the board is touched; there the robot presses on it."""
-INSTANTS = [round(1.5 + k * (FLIGHT_S - 1.5) / 199, 3) for k in range(200)]
 
 
 def check_kill(figure, start_s, calm_within, *settings):
-    """Both directions fall silent, as when the cloud is killed, for a minute."""
+    """Both directions fall silent for a minute, as if the cloud were gone; yet it lives on.
+
+    In test_cloud_kills.py it does not.
+    """
     silence = fly_through(start_s, 60.5, *LONG, *settings)
     speed = "1.5 m/s" if settings else "uncapped"
     for name, measured, asked, unit in (
