@@ -1,6 +1,6 @@
 """The limits of the guard: none can be switched off, in the file or in code."""
 
-from dataclasses import fields
+from dataclasses import FrozenInstanceError, fields
 from math import inf, nan
 
 import pytest
@@ -88,3 +88,10 @@ def test_the_file_refuses_a_speed_or_an_age_beyond_the_stop_rule():
         load_experiment("paper", ["guard.speed_max_mps=6.5"])
     with pytest.raises(BadInputError, match="command_age_max_ms"):
         load_experiment("paper", ["guard.command_age_max_ms=10001"])
+
+
+@pytest.mark.promise("P-GUARD-2")
+@pytest.mark.parametrize("name", [field.name for field in fields(Limits)])
+def test_a_limit_cannot_be_changed_once_it_is_set(name):
+    with pytest.raises(FrozenInstanceError):
+        setattr(LIMITS, name, getattr(LIMITS, name))

@@ -1,0 +1,69 @@
+"""The guard's limits are what world's experiment says, whatever comes through the tunnel."""
+
+from __future__ import annotations
+
+from collections import Counter
+from copy import deepcopy
+from typing import Any
+
+import pytest
+
+from cloudrc.faults.adversary import POLICIES
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.liar import tempting
+from cloudrc.faults.scenario import generator
+from cloudrc.faults.voice import at_bad_moments
+from cloudrc.messages import GuardState
+from cloudrc.world.guard import Guard
+
+HOSTILE = {"stop-and-go": 1, "false-basis": 8, "strange-numbers": 6}
+"""Policies, each with a seed: together they bring about all of ANSWERS, CAUSES and states."""
+ANSWERS = (
+    *("used", "limited_speed", "limited_yaw_rate"),
+    *("not_finite", "future", "stale", "start_refused"),
+)
+"""What commands and requests, flown, shortened and refused, are counted under."""
+CAUSES = {
+    *("mission starts from spawn", "mission ended"),
+    *("emergency stop", "acknowledged before touch-down"),
+}
+"""What requests have the guard do."""
+
+
+def bounds(guard: Guard) -> dict[str, Any]:
+    """What a guard goes by: its limits, and what it has made of them when it was made."""
+    parts = (
+        (guard, ("_limits", "_speed_max", "_land_speed", "_high", "_floor")),
+        (guard._rest, ("_low", "_high", "_pull_max")),
+        (guard._take_off, ("_low", "_high")),
+    )
+    found = {f"{type(part)} {name}": getattr(part, name) for part, names in parts for name in names}
+    return deepcopy(found | {"walls": guard._low[:2]})
+
+
+def fly_hostile(policy: str, seed: int) -> Flight:
+    """A cloud with valid keys commands by a policy, and speaks in the operator's name.
+
+    Its guard ends with the bounds that it began with.
+    """
+    lie, words = POLICIES[policy](generator(seed, 666)), at_bad_moments(generator(seed, 667))
+    flight = Flight(seed=seed, honest=False, tempt=tempting(lie, words))
+    guard, limits = flight.robot.guard, flight.robot.guard._limits
+    before = bounds(guard)
+    flight.fly(5.0)
+    assert flight.robot.guard is guard
+    assert guard._limits is limits
+    assert bounds(guard) == before == bounds(Guard(limits))
+    return flight
+
+
+@pytest.mark.promise("P-GUARD-2")
+def test_nothing_that_comes_through_the_tunnel_changes_the_limits() -> None:
+    answers, changes = Counter[str](), []
+    for policy, seed in HOSTILE.items():
+        flight = fly_hostile(policy, seed)
+        answers.update({name: flight.count(name) for name in ANSWERS})
+        changes += flight.changes
+    assert [name for name in ANSWERS if not answers[name]] == []
+    assert {change.state for change in changes} == set(GuardState)
+    assert {change.cause for change in changes} >= CAUSES
