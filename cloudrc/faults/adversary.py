@@ -32,6 +32,8 @@ Policy: TypeAlias = Callable[[Generator], Lie]
 HUGE = 1e308
 STRANGE = (nan, inf, -inf, HUGE, -HUGE, 5e-324, -0.0, 1e9, 6.0, -6.0, 0.0)
 TICK_NS = 2_000_000
+NONSENSE_NS = 80_000_000
+"""Long enough for more impossible commands than the guard bears in a second [ns]."""
 
 
 def temptation(schedule: Schedule) -> Callable[[CloudEndpoint], None]:
@@ -44,7 +46,7 @@ def temptation(schedule: Schedule) -> Callable[[CloudEndpoint], None]:
         names = ", ".join(POLICIES)
         raise BadInputError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
     lie = POLICIES[schedule.policy](generator(schedule.seed, 666))
-    if schedule.policy == SPEAKS:
+    if schedule.policy in SPEAKING:
         return tempting(lie, at_bad_moments(generator(schedule.seed, 667)))
     return tempting(lie)
 
@@ -199,20 +201,33 @@ def _operators_voice(rng: Generator) -> Lie:
     return FAST[int(rng.integers(len(FAST)))](rng)
 
 
+def _refused_and_released(rng: Generator) -> Lie:
+    """Fast, and now and then such nonsense that the guard lands; its words undo that in the air."""
+    fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
+
+    def lie(command: Command, control: Control) -> Command:
+        if control.stamp_ns % pause_ns < NONSENSE_NS:
+            return command._replace(velocity=(nan, nan, nan))
+        return fly(command, control)
+
+    return lie
+
+
 def _vector(values: list[float]) -> Vector:
     x, y, z = values
     return (x, y, z)
 
 
 FAST: tuple[Policy, ...] = (_towards_a_face, _face_after_face, _greedy, _on_the_limit, _random)
-SPEAKS = "operators-voice"
+SPEAKING = ("operators-voice", "refused-and-released")
 POLICIES: dict[str, Policy] = {
     "face-after-face": _face_after_face,
     "false-basis": _false_basis,
     "greedy": _greedy,
     "on-the-limit": _on_the_limit,
-    SPEAKS: _operators_voice,
+    "operators-voice": _operators_voice,
     "random": _random,
+    "refused-and-released": _refused_and_released,
     "shaking": _shaking,
     "stop-and-go": _stop_and_go,
     "strange-numbers": _strange_numbers,

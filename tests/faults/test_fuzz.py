@@ -10,8 +10,9 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
-from cloudrc.faults.adversary import POLICIES, choose
+from cloudrc.faults.adversary import POLICIES, choose, temptation
 from cloudrc.faults.compose import CALM, calm, compose
+from cloudrc.faults.flight import Flight
 from cloudrc.faults.fuzz import Finding, fly, judged
 from cloudrc.faults.remains import KILLED, Remains
 from cloudrc.faults.schedule import KINDS, Event, Schedule, dump, load, shaped
@@ -86,6 +87,14 @@ def test_the_operators_voice_says_every_word_and_the_operator_is_not_heard(
     assert {request.request for request in said} == set(Request)
     of_operator = [request for request in heard if request not in said]
     assert {request.request for request in of_operator} == {Request.START}, "before it was muted"
+
+
+def test_what_the_guard_lands_for_is_acknowledged_in_the_air() -> None:
+    schedule = Schedule(3, policy="refused-and-released")
+    flight = Flight(seed=schedule.seed, honest=False, tempt=temptation(schedule)).fly(15.0)
+    causes = [change.cause for change in flight.changes]
+    assert causes.count("acknowledged before touch-down") == 2
+    assert flight.watch.counts == {}
 
 
 def test_what_falls_out_of_the_fence_by_the_operators_word_is_told_and_fails_nothing(
