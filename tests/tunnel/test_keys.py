@@ -164,6 +164,17 @@ def test_what_is_written_is_whole_seconds_since_1970():
     assert "until" not in write(ROTATED._replace(until=None))
 
 
+def test_a_rotation_puts_the_new_key_before_the_current_one_and_forgets_the_one_before_that():
+    assert KeySet(B, A).rotated(b"c" * 32, MADE, 10.0) == KeySet(C, B, 10.0, MADE + 10.0)
+    assert KeySet(A).rotated(b"b" * 32, MADE) == KeySet(B, A, OVERLAP, MADE + OVERLAP)
+
+
+def test_a_rotated_key_file_says_the_whole_second_after_which_the_old_key_is_refused():
+    keys = KeySet(A).rotated(b"b" * 32, MADE + 0.25, 10.0)
+    assert keys.until == MADE + 11.0
+    assert parse(write(keys).encode()) == keys
+
+
 @pytest.mark.promise("P-LINK-9")
 @pytest.mark.parametrize(
     ("wall", "left"),
