@@ -85,8 +85,8 @@ mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways; print wh
 #   every sequence of 6 of 16 counters         test_every_sequence_of_six_agrees_with_a_set
 #   two clouds, interleaved to depth 10        test_no_interleaving_of_ten_takes_a_command_back
 #   10^6 commands and readings of the guard    test_a_million_commands_and_readings_stay_inside_the_caps
-#   killed at 200 instants, 1.5 m/s            test_without_its_cloud_the_robot_stops_at_any_instant
-#   killed at 200 instants, uncapped           test_uncapped_it_takes_a_little_longer_at_any_instant
+#   silent from 200 instants on, 1.5 m/s       test_without_its_cloud_the_robot_stops_at_any_instant
+#   silent from 200 instants on, uncapped      test_uncapped_it_takes_a_little_longer_at_any_instant
 #   killed at 200 instants, a new process      test_killed_at_any_instant_a_new_cloud_flies_on
 #   blackouts at 24 instants, each way         test_a_silence_anywhere_touches_nothing
 #   1,000 requests a second for 20 s           test_a_thousand_requests_a_second_do_not_disturb_the_control_loop
