@@ -222,7 +222,7 @@ class Counted(NamedTuple):
         stamp_ns: [ns], own clock.
         end: "world", "cloud" or "link".
         name: "received", "sent", "malformed", "late", "stale", "repeated", "old_epoch",
-            "not_finite", "recorder_dropped"...
+            "range", "recorder_dropped"...
         total: Since the start.
     """
 

@@ -17,7 +17,7 @@ OUTCOMES = (
     "stale",
     "repeated",
     "old_epoch",
-    "not_finite",
+    "range",
     "future",
     "malformed",
     "version",
@@ -29,7 +29,7 @@ OUTCOMES = (
     "unanswered",
 )
 """What becomes of a datagram; all but "sent" are told by its receiver."""
-ONLY_WORLD = {"stale", "not_finite", "future", "hello", "unanswered"}
+ONLY_WORLD = {"stale", "range", "future", "hello", "unanswered"}
 ONLY_CLOUD = {"accept_ignored"}
 LIMITS = ("speed", "yaw_rate", "fence")
 """Of the guard."""

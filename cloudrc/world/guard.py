@@ -28,13 +28,13 @@ limits are proven and tested without the states.
 from __future__ import annotations
 
 from collections import Counter, deque
-from math import inf, isfinite
+from math import inf
 
 from cloudrc.messages import NEVER_NS, ZERO, Command, GuardState, Vector
 from cloudrc.records import GuardChange
 from cloudrc.world import guard_rules as rules
 from cloudrc.world.guard_hits import Hits
-from cloudrc.world.guard_limits import Limits
+from cloudrc.world.guard_limits import RANGE, Limits
 from cloudrc.world.guard_rest import STILL, Rest, TakeOff
 from cloudrc.world.readings import Readings
 
@@ -156,14 +156,14 @@ class Guard:
             now_ns: World's clock [ns].
 
         Returns:
-            None if it may be flown, else why it is refused: "not_finite"; "future", if it names
-            odometry that has yet to be measured; "stale".
+            None if it may be flown, else why it is refused: "range", of NaN, too; "future", if it
+            names odometry that has yet to be measured; "stale".
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
-        if not (isfinite(x) and isfinite(y) and isfinite(z) and isfinite(yaw_rate)):
+        if not (abs(x) <= RANGE and abs(y) <= RANGE and abs(z) <= RANGE and abs(yaw_rate) <= RANGE):
             self._note_invalid(now_ns)
-            return "not_finite"
+            return "range"
         limits = self._limits
         age_ns = now_ns - command.basis_stamp_ns
         if age_ns < 0:

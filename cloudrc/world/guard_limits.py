@@ -19,6 +19,10 @@ from cloudrc.world.guard_rules import (
 
 AGE_MAX_NS = 10_000_000_000
 """Commands that are older are never flown [ns], whatever an experiment says."""
+RANGE = 1000.0
+"""Largest number of a command that is shortened to a cap, not refused [m/s, rad/s]: no controller
+asks a robot for more. One that does has a bug, and its direction is as wrong as its length. Source:
+threat T12, which has 1e308 refused; fault F23, which has what is over the cap shortened."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,12 +114,12 @@ def test_a_bad_datagram_is_dropped_and_counted(talk, spoil, outcome):
     assert talk.take(CommandApplied) == []
 
 
-def test_what_is_not_finite_or_stale_is_refused_and_counted(talk):
+def test_what_is_beyond_all_reason_or_stale_is_refused_and_counted(talk):
     talk.wait(500 * MS)
     talk.send(talk.command((float("nan"), 0.0, 0.0)))
     talk.send(talk.command(basis_ns=100 * MS))
     counts = talk.counts()
-    assert (counts["not_finite"], counts["stale"]) == (1, 1)
+    assert (counts["range"], counts["stale"]) == (1, 1)
     assert [change.state for change in talk.take(GuardChange)] == []
 
 

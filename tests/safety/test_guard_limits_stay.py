@@ -20,7 +20,7 @@ HOSTILE = {"stop-and-go": 1, "false-basis": 8, "strange-numbers": 6}
 """Policies, each with a seed: together they bring about all of ANSWERS, CAUSES and states."""
 ANSWERS = (
     *("used", "limited_speed", "limited_yaw_rate"),
-    *("not_finite", "future", "stale", "start_refused"),
+    *("range", "future", "stale", "start_refused"),
 )
 """What commands and requests, flown, shortened and refused, are counted under."""
 CAUSES = {

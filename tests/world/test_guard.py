@@ -1,7 +1,7 @@
 """The guard: who arms it, what it takes of a command, and when it falls into HOLD."""
 
 from itertools import pairwise
-from math import hypot, inf, nan
+from math import hypot, inf, nan, nextafter
 
 import pytest
 from guard_play import (
@@ -21,7 +21,7 @@ from guard_play import (
 
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard import Guard
-from cloudrc.world.guard_limits import Limits
+from cloudrc.world.guard_limits import RANGE, Limits
 from cloudrc.world.guard_rest import HARDEST, PULL_MAX
 from cloudrc.world.guard_rules import CREEP
 
@@ -93,14 +93,14 @@ def test_put_on_the_ground_nothing_is_armed_or_remembered():
 # What is taken of a command
 
 
-@pytest.mark.parametrize("bad", [nan, inf, -inf])
+@pytest.mark.parametrize("bad", [nan, inf, -inf, 1e308, -1e308, nextafter(RANGE, inf), -1000.1])
 @pytest.mark.parametrize("axis", range(4))
-def test_what_is_not_finite_is_refused_whole(bad, axis):
+def test_what_is_beyond_all_reason_is_refused_whole(bad, axis):
     guard = tracking((0.5, 0.0, 0.0))
     before = run(guard, 0, 100 * MS)[-1]
     values = [1.0, 1.0, 1.0, 0.1]
     values[axis] = bad
-    assert guard.offer(command(tuple(values[:3]), 100 * MS, values[3]), 100 * MS) == "not_finite"
+    assert guard.offer(command(tuple(values[:3]), 100 * MS, values[3]), 100 * MS) == "range"
     assert run(guard, 100 * MS, 102 * MS) == [before]
     assert guard.yaw_rate == 0.0
 
@@ -120,6 +120,13 @@ def test_the_speed_is_capped_and_keeps_its_direction():
     assert guard.reference[1] / guard.reference[0] == pytest.approx(4 / 3)
     assert 5.99 < hypot(*guard.reference) <= 6.0
     assert guard.counts["limited_speed"] == 61
+
+
+@pytest.mark.parametrize("most", [RANGE, -RANGE])
+def test_up_to_the_range_what_is_too_fast_is_shortened(most):
+    guard = armed()
+    assert guard.offer(command((most, most, most), yaw_rate=most), 0) is None
+    assert guard.counts == {"limited_speed": 1, "limited_yaw_rate": 1}
 
 
 @pytest.mark.parametrize(("asked", "allowed"), [(0.4, 0.4), (7.0, 1.0), (-7.0, -1.0)])

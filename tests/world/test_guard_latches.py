@@ -59,7 +59,9 @@ def test_hold_between_missions_has_no_limit():
     assert guard.state is LAND
 
 
-@pytest.mark.parametrize("bad", [command((nan, 0.0, 0.0)), command(basis_ns=1 << 60)])
+@pytest.mark.parametrize(
+    "bad", [command((nan, 0.0, 0.0)), command((1e308, 0.0, 0.0)), command(basis_ns=1 << 60)]
+)
 def test_five_impossible_commands_within_a_second_land(bad):
     guard = tracking((0.5, 0.0, 0.0))
     for k in range(5):
