@@ -78,7 +78,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     goto = add("goto", "fly to a point, or hold a held mission there")
     for axis in "XYZ":
         goto.add_argument(axis.lower(), type=float, metavar=axis, help="[m], world frame")
-    add("hold", "stop the robot where it is")
+    add("hold", "stop the robot where it is, 0.35 m up at least")
     add("resume", "go on with the mission that is held")
     add("estop", "stop the rotors at once: the robot falls, and its mission has failed")
     add("acknowledge", "release a robot that was stopped or has landed; arms nothing")

@@ -75,6 +75,15 @@ def test_a_robot_that_never_starts_fails_the_mission():
     assert_failed(flight, "timed_out", "the robot has not started within 3 s; is the link up?")
 
 
+def test_no_robot_is_held_where_it_would_scrape_along_the_floor():
+    flight = flying()
+    flight.step(position=(0.2, 0.1, 0.12))
+    flight.operate(Hold())
+    assert flight.setpoints[-1].position == (0.2, 0.1, 0.35)
+    flight.operate(Cancel())
+    assert flight.setpoints[-1].position == (0.2, 0.1, 0.35)
+
+
 @pytest.mark.parametrize("held", [False, True])
 def test_a_world_that_restarts_fails_the_mission(held):
     flight = flying()
@@ -84,7 +93,7 @@ def test_a_world_that_restarts_fails_the_mission(held):
     flight.step()
     text = "world restarted on the way to waypoint 1 of 3"
     assert_failed(flight, "world_restarted", text)
-    assert flight.setpoints[-1].position == flight.position
+    assert flight.setpoints[-1].position == (*flight.position[:2], 0.35)
 
 
 def test_a_world_that_restarts_before_a_start_from_here_fails_it():

@@ -285,7 +285,8 @@ class Teleop:
 
     def _aim_here(self) -> None:
         if self._seen is not None:
-            self._aim(self._seen.position, self._yaw, NO_WAYPOINT)
+            x, y, z = self._seen.position
+            self._aim((x, y, max(z, rules.HELD_LOWEST)), self._yaw, NO_WAYPOINT)
 
     def _aim(self, position: Vector, yaw: float, waypoint: int) -> None:
         self._yaw = yaw
