@@ -22,10 +22,10 @@ PROMISES = {"random": "P-FAULT-2", "adversarial": "P-FAULT-3", "clean": "P-FAULT
 NOTES = {
     "adversarial": (
         "",
-        "The cloud holds valid keys. Every second one flies amid faults of all kinds, and two of",
-        "eleven speak in the operator's place. A robot that these, or a hit, have stopped may come",
-        "to lie outside the fence, a [known limit](guard.md): it is told below the table, and a",
-        "breach beyond 1.5 m.",
+        "The cloud holds valid keys. Every second one flies amid faults of all kinds, and some",
+        "speak in the operator's place. A robot that these, or a hit, have stopped may come to lie",
+        "outside the fence, a [known limit](guard.md): it is told below the table, and a breach",
+        "beyond 1.5 m.",
     )
 }
 """What else is to be said, by kind."""

@@ -41,7 +41,7 @@ def buggy(schedule: Schedule, clock: Clock) -> Lie:
 
 
 def _ruined(command: Command, event: Event, rng: Generator) -> Command:
-    """One of the four numbers is none, or the velocity is huge."""
+    """One of the four numbers is not finite, or the velocity is huge."""
     if event.kind == "values_huge":
         x, y, z = (HUGE[n] for n in rng.integers(0, len(HUGE), 3).tolist())
         return command._replace(velocity=(x, y, z))

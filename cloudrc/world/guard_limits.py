@@ -8,14 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import isfinite
 
+from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import Vector
-from cloudrc.world.guard_rules import (
-    FLOOR_MARGIN,
-    MARGIN,
-    REACTION,
-    STOPPING_DISTANCE,
-    stopping_distance,
-)
+from cloudrc.world.guard_rules import MARGIN, REACTION, STOPPING_DISTANCE, stopping_distance
 
 AGE_MAX_NS = 10_000_000_000
 """Commands that are older are never flown [ns], whatever an experiment says."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from math import copysign, inf, sqrt
 
+from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Vector
 
 BRAKE = 3.0
@@ -19,7 +20,8 @@ STOPPING_DISTANCE = 8.7
 """Within which the fastest allowed speed has to be stopped [m]. Source: likewise."""
 SIXTH = 1.0 / (2.0 * BRAKE)
 CAUTION, MARGIN = 0.6, 0.2
-"""At the fence v has to keep CAUTION v + v^2/6 <= distance - MARGIN [s], [m].
+"""At the fence v has to keep CAUTION v + v^2/6 <= distance - MARGIN [s], [m]. At the floor with
+FLOOR_MARGIN instead, and there REACTION is enough, since the robot climbs readily.
 Deviation: DESIGN, section 5 has 0.2 s and 0.1 m. So late follows the low-level controller that a
 cloud which does its worst gets the robot 0.3 m beyond the fence with these."""
 FAR = 1e6
@@ -40,9 +42,6 @@ CREEP = 0.5
 """No faster than this [m/s], the robot may fly anywhere: it hits nothing hard."""
 HEIGHT_MAX, GRAVITY = 5.0, 9.81
 """A fall from higher than this [m] counts as one from there. [m/s^2]"""
-FLOOR_MARGIN = 0.35
-"""Takes the place of MARGIN at the floor, which parts of a tilted robot reach first [m]; there
-REACTION is enough, since the robot climbs readily."""
 LOW, LOW_SPEED = 0.25, 1.0
 """Lower than this [m] the robot flies sideways no faster than this [m/s]."""
 SINK_LAG = 0.5

@@ -7,10 +7,11 @@ import pytest
 from guard_flying import UP, Flight, hostile
 from guard_play import LIMITS
 
+from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import GuardState
 from cloudrc.world.guard import Guard
 from cloudrc.world.guard_rest import TAKE_OFF_MARGIN
-from cloudrc.world.guard_rules import CREEP, FLOOR_MARGIN, SLIDE, TUMBLE, fall_time
+from cloudrc.world.guard_rules import CREEP, SLIDE, TUMBLE, fall_time
 from cloudrc.world.simulator import Simulator
 
 

@@ -8,8 +8,9 @@ from guard_play import LIMITS
 
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.world.guard_limits import Limits
-from cloudrc.world.guard_rules import FLOOR_MARGIN, MARGIN
+from cloudrc.world.guard_rules import MARGIN
 
 NUMBERS = [field.name for field in fields(Limits) if not field.name.startswith("fence")]
 

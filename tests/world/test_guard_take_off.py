@@ -18,9 +18,9 @@ from guard_play import (
     states,
 )
 
+from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Command, GuardState
 from cloudrc.world.guard import Guard
-from cloudrc.world.guard_limits import FLOOR_MARGIN
 from cloudrc.world.guard_rest import HOP, HOP_SPEED, STILL, STILL_TICKS, TakeOff
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.robot import Robot

@@ -166,7 +166,7 @@ def _add_missions(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
 
 
 def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings) -> None:
-    @router.post("/hold", summary="Stop where you are", **_gives(models.MissionView, "Held"))
+    @router.post("/hold", summary="Stop, 0.35 m up at least", **_gives(models.MissionView, "Held"))
     async def hold() -> JSONResponse:
         return JSONResponse(await _ask(bridge, lambda s, now_ns: s.hold(now_ns).as_json()))
 

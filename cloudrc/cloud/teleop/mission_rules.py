@@ -16,12 +16,13 @@ from cloudrc.cloud.teleop.messages import (
     Verb,
 )
 from cloudrc.errors import BadInputError
+from cloudrc.geometry import fence
 from cloudrc.messages import MISSION_OVER, GuardState
 
 WORST_GUARD = GuardState.HOLD
 ANY_WORLD = ""
 """Until the robot is seen to have started it does not matter which world it stands in."""
-HELD_LOWEST = 0.35
+HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
 """No robot is held lower [m]: it would scrape along the floor. One that has not taken off yet does,
 and is held there. Source: the guard's HOLD, docs/safety/guard.md."""
 UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
