@@ -144,6 +144,24 @@ def test_before_its_end_teleop_lets_the_robot_hold_and_a_successor_goes_on():
     assert flight.setpoints[-1].position == B
 
 
+@pytest.mark.parametrize("guard", [GuardState.LAND, GuardState.ESTOP])
+@pytest.mark.parametrize("begun", [0, 1], ids=["starting", "flying"])
+def test_what_has_landed_while_teleop_was_away_has_failed_and_waits_for_nothing(guard, begun):
+    flight = ServiceFlight()
+    flight.downlink = bool(begun)
+    mission_id = flight.create()
+    flight.step(seconds=0.1)
+    assert flight.view(mission_id)["state"] == ("flying" if begun else "starting")
+    waits = flight.create(queue=True)
+    flight.guard = guard
+    flight.restart_teleop()
+    flight.see()  # before teleop does anything
+    flight.step(seconds=0.2)
+    failure, *_ = flight.view(mission_id)["verdict"]["failures"]
+    assert failure["code"] == "guard_stopped"
+    assert flight.view(waits)["state"] == "queued"
+
+
 def test_without_a_mission_there_is_nothing_to_pause():
     flight = ServiceFlight()
     flight.step()

@@ -196,8 +196,10 @@ class MissionService:
         """Start what waits, keep the limits of time, repeat what has to be repeated."""
         self.book.catch_up(now_ns)
         waiting = self.book.open()
-        if self._current is None and waiting and not self._stopped:
-            self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
+        if self._current is None and waiting:
+            begun = waiting[0].state != missions.QUEUED  # by a teleop before this one: no waiting
+            if begun or not self._stopped:
+                self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
         if self._setpoint is not None and now_ns >= self._setpoint_ns:
@@ -277,10 +279,8 @@ class MissionService:
         outcome = self._teleop.outcome
         if outcome is not None and event.event == outcome.code:
             criteria = Criteria(mission.order.contact, self._contact_speed_max)
-            elapsed, waypoints = self._teleop.elapsed(now_ns), len(mission.order.plan.legs)
-            verdict = judge(
-                outcome, mission.witness, criteria, waypoints=waypoints, elapsed=elapsed
-            )
+            time, count = self._teleop.elapsed(now_ns), len(mission.order.plan.legs)
+            verdict = judge(outcome, mission.witness, criteria, waypoints=count, elapsed=time)
             changed["verdict"] = verdict.as_json()
         self._note(mission, event.event, event.text, now_ns, **changed)
         if mission.ended:
