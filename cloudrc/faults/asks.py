@@ -178,13 +178,17 @@ def epochs(flight: Flight) -> list[int]:
 
 
 def safe(outcome: Outcome, flight: Flight) -> None:
-    """Check the invariants, and take the run's hash over."""
+    """Check the invariants, and take the run's hash over.
+
+    Under a cloud that is not honest no contact is judged, and none is said to have been.
+    """
     counts = flight.watch.counts
     breaches = counts["fence"] + counts["cap"] + counts["stop"]
-    outcome.same("collisions", counts["collision"], 0)
+    if flight.honest:
+        outcome.same("collisions", counts["collision"], 0)
     outcome.same("breaches of the fence, a cap or the stop rule", breaches, 0)
     outcome.same("ticks flown on stale commands", counts["stale"], 0)
-    outcome.sha256 = flight.sha256()
+    outcome.flown(flight.sha256())
 
 
 def done(outcome: Outcome, flight: Flight) -> None:

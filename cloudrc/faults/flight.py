@@ -33,12 +33,16 @@ from cloudrc.world.identity import WorldIdentity
 
 SHARED = b"one clock for all"[:16]
 OTHER = b"another clock..."
+LAND = GuardState.LAND
+BRAKES_NS = 200_000_000
+"""Within which a descent is stopped that the operator has acknowledged [ns]; DESIGN's 0.2 s."""
 
 
 class Flight:
     """World, cloud, desk and link, from take-off on.
 
     Attributes:
+        honest: Whether a contact is the cloud's failure.
         world: That end.
         cloud: That end.
         desk: Teleop.
@@ -63,7 +67,7 @@ class Flight:
         """
         seed = options.get("seed", 1)
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
-        self._honest, self._keep = options.get("honest", True), options.get("keep", True)
+        self.honest, self._keep = options.get("honest", True), options.get("keep", True)
         self._life, self._tempt = options.get("life", 1), options.get("tempt")
         self._second = options.get("second")
         shared = options.get("cloud_clock") is None
@@ -250,7 +254,11 @@ class Flight:
             if kind is GuardChange:
                 self.changes.append(record)  # type: ignore[arg-type]
             elif kind is Contact:
-                self.watch.see(record, self.state_at(record.stamp_ns), self._honest)  # type: ignore[arg-type]
+                stamp_ns = record.stamp_ns
+                state = self.state_at(stamp_ns)
+                if state is GuardState.HOLD and self.state_at(stamp_ns - BRAKES_NS) is LAND:
+                    state = LAND  # acknowledged right above what it was about to land on
+                self.watch.see(record, state, self.honest)  # type: ignore[arg-type]
 
     def state_at(self, stamp_ns: int) -> GuardState:
         """The guard's state at an instant [ns, world's clock]."""

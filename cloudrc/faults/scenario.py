@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -62,13 +63,24 @@ class Outcome:
 
     Attributes:
         checks: In order.
-        sha256: Over all records of the run; "" where there are none.
+        sha256: Over all records of all its flights; "" where there are none.
         skipped: Why it could not be run here; "" if it was.
     """
 
     checks: list[Check] = field(default_factory=list)
     sha256: str = ""
     skipped: str = ""
+
+    def flown(self, sha256: str) -> None:
+        """Take the hash of one more flight's records over."""
+        both = f"{self.sha256} {sha256}".encode()
+        self.sha256 = hashlib.sha256(both).hexdigest() if self.sha256 else sha256
+
+    def add(self, other: Outcome) -> None:
+        """Take over what another part of the scenario has shown."""
+        self.checks += other.checks
+        if other.sha256:
+            self.flown(other.sha256)
 
     def most(self, text: str, measured: float, limit: float, unit: str = "") -> None:
         """Check that `measured` is at most its `limit`, both in `unit` [any unit]."""

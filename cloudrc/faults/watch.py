@@ -8,7 +8,7 @@ motion on stale commands: in TRACK the newest accepted command's basis is never 
 limit. No collision, under an honest cloud: nothing but the arm's tip touches anything, and that the
 board. A robot that lands, since its cloud is gone for good or says what no honest one does, sinks
 where it is: the guard knows the fence, and not what lies below. What it comes down on is told, and
-no collision.
+no collision, also where the operator has acknowledged too late for it to stop above that.
 """
 
 from __future__ import annotations
