@@ -84,6 +84,7 @@ mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways; print wh
 #   every bit of 1,000 datagrams flipped       test_no_bit_of_a_thousand_datagrams_can_be_flipped
 #   every sequence of 6 of 16 counters         test_every_sequence_of_six_agrees_with_a_set
 #   two clouds, interleaved to depth 10        test_no_interleaving_of_ten_takes_a_command_back
+#   10^6 cases of hypothesis at the guard      test_a_million_cases_of_hypothesis_stay_inside_the_caps
 #   10^6 commands and readings of the guard    test_a_million_commands_and_readings_stay_inside_the_caps
 #   silent from 200 instants on, 1.5 m/s       test_without_its_cloud_the_robot_stops_at_any_instant
 #   silent from 200 instants on, uncapped      test_uncapped_it_takes_a_little_longer_at_any_instant

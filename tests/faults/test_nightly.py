@@ -19,6 +19,7 @@ NUMBERS = (
     "every bit of 1,000 datagrams flipped",
     "every sequence of 6 of 16 counters",
     "two clouds, interleaved to depth 10",
+    "10^6 cases of hypothesis at the guard",
     "10^6 commands and readings of the guard",
     "silent from 200 instants on, 1.5 m/s",
     "silent from 200 instants on, uncapped",
