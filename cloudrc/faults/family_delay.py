@@ -127,6 +127,9 @@ def _jitter(seed: int) -> Outcome:
     asks.safe(outcome, flight)
     asks.done(outcome, flight)
     outcome.same("jitter 40 ms: HOLDs", len(asks.held(flight)), 0)
+    age = "age_of_information_seconds"
+    young = meters.share_within("world", flight.of_world, age, 0.25)
+    outcome.least(f"metric {age}: share that is at most 0.25 s", young, 0.99)
     wild: Shape = lambda profile: replace(profile, delay=0.15, jitter=0.15)  # noqa: E731
     flight = Flight(seed=seed, uplink=wild, downlink=wild).fly(60.0)
     asks.safe(outcome, flight)
@@ -150,7 +153,7 @@ SCENARIOS = (
     Scenario(
         7,
         "duplication",
-        "every datagram arrives twice",
+        "every datagram arrives twice, on a link without jitter: no copy comes first",
         "the same path, bit by bit",
         "none",
         "cloudrc_datagrams_total{outcome=repeated}",
@@ -181,7 +184,7 @@ SCENARIOS = (
         "jitter of 40 ms, then of 150 ms about 150 ms",
         "first TRACK, then HOLD and TRACK without chatter: <= 2 changes in any second",
         "none",
-        "cloudrc_guard_transitions_total",
+        "cloudrc_age_of_information_seconds, cloudrc_guard_transitions_total",
         _jitter,
     ),
 )

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from math import nan
+from math import hypot, nan
 
 from cloudrc.faults import asks, meters
 from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.held import AGE_MAX
-from cloudrc.faults.scenario import Check, Outcome, Scenario
+from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.messages import GuardState
-from cloudrc.records import CommandApplied, GroundTruth
+from cloudrc.records import CommandApplied, Fault, GroundTruth
 
 
 def _cloud_killed(seed: int) -> Outcome:
@@ -43,13 +43,13 @@ def _cloud_evicted(seed: int) -> Outcome:
     outcome.most("away for 5 s: HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
     outcome.least("the journal tells: resumed", len(flight.events("resumed")), 1)
     meters.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=at)
-    outcome.checks += _evicted_for_long(seed)
+    outcome.add(_evicted_for_long(seed))
     return outcome
 
 
-def _evicted_for_long(seed: int) -> list[Check]:
-    outcome, at = Outcome(), instant(seed, 1.6, 2.6)
-    flight = Flight("criteria.time_limit_s=900", seed=seed, honest=False)
+def _evicted_for_long(seed: int) -> Outcome:
+    outcome, at = Outcome(), instant(seed)
+    flight = Flight("criteria.time_limit_s=900", seed=seed)
     flight.cloud.at(at, lambda now_ns: flight.kill_cloud_pod(now_ns, 360.0))
     flight.fly(at + 370.0)
     asks.safe(outcome, flight)
@@ -59,7 +59,7 @@ def _evicted_for_long(seed: int) -> list[Check]:
     asks.landing_told(outcome, flight)
     again = [time for time in asks.changes_into(flight, GuardState.TRACK) if time > landed]
     outcome.same("flown again without the operator", len(again), 0)
-    return outcome.checks
+    return outcome
 
 
 def _cloud_paused(seed: int) -> Outcome:
@@ -95,7 +95,14 @@ def _throttled(seed: int) -> Outcome:
         meters.moves(outcome, flight, "cloud", "loop_missed_periods_total", since=at)
         missed = flight.count("missed_periods", "cloud")
         outcome.least(f"{what}: missed periods counted", missed, 100)
+        meters.moves(outcome, flight, "cloud", "loop_lateness_seconds", since=at)
+        told = [r.stamp_ns * 1e-9 - at for r in _late(flight)]
+        outcome.most(f"{what}: it says that it is late after", min(told, default=nan), 2.0, "s")
     return outcome
+
+
+def _late(flight: Flight) -> list[Fault]:
+    return [r for r in flight.of_cloud if isinstance(r, Fault) and r.code == "late"]
 
 
 def _world_restarted(seed: int) -> Outcome:
@@ -107,15 +114,20 @@ def _world_restarted(seed: int) -> Outcome:
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
     outcome.same("changes of the guard after it", len(after), 0)
     path = [r for r in flight.trajectory() if r.stamp_ns * 1e-9 > at]
-    moved = max((abs(r.odometry.velocity[2]) for r in path), default=nan)
+    moved = max((hypot(*r.odometry.velocity) for r in path), default=nan)
     outcome.most("speed on the ground", moved, 0.01, "m/s")
+    raised = asks.drift(flight, at, flight.now)
+    outcome.most("way from where it stood up", raised, 0.01, "m")
     verdict = str(flight.mission.verdict)
     outcome.true("mission failed", flight.mission.state == "failed")
     outcome.true("with the code world_restarted", "world_restarted" in verdict)
     opened = asks.epochs(flight)
     outcome.true("a new epoch, higher than all before", opened == sorted(set(opened)))
-    meters.moves(outcome, flight, "world", "session_epoch", since=at + 2.0)
-    meters.moves(outcome, flight, "cloud", "missions_total", "world_restarted", since=at + 2.0)
+    back = at + 2.0
+    # What cloud still says to the world before.
+    meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "old_epoch", since=back)
+    meters.moves(outcome, flight, "world", "session_epoch", since=back)
+    meters.moves(outcome, flight, "cloud", "missions_total", "world_restarted", since=back)
     return outcome
 
 
@@ -194,14 +206,15 @@ SCENARIOS = (
         "CPU quota of 50, 30 and 10 % of a 100 ms period for 10 s",
         "stalls of up to 90 ms ride inside the age limit",
         "none",
-        "cloudrc_loop_missed_periods_total",
+        "fault 'late' in cloud, cloudrc_loop_lateness_seconds, cloudrc_loop_missed_periods_total",
         _throttled,
     ),
     Scenario(
         17,
         "world-restarted",
         "the world pod restarts within 2 s",
-        "back on the ground, never airborne without power; a new epoch; nothing resumes alone",
+        "back on the ground, never airborne without power; a new epoch, commands of the old one "
+        "are refused; nothing resumes alone",
         "the flight in progress",
         "mission failed: world_restarted; cloudrc_missions_total, cloudrc_session_epoch",
         _world_restarted,

@@ -151,7 +151,7 @@ def _liar(seed: int) -> Outcome:
         causes = " ".join(c.cause for c in flight.changes if c.state is GuardState.LAND)
         outcome.true(f"{name}: the cause is told", "impossible commands" in causes)
     for name, lie in CLAMPED.items():
-        flight = _lied_to(seed, _between(at, at + 1.0, lie))
+        flight = _lied_to(seed, _between(at, at + 1.0, lie), harmless=name != "100 m/s")
         asks.safe(outcome, flight)
         refused = sum("impossible" in change.cause for change in flight.changes)
         outcome.same(f"{name}: taken for impossible", refused, 0)
@@ -165,8 +165,9 @@ def _liar(seed: int) -> Outcome:
     return outcome
 
 
-def _lied_to(seed: int, lie: Lie) -> Flight:
-    return Flight(seed=seed, honest=False, tempt=tempting(lie)).fly(40.0)
+def _lied_to(seed: int, lie: Lie, harmless: bool = True) -> Flight:
+    """Fly with lies; one that is clamped and flown leads wherever it likes, into a pipe, too."""
+    return Flight(seed=seed, honest=harmless, tempt=tempting(lie)).fly(40.0)
 
 
 SCENARIOS = (

@@ -26,7 +26,7 @@ from cloudrc.faults.scenario import Outcome, Scenario, generator
 from cloudrc.geometry import fence
 from cloudrc.geometry.placement import overlapped_pipe
 from cloudrc.geometry.scene import Scene, load_scene
-from cloudrc.messages import ZERO, Command, GuardState, Vector
+from cloudrc.messages import Command, GuardState, Vector
 from cloudrc.records import Control
 
 NEARER = 0.05
@@ -129,13 +129,17 @@ def _refuses(document: dict[str, Any]) -> bool:
 
 def _unreachable(seed: int) -> Outcome:
     """The robot cannot get on: what it is told to fly comes to nothing."""
-    outcome, at = Outcome(), instant(seed, 12.0, 20.0)
+    outcome, at, stays = Outcome(), instant(seed, 12.0, 20.0), list[Vector]()
 
     def stalled(command: Command, control: Control) -> Command:
-        return command if control.stamp_ns * 1e-9 < at else command._replace(velocity=ZERO)
+        if control.stamp_ns * 1e-9 < at:
+            return command
+        stays.append(control.measured)
+        x, y, z = (a - b for a, b in zip(stays[0], control.measured, strict=True))
+        return command._replace(velocity=(x, y, z))
 
     tempt = tempting(stalled)
-    flight = Flight("criteria.time_limit_s=300", seed=seed, tempt=tempt, honest=False)
+    flight = Flight("criteria.time_limit_s=300", seed=seed, tempt=tempt)
     flight.fly_mission(200.0)
     asks.safe(outcome, flight)
     outcome.true("the mission ends", flight.mission.state == "failed")
@@ -143,6 +147,10 @@ def _unreachable(seed: int) -> Outcome:
     outcome.true("with the code leg_timed_out", "leg_timed_out" in verdict)
     outcome.true("it says which waypoint", "waypoint" in verdict and "not reached" in verdict)
     ended = max(event.stamp_ns for event in flight.events("leg_timed_out")) * 1e-9
+    reached = flight.events("reached")
+    leg = assembly.build_plan(flight.experiment).legs[len(reached)]
+    began = reached[-1].stamp_ns * 1e-9
+    outcome.most("the leg ends off its limit by", abs(ended - began - leg.time_limit), 0.05, "s")
     meters.moves(outcome, flight, "teleop", "missions_total", "leg_timed_out", since=ended - 0.01)
     outcome.true("the robot holds", flight.state_at(flight.run.now_ns) is GuardState.HOLD)
     return outcome

@@ -34,8 +34,8 @@ def _names(seed: int) -> Outcome:
     fails[0], addresses[0] = False, ["10.0.0.9"]
     outcome.true("follows the new address", peer.poll() == ("10.0.0.9", 7400))
     outcome.true("it says that too", "was 10.0.0.7" in said[-1])
-    outcome.least("it asks again not sooner than after", PEER_PAUSE[0], 0.1, "s")
-    outcome.most("it asks again after", PEER_PAUSE[1], 5.0, "s")
+    outcome.least("shortest pause that it is set to ask again after", PEER_PAUSE[0], 0.1, "s")
+    outcome.most("longest pause that it is set to ask again after", PEER_PAUSE[1], 5.0, "s")
     _flown_without_names(outcome, seed)
     return outcome
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import re
 import tempfile
+from contextlib import redirect_stderr
 from math import nan
 from pathlib import Path
 
-from cloudrc.config.load import load_experiment
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile
 from cloudrc.errors import BadInputError
@@ -121,16 +122,34 @@ def _two_clouds(seed: int) -> Outcome:
 
 
 def _configuration(seed: int) -> Outcome:
-    outcome = Outcome()
+    outcome, codes = Outcome(), list[int]()
     for setting, word in BAD_KEYS:
-        text = ""
-        try:
-            load_experiment("paper", [setting])
-        except BadInputError as error:
-            text = str(error)
-        outcome.true(f"{setting} is refused, naming {word}", word in text)
-    outcome.same("exit code", BadInputError.exit_code, 2)
+        code, said = _started("run", "paper", "--set", setting)
+        codes.append(code)
+        right = word in said and said.count("\n") == 1
+        outcome.true(f"{setting} is refused in one line, naming {word}", right)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "bad.yaml"
+        key = Path(folder) / "key"
+        key.write_text(write(SECRET), encoding="utf-8")
+        file.write_text("guard: {command_age_max_ms: 0}\n", encoding="utf-8")
+        for end in ("world", "cloud"):
+            ports = ("--listen", "127.0.0.1:7400", "--peer", "127.0.0.1:1")
+            code, said = _started(end, "--config", str(file), "--key", str(key), *ports)
+            codes.append(code)
+            right = str(file) in said and "guard.command_age_max_ms" in said
+            outcome.true(f"{end} does not start, naming file and key", right)
+    outcome.same("exit codes other than 2", sum(code != 2 for code in codes), 0)
     return outcome
+
+
+def _started(*arguments: str) -> tuple[int, str]:
+    """Run a command line; give its exit code and what it says of errors."""
+    from cloudrc.cli.main import main  # which knows of this module
+
+    said = io.StringIO()
+    with redirect_stderr(said):
+        return main(arguments), said.getvalue()
 
 
 def _secrets(seed: int) -> Outcome:
@@ -149,9 +168,9 @@ def _secrets(seed: int) -> Outcome:
         outcome.true(f"wrong key: {end} tells once to look at the keys", right)
 
     new = KeySet(Key(b"the next key of the fault suite!"), SECRET.current, 20.0)
-    outcome.checks += _rotated(seed, new, gap=8.0, holds=0).checks
+    outcome.add(_rotated(seed, new, gap=8.0, holds=0))
     late = new._replace(overlap=2.0)
-    outcome.checks += _rotated(seed, late, gap=8.0, holds=1).checks
+    outcome.add(_rotated(seed, late, gap=8.0, holds=1))
     _missing(outcome, seed)
     return outcome
 

@@ -33,6 +33,23 @@ def reading(role: str, records: Iterable[Record], name: str, *labels: str) -> fl
     return float(shown.get(labels, nan))
 
 
+def share_within(role: str, records: Iterable[Record], name: str, bound: float) -> float:
+    """Read which share [1] of a histogram is at most a bound of its buckets; NaN if it is empty.
+
+    Args:
+        role: Of the process.
+        records: That it has seen, oldest first.
+        name: Of the metric, without its prefix.
+        bound: Of one of its buckets [unit of the metric].
+    """
+    live = Live(role)
+    live.see(records)
+    shown = live.read()[f"cloudrc_{name}"]
+    assert isinstance(shown, Histogram)
+    counts = shown.cumulative()
+    return counts[shown.bounds.index(bound)] / counts[-1] if counts[-1] else nan
+
+
 def shown(flight: Flight, role: str) -> dict[str, object]:
     """Read every metric that a process shows at the end of a flight; of a histogram its counts."""
     live = Live(role)

@@ -15,9 +15,10 @@ from cloudrc.exposition.live import Live
 from cloudrc.faults import meters
 from cloudrc.faults.catalogue import find
 from cloudrc.faults.mortal import Mortal
+from cloudrc.faults.watch import Watch
 from cloudrc.link.sidecar_follow import PeerName
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.records import Counted, Fault
+from cloudrc.records import Contact, Counted, Fault
 from cloudrc.tunnel.complaints import Complaints
 from cloudrc.world.guard import Guard
 
@@ -60,6 +61,15 @@ def stops_its_rotors_above_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
             guard._flies, guard.reference = False, ZERO
 
     monkeypatch.setattr(Guard, "_look_after_itself", hasty)
+
+
+def touches_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    see = Watch.see
+
+    def touched(watch: Watch, contact: Contact, guard: GuardState, honest: bool) -> None:
+        see(watch, contact._replace(body="pipe_1"), GuardState.TRACK, honest)
+
+    monkeypatch.setattr(Watch, "see", touched)
 
 
 def tells_no_cause(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,18 +130,21 @@ BROKEN: list[tuple[str, Broken, str]] = [
     ("F2", tells_no_cause, "each HOLD tells the age of its command"),
     ("F3", stops_its_rotors_above_the_ground, "descent"),
     ("F3", tells_no_cause, "LAND tells why"),
+    ("F3", touches_something, "collisions"),
     ("F4", shows_it_10_s_later, "metric datagrams_lost_total uplink moves"),
     ("F5", shows_it_10_s_later, "metric guard_transitions_total hold moves"),
     ("F6", shows_it_10_s_later, "metric datagrams_reordered_total downlink moves"),
     ("F7", shows_it_10_s_later, "metric datagrams_total downlink repeated moves"),
     ("F9", says_nothing_of_the_wall_clock, "lines in the log: wall clock stepped"),
     ("F14", tells_no_cause, "LAND tells why"),
+    ("F14", touches_something, "collisions"),
     ("F15", tells_no_cause, "each HOLD tells the age of its command"),
     ("F15", tells_no_cause, "each TRACK after it tells of fresh commands"),
     ("F19", counts_the_tenth_failure_first, "metric dns_errors_total moves"),
     ("F19", forgets_the_peer, "no name is resolved for 30 s of flight: the same path"),
     ("F24", never_complains, "it is told once: peer speaks v"),
     ("F25", never_complains, "the second says why it waits"),
+    ("F23", touches_something, "collisions"),
     ("F27", offers_a_point_that_is_not_the_nearest, "legal points nearer than it"),
     ("F32", loses_an_event_of_a_reader, "its events have no gap"),
     ("F33", ends_without_a_word, "HOLD after"),

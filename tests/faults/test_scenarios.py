@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import xml.etree.ElementTree as Xml
@@ -12,9 +13,10 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
-from cloudrc.faults import document
+from cloudrc.faults import asks, document
 from cloudrc.faults.catalogue import find, scenarios
 from cloudrc.faults.document import Result
+from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Check, Mode, Outcome, Scenario
 
 FAULTS = range(1, 41)
@@ -106,8 +108,9 @@ def test_every_fault_is_survived(scenario: Scenario, seed: int) -> None:
 
 
 @pytest.mark.promise("P-FAULT-5")
-def test_one_seed_is_one_run() -> None:
-    scenario = find("F40", "virtual")
+@pytest.mark.parametrize("name", ["F40", "F16"], ids=["one flight", "three flights"])
+def test_one_seed_is_one_run(name: str) -> None:
+    scenario = find(name, "virtual")
     first, second, other = scenario.run(3), scenario.run(3), scenario.run(4)
     assert first.sha256 == second.sha256 != other.sha256
     assert first.checks == second.checks
@@ -131,6 +134,23 @@ def test_an_unknown_fault_is_bad_input() -> None:
 )
 def test_what_is_not_measured_has_not_passed(check: Check, passed: bool) -> None:
     assert check.passed is passed
+
+
+def test_the_hash_is_over_all_flights() -> None:
+    one, two = Outcome(), Outcome()
+    for outcome, hashes in ((one, "ab"), (two, "cb")):
+        for sha256 in hashes:
+            outcome.flown(sha256)
+    assert one.sha256 != two.sha256
+    one.add(Outcome())
+    assert one.sha256 == hashlib.sha256(b"a b").hexdigest()
+
+
+@pytest.mark.parametrize("honest", [False, True])
+def test_no_collision_is_counted_where_nobody_looks_for_one(honest: bool) -> None:
+    outcome = Outcome()
+    asks.safe(outcome, Flight(honest=honest).fly(0.1))
+    assert ("collisions" in [check.text for check in outcome.checks]) is honest
 
 
 def good() -> Outcome:
@@ -201,7 +221,7 @@ def test_the_command_prints_json_and_exits_by_the_checks(
     assert printed["schemaVersion"] == 1
     assert printed["faults"][0]["result"] == "passed"
     checks = {check["text"]: check["unit"] for check in printed["faults"][0]["checks"]}
-    assert checks["exit code"] == ""
+    assert checks["exit codes other than 2"] == ""
     assert "yes" in checks.values()
     assert Xml.parse(junit).getroot().attrib["tests"] == "1"
 
