@@ -26,6 +26,7 @@ from cloudrc.tunnel.keys import write
 LIMIT = 60.0
 """For whatever is waited for [s]."""
 LOOPBACK = "127.0.0.1"
+NAMES = ("world", "cloud", "teleop")
 PERIOD = 0.05
 """Between two looks at whether something has come about [s]."""
 
@@ -35,6 +36,8 @@ class Processes:
 
     Attributes:
         folder: With configuration, key, journal and recordings.
+        ports: Of the tunnel, UDP, by end.
+        metrics: Ports of the metrics, TCP, by process.
         running: The process of each name that was started last.
     """
 
@@ -51,7 +54,7 @@ class Processes:
         (self.folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
         replace_durably(self.folder / "key", write(SECRET).encode())
         self.ports = dict(zip(("world", "cloud"), free_ports(2), strict=True))
-        (self.ports["metrics"],) = free_ports(1, socket.SOCK_STREAM)
+        self.metrics = dict(zip(NAMES, free_ports(len(NAMES), socket.SOCK_STREAM), strict=True))
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self._all: list[subprocess.Popen[bytes]] = []
         self._recordings = 0
@@ -66,15 +69,16 @@ class Processes:
         here, there = (f"{LOOPBACK}:{self.ports[end]}" for end in ("world", "cloud"))
         flags = {
             "world": [
-                *("--listen", here, "--peer", there, "--key", "key", "--epochs", "epochs"),
-                *("--metrics", f"{LOOPBACK}:{self.ports['metrics']}", *record),
+                *("--listen", here, "--peer", there, "--key", "key", "--epochs", "epochs", *record),
             ],
             "cloud": [
                 *("--listen", there, "--peer", here, "--key", "key", "--teleop", ".", *record),
             ],
             "teleop": ["--socket", ".", "--journal", "journal"],
         }
+        metrics = f"{LOOPBACK}:{self.metrics[name]}"
         command = [sys.executable, "-m", "cloudrc", name, "--config", "config.yaml"]
+        command += ["--metrics", metrics]
         with (self.folder / f"{name}.log").open("ab") as log:
             process = subprocess.Popen(
                 [*command, *flags[name], *more],
@@ -147,13 +151,14 @@ class Processes:
         recovery = recover(paths[which], clean)
         return Recording.read(clean), recovery
 
-    def scrape(self, timeout: float = 5.0) -> dict[str, float]:
-        """Read world's metrics [any unit].
+    def scrape(self, name: str = "world", timeout: float = 5.0) -> dict[str, float]:
+        """Read the metrics of a process [any unit].
 
         Args:
+            name: Of the process.
             timeout: For the answer [s].
         """
-        url = f"http://{LOOPBACK}:{self.ports['metrics']}/metrics"
+        url = f"http://{LOOPBACK}:{self.metrics[name]}/metrics"
         with DIRECTLY.open(url, timeout=timeout) as answer:
             lines = answer.read().decode().splitlines()
         samples = (line.rpartition(" ") for line in lines if not line.startswith("#"))
