@@ -63,6 +63,9 @@ COOKIE_NS = 2_000_000_000
 """A cookie is valid in its slot of this length and in the next one [ns]."""
 GRACE_NS = 1_000_000_000
 """Authority of a cloud whose session is new, until it is heard for the first time [ns]."""
+REPEATS_MAX = 3
+"""An incumbent that is accepted so often and goes on asking, with another key than the epoch began
+with, has dropped that one before it learnt of the epoch: it gets a new epoch, under its own."""
 USED_MAX = 64
 """Old nonces remembered; at ten answers a second none is forgotten while its cookie is valid."""
 
@@ -130,6 +133,7 @@ class Door:
         self._age_max_ns = age_max_ns
         self._fresh_until_ns = -1
         self._incumbent = Hello(b"", b"", b"", AES_256_GCM)
+        self._repeated = 0  # acceptances of this epoch, since its cloud was last heard
         self._used: deque[bytes] = deque(maxlen=USED_MAX)
         self._challenged_ns = -CHALLENGE_NS
         self._answered_ns: deque[int] = deque(maxlen=ANSWERS_MAX)
@@ -144,6 +148,7 @@ class Door:
     def hear(self, now_ns: int) -> None:
         """Note that the incumbent is alive: a new datagram of its session has come [ns]."""
         self._fresh_until_ns = now_ns + self._age_max_ns
+        self._repeated = 0
 
     def admit(self, kind: int, counter: int, now_ns: int) -> None:
         """Let an ALIVE or OPERATOR datagram of the session in, once [ns, monotonic clock].
@@ -179,14 +184,17 @@ class Door:
         answered.append(now_ns)
         self._remember(hello.nonce, counter)
         if hello.nonce == self._incumbent.nonce:
-            # Whichever key this hello has: cloud takes the answer's for the key of the epoch.
             session = self._session
-            return Answer("hello", [session.greet(ACCEPT, self._accept(), session.epoch_key)])
-        if hello.nonce in self._used:
+            self._repeated += 1
+            if session.greeting_key == session.epoch_key or self._repeated <= REPEATS_MAX:
+                # Whichever key this hello has: cloud takes the answer's for the key of the epoch.
+                return Answer("hello", [session.greet(ACCEPT, self._accept(), session.epoch_key)])
+        elif hello.nonce in self._used:
             return self._answer("hello", BUSY, encode_busy(Busy(hello.nonce, used=True)))
-        if now_ns <= self._fresh_until_ns:
+        elif now_ns <= self._fresh_until_ns:
             return self._answer("busy", BUSY, encode_busy(Busy(hello.nonce, used=False)))
-        self._used.append(self._incumbent.nonce)
+        else:
+            self._used.append(self._incumbent.nonce)
         self._incumbent = hello
         self._fresh_until_ns = now_ns + max(GRACE_NS, self._age_max_ns)
         agreement = Agreement(hello.nonce, self._nonce, self._agreed())
@@ -207,6 +215,7 @@ class Door:
 
     def _begin(self, agreement: Agreement | None = None, key: Key | None = None) -> None:
         self._session.begin(self._next_epoch(), agreement, key)
+        self._repeated = 0
         for window in self._windows.values():
             window.reset()
 

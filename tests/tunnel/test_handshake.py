@@ -7,7 +7,14 @@ from doorstep import CLOCK, KEY, MS, NONCE, SECOND_NS, WORLD, Doorstep
 
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Accept, Busy, DecodeError, Direction, Kind
-from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, EPOCH_MAX, Door, epochs_after
+from cloudrc.tunnel.handshake import (
+    CHALLENGE_NS,
+    COOKIE_NS,
+    EPOCH_MAX,
+    REPEATS_MAX,
+    Door,
+    epochs_after,
+)
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.knocker import NO_COOKIE
 from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, Agreement, Session
@@ -171,6 +178,27 @@ def test_an_acceptance_that_is_repeated_names_the_key_that_its_epoch_began_with(
             assert epoch_key.verifies(data[:-16], data[-16:])
         step.door.move_on()
     assert step.world._openers[0][1] == new
+
+
+@pytest.mark.parametrize("heard", [False, True])
+def test_a_cloud_that_has_dropped_the_key_of_its_epoch_gets_another_epoch(heard):
+    """World moved on under the old key, which cloud had no more when the acceptance came."""
+    step = Doorstep()
+    step.world.ring.replace(KeySet(new := Key(b"n" * 32)), step.now_ns)
+    step.world.tend(step.now_ns)
+    step.world.open(step.cloud.greet(Kind.HELLO, bytes(codec.BODY_SIZES[Kind.HELLO]), KEY))
+    assert step.knock(cookie=step.door._cookie(step.now_ns)).opened
+    told = []
+    for _ in range(REPEATS_MAX + 2):
+        step.world.open(step.cloud.greet(Kind.HELLO, bytes(codec.BODY_SIZES[Kind.HELLO]), new))
+        if heard:
+            step.door.hear(step.now_ns)
+        answer = step.knock(cookie=step.door._cookie(step.now_ns))
+        (data,) = answer.datagrams
+        told.append((codec.peek(data)[1], answer.opened, new.verifies(data[:-16], data[-16:])))
+    repeated = [(1, False, False)] * REPEATS_MAX
+    assert told == (5 * repeated[:1] if heard else [*repeated, (2, True, True), (2, False, True)])
+    assert NONCE not in step.door._used
 
 
 @pytest.mark.promise("P-LINK-4")
