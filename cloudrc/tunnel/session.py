@@ -99,7 +99,8 @@ class Session:
         self._rekey_total = 0
         self._announced: tuple[int, Cipher] | None = None
         self._openers: dict[int, Opener] = {}  # by generation as the header has it: one byte of it
-        self._newest = 0  # generation that the peer has been heard with
+        self._newest = 0  # generation that the peer was last heard with for the first time
+        self._heard = ring.current  # key that the peer was last heard with
         self._tried: dict[int, list[Opener]] = {}
 
     def begin(self, epoch: int, agreement: Agreement | None = None, key: Key | None = None) -> None:
@@ -115,7 +116,7 @@ class Session:
             kind: count if kind in TIMELESS else 0 for kind, count in self._counters.items()
         }
         self._agreement = agreement or self._agreement
-        self._key = self.epoch_key = key or self._key
+        self._key = self.epoch_key = self._heard = key or self._key
         self._generation = self._generation_byte = 0
         self._rekey_ns = None
         self._rekey_total = self._sent() + REKEY_DATAGRAMS
@@ -162,6 +163,7 @@ class Session:
             body = opener[0].decrypt(data[4:16], data[16:], data[:16])
         except InvalidTag:
             raise DecodeError("tag") from None
+        self._heard = opener[1]
         return kind, direction, epoch, counter, body
 
     def next_counter(self, kind: int) -> int:
@@ -183,7 +185,7 @@ class Session:
             del self._openers[byte]
         if self._rekey_ns is None:
             self._rekey_ns = now_ns + REKEY_NS
-        if self._key not in self.accepted:
+        if self._key not in self.accepted or self._heard == self.ring.current != self._key:
             self._move_on(self.ring.current)
         elif now_ns >= self._rekey_ns or self._sent() >= self._rekey_total:
             self._move_on(self._key)
@@ -213,11 +215,14 @@ class Session:
         return header + cipher.encrypt(header[4:], b"", header)
 
     def _open_ahead(self, data: bytes, byte: int) -> bytes:
-        """Open a datagram of a generation that is new to us; keep its key if the tag is right."""
-        ahead = (byte - self._newest) % GENERATIONS
-        if ahead > AHEAD_MAX:
-            raise DecodeError("tag")
+        """Open a datagram of a generation that is new to us; keep its key if the tag is right.
+
+        One that lies a little behind is, too, if its key was not accepted for a while.
+        """
+        ahead = (byte - self._newest + KEPT - 1) % GENERATIONS - KEPT + 1
         generation = self._newest + ahead
+        if ahead > AHEAD_MAX or generation < 0:
+            raise DecodeError("tag")
         candidates = self._tried.get(generation)
         if candidates is None:  # kept, so that a flood of forged ones derives no key twice
             candidates = self._tried[generation] = [

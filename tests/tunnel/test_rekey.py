@@ -1,5 +1,7 @@
 """New keys in flight: every 120 s, after 2^32 datagrams, and when the key file is rotated."""
 
+import random
+
 import pytest
 
 from cloudrc.tunnel import codec, session
@@ -9,7 +11,7 @@ from cloudrc.tunnel.session import KEPT, REKEY_NS, Agreement, Session, pair
 
 BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
 SECOND_NS = 1_000_000_000
-OLD, NEW = Key(b"o" * 32), Key(b"n" * 32)
+OLD, NEW, WRONG = Key(b"o" * 32), Key(b"n" * 32), Key(b"w" * 32)
 GENERATION = 6  # where it stands in the header
 
 
@@ -27,6 +29,15 @@ class Ends:
 
     def rotate(self, end, key=NEW):
         self.rings[end].replace(KeySet(key, None, self.overlap), self.now_ns)
+
+    def hear_each_other(self):
+        """Whether what either end seals now is opened by the other."""
+        for end, other in ((self.world, self.cloud), (self.cloud, self.world)):
+            try:
+                other.open(end.seal(Kind.ALIVE, b""))
+            except DecodeError:
+                return False
+        return True
 
     def pass_time(self, seconds, *, deliver=True):
         """Every second both ends tend to themselves and send one datagram; what is refused."""
@@ -236,3 +247,50 @@ def test_while_two_keys_are_valid_greetings_of_both_are_taken():
     for key in (OLD, NEW):
         ends.world.open(ends.cloud.greet(Kind.HELLO, hello, key))
         assert ends.world.greeting_key == key
+
+
+@pytest.mark.promise("P-LINK-5")
+def test_an_end_that_had_a_wrong_key_goes_on_with_the_right_one():
+    """Its peer has used that one all the time, and was heard while the wrong one was there."""
+    ends = Ends(overlap=2.0)
+    ends.rotate("cloud")
+    ends.pass_time(3)
+    assert not ends.hear_each_other()
+    ends.overlap = 300.0
+    ends.rotate("cloud", OLD)
+    ends.pass_time(1, deliver=False)  # the old one is accepted again
+    ends.rotate("cloud", NEW)
+    ends.cloud.open(ends.world.seal(Kind.ALIVE, b""))
+    ends.rotate("cloud", OLD)
+    ends.pass_time(2)
+    assert ends.hear_each_other()
+
+
+def test_what_was_heard_in_the_epoch_before_tells_nothing_of_this_one():
+    ends = Ends()
+    for end in ("world", "cloud"):
+        ends.rotate(end)
+    ends.pass_time(3)
+    for end in (ends.world, ends.cloud):
+        end.begin(2, key=OLD)
+    ends.world.tend(ends.now_ns)
+    assert ends.world._key == OLD
+    assert ends.pass_time(3) == 0
+    assert ends.world._key == ends.cloud._key == NEW
+
+
+@pytest.mark.promise("P-LINK-5")
+def test_whatever_befell_the_key_files_once_they_are_the_same_both_ends_hear_each_other():
+    for chance in map(random.Random, range(1500)):
+        ends = Ends(overlap=chance.choice((2.0, 5.0, 30.0)))
+        for _ in range(chance.randint(1, 6)):
+            ends.rotate(chance.choice(("world", "cloud")), chance.choice((OLD, NEW, WRONG)))
+            if chance.random() < 0.5:
+                ends.hear_each_other()  # before either has looked at its file
+            ends.pass_time(chance.choice((0, 0, 1, 2, 3, 7)), deliver=chance.random() < 0.8)
+        last = chance.choice((OLD, NEW, Key(b"l" * 32)))
+        for end in chance.sample(("world", "cloud"), 2):
+            ends.rotate(end, last)
+            ends.pass_time(chance.choice((0, 1, 2)))
+        ends.pass_time(8)
+        assert ends.hear_each_other()
