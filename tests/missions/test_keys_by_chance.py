@@ -47,10 +47,9 @@ class Two:
         self.cloud = Mortal(self.build_cloud, Clock(), "cloud")
         links = LinkDirection(up, seed, uplink=True), LinkDirection(down, seed, uplink=False)
         self.run = VirtualRun(self.world, self.cloud, *links)
-        for _ in range(chance.randint(2, 12)):
-            chance.choice(
-                (self.rotate, self.rotate, self.kill, self.pause, self.start, self.start)
-            )()
+        whatever = (self.rotate, self.rotate, self.kill, self.pause, self.start, self.start)
+        for befalls in chance.choices(whatever, k=chance.randint(2, 12)):
+            befalls()
         self.end_with_one_key_file()
 
     def build_world(self, start_ns: int) -> Any:
