@@ -1,9 +1,11 @@
-"""World's end around a robot that does nothing: for a million short lives of the session."""
+"""Both ends around nothing, no robot and no loop: for a million short lives of the session."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
 
+from cloudrc.cloud.endpoint import CloudEndpoint
+from cloudrc.cloud.identity import CloudIdentity
 from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState, OperatorRequest, Request, Start
 from cloudrc.records import Arrival
 from cloudrc.tunnel import codec
@@ -57,6 +59,18 @@ def bare_world(
         command_age_max_ns=250 * MS,
         start_ns=start_ns,
     )
+
+
+def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
+    """Cloud's end; what is put into its `teleop.outputs` it sends."""
+    nothing = SimpleNamespace(
+        faults=[], counts={}, ready=False, outputs=[], outcome=None, settled=True,
+        reset=lambda: None, observe=lambda telemetry, now_ns: None, see=lambda seen, now_ns: None,
+        handle_deadline=lambda now_ns: None,
+    )  # fmt: skip
+    nothing.take_outputs = lambda: [nothing.outputs.pop(0) for _ in nothing.outputs[:]]
+    identity = CloudIdentity(CLOCK, nonce.ljust(16), keys)
+    return CloudEndpoint(nothing, nothing, identity, newest_wins=True, start_ns=start_ns)
 
 
 def ring() -> KeyRing:

@@ -8,14 +8,12 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from itertools import count
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from bare_world import MS, bare_world
+from bare_world import MS, bare_cloud, bare_world
 
 from cloudrc.cloud.endpoint import CloudEndpoint
-from cloudrc.cloud.identity import CloudIdentity
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.faults.mortal import Clock, Mortal
 from cloudrc.faults.schedule import Event, Schedule, shaped
@@ -58,14 +56,7 @@ class Two:
 
     def build_cloud(self, start_ns: int) -> CloudEndpoint:
         ring = self.rings["cloud"] = KeyRing(self.files["cloud"], start_ns)
-        identity = CloudIdentity(bytes(16), b"%16d" % next(self.lives), ring)
-        nothing = SimpleNamespace(
-            faults=[], counts={}, ready=False, outputs=[], outcome=None, settled=True,
-            reset=lambda: None, observe=lambda *_: None, see=lambda *_: None,
-            handle_deadline=lambda _: None,
-        )  # fmt: skip
-        nothing.take_outputs = lambda: [nothing.outputs.pop() for _ in nothing.outputs[:]]
-        return CloudEndpoint(nothing, nothing, identity, newest_wins=True, start_ns=start_ns)
+        return bare_cloud(b"cloud %d" % next(self.lives), ring, start_ns)
 
     def link_events(self) -> tuple[Event, ...]:
         chance, events = self.chance, []

@@ -16,12 +16,8 @@ from pathlib import Path
 
 sys.path += [str(Path(__file__).parents[1] / "missions"), str(Path(__file__).parents[2])]
 
-from types import SimpleNamespace
+from bare_world import Bare, BareCloud, bare_cloud, ring
 
-from bare_world import Bare, BareCloud, ring
-
-from cloudrc.cloud.endpoint import CloudEndpoint
-from cloudrc.cloud.identity import CloudIdentity
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
 from cloudrc.tunnel.session import pair
@@ -36,7 +32,7 @@ class Target:
     def __init__(self) -> None:
         self.bare = Bare(ring())
         self.world = self.bare.world
-        self.cloud = a_cloud()
+        self.cloud = bare_cloud(b"c" * 16, ring())
         self.frames: list[bytes] = []
         for _ in range(40):  # until both are in one session
             self.cloud.handle_deadline(self.cloud.next_deadline_ns())
@@ -113,18 +109,6 @@ class Target:
         size = codec.BODY_SIZES[kind]
         session = self.strangers[kind != Kind.TELEMETRY]
         return session.seal(kind, (rest * (1 + size // len(rest)))[:size])
-
-
-def a_cloud() -> CloudEndpoint:
-    """Cloud's end without anything behind it."""
-    nothing = SimpleNamespace(
-        faults=[], counts={}, ready=False, outputs=[], outcome=None, settled=True,
-        reset=lambda: None, observe=lambda telemetry, now_ns: None, see=lambda seen, now_ns: None,
-        handle_deadline=lambda now_ns: None,
-    )  # fmt: skip
-    return CloudEndpoint(
-        nothing, nothing, CloudIdentity(bytes(16), b"c" * 16, ring()), newest_wins=True
-    )
 
 
 def memory() -> float:
