@@ -170,7 +170,7 @@ def _estop(options: argparse.Namespace, api: Api) -> int:
 
 def _acknowledge(options: argparse.Namespace, api: Api) -> int:
     api.post("/v1/acknowledge")
-    print("acknowledged: the next mission may fly")
+    print("acknowledged: the next mission may fly; a landing low over the ground ends first")
     print(
         "where it was stopped or has touched down, the robot takes off only once it has been "
         "still, 0.5 m inside the fence"

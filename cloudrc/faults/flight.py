@@ -257,7 +257,7 @@ class Flight:
                 stamp_ns = record.stamp_ns
                 state = self.state_at(stamp_ns)
                 if state is GuardState.HOLD and self.state_at(stamp_ns - BRAKES_NS) is LAND:
-                    state = LAND  # acknowledged right above what it was about to land on
+                    state = LAND  # acknowledged right above a pipe that it was about to land on
                 self.watch.see(record, state, self.honest)  # type: ignore[arg-type]
 
     def state_at(self, stamp_ns: int) -> GuardState:

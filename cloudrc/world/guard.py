@@ -15,8 +15,9 @@ own clock and its own sensors only, and assumes that the cloud may say anything.
 
 ESTOP is reached from everywhere by the operator's word, and by a hit: what has flown into something
 at speed, or turned over, is thrown about by its rotors. It is left for GROUND by the
-acknowledgement. LAND acknowledged in the air becomes HOLD. Both end the mission: only a start arms
-again. HOLD before the robot has left the ground is GROUND: its rotors stop, the mission goes on.
+acknowledgement. LAND acknowledged in the air becomes HOLD; on something or low above it, GROUND, at
+touch-down. Both end the mission: only a start arms again. HOLD before the robot has left the ground
+is GROUND: its rotors stop, the mission goes on.
 
 A command is fresh while its *basis*, the odometry it was computed from, is at most
 `command_age_max` old. HOLD after a mission's end lasts as long as the operator likes: there a robot
@@ -35,7 +36,7 @@ from cloudrc.records import GuardChange
 from cloudrc.world import guard_rules as rules
 from cloudrc.world.guard_hits import Hits
 from cloudrc.world.guard_limits import RANGE, Limits
-from cloudrc.world.guard_rest import STILL, Rest, TakeOff
+from cloudrc.world.guard_rest import Descent, Rest, TakeOff
 from cloudrc.world.readings import Readings
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # an enum's member is slow to look up
@@ -45,10 +46,6 @@ RESUME_NS = 500_000_000
 """So many fresh commands within so long end a HOLD [ns]. Source: DESIGN, section 5."""
 SETTLE_NS = 1_000_000_000
 """Least time from one HOLD to the next, and from one TRACK to the next [ns]. Source: fault F5."""
-LAND_SPEED = 0.5
-"""Of the descent [m/s]. Source: DESIGN, section 5."""
-TOUCH_DOWN_NS = 400_000_000
-"""A descent that has stood still for so long has touched down [ns]."""
 INVALID_COMMANDS = 5
 INVALID_NS = 1_000_000_000
 """So many impossible commands within so long end in LAND [ns]. Source: fault F23."""
@@ -71,10 +68,9 @@ class Guard:
         """Begin on the ground."""
         self._limits = limits
         self._speed_max = limits.speed_max * rules.JUST_BELOW
-        self._land_speed = min(LAND_SPEED, 0.5 * limits.speed_max)
         self._low, self._high = limits.inside()
-        self._floor = self._low[2]
-        self._rest = Rest(self._low, self._high, 0.5 * limits.speed_max)
+        self._floor, half = self._low[2], 0.5 * limits.speed_max
+        self._rest, self._descent = Rest(self._low, self._high, half), Descent(self._floor, half)
         self._hits, self._take_off = Hits(), TakeOff(limits.fence_low, limits.fence_high)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
@@ -86,7 +82,7 @@ class Guard:
         self._acceleration = limits.acceleration_max
         self._track_until_ns = self._steady_until_ns = NEVER_NS
         self._tracked_ns = self._held_ns = -SETTLE_NS
-        self._alone_ns = self._moved_ns = 0
+        self._alone_ns = 0
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
         self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
 
@@ -139,7 +135,7 @@ class Guard:
         if self.latched and not self._flies:
             self._enter(GROUND, now_ns, f"acknowledged{self._take_off.condition}")
         elif self.state is LAND:
-            self._enter(HOLD, now_ns, "acknowledged before touch-down")
+            self._descent.acknowledged = True
 
     def forget_commands(self) -> None:
         """A new session or mission begins: what came before is no longer fresh."""
@@ -236,7 +232,7 @@ class Guard:
             self._look_after_itself(now_ns, readings)
             if not self._flies:
                 return None
-            sink = self._land_speed if self.state is LAND else 0.0
+            sink = self._descent.speed if self.state is LAND else 0.0
             reference = self._rest.follow(self.reference, readings, sink, dt)
         self._follow(reference, now_ns, readings, dt)
         return self.reference
@@ -267,11 +263,11 @@ class Guard:
         elif state is HOLD and self.armed and now_ns - self._alone_ns > limits.hold_max_ns:
             self._enter(LAND, now_ns, f"held for {limits.hold_max_ns * 1e-9:g} s without the cloud")
         elif state is LAND and self._flies:
-            sinking = self.reference[2] <= -self._land_speed
-            if not (sinking and abs(readings.velocity[2]) < STILL):
-                self._moved_ns = now_ns
-            elif now_ns - self._moved_ns >= TOUCH_DOWN_NS:
-                self._enter(LAND, now_ns, "touched down, rotors stopped")
+            if self._descent.may_stop(readings):
+                self._enter(HOLD, now_ns, "acknowledged before touch-down")
+            elif self._descent.is_over(now_ns, self.reference, readings):
+                state = GROUND if self._descent.acknowledged else LAND
+                self._enter(state, now_ns, "touched down, rotors stopped")
                 self._flies, self.reference = False, ZERO
                 self._take_off.forget(stopped=True)  # on a pipe, perhaps, from which it slides off
         if self.state is HOLD and self._take_off.may_end(readings):
@@ -292,7 +288,7 @@ class Guard:
             self._fresh_ns.clear()
         else:
             self.armed = armed
-            self._moved_ns = now_ns
+            self._descent.begin(now_ns)
             if state is not LAND:
                 self.reference = ZERO
                 self._hits.forget()

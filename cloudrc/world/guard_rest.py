@@ -1,4 +1,4 @@
-"""How the guard comes to rest and stays there: readings in, a velocity reference out.
+"""How the guard comes to rest, lands and takes off: readings in, a velocity reference out.
 
 Position and velocity of the sensors on board are all that is used. Braking starts hard and ends
 gently, because the low-level controller follows late and swings back; the promise that the stop
@@ -22,6 +22,10 @@ LEAD, LEAST_SHARE = 1.0, 0.2
 """By so much [m/s] the reference begins ahead of the robot, but not below this share of it."""
 STILL = 0.1
 """Slower than this the robot counts as come to rest [m/s]."""
+LAND_SPEED = 0.5
+"""Of the descent [m/s]. Source: DESIGN, section 5."""
+TOUCH_DOWN_NS = 400_000_000
+"""A descent that has stood still for so long has touched down [ns]."""
 STILL_TICKS = 200
 """So many at rest, 0.4 s: what is thrown up stands still for less than that."""
 PULL = 0.8
@@ -114,6 +118,49 @@ def brake_start(reference: Vector, velocity: Vector) -> Vector:
 def brake_rate(speed: float) -> float:
     """Say how fast the reference falls at a `speed` [m/s]: hard first, gently in the end."""
     return min(HARDEST, max(GENTLEST, speed / EASE))
+
+
+class Descent:
+    """Tells a robot that has touched down from one that sinks, and may still stop in the air.
+
+    What stands, or has not the room to come to rest in, would scrape along the ground, or into a
+    pipe beside it: it goes on down, though it is acknowledged, and its rotors stop.
+
+    Attributes:
+        speed: Downwards [m/s].
+        acknowledged: Whether the operator has seen it land.
+    """
+
+    def __init__(self, floor: float, speed_max: float) -> None:
+        """Begin where nothing lands.
+
+        Args:
+            floor: Lowest height at which a position is held [m].
+            speed_max: Of the descent, if it is below LAND_SPEED [m/s].
+        """
+        self._floor, self.speed = floor, min(LAND_SPEED, speed_max)
+        self.begin(0)
+
+    def begin(self, now_ns: int) -> None:
+        """A descent begins at `now_ns` [ns], of which the operator does not know."""
+        self._moved_ns, self.acknowledged = now_ns, False
+
+    def may_stop(self, readings: Readings) -> bool:
+        """Say whether the operator has called it off while it sinks freely, and high enough."""
+        free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
+        return self.acknowledged and free
+
+    def is_over(self, now_ns: int, reference: Vector, readings: Readings) -> bool:
+        """Note whether the robot moves; say whether it stands on something.
+
+        Args:
+            now_ns: World's clock [ns].
+            reference: As followed so far [m/s], world frame, shape (3,).
+            readings: Of the sensors on board.
+        """
+        if reference[2] > -self.speed or abs(readings.velocity[2]) >= STILL:
+            self._moved_ns = now_ns
+        return now_ns - self._moved_ns >= TOUCH_DOWN_NS
 
 
 class TakeOff:

@@ -232,7 +232,7 @@ def test_emergency_stop_and_acknowledgement(
     assert mission("acknowledge") == 0
     api.until(lambda: api.get("/v1/state")["seen"]["guard"] == "GROUND")
     assert capsys.readouterr().out.splitlines() == [
-        "acknowledged: the next mission may fly",
+        "acknowledged: the next mission may fly; a landing low over the ground ends first",
         "where it was stopped or has touched down, the robot takes off only once it has been "
         "still, 0.5 m inside the fence",
     ]

@@ -16,7 +16,7 @@ from cloudrc.faults.voice import at_bad_moments
 from cloudrc.messages import GuardState
 from cloudrc.world.guard import Guard
 
-HOSTILE = {"stop-and-go": 1, "false-basis": 8, "strange-numbers": 6}
+HOSTILE = {"stop-and-go": 1, "false-basis": 8, "strange-numbers": 64}
 """Policies, each with a seed: together they bring about all of ANSWERS, CAUSES and states."""
 ANSWERS = (
     *("used", "limited_speed", "limited_yaw_rate"),
@@ -33,8 +33,9 @@ CAUSES = {
 def bounds(guard: Guard) -> dict[str, Any]:
     """What a guard goes by: its limits, and what it has made of them when it was made."""
     parts = (
-        (guard, ("_limits", "_speed_max", "_land_speed", "_high", "_floor")),
+        (guard, ("_limits", "_speed_max", "_high", "_floor")),
         (guard._rest, ("_low", "_high", "_pull_max")),
+        (guard._descent, ("_floor", "speed")),
         (guard._take_off, ("_low", "_high")),
     )
     found = {f"{type(part)} {name}": getattr(part, name) for part, names in parts for name in names}

@@ -66,9 +66,9 @@ def holding(limits: Limits = LIMITS):
     return guard
 
 
-def landing():
+def landing(limits: Limits = LIMITS):
     """In LAND because of impossible commands; at 2 s."""
-    guard = holding()
+    guard = holding(limits)
     for _ in range(5):
         guard.offer(command((float("nan"), 0.0, 0.0)), 2000 * MS)
     assert guard.state is GuardState.LAND

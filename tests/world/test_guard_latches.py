@@ -19,8 +19,8 @@ from guard_play import (
 )
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard import LAND_SPEED, Guard
-from cloudrc.world.guard_rest import STILL
+from cloudrc.world.guard import Guard
+from cloudrc.world.guard_rest import LAND_SPEED, STILL
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -237,8 +237,9 @@ def test_a_landing_that_is_acknowledged_in_the_air_holds():
     guard = landing()
     run(guard, 2 * SECOND, 3 * SECOND, velocity=(0.0, 0.0, -0.5))
     guard.acknowledge(3 * SECOND)
+    run(guard, 3 * SECOND, 3 * SECOND + TICK, velocity=(0.0, 0.0, -0.5))
     assert guard.take_changes()[-1] == (3 * SECOND, HOLD, "acknowledged before touch-down")
-    assert run(guard, 3 * SECOND, 5 * SECOND)[-1] == ZERO
+    assert run(guard, 3 * SECOND + TICK, 5 * SECOND)[-1] == ZERO
     feed(guard, 5 * SECOND, 100)
     assert guard.state is HOLD
 

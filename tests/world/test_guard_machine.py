@@ -22,14 +22,21 @@ ALLOWED = {
     "start": set(),
     "end": {(TRACK, HOLD)},
     "stop": {(state, ESTOP) for state in (GROUND, TRACK, HOLD, LAND)},
-    "acknowledge": {(LAND, HOLD), (LAND, GROUND), (ESTOP, GROUND)},
+    "acknowledge": {(LAND, GROUND), (ESTOP, GROUND)},
     "spawn": {(state, GROUND) for state in GuardState},
     "fresh": {(GROUND, TRACK), (HOLD, TRACK)},
     "stale": set(),
     "impossible": {(TRACK, LAND), (HOLD, LAND)},
     "session": set(),
     "hit": {(state, ESTOP) for state in (TRACK, HOLD, LAND)},
-    "time": {(TRACK, HOLD), (HOLD, GROUND), (HOLD, LAND), (LAND, LAND)},
+    "time": {
+        (TRACK, HOLD),
+        (HOLD, GROUND),
+        (HOLD, LAND),
+        (LAND, LAND),
+        (LAND, HOLD),
+        (LAND, GROUND),
+    },
 }
 
 
@@ -42,6 +49,7 @@ class GuardMachine(RuleBasedStateMachine):
         self.climb = 0.0
         self.flown = None
         self.started = False  # by the operator, and not ended since
+        self.acknowledged = False  # the landing
         self.newest_basis_ns = None
         self.stamps = []
         self.state = GROUND
@@ -51,6 +59,9 @@ class GuardMachine(RuleBasedStateMachine):
         for change in self.guard.take_changes():
             assert (self.state, change.state) in ALLOWED[event], event
             assert change.cause
+            if self.state is LAND and change.state in (HOLD, GROUND):
+                assert self.acknowledged
+            self.acknowledged &= change.state is self.state is LAND
             assert change.stamp_ns == self.now_ns
             if change.state in (TRACK, HOLD) and event in ("fresh", "time"):
                 self.stamps.append(change.stamp_ns)
@@ -84,6 +95,7 @@ class GuardMachine(RuleBasedStateMachine):
 
     @rule()
     def acknowledge(self):
+        self.acknowledged = self.state is LAND
         self.guard.acknowledge(self.now_ns)
         self.noted("acknowledge")
 

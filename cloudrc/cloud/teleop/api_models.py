@@ -164,8 +164,9 @@ class Acknowledged(_Answer):
     """An acknowledgement on its way."""
 
     state: Literal["acknowledged"] = Field(
-        description="The next mission may fly; after a stop or a touch-down the robot takes off "
-        "only once it has been still, 0.5 m inside the fence"
+        description="The next mission may fly; a landing low over the ground ends first, and "
+        "after a stop or a touch-down the robot takes off only once it has been still, 0.5 m "
+        "inside the fence"
     )
 
 
