@@ -3,7 +3,15 @@
 import pytest
 from teleop_harness import AWAY, A, B, C, Flight
 
-from cloudrc.cloud.teleop.messages import Cancel, Continue, EmergencyStop, GoTo, StartMission
+from cloudrc.cloud.teleop.messages import (
+    Acknowledge,
+    Cancel,
+    Continue,
+    EmergencyStop,
+    GoTo,
+    StartMission,
+)
+from cloudrc.cloud.teleop.mission_rules import HELD_LOWEST
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.messages import MISSION_OVER, GuardState, Request, Start
 
@@ -41,6 +49,42 @@ def test_a_robot_that_stands_ready_for_somebody_else_does_not_take_off():
     flight.step(seconds=0.05)
     assert flight.teleop.outcome.code == "taken_over"
     assert flight.requests[-1].request is Request.END
+
+
+@pytest.mark.parametrize("first_sight", [True, False])
+def test_a_robot_that_stands_ready_for_a_mission_lost_here_does_not_take_off(first_sight):
+    """Its order was in a journal that rotted; or it arrives when nobody knows of it any more."""
+    flight = Flight()
+    if not first_sight:
+        flight.step()
+        flight.epoch += 1
+    flight.onboard = (ID, 0)
+    flight.step(seconds=0.05)
+    assert [request.request for request in flight.requests] == [Request.END]
+    assert flight.setpoints[-1].position == (0.0, 0.0, HELD_LOWEST)
+    assert flight.teleop.settled
+
+
+@pytest.mark.parametrize(
+    ("onboard", "guard"),
+    [((0, 0), GuardState.GROUND), ((ID, 0), GuardState.HOLD), ((ID, 0), GuardState.TRACK)],
+)
+def test_a_robot_that_flies_or_stands_for_nobody_is_told_nothing(onboard, guard):
+    flight = Flight()
+    flight.onboard, flight.guard = onboard, guard
+    flight.step(seconds=0.05)
+    assert flight.requests == []
+
+
+@pytest.mark.parametrize(
+    ("verb", "word"), [(EmergencyStop(), Request.ESTOP), (Acknowledge(), Request.ACKNOWLEDGE)]
+)
+def test_the_operators_word_comes_before_the_end_of_what_was_lost(verb, word):
+    flight = Flight()
+    flight.operate(verb)
+    flight.onboard = (ID, 0)
+    flight.step(seconds=0.3)
+    assert [request.request for request in flight.requests] == [word, Request.END]
 
 
 def test_a_robot_on_the_ground_may_have_been_told_to_start():

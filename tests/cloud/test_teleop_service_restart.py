@@ -10,7 +10,7 @@ from teleop_harness import AWAY, A, B, C
 
 from cloudrc.cloud.teleop.journal_format import parse, to_record
 from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook
-from cloudrc.messages import Request, Start
+from cloudrc.messages import GuardState, Request, Start
 
 
 def test_teleop_alone_restarts_and_the_mission_goes_on_at_the_same_waypoint():
@@ -28,6 +28,18 @@ def test_teleop_alone_restarts_and_the_mission_goes_on_at_the_same_waypoint():
     assert [reached["waypoint"] for reached in view["reached"]] == [0, 1, 2]
     assert view["verdict"]["exit_code"] == 0
     assert flight.names(mission_id).count("started") == 1
+
+
+def test_a_mission_that_waits_for_its_take_off_is_not_ended_by_who_goes_on_with_it():
+    """The new teleop sees a robot that stands, told of a mission, before it takes that up."""
+    flight, mission_id = flying()
+    flight.guard = GuardState.GROUND
+    before = len(flight.requests)
+    flight.restart_teleop()
+    flight.see()
+    flight.step(seconds=0.3)
+    assert flight.view(mission_id)["state"] == "flying"
+    assert {request.request for request in flight.requests[before:]} == {Request.START}
 
 
 def test_a_new_pod_goes_on_at_the_same_waypoint():

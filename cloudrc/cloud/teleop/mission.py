@@ -133,11 +133,12 @@ class Teleop:
 
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry, at the instant [ns] at which it arrives."""
-        before, self._seen, onboard = self._seen, seen, self._known_on_board(seen)
+        before, self._seen = self._seen, seen
+        onboard = rules.known_on_board(seen, self._mission_id)
         started = self.requests.see(seen) is Request.START and self.state is STARTING
         if self.state not in UNDER_WAY:
             if before is None or seen.epoch != before.epoch:
-                self._aim(seen.position, self._yaw, NO_WAYPOINT)
+                self._find(seen)
         elif harm := rules.harm_in(seen, self._mission_id, self._world, known=self._told):
             code, text = harm
             self._end(code, f"{text} {self._where()}", now_ns)
@@ -154,9 +155,14 @@ class Teleop:
         """Check the limits of time and repeat the request that is due at `now_ns` [ns]."""
         if self.state in UNDER_WAY:
             self._check_time(now_ns)
-        request = self.requests.due(now_ns)
-        if request is not None:
+        if (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
+
+    def _find(self, seen: Seen) -> None:
+        """Without a mission: what flies is held; what stands, for one lost here, shall stay."""
+        if seen.guard is GuardState.GROUND and seen.mission_id not in (0, self._mission_id):
+            self.requests.ask(Request.END, after=True)
+        self._aim_here()
 
     def _start(self, plan: Plan, mission_id: int, now_ns: int) -> None:
         self.state, self.outcome = STARTING, None
@@ -211,7 +217,7 @@ class Teleop:
         if not self._unaimed or seen is None or (anew and not self.requests.waits):
             return
         self._unaimed = False
-        leg = 0 if anew else max(self._leg, self._known_on_board(seen))
+        leg = 0 if anew else max(self._leg, rules.known_on_board(seen, self._mission_id))
         if leg < len(self._plan.legs):
             self._aim_at(leg)
 
@@ -219,10 +225,6 @@ class Teleop:
     def _to(self) -> Leg:
         """The leg that is flown."""
         return self._plan.legs[self._leg]
-
-    def _known_on_board(self, seen: Seen) -> int:
-        """How many waypoints of this mission the robot knows to be reached."""
-        return seen.reached if seen.mission_id == self._mission_id != 0 else 0
 
     def _advance(self, how: str, now_ns: int) -> None:
         """The waypoint is reached: on to the next, or done."""
@@ -260,8 +262,7 @@ class Teleop:
 
     def _check_time(self, now_ns: int) -> None:
         elapsed, flown = self.elapsed(now_ns), self._watch.flown
-        late = overdue(self._plan, self._leg, self.state, elapsed, flown)
-        if late is not None:
+        if late := overdue(self._plan, self._leg, self.state, elapsed, flown):
             self._end(*late, now_ns)
 
     def _end(self, code: str, text: str, now_ns: int) -> None:

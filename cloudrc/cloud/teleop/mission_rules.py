@@ -55,6 +55,11 @@ def refuse_unless_fitting(verb: Verb, state: State) -> None:
         raise BadInputError(f"{name}: the mission is {state.name}; {why}")
 
 
+def known_on_board(seen: Seen, mission_id: int) -> int:
+    """How many waypoints of a mission the robot knows to be reached."""
+    return seen.reached if seen.mission_id == mission_id != 0 else 0
+
+
 def harm_in(seen: Seen, mission_id: int, world: str, *, known: bool) -> tuple[str, str] | None:
     """Say what ends a mission that is under way, if anything seen does: code and text.
 
