@@ -158,7 +158,7 @@ class Descent:
             reference: As followed so far [m/s], world frame, shape (3,).
             readings: Of the sensors on board.
         """
-        if reference[2] > -self.speed or abs(readings.velocity[2]) >= STILL:
+        if reference[2] > -0.5 * self.speed or abs(readings.velocity[2]) >= STILL:
             self._moved_ns = now_ns
         return now_ns - self._moved_ns >= TOUCH_DOWN_NS
 

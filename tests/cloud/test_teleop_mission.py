@@ -53,12 +53,13 @@ def test_the_old_world_does_not_acknowledge_a_start_from_the_spawn():
     flight.operate(StartMission(PLAN))
     flight.downlink = False
     flight.step()
-    flight.mission = flight.requests[0].number
-    flight.step(seconds=0.1)
+    flight.mission = flight.requests[0].number  # a predecessor's word, by chance of this number
+    flight.step(seconds=0.15)
     assert flight.state == "STARTING"
-    flight.epoch += 1
-    flight.step()
-    assert flight.state == "FLYING"
+    assert flight.requests[-1].number == flight.requests[0].number + 1
+    flight.downlink = True
+    flight.step(seconds=0.15)
+    assert (flight.state, flight.epoch) == ("FLYING", 2)
 
 
 def test_a_start_from_here_needs_no_new_world():

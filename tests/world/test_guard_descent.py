@@ -69,3 +69,13 @@ def test_a_slow_robot_lands_slowly_and_its_landing_can_be_called_off():
     guard.acknowledge(3 * SECOND)
     run(guard, 3 * SECOND, 3 * SECOND + 10 * MS, velocity=(0.0, 0.0, -0.15))
     assert guard.state is HOLD
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
+def test_a_robot_that_lands_near_the_fence_touches_down_though_it_is_pulled_inwards(share):
+    """The pull takes some of the descent's speed: both together are no faster than the creep."""
+    x, y, _ = fence.HIGH
+    guard, place = landing(), (x - share, y - share, 0.1)
+    stood = run(guard, 2 * SECOND, 4 * SECOND, place)
+    assert None in stood
+    assert guard.take_changes()[-1].cause == "touched down, rotors stopped"

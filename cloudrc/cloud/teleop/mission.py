@@ -7,8 +7,8 @@ A pure state machine (`State`), joined to controller and robot by messages only:
     teleop.handle_deadline(now_ns)      regularly, at 10 Hz or faster
     teleop.take_outputs()               after any of them: Setpoint, OperatorRequest, MissionEvent
 
-A `Setpoint` holds until the next; an `OperatorRequest` comes out at 10 Hz until the robot is seen
-to have acted on it; each `MissionEvent` comes out once.
+A `Setpoint` holds until the next, for one session; an `OperatorRequest` comes out at 10 Hz until
+the robot is seen to have acted on it; each `MissionEvent` comes out once.
 
               StartMission             start seen             every waypoint reached
         IDLE -------------> STARTING -------------> FLYING --------------------------> DONE
@@ -24,6 +24,8 @@ of the caller's clock.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 from cloudrc.cloud.teleop import mission_rules as rules
 from cloudrc.cloud.teleop.messages import (
@@ -45,13 +47,12 @@ from cloudrc.cloud.teleop.messages import (
 from cloudrc.cloud.teleop.mission_leg import LegWatch, overdue, where
 from cloudrc.cloud.teleop.plan import NO_PLAN, Leg, Plan
 from cloudrc.cloud.teleop.request import Repeater
-from cloudrc.messages import MISSION_OVER, GuardState, Request, Setpoint, Start, Vector
+from cloudrc.messages import MISSION_OVER, GuardState, Request, Setpoint, Start
 from cloudrc.records import MissionEvent
 
 # An enum's member is slow to look up; these are asked for in every period.
 FLYING, STARTING = State.FLYING, State.STARTING
 UNDER_WAY = rules.UNDER_WAY
-NO_WAYPOINT = -1
 
 
 class Teleop:
@@ -59,29 +60,26 @@ class Teleop:
 
     Attributes:
         state: Of the mission.
+        leg: Index of the waypoint that is flown to; the number of waypoints once all are reached.
         outcome: How it ended; None while there is none or it is under way.
         requests: What is asked of the robot.
         outputs: What it has said since the last `take_outputs`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
+        """Begin at rest; `ended` says of a mission's number whether it is known to be over."""
         self.state = State.IDLE
         self.outcome: Outcome | None = None
         self.requests = Repeater()
         self.outputs: list[Output] = []
         self._seen: Seen | None = None
-        self._plan, self._mission_id = NO_PLAN, 0
-        self._leg, self._watch = 0, LegWatch()
-        self._world = rules.ANY_WORLD
+        self._plan, self._mission_id, self._is_ended = NO_PLAN, 0, ended
+        self.leg, self._watch = 0, LegWatch()
+        self._world, self._began_ns = rules.ANY_WORLD, 0
         self._continued: Continue | None = None
-        self._unaimed = self._told = False  # told: the robot has been of this mission
-        self._yaw = 0.0
-        self._began_ns = 0
-
-    @property
-    def leg(self) -> int:
-        """Index of the waypoint that is flown to; the number of waypoints once all are reached."""
-        return self._leg
+        self._unaimed = self._from_spawn = False  # from_spawn: and not continued from elsewhere
+        self._told = False  # the robot has been, of this mission
+        self._setpoint: Setpoint | None = None
 
     @property
     def settled(self) -> bool:
@@ -128,16 +126,17 @@ class Teleop:
             case Acknowledge():
                 self.requests.ask(Request.ACKNOWLEDGE, after=True)
             case Pause():
-                self._tell("paused", self._leg, f"paused by shutdown {self._where()}", now_ns)
+                self._tell("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
                 self.requests.ask(Request.END)
 
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry, at the instant [ns] at which it arrives."""
-        before, self._seen = self._seen, seen
-        onboard = rules.known_on_board(seen, self._mission_id)
+        anew = self._seen is None or self._seen.epoch != seen.epoch
+        self._seen, told = seen, self._setpoint
+        onboard, legs = rules.known_on_board(seen, self._mission_id), self._plan.legs
         started = self.requests.see(seen) is Request.START and self.state is STARTING
         if self.state not in UNDER_WAY:
-            if before is None or seen.epoch != before.epoch:
+            if anew:
                 self._find(seen)
         elif harm := rules.harm_in(seen, self._mission_id, self._world, known=self._told):
             code, text = harm
@@ -146,27 +145,33 @@ class Teleop:
             self._begin(seen, now_ns)
         elif self._unaimed:
             self._aim_ahead(seen)
-        while self._leg < onboard and self.state in (FLYING, State.HELD):
+        while self.leg < onboard and self.state in (FLYING, State.HELD):
             self._advance("known on board to be reached", now_ns)  # kept there, and lost here
-        while self.state is FLYING and self._watch.is_reached(self._to, seen, now_ns):
+        while self.state is FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
+        if anew and told is self._setpoint:
+            self._aim_again()
 
     def handle_deadline(self, now_ns: int) -> None:
         """Check the limits of time and repeat the request that is due at `now_ns` [ns]."""
         if self.state in UNDER_WAY:
-            self._check_time(now_ns)
+            elapsed, flown = self.elapsed(now_ns), self._watch.flown
+            if late := overdue(self._plan, self.leg, self.state, elapsed, flown):
+                self._end(*late, now_ns)
         if (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
 
     def _find(self, seen: Seen) -> None:
         """Without a mission: what flies is held; what stands, for one lost here, shall stay."""
-        if seen.guard is GuardState.GROUND and seen.mission_id not in (0, self._mission_id):
+        told = seen.mission_id
+        if told != self._mission_id and (self._is_ended(told) or rules.stands_for(told, seen)):
             self.requests.ask(Request.END, after=True)
         self._aim_here()
 
     def _start(self, plan: Plan, mission_id: int, now_ns: int) -> None:
         self.state, self.outcome = STARTING, None
-        self._plan, self._leg, self._continued = plan, 0, None
+        self._plan, self.leg, self._continued = plan, 0, None
+        self._from_spawn = plan.start is Start.SPAWN
         self._mission_id, self._began_ns = mission_id, now_ns
         seen = self._seen
         self._world = seen.world if seen and plan.start is Start.HERE else rules.ANY_WORLD
@@ -178,13 +183,13 @@ class Teleop:
     def _go_on(self, before: Continue, now_ns: int) -> None:
         """Start again from here, at the waypoint that was flown to."""
         self.state, self.outcome = STARTING, None
-        self._plan, self._leg, self._continued = before.plan, before.leg, before
+        self._plan, self.leg, self._continued = before.plan, before.leg, before
         self._mission_id, self._world = before.mission_id, before.world
-        self._unaimed, self._told = not before.held, True
+        self._unaimed, self._told, self._from_spawn = not before.held, True, False
         self._began_ns = now_ns - round(before.elapsed * 1e9)
-        self.requests.report(self._mission_id, self._leg)
+        self.requests.report(self._mission_id, self.leg)
         self.requests.ask(Request.START, Start.HERE)
-        if self._seen is not None:
+        if self._seen:
             self.see(self._seen, now_ns)  # it may be over, or the world another one
 
     def _begin(self, seen: Seen, now_ns: int) -> None:
@@ -195,14 +200,14 @@ class Teleop:
         self._world = seen.world
         if before is not None:
             text = f"resumed after a restart of teleop {self._where()}"
-            self._tell("resumed", self._leg, text, now_ns)
+            self._tell("resumed", self.leg, text, now_ns)
             if before.held:
                 self._hold(now_ns)
             return
         self._began_ns = now_ns
         if self._unaimed:
             self._unaimed = False
-            self._aim_at(self._leg)
+            self._aim_at(self.leg)
         place = "the spawn" if plan.start is Start.SPAWN else "here"
         text = f"mission started from {place}, waypoints: {len(plan.legs)}"
         self._tell("started", 0, text, now_ns)
@@ -213,63 +218,59 @@ class Teleop:
         Not while the robot may still fly a mission whose end was lost: it would leave at once, past
         the spawn, for a waypoint that is to be flown to from there.
         """
-        anew = self._plan.start is Start.SPAWN and self._continued is None
-        if not self._unaimed or seen is None or (anew and not self.requests.waits):
+        if not self._unaimed or seen is None or (self._from_spawn and not self.requests.waits):
             return
         self._unaimed = False
-        leg = 0 if anew else max(self._leg, rules.known_on_board(seen, self._mission_id))
+        onboard = rules.known_on_board(seen, self._mission_id)
+        leg = 0 if self._from_spawn else max(self.leg, onboard)
         if leg < len(self._plan.legs):
             self._aim_at(leg)
 
-    @property
-    def _to(self) -> Leg:
-        """The leg that is flown."""
-        return self._plan.legs[self._leg]
+    def _aim_again(self) -> None:
+        """Cloud forgets the setpoint with its session: somebody else may have moved the robot."""
+        if self.state is STARTING and self._from_spawn and not self.requests.waits:
+            self._unaimed = True
+            self._aim_here()
+        elif self._setpoint is not None:
+            self.outputs.append(self._setpoint)
 
     def _advance(self, how: str, now_ns: int) -> None:
         """The waypoint is reached: on to the next, or done."""
-        index, count = self._leg, len(self._plan.legs)
-        text = f"{where(self._plan, self._leg)} {how} at {self.elapsed(now_ns):.2f} s"
-        self._tell("reached", index, text, now_ns)
-        self._leg += 1
-        self.requests.report(self._mission_id, self._leg)
-        if self._leg < count:
+        text = f"{where(self._plan, self.leg)} {how} at {self.elapsed(now_ns):.2f} s"
+        self._tell("reached", self.leg, text, now_ns)
+        self.leg += 1
+        self.requests.report(self._mission_id, self.leg)
+        if self.leg < len(self._plan.legs):
             self._watch.begin()
             if self.state is FLYING:
-                self._aim_at(self._leg)
+                self._aim_at(self.leg)
         else:
-            text = f"mission done at {self.elapsed(now_ns):.2f} s"
-            self._end("done", text, now_ns)
+            self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
 
     def _hold(self, now_ns: int) -> None:
         self.state = State.HELD
         self._aim_here()
-        self._tell("held", self._leg, f"held {self._where()}", now_ns)
+        self._tell("held", self.leg, f"held {self._where()}", now_ns)
 
     def _resume(self, now_ns: int) -> None:
         self.state = State.FLYING
         self._watch.pause()
-        self._aim_at(self._leg)
-        self._tell("resumed", self._leg, f"resumed {self._where()}", now_ns)
+        self._aim_at(self.leg)
+        self._tell("resumed", self.leg, f"resumed {self._where()}", now_ns)
 
     def _go_to(self, leg: Leg, mission_id: int, now_ns: int) -> None:
         x, y, z = leg.position
-        self._tell("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
+        self._tell("goto", rules.NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
         if self.state is State.HELD:
-            self._aim(leg.position, leg.yaw, NO_WAYPOINT)
+            self._aim(Setpoint(leg.position, leg.yaw, rules.NO_WAYPOINT))
         else:
             self._start(Plan((leg,), Start.HERE, leg.time_limit), mission_id, now_ns)
 
-    def _check_time(self, now_ns: int) -> None:
-        elapsed, flown = self.elapsed(now_ns), self._watch.flown
-        if late := overdue(self._plan, self._leg, self.state, elapsed, flown):
-            self._end(*late, now_ns)
-
     def _end(self, code: str, text: str, now_ns: int) -> None:
         """However the mission ends, the robot is asked to hold where it is."""
-        waypoint = min(self._leg, len(self._plan.legs) - 1)
+        waypoint = min(self.leg, len(self._plan.legs) - 1)
         self.state = rules.ENDS.get(code, State.FAILED)
-        self.outcome = Outcome(code, text, waypoint, reached=self._leg)
+        self.outcome = Outcome(code, text, waypoint, reached=self.leg)
         if code != "done" and self._mission_id:
             self.requests.report(self._mission_id, MISSION_OVER)
         on_ground = self._seen is not None and self._seen.guard is GuardState.GROUND
@@ -282,19 +283,18 @@ class Teleop:
 
     def _aim_at(self, leg: int) -> None:
         to = self._plan.legs[leg]
-        self._aim(to.position, to.yaw, leg)
+        self._aim(Setpoint(to.position, to.yaw, leg))
 
     def _aim_here(self) -> None:
         if self._seen is not None:
-            x, y, z = self._seen.position
-            self._aim((x, y, max(z, rules.HELD_LOWEST)), self._yaw, NO_WAYPOINT)
+            self._aim(rules.held_at(self._seen, self._setpoint))
 
-    def _aim(self, position: Vector, yaw: float, waypoint: int) -> None:
-        self._yaw = yaw
-        self.outputs.append(Setpoint(position, yaw, waypoint))
+    def _aim(self, setpoint: Setpoint) -> None:
+        self._setpoint = setpoint
+        self.outputs.append(setpoint)
 
     def _tell(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
         self.outputs.append(MissionEvent(now_ns, event, waypoint, text))
 
     def _where(self) -> str:
-        return f"on the way to {where(self._plan, self._leg)}"
+        return f"on the way to {where(self._plan, self.leg)}"

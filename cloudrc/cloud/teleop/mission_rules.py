@@ -17,7 +17,7 @@ from cloudrc.cloud.teleop.messages import (
 )
 from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
-from cloudrc.messages import MISSION_OVER, GuardState
+from cloudrc.messages import MISSION_OVER, GuardState, Setpoint
 
 WORST_GUARD = GuardState.HOLD
 ANY_WORLD = ""
@@ -25,6 +25,7 @@ ANY_WORLD = ""
 HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
 """No robot is held lower [m]: it would scrape along the floor. One that has not taken off yet does,
 and is held there. Source: the guard's HOLD, docs/safety/guard.md."""
+NO_WAYPOINT = -1
 UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
 ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
 """By their codes; every other one is a failure."""
@@ -55,9 +56,21 @@ def refuse_unless_fitting(verb: Verb, state: State) -> None:
         raise BadInputError(f"{name}: the mission is {state.name}; {why}")
 
 
+def held_at(seen: Seen, before: Setpoint | None) -> Setpoint:
+    """Where a robot is held that is seen there; it looks as it was told before."""
+    x, y, z = seen.position
+    yaw = 0.0 if before is None else before.yaw
+    return Setpoint((x, y, max(z, HELD_LOWEST)), yaw, NO_WAYPOINT)
+
+
 def known_on_board(seen: Seen, mission_id: int) -> int:
     """How many waypoints of a mission the robot knows to be reached."""
     return seen.reached if seen.mission_id == mission_id != 0 else 0
+
+
+def stands_for(mission_id: int, seen: Seen) -> bool:
+    """Whether the robot stands on the ground, told of a mission: it may be ready to take off."""
+    return seen.guard is GuardState.GROUND and mission_id != 0
 
 
 def harm_in(seen: Seen, mission_id: int, world: str, *, known: bool) -> tuple[str, str] | None:

@@ -33,6 +33,7 @@ class Repeater:
         self._number = UNNUMBERED
         self._asked_epoch = 0
         self._ended_epoch = NO_EPOCH  # in which a mission's end was acted on, and no start since
+        self._stands = False  # a start was acted on, and nothing has been asked since
         self._due_ns = 0
 
     @property
@@ -62,6 +63,7 @@ class Repeater:
             after: Whether to wait until the robot has acted on what was asked before.
         """
         asked = self._progress._replace(request=request, start=start)
+        self._stands = False
         if self._pending is not None and self._pending.request is Request.START:
             self._ended_epoch = NO_EPOCH  # it may have been acted on
         if self._pending is not None and (after or self.stopping):
@@ -72,6 +74,7 @@ class Repeater:
 
     def forget(self) -> None:
         """Ask nothing any more, for the robot flies for somebody else; but stop it all the same."""
+        self._stands = False
         if not self.stopping:
             self._pending = self._afterwards = None
 
@@ -88,11 +91,25 @@ class Repeater:
             What was asked, once: when it is seen to have been acted on.
         """
         self._seen, pending = seen, self._pending
-        if pending is None or not self._is_acknowledged(pending, seen):
+        if pending is None:
+            self._stand_by_start(seen)
+            return None
+        if not self._is_acknowledged(pending, seen):
             return None
         self._pending, self._afterwards = self._afterwards, None
-        self._ended_epoch = NO_EPOCH if pending.request is Request.START else seen.epoch
+        self._stands = pending.request is Request.START and self._pending is None
+        if pending.request is Request.START:
+            self._ended_epoch = NO_EPOCH
+        elif pending.request is not Request.ACKNOWLEDGE:  # which ends nothing
+            self._ended_epoch = seen.epoch
         return pending.request
+
+    def _stand_by_start(self, seen: Seen) -> None:
+        """A predecessor's last word, late, has passed our start by: the robot is told again."""
+        passed_by = self._stands and 0 < self._number < seen.mission
+        if passed_by and seen.guard <= GuardState.HOLD:
+            if seen.mission_id == self._progress.mission_id:
+                self.ask(Request.START, Start.HERE)
 
     def due(self, now_ns: int) -> OperatorRequest | None:
         """Return the request if a copy of it has to leave at `now_ns` [ns]."""
@@ -101,8 +118,9 @@ class Repeater:
             return None
         if pending is None:
             return self._progress_due(seen, now_ns)
-        # A higher number than ours was acted on: an emergency stop has passed us by.
-        if pending.number == UNNUMBERED or seen.mission > pending.number:
+        # A higher number than ours was acted on: an emergency stop has passed us by. Or our very
+        # number, by a predecessor: ours would be seen by now.
+        if pending.number == UNNUMBERED or seen.mission >= pending.number:
             rise = 1 if self._number else PREDECESSORS
             self._number = max(self._number, seen.mission) + rise
             pending = self._pending = pending._replace(number=self._number)

@@ -63,13 +63,13 @@ class MissionService:
             salt: Random, so that the robot never takes a mission for one of another journal.
         """
         self._contact_speed_max = contact_speed_max
-        self._teleop = Teleop()
         self._outputs: list[Output | Fault] = []
         self._sight = Sight()
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
         self.book = MissionBook(write, entries, salt)
+        self._teleop = Teleop(self.book.has_ended)
 
     @property
     def over(self) -> bool:

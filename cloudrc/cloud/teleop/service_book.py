@@ -97,6 +97,10 @@ class MissionBook:
             raise UnknownMissionError(f"no mission '{mission_id}'; 'cloudrc mission list' has all")
         return mission
 
+    def has_ended(self, number: int) -> bool:
+        """Whether a mission, by the number under which the robot knows it, is over."""
+        return any(mission.number == number and mission.ended for mission in self.missions.values())
+
     def with_key(self, key: str) -> Mission | None:
         """Give the mission that was ordered under a key, if any."""
         found = (m for m in self.missions.values() if key and m.order.key == key)
