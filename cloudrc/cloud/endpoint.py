@@ -26,7 +26,7 @@ from cloudrc.messages import (
 )
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import USED, Channel
+from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
 from cloudrc.tunnel.complaints import BUSY, SILENCE, Complaints
 from cloudrc.tunnel.knocker import Knocker
@@ -206,7 +206,8 @@ class CloudEndpoint:
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
         """Take the epoch that world hands out to this very process, if it is a new one."""
-        agreement = self._knocker.accepted(epoch, accept, self._session.epoch)
+        asks, before = self._asks(now_ns), self._session.epoch
+        agreement = self._knocker.accepted(epoch, accept, before, asks=asks)
         if agreement is None:
             self._counts["accept_ignored"] += 1
             return
@@ -223,8 +224,8 @@ class CloudEndpoint:
 
     def _receive_telemetry(self, epoch: int, counter: int, body: bytes, now_ns: int) -> None:
         """Whatever arrives for this epoch is noted; loop and teleop get the newest."""
-        self._heard_ns = now_ns
         outcome = self._channel.take(counter)
+        self._heard_ns = self._heard_ns if outcome == REPEATED else now_ns  # those anybody can send
         self._counts[outcome] += 1
         used, delay = outcome == USED, nan
         if self._clock_is_shared:

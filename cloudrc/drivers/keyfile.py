@@ -38,7 +38,7 @@ class KeyFile:
         self._path = path
         self._seen = version(path)
         self._keys = read_keys(path)
-        self._due_ns = now_ns
+        self._due_ns, self._trouble = now_ns, ""
         self.ring = KeyRing(self._keys, now_ns, wall)
         self._caution = "" if wall is None else self._keys.caution(wall)
 
@@ -63,7 +63,10 @@ class KeyFile:
         try:
             keys = read_keys(self._path)
         except BadInputError as error:
-            return [Fault(now_ns, "key", f"the keys stay as they were: {error}")]
+            self._seen = None  # who may read it leaves no trace in what is seen of a file
+            told, self._trouble = self._trouble, f"the keys stay as they were: {error}"
+            return [] if told == self._trouble else [Fault(now_ns, "key", self._trouble)]
+        self._trouble = ""
         if keys == self._keys:
             return []
         before, self._keys = self.ring.current, keys

@@ -64,8 +64,9 @@ COOKIE_NS = 2_000_000_000
 GRACE_NS = 1_000_000_000
 """Authority of a cloud whose session is new, until it is heard for the first time [ns]."""
 REPEATS_MAX = 3
-"""An incumbent that is accepted so often and goes on asking, with another key than the epoch began
-with, has dropped that one before it learnt of the epoch: it gets a new epoch, under its own."""
+"""An incumbent that is accepted so often and goes on asking gets a new epoch, under its own key, if
+it has another one than the epoch began with, which it has dropped before it learnt of the epoch, or
+is not heard, so that there is nothing to lose."""
 USED_MAX = 64
 """Old nonces remembered; at ten answers a second none is forgotten while its cookie is valid."""
 
@@ -186,7 +187,8 @@ class Door:
         if hello.nonce == self._incumbent.nonce:
             session = self._session
             self._repeated += 1
-            if session.greeting_key == session.epoch_key or self._repeated <= REPEATS_MAX:
+            begun_with_it = session.greeting_key == session.epoch_key
+            if self._repeated <= REPEATS_MAX or (begun_with_it and now_ns <= self._fresh_until_ns):
                 # Whichever key this hello has: cloud takes the answer's for the key of the epoch.
                 return Answer("hello", [session.greet(ACCEPT, self._accept(), session.epoch_key)])
         elif hello.nonce in self._used:
@@ -201,9 +203,10 @@ class Door:
         self._begin(agreement, self._session.greeting_key)
         return self._answer("hello", ACCEPT, self._accept(), opened=True)
 
-    def move_on(self) -> bytes:
-        """Open the next epoch of the same session; the datagram that tells cloud."""
+    def move_on(self, now_ns: int) -> bytes:
+        """Open the next epoch of the same session [ns]; the datagram that tells cloud."""
         self._begin()
+        self._fresh_until_ns = now_ns + max(GRACE_NS, self._age_max_ns)  # until it can be heard
         return self._session.greet(ACCEPT, self._accept())
 
     def _remember(self, nonce: bytes, counter: int) -> None:

@@ -16,6 +16,8 @@ REPLIES_MAX = 3
 """Challenges that cloud answers at once, between two hellos of its own accord."""
 COOKIES_MAX = 4096
 """Cookies that cloud remembers: over two hours of world's, a slot each."""
+EPOCHS = 2**32
+"""An epoch that is less than half of them ahead is newer; after the last one comes 1."""
 LEFT_MAX = 64
 """Earlier world processes remembered."""
 
@@ -63,32 +65,46 @@ class Knocker:
         """Take a refusal; whether it is one of what cloud asks for, by another's authority."""
         if busy.nonce != self._nonce:
             return False
-        if busy.used:  # ours, but lost to another cloud meanwhile: ask under another name
-            self._nonces += 1
-            text = b"%s %d" % (self._seed, self._nonces)
-            self._nonce = hashlib.sha256(text).digest()[:16]
+        if busy.used:  # ours, but lost to another cloud meanwhile
+            self._rename()
         return not busy.used
 
-    def accepted(self, epoch: int, accept: Accept, current: int) -> Agreement | None:
+    def accepted(self, epoch: int, accept: Accept, current: int, *, asks: bool) -> Agreement | None:
         """Take an acceptance.
+
+        Another world is taken while cloud asks only: what a process that is gone has sent may come
+        late. Was it taken all the same, the one that lives is among those left: it answers what
+        cloud goes on asking, and is asked under another name.
 
         Args:
             epoch: From its header.
             accept: Its body.
             current: Epoch of the session until now.
+            asks: Whether cloud wants a session: it has none, or does not hear world in it.
 
         Returns:
             What the session under the new epoch rests on; None if this is not for us, or old.
         """
-        if accept.nonce != self._nonce or accept.world_nonce in self._left:
+        known = accept.world_nonce == self._world
+        if accept.nonce != self._nonce or (self._world and not known and not asks):
             return None
-        if accept.world_nonce == self._world:
-            if epoch <= current:
+        if accept.world_nonce in self._left:
+            self._rename()
+            return None
+        if known:
+            if not 0 < (epoch - current) % EPOCHS < EPOCHS // 2:
                 return None
         elif self._world:
             self._left.append(self._world)  # a process that is gone does not come back
         self._world = accept.world_nonce
         return Agreement(accept.nonce, accept.world_nonce, accept.suite)
+
+    def _rename(self) -> None:
+        """Ask under another name, of which nothing has been captured."""
+        self._nonces += 1
+        text = b"%s %d" % (self._seed, self._nonces)
+        self._nonce = hashlib.sha256(text).digest()[:16]
+        self._left.clear()
 
     def _hello(self) -> bytes:
         return encode_hello(Hello(self._nonce, self._clock, self._cookie, self._suite))

@@ -51,7 +51,9 @@ REKEY_DATAGRAMS = 2**32
 """Of all kinds. Deviation: WireGuard's 2^60; the design asks for 2^32."""
 GENERATIONS = 256
 AHEAD_MAX = 127
-"""Generations that a peer may be ahead; over four hours of silence at 120 s each."""
+"""Generations that a peer may be ahead without a silence; the header has one byte of them."""
+SILENT_MAX = 64 * GENERATIONS
+"""And so many after the longest silence; over a week of it, a peer moves on twice as often."""
 KEPT = 3
 """Generations that are opened side by side: late datagrams, and a key that is announced."""
 
@@ -100,6 +102,7 @@ class Session:
         self._announced: tuple[int, Cipher] | None = None
         self._openers: dict[int, Opener] = {}  # by generation as the header has it: one byte of it
         self._newest = 0  # generation that the peer was last heard with for the first time
+        self._newest_ns = self._tended_ns = now_ns  # when that was, by the last look
         self._heard = ring.current  # key that the peer was last heard with
         self._tried: dict[int, list[Opener]] = {}
 
@@ -123,7 +126,7 @@ class Session:
         self._announced = None
         self._cipher = self._derive(self._key, self._sends, 0)
         self._openers = {0: (self._derive(self._key, self._opens, 0), self._key)}
-        self._newest = 0
+        self._newest, self._newest_ns = 0, self._tended_ns
         self._tried = {}
 
     def seal(self, kind: int, body: bytes) -> bytes:
@@ -162,7 +165,9 @@ class Session:
         try:
             body = opener[0].decrypt(data[4:16], data[16:], data[:16])
         except InvalidTag:
-            raise DecodeError("tag") from None
+            if self._silent < GENERATIONS - KEPT:
+                raise DecodeError("tag") from None
+            return kind, direction, epoch, counter, self._open_ahead(data, generation)
         self._heard = opener[1]
         return kind, direction, epoch, counter, body
 
@@ -176,7 +181,7 @@ class Session:
         Returns:
             Datagrams to send: the announcement of a key that the peer has not used yet.
         """
-        self.accepted = self.ring.accepted(now_ns)
+        self.accepted, self._tended_ns = self.ring.accepted(now_ns), now_ns
         if not self.epoch:
             return []
         self._tried = {}
@@ -217,29 +222,42 @@ class Session:
     def _open_ahead(self, data: bytes, byte: int) -> bytes:
         """Open a datagram of a generation that is new to us; keep its key if the tag is right.
 
-        One that lies a little behind is, too, if its key was not accepted for a while.
+        One that lies a little behind is, too, if its key was not accepted for a while. After a
+        silence the byte in the header stands for several.
         """
         ahead = (byte - self._newest + KEPT - 1) % GENERATIONS - KEPT + 1
-        generation = self._newest + ahead
-        if ahead > AHEAD_MAX or generation < 0:
-            raise DecodeError("tag")
-        candidates = self._tried.get(generation)
-        if candidates is None:  # kept, so that a flood of forged ones derives no key twice
-            candidates = self._tried[generation] = [
-                (self._derive(key, self._opens, generation), key) for key in self.accepted
-            ]
-        for cipher, key in candidates:
-            try:
-                body = cipher.decrypt(data[4:16], data[16:], data[:16])
-            except InvalidTag:
-                continue
-            self._keep(generation, (cipher, key))
-            return body
+        last = self._newest + AHEAD_MAX + self._silent
+        first = self._newest + ahead
+        for generation in range(
+            first if first >= 0 else first + GENERATIONS, last + 1, GENERATIONS
+        ):
+            for cipher, key in self._candidates(generation):
+                try:
+                    body = cipher.decrypt(data[4:16], data[16:], data[:16])
+                except InvalidTag:
+                    continue
+                self._keep(generation, (cipher, key))
+                return body
         raise DecodeError("tag")
 
+    @property
+    def _silent(self) -> int:
+        """How many generations the peer may have moved on by since it was heard with a new one."""
+        return min(2 * (self._tended_ns - self._newest_ns) // REKEY_NS, SILENT_MAX)
+
+    def _candidates(self, generation: int) -> list[Opener]:
+        """What may open a generation; kept, so that a flood of forged ones derives no key twice."""
+        if generation not in self._tried:
+            self._tried[generation] = [
+                (self._derive(key, self._opens, generation), key) for key in self.accepted
+            ]
+        return self._tried[generation]
+
     def _keep(self, generation: int, opener: Opener) -> None:
+        if generation > self._newest + KEPT:  # after a silence: their bytes are the next ones' soon
+            self._openers.clear()
         self._openers[generation % GENERATIONS] = opener
-        self._newest = generation
+        self._newest, self._newest_ns = generation, self._tended_ns
         while len(self._openers) > KEPT:
             del self._openers[next(iter(self._openers))]
         if opener[1] == self.ring.current != self._key:

@@ -262,7 +262,7 @@ class WorldEndpoint:
         self._touches = Touches()
         if request.start is Start.SPAWN:
             self.robot.put_on_ground(now_ns, "mission starts from spawn")
-            self._greet([self._door.move_on()])
+            self._greet([self._door.move_on(now_ns + self._clock.slip_ns)])
             self._begin_epoch("mission starts from spawn")
         self.robot.guard.start_mission(now_ns)
 

@@ -77,6 +77,25 @@ def test_a_file_that_is_wrong_leaves_the_keys_and_is_told_once(path: Path, wrong
     assert keys.ring.current == Key(SECOND)
 
 
+def test_a_file_that_cannot_be_read_for_a_while_is_taken_as_soon_as_it_can(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who may read it changes nothing of what is seen of it from outside."""
+    keys = KeyFile(path, 0)
+    put(path, SECOND)
+    with monkeypatch.context() as forbidden:
+        forbidden.setattr(Path, "open", forbid)
+        (said,) = keys.follow(PERIOD_NS)
+        assert "Permission denied" in said.text
+        assert keys.follow(2 * PERIOD_NS) == []
+    keys.follow(3 * PERIOD_NS)
+    assert keys.ring.current == Key(SECOND)
+
+
+def forbid(*args: object) -> None:
+    raise PermissionError(13, "Permission denied")
+
+
 def test_a_file_that_is_gone_leaves_the_keys(path: Path) -> None:
     keys = KeyFile(path, 0)
     path.unlink()

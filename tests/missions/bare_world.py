@@ -112,7 +112,7 @@ class BareCloud:
             self.knocker.refused(codec.decode_busy(body))
         if kind == Kind.ACCEPT:
             accept = codec.decode_accept(body)
-            agreement = self.knocker.accepted(epoch, accept, self.session.epoch)
+            agreement = self.knocker.accepted(epoch, accept, self.session.epoch, asks=True)
             if agreement is not None:
                 self.session.begin(epoch, agreement)
         return None

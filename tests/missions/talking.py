@@ -68,7 +68,8 @@ class Talk:
                 self.send(session.greet(Kind.HELLO, knocker.challenged(cookie)))
                 answers = self.hear(Kind.ACCEPT)
         for _, epoch, body in answers:
-            agreement = knocker.accepted(epoch, codec.decode_accept(body), session.epoch)
+            accept = codec.decode_accept(body)
+            agreement = knocker.accepted(epoch, accept, session.epoch, asks=True)
             if agreement is not None:
                 session.begin(epoch, agreement)
             return epoch

@@ -11,6 +11,7 @@ from cloudrc.tunnel.handshake import (
     CHALLENGE_NS,
     COOKIE_NS,
     EPOCH_MAX,
+    GRACE_NS,
     REPEATS_MAX,
     Door,
     epochs_after,
@@ -144,7 +145,9 @@ def test_a_session_rests_on_the_key_of_its_hello():
             assert key.verifies(data[:-16], data[-16:])
         assert step.world._key == key
         assert step.world._openers[0][1] == key
-        assert key.verifies(*(lambda told: (told[:-16], told[-16:]))(step.door.move_on()))
+        assert key.verifies(
+            *(lambda told: (told[:-16], told[-16:]))(step.door.move_on(step.now_ns))
+        )
         step.now_ns += 2 * SECOND_NS
 
 
@@ -176,7 +179,7 @@ def test_an_acceptance_that_is_repeated_names_the_key_that_its_epoch_began_with(
             (data,) = step.knock(cookie=step.door._cookie(step.now_ns)).datagrams
             assert codec.peek(data)[:2] == (Kind.ACCEPT, epoch)
             assert epoch_key.verifies(data[:-16], data[-16:])
-        step.door.move_on()
+        step.door.move_on(step.now_ns)
     assert step.world._openers[0][1] == new
 
 
@@ -242,10 +245,36 @@ def test_a_repeat_does_not_count_as_a_sign_of_life(step):
     assert step.knock(b"m" * 16, step.cookie()).opened
 
 
+def test_an_incumbent_that_asks_and_is_not_heard_gets_another_epoch(step):
+    """What it seals cannot be opened here, for whatever reason: nothing is lost with the epoch."""
+    step.knock(cookie=step.cookie())
+    for counter in range(2 * REPEATS_MAX):
+        step.now_ns += SECOND_NS // 5
+        step.door.admit(Kind.ALIVE, counter, step.now_ns)
+        assert not step.knock(cookie=step.door._cookie(step.now_ns)).opened
+    opened = []
+    for _ in range(2 * REPEATS_MAX):
+        step.now_ns += SECOND_NS // 2
+        opened.append(step.knock(cookie=step.door._cookie(step.now_ns)).opened)
+    assert opened.index(True) == REPEATS_MAX - 1
+    assert step.world.epoch == 2
+
+
+def test_who_has_a_session_is_given_time_to_be_heard_in_its_next_epoch(step):
+    step.knock(cookie=step.cookie())
+    step.door.admit(Kind.OPERATOR, 0, step.now_ns)
+    step.now_ns += 250 * MS
+    step.door.move_on(step.now_ns)
+    step.now_ns += GRACE_NS
+    assert step.knock(b"another".ljust(16), step.cookie()).outcome == "busy"
+    step.now_ns += 1
+    assert step.knock(b"another".ljust(16), step.cookie()).opened
+
+
 def test_a_new_epoch_of_the_same_session_keeps_who_has_it(step):
     step.knock(cookie=step.cookie())
     step.door.admit(Kind.OPERATOR, 0, step.now_ns)
-    kind, epoch, _ = codec.peek(step.door.move_on())[0], step.world.epoch, None
+    kind, epoch, _ = codec.peek(step.door.move_on(step.now_ns))[0], step.world.epoch, None
     assert (kind, epoch) == (Kind.ACCEPT, 2)
     step.door.admit(Kind.OPERATOR, 0, step.now_ns)  # counters begin again
 

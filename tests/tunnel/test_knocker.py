@@ -71,32 +71,63 @@ def accept(nonce=NONCE, world=WORLD, suite=AES_256_GCM):
     return Accept(nonce, world, CLOCK, suite)
 
 
+def accepted(knocker, epoch, answer, current, *, asks=True):
+    return knocker.accepted(epoch, answer, current, asks=asks)
+
+
 def test_an_acceptance_gives_what_both_agree_on(knocker):
-    agreement = knocker.accepted(3, accept(suite=CHACHA20_POLY1305), 0)
+    agreement = accepted(knocker, 3, accept(suite=CHACHA20_POLY1305), 0)
     assert agreement == Agreement(NONCE, WORLD, CHACHA20_POLY1305)
 
 
 @pytest.mark.parametrize(("epoch", "counts"), [(2, False), (3, False), (4, True)])
 def test_of_one_world_only_a_newer_epoch_counts(knocker, epoch, counts):
-    knocker.accepted(3, accept(), 0)
-    assert (knocker.accepted(epoch, accept(), 3) is not None) == counts
+    accepted(knocker, 3, accept(), 0)
+    assert (accepted(knocker, epoch, accept(), 3) is not None) == counts
 
 
 def test_another_process_of_world_may_begin_again_from_one(knocker):
-    knocker.accepted(3, accept(), 0)
-    assert knocker.accepted(1, accept(world=b"v" * 16), 3)
+    accepted(knocker, 3, accept(), 0)
+    assert accepted(knocker, 1, accept(world=b"v" * 16), 3)
 
 
 @pytest.mark.promise("P-LINK-2")
 def test_a_world_that_is_gone_does_not_come_back(knocker):
-    knocker.accepted(3, accept(), 0)
-    knocker.accepted(4, accept(world=b"v" * 16), 3)
-    assert knocker.accepted(9, accept(), 4) is None
-    assert knocker.accepted(5, accept(world=b"v" * 16), 4)
+    accepted(knocker, 3, accept(), 0)
+    accepted(knocker, 4, accept(world=b"v" * 16), 3)
+    assert accepted(knocker, 9, accept(), 4) is None
+    name = codec.decode_hello(knocker.hello()).nonce
+    assert accepted(knocker, 5, accept(name, b"v" * 16), 4)
+
+
+def test_what_a_world_that_is_gone_said_late_does_not_take_the_place_of_the_one_that_is_heard(
+    knocker,
+):
+    accepted(knocker, 3, accept(), 0)
+    assert accepted(knocker, 1, accept(world=b"v" * 16), 3, asks=False) is None
+    assert accepted(knocker, 4, accept(), 3, asks=False)
+
+
+def test_a_world_that_was_taken_for_gone_is_asked_under_another_name(knocker):
+    """What the one before had said came late, and was taken while nobody was heard."""
+    accepted(knocker, 3, accept(world=b"v" * 16), 0)
+    accepted(knocker, 9, accept(), 3)
+    assert accepted(knocker, 3, accept(world=b"v" * 16), 9) is None  # alive, and answers
+    name = codec.decode_hello(knocker.hello()).nonce
+    assert name != NONCE
+    assert accepted(knocker, 9, accept(), 9) is None  # the late word, once more
+    assert accepted(knocker, 4, accept(name, b"v" * 16), 9)
+    assert codec.decode_hello(knocker.hello()).nonce == name
+
+
+def test_after_the_last_epoch_of_all_the_first_is_newer(knocker):
+    accepted(knocker, 2**32 - 1, accept(), 0)
+    assert accepted(knocker, 2**32 - 2, accept(), 2**32 - 1) is None
+    assert accepted(knocker, 1, accept(), 2**32 - 1)
 
 
 def test_an_acceptance_of_somebody_else_does_not_count(knocker):
-    assert knocker.accepted(3, accept(nonce=b"m" * 16), 0) is None
+    assert accepted(knocker, 3, accept(nonce=b"m" * 16), 0) is None
 
 
 def test_a_refusal_by_anothers_authority_is_told_and_asked_again_as_before(knocker):
@@ -112,7 +143,7 @@ def test_a_used_name_is_replaced_once(knocker):
     assert codec.decode_hello(knocker.hello()).nonce == second
     knocker.refused(Busy(second, used=True))
     assert codec.decode_hello(knocker.hello()).nonce not in (NONCE, second)
-    assert knocker.accepted(1, accept(), 0) is None
+    assert accepted(knocker, 1, accept(), 0) is None
 
 
 def test_somebody_elses_refusal_does_not_count(knocker):
@@ -120,11 +151,11 @@ def test_somebody_elses_refusal_does_not_count(knocker):
 
 
 def test_the_first_world_is_nobodys_successor(knocker):
-    knocker.accepted(3, accept(), 0)
+    accepted(knocker, 3, accept(), 0)
     assert not knocker._left
 
 
 def test_what_is_remembered_of_worlds_is_bounded(knocker):
     for number in range(3 * LEFT_MAX):
-        knocker.accepted(1, accept(world=b"%016d" % number), 0)
+        accepted(knocker, 1, accept(world=b"%016d" % number), 0)
     assert len(knocker._left) == LEFT_MAX

@@ -136,6 +136,19 @@ def test_a_peer_may_be_far_ahead_after_a_long_silence(ahead, opened):
             world.open(data)
 
 
+@pytest.mark.parametrize("ahead", [128, 255, 256, 300, 700])
+def test_after_a_longer_silence_the_byte_of_the_header_stands_for_several_generations(ahead):
+    """By the clock of who has heard nothing for so long."""
+    world, cloud = pair()
+    world.tend(0)
+    for number in range(ahead + 1):
+        cloud.tend(number * REKEY_NS)
+    world.tend(ahead * REKEY_NS)
+    assert world.open(cloud.seal(Kind.COMMAND, BODY))[4] == BODY
+    cloud.tend((ahead + 1) * REKEY_NS)
+    assert world.open(cloud.seal(Kind.COMMAND, BODY))[3] == 1
+
+
 def test_generations_go_on_beyond_the_byte_of_the_header():
     world, cloud = pair()
     for number in range(600):
