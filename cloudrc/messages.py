@@ -160,8 +160,10 @@ class Setpoint(NamedTuple):
         position: [m], world frame, shape (3,).
         yaw: [rad].
         waypoint: Index of the mission's waypoint that it belongs to; -1 if it belongs to none.
+        epoch: Session in which the robot was seen that it is meant for; 0 if that was in none.
     """
 
     position: Vector
     yaw: float = 0.0
     waypoint: int = -1
+    epoch: int = 0

@@ -76,8 +76,7 @@ class CloudEndpoint:
         self._session = make_session(Direction.DOWNLINK, identity.ring, start_ns)
         self._knocker = Knocker(identity.nonce, identity.clock_id, identity.suite)
         self._complaints = Complaints()
-        self._hellos = 0
-        self._channel = Channel(newest_wins)
+        self._channel, self._hellos = Channel(newest_wins), 0
         self._clock_is_shared = False
         self._setpoint: Setpoint | None = None
         self._world = ""
@@ -86,9 +85,8 @@ class CloudEndpoint:
         self._alarm = Alarm()
         self._asked = 0  # the highest number of an operator's request
         self._tick_ns = self._hello_ns = self._heard_ns = self._alive_ns = start_ns
-        self._flying_ns = start_ns
+        self._flying_ns, self._commanded_ns = start_ns, NEVER_NS
         self._count_ns = start_ns + COUNT_PERIOD_NS
-        self._commanded_ns = NEVER_NS
         self._datagrams: list[bytes] = []
         self._records: list[Record] = []
         self._counts: defaultdict[str, int] = defaultdict(int)
@@ -206,8 +204,8 @@ class CloudEndpoint:
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
         """Take the epoch that world hands out to this very process, if it is a new one."""
-        asks, before = self._asks(now_ns), self._session.epoch
-        agreement = self._knocker.accepted(epoch, accept, before, asks=asks)
+        asks = self._asks(now_ns)
+        agreement = self._knocker.accepted(epoch, accept, self._session.epoch, asks=asks)
         if agreement is None:
             self._counts["accept_ignored"] += 1
             return
@@ -261,7 +259,8 @@ class CloudEndpoint:
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():
             if isinstance(message, Setpoint):
-                self._setpoint = message
+                if message.epoch in (NO_EPOCH, self._session.epoch):  # or for where the robot was
+                    self._setpoint = message
             elif isinstance(message, OperatorRequest):
                 self._relay(message)
             else:
@@ -272,11 +271,12 @@ class CloudEndpoint:
     def _relay(self, request: OperatorRequest) -> None:
         """Pass a request on; one without a number is an alarm, before which nothing starts.
 
-        Without a session nothing can be sealed: the request is dropped, for teleop repeats it.
+        Nor before the robot is seen; and nothing without a session. Teleop repeats what is dropped.
         """
+        may_start = self._loop.ready and not self._alarm.sounds
         if request.number == 0 and request.request is Request.ESTOP:
             self._alarm.sound()
-        elif self._session.epoch and not (self._alarm.sounds and request.request is Request.START):
+        elif self._session.epoch and (may_start or request.request is not Request.START):
             self._asked = max(self._asked, request.number)
             self._send(Kind.OPERATOR, codec.encode_operator(request))
 

@@ -219,7 +219,6 @@ class WorldEndpoint:
         if answer.opened:
             self._clock_is_shared = self._door.shares_clock
             self._mission = 0
-            self._touches = Touches()
             self._begin_epoch("cloud said hello")
         self._greet(answer.datagrams)
 
@@ -258,8 +257,8 @@ class WorldEndpoint:
     def _start_mission(self, request: OperatorRequest, now_ns: int) -> None:
         if request.mission_id != self._progress[0] or request.start is Start.SPAWN:
             self._progress = (request.mission_id, 0)  # from the spawn nothing is reached yet
+            self._touches = Touches()
         self._keep_progress(request)
-        self._touches = Touches()
         if request.start is Start.SPAWN:
             self.robot.put_on_ground(now_ns, "mission starts from spawn")
             self._greet([self._door.move_on(now_ns + self._clock.slip_ns)])

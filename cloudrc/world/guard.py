@@ -116,8 +116,8 @@ class Guard:
             return
         if not self.armed:
             self.forget_commands()  # only what is computed for this mission counts
+            self._alone_ns = now_ns
         self.armed = True
-        self._alone_ns = now_ns
 
     def end_mission(self, now_ns: int) -> None:
         """The mission is over: hold here until the operator starts the next one."""

@@ -87,7 +87,8 @@ class Flight:
         return [said for said in self.said if isinstance(said, Setpoint)]
 
     def _collect(self):
-        for said in self.teleop.take_outputs():
+        for output in self.teleop.take_outputs():
+            said = output._replace(epoch=0) if isinstance(output, Setpoint) else output
             self.said.append(said)
             self.said_at.append(self.now_ns)
             if isinstance(said, OperatorRequest) and self.downlink:

@@ -189,11 +189,11 @@ def test_numbers_go_on_well_above_what_the_robot_shows():
 def test_what_a_predecessor_asked_last_is_not_taken_for_ones_own_start():
     """It asked for the mission's end, was gone at once, and the robot shows that only now."""
     repeater, seen = Repeater(), Seen(1, A, GuardState.TRACK, 41)
-    repeater.see(seen)
+    repeater.see(seen, 0)
     repeater.ask(Request.START, Start.HERE)
     own = repeater.due(0).number
-    assert repeater.see(seen._replace(mission=42)) is None
-    assert repeater.see(seen._replace(mission=own)) is Request.START
+    assert repeater.see(seen._replace(mission=42), 0) is None
+    assert repeater.see(seen._replace(mission=own), 0) is Request.START
 
 
 @pytest.mark.parametrize(

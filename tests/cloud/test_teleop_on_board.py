@@ -4,17 +4,12 @@ import pytest
 from teleop_harness import AWAY, A, B, C, Flight
 
 from cloudrc.cloud.teleop.messages import (
-    Acknowledge,
     Cancel,
     Continue,
     EmergencyStop,
     GoTo,
-    Hold,
-    Pause,
     StartMission,
 )
-from cloudrc.cloud.teleop.mission import Teleop
-from cloudrc.cloud.teleop.mission_rules import HELD_LOWEST
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.messages import MISSION_OVER, GuardState, Request, Start
 
@@ -52,146 +47,6 @@ def test_a_robot_that_stands_ready_for_somebody_else_does_not_take_off():
     flight.step(seconds=0.05)
     assert flight.teleop.outcome.code == "taken_over"
     assert flight.requests[-1].request is Request.END
-
-
-@pytest.mark.parametrize("first_sight", [True, False])
-def test_a_robot_that_stands_ready_for_a_mission_lost_here_does_not_take_off(first_sight):
-    """Its order was in a journal that rotted; or it arrives when nobody knows of it any more."""
-    flight = Flight()
-    if not first_sight:
-        flight.step()
-        flight.epoch += 1
-    flight.onboard = (ID, 0)
-    flight.step(seconds=0.05)
-    assert [request.request for request in flight.requests] == [Request.END]
-    assert flight.setpoints[-1].position == (0.0, 0.0, HELD_LOWEST)
-    assert flight.teleop.settled
-
-
-@pytest.mark.parametrize(
-    ("onboard", "guard"),
-    [((0, 0), GuardState.GROUND), ((ID, 0), GuardState.HOLD), ((ID, 0), GuardState.TRACK)],
-)
-def test_a_robot_that_flies_or_stands_for_nobody_is_told_nothing(onboard, guard):
-    flight = Flight()
-    flight.onboard, flight.guard = onboard, guard
-    flight.step(seconds=0.05)
-    assert flight.requests == []
-
-
-@pytest.mark.parametrize(
-    ("verb", "word"), [(EmergencyStop(), Request.ESTOP), (Acknowledge(), Request.ACKNOWLEDGE)]
-)
-def test_the_operators_word_comes_before_the_end_of_what_was_lost(verb, word):
-    flight = Flight()
-    flight.operate(verb)
-    flight.onboard = (ID, 0)
-    flight.step(seconds=0.3)
-    assert [request.request for request in flight.requests] == [word, Request.END]
-
-
-def started():
-    flight = Flight()
-    flight.step(position=AWAY)
-    flight.operate(StartMission(THREE, ID))
-    flight.step(seconds=0.05)
-    assert flight.state == "FLYING"
-    return flight
-
-
-def test_a_predecessors_end_that_comes_late_does_not_keep_the_robot_from_its_mission():
-    flight = started()
-    flight.mission += 1
-    flight.guard = GuardState.HOLD
-    flight.step(seconds=0.2)
-    assert flight.guard is GuardState.TRACK
-    assert (flight.requests[-1].request, flight.requests[-1].start) == (Request.START, Start.HERE)
-    assert flight.setpoints[-1].waypoint == 0
-    assert [event.event for event in flight.events] == ["started"]
-
-
-@pytest.mark.parametrize("verb", [Cancel(), EmergencyStop(), Pause()])
-def test_who_has_ended_its_mission_does_not_start_again(verb):
-    flight = started()
-    flight.operate(verb)
-    flight.step(seconds=0.2)
-    asked = len(flight.requests)
-    flight.mission += 1
-    flight.guard = GuardState.HOLD
-    flight.step(seconds=0.3)
-    assert flight.requests[asked:] == []
-
-
-def test_an_emergency_stop_by_somebody_else_is_not_undone():
-    flight = started()
-    flight.mission += 1
-    flight.guard = GuardState.ESTOP
-    flight.step(seconds=0.3)
-    assert flight.teleop.outcome.code == "guard_stopped"
-    assert [r.request for r in flight.requests if r.request is not Request.PROGRESS] == [
-        Request.START,
-        Request.END,
-    ]
-    assert flight.guard is GuardState.ESTOP
-
-
-def test_cloud_is_told_the_setpoint_again_in_every_session():
-    flight = started()
-    told = flight.setpoints[-1]
-    flight.restart_cloud()
-    flight.step()
-    assert flight.setpoints[-2:] == [told, told]
-    flight.step()
-    assert flight.setpoints.count(told) == 2
-
-
-def test_the_point_where_the_robot_is_held_is_told_again_too():
-    flight = started()
-    flight.operate(Hold())
-    flight.operate(GoTo(C))
-    flight.restart_cloud()
-    flight.step(position=A)
-    assert [setpoint.position for setpoint in flight.setpoints[-2:]] == [C, C]
-
-
-def test_in_another_session_a_start_has_the_robot_stay_until_it_is_seen_to_wait():
-    """Somebody else has had it in between, and has left it armed elsewhere."""
-    flight = Flight()
-    flight.step()
-    flight.downlink = False
-    flight.operate(StartMission(FROM_SPAWN, ID))
-    flight.step(seconds=0.05)
-    assert flight.setpoints[-1].position == A
-    flight.restart_cloud()
-    flight.onboard, flight.guard = (ID + 1, 3), GuardState.TRACK
-    flight.step(position=AWAY, seconds=0.3)
-    assert (flight.state, flight.setpoints[-1].position) == ("STARTING", AWAY)
-    flight.downlink = True
-    flight.step(seconds=0.3)
-    assert (flight.state, flight.setpoints[-1].position) == ("FLYING", A)
-
-
-def test_an_acknowledgement_does_not_tell_that_the_robot_waits():
-    """One that flies on, for a mission that is lost here, would leave for the next one's point."""
-    flight = Flight()
-    flight.onboard, flight.guard = (ID + 1, 2), GuardState.TRACK
-    flight.step(position=AWAY)
-    flight.operate(Acknowledge())
-    flight.step(seconds=0.2)
-    flight.downlink = False
-    flight.operate(StartMission(FROM_SPAWN, ID))
-    flight.step(seconds=0.2)
-    assert flight.setpoints[-1].position == AWAY
-
-
-@pytest.mark.parametrize("ended", [True, False])
-def test_who_finds_a_mission_flown_that_is_known_to_be_over_ends_it(ended):
-    flight = Flight()
-    flight.teleop = Teleop(lambda number: ended and number == ID)
-    flight.onboard, flight.guard = (ID, 1), GuardState.TRACK
-    flight.step(position=AWAY, seconds=0.2)
-    assert {request.request for request in flight.requests} == ({Request.END} if ended else set())
-    assert flight.setpoints[-1].position == AWAY
 
 
 def test_a_robot_on_the_ground_may_have_been_told_to_start():

@@ -114,12 +114,12 @@ def test_more_than_there_is_cannot_be_reached():
 def test_progress_waits_for_what_is_asked():
     repeater = Repeater()
     seen = Seen(1, A, GuardState.TRACK, 4, mission_id=ID, reached=0)
-    repeater.see(seen)
+    repeater.see(seen, 0)
     repeater.report(ID, 2)
     repeater.ask(Request.END)
     assert repeater.due(0).request is Request.END
     assert repeater.due(50_000_000) is None
-    repeater.see(seen._replace(mission=4 + PREDECESSORS))
+    repeater.see(seen._replace(mission=4 + PREDECESSORS), 0)
     assert repeater.due(99_999_999) is None
     assert repeater.due(100_000_000) == OperatorRequest(0, Request.PROGRESS, Start.SPAWN, ID, 2)
 

@@ -10,7 +10,7 @@ from teleop_harness import AWAY, A, B, C
 
 from cloudrc.cloud.teleop.journal_format import parse, to_record
 from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook
-from cloudrc.messages import GuardState, Request, Start
+from cloudrc.messages import MISSION_OVER, GuardState, Request, Start
 
 
 def test_teleop_alone_restarts_and_the_mission_goes_on_at_the_same_waypoint():
@@ -40,6 +40,30 @@ def test_a_mission_that_waits_for_its_take_off_is_not_ended_by_who_goes_on_with_
     flight.step(seconds=0.3)
     assert flight.view(mission_id)["state"] == "flying"
     assert {request.request for request in flight.requests[before:]} == {Request.START}
+
+
+def test_a_mission_that_is_cancelled_right_after_a_restart_is_cancelled_in_flight():
+    flight, mission_id = flying()
+    flight.restart_teleop()
+    flight.teleop.cancel(mission_id, flight.now_ns)
+    flight.step(seconds=0.3)
+    assert flight.view(mission_id)["state"] == "cancelled"
+    assert "before it began" not in flight.view(mission_id)["events"][-1]["text"]
+    assert flight.onboard[1] == MISSION_OVER
+    assert flight.guard is GuardState.HOLD
+
+
+def test_who_is_asked_to_end_leaves_what_waits_to_its_successor():
+    flight, first = flying()
+    second = flight.create(queue=True)
+    flight.step(position=B, seconds=0.05)
+    flight.teleop.pause(flight.now_ns)
+    flight.step(position=C, seconds=0.5)
+    assert flight.view(first)["state"] == "done"
+    assert flight.view(second)["state"] == "queued"
+    flight.restart_teleop()
+    flight.step(seconds=0.3)
+    assert flight.view(second)["state"] == "flying"
 
 
 def test_a_new_pod_goes_on_at_the_same_waypoint():

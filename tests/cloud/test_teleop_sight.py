@@ -50,7 +50,7 @@ def test_the_robot_is_shown_with_its_state_since_when_and_what_comes_next():
     before = seen(flight)["guard_for_s"]
     assert before > 0.5
     assert seen(flight)["next_step"] == "the robot flies its mission"
-    flight.guard = HOLD
+    flight.guard, flight.downlink = HOLD, False
     flight.step()
     assert (seen(flight)["guard"], seen(flight)["guard_for_s"]) == ("HOLD", 0.0)
     flight.step(seconds=3.2)

@@ -75,8 +75,8 @@ class Talk:
             return epoch
         return 0
 
-    def request(self, number: int, request: Request, start: Start) -> None:
-        body = codec.encode_operator(OperatorRequest(number, request, start))
+    def request(self, number: int, request: Request, start: Start, mission_id: int = 0) -> None:
+        body = codec.encode_operator(OperatorRequest(number, request, start, mission_id))
         self.send(self.session.seal(Kind.OPERATOR, body))
 
     def command(self, velocity=(0.0, 0.0, 1.0), basis_ns=None) -> bytes:

@@ -80,3 +80,17 @@ def test_only_a_hold_within_a_mission_is_counted_as_held(talk):
     ask(talk, 2, Request.END)
     talk.wait(talk.now_ns + 4_000 * MS)
     assert talk.counts()["held_seconds"] == held
+
+
+def test_what_the_robot_has_touched_is_told_until_another_mission_starts(talk):
+    """Cloud may die right after the touch: its successor has to learn of it."""
+    ask(talk, 2, Request.END)
+    talk.world._touches.pipes = 1
+    talk.wait(talk.now_ns + 300 * MS)
+    talk.hello(b"another")
+    talk.request(3, Request.START, Start.HERE)
+    talk.wait(talk.now_ns + 20 * MS)
+    assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == 1
+    talk.request(4, Request.START, Start.HERE, mission_id=7)
+    talk.wait(talk.now_ns + 20 * MS)
+    assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == 0

@@ -38,6 +38,15 @@ def test_a_minute_of_hold_in_a_mission_ends_in_land():
     assert not guard.armed
 
 
+def test_a_mission_that_is_started_again_and_again_lands_all_the_same():
+    """Nobody has to hear its commands for that."""
+    guard = holding()
+    for second in range(3, 61):
+        guard.start_mission(second * SECOND)
+    run(guard, 61 * SECOND, 61 * SECOND + TICK)
+    assert guard.state is LAND
+
+
 def test_a_hold_that_goes_down_to_its_place_does_not_land():
     """As slowly as a descent, and standing still, as if on something."""
     guard = holding()

@@ -18,9 +18,8 @@ the robot is seen to have acted on it; each `MissionEvent` comes out once.
 
 Cancel leads from STARTING, FLYING and HELD to CANCELLED; a limit of time, a world that restarts,
 a guard that lands or an emergency stop lead to FAILED. Every end holds: the robot is asked to hold
-by itself, and the setpoint stays where it was seen. The robot keeps in mind, too, how many
-waypoints are reached and that a mission is over, for a teleop that forgets. Times are nanoseconds
-of the caller's clock.
+by itself, and the setpoint stays where it was seen. The robot keeps in mind how many waypoints are
+reached and that a mission is over, for a teleop that forgets. Times are the caller's clock [ns].
 """
 
 from __future__ import annotations
@@ -78,7 +77,7 @@ class Teleop:
         self._world, self._began_ns = rules.ANY_WORLD, 0
         self._continued: Continue | None = None
         self._unaimed = self._from_spawn = False  # from_spawn: and not continued from elsewhere
-        self._told = False  # the robot has been, of this mission
+        self._expected: tuple[int, ...] = ()  # missions that may be on board; any if there are none
         self._setpoint: Setpoint | None = None
 
     @property
@@ -134,11 +133,11 @@ class Teleop:
         anew = self._seen is None or self._seen.epoch != seen.epoch
         self._seen, told = seen, self._setpoint
         onboard, legs = rules.known_on_board(seen, self._mission_id), self._plan.legs
-        started = self.requests.see(seen) is Request.START and self.state is STARTING
+        started = self.requests.see(seen, now_ns) is Request.START and self.state is STARTING
         if self.state not in UNDER_WAY:
             if anew:
                 self._find(seen)
-        elif harm := rules.harm_in(seen, self._mission_id, self._world, known=self._told):
+        elif harm := rules.harm_in(seen, self._mission_id, self._world, self._expected):
             code, text = harm
             self._end(code, f"{text} {self._where()}", now_ns)
         elif started:
@@ -164,28 +163,29 @@ class Teleop:
     def _find(self, seen: Seen) -> None:
         """Without a mission: what flies is held; what stands, for one lost here, shall stay."""
         told = seen.mission_id
-        if told != self._mission_id and (self._is_ended(told) or rules.stands_for(told, seen)):
+        over = self._is_ended(told) or rules.stands_for(told, seen)
+        if told != self._mission_id and over and not self.requests.stopping:
             self.requests.ask(Request.END, after=True)
         self._aim_here()
 
     def _start(self, plan: Plan, mission_id: int, now_ns: int) -> None:
         self.state, self.outcome = STARTING, None
-        self._plan, self.leg, self._continued = plan, 0, None
+        self._plan, self.leg, self._continued, self._unaimed = plan, 0, None, True
         self._from_spawn = plan.start is Start.SPAWN
         self._mission_id, self._began_ns = mission_id, now_ns
-        seen = self._seen
-        self._world = seen.world if seen and plan.start is Start.HERE else rules.ANY_WORLD
+        here = None if self._from_spawn else self._seen
+        self._world = here.world if here else rules.ANY_WORLD
+        self._expected = (here.mission_id, mission_id) if here else ()
         self.requests.report(mission_id, 0)
         self.requests.ask(Request.START, plan.start, after=True)
-        self._unaimed, self._told = True, False
-        self._aim_ahead(seen)
+        self._aim_ahead(self._seen)
 
     def _go_on(self, before: Continue, now_ns: int) -> None:
         """Start again from here, at the waypoint that was flown to."""
-        self.state, self.outcome = STARTING, None
+        self.state, self.outcome, self._from_spawn = STARTING, None, False
         self._plan, self.leg, self._continued = before.plan, before.leg, before
         self._mission_id, self._world = before.mission_id, before.world
-        self._unaimed, self._told, self._from_spawn = not before.held, True, False
+        self._unaimed, self._expected = not before.held, (before.mission_id,)
         self._began_ns = now_ns - round(before.elapsed * 1e9)
         self.requests.report(self._mission_id, self.leg)
         self.requests.ask(Request.START, Start.HERE)
@@ -195,7 +195,7 @@ class Teleop:
     def _begin(self, seen: Seen, now_ns: int) -> None:
         """The robot is seen to have started: the clocks of mission and leg begin."""
         plan, before = self._plan, self._continued
-        self.state, self._told = FLYING, True
+        self.state, self._expected = FLYING, (self._mission_id,)
         self._watch.begin()
         self._world = seen.world
         if before is not None:
@@ -232,7 +232,7 @@ class Teleop:
             self._unaimed = True
             self._aim_here()
         elif self._setpoint is not None:
-            self.outputs.append(self._setpoint)
+            self._aim(self._setpoint)
 
     def _advance(self, how: str, now_ns: int) -> None:
         """The waypoint is reached: on to the next, or done."""
@@ -290,8 +290,8 @@ class Teleop:
             self._aim(rules.held_at(self._seen, self._setpoint))
 
     def _aim(self, setpoint: Setpoint) -> None:
-        self._setpoint = setpoint
-        self.outputs.append(setpoint)
+        self._setpoint = setpoint._replace(epoch=self._seen.epoch if self._seen else 0)
+        self.outputs.append(self._setpoint)
 
     def _tell(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
         self.outputs.append(MissionEvent(now_ns, event, waypoint, text))

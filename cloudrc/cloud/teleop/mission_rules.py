@@ -73,18 +73,21 @@ def stands_for(mission_id: int, seen: Seen) -> bool:
     return seen.guard is GuardState.GROUND and mission_id != 0
 
 
-def harm_in(seen: Seen, mission_id: int, world: str, *, known: bool) -> tuple[str, str] | None:
+def harm_in(
+    seen: Seen, mission_id: int, world: str, expected: tuple[int, ...]
+) -> tuple[str, str] | None:
     """Say what ends a mission that is under way, if anything seen does: code and text.
 
     Args:
         seen: The newest telemetry.
         mission_id: Of the mission.
         world: In which it was started, or `ANY_WORLD`.
-        known: Whether the robot has been told of the mission: it then is the last that it knows.
+        expected: Missions that may be on board: this one, once the robot has been told of it, or
+            before that the one that a mission from here has found; empty if it may be any.
     """
     if world not in (ANY_WORLD, seen.world):
         return "world_restarted", "world restarted"
-    if known and seen.mission_id != mission_id:
+    if expected and seen.mission_id not in expected:
         return "taken_over", "somebody else has started another mission"
     if seen.reached == MISSION_OVER and seen.mission_id == mission_id:
         return "end_lost", "the robot knows it to be over, how it ended was not kept;"

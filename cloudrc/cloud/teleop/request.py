@@ -8,7 +8,10 @@ from cloudrc.messages import GuardState, OperatorRequest, Request, Start
 REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""
 UNNUMBERED = 0
-NO_EPOCH = -1
+NOT_ENDED = (-1, 0)
+IDLE_NS = 3_000_000_000
+"""A robot that was told to start, and holds or stands for so long though it is heard, has been told
+something else by somebody else: it is told again."""
 PREDECESSORS = 1_000
 """So many numbers are left to a process before this one: it may have asked what the robot does not
 show yet, and a request of this one must not be taken for that."""
@@ -32,8 +35,9 @@ class Repeater:
         self._progress = OperatorRequest(UNNUMBERED, Request.PROGRESS)
         self._number = UNNUMBERED
         self._asked_epoch = 0
-        self._ended_epoch = NO_EPOCH  # in which a mission's end was acted on, and no start since
+        self._ended = NOT_ENDED  # epoch and number of the end that is acted on; no start since
         self._stands = False  # a start was acted on, and nothing has been asked since
+        self._flies_ns = 0
         self._due_ns = 0
 
     @property
@@ -52,7 +56,7 @@ class Repeater:
         seen = self._seen
         if seen is None or self._afterwards is not None:
             return False
-        return seen.guard is GuardState.GROUND or seen.epoch == self._ended_epoch
+        return seen.guard is GuardState.GROUND or (seen.epoch, seen.mission) == self._ended
 
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
         """Begin to repeat a new request.
@@ -65,10 +69,12 @@ class Repeater:
         asked = self._progress._replace(request=request, start=start)
         self._stands = False
         if self._pending is not None and self._pending.request is Request.START:
-            self._ended_epoch = NO_EPOCH  # it may have been acted on
+            self._ended = NOT_ENDED  # it may have been acted on
         if self._pending is not None and (after or self.stopping):
             if self._pending.request is not request:
                 self._afterwards = asked
+            elif not after:
+                self._afterwards = None
         else:
             self._pending, self._afterwards = asked, None
 
@@ -84,31 +90,34 @@ class Repeater:
         if self._pending is None:
             self._due_ns = 0
 
-    def see(self, seen: Seen) -> Request | None:
-        """Take note of what is seen.
+    def see(self, seen: Seen, now_ns: int) -> Request | None:
+        """Take note of what is seen at `now_ns` [ns].
 
         Returns:
             What was asked, once: when it is seen to have been acted on.
         """
         self._seen, pending = seen, self._pending
         if pending is None:
-            self._stand_by_start(seen)
+            self._stand_by_start(seen, now_ns)
             return None
+        self._flies_ns = now_ns
         if not self._is_acknowledged(pending, seen):
             return None
         self._pending, self._afterwards = self._afterwards, None
         self._stands = pending.request is Request.START and self._pending is None
         if pending.request is Request.START:
-            self._ended_epoch = NO_EPOCH
+            self._ended = NOT_ENDED
         elif pending.request is not Request.ACKNOWLEDGE:  # which ends nothing
-            self._ended_epoch = seen.epoch
+            self._ended = seen.epoch, seen.mission
         return pending.request
 
-    def _stand_by_start(self, seen: Seen) -> None:
-        """A predecessor's last word, late, has passed our start by: the robot is told again."""
-        passed_by = self._stands and 0 < self._number < seen.mission
-        if passed_by and seen.guard <= GuardState.HOLD:
-            if seen.mission_id == self._progress.mission_id:
+    def _stand_by_start(self, seen: Seen, now_ns: int) -> None:
+        """What a predecessor or another cloud has said has passed our start by: say it again."""
+        ours = self._stands and seen.mission_id == self._progress.mission_id
+        if not ours or seen.guard not in (GuardState.GROUND, GuardState.HOLD):
+            self._flies_ns = now_ns
+        if ours and seen.guard <= GuardState.HOLD:
+            if 0 < self._number < seen.mission or now_ns - self._flies_ns >= IDLE_NS:
                 self.ask(Request.START, Start.HERE)
 
     def due(self, now_ns: int) -> OperatorRequest | None:

@@ -30,7 +30,7 @@ from cloudrc.cloud.teleop.messages import (
 )
 from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook
+from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook, busy
 from cloudrc.cloud.teleop.service_mission import Mission, Order
 from cloudrc.cloud.teleop.sight import LATCHED, Sight
 from cloudrc.cloud.teleop.verdict import Criteria, Failure, Verdict, Witness, judge
@@ -68,6 +68,7 @@ class MissionService:
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
+        self._ends = False  # this process; what has not begun is its successor's
         self.book = MissionBook(write, entries, salt)
         self._teleop = Teleop(self.book.has_ended)
 
@@ -95,7 +96,7 @@ class MissionService:
         if known is not None:
             return known, False
         if waiting and not order.queue:
-            raise _busy(waiting[0], "cancel it first, or queue the new one")
+            raise busy(waiting[0], "cancel it first, or queue the new one")
         if len(waiting) > QUEUE_MAX:
             raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
         self._refuse_if_stopped()
@@ -116,6 +117,8 @@ class MissionService:
         mission = self.book.find(mission_id)
         if mission.ended:
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
+        if self._current is None and mission.state != missions.QUEUED:
+            self._launch(mission, missions.first_verb(mission), now_ns)  # begun before this process
         if mission is self._current:
             return self._operate(Cancel(), now_ns)
         text = "mission cancelled before it began"
@@ -145,7 +148,7 @@ class MissionService:
         """
         waiting = self.book.open()
         if waiting and waiting[0].state != missions.HELD:
-            raise _busy(waiting[0], "hold or cancel it first")
+            raise busy(waiting[0], "hold or cancel it first")
         if waiting:
             return self._operate(GoTo(position, yaw), now_ns)
         self._refuse_if_stopped()
@@ -168,12 +171,13 @@ class MissionService:
     def acknowledge(self, now_ns: int) -> None:
         """Release a robot that has landed or was stopped; raises ConflictError in a mission."""
         if self._current is not None:
-            raise _busy(self._current, "there is nothing to acknowledge")
+            raise busy(self._current, "there is nothing to acknowledge")
         self._teleop.operate(Acknowledge(), now_ns)
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
         """Before this process ends: what is flown is held, for a successor to go on with."""
+        self._ends = True
         if self._current is not None:
             self._operate(Pause(), now_ns)
 
@@ -196,7 +200,7 @@ class MissionService:
         """Start what waits, keep the limits of time, repeat what has to be repeated."""
         self.book.catch_up(now_ns)
         waiting = self.book.open()
-        if self._current is None and waiting:
+        if self._current is None and waiting and not self._ends:
             begun = waiting[0].state != missions.QUEUED  # by a teleop before this one: no waiting
             if begun or not self._stopped:
                 self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
@@ -293,7 +297,3 @@ class MissionService:
         trouble = self.book.news()
         if trouble:
             self._outputs.append(Fault(now_ns, "journal", trouble))
-
-
-def _busy(mission: Mission, advice: str) -> ConflictError:
-    return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)

@@ -50,6 +50,11 @@ class ConflictError(CloudrcError):
         self.mission = mission
 
 
+def busy(mission: Mission, advice: str) -> ConflictError:
+    """What to raise where a mission is in the way."""
+    return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)
+
+
 class MissionBook:
     """All missions, oldest first.
 
