@@ -53,6 +53,19 @@ def test_a_mission_that_is_cancelled_right_after_a_restart_is_cancelled_in_fligh
     assert flight.guard is GuardState.HOLD
 
 
+def test_a_world_that_slipped_before_a_restart_does_not_make_the_mission_invalid():
+    """Neither do the seconds count that were flown since the last entry."""
+    flight, mission_id = flying()
+    flight.step(seconds=10.0)
+    flight.slip_ns = 300_000_000
+    flight.step(seconds=0.1)
+    flight.restart_teleop()
+    flight.slip_ns = 600_000_000
+    for point in (B, C):
+        flight.step(position=point, seconds=0.1)
+    assert flight.view(mission_id)["verdict"]["outcome"] == "success"
+
+
 def test_who_is_asked_to_end_leaves_what_waits_to_its_successor():
     flight, first = flying()
     second = flight.create(queue=True)

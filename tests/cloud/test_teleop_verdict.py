@@ -44,6 +44,15 @@ def test_every_rule(outcome, witness, contact, expected):
     assert codes(outcome, witness, contact=contact) == expected
 
 
+def test_what_slips_while_teleop_is_away_counts_no_more_than_the_time_that_passes():
+    witness = Witness.begin(seen(slip_ns=5)).see(seen(slip_ns=9))
+    for shown in (1_000, 5_000):
+        witness = witness.after_restart().see(seen(slip_ns=shown))
+        assert witness.slip_ns - witness.slip_began_ns == 4
+    witness = witness.see(seen(slip_ns=5_003))
+    assert witness.slip_ns - witness.slip_began_ns == 7
+
+
 @pytest.mark.parametrize(("slipped", "verdict"), [(1.49, "success"), (1.51, "invalid")])
 def test_a_slow_world_makes_it_invalid(slipped, verdict):
     """5 % of 30 s are 1.5 s."""

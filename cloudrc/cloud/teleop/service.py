@@ -251,6 +251,7 @@ class MissionService:
         self._current = mission
         self._teleop.operate(verb, now_ns)
         if isinstance(verb, Continue):
+            mission.witness = mission.witness.after_restart()
             text = "teleop has restarted; the robot is asked to go on"
             self._note(mission, "restarted", text, now_ns)
         else:

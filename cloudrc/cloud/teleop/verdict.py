@@ -17,6 +17,8 @@ REAL_TIME_FACTOR_MIN = 0.95
 """Below it the simulated robot was slower than its network. Source: DESIGN, section 9."""
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 """Source: DESIGN, section 9."""
+AWAY = -1
+"""In place of a slip [ns]: world has not been seen yet by this process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +74,8 @@ class Witness:
         pipe_touches: Of them since the mission began.
         touch_before: Speed of an earlier mission's touch, still shown [m/s]; None if none.
         touch_speed: Of this mission's touch [m/s]; None if the board was not touched.
-        slip_began_ns: World's slip when the mission began [ns].
-        slip_ns: The same when it was last seen [ns].
+        slip_began_ns: World's slip when the mission began [ns], less what was not looked at.
+        slip_ns: World's slip when it was last seen [ns]; AWAY after a restart of teleop.
     """
 
     pipe_contacts: int = 0
@@ -104,8 +106,13 @@ class Witness:
             pipe_contacts=seen.pipe_contacts,
             pipe_touches=self.pipe_touches + new,
             touch_speed=touch,
+            slip_began_ns=self.slip_began_ns + (seen.slip_ns if self.slip_ns == AWAY else 0),
             slip_ns=seen.slip_ns,
         )
+
+    def after_restart(self) -> Witness:
+        """Go on where it was left: no more than the time is slip counted that passed meanwhile."""
+        return replace(self, slip_began_ns=self.slip_began_ns - self.slip_ns, slip_ns=AWAY)
 
     def news(self, before: Witness, elapsed: float) -> Iterator[tuple[str, str]]:
         """Say what is touched now and was not before, at `elapsed` [s]: event and text."""
