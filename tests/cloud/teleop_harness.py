@@ -9,6 +9,9 @@ from cloudrc.records import MissionEvent
 PERIOD_NS = 10_000_000
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
 AWAY = (0.0, -5.0, 1.0)
+ID = 7
+THREE = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)), Start.HERE)
+FROM_SPAWN = Plan(THREE.legs)
 PLAN = Plan((Leg(A, yaw=0.3), Leg(B, tolerance=0.2, dwell=0.0), Leg(C)))
 
 

@@ -1,7 +1,7 @@
 """Words of predecessors, of rivals and of sessions before: the robot is led by none of them."""
 
 import pytest
-from teleop_harness import AWAY, A, B, C, Flight
+from teleop_harness import AWAY, FROM_SPAWN, ID, THREE, A, B, C, Flight
 
 from cloudrc.cloud.teleop.messages import (
     Acknowledge,
@@ -14,12 +14,7 @@ from cloudrc.cloud.teleop.messages import (
 )
 from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.cloud.teleop.mission_rules import HELD_LOWEST
-from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.messages import GuardState, Request, Setpoint, Start
-
-ID = 7
-THREE = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)), Start.HERE)
-FROM_SPAWN = Plan(THREE.legs)
 
 
 @pytest.mark.parametrize("first_sight", [True, False])

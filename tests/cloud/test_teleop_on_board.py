@@ -1,7 +1,7 @@
 """What the robot knows of missions, whose it is and what is over: nobody flies on against it."""
 
 import pytest
-from teleop_harness import AWAY, A, B, C, Flight
+from teleop_harness import AWAY, FROM_SPAWN, ID, THREE, A, B, Flight
 
 from cloudrc.cloud.teleop.messages import (
     Cancel,
@@ -10,12 +10,7 @@ from cloudrc.cloud.teleop.messages import (
     GoTo,
     StartMission,
 )
-from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.messages import MISSION_OVER, GuardState, Request, Start
-
-ID = 7
-THREE = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)), Start.HERE)
-FROM_SPAWN = Plan(THREE.legs)
+from cloudrc.messages import MISSION_OVER, GuardState, Request
 
 
 @pytest.mark.promise("P-MISSION-8")

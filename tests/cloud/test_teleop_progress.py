@@ -3,18 +3,14 @@
 import pytest
 from journal_disks import PATH, KilledError, MemoryDisk, full
 from service_harness import PLAN, ServiceFlight, flying
-from teleop_harness import AWAY, A, B, C, Flight
+from teleop_harness import AWAY, ID, THREE, A, B, C, Flight
 
 from cloudrc.cloud.teleop.journal import Journal
 from cloudrc.cloud.teleop.messages import Continue, Hold, Seen, StartMission
-from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.cloud.teleop.request import PREDECESSORS, Repeater
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.service_mission import Order, number_of
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
-
-ID = 7
-THREE = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)), Start.HERE)
 
 
 def test_the_robot_is_told_of_every_waypoint_reached():

@@ -163,7 +163,7 @@ class Teleop:
     def _find(self, seen: Seen) -> None:
         """Without a mission: what flies is held; what stands, for one lost here, shall stay."""
         told = seen.mission_id
-        over = self._is_ended(told) or rules.stands_for(told, seen)
+        over = self._is_ended(told) or rules.stands_ready(seen)
         if told != self._mission_id and over and not self.requests.stopping:
             self.requests.ask(Request.END, after=True)
         self._aim_here()

@@ -68,9 +68,9 @@ def known_on_board(seen: Seen, mission_id: int) -> int:
     return seen.reached if seen.mission_id == mission_id != 0 else 0
 
 
-def stands_for(mission_id: int, seen: Seen) -> bool:
-    """Whether the robot stands on the ground, told of a mission: it may be ready to take off."""
-    return seen.guard is GuardState.GROUND and mission_id != 0
+def stands_ready(seen: Seen) -> bool:
+    """Whether the robot stands on the ground, told of a mission: it may take off for that."""
+    return seen.guard is GuardState.GROUND and seen.mission_id != 0
 
 
 def harm_in(
