@@ -56,6 +56,8 @@ SILENT_MAX = 64 * GENERATIONS
 """And so many after the longest silence; over a week of it, a peer moves on twice as often."""
 KEPT = 3
 """Generations that are opened side by side: late datagrams, and a key that is announced."""
+LOOKS = 3
+"""In a row at which the peer is heard with the key before, until this end goes back to it."""
 
 Cipher: TypeAlias = AESGCM | ChaCha20Poly1305
 Opener: TypeAlias = tuple[Cipher, Key]
@@ -104,6 +106,7 @@ class Session:
         self._newest = 0  # generation that the peer was last heard with for the first time
         self._newest_ns = self._tended_ns = now_ns  # when that was, by the last look
         self._heard = ring.current  # key that the peer was last heard with
+        self._apart = 0  # looks in a row at which it was another one than ours
         self._tried: dict[int, list[Opener]] = {}
 
     def begin(self, epoch: int, agreement: Agreement | None = None, key: Key | None = None) -> None:
@@ -115,12 +118,10 @@ class Session:
             key: That they were authenticated with; None for the one in use.
         """
         self.epoch = epoch
-        self._counters = {
-            kind: count if kind in TIMELESS else 0 for kind, count in self._counters.items()
-        }
+        self._counters |= dict.fromkeys(self._counters.keys() - TIMELESS, 0)
         self._agreement = agreement or self._agreement
         self._key = self.epoch_key = self._heard = key or self._key
-        self._generation = self._generation_byte = 0
+        self._generation = self._generation_byte = self._apart = 0
         self._rekey_ns = None
         self._rekey_total = self._sent() + REKEY_DATAGRAMS
         self._announced = None
@@ -190,12 +191,19 @@ class Session:
             del self._openers[byte]
         if self._rekey_ns is None:
             self._rekey_ns = now_ns + REKEY_NS
-        if self._key not in self.accepted or self._heard == self.ring.current != self._key:
-            self._move_on(self.ring.current)
+        if (key := self._key_for_peer()) != self._key:
+            self._move_on(key)
         elif now_ns >= self._rekey_ns or self._sent() >= self._rekey_total:
             self._move_on(self._key)
             self._rekey_ns, self._rekey_total = now_ns + REKEY_NS, self._sent() + REKEY_DATAGRAMS
         return [] if self._key == self.ring.current else [self._announce()]
+
+    def _key_for_peer(self) -> Key:
+        """The one to seal with: which the peer is heard with, for it may not have ours any more."""
+        heard = self._heard if self._heard in self.accepted else self.ring.current
+        self._apart = self._apart + 1 if heard != self._key else 0
+        looks = 1 if heard == self.ring.current or self._key not in self.accepted else LOOKS
+        return heard if self._apart >= looks else self._key
 
     def _sent(self) -> int:
         return sum(self._counters.values())
@@ -205,6 +213,7 @@ class Session:
         self._generation = (self._announced[0] if self._announced else self._generation) + 1
         self._generation_byte = self._generation % GENERATIONS
         self._key = key
+        self._apart = 0
         self._cipher = self._derive(key, self._sends, self._generation)
         self._announced = None
 
@@ -227,10 +236,8 @@ class Session:
         """
         ahead = (byte - self._newest + KEPT - 1) % GENERATIONS - KEPT + 1
         last = self._newest + AHEAD_MAX + self._silent
-        first = self._newest + ahead
-        for generation in range(
-            first if first >= 0 else first + GENERATIONS, last + 1, GENERATIONS
-        ):
+        first = self._newest + ahead + GENERATIONS * (self._newest + ahead < 0)
+        for generation in range(first, last + 1, GENERATIONS):
             for cipher, key in self._candidates(generation):
                 try:
                     body = cipher.decrypt(data[4:16], data[16:], data[:16])
