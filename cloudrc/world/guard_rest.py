@@ -184,8 +184,8 @@ class TakeOff:
         (ax, ay, az), (bx, by, bz) = low, high
         self._low = (ax + TAKE_OFF_MARGIN, ay + TAKE_OFF_MARGIN, az)
         self._high = (bx - TAKE_OFF_MARGIN, by - TAKE_OFF_MARGIN, bz)
-        self._stopped, self._still = False, 0
-        self.forget()
+        self.over = self._stopped = False
+        self._still, self._height = 0, nan
 
     @property
     def allowed(self) -> bool:
@@ -203,9 +203,9 @@ class TakeOff:
         Args:
             stopped: Whether its rotors were stopped elsewhere than on the ground, perhaps.
         """
-        self.over, self._height = False, nan
+        self.over = False
         if stopped:
-            self._stopped, self._still = True, 0
+            self._stopped, self._still, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
         """Note where the robot stands, or see whether it has left.

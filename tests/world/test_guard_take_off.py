@@ -4,19 +4,7 @@ from itertools import pairwise
 from math import hypot, nan
 
 import pytest
-from guard_play import (
-    HERE,
-    LIMITS,
-    MS,
-    SECOND,
-    TICK,
-    armed,
-    command,
-    feed,
-    run,
-    sensed,
-    states,
-)
+from guard_play import HERE, LIMITS, MS, SECOND, TICK, armed, command, feed, run, sensed, states
 
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Command, GuardState
@@ -244,6 +232,19 @@ def test_the_next_take_off_is_another_one():
     feed(guard, 2 * SECOND, 1, position=HERE)
     guard.take_changes()
     run(guard, 3 * SECOND, 4 * SECOND, HERE)
+    assert states(guard) == [HOLD, GROUND]
+
+
+def test_acknowledged_started_and_led_within_one_tick_it_knows_where_it_stood():
+    """Else it would take what scrapes along the ground for a robot that flies."""
+    guard = standing()
+    guard.stop(10 * MS)
+    run(guard, 10 * MS, 1 * SECOND, STANDS)
+    guard.acknowledge(1 * SECOND)
+    guard.start_mission(1 * SECOND)
+    guard.offer(command((0.0, 0.0, 1.0), 1 * SECOND), 1 * SECOND)
+    assert states(guard) == [ESTOP, GROUND, TRACK]
+    run(guard, 1 * SECOND, 2 * SECOND, STANDS)
     assert states(guard) == [HOLD, GROUND]
 
 
