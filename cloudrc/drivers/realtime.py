@@ -22,6 +22,10 @@ DRAIN_MAX = 256
 """Datagrams taken per wake, so that a flood cannot keep the loop from its deadlines."""
 RECEIVE_BUFFER = 1 << 22
 """Asked of the kernel, which may give less: room for honest datagrams behind a flood [bytes]."""
+BACKLOG_MAX = 2 * RECEIVE_BUFFER // 512
+"""More than can wait in the socket: Linux doubles the room, a datagram takes 768 bytes at least."""
+STALL_NS = 50_000_000
+"""After a wake this late all that waits is taken at once: it came before that wake [ns]."""
 SINK_PERIOD_NS = 20_000_000
 WAIT_MAX_NS = 100_000_000
 ROUTE_PERIOD_NS = 500_000_000
@@ -59,10 +63,10 @@ class Peer:
             self._followed_ns = now_ns + ROUTE_PERIOD_NS
             self.address = self.route.look()
 
-    def receive(self) -> list[bytes]:
-        """Everything that waits in the socket; one byte too many marks an oversized datagram."""
+    def receive(self, most: int = DRAIN_MAX) -> list[bytes]:
+        """What waits in the socket; one byte too many marks an oversized datagram."""
         datagrams: list[bytes] = []
-        while len(datagrams) < DRAIN_MAX:
+        while len(datagrams) < most:
             try:
                 datagrams.append(self.socket.recv(DATAGRAM_MAX + 1))
             except BlockingIOError:
@@ -135,13 +139,16 @@ def serve(
     gc.collect()
     gc.freeze()  # what is loaded now stays: the collector need not look at it in flight
     sink_ns = time.monotonic_ns()
+    stalled = False
     while not stop():
         deadline_ns = endpoint.next_deadline_ns()
         wait_ns = min(deadline_ns - time.monotonic_ns(), WAIT_MAX_NS)
         readable, _, _ = select.select([peer.socket], [], [], max(wait_ns, 0) * 1e-9)
         now_ns = time.monotonic_ns()
+        # Not twice in a row: a flood that is too much would keep the loop in it.
+        stalled = not stalled and now_ns - deadline_ns > STALL_NS
         if readable:
-            for data in peer.receive():
+            for data in peer.receive(BACKLOG_MAX if stalled else DRAIN_MAX):
                 endpoint.receive_datagram(data, now_ns)
         if now_ns >= deadline_ns:
             endpoint.handle_deadline(now_ns)
