@@ -13,17 +13,9 @@ from math import nan
 
 from cloudrc.cloud.identity import CloudIdentity as CloudIdentity
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.cloud.operator import Alarm
+from cloudrc.cloud.operator import Alarm, seen_in
 from cloudrc.cloud.operator import Operator as Operator
-from cloudrc.cloud.teleop.messages import Seen
-from cloudrc.messages import (
-    NEVER_NS,
-    GuardState,
-    OperatorRequest,
-    Request,
-    Setpoint,
-    Telemetry,
-)
+from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
@@ -72,20 +64,27 @@ class CloudEndpoint:
             newest_wins: Policy for late telemetry.
             start_ns: Cloud's monotonic clock now [ns].
         """
-        self._loop, self.teleop, self._identity = loop, teleop, identity
+        self._loop = loop
+        self.teleop = teleop
+        self._identity = identity
         self._session = make_session(Direction.DOWNLINK, identity.ring, start_ns)
         self._knocker = Knocker(identity.nonce, identity.clock_id, identity.suite)
         self._complaints = Complaints()
-        self._channel, self._hellos = Channel(newest_wins), 0
+        self._channel = Channel(newest_wins)
+        self._hellos = 0
         self._clock_is_shared = False
         self._setpoint: Setpoint | None = None
-        self._world = ""
+        self._world = ""  # names the process that has accepted the session
         self.guard = GuardState.GROUND  # as telemetry last told
-        self._delays = (nan, nan, nan)
+        self._delays = (nan, nan, nan)  # horizon, round trip and loop of the last command [s]
         self._alarm = Alarm()
         self._asked = 0  # the highest number of an operator's request
-        self._tick_ns = self._hello_ns = self._heard_ns = self._alive_ns = start_ns
-        self._flying_ns, self._commanded_ns = start_ns, NEVER_NS
+        self._tick_ns = start_ns
+        self._hello_ns = start_ns
+        self._alive_ns = start_ns
+        self._heard_ns = start_ns
+        self._flying_ns = start_ns
+        self._commanded_ns = NEVER_NS
         self._count_ns = start_ns + COUNT_PERIOD_NS
         self._datagrams: list[bytes] = []
         self._records: list[Record] = []
@@ -223,9 +222,11 @@ class CloudEndpoint:
     def _receive_telemetry(self, epoch: int, counter: int, body: bytes, now_ns: int) -> None:
         """Whatever arrives for this epoch is noted; loop and teleop get the newest."""
         outcome = self._channel.take(counter)
-        self._heard_ns = self._heard_ns if outcome == REPEATED else now_ns  # those anybody can send
+        if outcome != REPEATED:  # those anybody can send
+            self._heard_ns = now_ns
         self._counts[outcome] += 1
-        used, delay = outcome == USED, nan
+        used = outcome == USED
+        delay = nan
         if self._clock_is_shared:
             stamp_ns, slip_ns = codec.decode_stamps(body)
             delay = (now_ns - stamp_ns - slip_ns) * 1e-9
@@ -236,25 +237,9 @@ class CloudEndpoint:
             self._alarm.see(telemetry.guard, telemetry.mission)
             self._loop.observe(telemetry, now_ns)
             self._asked = max(self._asked, telemetry.mission)
-            self.teleop.see(self._seen(telemetry, epoch), now_ns)
+            self.teleop.see(seen_in(telemetry, epoch, self._world, self._delays), now_ns)
             if self.teleop.outputs:
                 self._take_from_teleop()
-
-    def _seen(self, telemetry: Telemetry, epoch: int) -> Seen:
-        known = (
-            epoch,
-            telemetry.odometry.position,
-            telemetry.guard,
-            telemetry.mission,
-            self._world,
-            telemetry.pipe_contacts,
-            telemetry.touch_speed,
-            telemetry.slip_ns,
-            *self._delays,
-            telemetry.mission_id,
-            telemetry.reached,
-        )
-        return _new(Seen, known)
 
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():

@@ -9,11 +9,12 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from cloudrc.cloud.teleop.messages import Outcome, Output, Seen
-from cloudrc.messages import GuardState, OperatorRequest, Request
+from cloudrc.messages import GuardState, OperatorRequest, Request, Telemetry
 from cloudrc.records import Fault
 
 REPEAT_NS = 100_000_000
 """Time between two copies of the alarm [ns]."""
+_new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
 
 
 class Operator(Protocol):
@@ -39,6 +40,33 @@ class Operator(Protocol):
 
     def take_outputs(self) -> Sequence[Output | Fault]:
         """Hand over what it has said since the last call."""
+
+
+def seen_in(
+    telemetry: Telemetry, epoch: int, world: str, delays: tuple[float, float, float]
+) -> Seen:
+    """Make what teleop is told of telemetry.
+
+    Args:
+        telemetry: The newest.
+        epoch: Session that it belongs to.
+        world: Names world's process.
+        delays: Horizon, round trip and loop delay of the last command [s]; NaN before the first.
+    """
+    known = (
+        epoch,
+        telemetry.odometry.position,
+        telemetry.guard,
+        telemetry.mission,
+        world,
+        telemetry.pipe_contacts,
+        telemetry.touch_speed,
+        telemetry.slip_ns,
+        *delays,
+        telemetry.mission_id,
+        telemetry.reached,
+    )
+    return _new(Seen, known)
 
 
 class Alarm:

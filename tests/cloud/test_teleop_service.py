@@ -6,9 +6,9 @@ from teleop_harness import AWAY, A, B, C
 
 from cloudrc.cli.teleop import _open_service
 from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.cloud.teleop.service import QUEUE_MAX
 from cloudrc.cloud.teleop.service_book import (
     KEPT,
+    QUEUE_MAX,
     ConflictError,
     UnavailableError,
     UnknownMissionError,

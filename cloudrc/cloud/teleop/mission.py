@@ -43,10 +43,11 @@ from cloudrc.cloud.teleop.messages import (
     State,
     Verb,
 )
+from cloudrc.cloud.teleop.mission_aim import Aim
 from cloudrc.cloud.teleop.mission_leg import LegWatch, overdue, where
 from cloudrc.cloud.teleop.plan import NO_PLAN, Leg, Plan
 from cloudrc.cloud.teleop.request import Repeater
-from cloudrc.messages import MISSION_OVER, GuardState, Request, Setpoint, Start
+from cloudrc.messages import MISSION_OVER, GuardState, Request, Start
 from cloudrc.records import MissionEvent
 
 # An enum's member is slow to look up; these are asked for in every period.
@@ -71,14 +72,18 @@ class Teleop:
         self.outcome: Outcome | None = None
         self.requests = Repeater()
         self.outputs: list[Output] = []
+        self.leg = 0
+        self._is_ended = ended
         self._seen: Seen | None = None
-        self._plan, self._mission_id, self._is_ended = NO_PLAN, 0, ended
-        self.leg, self._watch = 0, LegWatch()
-        self._world, self._began_ns = rules.ANY_WORLD, 0
-        self._continued: Continue | None = None
-        self._unaimed = self._from_spawn = False  # from_spawn: and not continued from elsewhere
+        self._plan = NO_PLAN
+        self._mission_id = 0
+        self._continued: Continue | None = None  # how it stood, if a teleop before began it
+        self._world = rules.ANY_WORLD  # in which it was started
         self._expected: tuple[int, ...] = ()  # missions that may be on board; any if there are none
-        self._setpoint: Setpoint | None = None
+        self._began_ns = 0
+        self._watch = LegWatch()
+        # Not the list's own method: every `take_outputs` leaves another list.
+        self._aim = Aim(self.requests, lambda setpoint: self.outputs.append(setpoint))
 
     @property
     def settled(self) -> bool:
@@ -130,8 +135,9 @@ class Teleop:
 
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry, at the instant [ns] at which it arrives."""
-        anew = self._seen is None or self._seen.epoch != seen.epoch
-        self._seen, told = seen, self._setpoint
+        self._seen = seen
+        anew = self._aim.see(seen)
+        told = self._aim.setpoint
         onboard, legs = rules.known_on_board(seen, self._mission_id), self._plan.legs
         started = self.requests.see(seen, now_ns) is Request.START and self.state is STARTING
         if self.state not in UNDER_WAY:
@@ -142,14 +148,14 @@ class Teleop:
             self._end(code, f"{text} {self._where()}", now_ns)
         elif started:
             self._begin(seen, now_ns)
-        elif self._unaimed:
-            self._aim_ahead(seen)
+        elif self._aim.awaited:
+            self._aim.ahead(self.leg)
         while self.leg < onboard and self.state in (FLYING, State.HELD):
             self._advance("known on board to be reached", now_ns)  # kept there, and lost here
         while self.state is FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
-        if anew and told is self._setpoint:
-            self._aim_again()
+        if anew and told is self._aim.setpoint:
+            self._aim.again(starting=self.state is STARTING)
 
     def handle_deadline(self, now_ns: int) -> None:
         """Check the limits of time and repeat the request that is due at `now_ns` [ns]."""
@@ -166,38 +172,48 @@ class Teleop:
         over = self._is_ended(told) or rules.stands_ready(seen)
         if told != self._mission_id and over and not self.requests.stopping:
             self.requests.ask(Request.END, after=True)
-        self._aim_here()
+        self._aim.here()
 
     def _start(self, plan: Plan, mission_id: int, now_ns: int) -> None:
-        self.state, self.outcome = STARTING, None
-        self._plan, self.leg, self._continued, self._unaimed = plan, 0, None, True
-        self._from_spawn = plan.start is Start.SPAWN
-        self._mission_id, self._began_ns = mission_id, now_ns
-        here = None if self._from_spawn else self._seen
+        self.state = STARTING
+        self.outcome = None
+        self.leg = 0
+        self._plan = plan
+        self._mission_id = mission_id
+        self._continued = None
+        self._began_ns = now_ns
+        here = None if plan.start is Start.SPAWN else self._seen
         self._world = here.world if here else rules.ANY_WORLD
         self._expected = (here.mission_id, mission_id) if here else ()
         self.requests.report(mission_id, 0)
         self.requests.ask(Request.START, plan.start, after=True)
-        self._aim_ahead(self._seen)
+        self._aim.begin(plan, mission_id)
+        self._aim.ahead(0)
 
     def _go_on(self, before: Continue, now_ns: int) -> None:
         """Start again from here, at the waypoint that was flown to."""
-        self.state, self.outcome, self._from_spawn = STARTING, None, False
-        self._plan, self.leg, self._continued = before.plan, before.leg, before
-        self._mission_id, self._world = before.mission_id, before.world
-        self._unaimed, self._expected = not before.held, (before.mission_id,)
+        self.state = STARTING
+        self.outcome = None
+        self.leg = before.leg
+        self._plan = before.plan
+        self._mission_id = before.mission_id
+        self._continued = before
         self._began_ns = now_ns - round(before.elapsed * 1e9)
+        self._world = before.world
+        self._expected = (before.mission_id,)
         self.requests.report(self._mission_id, self.leg)
         self.requests.ask(Request.START, Start.HERE)
+        self._aim.begin(before.plan, before.mission_id, before)
         if self._seen:
             self.see(self._seen, now_ns)  # it may be over, or the world another one
 
     def _begin(self, seen: Seen, now_ns: int) -> None:
         """The robot is seen to have started: the clocks of mission and leg begin."""
         plan, before = self._plan, self._continued
-        self.state, self._expected = FLYING, (self._mission_id,)
-        self._watch.begin()
+        self.state = FLYING
+        self._expected = (self._mission_id,)
         self._world = seen.world
+        self._watch.begin()
         if before is not None:
             text = f"resumed after a restart of teleop {self._where()}"
             self._tell("resumed", self.leg, text, now_ns)
@@ -205,34 +221,10 @@ class Teleop:
                 self._hold(now_ns)
             return
         self._began_ns = now_ns
-        if self._unaimed:
-            self._unaimed = False
-            self._aim_at(self.leg)
+        self._aim.started(self.leg)
         place = "the spawn" if plan.start is Start.SPAWN else "here"
         text = f"mission started from {place}, waypoints: {len(plan.legs)}"
         self._tell("started", 0, text, now_ns)
-
-    def _aim_ahead(self, seen: Seen | None) -> None:
-        """Aim before the start is seen: the first command that is flown then leads the right way.
-
-        Not while the robot may still fly a mission whose end was lost: it would leave at once, past
-        the spawn, for a waypoint that is to be flown to from there.
-        """
-        if not self._unaimed or seen is None or (self._from_spawn and not self.requests.waits):
-            return
-        self._unaimed = False
-        onboard = rules.known_on_board(seen, self._mission_id)
-        leg = 0 if self._from_spawn else max(self.leg, onboard)
-        if leg < len(self._plan.legs):
-            self._aim_at(leg)
-
-    def _aim_again(self) -> None:
-        """Cloud forgets the setpoint with its session: somebody else may have moved the robot."""
-        if self.state is STARTING and self._from_spawn and not self.requests.waits:
-            self._unaimed = True
-            self._aim_here()
-        elif self._setpoint is not None:
-            self._aim(self._setpoint)
 
     def _advance(self, how: str, now_ns: int) -> None:
         """The waypoint is reached: on to the next, or done."""
@@ -243,26 +235,26 @@ class Teleop:
         if self.leg < len(self._plan.legs):
             self._watch.begin()
             if self.state is FLYING:
-                self._aim_at(self.leg)
+                self._aim.at(self.leg)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
 
     def _hold(self, now_ns: int) -> None:
         self.state = State.HELD
-        self._aim_here()
+        self._aim.here()
         self._tell("held", self.leg, f"held {self._where()}", now_ns)
 
     def _resume(self, now_ns: int) -> None:
         self.state = State.FLYING
         self._watch.pause()
-        self._aim_at(self.leg)
+        self._aim.at(self.leg)
         self._tell("resumed", self.leg, f"resumed {self._where()}", now_ns)
 
     def _go_to(self, leg: Leg, mission_id: int, now_ns: int) -> None:
         x, y, z = leg.position
         self._tell("goto", rules.NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
         if self.state is State.HELD:
-            self._aim(Setpoint(leg.position, leg.yaw, rules.NO_WAYPOINT))
+            self._aim.at_point(leg.position, leg.yaw)
         else:
             self._start(Plan((leg,), Start.HERE, leg.time_limit), mission_id, now_ns)
 
@@ -278,20 +270,8 @@ class Teleop:
             self.requests.ask(Request.END)
         else:
             self.requests.forget()  # what flies is not ours to end
-        self._aim_here()
+        self._aim.here()
         self._tell(code, waypoint, text, now_ns)
-
-    def _aim_at(self, leg: int) -> None:
-        to = self._plan.legs[leg]
-        self._aim(Setpoint(to.position, to.yaw, leg))
-
-    def _aim_here(self) -> None:
-        if self._seen is not None:
-            self._aim(rules.held_at(self._seen, self._setpoint))
-
-    def _aim(self, setpoint: Setpoint) -> None:
-        self._setpoint = setpoint._replace(epoch=self._seen.epoch if self._seen else 0)
-        self.outputs.append(self._setpoint)
 
     def _tell(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
         self.outputs.append(MissionEvent(now_ns, event, waypoint, text))

@@ -33,14 +33,13 @@ from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook, busy
 from cloudrc.cloud.teleop.service_mission import Mission, Order
 from cloudrc.cloud.teleop.sight import LATCHED, Sight
-from cloudrc.cloud.teleop.verdict import Criteria, Failure, Verdict, Witness, judge
+from cloudrc.cloud.teleop.verdict import Witness
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Setpoint, Start, Vector
 from cloudrc.records import Fault, MissionEvent
 
 SETPOINT_PERIOD_NS = 100_000_000
 """Time between two copies of the setpoint [ns], so that either process may restart."""
-QUEUE_MAX = 16
 
 
 class MissionService:
@@ -89,16 +88,14 @@ class MissionService:
             The mission, and whether it is new: the same key gives the same mission.
 
         Raises:
-            ConflictError: If another one is under way and the order does not want to wait.
+            ConflictError: If another one is under way and the order does not want to wait, or too
+                many do, or the operator has to acknowledge first.
             UnavailableError: If it cannot be kept.
         """
-        known, waiting = self.book.with_key(order.key), self.book.open()
+        known = self.book.with_key(order.key)
         if known is not None:
             return known, False
-        if waiting and not order.queue:
-            raise busy(waiting[0], "cancel it first, or queue the new one")
-        if len(waiting) > QUEUE_MAX:
-            raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
+        waiting = self.book.waits_for(order)
         self._refuse_if_stopped()
         mission = self.book.add(order)
         if waiting:
@@ -121,9 +118,8 @@ class MissionService:
             self._launch(mission, missions.first_verb(mission), now_ns)  # begun before this process
         if mission is self._current:
             return self._operate(Cancel(), now_ns)
-        text = "mission cancelled before it began"
-        verdict = Verdict("interrupted", (Failure("cancelled", text),))
-        self._note(mission, "cancelled", text, now_ns, verdict=verdict.as_json())
+        verdict = missions.never_began()
+        self._note(mission, "cancelled", missions.NEVER_BEGAN, now_ns, verdict=verdict)
         return mission
 
     def hold(self, now_ns: int) -> Mission:
@@ -188,7 +184,8 @@ class MissionService:
 
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry."""
-        mission, anew = self._current, self._sight.see(seen, now_ns)
+        mission = self._current
+        anew = self._sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
             self._watch(mission, seen, now_ns)
             if anew:
@@ -260,15 +257,16 @@ class MissionService:
 
     def _watch(self, mission: Mission, seen: Seen, now_ns: int) -> None:
         """Write down at once what the robot touches."""
-        before, after = mission.witness, mission.witness.see(seen)
-        mission.witness = after
-        for event, text in after.news(before, self._teleop.elapsed(now_ns)):
+        before = mission.witness
+        mission.witness = before.see(seen)
+        for event, text in mission.witness.news(before, self._teleop.elapsed(now_ns)):
             self._note(mission, event, text, now_ns)
 
     def _collect(self, now_ns: int) -> None:
         for output in self._teleop.take_outputs():
             if isinstance(output, Setpoint):
-                self._setpoint, self._setpoint_ns = output, now_ns + SETPOINT_PERIOD_NS
+                self._setpoint = output
+                self._setpoint_ns = now_ns + SETPOINT_PERIOD_NS
             elif isinstance(output, MissionEvent):
                 self._follow(output, now_ns)
             self._outputs.append(output)
@@ -283,10 +281,8 @@ class MissionService:
             changed |= {"world": seen.world, "witness": asdict(Witness.begin(seen))}
         outcome = self._teleop.outcome
         if outcome is not None and event.event == outcome.code:
-            criteria = Criteria(mission.order.contact, self._contact_speed_max)
-            time, count = self._teleop.elapsed(now_ns), len(mission.order.plan.legs)
-            verdict = judge(outcome, mission.witness, criteria, waypoints=count, elapsed=time)
-            changed["verdict"] = verdict.as_json()
+            elapsed = self._teleop.elapsed(now_ns)
+            changed["verdict"] = mission.judged(outcome, self._contact_speed_max, elapsed)
         self._note(mission, event.event, event.text, now_ns, **changed)
         if mission.ended:
             self._current = None

@@ -24,6 +24,8 @@ from cloudrc.cloud.teleop.service_mission import (
 )
 from cloudrc.errors import CloudrcError
 
+QUEUE_MAX = 16
+"""Missions that may wait for the one under way."""
 KEPT = 100
 """Missions that have ended and are still known."""
 KEEP_PERIOD_NS = 1_000_000_000
@@ -90,6 +92,19 @@ class MissionBook:
     def open(self) -> list[Mission]:
         """Missions that have not ended; the first is the one to fly."""
         return [mission for mission in self.missions.values() if not mission.ended]
+
+    def waits_for(self, order: Order) -> list[Mission]:
+        """Give the missions that a new one has to wait for.
+
+        Raises:
+            ConflictError: If there are any and the order does not want to wait, or too many do.
+        """
+        before = self.open()
+        if before and not order.queue:
+            raise busy(before[0], "cancel it first, or queue the new one")
+        if len(before) > QUEUE_MAX:
+            raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", before[0].id)
+        return before
 
     def find(self, mission_id: str) -> Mission:
         """Give a mission.

@@ -7,14 +7,15 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from cloudrc.cloud.teleop.journal_format import Entry
-from cloudrc.cloud.teleop.messages import Continue, StartMission
+from cloudrc.cloud.teleop.messages import Continue, Outcome, StartMission
 from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.cloud.teleop.verdict import Failure, Verdict, Witness
+from cloudrc.cloud.teleop.verdict import Criteria, Failure, Verdict, Witness, judge
 from cloudrc.messages import Start
 
 QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
 DONE, FAILED, CANCELLED = "done", "failed", "cancelled"
 ENDED = (DONE, FAILED, CANCELLED)
+NEVER_BEGAN = "mission cancelled before it began"
 
 STATES = {
     "queued": QUEUED,
@@ -110,6 +111,18 @@ class Mission:
         goes_on = f"is held on the way to {where}" if self.state == HELD else f"goes on to {where}"
         return f"the controller has a new session, as after a restart; the mission {goes_on}"
 
+    def judged(self, outcome: Outcome, contact_speed_max: float, elapsed: float) -> dict[str, Any]:
+        """The verdict on how it ended, as the API shows it.
+
+        Args:
+            outcome: How that was.
+            contact_speed_max: Below which the arm's tip may meet the board [m/s].
+            elapsed: How long it has lasted [s].
+        """
+        criteria = Criteria(self.order.contact, contact_speed_max)
+        count = len(self.order.plan.legs)
+        return judge(outcome, self.witness, criteria, waypoints=count, elapsed=elapsed).as_json()
+
     def forsake(self) -> None:
         """A later mission has begun: this one is over, although nothing kept says how it ended."""
         text = "how it ended was not kept: the journal was damaged or could not be written"
@@ -185,6 +198,11 @@ def number_of(mission_id: str, salt: bytes) -> int:
     """
     digest = hashlib.sha256(salt + mission_id.encode()).digest()
     return int.from_bytes(digest[:8], "little") >> 1 or 1
+
+
+def never_began() -> dict[str, Any]:
+    """The verdict on a mission that was cancelled before it began, as the API shows it."""
+    return Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
 
 
 def first_verb(mission: Mission) -> StartMission | Continue:
