@@ -244,7 +244,7 @@ class CloudEndpoint:
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():
             if isinstance(message, Setpoint):
-                if message.epoch in (NO_EPOCH, self._session.epoch):  # or for where the robot was
+                if self._is_for_now(message.epoch):
                     self._setpoint = message
             elif isinstance(message, OperatorRequest):
                 self._relay(message)
@@ -253,12 +253,22 @@ class CloudEndpoint:
                 if isinstance(message, MissionEvent) and message.event == "started":
                     self._loop.start_mission()
 
+    def _is_for_now(self, epoch: int) -> bool:
+        """Whether words are for this session: in another one the robot may have been elsewhere."""
+        return epoch in (NO_EPOCH, self._session.epoch)
+
     def _relay(self, request: OperatorRequest) -> None:
         """Pass a request on; one without a number is an alarm, before which nothing starts.
 
-        Nor before the robot is seen; and nothing without a session. Teleop repeats what is dropped.
+        Nor before the robot is seen, nor by a word for another session: teleop may lag, and
+        somebody else may have moved the robot since. Without a session nothing is passed on.
+        Teleop repeats what is dropped.
+
+        All other words pass whenever they were said. An end and a stop lead nowhere, progress is of
+        the mission that it names; an acknowledgement arms nothing, and teleop would but say it
+        again in this session, as it stands.
         """
-        may_start = self._loop.ready and not self._alarm.sounds
+        may_start = self._loop.ready and not self._alarm.sounds and self._is_for_now(request.epoch)
         if request.number == 0 and request.request is Request.ESTOP:
             self._alarm.sound()
         elif self._session.epoch and (may_start or request.request is not Request.START):

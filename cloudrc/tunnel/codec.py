@@ -235,8 +235,9 @@ def decode_command(body: bytes) -> Command:
 
 
 def encode_operator(request: OperatorRequest) -> bytes:
-    """Lay out the body of an OPERATOR datagram."""
-    return _OPERATOR.pack(*request)
+    """Lay out the body of an OPERATOR datagram; the epoch stands in the header."""
+    number, asked, start, mission_id, reached, _ = request
+    return _OPERATOR.pack(number, asked, start, mission_id, reached)
 
 
 def decode_operator(body: bytes) -> OperatorRequest:

@@ -91,7 +91,8 @@ class Flight:
 
     def _collect(self):
         for output in self.teleop.take_outputs():
-            said = output._replace(epoch=0) if isinstance(output, Setpoint) else output
+            for_session = isinstance(output, Setpoint | OperatorRequest)
+            said = output._replace(epoch=0) if for_session else output
             self.said.append(said)
             self.said_at.append(self.now_ns)
             if isinstance(said, OperatorRequest) and self.downlink:

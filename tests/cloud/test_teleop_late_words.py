@@ -14,7 +14,8 @@ from cloudrc.cloud.teleop.messages import (
 )
 from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.cloud.teleop.mission_rules import HELD_LOWEST
-from cloudrc.messages import GuardState, Request, Setpoint, Start
+from cloudrc.cloud.teleop.request import REPEAT_NS
+from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 
 
 @pytest.mark.parametrize("first_sight", [True, False])
@@ -155,6 +156,33 @@ def test_a_setpoint_says_for_which_session_it_is():
         flight.see()
         said += flight.teleop.take_outputs()
     assert [(type(each), each.epoch) for each in said] == [(Setpoint, 1), (Setpoint, 2)]
+
+
+def test_every_copy_of_a_request_says_in_which_session_the_robot_was_seen():
+    flight = Flight()
+    flight.step()
+    flight.operate(StartMission(FROM_SPAWN, ID))
+    said = []
+    for epoch in (1, 1, 2):
+        flight.epoch = epoch
+        flight.now_ns += REPEAT_NS
+        flight.see()
+        flight.teleop.handle_deadline(flight.now_ns)
+        said += [each for each in flight.teleop.take_outputs() if isinstance(each, OperatorRequest)]
+    assert {each.request for each in said} == {Request.START}
+    assert [each.epoch for each in said] == [1, 1, 2]
+    assert len({each.number for each in said}) == 1
+
+
+def test_a_request_that_waits_for_the_robot_is_for_the_session_in_which_it_comes_in_sight():
+    flight = Flight()
+    flight.operate(EmergencyStop())
+    assert flight.teleop.take_outputs() == []
+    flight.epoch = 3
+    flight.see()
+    flight.teleop.handle_deadline(0)
+    said = [each for each in flight.teleop.take_outputs() if isinstance(each, OperatorRequest)]
+    assert [(each.request, each.epoch) for each in said] == [(Request.ESTOP, 3)]
 
 
 @pytest.mark.parametrize("verb", [Cancel(), EmergencyStop(), Pause()])

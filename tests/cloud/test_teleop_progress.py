@@ -117,7 +117,8 @@ def test_progress_waits_for_what_is_asked():
     assert repeater.due(50_000_000) is None
     repeater.see(seen._replace(mission=4 + PREDECESSORS), 0)
     assert repeater.due(99_999_999) is None
-    assert repeater.due(100_000_000) == OperatorRequest(0, Request.PROGRESS, Start.SPAWN, ID, 2)
+    told = OperatorRequest(0, Request.PROGRESS, Start.SPAWN, ID, 2, seen.epoch)
+    assert repeater.due(100_000_000) == told
 
 
 def test_numbers_of_missions_do_not_repeat_with_a_new_journal():

@@ -29,8 +29,16 @@ messages = st.one_of(
         rtt=numbers,
         loop_delay=numbers,
     ),
-    st.builds(Setpoint, vectors, numbers, st.integers(-1, 9999)),
-    st.builds(OperatorRequest, counts, st.sampled_from(Request), st.sampled_from(Start)),
+    st.builds(Setpoint, vectors, numbers, st.integers(-1, 9999), counts),
+    st.builds(
+        OperatorRequest,
+        number=counts,
+        request=st.sampled_from(Request),
+        start=st.sampled_from(Start),
+        mission_id=counts,
+        reached=counts,
+        epoch=counts,
+    ),
     st.builds(MissionEvent, counts, st.text(max_size=20), st.integers(-1, 9999), st.text()),
 )
 

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import pytest
-from flying import Ends, join
+from flying import CLOCK, Ends, join
 
+from cloudrc import assembly
+from cloudrc.cloud.identity import CloudIdentity
+from cloudrc.cloud.operator import Operator
+from cloudrc.cloud.teleop.messages import Output, Seen
 from cloudrc.config.load import load_experiment
-from cloudrc.messages import OperatorRequest, Request, Setpoint
+from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.records import Fault, GuardChange, Record
 from cloudrc.tunnel.codec import Kind, peek
 
 HOVER = load_experiment("hover", ["link.profile=ideal"])
 S = 1_000_000_000
+LAG_NS = 2 * S
 ELSEWHERE = (5.0, 5.0, 1.0)
 
 
@@ -48,3 +54,67 @@ def test_nothing_starts_in_a_session_before_the_robot_is_seen_in_it(ends: Ends) 
     ends.cloud._loop.reset()  # as a new session does
     assert say(ends, start) == []
     assert say(ends, end) == [Kind.OPERATOR]
+
+
+@pytest.mark.promise("P-MISSION-8")
+def test_a_start_that_was_said_in_another_session_is_not_passed_on(ends: Ends) -> None:
+    """Teleop lags, as behind a slow disk; meanwhile somebody else may have moved the robot."""
+    epoch = ends.cloud._session.epoch
+    for start in Start:
+        said = OperatorRequest(99, Request.START, start)
+        assert say(ends, said._replace(epoch=epoch - 1), said._replace(epoch=epoch + 1)) == []
+        assert say(ends, said._replace(epoch=epoch)) == [Kind.OPERATOR]
+        assert say(ends, said) == [Kind.OPERATOR], "for no session"
+
+
+@pytest.mark.parametrize("request_", [each for each in Request if each is not Request.START])
+def test_what_arms_nothing_is_passed_on_whenever_it_was_said(ends: Ends, request_: Request) -> None:
+    epoch = ends.cloud._session.epoch
+    said = OperatorRequest(99, request_, epoch=epoch - 1)
+    assert say(ends, said, said._replace(epoch=epoch)) == [Kind.OPERATOR] * 2
+
+
+class Lagging:
+    """A teleop of its own process; what it says comes late, as from behind a slow disk."""
+
+    outcome, settled = None, True
+
+    def __init__(self, teleop: Operator) -> None:
+        self._teleop = teleop
+        self._late: list[tuple[int, Output | Fault]] = []
+        self.outputs: list[Output | Fault] = []
+        self.epochs: dict[int, int] = {}  # each one seen, and when first [ns]
+
+    def see(self, seen: Seen, now_ns: int) -> None:
+        self.epochs.setdefault(seen.epoch, now_ns)
+        self._teleop.see(seen, now_ns)
+
+    def handle_deadline(self, now_ns: int) -> None:
+        self._teleop.handle_deadline(now_ns)
+        self._late += [(now_ns + LAG_NS, said) for said in self._teleop.take_outputs()]
+        while self._late and self._late[0][0] <= now_ns:
+            self.outputs.append(self._late.pop(0)[1])
+
+    def take_outputs(self) -> list[Output | Fault]:
+        outputs, self.outputs = self.outputs, []
+        return outputs
+
+
+@pytest.mark.promise("P-MISSION-8")
+def test_a_teleop_that_lags_starts_its_mission_in_the_session_that_it_has_seen() -> None:
+    """Its first order is on the way while cloud restarts; it arrives in the next session."""
+    ends = join(HOVER)
+    teleop = ends.cloud.teleop = Lagging(ends.cloud.teleop)
+    changes: list[GuardChange] = []
+
+    def note(world: list[Record], cloud: list[Record]) -> None:
+        changes.extend(record for record in world if isinstance(record, GuardChange))
+
+    ends.run.fly(lambda: False, LAG_NS - S // 2, note)
+    ends.run._cloud = assembly.build_cloud(
+        HOVER, CloudIdentity(CLOCK, b"another".ljust(16)), lambda: ends.run.now_ns, teleop
+    )
+    ends.run.fly(lambda: False, 4 * LAG_NS, note)
+    _, second, _ = teleop.epochs.values()  # the third is that of the start from the spawn
+    assert changes[0].stamp_ns >= second + LAG_NS
+    assert changes[-1].state is GuardState.TRACK

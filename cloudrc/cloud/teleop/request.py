@@ -23,7 +23,7 @@ class Repeater:
     A request supersedes the one before it, acknowledged or not: its number is higher, and the
     robot acts on rising numbers only; but an emergency stop is superseded by nothing. Numbers go on
     from what the robot shows, well above what a predecessor may have asked; until the robot is in
-    sight nothing is sent.
+    sight nothing is sent. Every copy names the session in which it was seen last.
 
     When nothing is asked, the robot is told how far the mission is until it shows that it knows.
     """
@@ -137,7 +137,7 @@ class Repeater:
         elif now_ns < self._due_ns:
             return None
         self._due_ns = now_ns + REPEAT_NS
-        return pending
+        return pending._replace(epoch=seen.epoch)
 
     def _progress_due(self, seen: Seen, now_ns: int) -> OperatorRequest | None:
         """The mission's progress, if the robot flies this very mission and does not know."""
@@ -146,7 +146,7 @@ class Repeater:
         if not unknown or now_ns < self._due_ns:
             return None
         self._due_ns = now_ns + REPEAT_NS
-        return told
+        return told._replace(epoch=seen.epoch)
 
     def _is_acknowledged(self, pending: OperatorRequest, seen: Seen) -> bool:
         if pending.number == UNNUMBERED or seen.mission != pending.number:
