@@ -35,7 +35,7 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
         413: f"The body is longer than {BODY_MAX // 1024} KiB",
         422: "A value cannot be used; `problems` has every one",
         429: "Too many requests; try again in a second",
-        503: "Not now: teleop is starting, or another one still holds the journal; try again",
+        503: "Not now: teleop is starting or ending, or another one holds the journal; try again",
     }.items()
 }
 

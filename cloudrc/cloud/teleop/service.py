@@ -30,9 +30,9 @@ from cloudrc.cloud.teleop.messages import (
 )
 from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook, busy
+from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook, UnavailableError, busy
 from cloudrc.cloud.teleop.service_mission import Mission, Order
-from cloudrc.cloud.teleop.sight import LATCHED, Sight
+from cloudrc.cloud.teleop.sight import Sight
 from cloudrc.cloud.teleop.verdict import Witness
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Setpoint, Start, Vector
@@ -82,7 +82,7 @@ class MissionService:
         return self._sight.seen is not None
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Take an order; it is started at once or waits.
+        """Take an order; it is started at once or waits: for others, or for the next process.
 
         Returns:
             The mission, and whether it is new: the same key gives the same mission.
@@ -98,8 +98,9 @@ class MissionService:
         waiting = self.book.waits_for(order)
         self._refuse_if_stopped()
         mission = self.book.add(order)
-        if waiting:
-            self._note(mission, "queued", f"mission waits for {waiting[-1].id}", now_ns)
+        if waiting or self._ends:
+            before = waiting[-1].id if waiting else "the next teleop: this one ends"
+            self._note(mission, "queued", f"mission waits for {before}", now_ns)
         else:
             self._launch(mission, StartMission(order.plan, mission.number), now_ns)
         return mission, True
@@ -140,8 +141,10 @@ class MissionService:
 
         Raises:
             ConflictError: If a mission is under way that is not held.
-            UnavailableError: If it cannot be kept.
+            UnavailableError: If it cannot be kept, or this process ends: a point is for now.
         """
+        if self._ends:
+            raise UnavailableError("teleop ends; say it again to the next one")
         waiting = self.book.open()
         if waiting and waiting[0].state != missions.HELD:
             raise busy(waiting[0], "hold or cancel it first")
@@ -226,8 +229,7 @@ class MissionService:
         """Why nothing can fly before the operator acknowledges it; "" if it can."""
         if self._teleop.requests.stopping:
             return "an emergency stop is on its way to the robot"
-        guard = self._sight.guard
-        return f"the guard is in {guard.name} and lets nothing fly" if guard in LATCHED else ""
+        return self._sight.latched
 
     def _refuse_if_stopped(self) -> None:
         if self._stopped:

@@ -39,7 +39,7 @@ class UnknownMissionError(CloudrcError):
 
 
 class UnavailableError(CloudrcError):
-    """Not now: the journal cannot be written, or another teleop holds it."""
+    """Not now: the journal cannot be written, another teleop holds it, or this one ends."""
 
 
 class ConflictError(CloudrcError):

@@ -56,6 +56,12 @@ class Sight:
         """State of the guard; GROUND until it has been seen."""
         return GROUND if self.seen is None else self.seen.guard
 
+    @property
+    def latched(self) -> str:
+        """Why the guard lets nothing fly before it is acknowledged; "" if it does."""
+        guard = self.guard
+        return f"the guard is in {guard.name} and lets nothing fly" if guard in LATCHED else ""
+
     def see(self, seen: Seen, now_ns: int) -> bool:
         """Take note of telemetry as it arrives [ns].
 
