@@ -13,7 +13,7 @@ from math import nan
 
 from cloudrc.cloud.identity import CloudIdentity as CloudIdentity
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.cloud.operator import Alarm, seen_in
+from cloudrc.cloud.operator import Alarm, is_meant_for, seen_in
 from cloudrc.cloud.operator import Operator as Operator
 from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
@@ -243,9 +243,10 @@ class CloudEndpoint:
 
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():
-            if isinstance(message, Setpoint):
-                if self._is_for_now(message.epoch):
-                    self._setpoint = message
+            if not is_meant_for(self._session.epoch, message):
+                self._counts["words_dropped"] += 1
+            elif isinstance(message, Setpoint):
+                self._setpoint = message
             elif isinstance(message, OperatorRequest):
                 self._relay(message)
             else:
@@ -253,22 +254,12 @@ class CloudEndpoint:
                 if isinstance(message, MissionEvent) and message.event == "started":
                     self._loop.start_mission()
 
-    def _is_for_now(self, epoch: int) -> bool:
-        """Whether words are for this session: in another one the robot may have been elsewhere."""
-        return epoch in (NO_EPOCH, self._session.epoch)
-
     def _relay(self, request: OperatorRequest) -> None:
         """Pass a request on; one without a number is an alarm, before which nothing starts.
 
-        Nor before the robot is seen, nor by a word for another session: teleop may lag, and
-        somebody else may have moved the robot since. Without a session nothing is passed on.
-        Teleop repeats what is dropped.
-
-        All other words pass whenever they were said. An end and a stop lead nowhere, progress is of
-        the mission that it names; an acknowledgement arms nothing, and teleop would but say it
-        again in this session, as it stands.
+        Nor before the robot is seen; and nothing without a session. Teleop repeats what is dropped.
         """
-        may_start = self._loop.ready and not self._alarm.sounds and self._is_for_now(request.epoch)
+        may_start = self._loop.ready and not self._alarm.sounds
         if request.number == 0 and request.request is Request.ESTOP:
             self._alarm.sound()
         elif self._session.epoch and (may_start or request.request is not Request.START):

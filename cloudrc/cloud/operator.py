@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from cloudrc.cloud.teleop.messages import Outcome, Output, Seen
-from cloudrc.messages import GuardState, OperatorRequest, Request, Telemetry
+from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Telemetry
 from cloudrc.records import Fault
+from cloudrc.tunnel.session import NO_EPOCH
 
 REPEAT_NS = 100_000_000
 """Time between two copies of the alarm [ns]."""
@@ -40,6 +41,24 @@ class Operator(Protocol):
 
     def take_outputs(self) -> Sequence[Output | Fault]:
         """Hand over what it has said since the last call."""
+
+
+def is_meant_for(epoch: int, said: Output | Fault) -> bool:
+    """Whether what teleop says may lead the robot in a session.
+
+    Where to fly, and to start, is meant for one session: teleop may lag, and somebody else may have
+    moved the robot since; it says it again. All else passes whenever it was said. An end and a stop
+    lead nowhere, progress is of the mission that it names, and an acknowledgement arms nothing.
+
+    Args:
+        epoch: Of the session.
+        said: What is to be obeyed in it.
+    """
+    if isinstance(said, Setpoint) or (
+        isinstance(said, OperatorRequest) and said.request is Request.START
+    ):
+        return said.epoch in (NO_EPOCH, epoch)
+    return True
 
 
 def seen_in(

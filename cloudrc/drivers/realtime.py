@@ -138,8 +138,7 @@ def serve(
         raise ValueError(f"{end} has no key, and nothing leaves a process unsealed")
     gc.collect()
     gc.freeze()  # what is loaded now stays: the collector need not look at it in flight
-    sink_ns = time.monotonic_ns()
-    stalled = False
+    stalled, sink_ns = False, time.monotonic_ns()
     while not stop():
         deadline_ns = endpoint.next_deadline_ns()
         wait_ns = min(deadline_ns - time.monotonic_ns(), WAIT_MAX_NS)

@@ -67,6 +67,7 @@ class CloudEnd(End):
             "cloudrc_predictions_judged_total": plain(prediction.judged),
             "cloudrc_horizon_clamped_total": plain(counts.get("horizon_clamped", 0)),
             "cloudrc_commands_frozen_total": plain(counts.get("frozen", 0)),
+            "cloudrc_words_dropped_total": plain(counts.get("words_dropped", 0)),
             "cloudrc_loop_missed_periods_total": plain(counts.get("missed_periods", 0)),
             "cloudrc_plugin_failures_total": {
                 (plugin,): counts.get(f"{plugin}_failed", 0) for plugin in PLUGINS

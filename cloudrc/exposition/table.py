@@ -239,6 +239,11 @@ _ENTRIES = (
         buckets=LATENESS_BUCKETS,
     ),
     counter("cloudrc_loop_busy_seconds_total", "Time spent in handling deadlines.", ENDS),
+    counter(
+        "cloudrc_words_dropped_total",
+        "Setpoints and starts that teleop has said in another session.",
+        (CLOUD,),
+    ),
     counter("cloudrc_loop_missed_periods_total", "Commands skipped by a late loop.", (CLOUD,)),
     counter(
         "cloudrc_recorder_dropped_records_total",

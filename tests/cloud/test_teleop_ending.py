@@ -1,11 +1,13 @@
-"""A teleop that has been asked to end: it begins nothing, and what is ordered is not lost."""
+"""A teleop that has been asked to end: it begins nothing."""
 
 import pytest
 from service_harness import ServiceFlight, flying
 from teleop_harness import AWAY, B, C
 
-from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
+from cloudrc.cloud.teleop.service_book import UnavailableError
 from cloudrc.messages import GuardState, Request
+
+HALFWAY = (0.5, 0.0, 1.0)
 
 
 def idle():
@@ -27,48 +29,57 @@ def held():
     return flight
 
 
+def go_to(flight):
+    flight.teleop.go_to(AWAY, 0.0, flight.now_ns)
+
+
+def resume(flight):
+    flight.teleop.resume(flight.now_ns)
+
+
 @pytest.mark.promise("P-MISSION-4")
-@pytest.mark.parametrize("before", [idle, done])
-def test_what_is_ordered_while_teleop_ends_is_flown_by_its_successor(before):
+@pytest.mark.parametrize(
+    ("before", "say"),
+    [
+        (idle, ServiceFlight.create),
+        (done, ServiceFlight.create),
+        (held, lambda flight: flight.create(queue=True)),
+        (idle, go_to),
+        (done, go_to),
+        (held, go_to),
+        (held, resume),
+    ],
+)
+def test_nothing_is_begun_while_teleop_ends(before, say):
+    """It is refused, for its sender to say it again to the next teleop; nothing is kept of it."""
     flight = before()
     flight.teleop.pause(flight.now_ns)
-    asked = len(flight.requests)
-    mission_id = flight.create(key="uid")
+    flight.step(seconds=0.2)
+    kept, asked = list(flight.kept), len(flight.requests)
+    with pytest.raises(UnavailableError, match="teleop ends; say it again to the next one"):
+        say(flight)
     flight.step(seconds=0.5)
-    assert flight.view(mission_id)["state"] == "queued"
-    assert "the next teleop" in flight.view(mission_id)["events"][-1]["text"]
+    assert flight.kept == kept
     assert Request.START not in {request.request for request in flight.requests[asked:]}
+    assert AWAY not in {setpoint.position for setpoint in flight.setpoints}
+
+
+def test_an_order_that_is_known_is_known_to_a_teleop_that_ends_and_to_the_next():
+    flight = idle()
+    mission_id = flight.create(key="uid")
+    flight.teleop.pause(flight.now_ns)
+    assert flight.create(key="uid") == mission_id
     flight.restart_teleop()
     assert flight.create(key="uid") == mission_id
-    flight.step(seconds=0.3)
-    assert flight.view(mission_id)["state"] == "flying"
 
 
-def test_a_second_order_then_is_like_one_behind_any_other():
-    flight = idle()
+def test_where_it_is_seen_the_robot_stays_though_its_end_is_lost():
+    """Cloud keeps the setpoint, and obeys it alone while there is no teleop."""
+    flight, _ = flying()
+    flight.step(position=HALFWAY, seconds=0.1)
     flight.teleop.pause(flight.now_ns)
-    first = flight.create()
-    with pytest.raises(ConflictError, match=f"mission {first} is queued"):
-        flight.create()
-    second = flight.create(queue=True)
-    flight.teleop.cancel(first, flight.now_ns)
-    flight.restart_teleop()
-    flight.step(seconds=0.3)
-    assert [flight.view(each)["state"] for each in (first, second)] == ["cancelled", "flying"]
-
-
-@pytest.mark.parametrize("before", [idle, done, held])
-def test_a_point_to_go_to_is_refused_while_teleop_ends(before):
-    """The next teleop would lead the robot there whenever it comes."""
-    flight = before()
-    flight.teleop.pause(flight.now_ns)
-    flight.step(seconds=0.2)
-    kept = list(flight.kept)
-    with pytest.raises(UnavailableError, match="teleop ends"):
-        flight.teleop.go_to(AWAY, 0.0, flight.now_ns)
-    flight.step(seconds=0.2)
-    assert flight.kept == kept
-    assert AWAY not in {setpoint.position for setpoint in flight.setpoints}
+    flight.step(seconds=0.1)
+    assert flight.setpoints[-1].position == HALFWAY
 
 
 def test_a_teleop_that_ends_still_stops_the_rotors_and_releases_the_robot():

@@ -100,10 +100,14 @@ def test_a_robot_that_flies_and_rests_by_turns_is_told_nothing():
     assert flight.requests[asked:] == []
 
 
-def test_a_mission_from_here_is_not_flown_from_where_somebody_else_has_left_the_robot():
+@pytest.mark.parametrize("in_sight", [True, False])
+def test_a_mission_from_here_is_not_flown_from_where_somebody_else_has_left_the_robot(in_sight):
+    """Whether it was ordered with the robot in sight or before that."""
     flight = Flight()
     flight.onboard, flight.guard = (ID - 1, 3), GuardState.HOLD
-    flight.step(position=AWAY)
+    flight.position = AWAY
+    if in_sight:
+        flight.step()
     flight.downlink = False
     flight.operate(StartMission(THREE, ID))
     flight.step(seconds=0.1)

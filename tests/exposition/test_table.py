@@ -19,6 +19,7 @@ UNITS = ("seconds", "meters", "newtons", "meters_per_second", "radians_per_secon
 NOT_DATAGRAMS = {
     "stalls",
     "missed_periods",
+    "words_dropped",
     "horizon_clamped",
     "frozen",
     "start_refused",

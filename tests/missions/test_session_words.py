@@ -42,6 +42,7 @@ def test_a_setpoint_for_another_session_is_not_flown(ends: Ends) -> None:
     before = ends.cloud._setpoint
     say(ends, Setpoint(ELSEWHERE, epoch=epoch - 1), Setpoint(ELSEWHERE, epoch=epoch + 1))
     assert ends.cloud._setpoint is before
+    assert ends.cloud._counts["words_dropped"] == 2
     for mine in (Setpoint(ELSEWHERE, epoch=epoch), Setpoint(ELSEWHERE)):
         say(ends, mine)
         assert ends.cloud._setpoint == mine
@@ -65,6 +66,7 @@ def test_a_start_that_was_said_in_another_session_is_not_passed_on(ends: Ends) -
         assert say(ends, said._replace(epoch=epoch - 1), said._replace(epoch=epoch + 1)) == []
         assert say(ends, said._replace(epoch=epoch)) == [Kind.OPERATOR]
         assert say(ends, said) == [Kind.OPERATOR], "for no session"
+    assert ends.cloud._counts["words_dropped"] == 2 * len(Start)
 
 
 @pytest.mark.parametrize("request_", [each for each in Request if each is not Request.START])

@@ -132,6 +132,7 @@ class Teleop:
             case Pause():
                 self._tell("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
                 self.requests.ask(Request.END)
+                self._aim.here()  # should the end be lost, cloud keeps this
 
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry, at the instant [ns] at which it arrives."""
@@ -140,6 +141,8 @@ class Teleop:
         told = self._aim.setpoint
         onboard, legs = rules.known_on_board(seen, self._mission_id), self._plan.legs
         started = self.requests.see(seen, now_ns) is Request.START and self.state is STARTING
+        if self.state is STARTING and not self._expected and self._plan.start is Start.HERE:
+            self._expected = (seen.mission_id, self._mission_id)  # ordered before it was in sight
         if self.state not in UNDER_WAY:
             if anew:
                 self._find(seen)

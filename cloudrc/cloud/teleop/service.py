@@ -82,7 +82,7 @@ class MissionService:
         return self._sight.seen is not None
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Take an order; it is started at once or waits: for others, or for the next process.
+        """Take an order; it is started at once or waits.
 
         Returns:
             The mission, and whether it is new: the same key gives the same mission.
@@ -90,17 +90,16 @@ class MissionService:
         Raises:
             ConflictError: If another one is under way and the order does not want to wait, or too
                 many do, or the operator has to acknowledge first.
-            UnavailableError: If it cannot be kept.
+            UnavailableError: If it cannot be kept, or this process ends.
         """
         known = self.book.with_key(order.key)
         if known is not None:
             return known, False
         waiting = self.book.waits_for(order)
-        self._refuse_if_stopped()
+        self._refuse_to_fly()
         mission = self.book.add(order)
-        if waiting or self._ends:
-            before = waiting[-1].id if waiting else "the next teleop: this one ends"
-            self._note(mission, "queued", f"mission waits for {before}", now_ns)
+        if waiting:
+            self._note(mission, "queued", f"mission waits for {waiting[-1].id}", now_ns)
         else:
             self._launch(mission, StartMission(order.plan, mission.number), now_ns)
         return mission, True
@@ -128,7 +127,8 @@ class MissionService:
         return self._operate(Hold(), now_ns)
 
     def resume(self, now_ns: int) -> Mission:
-        """Go on with the mission that is held; raises ConflictError if none is."""
+        """Go on with what is held; raises ConflictError, or UnavailableError at the end."""
+        self._refuse_to_fly()
         return self._operate(Resume(), now_ns)
 
     def go_to(self, position: Vector, yaw: float, now_ns: int) -> Mission:
@@ -141,16 +141,14 @@ class MissionService:
 
         Raises:
             ConflictError: If a mission is under way that is not held.
-            UnavailableError: If it cannot be kept, or this process ends: a point is for now.
+            UnavailableError: If it cannot be kept, or this process ends.
         """
-        if self._ends:
-            raise UnavailableError("teleop ends; say it again to the next one")
+        self._refuse_to_fly()
         waiting = self.book.open()
         if waiting and waiting[0].state != missions.HELD:
             raise busy(waiting[0], "hold or cancel it first")
         if waiting:
             return self._operate(GoTo(position, yaw), now_ns)
-        self._refuse_if_stopped()
         leg = Leg(position, yaw)
         mission = self.book.add(Order(Plan((leg,), Start.HERE, leg.time_limit), "goto"))
         self._launch(mission, GoTo(position, yaw, mission.number), now_ns)
@@ -231,7 +229,9 @@ class MissionService:
             return "an emergency stop is on its way to the robot"
         return self._sight.latched
 
-    def _refuse_if_stopped(self) -> None:
+    def _refuse_to_fly(self) -> None:
+        if self._ends:  # the robot is asked to hold
+            raise UnavailableError("teleop ends; say it again to the next one")
         if self._stopped:
             raise ConflictError(f"{self._stopped}; see why, then: cloudrc mission acknowledge")
 
