@@ -38,6 +38,8 @@ RANGES: dict[str, tuple[float, float, float]] = {
     "world_throttled": (8.0, 0.1, 0.95),
     "wall_clock": (0.0, -4e9, 4e9),
     "journal_full": (10.0, 0.0, 0.0),
+    "journal_slow": (10.0, 0.05, 3.0),
+    "teleop_paused": (5.0, 0.0, 0.0),
     "journal_torn": (8.0, 1.0, 60.0),
     "journal_rotten": (8.0, 0.0, 1.0),
     "api_flood": (5.0, 10.0, 150.0),
@@ -76,6 +78,7 @@ def compose(seed: int) -> Schedule:
         cloud_offset=round(float(rng.uniform(-1e5, 1e5)), 3) if rng.random() < 0.5 else 0.0,
         cloud_drift=int(rng.integers(-500, 501)) if rng.random() < 0.3 else 0,
         duration=DURATION,
+        apart=bool(rng.random() < 0.5),
     )
 
 

@@ -1,20 +1,26 @@
 """The operator's desk in virtual time: teleop's service with its journal, which may die and return.
 
 Cloud's end is joined to it as it is to the process of teleop: while that is away, nobody answers.
+It sees and says everything at once, as long as cloud asks it to; see `Apart` for one that does not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from cloudrc.cloud.operator import Operator
+from cloudrc.cloud.teleop.api_bridge import Call
 from cloudrc.cloud.teleop.journal import Journal
 from cloudrc.cloud.teleop.journal_format import Entry
 from cloudrc.cloud.teleop.messages import Outcome, Output, Seen
 from cloudrc.cloud.teleop.plan import Plan
 from cloudrc.cloud.teleop.service import MissionService
+from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
 from cloudrc.cloud.teleop.service_mission import Mission, Order
+from cloudrc.faults.mortal import Mortal
 from cloudrc.records import Fault, MissionEvent
 
 Keep = Callable[[Entry], None]
@@ -77,6 +83,24 @@ class Desk:
         assert self.service is not None, "teleop is down"
         mission, _ = self.service.create(Order(plan, **options), now_ns)
         return mission
+
+    def ask(self, call: Call, now_ns: int) -> None:
+        """Have a call of the API made on cloud's clock [ns]; what it refuses is dropped."""
+        if self.service is not None:
+            with suppress(ConflictError, UnavailableError):
+                call(self.service, now_ns)
+
+    def shut_down(self, now_ns: int) -> None:
+        """SIGTERM at an instant [ns] of cloud's clock."""
+        if self.service is not None:
+            self.service.pause(now_ns)
+
+    def live(self, host: Mortal) -> None:
+        """Time begins on the machine of cloud, which is teleop's, too."""
+
+    def join(self, start_ns: int) -> Operator:
+        """Give a new cloud, born at an instant [ns] of its clock, what it has for teleop."""
+        return self
 
     @property
     def missions(self) -> list[Mission]:

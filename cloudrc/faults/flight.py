@@ -13,13 +13,14 @@ from typing import Any, Unpack
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.identity import CloudIdentity
-from cloudrc.cloud.teleop.service_mission import Mission
+from cloudrc.cloud.teleop.service_mission import Mission, Order
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.crowd import Crowd
 from cloudrc.faults.desk import Desk
+from cloudrc.faults.desk_apart import apart
 from cloudrc.faults.mortal import Clock, Mortal
 from cloudrc.faults.options import SECRET, Options, Shape
 from cloudrc.faults.watch import Watch
@@ -85,12 +86,14 @@ class Flight:
         self.changes: list[GuardChange] = []
         self._hash = RecordHash()
         self.watch = _watch(self.experiment)
-        limit = self.experiment.criteria.contact_speed_max_mps
-        self.desk = Desk(limit, options.get("journal"))
+        limit, path = self.experiment.criteria.contact_speed_max_mps, options.get("journal")
+        goes_apart = options.get("apart", False)
+        self.desk = apart(limit, path, seed) if goes_apart else Desk(limit, path)
         if options.get("start", True):
             self.order()
         self.world = Mortal(self._build_world, Clock())
         self.cloud = Mortal(self._build_cloud, self._clock, "cloud")
+        self.desk.live(self.cloud)
         self.uplink = _link(self.experiment, options.get("uplink"), True)
         self.downlink = _link(self.experiment, options.get("downlink"), False)
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
@@ -116,6 +119,12 @@ class Flight:
         plan = assembly.build_plan(self.experiment)
         contact = self.experiment.criteria.contact
         return self.desk.order(plan, self._clock.at(now_ns), contact=contact, **options)
+
+    def ask_for_mission(self, now_ns: int) -> None:
+        """Order it at an instant [ns] of virtual time, if it is taken."""
+        plan = assembly.build_plan(self.experiment)
+        order = Order(plan, contact=self.experiment.criteria.contact)
+        self.desk.ask(lambda service, own_ns: service.create(order, own_ns), self._clock.at(now_ns))
 
     def fly(self, until: float, over: Callable[[], bool] = lambda: False) -> Flight:
         """Go on.
@@ -212,7 +221,8 @@ class Flight:
         identity = CloudIdentity(
             self._cloud_clock_id, nonce.ljust(16), self._ring("cloud", start_ns)
         )
-        cloud = assembly.build_cloud(self.experiment, identity, lambda: start_ns, self.desk)
+        teleop = self.desk.join(start_ns)
+        cloud = assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
         if self._tempt is not None:
             self._tempt(cloud)
         if self._second is not None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from cloudrc.cloud.endpoint import CloudEndpoint
-from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
+from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.sight import LATCHED
 from cloudrc.faults.adversary import temptation
 from cloudrc.faults.asks import held
@@ -75,7 +75,6 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         schedule: What befalls the flight.
         keep: Whether records are kept and hashed; takes twice as long.
     """
-    second = schedule.of("second_cloud")
     offset = schedule.cloud_offset or schedule.cloud_drift
     clock = Clock(round((schedule.cloud_offset + 1e6) * 1e9), schedule.cloud_drift)
     flight = Flight(
@@ -87,7 +86,8 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         honest=not schedule.policy,
         keep=keep,
         tempt=_tempt(schedule, clock if offset else Clock()),
-        second=second[0].at if second else None,
+        second=min((event.at for event in schedule.of("second_cloud")), default=None),
+        apart=schedule.has_teleop_apart,
     )
     operator = Operator(flight)
     flight.listeners.append(operator.look)
@@ -154,15 +154,12 @@ class Operator:
         if not seen or (flight.desk.missions and not flight.mission.ended):
             return
         self._next_ns = now_ns + PATIENCE_NS
-        try:
-            # What the operator sees: a world that was restarted is in GROUND, and changes nothing.
-            own_ns = flight.cloud.clock.at(now_ns)
-            if service.state(own_ns)["seen"]["guard"] in [each.name for each in LATCHED]:
-                service.acknowledge(own_ns)
-            else:
-                flight.order(now_ns)
-        except (ConflictError, UnavailableError):
-            return
+        # What the operator sees: a world that was restarted is in GROUND, and changes nothing.
+        own_ns = flight.cloud.clock.at(now_ns)
+        if service.state(own_ns)["seen"]["guard"] in [each.name for each in LATCHED]:
+            flight.desk.ask(MissionService.acknowledge, own_ns)
+        else:
+            flight.ask_for_mission(now_ns)
 
 
 def judged(schedule: Schedule) -> frozenset[str]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from cloudrc import assembly
 from cloudrc.cloud.teleop.api_bridge import Bridge, Call
 from cloudrc.cloud.teleop.journal_format import MAGIC, parse, to_bytes
-from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
+from cloudrc.cloud.teleop.service import MissionService
+from cloudrc.cloud.teleop.service_book import UnavailableError
 from cloudrc.cloud.teleop.service_mission import Order
+from cloudrc.faults.desk_apart import Apart
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.inject_way import waylay
 from cloudrc.faults.options import SECRET
-from cloudrc.faults.schedule import Event, Schedule
+from cloudrc.faults.schedule import STALLS, Event, Schedule
 from cloudrc.faults.walls import Wall
 from cloudrc.tunnel.keys import Key, KeySet
 
@@ -87,13 +91,16 @@ def _at_the_desk(flight: Flight, event: Event) -> bool:
     elif event.kind in ("journal_torn", "journal_rotten"):
         cloud.at(event.at, lambda now_ns: _damage(flight, event, now_ns))
     elif event.kind == "api_flood":
+        call = partial(_flood, flight, event)
         for n in range(int(event.duration / FLOOD_PERIOD) + 1):
-            cloud.at(event.at + n * FLOOD_PERIOD, lambda now_ns: _flood(flight, event, now_ns))
+            cloud.at(event.at + n * FLOOD_PERIOD, lambda now_ns: _ask(flight, call, now_ns))
     elif event.kind == "second_order":
-        cloud.at(event.at, lambda now_ns: _order(flight, now_ns))
+        cloud.at(event.at, flight.ask_for_mission)
     elif event.kind == "held":
-        cloud.at(event.at, lambda now_ns: _say(flight, "hold", now_ns))
-        cloud.at(event.end, lambda now_ns: _say(flight, "resume", now_ns))
+        cloud.at(event.at, lambda now_ns: _ask(flight, MissionService.hold, now_ns))
+        cloud.at(event.end, lambda now_ns: _ask(flight, MissionService.resume, now_ns))
+    elif event.kind in STALLS:
+        _stall(flight, event)
     else:
         return False
     return True
@@ -103,11 +110,7 @@ def _shut_down(flight: Flight, event: Event) -> None:
     """SIGTERM: teleop holds what is flown and writes it down; a while later it is gone."""
     cloud, gone = flight.cloud, event.at + event.value * event.duration
 
-    def ask(now_ns: int) -> None:
-        if flight.desk.service is not None:
-            flight.desk.service.pause(cloud.clock.at(now_ns))
-
-    cloud.at(event.at, ask)
+    cloud.at(event.at, lambda now_ns: flight.desk.shut_down(cloud.clock.at(now_ns)))
     if event.kind == "pod_shut_down":
         cloud.at(gone, lambda now_ns: flight.kill_cloud_pod(now_ns, event.end - gone))
     else:
@@ -115,24 +118,18 @@ def _shut_down(flight: Flight, event: Event) -> None:
         cloud.at(event.end, lambda _: flight.desk.start())
 
 
+def _stall(flight: Flight, event: Event) -> None:
+    """Teleop, a process of its own, stands still."""
+    desk = flight.desk
+    assert isinstance(desk, Apart), "the flight of such a schedule has one"
+    if event.kind == "journal_slow":
+        desk.slow.append(event)
+    else:
+        flight.cloud.at(event.at, lambda now_ns: desk.stop(now_ns, event.duration))
+
+
 def _refuse() -> None:
     raise OSError(28, "No space left on device")
-
-
-def _say(flight: Flight, verb: str, now_ns: int) -> None:
-    try:
-        if flight.desk.service is not None:
-            getattr(flight.desk.service, verb)(flight.cloud.clock.at(now_ns))
-    except ConflictError:
-        return
-
-
-def _order(flight: Flight, now_ns: int) -> None:
-    try:
-        if flight.desk.service is not None:
-            flight.order(now_ns)
-    except (ConflictError, UnavailableError):
-        return
 
 
 def _damage(flight: Flight, event: Event, now_ns: int) -> None:
@@ -146,11 +143,12 @@ def _damage(flight: Flight, event: Event, now_ns: int) -> None:
     flight.desk.entries = parse(bytes(data)).entries
 
 
-def _flood(flight: Flight, event: Event, now_ns: int) -> None:
+def _ask(flight: Flight, call: Call, now_ns: int) -> None:
+    flight.desk.ask(call, flight.cloud.clock.at(now_ns))
+
+
+def _flood(flight: Flight, event: Event, service: MissionService, own_ns: int) -> None:
     """Many requests at once through the API's bridge: people who look, one who orders."""
-    service = flight.desk.service
-    if service is None:
-        return
     bridge, plan = Bridge(), assembly.build_plan(flight.experiment)
     bridge.open(service)
     calls: list[Call] = [
@@ -164,4 +162,4 @@ def _flood(flight: Flight, event: Event, now_ns: int) -> None:
         except UnavailableError:
             break
     for call in bridge.take():
-        call(flight.cloud.clock.at(now_ns))
+        call(own_ns)

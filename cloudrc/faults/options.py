@@ -33,6 +33,7 @@ class Options(TypedDict, total=False):
         secrets: Key files by end; the same one for both by default.
         second: When another cloud wants the robot, too [s]; never by default.
         journal: Of teleop; in memory by default.
+        apart: Whether teleop is a process of its own; it is in cloud's by default.
     """
 
     seed: int
@@ -47,6 +48,7 @@ class Options(TypedDict, total=False):
     secrets: dict[str, KeySet]
     second: float | None
     journal: Path
+    apart: bool
 
 
 def blackouts(*spans: tuple[float, float]) -> Shape:

@@ -33,6 +33,8 @@ KINDS: dict[str, str] = {
     "world_throttled": "the world process runs for a share of value of each 100 ms",
     "wall_clock": "the wall clock of both ends steps by value [s], and stays there",
     "journal_full": "the journal refuses every entry",
+    "journal_slow": "every fsync of the journal takes value [s]",
+    "teleop_paused": "the teleop process stands still",
     "journal_torn": "the cloud pod is away, its journal has lost its last value bytes",
     "journal_rotten": "the cloud pod is away, a bit of its journal is wrong, at a share of value",
     "api_flood": "value requests to teleop in every 100 ms",
@@ -50,6 +52,8 @@ KINDS: dict[str, str] = {
     "held": "the operator holds the mission, resumes it after the duration",
 }
 """Every kind of fault."""
+STALLS = ("journal_slow", "teleop_paused")
+"""Kinds in which teleop is a process of its own, whatever the schedule says."""
 WAYS = ("both", "up", "down")
 SHARES = (
     *("loss", "corruption", "cloud_throttled", "world_throttled", "journal_rotten"),
@@ -103,6 +107,7 @@ class Schedule:
         cloud_drift: How fast cloud's clock is [ppm], a whole number.
         policy: Of an adversary in the place of cloud; "" for an honest cloud.
         duration: Of the flight [s].
+        apart: Whether teleop is a process of its own, as in production.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -115,6 +120,12 @@ class Schedule:
     cloud_drift: int = 0
     policy: str = ""
     duration: float = 60.0
+    apart: bool = False
+
+    @property
+    def has_teleop_apart(self) -> bool:
+        """Whether teleop is a process of its own: it is, or some of its faults take it."""
+        return self.apart or bool(self.of(*STALLS))
 
     @property
     def quiet_from(self) -> float:

@@ -128,7 +128,7 @@ def test_every_kind_of_fault_is_composed_and_ends_before_the_calm() -> None:
 
 def test_a_schedule_is_what_its_file_says(tmp_path: Path) -> None:
     path = tmp_path / "schedule.yaml"
-    for schedule in (compose(8), choose(3), Schedule(2)):
+    for schedule in (compose(8), choose(3), Schedule(2), Schedule(2, apart=True)):
         path.write_text(dump(schedule, "a note\nof two lines"))
         assert load(path) == schedule
 
@@ -147,6 +147,7 @@ def test_a_schedule_is_what_its_file_says(tmp_path: Path) -> None:
         "seed: 1\nduration: 0",
         "seed: 1\nduration: .inf",
         "seed: 1\nreorder: 2",
+        "seed: 1\napart: perhaps",
         "seed: 1\nevents: [{kind: blackout, at: nan}]",
         "seed: 1\nevents: [{kind: blackout, at: .nan}]",
         "seed: 1\nevents: [{kind: blackout, at: -1}]",

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
+from cloudrc.cloud.teleop.messages import Seen
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.faults import fuzz
 from cloudrc.faults.compose import RANGES, compose
@@ -14,7 +16,7 @@ from cloudrc.faults.flight import Flight
 from cloudrc.faults.fuzz import fly, judged
 from cloudrc.faults.inject import inject
 from cloudrc.faults.remains import KILLED
-from cloudrc.faults.schedule import KINDS, Event, Schedule, dump, load
+from cloudrc.faults.schedule import KINDS, STALLS, Event, Schedule, dump, load
 from cloudrc.faults.shrink import shrink
 from cloudrc.faults.walls import Wall
 from cloudrc.link.sidecar_follow import PeerName
@@ -25,7 +27,7 @@ from cloudrc.tunnel.keys import KeyRing, KeySet
 Patch = pytest.MonkeyPatch
 NEW = (
     *("teleop_shut_down", "pod_shut_down", "names_lost", "key_wrong"),
-    *("values_invalid", "values_huge", *KILLED),
+    *("values_invalid", "values_huge", *KILLED, *STALLS),
 )
 
 
@@ -136,6 +138,36 @@ def test_huge_numbers_that_pass_the_guard_are_found(monkeypatch: Patch) -> None:
     monkeypatch.setattr("cloudrc.world.guard.RANGE", 1e308)
     monkeypatch.setattr("cloudrc.world.guard.rules.towards", lambda start, end, step: end)
     assert "cap" in _flown(huge)
+
+
+@pytest.mark.parametrize("kind", STALLS)
+def test_a_teleop_that_stands_still_does_not_see_the_robot(kind: str, monkeypatch: Patch) -> None:
+    looks: list[int] = []
+    see = MissionService.see
+
+    def look(service: MissionService, seen: Seen, now_ns: int) -> None:
+        looks.append(now_ns)
+        see(service, seen, now_ns)
+
+    monkeypatch.setattr(MissionService, "see", look)
+    written, gaps = Event("held", 7.5, 0.1), list[int]()
+    for duration in (0.02, 2.5):
+        looks.clear()
+        assert _flown(Event(kind, 7.0, duration, 2.0), written, until=12.0) == set()
+        gaps.append(max(after - before for before, after in pairwise(looks)))
+    assert gaps[0] < 0.1e9
+    assert gaps[1] >= 2.0e9
+
+
+def test_a_needless_process_of_teleop_is_left_out_and_one_that_it_takes_is_not() -> None:
+    schedule = Schedule(5, events=(Event("blackout", 1.0, 1.0),), apart=True)
+    assert not shrink(schedule, lambda each: bool(each.events)).apart
+    assert shrink(schedule, lambda each: each.apart).apart
+
+
+def test_teleop_is_apart_in_half_of_the_schedules() -> None:
+    chosen = [compose(seed).apart for seed in range(400)]
+    assert 150 < sum(chosen) < 250
 
 
 def _says_the_same(source: Path, target: Path) -> Recovery:
