@@ -20,13 +20,19 @@ INVARIANTS = {
 PROMISES = {"random": "P-FAULT-2", "adversarial": "P-FAULT-3", "clean": "P-FAULT-4"}
 """Ids in `docs/safety/promises.md`."""
 NOTES = {
+    "random": (
+        "",
+        "In half of the schedules teleop is a process of its own, as in production: it looks every",
+        "20 ms, its sockets take 11 datagrams, and while its journal waits for the disk it neither",
+        "hears nor speaks.",
+    ),
     "adversarial": (
         "",
         "The cloud holds valid keys. Every second one flies amid faults of all kinds, and some",
         "speak in the operator's place. A robot that these, or a hit, have stopped may come to lie",
         "outside the fence, a [known limit](guard.md): it is told below the table, and a breach",
         "beyond 1.5 m.",
-    )
+    ),
 }
 """What else is to be said, by kind."""
 
