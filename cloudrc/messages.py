@@ -144,6 +144,8 @@ class OperatorRequest(NamedTuple):
         start: Where the mission starts from; only read with Request.START.
         mission_id: Names the mission, below 2^63.
         reached: How many of its waypoints are reached; `MISSION_OVER` if it has ended before that.
+        basis_stamp_ns: When the newest odometry was measured that cloud has had as it passed this
+            on [ns, world's clock]; before any, `NEVER_NS`.
         epoch: Session in which the robot was seen when teleop said it; 0 if that was in none. For
             cloud alone: it is not told to the robot.
     """
@@ -153,6 +155,7 @@ class OperatorRequest(NamedTuple):
     start: Start = Start.SPAWN
     mission_id: int = 0
     reached: int = 0
+    basis_stamp_ns: int = NEVER_NS
     epoch: int = 0
 
 

@@ -259,12 +259,16 @@ class CloudEndpoint:
 
         Nor before the robot is seen; and nothing without a session. Teleop repeats what is dropped.
         """
+        if request.number > codec.NUMBER_MAX:  # somebody with the keys has used them up
+            self._counts["words_dropped"] += 1
+            return
         may_start = self._loop.ready and not self._alarm.sounds
         if request.number == 0 and request.request is Request.ESTOP:
             self._alarm.sound()
         elif self._session.epoch and (may_start or request.request is not Request.START):
             self._asked = max(self._asked, request.number)
-            self._send(Kind.OPERATOR, codec.encode_operator(request))
+            known = request._replace(basis_stamp_ns=self._loop.basis_stamp_ns)
+            self._send(Kind.OPERATOR, codec.encode_operator(known))
 
     def _send_command(self, setpoint: Setpoint, now_ns: int) -> None:
         elapsed_ns = now_ns - self._commanded_ns if self._commanded_ns >= 0 else PERIOD_NS
@@ -276,7 +280,7 @@ class CloudEndpoint:
         self._delays = (control.horizon, control.rtt, control.loop_delay)
 
     def _note_counts(self, now_ns: int) -> None:
-        self._count_ns += COUNT_PERIOD_NS
+        self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
         self._datagrams += self._session.tend(now_ns)
         for name, count in sorted((self._counts | self._loop.counts).items()):
             self._records.append(Counted(now_ns, "cloud", name, count))

@@ -64,6 +64,11 @@ class ControlLoop:
         self._trusted_ns = NEVER_NS
 
     @property
+    def basis_stamp_ns(self) -> int:
+        """When the newest odometry was measured [ns, world's clock]; `NEVER_NS` before any."""
+        return NEVER_NS if self._basis is None else self._basis.stamp_ns
+
+    @property
     def ready(self) -> bool:
         """Whether there is telemetry to compute a command from."""
         return self._basis is not None

@@ -28,8 +28,9 @@ from cloudrc.messages import (
     Telemetry,
 )
 
-VERSION = 2
-"""Of the wire, one per build; 1 had no tags. Another one is refused, never spoken."""
+VERSION = 3
+"""Of the wire, one per build; 1 had no tags, in 2 a request did not say on what it was based.
+Another one is refused, never spoken."""
 DATAGRAM_MAX = 512
 """Longer than any datagram of ours [bytes]; a longer one is refused unread."""
 
@@ -116,11 +117,14 @@ _HEADER = struct.Struct("<BBIBBQ")
 _TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIdIQHB")
 _STAMPS = struct.Struct(f"<q{struct.calcsize('<3d4d3d3ddqq')}xq")
 _COMMAND = struct.Struct("<qqq3dd")
-_OPERATOR = struct.Struct("<IBBQH")
+_OPERATOR = struct.Struct("<IBBQHq")
 _HELLO = struct.Struct("<16s16s16sB")
 _ACCEPT = struct.Struct("<16s16s16sB")
 _COOKIE = struct.Struct("<16s")
 _BUSY = struct.Struct("<16s?")
+
+NUMBER_MAX = 2**32 - 1
+"""The highest number that a request can have."""
 
 _new = tuple.__new__  # of a named tuple: four times as fast as calling it
 _unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
@@ -236,17 +240,18 @@ def decode_command(body: bytes) -> Command:
 
 def encode_operator(request: OperatorRequest) -> bytes:
     """Lay out the body of an OPERATOR datagram; the epoch stands in the header."""
-    number, asked, start, mission_id, reached, _ = request
-    return _OPERATOR.pack(number, asked, start, mission_id, reached)
+    number, asked, start, mission_id, reached, basis_stamp_ns, _ = request
+    return _OPERATOR.pack(number, asked, start, mission_id, reached, basis_stamp_ns)
 
 
 def decode_operator(body: bytes) -> OperatorRequest:
     """Read the body of an OPERATOR datagram."""
-    number, request, start, mission_id, reached = _OPERATOR.unpack(body)
+    number, request, start, mission_id, reached, basis_stamp_ns = _OPERATOR.unpack(body)
     try:
-        return OperatorRequest(number, Request(request), Start(start), mission_id, reached)
+        asked = Request(request), Start(start)
     except ValueError:
         raise DecodeError("malformed") from None
+    return OperatorRequest(number, *asked, mission_id, reached, basis_stamp_ns)
 
 
 def encode_hello(hello: Hello) -> bytes:

@@ -143,6 +143,10 @@ class KeyRing:
     The overlap counts on the process's own monotonic clock from the moment it reads the file. A
     process that starts cannot know how long the file has been there: it accepts the key before only
     as long as the file says, by the wall clock, which is asked this once. In flight none is.
+
+    Attributes:
+        current: The key to use.
+        version: Rises whenever new ones are put in.
     """
 
     def __init__(self, keys: KeySet, now_ns: int = 0, wall: float | None = None) -> None:
@@ -154,6 +158,7 @@ class KeyRing:
             wall: What the wall clock says [s since 1970]; None to count the overlap from now.
         """
         self.current = keys.current
+        self.version = 0
         self._previous = keys.previous
         self._until_ns = now_ns + round(keys.left(wall) * 1e9)
 
@@ -169,6 +174,7 @@ class KeyRing:
         if previous == self._previous:
             until_ns = min(until_ns, self._until_ns)
         self.current, self._previous, self._until_ns = keys.current, previous, until_ns
+        self.version += 1
 
     def accepted(self, now_ns: int) -> tuple[Key, ...]:
         """The keys that are valid at this moment, the one to use first."""

@@ -20,9 +20,8 @@ whole end is sealed if its identity has keys: `WorldIdentity(clock, nonce, ring=
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
-from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
 from cloudrc.tunnel.codec import (
@@ -37,6 +36,7 @@ from cloudrc.tunnel.codec import (
     encode_header,
 )
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from cloudrc.tunnel.openers import GENERATIONS, Cipher, Openers
 
 ACCEPT, ALIVE = int(Kind.ACCEPT), int(Kind.ALIVE)  # an enum's member is slow to look up
 NO_EPOCH = 0
@@ -49,18 +49,8 @@ REKEY_NS = 120_000_000_000
 """Source: WireGuard's REKEY-AFTER-TIME."""
 REKEY_DATAGRAMS = 2**32
 """Of all kinds. Deviation: WireGuard's 2^60; the design asks for 2^32."""
-GENERATIONS = 256
-AHEAD_MAX = 127
-"""Generations that a peer may be ahead without a silence; the header has one byte of them."""
-SILENT_MAX = 64 * GENERATIONS
-"""And so many after the longest silence; over a week of it, a peer moves on twice as often."""
-KEPT = 3
-"""Generations that are opened side by side: late datagrams, and a key that is announced."""
 LOOKS = 3
 """In a row at which the peer is heard with the key before, until this end goes back to it."""
-
-Cipher: TypeAlias = AESGCM | ChaCha20Poly1305
-Opener: TypeAlias = tuple[Cipher, Key]
 
 
 class Agreement(NamedTuple):
@@ -93,6 +83,7 @@ class Session:
         self.epoch = NO_EPOCH
         self.ring = ring
         self.accepted = ring.accepted(now_ns)
+        self._ring_version = ring.version
         self.greeting_key = ring.current  # that the last greeting was opened with
         self._sends, self._opens = int(sends), 1 - int(sends)
         self._counters = dict.fromkeys(map(int, Kind), 0)
@@ -101,13 +92,12 @@ class Session:
         self._generation = self._generation_byte = 0
         self._rekey_ns: int | None = None
         self._rekey_total = 0
-        self._announced: tuple[int, Cipher] | None = None
-        self._openers: dict[int, Opener] = {}  # by generation as the header has it: one byte of it
-        self._newest = 0  # generation that the peer was last heard with for the first time
-        self._newest_ns = self._tended_ns = now_ns  # when that was, by the last look
-        self._heard = ring.current  # key that the peer was last heard with
-        self._apart = 0  # looks in a row at which it was another one than ours
-        self._tried: dict[int, list[Opener]] = {}
+        self._announced: tuple[int, Key, Cipher] | None = None
+        self._openers: Openers | None = None  # of the epoch
+        self._newest = dict.fromkeys(map(int, Kind), -1)  # counters that the peer was heard with
+        self._heard = ring.current  # key that it was last heard with
+        self._apart = 0  # looks in a row at which that was another one than ours
+        self._tended_ns = now_ns
 
     def begin(self, epoch: int, agreement: Agreement | None = None, key: Key | None = None) -> None:
         """Begin a new epoch: new keys, and counters start again but for those of no epoch.
@@ -126,9 +116,9 @@ class Session:
         self._rekey_total = self._sent() + REKEY_DATAGRAMS
         self._announced = None
         self._cipher = self._derive(self._key, self._sends, 0)
-        self._openers = {0: (self._derive(self._key, self._opens, 0), self._key)}
-        self._newest, self._newest_ns = 0, self._tended_ns
-        self._tried = {}
+        self._openers = Openers(self._derive_opening, self._key, self._tended_ns)
+        self._openers.accepted = self.accepted
+        self._newest = dict.fromkeys(self._newest, -1)
 
     def seal(self, kind: int, body: bytes) -> bytes:
         """Make the datagram of the session that carries `body`."""
@@ -156,20 +146,17 @@ class Session:
         _, direction, epoch, generation, kind, counter = check(data)
         if direction != self._opens:
             raise DecodeError("direction")
+        if self._ring_version != self.ring.version:
+            self._take_up_keys()
         if kind <= LAST_GREETING:
             return kind, direction, epoch, counter, self._open_greeting(data)
         if epoch != self.epoch or not epoch:
             raise DecodeError("old_epoch")
-        opener = self._openers.get(generation)
-        if opener is None:
-            return kind, direction, epoch, counter, self._open_ahead(data, generation)
-        try:
-            body = opener[0].decrypt(data[4:16], data[16:], data[:16])
-        except InvalidTag:
-            if self._silent < GENERATIONS - KEPT:
-                raise DecodeError("tag") from None
-            return kind, direction, epoch, counter, self._open_ahead(data, generation)
-        self._heard = opener[1]
+        assert self._openers is not None, "an epoch has them"
+        body, key, anew = self._openers.open(data, generation)
+        if counter > self._newest[kind]:  # what is repeated anybody can send
+            self._newest[kind] = counter
+            self._hear(key, anew)
         return kind, direction, epoch, counter, body
 
     def next_counter(self, kind: int) -> int:
@@ -182,13 +169,11 @@ class Session:
         Returns:
             Datagrams to send: the announcement of a key that the peer has not used yet.
         """
-        self.accepted, self._tended_ns = self.ring.accepted(now_ns), now_ns
-        if not self.epoch:
+        self._tended_ns = now_ns
+        self._take_up_keys()
+        if self._openers is None:
             return []
-        self._tried = {}
-        stale = [byte for byte, (_, key) in self._openers.items() if key not in self.accepted]
-        for byte in stale:
-            del self._openers[byte]
+        self._openers.look(now_ns)
         if self._rekey_ns is None:
             self._rekey_ns = now_ns + REKEY_NS
         if (key := self._key_for_peer()) != self._key:
@@ -197,6 +182,22 @@ class Session:
             self._move_on(self._key)
             self._rekey_ns, self._rekey_total = now_ns + REKEY_NS, self._sent() + REKEY_DATAGRAMS
         return [] if self._key == self.ring.current else [self._announce()]
+
+    def _take_up_keys(self) -> None:
+        """A key that is not accepted any more opens nothing from now on."""
+        self._ring_version = self.ring.version
+        self.accepted = self.ring.accepted(self._tended_ns)
+        if self._openers is not None and self._openers.accepted != self.accepted:
+            self._openers.accept(self.accepted)
+
+    def _hear(self, key: Key, anew: bool) -> None:
+        """The peer seals with this key, or, in a generation that is new, announces it perhaps."""
+        assert self._openers is not None
+        self._openers.hear()
+        if not anew:
+            self._heard = key
+        elif key == self.ring.current != self._key:
+            self._move_on(key)
 
     def _key_for_peer(self) -> Key:
         """The one to seal with: which the peer is heard with, for it may not have ours any more."""
@@ -210,65 +211,28 @@ class Session:
 
     def _move_on(self, key: Key) -> None:
         """Seal with the next generation, of this key."""
-        self._generation = (self._announced[0] if self._announced else self._generation) + 1
+        self._generation = self._next_generation
         self._generation_byte = self._generation % GENERATIONS
         self._key = key
         self._apart = 0
         self._cipher = self._derive(key, self._sends, self._generation)
         self._announced = None
 
+    @property
+    def _next_generation(self) -> int:
+        return 1 + (self._announced[0] if self._announced else self._generation)
+
     def _announce(self) -> bytes:
         """Say, sealed with the new key, that this end has it."""
-        if self._announced is None:
-            generation = self._generation + 1
-            self._announced = generation, self._derive(self.ring.current, self._sends, generation)
-        generation, cipher = self._announced
+        key = self.ring.current
+        if self._announced is None or self._announced[1] != key:
+            generation = self._next_generation
+            self._announced = generation, key, self._derive(key, self._sends, generation)
+        generation, _, cipher = self._announced
         counter = self._counters[ALIVE]
         self._counters[ALIVE] = counter + 1
         header = encode_header(ALIVE, self._sends, self.epoch, counter, generation % GENERATIONS)
         return header + cipher.encrypt(header[4:], b"", header)
-
-    def _open_ahead(self, data: bytes, byte: int) -> bytes:
-        """Open a datagram of a generation that is new to us; keep its key if the tag is right.
-
-        One that lies a little behind is, too, if its key was not accepted for a while. After a
-        silence the byte in the header stands for several.
-        """
-        ahead = (byte - self._newest + KEPT - 1) % GENERATIONS - KEPT + 1
-        last = self._newest + AHEAD_MAX + self._silent
-        first = self._newest + ahead + GENERATIONS * (self._newest + ahead < 0)
-        for generation in range(first, last + 1, GENERATIONS):
-            for cipher, key in self._candidates(generation):
-                try:
-                    body = cipher.decrypt(data[4:16], data[16:], data[:16])
-                except InvalidTag:
-                    continue
-                self._keep(generation, (cipher, key))
-                return body
-        raise DecodeError("tag")
-
-    @property
-    def _silent(self) -> int:
-        """How many generations the peer may have moved on by since it was heard with a new one."""
-        return min(2 * (self._tended_ns - self._newest_ns) // REKEY_NS, SILENT_MAX)
-
-    def _candidates(self, generation: int) -> list[Opener]:
-        """What may open a generation; kept, so that a flood of forged ones derives no key twice."""
-        if generation not in self._tried:
-            self._tried[generation] = [
-                (self._derive(key, self._opens, generation), key) for key in self.accepted
-            ]
-        return self._tried[generation]
-
-    def _keep(self, generation: int, opener: Opener) -> None:
-        if generation > self._newest + KEPT:  # after a silence: their bytes are the next ones' soon
-            self._openers.clear()
-        self._openers[generation % GENERATIONS] = opener
-        self._newest, self._newest_ns = generation, self._tended_ns
-        while len(self._openers) > KEPT:
-            del self._openers[next(iter(self._openers))]
-        if opener[1] == self.ring.current != self._key:
-            self._move_on(self.ring.current)
 
     def _open_greeting(self, data: bytes) -> bytes:
         signed, tag = data[:-TAG_SIZE], data[-TAG_SIZE:]
@@ -277,6 +241,9 @@ class Session:
                 self.greeting_key = key
                 return signed[HEADER_SIZE:]
         raise DecodeError("tag")
+
+    def _derive_opening(self, key: Key, generation: int) -> Cipher:
+        return self._derive(key, self._opens, generation)
 
     def _derive(self, key: Key, direction: int, generation: int) -> Cipher:
         assert self._agreement is not None, "greetings come first"

@@ -16,7 +16,6 @@ from cloudrc.messages import (
     GuardState,
     Odometry,
     OperatorRequest,
-    Request,
     Start,
     Telemetry,
 )
@@ -38,13 +37,13 @@ from cloudrc.tunnel.handshake import Door
 from cloudrc.tunnel.unsealed import make_session
 from cloudrc.world.clock import CATCH_UP_NS, SimulationClock
 from cloudrc.world.identity import WorldIdentity as WorldIdentity
+from cloudrc.world.orders import Orders
 from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
-from cloudrc.world.touches import Touches
 
 ODOMETRY_PERIOD_NS = 10_000_000
 """Source: plant.md, 100 Hz."""
-COUNT_PERIOD_NS = 1_000_000_000
+COUNT_PERIOD_NS = TEND_PERIOD_NS = 1_000_000_000
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # an enum's member is slow to look up
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 _new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
@@ -81,17 +80,16 @@ class WorldEndpoint:
         self._complaints = Complaints()
         self._command_age_max_ns = command_age_max_ns
         self._clock_is_shared = False
-        self._mission = 0
-        self._progress = (0, 0)  # mission and waypoints reached: kept through every epoch
-        self._touches = Touches()
         self._stalled_wake_ns = NEVER_NS
         self._odometry_ns = start_ns
         self._count_ns = start_ns + COUNT_PERIOD_NS
+        self._tend_ns = start_ns + TEND_PERIOD_NS
         self._waiting: tuple[int, int, Command] | None = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._datagrams: list[bytes] = []
         self._records: list[Record] = []
         self._counts: defaultdict[str, int] = defaultdict(int)
+        self._orders = Orders(robot.guard, self._counts, command_age_max_ns)
 
     @property
     def slip_ns(self) -> int:
@@ -110,6 +108,9 @@ class WorldEndpoint:
     def handle_deadline(self, now_ns: int) -> None:
         """Run every tick up to and including `now_ns`; odometry leaves on its way."""
         self._advance(self._follow(now_ns) + 1)
+        if now_ns >= self._tend_ns:  # by the machine's clock: world's may lag
+            self._tend_ns = now_ns + TEND_PERIOD_NS
+            self._greet(self._session.tend(now_ns))
 
     def take_datagrams(self) -> list[bytes]:
         """Hand over the datagrams to send."""
@@ -135,7 +136,7 @@ class WorldEndpoint:
                 self._door.admit(kind, counter, now_ns)
                 if kind == Kind.OPERATOR:
                     self._advance(world_ns)
-                    self._receive_operator(codec.decode_operator(body))
+                    self._receive_operator(codec.decode_operator(body), now_ns)
         except DecodeError as error:
             self._counts[str(error)] += 1
             if not self._session.epoch:
@@ -167,6 +168,8 @@ class WorldEndpoint:
         assert self._waiting is not None
         epoch, counter, command = self._waiting
         self._waiting = None
+        if self.robot.guard.state is not TRACK:  # ended or stopped in the same wake
+            return
         echo_ns, basis_ns, _, velocity, _ = command
         self._echo_stamp_ns, self._applied_ns = echo_ns, now_ns
         self._records.append(_new(CommandApplied, (now_ns, epoch, counter, basis_ns, velocity)))
@@ -174,6 +177,7 @@ class WorldEndpoint:
     def _send_telemetry(self, now_ns: int) -> None:
         """Measure, tell cloud, and note down the truth."""
         simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
+        orders = self._orders
         tip_force = simulator.tip_force()
         position, orientation, velocity, rate, _ = simulator.readings
         truth = _new(Odometry, (now_ns, position, orientation, velocity, rate))
@@ -183,7 +187,7 @@ class WorldEndpoint:
         if simulator.touches:
             for touch in simulator.take_contacts():
                 records.append(Contact(now_ns, **touch._asdict()))
-                self._touches.note(touch)
+                self._orders.touches.note(touch)
         if epoch := self._session.epoch:
             known = (
                 now_ns,
@@ -192,11 +196,12 @@ class WorldEndpoint:
                 self._echo_stamp_ns,
                 now_ns - self._applied_ns if self._applied_ns >= 0 else 0,
                 self._clock.slip_ns,
-                self._mission,
+                orders.number,
                 guard.state,
-                self._touches.pipes,
-                self._touches.speed,
-                *self._progress,
+                orders.touches.pipes,
+                orders.touches.speed,
+                orders.mission_id,
+                orders.reached,
             )
             telemetry = _new(Telemetry, known)
             counter = self._session.next_counter(TELEMETRY)
@@ -205,7 +210,6 @@ class WorldEndpoint:
         if now_ns >= self._count_ns:
             self._count_ns += COUNT_PERIOD_NS
             self._counts["held_seconds"] += guard.armed and guard.state is HOLD
-            self._greet(self._session.tend(now_ns + self._clock.slip_ns))
             for name, count in sorted((self._counts | guard.counts).items()):
                 records.append(Counted(now_ns, "world", name, count))
         self._odometry_ns += ODOMETRY_PERIOD_NS
@@ -218,7 +222,7 @@ class WorldEndpoint:
         self._counts[answer.outcome] += 1
         if answer.opened:
             self._clock_is_shared = self._door.shares_clock
-            self._mission = 0
+            self._orders.number = 0
             self._begin_epoch("cloud said hello")
         self._greet(answer.datagrams)
 
@@ -232,44 +236,16 @@ class WorldEndpoint:
         epoch, now_ns = self._session.epoch, self._clock.tick_ns
         self._records.append(SessionOpened(now_ns, "world", epoch, cause))
 
-    def _receive_operator(self, request: OperatorRequest) -> None:
-        if request.request is Request.PROGRESS:
-            self._keep_progress(request)
+    def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
+        """Do as the operator asks; a mission from the spawn begins an epoch of its own."""
+        tick_ns, waited = self._clock.tick_ns, now_ns == self._stalled_wake_ns
+        if not self._orders.obey(request, tick_ns, waited=waited):
             return
-        if request.number <= self._mission:
-            return
-        guard, now_ns = self.robot.guard, self._clock.tick_ns
-        if request.request is Request.START and guard.latched:
-            # Not acted on, so not confirmed either: the operator has to acknowledge first.
-            self._counts["start_refused"] += 1
-            return
-        self._mission = request.number
-        self._keep_progress(request)
-        if request.request is Request.START:
-            self._start_mission(request, now_ns)
-        elif request.request is Request.END:
-            guard.end_mission(now_ns)
-        elif request.request is Request.ESTOP:
-            guard.stop(now_ns)
-        else:
-            guard.acknowledge(now_ns)
-
-    def _start_mission(self, request: OperatorRequest, now_ns: int) -> None:
-        if request.mission_id != self._progress[0] or request.start is Start.SPAWN:
-            self._progress = (request.mission_id, 0)  # from the spawn nothing is reached yet
-            self._touches = Touches()
-        self._keep_progress(request)
         if request.start is Start.SPAWN:
-            self.robot.put_on_ground(now_ns, "mission starts from spawn")
-            self._greet([self._door.move_on(now_ns + self._clock.slip_ns)])
+            self.robot.put_on_ground(tick_ns, "mission starts from spawn")
+            self._greet([self._door.move_on(now_ns)])
             self._begin_epoch("mission starts from spawn")
-        self.robot.guard.start_mission(now_ns)
-
-    def _keep_progress(self, request: OperatorRequest) -> None:
-        """The onboard witness of how far a mission is; it only ever rises."""
-        mission_id, reached = self._progress
-        if request.mission_id == mission_id:
-            self._progress = (mission_id, max(reached, request.reached))
+        self.robot.guard.start_mission(tick_ns)
 
     def _receive_command(
         self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int

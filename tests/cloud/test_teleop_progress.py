@@ -117,7 +117,7 @@ def test_progress_waits_for_what_is_asked():
     assert repeater.due(50_000_000) is None
     repeater.see(seen._replace(mission=4 + PREDECESSORS), 0)
     assert repeater.due(99_999_999) is None
-    told = OperatorRequest(0, Request.PROGRESS, Start.SPAWN, ID, 2, seen.epoch)
+    told = OperatorRequest(0, Request.PROGRESS, Start.SPAWN, ID, 2, epoch=seen.epoch)
     assert repeater.due(100_000_000) == told
 
 

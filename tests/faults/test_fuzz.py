@@ -76,9 +76,9 @@ def test_the_operators_voice_says_every_word_and_the_operator_is_not_heard(
     heard: list[OperatorRequest] = []
     receive = WorldEndpoint._receive_operator
 
-    def hear(world: WorldEndpoint, request: OperatorRequest) -> None:
+    def hear(world: WorldEndpoint, request: OperatorRequest, now_ns: int) -> None:
         heard.append(request)
-        receive(world, request)
+        receive(world, request, now_ns)
 
     monkeypatch.setattr(WorldEndpoint, "_receive_operator", hear)
     for seed in (27, 38):

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.identity import CloudIdentity
-from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState, OperatorRequest, Request, Start
-from cloudrc.records import Arrival
+from cloudrc.messages import (
+    NEVER_NS,
+    UPRIGHT,
+    ZERO,
+    Command,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Start,
+    Telemetry,
+)
+from cloudrc.records import Arrival, Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
@@ -61,16 +72,31 @@ def bare_world(
     )
 
 
+class NoLoop:
+    """Stands for cloud's loop: it knows when the robot was seen, and computes nothing."""
+
+    def __init__(self) -> None:
+        self.faults: list[Fault] = []
+        self.counts: dict[str, int] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        self.ready, self.basis_stamp_ns = False, NEVER_NS
+
+    def observe(self, telemetry: Telemetry, now_ns: int) -> None:
+        self.ready, self.basis_stamp_ns = True, telemetry.stamp_ns
+
+
 def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
     """Cloud's end; what is put into its `teleop.outputs` it sends."""
-    nothing = SimpleNamespace(
-        faults=[], counts={}, ready=False, outputs=[], outcome=None, settled=True,
-        reset=lambda: None, observe=lambda telemetry, now_ns: None, see=lambda seen, now_ns: None,
-        handle_deadline=lambda now_ns: None,
+    teleop = SimpleNamespace(
+        outputs=[], outcome=None, settled=True,
+        see=lambda seen, now_ns: None, handle_deadline=lambda now_ns: None,
     )  # fmt: skip
-    nothing.take_outputs = lambda: [nothing.outputs.pop(0) for _ in nothing.outputs[:]]
+    teleop.take_outputs = lambda: [teleop.outputs.pop(0) for _ in teleop.outputs[:]]
     identity = CloudIdentity(CLOCK, nonce.ljust(16), keys)
-    return CloudEndpoint(nothing, nothing, identity, newest_wins=True, start_ns=start_ns)
+    loop: Any = NoLoop()
+    return CloudEndpoint(loop, teleop, identity, newest_wins=True, start_ns=start_ns)
 
 
 def ring() -> KeyRing:
@@ -92,9 +118,10 @@ class BareCloud:
         body = codec.encode_command(Command(now_ns, now_ns, 0, ZERO, 0.0))
         return self.session.seal(Kind.COMMAND, body)
 
-    def start(self, number: int) -> bytes:
+    def start(self, number: int, basis_ns: int = 0) -> bytes:
         """Ask for a mission from the spawn: world opens an epoch."""
-        body = codec.encode_operator(OperatorRequest(number, Request.START, Start.SPAWN))
+        asked = OperatorRequest(number, Request.START, Start.SPAWN, basis_stamp_ns=basis_ns)
+        body = codec.encode_operator(asked)
         return self.session.seal(Kind.OPERATOR, body)
 
     def receive(self, data: bytes) -> bytes | None:

@@ -76,8 +76,17 @@ class Talk:
         return 0
 
     def request(self, number: int, request: Request, start: Start, mission_id: int = 0) -> None:
-        body = codec.encode_operator(OperatorRequest(number, request, start, mission_id))
-        self.send(self.session.seal(Kind.OPERATOR, body))
+        self.send(self.asked(number, request, start, mission_id))
+
+    def asked(self, number: int, request: Request, start: Start, mission_id: int = 0) -> bytes:
+        """A request that is passed on now."""
+        told = OperatorRequest(number, request, start, mission_id, basis_stamp_ns=self.world_ns)
+        return self.session.seal(Kind.OPERATOR, codec.encode_operator(told))
+
+    @property
+    def world_ns(self) -> int:
+        """World's clock."""
+        return self.now_ns - self.world.slip_ns
 
     def command(self, velocity=(0.0, 0.0, 1.0), basis_ns=None) -> bytes:
         basis_ns = self.now_ns if basis_ns is None else basis_ns

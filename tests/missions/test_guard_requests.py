@@ -5,6 +5,7 @@ from talking import MS, talking
 
 from cloudrc.messages import GuardState, Request, Start
 from cloudrc.records import CommandApplied, GuardChange, SessionOpened, TelemetrySent
+from cloudrc.world.orders import LEAP_MAX
 
 
 @pytest.fixture
@@ -50,6 +51,66 @@ def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
     assert talk.take(GuardChange)[-1].state is GuardState.TRACK
 
 
+@pytest.mark.promise("P-GUARD-6")
+@pytest.mark.parametrize("start", Start)
+@pytest.mark.parametrize(
+    ("held_back", "ahead", "outcome"),
+    [
+        (998 * MS, 0, ""),
+        (1_003 * MS, 0, "stale"),
+        (200_000 * MS, 0, "stale"),
+        (0, 3 * MS, "future"),
+    ],
+)
+def test_a_start_that_was_held_back_on_the_way_starts_nothing(
+    talk, start, held_back, ahead, outcome
+):
+    """Its mission may be over by then, and given up; nobody expects the robot to take off."""
+    talk.request(2, Request.END, Start.HERE)
+    talk.now_ns += ahead
+    captured = talk.asked(3, Request.START, start)
+    talk.wait(talk.now_ns - ahead + held_back)
+    talk.send(captured)
+    assert talk.world._counts[outcome] == (outcome != "")
+    assert talk.world.robot.guard.armed == (outcome == "")
+    if outcome:  # said anew, it is obeyed
+        talk.send(talk.asked(4, Request.START, start))
+        assert talk.world.robot.guard.armed
+
+
+@pytest.mark.parametrize("request_", [Request.END, Request.ESTOP])
+def test_what_stops_the_robot_does_so_however_late_it_comes(talk, request_):
+    captured = talk.asked(2, request_, Start.HERE)
+    talk.wait(talk.now_ns + 200_000 * MS)
+    talk.send(captured)
+    assert not talk.world.robot.guard.armed
+    assert talk.world._orders.number == 2
+
+
+def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
+    """World's clock stood still meanwhile: the age of what it was based on says nothing."""
+    captured = talk.asked(2, Request.START, Start.SPAWN)
+    talk.now_ns += 60_000 * MS
+    talk.send(captured)
+    assert talk.world._counts["stale"] == 1
+    assert talk.world._orders.number == 1
+
+
+def test_a_number_that_leaps_does_not_take_the_next_ones_away(talk):
+    for number in (2**32 - 1, 2 + LEAP_MAX):
+        talk.request(number, Request.END, Start.HERE)
+    assert talk.world._counts["malformed"] == 2
+    assert ask(talk, 1 + LEAP_MAX, Request.END)[1] == 1 + LEAP_MAX
+
+
+def test_a_command_that_waits_as_the_robot_is_stopped_is_not_told_to_be_flown(talk):
+    applied = len(talk.take(CommandApplied))
+    talk.send(talk.command())
+    talk.request(2, Request.ESTOP, Start.HERE)
+    talk.wait(talk.now_ns + 20 * MS)
+    assert len(talk.take(CommandApplied)) <= applied + 1
+
+
 def test_the_end_of_a_mission_is_confirmed_even_while_latched(talk):
     ask(talk, 2, Request.ESTOP)
     assert ask(talk, 3, Request.END) == (GuardState.ESTOP, 3)
@@ -85,7 +146,7 @@ def test_only_a_hold_within_a_mission_is_counted_as_held(talk):
 def test_what_the_robot_has_touched_is_told_until_another_mission_starts(talk):
     """Cloud may die right after the touch: its successor has to learn of it."""
     ask(talk, 2, Request.END)
-    talk.world._touches.pipes = 1
+    talk.world._orders.touches.pipes = 1
     talk.wait(talk.now_ns + 300 * MS)
     talk.hello(b"another")
     talk.request(3, Request.START, Start.HERE)

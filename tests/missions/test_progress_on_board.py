@@ -34,6 +34,7 @@ class Operated(Talk):
     """A world that is asked for things."""
 
     def ask(self, request: Request, number: int = 0, **what: int) -> Telemetry:
+        what |= {"basis_stamp_ns": self.world_ns}
         asked = OperatorRequest(number, request, Start.HERE, **what)
         self.say(Kind.OPERATOR, codec.encode_operator(asked))
         self.wait(self.now_ns + 20_000_000)

@@ -144,7 +144,7 @@ def spawn(bare: Bare) -> None:
     """Whoever has the session starts a mission from the spawn."""
     for cloud in bare.clouds.values():
         if cloud.session.epoch == bare.world._session.epoch != 0:
-            bare.send(cloud.start(bare.world._mission + 1))
+            bare.send(cloud.start(bare.world._orders.number + 1))
 
 
 def check(names: tuple[str, ...]) -> None:

@@ -65,12 +65,12 @@ class Target:
         return (
             [[end._counts[name] for name in accepted] for end in ends],
             [
-                (end._session.epoch, end._session._newest, len(end._session._openers))
+                (end._session.epoch, dict(end._session._newest), len(end._session._openers._kept))
                 for end in ends
             ],
             self.world._door._fresh_until_ns,
             self.cloud._heard_ns,
-            self.world._mission,
+            self.world._orders.number,
             self.world._waiting,
         )
 

@@ -49,6 +49,7 @@ requests = st.builds(
     st.sampled_from(Start),
     st.integers(0, 2**64 - 1),
     st.integers(0, 2**16 - 1),
+    st.integers(-1, 2**63 - 1),
     epoch=st.just(0),  # is for cloud alone
 )
 
@@ -91,7 +92,7 @@ def test_for_which_session_a_request_is_meant_is_not_told_to_the_robot(request_,
 
 def test_the_header_lies_where_the_design_puts_it():
     data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788, generation=9)
-    assert data == bytes([2, 1, 4, 3, 2, 1, 9, 6]) + bytes.fromhex("8877665544332211")
+    assert data == bytes([3, 1, 4, 3, 2, 1, 9, 6]) + bytes.fromhex("8877665544332211")
     assert codec.peek(data) == (Kind.COMMAND, 0x01020304, 0x1122334455667788)
 
 

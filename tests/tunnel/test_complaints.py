@@ -18,12 +18,12 @@ def faults(bare):
 
 def test_another_version_is_told_once():
     bare = Bare(ring())
-    hello = bytes([3]) + bare.cloud("a").hello()[1:]
+    hello = bytes([4]) + bare.cloud("a").hello()[1:]
     for _ in range(3):
         bare.world.receive_datagram(hello, 0)
     (fault,) = faults(bare)
     assert fault.code == "version"
-    assert fault.text.startswith("peer speaks v3, we speak v2: ")
+    assert fault.text.startswith("peer speaks v4, we speak v3: ")
     assert bare.world._counts["version"] == 3
 
 
@@ -59,7 +59,7 @@ def test_a_tag_is_worth_a_word_if_it_is_a_greetings(kind):
 
 def test_of_another_version_both_are_named():
     complaints = Complaints()
-    text = "peer speaks v9, we speak v2: run the same version of cloudrc at both ends"
+    text = "peer speaks v9, we speak v3: run the same version of cloudrc at both ends"
     assert complaints.about("version", bytes([9, 1, 2]), 7) == [Fault(7, "version", text)]
     assert complaints.about("version", bytes([9, 1, 2]), 8) == []
 
@@ -67,8 +67,8 @@ def test_of_another_version_both_are_named():
 def test_garbage_does_not_hide_that_the_peer_speaks_another_version():
     complaints = Complaints()
     assert len(complaints.about("version", bytes(16), 7)) == 1
-    (fault,) = complaints.about("version", bytes([3]) + bytes(15), 8)
-    assert fault.text.startswith("peer speaks v3, ")
+    (fault,) = complaints.about("version", bytes([4]) + bytes(15), 8)
+    assert fault.text.startswith("peer speaks v4, ")
 
 
 def test_after_a_session_it_is_said_again():

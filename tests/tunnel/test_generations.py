@@ -2,38 +2,57 @@
 
 import pytest
 
-from cloudrc.tunnel import codec, session
+from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Kind
-from cloudrc.tunnel.session import REKEY_NS, pair
+from cloudrc.tunnel.openers import AHEAD_MAX, FAR_MAX, FAR_TRIES, SILENCE_NS
+from cloudrc.tunnel.session import REKEY_NS, Session, pair
 
 BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
 GENERATION = 6  # where it stands in the header
 
 
-@pytest.mark.parametrize(("ahead", "opened"), [(127, True), (128, False)])
-def test_a_peer_may_be_far_ahead_after_a_long_silence(ahead, opened):
-    world, cloud = pair()
-    for number in range(ahead + 1):
-        cloud.tend(number * REKEY_NS)
-    data = cloud.seal(Kind.COMMAND, BODY)
-    if opened:
-        assert world.open(data)[4] == BODY
-    else:
-        with pytest.raises(DecodeError, match=r"^tag$"):
-            world.open(data)
-
-
-@pytest.mark.parametrize("ahead", [128, 255, 256, 300, 700])
-def test_after_a_longer_silence_the_byte_of_the_header_stands_for_several_generations(ahead):
-    """By the clock of who has heard nothing for so long."""
+def after(rekeys, *, silence_ns=0):
+    """Both ends of a session; cloud has moved on, and world has heard nothing for so long [ns]."""
     world, cloud = pair()
     world.tend(0)
-    for number in range(ahead + 1):
+    world.tend(silence_ns)
+    for number in range(rekeys + 1):
         cloud.tend(number * REKEY_NS)
-    world.tend(ahead * REKEY_NS)
+    return world, cloud
+
+
+def refuses(world, data):
+    try:
+        world.open(data)
+    except DecodeError as error:
+        return str(error) == "tag"
+    return False
+
+
+@pytest.mark.parametrize(
+    ("rekeys", "silence_ns", "refused"),
+    [
+        (AHEAD_MAX, 0, False),
+        (AHEAD_MAX + 1, 0, True),
+        (AHEAD_MAX + 1, SILENCE_NS - 1, True),
+        (AHEAD_MAX + 1, SILENCE_NS, False),
+    ],
+)
+def test_a_peer_that_is_not_heard_may_have_moved_on_further(rekeys, silence_ns, refused):
+    world, cloud = after(rekeys, silence_ns=silence_ns)
+    assert refuses(world, cloud.seal(Kind.COMMAND, BODY)) == refused
+
+
+@pytest.mark.promise("P-LINK-5")
+@pytest.mark.parametrize("rekeys", [128, 255, 256, 300, 700])
+def test_however_long_an_end_slept_it_hears_its_peer_some_seconds_after(rekeys):
+    """Its own clock stood still meanwhile; the peer's did not."""
+    world, cloud = after(rekeys, silence_ns=SILENCE_NS)
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[4] == BODY
-    cloud.tend((ahead + 1) * REKEY_NS)
+    cloud.tend((rekeys + 1) * REKEY_NS)
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[3] == 1
+    world.tend(2 * SILENCE_NS)
+    assert world.open(cloud.seal(Kind.COMMAND, BODY))[3] == 2
 
 
 def test_generations_go_on_beyond_the_byte_of_the_header():
@@ -43,13 +62,51 @@ def test_generations_go_on_beyond_the_byte_of_the_header():
         assert world.open(cloud.seal(Kind.ALIVE, b""))[3] == number
 
 
+def test_what_is_heard_is_not_silent_and_what_is_repeated_is_not_heard():
+    world, cloud = pair()
+    old = cloud.seal(Kind.COMMAND, BODY)
+    for data in (old, cloud.seal(Kind.COMMAND, BODY)):
+        world.open(data)
+    world.tend(SILENCE_NS)
+    for heard, silent in ((cloud.seal(Kind.COMMAND, BODY), False), (old, True)):
+        world.open(heard)
+        world.tend(world._tended_ns + SILENCE_NS)
+        assert world._openers._is_silent == silent
+
+
 def test_a_forged_generation_opens_nothing_and_keeps_little():
     world, cloud = pair()
-    data = bytearray(cloud.seal(Kind.COMMAND, BODY))
     for byte in range(1, 256):
-        data[GENERATION] = byte
-        with pytest.raises(DecodeError, match=r"^tag$"):
-            world.open(bytes(data))
-    assert len(world._tried) <= session.AHEAD_MAX
+        assert refuses(world, forged(cloud, byte))
+    assert len(world._openers._tried) <= AHEAD_MAX
     world.tend(1)
-    assert world._tried == {}
+    assert world._openers._tried == {}
+
+
+def forged(cloud, byte):
+    data = bytearray(cloud.seal(Kind.COMMAND, BODY))
+    data[GENERATION] = byte
+    return bytes(data)
+
+
+def test_in_a_silence_forged_generations_are_tried_a_few_times_a_second(monkeypatch):
+    world, cloud = after(0, silence_ns=SILENCE_NS)
+    derived, derive = [], Session._derive
+    monkeypatch.setattr(Session, "_derive", lambda *how: (derived.append(how), derive(*how))[1])
+    for _ in range(2):
+        for byte in range(1, 256):
+            assert refuses(world, forged(cloud, byte))
+        far = len(derived) - AHEAD_MAX
+        assert far <= FAR_TRIES * (FAR_MAX // 256 + 1)
+        derived.clear()
+        world.tend(world._tended_ns + 1)
+
+
+def test_an_honest_peer_is_found_behind_them():
+    world, cloud = after(300, silence_ns=SILENCE_NS)
+    for byte in range(FAR_TRIES):
+        assert refuses(world, forged(cloud, 200 + byte))
+    honest = cloud.seal(Kind.COMMAND, BODY)
+    assert refuses(world, honest)
+    world.tend(SILENCE_NS + 1)
+    assert not refuses(world, honest)

@@ -144,7 +144,7 @@ def test_a_session_rests_on_the_key_of_its_hello():
             (data,) = step.knock(key.name.encode().ljust(16), cookie).datagrams
             assert key.verifies(data[:-16], data[-16:])
         assert step.world._key == key
-        assert step.world._openers[0][1] == key
+        assert step.world._openers._kept[0][1] == key
         assert key.verifies(
             *(lambda told: (told[:-16], told[-16:]))(step.door.move_on(step.now_ns))
         )
@@ -180,7 +180,7 @@ def test_an_acceptance_that_is_repeated_names_the_key_that_its_epoch_began_with(
             assert codec.peek(data)[:2] == (Kind.ACCEPT, epoch)
             assert epoch_key.verifies(data[:-16], data[-16:])
         step.door.move_on(step.now_ns)
-    assert step.world._openers[0][1] == new
+    assert step.world._openers._kept[0][1] == new
 
 
 @pytest.mark.parametrize(

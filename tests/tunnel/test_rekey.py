@@ -7,7 +7,8 @@ import pytest
 from cloudrc.tunnel import codec, session
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.session import KEPT, REKEY_NS, Agreement, Session, pair
+from cloudrc.tunnel.openers import KEPT
+from cloudrc.tunnel.session import REKEY_NS, Agreement, Session, pair
 
 BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
 SECOND_NS = 1_000_000_000
@@ -116,7 +117,7 @@ def test_generations_long_gone_are_forgotten():
     cloud.tend(0)
     late = cloud.seal(Kind.COMMAND, BODY)
     for number in range(1, KEPT + 1):
-        assert len(world._openers) <= KEPT
+        assert len(world._openers._kept) <= KEPT
         cloud.tend(number * REKEY_NS)
         world.open(cloud.seal(Kind.COMMAND, BODY))
     with pytest.raises(DecodeError, match=r"^tag$"):

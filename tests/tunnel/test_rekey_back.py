@@ -3,9 +3,12 @@
 import pytest
 from test_rekey import NEW, OLD, SECOND_NS, Ends
 
-from cloudrc.tunnel.codec import Kind
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.codec import DecodeError, Kind
 from cloudrc.tunnel.keys import Key, KeySet
 from cloudrc.tunnel.session import LOOKS
+
+HELLO = bytes(codec.BODY_SIZES[Kind.HELLO])
 
 
 def rotated():
@@ -62,7 +65,7 @@ def test_a_peer_that_is_heard_with_the_key_before_is_given_time():
 @pytest.mark.parametrize("between", ["heard", "begun"])
 def test_the_looks_are_counted_in_a_row(between):
     ends = rotated()
-    new = ends.cloud.seal(Kind.ALIVE, b"")
+    new = ends.cloud.seal(Kind.COMMAND, bytes(codec.BODY_SIZES[Kind.COMMAND]))
     go_back(ends)
     for _ in range(LOOKS - 1):
         look(ends, heard=ends.cloud.seal(Kind.ALIVE, b""))
@@ -78,6 +81,34 @@ def test_the_looks_are_counted_in_a_row(between):
     assert ends.world._key == NEW
 
 
+@pytest.mark.promise("P-LINK-1")
+@pytest.mark.parametrize("end", ["world", "cloud"])
+def test_what_was_captured_before_a_rotation_leads_nobody_back(end):
+    ends = Ends()
+    peer, end = (ends.cloud, ends.world) if end == "world" else (ends.world, ends.cloud)
+    captured = peer.seal(Kind.ALIVE, b"")
+    end.open(captured)
+    for which in ("world", "cloud"):
+        ends.rotate(which)
+    ends.pass_time(5)
+    for _ in range(2 * LOOKS):
+        ends.pass_time(1)
+        for _ in range(3):
+            end.open(captured)
+    assert end._key == NEW
+
+
+@pytest.mark.promise("P-LINK-9")
+def test_a_key_that_is_retired_opens_nothing_from_then_on():
+    ends = rotated()
+    ends.cloud._move_on(OLD)
+    ends.world.open(ends.cloud.seal(Kind.ALIVE, b""))
+    ends.world.ring.replace(KeySet(Key(b"m" * 32), NEW), ends.now_ns)
+    for data in (ends.cloud.seal(Kind.ALIVE, b""), ends.cloud.greet(Kind.HELLO, HELLO, OLD)):
+        with pytest.raises(DecodeError, match=r"^tag$"):
+            ends.world.open(data)
+
+
 def test_a_key_that_is_not_valid_any_more_is_left_at_once_for_the_one_that_is_heard():
     ends = Ends()
     ends.world.ring.replace(KeySet(NEW, OLD, 300.0), 0)
@@ -85,3 +116,15 @@ def test_a_key_that_is_not_valid_any_more_is_left_at_once_for_the_one_that_is_he
     ends.world._key = Key(b"x" * 32)
     ends.world.tend(ends.now_ns)
     assert ends.world._key == OLD
+
+
+def test_a_second_new_key_is_announced_in_place_of_the_first():
+    ends = Ends()
+    latest = Key(b"m" * 32)
+    for key in (NEW, latest):
+        ends.world.ring.replace(KeySet(key, OLD, 300.0), ends.now_ns)
+        (announced,) = ends.world.tend(ends.now_ns)
+    ends.cloud.ring.replace(KeySet(latest, OLD, 300.0), ends.now_ns)
+    ends.cloud.tend(ends.now_ns)
+    ends.cloud.open(announced)
+    assert ends.cloud._key == latest

@@ -28,7 +28,9 @@ def a_session(sends=Direction.DOWNLINK, secret=bytes(32)):
 
 def state(session):
     """All that a datagram could change; ciphers by where they are."""
-    return {name: repr(value) for name, value in vars(session).items() if name != "_tried"}
+    known = {} if session._openers is None else vars(session._openers)
+    known = {name: value for name, value in known.items() if name not in ("_tried", "_far_tries")}
+    return {name: repr(value) for name, value in (vars(session) | known).items()}
 
 
 def unsealed():

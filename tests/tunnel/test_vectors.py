@@ -70,12 +70,12 @@ def test_hkdf_is_that_of_rfc_5869(key, salt, info, length, result):
 
 
 def test_a_key_derives_by_hkdf_with_version_and_use():
-    label = b"cloudrc 2 use"
+    label = b"cloudrc 3 use"
     assert Key(SECRET).derive(b"salt", b"use") == derived(SECRET, b"salt", label)
 
 
 def test_a_keys_name_is_made_of_nothing_but_what_is_derived():
-    assert Key(SECRET).name == derived(SECRET, b"", b"cloudrc 2 name")[:4].hex()
+    assert Key(SECRET).name == derived(SECRET, b"", b"cloudrc 3 name")[:4].hex()
 
 
 # McGrew and Viega, "The Galois/Counter Mode of Operation", submitted to NIST: test case 16.
@@ -126,9 +126,9 @@ def test_chacha20_poly1305_is_that_of_rfc_8439():
 
 def by_hand(suite, direction, epoch, generation, kind, counter, body):
     """A sealed datagram as docs/safety/wire.md describes it."""
-    use = b"cloudrc 2 session %d %d %d %d" % (suite, direction, epoch, generation)
+    use = b"cloudrc 3 session %d %d %d %d" % (suite, direction, epoch, generation)
     key = derived(SECRET, b"cloud".ljust(16) + b"world".ljust(16), use)
-    header = struct.pack("<BBIBBQ", 2, direction, epoch, generation % 256, kind, counter)
+    header = struct.pack("<BBIBBQ", 3, direction, epoch, generation % 256, kind, counter)
     cipher = AESGCM(key) if suite == 1 else ChaCha20Poly1305(key)
     return header + cipher.encrypt(header[4:], body, header)
 
@@ -147,8 +147,8 @@ def test_a_datagram_can_be_made_from_the_description_alone(suite):
 def test_a_greeting_can_be_made_from_the_description_alone():
     session = Session(Direction.DOWNLINK, KeyRing(KeySet(Key(SECRET))))
     body = codec.encode_hello(Hello(b"n" * 16, b"c" * 16, b"k" * 16, 1))
-    data = struct.pack("<BBIBBQ", 2, 1, 0, 0, 1, 0) + body
-    tagging = derived(SECRET, b"", b"cloudrc 2 greeting")
+    data = struct.pack("<BBIBBQ", 3, 1, 0, 0, 1, 0) + body
+    tagging = derived(SECRET, b"", b"cloudrc 3 greeting")
     tag = hmac.digest(tagging, data, hashlib.sha256)[:16]
     assert session.greet(Kind.HELLO, body) == data + tag
 
@@ -158,7 +158,7 @@ def test_a_cookie_can_be_made_from_the_description_alone():
         nonce=b"w" * 16, clock_id=bytes(16), suite=1, last_epoch=0, next_epoch=None
     )
     door = Door(Session(Direction.UPLINK, KeyRing(KeySet(Key(SECRET)))), identity, age_max_ns=1)
-    cookies = derived(SECRET, b"w" * 16, b"cloudrc 2 cookies")
+    cookies = derived(SECRET, b"w" * 16, b"cloudrc 3 cookies")
     (answer,) = door.knock(Hello(bytes(16), bytes(16), bytes(16), 1), 0, 7_999_999_999).datagrams
     assert answer[16:32] == hmac.digest(cookies, b"3", hashlib.sha256)[:16]
 
@@ -175,18 +175,18 @@ def test_the_second_name_of_a_cloud_is_made_of_the_first():
 
 FROZEN = {
     (AES_256_GCM, Kind.COMMAND): (
-        "02010700000000060000000000000000b6cb11678ecd4497ead0b945da06ce56afcab9b4b46fbb1e"
-        "f6134704ddf229ef13fb66fe61dd2bf198e26866b1e0e1f5db509467ddf4bc46de9a139922145987"
-        "0fc366d9eb3eaf42"
+        "030107000000000600000000000000004140a41a65ceffbe64157a8ed922770d3395d2518d777272"
+        "e4ac86eefdf3b52bee3645687826c9cb2f4b6cef2ff66ebaeeef8b7740babe90bfcd0d5093cf14da"
+        "9016c6251a4a5af3"
     ),
-    (AES_256_GCM, Kind.ALIVE): ("02010700000000080000000000000000626e48d8c65ea0b512aae3333de2a082"),
+    (AES_256_GCM, Kind.ALIVE): ("03010700000000080000000000000000267d35aae083cbd6c55892eb6be087f8"),
     (CHACHA20_POLY1305, Kind.COMMAND): (
-        "020107000000000600000000000000000f97d070d07855d57af3edb2ec9b429ca89faad893a0d373"
-        "c9b9850fc00b3503663e39fc2c7df68f7f6843e0e478581b3d19969773ceb2183fc1615f84eccaa0"
-        "50d3fc37fdb51b7b"
+        "03010700000000060000000000000000d3f7694f8f3e3cb83d00abc844ec1ec9545f38d966ff1a7c"
+        "a5b0985bffe127e91a498c75cf206c8640c55a94a5aeb0182672e43efc9b7c3b7ab5f0e90a1467ba"
+        "f923b8181e7189b2"
     ),
     (CHACHA20_POLY1305, Kind.ALIVE): (
-        "0201070000000008000000000000000063b49812bf4087ba4c4e881cb1294848"
+        "0301070000000008000000000000000086b4897818b755c8339c367306dd0039"
     ),
 }
 
