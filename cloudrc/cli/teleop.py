@@ -208,6 +208,8 @@ def _start(
 
     if not (options.start or options.mission):
         return False
+    if service.book.open():  # of the process before this one, which had the same flags: it goes on
+        return True
     criteria, mission, name = experiment.criteria, experiment.mission, experiment.name
     if options.mission:
         mission, name = _load(options.mission, experiment), Path(options.mission).stem

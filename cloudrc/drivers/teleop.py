@@ -21,6 +21,9 @@ PERIOD_NS = 20_000_000
 """Between two deadlines of teleop's machine [ns]."""
 TELL_NS = PERIOD_NS - 5_000_000
 """Teleop is told what is seen no more often than this [ns]: every second telemetry."""
+STALL_NS = 100_000_000
+"""After a wake this late what waits in the socket shows the past, for it has no room for more than
+the beginning of a stall: the present comes with the next wake [ns]."""
 SILENCE_NS = 1_000_000_000
 """Teleop speaks at 10 Hz; without a word for so long it is taken to be away [ns]."""
 EVENTS_KEPT = 256
@@ -113,18 +116,24 @@ def serve_teleop(
         stop: Asked at every wake.
     """
     unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
-    deadline_ns = time.monotonic_ns()
+    deadline_ns, stalled = time.monotonic_ns(), False
     while not stop():
         # Not woken by what comes: telemetry is twice as frequent, and of several the newest counts.
         time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
         now_ns = time.monotonic_ns()
-        arrived = peer.receive()
+        arrived, was_stalled = peer.receive(), stalled
+        stalled = not was_stalled and now_ns - deadline_ns > STALL_NS
+        deadline_ns += ((now_ns - deadline_ns) // PERIOD_NS + 1) * PERIOD_NS
+        if stalled:
+            continue
+        seen = _newest(arrived, decode)
+        if was_stalled and seen is not None:  # first: a call may be about where the robot is
+            machine.see(seen, now_ns)
         for call in calls():  # first: what has arrived may already show what a call asked for
             call(now_ns)
-        if (seen := _newest(arrived, decode)) is not None:
+        if not was_stalled and seen is not None:
             machine.see(seen, now_ns)
         machine.handle_deadline(now_ns)
-        deadline_ns += ((now_ns - deadline_ns) // PERIOD_NS + 1) * PERIOD_NS
         _send_again(unsent, peer)
         told = _send(machine.take_outputs(), unsent, peer, encode)
         if told:

@@ -4,9 +4,9 @@ A model of `cloudrc.drivers.teleop.serve_teleop`, joined to the very `RemoteTele
 
     CloudEndpoint - RemoteTeleop  <- two sockets, 11 datagrams each ->  Apart - MissionService
 
-It looks every 20 ms, obeys the calls of the API first, then sees the newest of what waits for it.
+It looks every 20 ms, obeys the calls of the API, and sees the newest of what waits for it.
 While it stands still, for an fsync of its journal or stopped by a signal, nothing is heard or said,
-and what its socket has no room for is lost: at the end it sees the past first, then the present.
+and what its socket has no room for is lost: what waits at the end is of the past, and passed over.
 It lives on while cloud is frozen or killed.
 """
 
@@ -21,12 +21,14 @@ from cloudrc.cloud.teleop import wire
 from cloudrc.cloud.teleop.api_bridge import WAITING_MAX, Call
 from cloudrc.cloud.teleop.journal_format import Entry
 from cloudrc.cloud.teleop.messages import Seen
-from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop
+from cloudrc.cloud.teleop.service import MissionService
+from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, STALL_NS, RemoteTeleop
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.faults.desk import Desk
 from cloudrc.faults.mortal import Mortal
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Event
+from cloudrc.messages import NEVER_NS
 from cloudrc.records import Fault, MissionEvent
 
 SOCKET_MAX = 11
@@ -144,7 +146,8 @@ class Apart(Desk):
         self._at_teleop.waiting.clear()
         self._calls: list[Call] = []
         self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
-        self._ends, self._free_ns, self._turn_ns = False, 0, 0
+        self._ends, self._free_ns, self._turn_ns = False, 0, NEVER_NS
+        self._stalled = False
         self._life += 1
 
     def _tick(self, now_ns: int) -> None:
@@ -162,23 +165,37 @@ class Apart(Desk):
         if service is None or self._host is None or now_ns < self._free_ns:
             return
         self._send()  # what has waited for the end of an fsync
-        own_ns, self._turn_ns, self._free_ns = self._host.clock.at(now_ns), now_ns, now_ns
-        if self._ends:
-            self._ends = False
-            service.pause(own_ns)
-        arrived = self._peer.receive()
-        calls, self._calls = self._calls, []
-        for call in calls:  # first: what has arrived may already show what a call asked for
-            super().ask(call, own_ns)
-        if arrived:
-            seen = wire.decode(arrived[-1])
-            assert isinstance(seen, Seen), "cloud says nothing else"
-            super().see(seen, own_ns)
+        own_ns, turned_ns = self._host.clock.at(now_ns), self._turn_ns
+        self._turn_ns = self._free_ns = now_ns
+        arrived, was_stalled = self._peer.receive(), self._stalled
+        late_ns = now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0
+        self._stalled = not was_stalled and late_ns > STALL_NS
+        if self._stalled:
+            return
+        if was_stalled:
+            self._look_at(arrived, own_ns)
+        self._obey(service, own_ns)
+        if not was_stalled:
+            self._look_at(arrived, own_ns)
         super().handle_deadline(own_ns)
         if self._free_ns > now_ns:
             self._turn_when_free()
         else:
             self._send()
+
+    def _obey(self, service: MissionService, own_ns: int) -> None:
+        if self._ends:
+            self._ends = False
+            service.pause(own_ns)
+        calls, self._calls = self._calls, []
+        for call in calls:
+            super().ask(call, own_ns)
+
+    def _look_at(self, arrived: list[bytes], own_ns: int) -> None:
+        if arrived:
+            seen = wire.decode(arrived[-1])
+            assert isinstance(seen, Seen), "cloud says nothing else"
+            super().see(seen, own_ns)
 
     def _send(self) -> None:
         """Say it to cloud: events wait for one that is there, everything else is repeated."""

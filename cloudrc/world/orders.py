@@ -9,9 +9,6 @@ from cloudrc.tunnel.codec import DecodeError
 from cloudrc.world.guard import Guard
 from cloudrc.world.touches import Touches
 
-LEAP_MAX = 1 << 24
-"""By which the number of a request may rise. A process of teleop leaves out a thousand; what is
-higher would take the numbers away that the operator's next requests need."""
 START_AGE_MAX_NS = 1_000_000_000
 """What cloud saw when it passed a start on may be so old [ns], or as old as a command may be."""
 
@@ -53,16 +50,14 @@ class Orders:
             Whether a mission is to be started.
 
         Raises:
-            DecodeError: "malformed" if its number leaps, "stale" or "future" for a start that was
-                not said just now: somebody may have held it back, and the mission may be over.
+            DecodeError: "stale" or "future" for a start that was not said just now: somebody may
+                have held it back, and the mission may be over.
         """
         if request.request is Request.PROGRESS:
             self._keep_progress(request)
             return False
         if request.number <= self.number:
             return False
-        if request.number > self.number + LEAP_MAX:
-            raise DecodeError("malformed")
         starts = request.request is Request.START
         if starts:
             self._refuse_unless_new(now_ns - request.basis_stamp_ns, waited)

@@ -6,14 +6,14 @@ import time
 import pytest
 
 from cloudrc.cloud.teleop.wire import decode, encode
-from cloudrc.drivers.teleop import EVENTS_KEPT, RemoteTeleop, serve_teleop
+from cloudrc.drivers.teleop import EVENTS_KEPT, STALL_NS, RemoteTeleop, serve_teleop
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Setpoint
 from cloudrc.records import Fault, MissionEvent
 
 SECOND = 1_000_000_000
-POINT = Setpoint((1.0, 2.0, 3.0))
+POINT, PAST = Setpoint((1.0, 2.0, 3.0)), Setpoint((0.0, 0.0, 3.0))
 
 
 def event(number):
@@ -190,6 +190,38 @@ def test_of_what_has_arrived_meanwhile_the_newest_counts(peers):
         stop=lambda: next(stops),
     )
     assert (machine.seen, machine.deadlines) == ([newest], 1)
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "first"),
+    [((0, 0), ["asked", PAST]), ((2 * STALL_NS, 0), [POINT, "asked"])],
+)
+def test_after_a_stall_the_past_is_passed_over_and_what_is_asked_is_asked_of_the_present(
+    peers, monkeypatch, late_ns, first
+):
+    """Where the robot is held, for one: its socket has kept the beginning of the stall alone."""
+    machine, wakes, clock = Machine(), iter(late_ns), [SECOND]
+    peers[1].send(encode(PAST))
+
+    def sleep(seconds):
+        clock[0] += round(seconds * 1e9) + next(wakes)
+        if seconds > 0:
+            peers[1].send(encode(POINT))
+
+    monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
+    monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
+    stops = iter([False, False, True])
+    calls = [[lambda now_ns: machine.seen.append("asked")]]
+    serve_teleop(
+        machine,
+        peers[0],
+        encode,
+        decode,
+        calls=lambda: calls.pop() if calls else [],
+        tell=lambda told: None,
+        stop=lambda: next(stops),
+    )
+    assert machine.seen[:2] == first
 
 
 def test_events_wait_for_a_cloud_that_is_away_and_keep_their_order(peers, service, tmp_path):

@@ -5,7 +5,6 @@ from talking import MS, talking
 
 from cloudrc.messages import GuardState, Request, Start
 from cloudrc.records import CommandApplied, GuardChange, SessionOpened, TelemetrySent
-from cloudrc.world.orders import LEAP_MAX
 
 
 @pytest.fixture
@@ -94,13 +93,6 @@ def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
     talk.send(captured)
     assert talk.world._counts["stale"] == 1
     assert talk.world._orders.number == 1
-
-
-def test_a_number_that_leaps_does_not_take_the_next_ones_away(talk):
-    for number in (2**32 - 1, 2 + LEAP_MAX):
-        talk.request(number, Request.END, Start.HERE)
-    assert talk.world._counts["malformed"] == 2
-    assert ask(talk, 1 + LEAP_MAX, Request.END)[1] == 1 + LEAP_MAX
 
 
 def test_a_command_that_waits_as_the_robot_is_stopped_is_not_told_to_be_flown(talk):

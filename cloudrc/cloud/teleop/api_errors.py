@@ -87,4 +87,5 @@ def handle_errors(app: FastAPI) -> None:
 
     @app.exception_handler(TimeoutError)
     async def too_late(request: Request, error: TimeoutError) -> JSONResponse:
-        return JSONResponse({"detail": "teleop did not answer in time; try again"}, 503)
+        text = "teleop did not answer in time, but may do it yet: look before you try again"
+        return JSONResponse({"detail": text}, 503)

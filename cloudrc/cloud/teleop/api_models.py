@@ -91,7 +91,7 @@ class Event(_Answer):
         description="queued, starting, started, reached, held, resumed, goto, restarted, "
         "new_session, board_touched, pipe_touched, paused; at the end done, cancelled, timed_out, "
         "leg_timed_out, world_restarted, guard_stopped, emergency_stopped, taken_over or "
-        "end_lost"
+        "end_lost; acknowledged after emergency_stopped"
     )
     waypoint: int = Field(description="Index of the waypoint concerned")
     text: str = Field(description="The same in words")

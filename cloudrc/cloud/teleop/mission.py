@@ -25,6 +25,7 @@ reached and that a mission is over, for a teleop that forgets. Times are the cal
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from cloudrc.cloud.teleop import mission_rules as rules
 from cloudrc.cloud.teleop.messages import (
@@ -132,19 +133,19 @@ class Teleop:
             case Pause():
                 self._tell("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
                 self.requests.ask(Request.END)
-                self._aim.here()  # should the end be lost, cloud keeps this
+                self._aim.stay()  # should the end be lost, cloud keeps this
 
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry, at the instant [ns] at which it arrives."""
-        self._seen = seen
+        before, self._seen = self._seen, seen
         anew = self._aim.see(seen)
         told = self._aim.setpoint
         onboard, legs = rules.known_on_board(seen, self._mission_id), self._plan.legs
         started = self.requests.see(seen, now_ns) is Request.START and self.state is STARTING
-        if self.state is STARTING and not self._expected and self._plan.start is Start.HERE:
-            self._expected = (seen.mission_id, self._mission_id)  # ordered before it was in sight
+        if self.state is STARTING and not started:
+            self._look_before_start(seen)
         if self.state not in UNDER_WAY:
-            if anew:
+            if anew or (before and before.mission_id != seen.mission_id):
                 self._find(seen)
         elif harm := rules.harm_in(seen, self._mission_id, self._world, self._expected):
             code, text = harm
@@ -154,7 +155,9 @@ class Teleop:
         elif self._aim.awaited:
             self._aim.ahead(self.leg)
         while self.leg < onboard and self.state in (FLYING, State.HELD):
-            self._advance("known on board to be reached", now_ns)  # kept there, and lost here
+            # Kept there, and lost here; there may be more at once than cloud's socket has room for.
+            how = "known on board to be reached"
+            self._advance(how, now_ns, aim=self.leg + 1 == onboard)
         while self.state is FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
         if anew and told is self._aim.setpoint:
@@ -168,6 +171,17 @@ class Teleop:
                 self._end(*late, now_ns)
         if (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
+
+    def _look_before_start(self, seen: Seen) -> None:
+        """A robot that flies this very mission goes on: its start could not be written down."""
+        mine, from_here = self._mission_id, self._plan.start is Start.HERE
+        if seen.mission_id == mine != 0 and self._continued is None and not from_here:
+            self._plan = replace(self._plan, start=Start.HERE)
+            self._expected = (mine,)
+            self._aim.begin(self._plan, mine)
+            self.requests.ask(Request.START, Start.HERE)
+        elif from_here and not self._expected:
+            self._expected = (seen.mission_id, mine)
 
     def _find(self, seen: Seen) -> None:
         """Without a mission: what flies is held; what stands, for one lost here, shall stay."""
@@ -218,10 +232,11 @@ class Teleop:
         self._world = seen.world
         self._watch.begin()
         if before is not None:
-            text = f"resumed after a restart of teleop {self._where()}"
-            self._tell("resumed", self.leg, text, now_ns)
             if before.held:
                 self._hold(now_ns)
+                return
+            text = f"resumed after a restart of teleop {self._where()}"
+            self._tell("resumed", self.leg, text, now_ns)
             return
         self._began_ns = now_ns
         self._aim.started(self.leg)
@@ -229,15 +244,15 @@ class Teleop:
         text = f"mission started from {place}, waypoints: {len(plan.legs)}"
         self._tell("started", 0, text, now_ns)
 
-    def _advance(self, how: str, now_ns: int) -> None:
-        """The waypoint is reached: on to the next, or done."""
+    def _advance(self, how: str, now_ns: int, *, aim: bool = True) -> None:
+        """The waypoint is reached: on to the next, or done; `aim` at it unless more are reached."""
         text = f"{where(self._plan, self.leg)} {how} at {self.elapsed(now_ns):.2f} s"
         self._tell("reached", self.leg, text, now_ns)
         self.leg += 1
         self.requests.report(self._mission_id, self.leg)
         if self.leg < len(self._plan.legs):
             self._watch.begin()
-            if self.state is FLYING:
+            if self.state is FLYING and aim:
                 self._aim.at(self.leg)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)

@@ -38,6 +38,7 @@ class Aim:
         self._plan = NO_PLAN
         self._mission_id = 0
         self._continued = False
+        self._stays = False  # leads nowhere any more
 
     def see(self, seen: Seen) -> bool:
         """Take note of the newest telemetry.
@@ -98,9 +99,10 @@ class Aim:
             self.at(leg)
 
     def at(self, leg: int) -> None:
-        """Aim at the waypoint of this index."""
+        """Aim at the waypoint of this index, unless the robot is to stay."""
         to = self._plan.legs[leg]
-        self._aim(Setpoint(to.position, to.yaw, leg))
+        if not self._stays:
+            self._aim(Setpoint(to.position, to.yaw, leg))
 
     def at_point(self, position: Vector, yaw: float) -> None:
         """Aim at a point that is no waypoint: position [m], world frame, shape (3,); yaw [rad]."""
@@ -110,6 +112,11 @@ class Aim:
         """Aim at where the robot is seen, if it is."""
         if self._seen is not None:
             self._aim(rules.held_at(self._seen, self.setpoint))
+
+    def stay(self) -> None:
+        """Aim at where the robot is seen, and at no waypoint from now on."""
+        self.here()
+        self._stays = True
 
     @property
     def _from_spawn(self) -> bool:

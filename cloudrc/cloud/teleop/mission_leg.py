@@ -51,6 +51,8 @@ class LegWatch:
             return False
         if before_ns >= 0:
             self._flown_ns += min(now_ns - before_ns, GAP_MAX_NS)
+            if now_ns - before_ns > GAP_MAX_NS:
+                self._near_since_ns = NEVER_NS  # where it was meanwhile nobody knows
         if dist(seen.position, leg.position) > leg.tolerance:
             self._near_since_ns = NEVER_NS
             return False

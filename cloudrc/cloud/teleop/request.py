@@ -14,7 +14,8 @@ IDLE_NS = 3_000_000_000
 something else by somebody else: it is told again."""
 PREDECESSORS = 1_000
 """So many numbers are left to a process before this one: it may have asked what the robot does not
-show yet, and a request of this one must not be taken for that."""
+show yet, and a request of this one must not be taken for that. It may even have asked nothing else,
+and begun as this one does: so the first number also rises with the machine's clock."""
 
 
 class Repeater:
@@ -130,8 +131,8 @@ class Repeater:
         # A higher number than ours was acted on: an emergency stop has passed us by. Or our very
         # number, by a predecessor: ours would be seen by now.
         if pending.number == UNNUMBERED or seen.mission >= pending.number:
-            rise = 1 if self._number else PREDECESSORS
-            self._number = max(self._number, seen.mission) + rise
+            first = 0 if self._number else max(seen.mission + PREDECESSORS, now_ns // REPEAT_NS)
+            self._number = max(self._number, seen.mission, first - 1) + 1
             pending = self._pending = pending._replace(number=self._number)
             self._asked_epoch = seen.epoch
         elif now_ns < self._due_ns:
@@ -151,6 +152,8 @@ class Repeater:
     def _is_acknowledged(self, pending: OperatorRequest, seen: Seen) -> bool:
         if pending.number == UNNUMBERED or seen.mission != pending.number:
             return False
+        if pending.request is Request.ESTOP:  # of nothing else is its number enough
+            return seen.guard is GuardState.ESTOP
         if pending.request is Request.START and pending.start is Start.SPAWN:
             # Until the epoch changes it is the old world that is seen.
             return seen.epoch != self._asked_epoch

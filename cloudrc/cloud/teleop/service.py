@@ -70,6 +70,8 @@ class MissionService:
         self._ends = False  # this process; what has not begun is its successor's
         self.book = MissionBook(write, entries, salt)
         self._teleop = Teleop(self.book.has_ended)
+        if self.book.stopped() is not None:  # the robot may not have heard of it yet
+            self._teleop.operate(EmergencyStop(), 0)
 
     @property
     def over(self) -> bool:
@@ -155,11 +157,7 @@ class MissionService:
         return mission
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
-        """Stop the rotors at once, in every state; a mission under way has failed.
-
-        Returns:
-            The mission that was under way, if there was one.
-        """
+        """Stop the rotors at once, in every state; give the mission under way, which has failed."""
         mission = self._current
         self._teleop.operate(EmergencyStop(), now_ns)
         self._collect(now_ns)
@@ -170,6 +168,8 @@ class MissionService:
         if self._current is not None:
             raise busy(self._current, "there is nothing to acknowledge")
         self._teleop.operate(Acknowledge(), now_ns)
+        if (stopped := self.book.stopped()) is not None:
+            self._note(stopped, "acknowledged", "the operator has acknowledged the stop", now_ns)
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
@@ -200,7 +200,7 @@ class MissionService:
         waiting = self.book.open()
         if self._current is None and waiting and not self._ends:
             begun = waiting[0].state != missions.QUEUED  # by a teleop before this one: no waiting
-            if begun or not self._stopped:
+            if begun or (self.seen and self.book.kept and not self._stopped):
                 self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)

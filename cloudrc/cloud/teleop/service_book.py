@@ -85,6 +85,11 @@ class MissionBook:
         for entry in entries:
             self._apply(entry)
 
+    @property
+    def kept(self) -> bool:
+        """Whether the disk has taken everything."""
+        return not self._backlog
+
     def knows(self, entry: Entry) -> bool:
         """Whether an entry is of a mission that is still known."""
         return entry["mission"] in self.missions
@@ -92,6 +97,15 @@ class MissionBook:
     def open(self) -> list[Mission]:
         """Missions that have not ended; the first is the one to fly."""
         return [mission for mission in self.missions.values() if not mission.ended]
+
+    def stopped(self) -> Mission | None:
+        """Give the mission that the operator has stopped, and not acknowledged since, if any."""
+        for mission in reversed(self.missions.values()):
+            events = [event["event"] for event in mission.events]
+            if "started" in events or "emergency_stopped" in events:
+                waits = "emergency_stopped" in events and "acknowledged" not in events
+                return mission if waits else None
+        return None
 
     def waits_for(self, order: Order) -> list[Mission]:
         """Give the missions that a new one has to wait for.

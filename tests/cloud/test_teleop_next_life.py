@@ -1,0 +1,176 @@
+"""A teleop that takes over from one that was killed, and what that one had said or not written."""
+
+from argparse import Namespace
+
+import pytest
+from service_harness import flying
+from teleop_harness import AWAY, FROM_SPAWN, ID, THREE, A, B, C, Flight
+
+from cloudrc.cli.teleop import _start
+from cloudrc.cloud.teleop.messages import EmergencyStop, Pause, StartMission
+from cloudrc.cloud.teleop.mission import Teleop
+from cloudrc.cloud.teleop.plan import Leg, Plan
+from cloudrc.cloud.teleop.request import PREDECESSORS, REPEAT_NS, Repeater
+from cloudrc.config.load import load_experiment
+from cloudrc.messages import GuardState, OperatorRequest, Request, Start
+
+
+def held_back(flight, number):
+    """A start of the teleop before reaches the robot only now."""
+    flight._obey(OperatorRequest(number, Request.START, mission_id=ID))
+
+
+def test_its_first_number_is_above_that_of_one_that_was_not_seen():
+    """Whoever begins later begins higher, though both see a robot that has been asked nothing."""
+    numbers = []
+    for now_ns in (REPEAT_NS * 5_000, REPEAT_NS * 5_010, 0):
+        flight = Flight()
+        flight.see()
+        repeater = Repeater()
+        repeater.see(flight.teleop._seen, now_ns)
+        repeater.ask(Request.END)
+        numbers.append(repeater.due(now_ns).number)
+    assert numbers == [5_000, 5_010, PREDECESSORS]
+
+
+@pytest.mark.promise("P-API-8")
+def test_a_start_under_the_number_of_an_emergency_stop_does_not_settle_it():
+    flight = Flight()
+    flight.step()
+    flight.downlink = False
+    flight.operate(EmergencyStop())
+    flight.step(seconds=0.2)
+    held_back(flight, flight.requests[-1].number)
+    flight.step(seconds=0.05)
+    assert flight.teleop.requests.stopping
+    flight.downlink = True
+    flight.step(seconds=0.2)
+    assert flight.guard is GuardState.ESTOP
+    assert flight.teleop.settled
+
+
+def test_a_start_that_becomes_visible_later_is_ended():
+    """Nobody flies that mission any more."""
+    flight = Flight()
+    flight.teleop = Teleop(ended=lambda number: number == ID)
+    flight.step(seconds=0.5)
+    assert flight.requests == []
+    held_back(flight, 1)
+    flight.step(seconds=0.1)
+    assert flight.requests[-1].request is Request.END
+    assert flight.guard is GuardState.HOLD
+
+
+def test_a_mission_is_stopped_by_the_next_teleop_too_if_nobody_has_acknowledged_it():
+    """The robot may not have heard of it: the link was silent, and then teleop died."""
+    flight, mission_id = flying()
+    waiting = flight.create(queue=True)
+    flight.downlink = False
+    flight.teleop.stop_rotors(flight.now_ns)
+    flight.step(seconds=0.2)
+    flight.restart_teleop()
+    flight.downlink = True
+    flight.step(seconds=0.5)
+    assert flight.guard is GuardState.ESTOP
+    assert flight.view(waiting)["state"] == "queued"
+    flight.teleop.acknowledge(flight.now_ns)
+    assert flight.names(mission_id)[-1] == "acknowledged"
+    assert flight.view(mission_id)["state"] == "failed"
+    flight.step(seconds=0.5)
+    assert flight.view(waiting)["state"] == "flying"
+
+
+@pytest.mark.parametrize("next_mission", [False, True])
+def test_a_stop_that_was_acknowledged_is_not_asked_again(next_mission):
+    flight, _ = flying()
+    flight.teleop.stop_rotors(flight.now_ns)
+    flight.step(seconds=0.2)
+    flight.teleop.acknowledge(flight.now_ns)
+    flight.step(seconds=0.2)
+    if next_mission:
+        flight.create()
+        flight.step(seconds=0.2)
+    asked = len(flight.requests)
+    flight.restart_teleop()
+    flight.step(seconds=0.5)
+    assert Request.ESTOP not in {request.request for request in flight.requests[asked:]}
+
+
+@pytest.mark.promise("P-MISSION-4")
+@pytest.mark.parametrize("state", ["flying", "starting"])
+def test_asked_to_end_it_leads_nowhere_though_a_waypoint_is_reached(state):
+    flight = Flight()
+    flight.step()
+    flight.downlink = state == "flying"
+    flight.operate(StartMission(THREE if state == "flying" else FROM_SPAWN, ID))
+    flight.step(seconds=0.05)
+    flight.downlink = False
+    flight.operate(Pause())
+    for point in (A, B):
+        flight.step(position=point, seconds=0.1)
+    assert flight.setpoints[-1].waypoint == -1
+
+
+@pytest.mark.promise("P-MISSION-4")
+def test_a_mission_that_is_held_never_says_that_it_is_resumed_before_it_is():
+    """Killed between the two, teleop would fly on in its next life."""
+    flight, mission_id = flying()
+    flight.teleop.hold(flight.now_ns)
+    flight.restart_teleop()
+    flight.step(seconds=0.3)
+    assert flight.view(mission_id)["state"] == "held"
+    assert "resumed" not in flight.names(mission_id)
+
+
+@pytest.mark.promise("P-MISSION-2")
+def test_what_waits_is_not_begun_before_what_is_flown_is_written_down():
+    flight, first = flying()
+    second = flight.create(queue=True)
+    flight.full = True
+    for point in (B, C):
+        flight.step(position=point, seconds=0.1)
+    assert flight.view(first)["state"] == "done"
+    flight.step(seconds=3.0)
+    assert flight.view(second)["state"] == "queued"
+    flight.full = False
+    flight.step(seconds=1.5)
+    assert flight.view(second)["state"] in ("starting", "flying")
+
+
+def test_what_waits_is_not_begun_before_the_robot_is_seen():
+    """It may be stopped, and would fail it."""
+    flight, _ = flying()
+    waiting = flight.create(queue=True)
+    flight.teleop.stop_rotors(flight.now_ns)
+    flight.step(position=AWAY, seconds=0.2)
+    for _ in range(2):
+        flight.restart_teleop()
+        flight.teleop.handle_deadline(flight.now_ns)
+        flight.step(seconds=0.2)
+        assert flight.view(waiting)["state"] == "queued"
+
+
+def test_time_in_which_nobody_looks_is_no_dwell():
+    """Two glimpses four seconds apart do not show that the robot stayed there between them."""
+    flight = Flight()
+    flight.step()
+    flight.operate(StartMission(Plan((Leg(A, dwell=2.0),), Start.HERE), ID))
+    flight.step(seconds=0.1)
+    flight.position = A
+    flight.see()
+    flight.now_ns += 4_000_000_000
+    flight.see()
+    assert flight.state == "FLYING"
+    flight.step(seconds=2.1)
+    assert flight.state == "DONE"
+
+
+def test_a_successor_with_the_same_flags_goes_on_with_the_mission_under_way():
+    flight, mission_id = flying()
+    flight.restart_teleop()
+    flags = Namespace(start=True, mission=None)
+    assert _start(flags, load_experiment("hover"), flight.teleop)
+    assert list(flight.teleop.book.missions) == [mission_id]
+    flight.teleop.cancel(mission_id, flight.now_ns)
+    assert _start(flags, load_experiment("hover"), flight.teleop)
+    assert len(flight.teleop.book.missions) == 2
