@@ -23,7 +23,9 @@ TELL_NS = PERIOD_NS - 5_000_000
 """Teleop is told what is seen no more often than this [ns]: every second telemetry."""
 STALL_NS = 100_000_000
 """After a wake this late what waits in the socket shows the past, for it has no room for more than
-the beginning of a stall: the present comes with the next wake [ns]."""
+the beginning of a stall: the present comes with one of the next wakes [ns]."""
+BLIND_WAKES = 5
+"""So many of them may pass without it, and then what is asked is done all the same."""
 SILENCE_NS = 1_000_000_000
 """Teleop speaks at 10 Hz; without a word for so long it is taken to be away [ns]."""
 EVENTS_KEPT = 256
@@ -116,28 +118,41 @@ def serve_teleop(
         stop: Asked at every wake.
     """
     unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
-    deadline_ns, stalled = time.monotonic_ns(), False
+    deadline_ns, blind = time.monotonic_ns(), 0
     while not stop():
         # Not woken by what comes: telemetry is twice as frequent, and of several the newest counts.
         time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
         now_ns = time.monotonic_ns()
-        arrived, was_stalled = peer.receive(), stalled
-        stalled = not was_stalled and now_ns - deadline_ns > STALL_NS
-        deadline_ns += ((now_ns - deadline_ns) // PERIOD_NS + 1) * PERIOD_NS
-        if stalled:
+        arrived, was_blind, late_ns = peer.receive(), blind, now_ns - deadline_ns
+        deadline_ns += (late_ns // PERIOD_NS + 1) * PERIOD_NS
+        blind = blind_for(blind, late_ns, bool(arrived))
+        if blind:
             continue
         seen = _newest(arrived, decode)
-        if was_stalled and seen is not None:  # first: a call may be about where the robot is
+        if was_blind and seen is not None:  # first: a call may be about where the robot is
             machine.see(seen, now_ns)
         for call in calls():  # first: what has arrived may already show what a call asked for
             call(now_ns)
-        if not was_stalled and seen is not None:
+        if not was_blind and seen is not None:
             machine.see(seen, now_ns)
         machine.handle_deadline(now_ns)
         _send_again(unsent, peer)
         told = _send(machine.take_outputs(), unsent, peer, encode)
         if told:
             tell(told)
+
+
+def blind_for(before: int, late_ns: int, arrived: bool) -> int:
+    """Say for how many wakes more teleop does not look; a loop that is always late looks in turns.
+
+    Args:
+        before: What was said at the wake before.
+        late_ns: By how much this one is late [ns].
+        arrived: Whether something waits in the socket.
+    """
+    if before:
+        return 0 if arrived else before - 1
+    return BLIND_WAKES if late_ns > STALL_NS else 0
 
 
 def _newest(arrived: list[bytes], decode: Decode) -> Any:

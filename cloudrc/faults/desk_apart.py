@@ -22,7 +22,7 @@ from cloudrc.cloud.teleop.api_bridge import WAITING_MAX, Call
 from cloudrc.cloud.teleop.journal_format import Entry
 from cloudrc.cloud.teleop.messages import Seen
 from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, STALL_NS, RemoteTeleop
+from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, blind_for
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.faults.desk import Desk
 from cloudrc.faults.mortal import Mortal
@@ -147,7 +147,7 @@ class Apart(Desk):
         self._calls: list[Call] = []
         self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
         self._ends, self._free_ns, self._turn_ns = False, 0, NEVER_NS
-        self._stalled = False
+        self._blind = 0
         self._life += 1
 
     def _tick(self, now_ns: int) -> None:
@@ -167,15 +167,15 @@ class Apart(Desk):
         self._send()  # what has waited for the end of an fsync
         own_ns, turned_ns = self._host.clock.at(now_ns), self._turn_ns
         self._turn_ns = self._free_ns = now_ns
-        arrived, was_stalled = self._peer.receive(), self._stalled
+        arrived, was_blind = self._peer.receive(), self._blind
         late_ns = now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0
-        self._stalled = not was_stalled and late_ns > STALL_NS
-        if self._stalled:
+        self._blind = blind_for(was_blind, late_ns, bool(arrived))
+        if self._blind:
             return
-        if was_stalled:
+        if was_blind:
             self._look_at(arrived, own_ns)
         self._obey(service, own_ns)
-        if not was_stalled:
+        if not was_blind:
             self._look_at(arrived, own_ns)
         super().handle_deadline(own_ns)
         if self._free_ns > now_ns:

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from cloudrc.cloud.teleop.wire import decode, encode
-from cloudrc.drivers.teleop import EVENTS_KEPT, STALL_NS, RemoteTeleop, serve_teleop
+from cloudrc.drivers.teleop import BLIND_WAKES, EVENTS_KEPT, STALL_NS, RemoteTeleop, serve_teleop
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Setpoint
@@ -193,25 +193,37 @@ def test_of_what_has_arrived_meanwhile_the_newest_counts(peers):
 
 
 @pytest.mark.parametrize(
-    ("late_ns", "first"),
-    [((0, 0), ["asked", PAST]), ((2 * STALL_NS, 0), [POINT, "asked"])],
+    ("wakes", "done"),
+    [
+        ("-", ["asked", PAST]),
+        ("sp", [POINT, "asked"]),
+        ("s--p", [POINT, "asked"]),
+        ("s" + "-" * (BLIND_WAKES - 1), []),
+        ("s" + "-" * BLIND_WAKES, ["asked"]),
+        ("ss", [PAST, "asked"]),
+    ],
 )
 def test_after_a_stall_the_past_is_passed_over_and_what_is_asked_is_asked_of_the_present(
-    peers, monkeypatch, late_ns, first
+    peers, monkeypatch, wakes, done
 ):
-    """Where the robot is held, for one: its socket has kept the beginning of the stall alone."""
-    machine, wakes, clock = Machine(), iter(late_ns), [SECOND]
-    peers[1].send(encode(PAST))
+    """Where the robot is held, for one: its socket has kept the beginning of the stall alone.
+
+    At each wake the present has arrived (p), or comes after a stall (s), with the past.
+    """
+    machine, clock = Machine(), [SECOND]
+    coming, stops = iter(wakes), iter([False] * len(wakes) + [True])
+    calls = [[lambda now_ns: machine.seen.append("asked")]]
+    if wakes == "-":
+        peers[1].send(encode(PAST))
 
     def sleep(seconds):
-        clock[0] += round(seconds * 1e9) + next(wakes)
-        if seconds > 0:
-            peers[1].send(encode(POINT))
+        what = next(coming)
+        clock[0] += round(seconds * 1e9) + (2 * STALL_NS if what == "s" else 0)
+        if what in "sp":
+            peers[1].send(encode(PAST if what == "s" else POINT))
 
     monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
-    stops = iter([False, False, True])
-    calls = [[lambda now_ns: machine.seen.append("asked")]]
     serve_teleop(
         machine,
         peers[0],
@@ -221,7 +233,7 @@ def test_after_a_stall_the_past_is_passed_over_and_what_is_asked_is_asked_of_the
         tell=lambda told: None,
         stop=lambda: next(stops),
     )
-    assert machine.seen[:2] == first
+    assert machine.seen == done
 
 
 def test_events_wait_for_a_cloud_that_is_away_and_keep_their_order(peers, service, tmp_path):

@@ -15,7 +15,7 @@ something else by somebody else: it is told again."""
 PREDECESSORS = 1_000
 """So many numbers are left to a process before this one: it may have asked what the robot does not
 show yet, and a request of this one must not be taken for that. It may even have asked nothing else,
-and begun as this one does: so the first number also rises with the machine's clock."""
+and begun as this one does: so the first number rises with the machine's clock, too."""
 
 
 class Repeater:
@@ -131,8 +131,8 @@ class Repeater:
         # A higher number than ours was acted on: an emergency stop has passed us by. Or our very
         # number, by a predecessor: ours would be seen by now.
         if pending.number == UNNUMBERED or seen.mission >= pending.number:
-            first = 0 if self._number else max(seen.mission + PREDECESSORS, now_ns // REPEAT_NS)
-            self._number = max(self._number, seen.mission, first - 1) + 1
+            rise = 1 if self._number else PREDECESSORS + now_ns // REPEAT_NS
+            self._number = max(self._number, seen.mission) + rise
             pending = self._pending = pending._replace(number=self._number)
             self._asked_epoch = seen.epoch
         elif now_ns < self._due_ns:
