@@ -206,7 +206,7 @@ class Fault(NamedTuple):
     Attributes:
         stamp_ns: [ns], own clock.
         code: One word: "estimator_failed", "predictor_failed", "controller_failed", "recorder",
-            "late".
+            "link_check", "late".
         text: What, where, what to do.
     """
 

@@ -7,7 +7,6 @@ when the link's profile is seen or changes.
 
 from __future__ import annotations
 
-import contextlib
 import queue
 import threading
 import time
@@ -19,7 +18,7 @@ from pathlib import Path
 
 from cloudrc.drivers.standing_basis import Basis, Judged
 from cloudrc.drivers.standing_tally import Tally
-from cloudrc.errors import CloudrcError
+from cloudrc.errors import in_words
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import from_text
 from cloudrc.link.verify_block import Block
@@ -62,6 +61,7 @@ class StandingCheck:
         self._settled = False
         self._trip = float("nan")
         self._said = "ok"
+        self._failure = ""  # of the thread, in words, until it has been told
         self._jobs: queue.SimpleQueue[Callable[[], None]] | None = None
         self._breathe: Callable[[], None] = lambda: None
 
@@ -126,7 +126,7 @@ class StandingCheck:
         if now_ns < self._quiet_ns:
             self._tally.forget()
             return []
-        return self._judge(now_ns) if now_ns >= self._due_ns else []
+        return [*self._judge(now_ns), *self._failed(now_ns)] if now_ns >= self._due_ns else []
 
     def _begin(self, now_ns: int) -> None:
         self._blocks.clear()
@@ -196,6 +196,14 @@ class StandingCheck:
         text = f"the {way} is not what was asked for: {wrong}; see 'cloudrc link verify'"
         return [Fault(now_ns, "link", text)]
 
+    def fail(self, error: Exception) -> None:
+        """Have it told that single datagrams could not be compared."""
+        self._failure = f"the standing check of the link failed ({in_words(error)}); it goes on"
+
+    def _failed(self, now_ns: int) -> list[Record]:
+        text, self._failure = self._failure, ""
+        return [Fault(now_ns, "link_check", text)] if text else []
+
 
 def _follow(
     check: StandingCheck,
@@ -206,7 +214,7 @@ def _follow(
 ) -> None:
     """Begin with what is asked; for ever do what is to do, and look whether the profile changes."""
     check.follow(asked)
-    seen = ""
+    seen, failed = "", False
     while True:
         try:
             text = path.read_text(encoding="utf-8") if path is not None else seen
@@ -214,10 +222,16 @@ def _follow(
                 seen = text
                 state = from_text(text)
                 check.follow(load(state.profile), state.shaper)
-        except (OSError, ValueError, CloudrcError):
-            pass  # not there yet, or half written: what was asked before still holds
-        with contextlib.suppress(queue.Empty):
+        except Exception:  # not there yet, half written or nonsense: what was asked still holds
+            pass
+        try:
             jobs.get(timeout=LOOK_PERIOD)()
+        except queue.Empty:
+            pass
+        except Exception as error:  # statistics go on judging, and the next job may do better
+            if not failed:
+                failed = True
+                check.fail(error)
 
 
 def _breathe() -> None:

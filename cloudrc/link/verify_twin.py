@@ -26,6 +26,8 @@ from cloudrc.link.verify_twin_rows import FEWEST, Pairs, judged
 
 WINDOW = 128
 """So many datagrams later one that has not arrived is lost."""
+SPAN_MAX = 30_000
+"""Datagrams that are compared at most, those that did not arrive included: those of 5 min."""
 NEAR = 3e-3
 """A datagram that arrives within so much of its drawn delay met its drawn fate [s]."""
 SAME_SHARE = 0.5
@@ -182,9 +184,12 @@ class _Log(NamedTuple):
 
 def _in_order(heard: Sequence[Heard]) -> _Log | None:
     """Sort by counter what is final; None if that is too little."""
+    newest = max((counter for _, counter, _ in heard), default=0)
+    # What lies behind a gap of hours is compared with nothing: each that is missing costs memory.
+    heard = [one for one in heard if newest - one[1] < SPAN_MAX]
     if len(heard) < FEWEST // 2:
         return None
-    first, last = heard[0][1], max(counter for _, counter, _ in heard) - WINDOW
+    first, last = heard[0][1], newest - WINDOW
     count, begin_ns = last - first + 1, heard[0][0]
     if count < FEWEST:
         return None

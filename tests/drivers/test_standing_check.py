@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from math import nan
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Event
 
 import pytest
 from standing_flights import (
     DRAWS,
     P1,
     PAPER,
+    PERIOD_NS,
     ZERO,
     arrivals,
     checked,
@@ -19,11 +23,13 @@ from standing_flights import (
     newest,
 )
 
+from cloudrc.drivers.standing_basis import Basis
 from cloudrc.drivers.standing_check import StandingCheck
 from cloudrc.drivers.standing_tally import Tally
 from cloudrc.exposition.check import Check
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.records import Arrival, Control, Lateness, LinkChecked, Record
+from cloudrc.link.verify_twin import WINDOW, Heard, Twin
+from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
 FAULTS = {
     "mean": replace(PAPER, delay=PAPER.delay * 1.5),
@@ -113,8 +119,6 @@ def test_a_new_profile_is_judged_by_from_then_on() -> None:
 
 
 def test_the_profile_is_followed_in_the_state_of_the_link(tmp_path: Path) -> None:
-    from threading import Event
-
     seen = Event()
     check, slow = downlink(PAPER), DirectionProfile(0.070)
     follow = check.follow
@@ -149,6 +153,46 @@ def test_a_new_session_begins_anew() -> None:
     block = tally.take()
     assert (block.sent, block.lost) == (700 - 500 - 128, 1), "501 can still arrive until then"
     assert tally.see(Arrival(0, False, 2, 0, 0.05, True))
+
+
+@pytest.mark.parametrize(
+    ("gap", "compared"),
+    [(20_000, 24_000 - WINDOW), (10**6, 2000 - WINDOW), (10**18, 2000 - WINDOW)],
+)
+def test_what_lies_behind_a_gap_of_hours_is_compared_with_nothing(gap: int, compared: int) -> None:
+    """Of minutes, though, all that should have come; a hostile counter may jump by anything."""
+    heard = [(n * PERIOD_NS, n + gap * (n >= 2000), 0.0705) for n in range(4000)]
+    found = Twin(DirectionProfile(0.070), DRAWS).compare(1, heard)
+    assert found is not None
+    assert (len(found.pairs.sent), int(found.pairs.arrived.sum())) == (
+        compared,
+        min(compared, 4000 - WINDOW),
+    )
+
+
+def test_a_comparison_that_fails_is_told_once_and_the_next_is_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    followed, made = Event(), SimpleQueue[int]()
+
+    def fails(self: Basis, epoch: int, heard: Sequence[Heard]) -> None:
+        made.put(epoch)
+        raise MemoryError("no\nroom")
+
+    monkeypatch.setattr(Basis, "compare", fails)
+    check = StandingCheck(uplink=False, stream=DRAWS)
+    steady = DirectionProfile(0.070)
+    monkeypatch.setattr(
+        check, "follow", lambda *asked: (StandingCheck.follow(check, *asked), followed.set())
+    )
+    check.begin((steady, steady), None, lambda values: (steady, steady))
+    assert followed.wait(20.0)
+    flight, faults = arrivals(steady, 90.0), list[Fault]()
+    for third in (flight[:3000], flight[3000:6000], flight[6000:]):
+        faults += checked(check, third)[1]
+        assert made.get(timeout=20.0) == 1
+    text = "the standing check of the link failed (MemoryError: no room); it goes on"
+    assert [(fault.code, fault.text) for fault in faults] == [("link_check", text)]
 
 
 def test_what_is_exposed_is_the_newest_verdict() -> None:
