@@ -2,7 +2,8 @@
 
 The link's process publishes its state whenever it has changed it (`cloudrc/link/state.py`). A look
 at the file costs a system call and is made ten times a second. How late a relay's datagrams left is
-in a file beside it, and noted every other second.
+in a file beside it, and noted every other second. The link's process is not trusted: whatever its
+files hold, the loop goes on.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from collections.abc import Iterable
 from math import nan
 from pathlib import Path
 
-from cloudrc.link.route import version
-from cloudrc.link.state import RELEASED_SUFFIX, LinkState, from_text
+from cloudrc.errors import in_one_line
+from cloudrc.link.route import read, version
+from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, LinkState, from_text
 from cloudrc.records import (
     Counted,
     GuardChange,
@@ -29,6 +31,8 @@ RELEASED_PERIOD_NS = 2_000_000_000
 """Between two notes of how late datagrams left [ns]."""
 BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
 """With these a mission begins: a recording that is cut there has to say what the link was."""
+NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
+"""What comes of a file that cannot be read, or in which stands what nobody would write."""
 
 
 class LinkNotes:
@@ -43,9 +47,10 @@ class LinkNotes:
         """
         self._path, self._place, self._uplink = path, str(path), uplink
         self._seen: tuple[int, int, int] | None = None
-        self._state: LinkState | None = None
+        self._since_ns: int | None = None
+        self._note: LinkChanged | None = None
         self._released = path.with_suffix(RELEASED_SUFFIX)
-        self._due_ns = self._released_ns = 0
+        self._due_ns = self._released_ns = self._noted_ns = 0
 
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
         """Say what there is to be noted after these records.
@@ -68,17 +73,21 @@ class LinkNotes:
         changed = now_ns >= self._due_ns and self._look(now_ns)
         if not changed and BEGINNINGS.isdisjoint(map(type, records)):
             return []
-        state = self._state
-        return [_note(state, self._uplink, now_ns, slip_ns)] if state is not None else []
+        note, later = self._note, (now_ns - self._noted_ns) * 1e-9
+        if note is None:
+            return []
+        age, time_line = note.age + later, note.time_line + later
+        return [note._replace(stamp_ns=now_ns - slip_ns, age=age, time_line=time_line)]
 
     def _late(self, stamp_ns: int) -> list[Record]:
         """Say how late datagrams left since the relay began; nothing where none does."""
         try:
-            told = json.loads(self._released.read_text(encoding="utf-8"))
-            way = "uplink" if self._uplink else "downlink"
-            return [Counted(stamp_ns, "link", f"{way}_{name}", int(n)) for name, n in told.items()]
-        except (OSError, ValueError, TypeError, AttributeError):
+            told = json.loads(read(self._released))
+            counts = {name: int(n) for name, n in told.items() if name in RELEASED}
+        except NONSENSE:
             return []
+        way = "uplink" if self._uplink else "downlink"
+        return [Counted(stamp_ns, "link", f"{way}_{name}", n) for name, n in counts.items()]
 
     def _look(self, now_ns: int) -> bool:
         """Read the file if it is another one; say whether the state has changed."""
@@ -87,21 +96,23 @@ class LinkNotes:
         if seen == self._seen:
             return False
         try:
-            state, before = from_text(self._path.read_text(encoding="utf-8")), self._state
-        except (OSError, ValueError):
+            state = from_text(read(self._path).decode())
+            self._note = _note(state, self._uplink, now_ns)
+        except NONSENSE:
             return False
-        self._seen, self._state = seen, state
-        return before is None or before.since_ns != state.since_ns
+        before_ns, self._since_ns = self._since_ns, state.since_ns
+        self._seen, self._noted_ns = seen, now_ns
+        return before_ns != state.since_ns
 
 
-def _note(state: LinkState, uplink: bool, now_ns: int, slip_ns: int) -> LinkChanged:
+def _note(state: LinkState, uplink: bool, now_ns: int) -> LinkChanged:
     asked = {key: nan if value is None else float(value) for key, value in state.asked.items()}
     time_line = nan if state.origin_ns is None else (now_ns - state.origin_ns) * 1e-9
     return LinkChanged(
-        stamp_ns=now_ns - slip_ns,
+        stamp_ns=now_ns,
         uplink=uplink,
-        shaper=state.shaper,
-        cause=state.cause,
+        shaper=in_one_line(state.shaper),
+        cause=in_one_line(state.cause),
         age=max(0, now_ns - state.since_ns) * 1e-9,
         time_line=time_line,
         delay=asked.get("delay", nan),

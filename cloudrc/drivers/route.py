@@ -10,7 +10,7 @@ from __future__ import annotations
 from ipaddress import AddressValueError, IPv4Address
 from pathlib import Path
 
-from cloudrc.link.route import version
+from cloudrc.link.route import read, version
 
 Address = tuple[str, int]
 
@@ -32,7 +32,7 @@ class Route:
         try:
             seen = version(self._path)
             if seen != self._seen:
-                self._address = parse(self._path.read_text(encoding="ascii"))
+                self._address = parse(read(self._path).decode("ascii"))
                 self._seen = seen
         except (OSError, ValueError):
             self._seen = None

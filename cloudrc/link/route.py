@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
+
+SIZE_MAX = 1 << 20
+"""Longest that is read [bytes]: what a ConfigMap holds."""
 
 
 def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | None:
@@ -18,6 +22,26 @@ def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | 
     except OSError:
         return None
     return status.st_mtime_ns, status.st_ino, status.st_size
+
+
+def read(path: Path) -> bytes:
+    """Read a file that somebody else has written, without waiting for anybody.
+
+    Raises:
+        OSError: If it cannot be read.
+        ValueError: If it is no file, as a pipe is none, or longer than SIZE_MAX.
+    """
+    with open(path, "rb", opener=_at_once) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise ValueError(f"{path}: not a file")
+        data = file.read(SIZE_MAX + 1)
+    if len(data) > SIZE_MAX:
+        raise ValueError(f"{path}: longer than {SIZE_MAX} bytes")
+    return data
+
+
+def _at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def publish(path: Path, text: str) -> None:

@@ -18,6 +18,11 @@ STATE_FILE = "link.json"
 RELEASED_SUFFIX = ".released"
 """Of the file beside it that tells how late a relay's datagrams left so far: names and whole
 numbers, as JSON. A file of its own, since the state is read only when the link changes."""
+RELEASED = frozenset(
+    {"released", "released_early", "overflow", "stalled"}
+    | {f"release_error_{quantile}_ns" for quantile in ("p50", "p99", "p999")}
+)
+"""The names in it."""
 CHANGE_FILE = "change.json"
 """Name of the file beside the profile that says who changed it and why."""
 

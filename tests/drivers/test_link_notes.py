@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import replace
+from dataclasses import asdict, replace
+from math import nan
 from pathlib import Path
 
 import pytest
 
 from cloudrc.drivers.feed import Feed, in_words
 from cloudrc.drivers.link_notes import LinkNotes
-from cloudrc.link.route import publish
+from cloudrc.link.relay_errors import ReleaseErrors, in_ns
+from cloudrc.link.route import SIZE_MAX, publish
 from cloudrc.link.state import LinkState, to_text
 from cloudrc.messages import GuardState
-from cloudrc.records import Counted, GuardChange, LinkChanged, Record
+from cloudrc.records import Counted, GuardChange, LinkChanged, Record, SessionOpened
 
 MS = 1_000_000
 STATE = LinkState(
@@ -96,6 +98,73 @@ def test_a_refusal_or_a_broken_file_is_no_change(tmp_path: Path) -> None:
         assert notes.after([], at * MS) == []
     tell(path, SET)
     assert len(notes.after([], 1000 * MS)) == 1
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"asked": {"delay": "45 ms"}},
+        {"asked": [1]},
+        {"since_ns": "5"},
+        {"since_ns": -(10**400)},
+        {"origin_ns": "5"},
+        {"profile": []},
+        {"direction": {}},
+        {"shaper": 5},
+        {"reason": "x" * SIZE_MAX},
+    ],
+    ids=lambda wrong: next(iter(wrong)),
+)
+def test_a_state_of_which_nothing_can_be_noted_is_no_change(
+    tmp_path: Path, wrong: dict[str, object]
+) -> None:
+    path = tmp_path / "link.json"
+    tell(path, STATE)
+    notes, began = LinkNotes(path, uplink=False), [SessionOpened(0, "cloud", 1, "")]
+    (before,) = notes.after([], 200 * MS)
+    path.write_text(json.dumps(asdict(SET) | wrong))
+    (again,) = notes.after(began, 400 * MS)
+    assert isinstance(before, LinkChanged)
+    assert again == before._replace(
+        stamp_ns=400 * MS, age=pytest.approx(0.3), time_line=pytest.approx(nan, nan_ok=True)
+    )
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"released": Infinity}', '{"released": [1]}'])
+def test_nonsense_in_either_file_ends_nothing(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "link.json"
+    for one in (path, path.with_suffix(".released")):
+        one.write_text(text)
+    assert LinkNotes(path, uplink=True).after([], 0) == []
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "link.json"
+    for one in (path, path.with_suffix(".released")):
+        os.mkfifo(one)
+    assert LinkNotes(path, uplink=True).after([], 0) == []
+
+
+def test_foreign_words_are_noted_in_one_line_that_can_be_written(tmp_path: Path) -> None:
+    path = tmp_path / "link.json"
+    tell(path, replace(STATE, cause="torn\nin two \udce9 " + "x" * 10_000))
+    (noted,) = LinkNotes(path, uplink=False).after([], 200 * MS)
+    assert isinstance(noted, LinkChanged)
+    assert noted.cause.startswith("torn in two \\udce9 xxx")
+    assert len(noted.cause.encode()) < 2100
+
+
+def test_only_what_a_relay_tells_is_counted(tmp_path: Path) -> None:
+    """Names that come from elsewhere would be kept for ever by whoever counts them."""
+    path = tmp_path / "link.json"
+    errors = ReleaseErrors()
+    errors.observe(5)
+    told = in_ns(errors) | {"overflow": 1, "stalled": 2}
+    path.with_suffix(".released").write_text(json.dumps(told | {"another": 3}))
+    counted = LinkNotes(path, uplink=True).after([], 0)
+    assert [one.name for one in counted if isinstance(one, Counted)] == [
+        f"uplink_{name}" for name in told
+    ]
 
 
 def test_it_is_told_in_words(tmp_path: Path) -> None:

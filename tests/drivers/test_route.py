@@ -57,6 +57,17 @@ def test_what_is_no_address_changes_nothing(tmp_path: Path, text: str) -> None:
     assert route.look() == THERE
 
 
+def test_what_is_no_file_or_an_endless_one_is_not_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "route"
+    write(path, "127.0.0.1:7401\n", 1)
+    route = Route(path)
+    route.look()
+    for make in (os.mkfifo, os.mkdir, lambda path: path.symlink_to("/dev/zero")):
+        path.rmdir() if path.is_dir() else path.unlink()
+        make(path)
+        assert route.look() == HERE
+
+
 @pytest.mark.parametrize(
     "text", ["cloud:7400", "1.2.3:7400", "1.2.3.4:0", "1.2.3.4:65536", "1.2.3.4:x", "[::1]:7400"]
 )

@@ -118,7 +118,7 @@ def test_a_new_profile_is_judged_by_from_then_on() -> None:
     assert newest(records)["mean"].asked == pytest.approx(0.120, abs=1e-3)
 
 
-def test_the_profile_is_followed_in_the_state_of_the_link(tmp_path: Path) -> None:
+def test_the_profile_is_followed_in_the_state_of_the_link_through_nonsense(tmp_path: Path) -> None:
     seen = Event()
     check, slow = downlink(PAPER), DirectionProfile(0.070)
     follow = check.follow
@@ -129,10 +129,17 @@ def test_the_profile_is_followed_in_the_state_of_the_link(tmp_path: Path) -> Non
             seen.set()
 
     check.follow = watched  # type: ignore[method-assign]
-    state = {"shaper": "relay", "reason": "", "mode": "relay", "direction": "uplink"}
-    state |= {"profile": {"downlink": {"delay_ms": 70}}, "since": "", "since_ns": 0}  # type: ignore[dict-item]
-    (tmp_path / "link.json").write_text(json.dumps(state))
-    check.begin((PAPER, PAPER), tmp_path / "link.json", lambda values: (DirectionProfile(), slow))
+    state, path = {"shaper": "relay", "reason": "", "mode": "relay"}, tmp_path / "link.json"
+    state |= {"direction": "uplink", "since": "", "since_ns": 0}  # type: ignore[dict-item]
+    path.write_text(json.dumps(state | {"profile": "nonsense"}))
+
+    def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
+        if values == "nonsense":
+            path.write_text(json.dumps(state | {"profile": {"downlink": {"delay_ms": 70}}}))
+            raise OverflowError
+        return DirectionProfile(), slow
+
+    check.begin((PAPER, PAPER), path, load)
     assert seen.wait(20.0)
     records, _ = checked(check, arrivals(slow))
     assert newest(records)["mean"].asked == pytest.approx(0.070)
