@@ -62,7 +62,7 @@ class DelayMeter:
         Raises:
             ValueError: If the estimator gives something that is not finite.
         """
-        horizon = self._estimator.horizon((now_ns - self._stamp_ns) * 1e-9)
+        horizon = float(self._estimator.horizon((now_ns - self._stamp_ns) * 1e-9))
         if 0.0 <= horizon <= HORIZON_MAX:
             return horizon
         if not isfinite(horizon):

@@ -1,8 +1,8 @@
 """The control loop: the newest telemetry becomes a command, through estimator, predictor, PID.
 
-A plug-in may be wrong: it raises, or returns something that is not finite. Then the loop does the
-careful thing (looks ahead by the last good horizon, uses the last sample, commands zero), counts
-it, and says once what happened; it never stops.
+A plug-in may be wrong: it raises, or returns something that is not finite, or no numbers at all.
+Then the loop does the careful thing (looks ahead by the last good horizon, uses the last sample,
+commands zero), counts it, and says once what happened; it never stops.
 
 While no echo shows that commands are flown, the reference is frozen: the command is to stand still
 and the controller is not asked, so that no integral winds up and no predictor believes in motion
@@ -19,14 +19,13 @@ from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.delays import DelayMeter
 from cloudrc.cloud.estimators import Estimator
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry
+from cloudrc.errors import in_words
+from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry, Vector
 from cloudrc.records import Control, Fault
 
 FREEZE_NS = 400_000_000
 """An echo that is silent for longer than horizon and this freezes the reference [ns].
 Source: DESIGN, section 5."""
-PLUG_IN_ERRORS = (Exception, SystemExit)
-"""A plug-in is foreign code: anything may come out of it; a person's Ctrl-C is not its own."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 _new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
 
@@ -40,19 +39,34 @@ class ControlLoop:
         predictor: Predictor,
         controller: Controller,
     ) -> None:
-        """Join three plug-ins; the estimator is built anew for every session."""
+        """Join three plug-ins; the estimator is built anew for every session.
+
+        Before anything flies a plug-in that fails may end this: whatever it raises gets out.
+        """
         self._build_estimator = build_estimator
         self._predictor = predictor
         self._controller = controller
         self.faults: list[Fault] = []
         self.counts: Counter[str] = Counter()
-        self.reset()
+        self._undated: list[Fault] = []
+        estimator = build_estimator()
+        predictor.reset()
+        controller.reset()
+        self._begin(estimator)
 
     def reset(self) -> None:
         """A new session begins: nothing measured in the old one counts."""
-        self._delays = DelayMeter(self._build_estimator(), self.counts)
-        self._predictor.reset()
-        self._controller.reset()
+        try:
+            estimator = self._build_estimator()
+        except BaseException as error:
+            self._note("estimator", error, NEVER_NS)
+            estimator = Estimator()  # which knows nothing: the horizon stays 0
+        self._reset("predictor", self._predictor.reset)
+        self._reset("controller", self._controller.reset)
+        self._begin(estimator)
+
+    def _begin(self, estimator: Estimator) -> None:
+        self._delays = DelayMeter(estimator, self.counts)
         self._basis: Odometry | None = None
         self._basis_arrival_ns = 0
         self._horizon = 0.0
@@ -60,8 +74,14 @@ class ControlLoop:
 
     def start_mission(self) -> None:
         """A mission begins within the session: the controller starts anew."""
-        self._controller.reset()
+        self._reset("controller", self._controller.reset)
         self._trusted_ns = NEVER_NS
+
+    def _reset(self, kind: str, reset: Callable[[], None]) -> None:
+        try:
+            reset()
+        except BaseException as error:
+            self._note(kind, error, NEVER_NS, "it is asked on as it is")
 
     @property
     def basis_stamp_ns(self) -> int:
@@ -76,13 +96,16 @@ class ControlLoop:
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
         """Take in telemetry that became the newest, at its arrival [ns, cloud's clock]."""
         self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
+        if self._undated:
+            self.faults += [fault._replace(stamp_ns=now_ns) for fault in self._undated]
+            self._undated.clear()
         try:
             self._delays.observe(telemetry, now_ns)
-        except PLUG_IN_ERRORS as error:
+        except BaseException as error:
             self._note("estimator", error, now_ns)
         try:
             self._predictor.observe(telemetry.odometry)
-        except PLUG_IN_ERRORS as error:
+        except BaseException as error:
             self._note("predictor", error, now_ns)
 
     def command(
@@ -111,7 +134,7 @@ class ControlLoop:
         command = _new(Command, (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate))
         try:
             self._predictor.commanded(command)
-        except PLUG_IN_ERRORS as error:
+        except BaseException as error:
             self._note("predictor", error, now_ns)
         known = (
             now_ns,
@@ -143,7 +166,7 @@ class ControlLoop:
     def _look_ahead(self, now_ns: int) -> float:
         try:
             self._horizon = self._delays.horizon(now_ns)
-        except PLUG_IN_ERRORS as error:
+        except BaseException as error:
             self._note("estimator", error, now_ns)
         return self._horizon
 
@@ -153,25 +176,30 @@ class ControlLoop:
     def _predict(self, basis: Odometry, horizon: float, now_ns: int) -> Odometry:
         try:
             estimate = self._predictor.predict(basis, horizon)
-            numbers = sum(estimate.position) + sum(estimate.velocity)
-            if not isfinite(numbers + sum(estimate.orientation_wxyz)):
+            position, velocity = _triple(estimate.position), _triple(estimate.velocity)
+            w, x, y, z = estimate.orientation_wxyz
+            orientation = (float(w), float(x), float(y), float(z))
+            if not isfinite(sum(position) + sum(velocity) + sum(orientation)):
                 raise ValueError(f"it returned {estimate}")
-        except PLUG_IN_ERRORS as error:
+            stamp_ns, rate = estimate.stamp_ns, estimate.angular_velocity_body
+            return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
+        except BaseException as error:
             self._note("predictor", error, now_ns)
             return basis
-        return estimate
 
     def _steer(
         self, estimate: Odometry, setpoint: Setpoint, dt: float, now_ns: int
     ) -> ControlOutput:
         try:
             output = self._controller.update(estimate, setpoint, dt)
-            if not isfinite(sum(output.velocity) + output.yaw_rate):
+            velocity, yaw_rate = _triple(output.velocity), float(output.yaw_rate)
+            if not isfinite(sum(velocity) + yaw_rate):
                 raise ValueError(f"it returned {output}")
-        except PLUG_IN_ERRORS as error:
+            terms = _triple(output.proportional), _triple(output.integral)
+            return _new(ControlOutput, (velocity, yaw_rate, *terms, _triple(output.derivative)))
+        except BaseException as error:
             self._note("controller", error, now_ns)
             return STAND_STILL
-        return output
 
     def _is_unheard(self, now_ns: int, horizon: float) -> bool:
         """Whether the echo has been silent for too long; before the first it has time, too."""
@@ -181,12 +209,19 @@ class ControlLoop:
             self._trusted_ns = now_ns
         return now_ns - self._trusted_ns > horizon * 1e9 + FREEZE_NS
 
-    def _note(self, kind: str, error: BaseException, now_ns: int) -> None:
-        """Count what a plug-in did wrong; report it the first time."""
+    def _note(self, kind: str, error: BaseException, now_ns: int, instead: str = "") -> None:
+        """Count what a plug-in did wrong; report it the first time.
+
+        It is foreign code: anything may come out of it, but a person's Ctrl-C is not its own.
+        What is noted at NEVER_NS is dated by the next telemetry.
+        """
+        if isinstance(error, KeyboardInterrupt):
+            raise error
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:
-            self.faults.append(Fault(now_ns, code, _explain(kind, error)))
+            fault = Fault(now_ns, code, _explain(kind, error, instead))
+            (self._undated if now_ns == NEVER_NS else self.faults).append(fault)
 
 
 _INSTEAD = {
@@ -196,6 +231,12 @@ _INSTEAD = {
 }
 
 
-def _explain(kind: str, error: BaseException) -> str:
-    text = " ".join(f"{type(error).__name__}: {error}".split())
-    return f"the {kind} failed ({text}); {_INSTEAD[kind]}; mend cloud.{kind} or choose another"
+def _explain(kind: str, error: BaseException, instead: str) -> str:
+    what = f"the {kind} failed ({in_words(error)}); {instead or _INSTEAD[kind]}"
+    return f"{what}; mend cloud.{kind} or choose another"
+
+
+def _triple(numbers: Vector) -> Vector:
+    """Have it of numbers, whatever a plug-in has made of it; what is a triple stays as it is."""
+    x, y, z = numbers
+    return float(x), float(y), float(z)

@@ -1,0 +1,37 @@
+"""A control loop without ends: telemetry for it, and what it commands."""
+
+from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.cloud.controllers.pid import build as pid
+from cloudrc.cloud.estimators.running_mean import build as running_mean
+from cloudrc.cloud.loop import ControlLoop
+from cloudrc.cloud.predictors.last_sample import build as last_sample
+from cloudrc.messages import NEVER_NS, UPRIGHT, ZERO, GuardState, Odometry, Setpoint, Telemetry
+
+MS = 1_000_000
+HERE = (1.0, 2.0, 3.0)
+THERE = Setpoint((2.0, 2.0, 3.0))
+
+
+def telemetry(stamp_ms, echo_ms=None, hold_ms=0):
+    odometry = Odometry(stamp_ms * MS, HERE, UPRIGHT, ZERO, ZERO)
+    echo_ns = NEVER_NS if echo_ms is None else echo_ms * MS
+    return Telemetry(stamp_ms * MS, odometry, 0.0, echo_ns, hold_ms * MS, 0, 1, GuardState.TRACK)
+
+
+def loop(estimator=running_mean, predictor=None, controller=None):
+    return ControlLoop(estimator, predictor or last_sample(), controller or pid())
+
+
+def command(a_loop, now_ms):
+    return a_loop.command(THERE, now_ms * MS, 0.01, 1, 0)
+
+
+class Integrating(Controller):
+    """Says how often it was asked."""
+
+    def __init__(self):
+        self.asked = 0
+
+    def update(self, estimate, setpoint, dt):
+        self.asked += 1
+        return ControlOutput((1.0, 0.0, 0.0), 0.5)
