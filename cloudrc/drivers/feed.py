@@ -47,6 +47,7 @@ class Feed:
         self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
         self._links: dict[bool, str] = {}
+        self._rest = b""  # of a line that was longer than the pipe had room for
         os.set_blocking(descriptor, False)
 
     @classmethod
@@ -86,8 +87,12 @@ class Feed:
         return True
 
     def _write(self, line: str) -> None:
+        """Write a line, or lose it whole: what is left of a longer one goes before the next."""
+        data = line.encode(errors="backslashreplace") + b"\n"
         try:
-            os.write(self._descriptor, line.encode() + b"\n")
+            self._rest = self._rest[os.write(self._descriptor, self._rest) :]
+            if not self._rest:
+                self._rest = data[os.write(self._descriptor, data) :]
         except OSError:  # full or closed: to watch is a courtesy, to fly is not
             pass
 

@@ -21,8 +21,8 @@ from pathlib import Path
 from cloudrc.drivers import flights
 from cloudrc.drivers.feed import READY, from_line
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.errors import InvalidRunError, TimedOutError
-from cloudrc.records import Record
+from cloudrc.errors import InvalidRunError, TimedOutError, in_one_line
+from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
 START_LIMIT = 60.0
@@ -56,6 +56,7 @@ class Child:
         unread: The beginning of a line of its feed whose end has not come yet.
         heard: When it last told something [s], monotonic clock; None before the first time.
         ready: Whether it has said so.
+        garbled: Whether it has told what is no record.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Child:
     unread: bytes = field(default=b"")
     heard: float | None = field(default=None)
     ready: bool = field(default=False)
+    garbled: bool = field(default=False)
 
     def last_words(self) -> str:
         """The last line that it wrote to its log, if any."""
@@ -197,10 +199,10 @@ class LocalRun:
                 self._selector.unregister(key.fileobj)
             *lines, child.unread = (child.unread + data).split(b"\n")
             for line in lines:
-                if line.decode() == READY:
+                if line == READY.encode():
                     child.ready = True
                 else:
-                    told.append(from_line(line.decode()))
+                    told += _told(child, line)
                     if child.name in TELL_ALWAYS:
                         child.heard = time.monotonic()
         return told
@@ -240,6 +242,18 @@ class LocalRun:
         for child in self._children:
             if child.process.stdout is not None:
                 child.process.stdout.close()
+
+
+def _told(child: Child, line: bytes) -> list[Record]:
+    """Read a line of a feed; one that is no record is said once, and ends no flight."""
+    try:
+        return [from_line(line.decode())]
+    except ValueError as error:
+        if child.garbled:
+            return []
+        child.garbled = True
+        what = in_one_line(str(error))[:120]
+        return [Fault(0, "feed", f"of the {child.name} process a line was left out: {what}")]
 
 
 def _free_addresses(count: int) -> list[str]:

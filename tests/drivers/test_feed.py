@@ -66,6 +66,23 @@ def test_a_full_pipe_does_not_block():
     os.close(writer)
 
 
+def test_a_line_is_told_whole_however_long_and_in_any_characters():
+    """A pipe has room for 64 KiB; the rest of a longer line goes before the next, or instead."""
+    reader, writer = os.pipe()
+    os.set_blocking(reader, False)
+    feed, data = Feed(writer), b""
+    long = EVENT._replace(text="x" * 150_000)
+    for event in (long, EVENT, EVENT, EVENT):
+        feed.tell([event])
+        data += os.read(reader, 1 << 20)
+    *lines, rest = data.decode().split("\n")
+    assert ([from_line(line) for line in lines], rest) == ([long, EVENT, EVENT], "")
+    Feed(writer, watched=False).tell([EVENT._replace(text="caf\udce9")])
+    assert os.read(reader, 100) == b"caf\\udce9\n"
+    os.close(reader)
+    os.close(writer)
+
+
 def test_processes_of_one_machine_share_their_clock():
     assert clock_id() == clock_id()
     assert len(clock_id()) == 16
