@@ -66,8 +66,8 @@ class End:
 
     def _see_arrival(self, record: Arrival) -> None:
         stamp_ns, _, epoch, counter, delay, used = record
-        self._heard_ns, self._silent = stamp_ns, False
-        self._stream.take(epoch, counter)
+        if self._stream.take(epoch, counter):  # those that are repeated anybody can send
+            self._heard_ns, self._silent = stamp_ns, False
         if delay == delay:  # not NaN: both ends share a clock
             self._one_way.observe(delay)
         if used:

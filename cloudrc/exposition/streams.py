@@ -30,13 +30,16 @@ class Stream:
         """How many datagrams have left the window: those that are judged, arrived or lost."""
         return self._before + max(0, self._newest - self._first - WINDOW + 1)
 
-    def take(self, epoch: int, counter: int) -> None:
-        """Note that the datagram with this counter has arrived."""
+    def take(self, epoch: int, counter: int) -> bool:
+        """Note that the datagram with this counter has arrived; True if it is sure to be new.
+
+        Any other may be one that was caught and sent again, which takes no key.
+        """
         if epoch != self._epoch:
             # What was sent before the first arrival may have been sent to nobody: not judged.
             self._before = self.expected
             self._epoch, self._first, self._newest, self._seen = epoch, counter, counter, _MASK
-            return
+            return True
         ahead = counter - self._newest
         if ahead == 1:
             if not self._seen & _OLDEST:
@@ -49,6 +52,9 @@ class Stream:
         elif ahead > -WINDOW and not self._seen >> -ahead & 1:
             self._seen |= 1 << -ahead
             self.reordered += 1
+        else:
+            return False
+        return True
 
     def _skip(self, ahead: int) -> None:
         """Move the window; those between never arrive, or late."""

@@ -190,6 +190,20 @@ def test_an_end_has_a_peer_while_it_hears_it(role: str) -> None:
     assert heard(role, opened, arrival, again, wake(5010))
 
 
+@pytest.mark.parametrize("role", labels.ENDS)
+@pytest.mark.parametrize(("behind", "hears"), [(0, False), (1, True), (500, False)])
+def test_a_datagram_that_is_sent_again_is_no_sign_of_life(
+    role: str, behind: int, hears: bool
+) -> None:
+    """Whoever has caught one can send it again without a key; one that is only late is new."""
+    opened = SessionOpened(0, role, 1, "")
+    first, newest = (
+        Arrival(100 * MS, role == "cloud", 1, counter, math.nan, True) for counter in (0, 600)
+    )
+    again = newest._replace(stamp_ns=2000 * MS, counter=600 - behind, used=False)
+    assert heard(role, opened, first, newest, again, wake(2500)) == hears
+
+
 def test_world_waits_for_the_first_command_of_a_cloud_that_has_none_yet() -> None:
     assert heard("world", SessionOpened(0, "world", 1, ""), wake(60_000))
     assert not heard("cloud", SessionOpened(0, "cloud", 1, ""), wake(60_000))
