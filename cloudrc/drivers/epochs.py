@@ -50,15 +50,16 @@ class EpochFile:
     def _read(self) -> int:
         try:
             text = self._path.read_text(encoding="ascii").strip()
+            epoch = int(text) if text.isdecimal() else -1  # no number may have 4301 digits
         except FileNotFoundError:
             return 0
         except (OSError, ValueError) as error:
             self._note(f"{error}; epochs begin again")
             return 0
-        if not text.isdecimal() or int(text) > EPOCH_MAX:
+        if not 0 <= epoch <= EPOCH_MAX:
             self._note("it holds no epoch; epochs begin again")
             return 0
-        return int(text)
+        return epoch
 
     def _note(self, what: str) -> None:
         self.trouble = f"{self._path}: {what}"
