@@ -204,17 +204,24 @@ def _start(
     import time
 
     from cloudrc import assembly
+    from cloudrc.cloud.teleop.service_book import ConflictError
     from cloudrc.cloud.teleop.service_mission import Order
 
     if not (options.start or options.mission):
         return False
-    if service.book.open():  # of the process before this one, which had the same flags: it goes on
-        return True
     criteria, mission, name = experiment.criteria, experiment.mission, experiment.name
     if options.mission:
         mission, name = _load(options.mission, experiment), Path(options.mission).stem
     plan = assembly.mission_plan(mission, criteria.time_limit_s, experiment.seed)
-    service.create(Order(plan, name, contact=criteria.contact), time.monotonic_ns())
+    if any(each.order.plan == plan for each in service.book.open()):
+        return True  # of the process before this one, which had the same flags: it goes on
+    try:
+        service.create(Order(plan, name, contact=criteria.contact), time.monotonic_ns())
+    except ConflictError as error:
+        if not options.api:
+            raise
+        print(f"cloudrc teleop: {error}", file=sys.stderr, flush=True)
+        return False  # whoever acknowledges a stop, or cancels what is in the way, needs the API
     return True
 
 

@@ -213,6 +213,8 @@ class CloudEndpoint:
         self._channel.reset()
         self._loop.reset()
         self._setpoint = None  # meant for where the robot was; teleop says it again
+        self._asked = 0  # what was asked in the session before counts no more
+        self._alarm.begin_again()
         self._world = accept.world_nonce.hex()
         self._clock_is_shared = accept.clock == self._identity.clock_id
         self._heard_ns = now_ns

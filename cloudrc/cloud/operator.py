@@ -107,6 +107,10 @@ class Alarm:
         if not self.sounds:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
+    def begin_again(self) -> None:
+        """In another session numbers may begin again."""
+        self._number = self._acted_on = self._due_ns = 0
+
     def see(self, guard: GuardState, acted_on: int) -> None:
         """Take note of the guard's state, and of the last request that world has acted on."""
         self._acted_on = acted_on

@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Iterable
 from enum import IntEnum
-from typing import Any, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from cloudrc import records as kinds
 from cloudrc.records import (
@@ -122,8 +122,11 @@ def from_line(line: str) -> Record:
     """
     try:
         name, values = json.loads(line)
-        record: Record = _build(getattr(kinds, name), values)
-    except (TypeError, AttributeError, ValueError) as error:
+        kind = getattr(kinds, name)
+        if kind not in get_args(Record):
+            raise ValueError(name)
+        record: Record = _build(kind, values)
+    except (TypeError, AttributeError, ValueError, RecursionError) as error:
         raise ValueError(f"not a record: {line!r}") from error
     return record
 

@@ -95,13 +95,14 @@ class LinkNotes:
         seen = version(self._place)
         if seen == self._seen:
             return False
+        self._seen = seen  # nonsense stays nonsense until it is another file
         try:
             state = from_text(read(self._path).decode())
             self._note = _note(state, self._uplink, now_ns)
         except NONSENSE:
             return False
         before_ns, self._since_ns = self._since_ns, state.since_ns
-        self._seen, self._noted_ns = seen, now_ns
+        self._noted_ns = now_ns
         return before_ns != state.since_ns
 
 

@@ -241,7 +241,7 @@ _ENTRIES = (
     counter("cloudrc_loop_busy_seconds_total", "Time spent in handling deadlines.", ENDS),
     counter(
         "cloudrc_words_dropped_total",
-        "Setpoints and starts that teleop has said in another session.",
+        "Words of teleop for another session, or without a number left, which are not passed on.",
         (CLOUD,),
     ),
     counter("cloudrc_loop_missed_periods_total", "Commands skipped by a late loop.", (CLOUD,)),

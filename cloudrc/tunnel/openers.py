@@ -22,7 +22,7 @@ AHEAD_MAX = 127
 FAR_MAX = 64 * GENERATIONS
 """And so many more one that is not: over a week, for a peer that moves on twice as often."""
 FAR_TRIES = 8
-"""Datagrams between two looks for which those are tried, at 2 ms each when its byte is new."""
+"""Datagrams between two looks for which those are tried, at 0.5 ms each."""
 SILENCE_NS = 5_000_000_000
 """Without anything new for so long a peer is not heard [ns]."""
 KEPT = 3

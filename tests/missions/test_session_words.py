@@ -9,10 +9,12 @@ from cloudrc import assembly
 from cloudrc.cloud.identity import CloudIdentity
 from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.teleop.messages import Output, Seen
+from cloudrc.cloud.teleop.wire import ALARM
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, GuardChange, Record
-from cloudrc.tunnel.codec import Kind, peek
+from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
+from cloudrc.world.identity import WorldIdentity
 
 HOVER = load_experiment("hover", ["link.profile=ideal"])
 S = 1_000_000_000
@@ -67,6 +69,24 @@ def test_a_start_that_was_said_in_another_session_is_not_passed_on(ends: Ends) -
         assert say(ends, said._replace(epoch=epoch)) == [Kind.OPERATOR]
         assert say(ends, said) == [Kind.OPERATOR], "for no session"
     assert ends.cloud._counts["words_dropped"] == 2 * len(Start)
+
+
+@pytest.mark.promise("P-API-8")
+def test_when_the_numbers_are_used_up_nothing_breaks_and_the_next_session_has_them_all_again(
+    ends: Ends,
+) -> None:
+    """Somebody with the keys has asked for something under the highest number of all."""
+    cloud, run = ends.cloud, ends.run
+    said = OperatorRequest(NUMBER_MAX, Request.END)
+    assert say(ends, said) == [Kind.OPERATOR]
+    assert say(ends, said._replace(number=NUMBER_MAX + 1), ALARM) == []
+    run.fly(lambda: False, run.now_ns + S, lambda world, cloud: None)
+    assert cloud._counts["words_dropped"] > 2
+    identity = WorldIdentity(CLOCK, b"another".ljust(16), last_epoch=cloud._session.epoch)
+    world = assembly.build_world(HOVER, identity, lambda: run.now_ns)
+    run._world = world
+    run.fly(lambda: False, run.now_ns + 2 * S, lambda world, cloud: None)
+    assert world.robot.guard.state is GuardState.ESTOP
 
 
 @pytest.mark.parametrize("request_", [each for each in Request if each is not Request.START])

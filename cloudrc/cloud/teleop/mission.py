@@ -25,7 +25,6 @@ reached and that a mission is over, for a teleop that forgets. Times are the cal
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 from cloudrc.cloud.teleop import mission_rules as rules
 from cloudrc.cloud.teleop.messages import (
@@ -142,8 +141,8 @@ class Teleop:
         told = self._aim.setpoint
         onboard, legs = rules.known_on_board(seen, self._mission_id), self._plan.legs
         started = self.requests.see(seen, now_ns) is Request.START and self.state is STARTING
-        if self.state is STARTING and not started:
-            self._look_before_start(seen)
+        if self.state is STARTING and not self._expected and self._plan.start is Start.HERE:
+            self._expected = (seen.mission_id, self._mission_id)  # ordered before it was in sight
         if self.state not in UNDER_WAY:
             if anew or (before and before.mission_id != seen.mission_id):
                 self._find(seen)
@@ -171,17 +170,6 @@ class Teleop:
                 self._end(*late, now_ns)
         if (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
-
-    def _look_before_start(self, seen: Seen) -> None:
-        """A robot that flies this very mission goes on: its start could not be written down."""
-        mine, from_here = self._mission_id, self._plan.start is Start.HERE
-        if seen.mission_id == mine != 0 and self._continued is None and not from_here:
-            self._plan = replace(self._plan, start=Start.HERE)
-            self._expected = (mine,)
-            self._aim.begin(self._plan, mine)
-            self.requests.ask(Request.START, Start.HERE)
-        elif from_here and not self._expected:
-            self._expected = (seen.mission_id, mine)
 
     def _find(self, seen: Seen) -> None:
         """Without a mission: what flies is held; what stands, for one lost here, shall stay."""

@@ -14,6 +14,8 @@ from cloudrc.messages import NEVER_NS, GuardState
 
 GAP_MAX_NS = 500_000_000
 """Of a longer silence between two telemetries only so much counts as flown [ns]."""
+UNSEEN_MAX_NS = 2_000_000_000
+"""After a longer one nobody knows where the robot was meanwhile [ns]."""
 HOLD = GuardState.HOLD  # looked up with every telemetry
 
 
@@ -51,7 +53,7 @@ class LegWatch:
             return False
         if before_ns >= 0:
             self._flown_ns += min(now_ns - before_ns, GAP_MAX_NS)
-            if now_ns - before_ns > GAP_MAX_NS:
+            if now_ns - before_ns > UNSEEN_MAX_NS:
                 self._near_since_ns = NEVER_NS  # where it was meanwhile nobody knows
         if dist(seen.position, leg.position) > leg.tolerance:
             self._near_since_ns = NEVER_NS

@@ -16,6 +16,8 @@ PREDECESSORS = 1_000
 """So many numbers are left to a process before this one: it may have asked what the robot does not
 show yet, and a request of this one must not be taken for that. It may even have asked nothing else,
 and begun as this one does: so the first number rises with the machine's clock, too."""
+CLOCK_MAX = 65_536
+"""By so much at most: numbers have to last for all processes of a session."""
 
 
 class Repeater:
@@ -85,6 +87,11 @@ class Repeater:
         if not self.stopping:
             self._pending = self._afterwards = None
 
+    def withdraw_stop(self) -> None:
+        """The robot that was to be stopped flies something else by now, or is another one."""
+        if self.stopping:
+            self._pending, self._afterwards = self._afterwards, None
+
     def report(self, mission_id: int, reached: int) -> None:
         """Tell the robot from now on how many waypoints of a mission are reached; 0: no mission."""
         self._progress = self._progress._replace(mission_id=mission_id, reached=reached)
@@ -131,7 +138,7 @@ class Repeater:
         # A higher number than ours was acted on: an emergency stop has passed us by. Or our very
         # number, by a predecessor: ours would be seen by now.
         if pending.number == UNNUMBERED or seen.mission >= pending.number:
-            rise = 1 if self._number else PREDECESSORS + now_ns // REPEAT_NS
+            rise = 1 if self._number else PREDECESSORS + now_ns // REPEAT_NS % CLOCK_MAX
             self._number = max(self._number, seen.mission) + rise
             pending = self._pending = pending._replace(number=self._number)
             self._asked_epoch = seen.epoch

@@ -15,10 +15,8 @@ from typing import Any
 from cloudrc.cloud.teleop import service_mission as missions
 from cloudrc.cloud.teleop.journal_format import Entry
 from cloudrc.cloud.teleop.messages import (
-    Acknowledge,
     Cancel,
     Continue,
-    EmergencyStop,
     GoTo,
     Hold,
     Output,
@@ -32,6 +30,7 @@ from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook, UnavailableError, busy
 from cloudrc.cloud.teleop.service_mission import Mission, Order
+from cloudrc.cloud.teleop.service_stop import Stop
 from cloudrc.cloud.teleop.sight import Sight
 from cloudrc.cloud.teleop.verdict import Witness
 from cloudrc.errors import BadInputError
@@ -70,8 +69,7 @@ class MissionService:
         self._ends = False  # this process; what has not begun is its successor's
         self.book = MissionBook(write, entries, salt)
         self._teleop = Teleop(self.book.has_ended)
-        if self.book.stopped() is not None:  # the robot may not have heard of it yet
-            self._teleop.operate(EmergencyStop(), 0)
+        self._stop = Stop(self.book, self._teleop)
 
     @property
     def over(self) -> bool:
@@ -159,7 +157,7 @@ class MissionService:
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once, in every state; give the mission under way, which has failed."""
         mission = self._current
-        self._teleop.operate(EmergencyStop(), now_ns)
+        self._stop.ask(now_ns)
         self._collect(now_ns)
         return mission
 
@@ -167,9 +165,7 @@ class MissionService:
         """Release a robot that has landed or was stopped; raises ConflictError in a mission."""
         if self._current is not None:
             raise busy(self._current, "there is nothing to acknowledge")
-        self._teleop.operate(Acknowledge(), now_ns)
-        if (stopped := self.book.stopped()) is not None:
-            self._note(stopped, "acknowledged", "the operator has acknowledged the stop", now_ns)
+        self._stop.release(now_ns)
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
@@ -186,12 +182,15 @@ class MissionService:
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry."""
         mission = self._current
+        self._stop.meet(seen)
         anew = self._sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
             self._watch(mission, seen, now_ns)
             if anew:
                 self._note(mission, "new_session", mission.in_new_session(), now_ns)
         self._teleop.see(seen, now_ns)
+        if (stopped := self._stop.released()) is not None:
+            self._note(stopped, "acknowledged", "the operator has acknowledged the stop", now_ns)
         self._collect(now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
@@ -225,7 +224,7 @@ class MissionService:
     @property
     def _stopped(self) -> str:
         """Why nothing can fly before the operator acknowledges it; "" if it can."""
-        if self._teleop.requests.stopping:
+        if self._stop.is_asked:
             return "an emergency stop is on its way to the robot"
         return self._sight.latched
 
@@ -276,9 +275,7 @@ class MissionService:
     def _follow(self, event: MissionEvent, now_ns: int) -> None:
         mission, seen = self._current, self._sight.seen
         assert mission is not None, "events are of missions only"
-        changed: dict[str, Any] = {}
-        if event.waypoint >= 0:
-            changed["waypoint"] = event.waypoint
+        changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
             changed |= {"world": seen.world, "witness": asdict(Witness.begin(seen))}
         outcome = self._teleop.outcome
@@ -293,6 +290,5 @@ class MissionService:
         if mission is self._current:
             changed["time_s"] = round(self._teleop.elapsed(now_ns), 3)
         self.book.note(mission, event, text, **changed)
-        trouble = self.book.news()
-        if trouble:
+        if trouble := self.book.news():
             self._outputs.append(Fault(now_ns, "journal", trouble))
