@@ -115,3 +115,21 @@ def test_tokens_are_followed_when_they_change(tmp_path, monkeypatch):
     assert tokens.caller(new) is None  # what cannot be read admits nobody
     (folder / "operator").write_text(OPERATOR)
     assert tokens.caller(old).role == "operator"
+
+
+@pytest.mark.promise("P-API-4")
+def test_a_token_that_changes_while_it_is_first_read_is_followed(tmp_path, monkeypatch):
+    monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
+    folder = token_folder(tmp_path / "t", operator=OPERATOR)
+    read = Tokens._read
+
+    def read_and_change(tokens):
+        monkeypatch.setattr(Tokens, "_read", read)
+        found = read(tokens)
+        (folder / "operator").write_text("another-token-altogether")
+        return found
+
+    monkeypatch.setattr(Tokens, "_read", read_and_change)
+    tokens = Tokens(folder)
+    assert tokens.caller(f"Bearer {OPERATOR}".encode()) is None
+    assert tokens.caller(b"Bearer another-token-altogether").role == "operator"

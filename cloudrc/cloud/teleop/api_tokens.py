@@ -58,8 +58,8 @@ class Tokens:
             BadInputError: If one cannot be used; its text has no token in it.
         """
         self._folder = folder
+        self._state, self._looked = self._look(), time.monotonic()  # first: what changes since
         self._known = self._read()
-        self._state, self._looked = self._look(), time.monotonic()
 
     def caller(self, header: bytes | None) -> Caller | None:
         """Say who sends this Authorization header; None if nobody who is known."""
