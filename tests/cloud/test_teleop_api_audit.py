@@ -1,6 +1,7 @@
 """The audit log: who commanded what, on a disk that may be slow, full or missing."""
 
 import stat
+import threading
 import time
 
 import pytest
@@ -64,3 +65,31 @@ def test_what_a_slow_disk_makes_too_many_is_dropped_and_counted(tmp_path, monkey
     for _ in range(5):
         audit.note(x=1)
     assert audit.dropped == 3
+
+
+def test_a_disk_that_hangs_keeps_nothing_alive_and_what_is_given_up_is_counted(
+    tmp_path, monkeypatch
+):
+    from cloudrc.cloud.teleop import api_audit
+
+    begun, released = threading.Event(), threading.Event()
+
+    def hang(audit, path, data):
+        begun.set()
+        released.wait()
+
+    monkeypatch.setattr(api_audit, "WAITING_MAX", 2)
+    monkeypatch.setattr(api_audit, "STOP_LIMIT", 0.05)
+    monkeypatch.setattr(api_audit.Audit, "_write", hang)
+    audit = api_audit.Audit(tmp_path / "audit")
+    audit.note(x=1)
+    assert begun.wait(5.0)
+    for _ in range(3):
+        audit.note(x=1)
+    closing = threading.Thread(target=audit.close, daemon=True)
+    closing.start()
+    closing.join(5.0)
+    ended, dropped = not closing.is_alive(), audit.dropped
+    released.set()
+    assert ended
+    assert dropped == 4  # one that is being written, two that wait, one that found no room

@@ -13,6 +13,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,7 @@ class Audit:
         self._path, self._complain, self._size_max = path, complain, size_max
         self._waiting: queue.Queue[bytes | None] = queue.Queue(WAITING_MAX)
         self._troubled = False
+        self._writing = 0  # lines that the disk is given just now
         self._thread = threading.Thread(target=self._write_all, name="audit", daemon=True)
         if path is not None:
             self._thread.start()
@@ -65,10 +67,24 @@ class Audit:
             self.dropped += 1
 
     def close(self) -> None:
-        """Write what waits, and end."""
-        if self._path is not None:
-            self._waiting.put(None)
-            self._thread.join(STOP_LIMIT)
+        """Write what waits, and end; what a disk that hangs does not take is given up."""
+        if self._path is None:
+            return
+        with suppress(queue.Full):
+            self._waiting.put(None, timeout=STOP_LIMIT)
+        self._thread.join(STOP_LIMIT)
+        if self._thread.is_alive():
+            self._give_up()
+
+    def _give_up(self) -> None:
+        lost, self._writing = self._writing, 0
+        with suppress(queue.Empty):
+            while True:
+                lost += self._waiting.get_nowait() is not None
+        self._waiting.put_nowait(None)  # should the disk come back
+        self.dropped += lost
+        if lost:
+            self._complain(f"the audit log {self._path}: the disk hangs; {lost} lines are lost")
 
     def _write_all(self) -> None:
         assert self._path is not None, "the thread is started for a file"
@@ -79,6 +95,7 @@ class Audit:
                 lines.append(self._waiting.get())
             ends = None in lines
             data = [line for line in lines if line is not None]
+            self._writing = len(data)
             try:
                 self._write(self._path, b"".join(data))
                 self._troubled = False
@@ -87,6 +104,7 @@ class Audit:
                 if not self._troubled:
                     self._complain(f"the audit log {self._path} cannot be written: {error}")
                 self._troubled = True
+            self._writing = 0
 
     def _write(self, path: Path, data: bytes) -> None:
         with open(path, "ab", opener=_private) as file:
