@@ -1,5 +1,8 @@
 """The audit log: who commanded what, on a disk that may be slow, full or missing."""
 
+import errno
+import io
+import json
 import stat
 import threading
 import time
@@ -93,3 +96,36 @@ def test_a_disk_that_hangs_keeps_nothing_alive_and_what_is_given_up_is_counted(
     released.set()
     assert ended
     assert dropped == 4  # one that is being written, two that wait, one that found no room
+
+
+def test_what_a_full_disk_tears_swallows_no_other_line(tmp_path, monkeypatch):
+    from cloudrc.cloud.teleop import api_audit
+
+    real, left = io.FileIO.write, [50]
+
+    class Full(io.FileIO):
+        """A file on a disk that has room for so many bytes."""
+
+        def write(self, data):
+            if not left[0]:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            written = real(self, bytes(data)[: left[0]])
+            left[0] -= written
+            return written
+
+    def open_full(path, mode, buffering=-1, opener=None):
+        raw = Full(path, mode, opener=opener)
+        return raw if buffering == 0 else io.BufferedWriter(raw)
+
+    monkeypatch.setattr(api_audit, "open", open_full, raising=False)
+    path = tmp_path / "audit"
+    audit = api_audit.Audit(path)
+    audit.close()
+    audit._path = path
+    for number, room in (1, 10_000), (2, 10), (3, 10_000):
+        left[0] = room
+        audit.note(number=number)
+        audit._waiting.put(None)
+        audit._write_all()
+    assert [json.loads(line)["number"] for line in path.read_text().splitlines()] == [1, 3]
+    assert audit.dropped == 1

@@ -107,10 +107,17 @@ class Audit:
             self._writing = 0
 
     def _write(self, path: Path, data: bytes) -> None:
-        with open(path, "ab", opener=_private) as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+        # Unbuffered, since what a full disk has torn must not be tried again by `close`.
+        with open(path, "ab", buffering=0, opener=_private) as file:
+            began = file.tell()
+            try:
+                while data:
+                    data = data[file.write(data) or 0 :]
+                os.fsync(file.fileno())
+            except OSError:
+                with suppress(OSError):
+                    file.truncate(began)  # half a line would swallow the next one
+                raise
             full = file.tell() > self._size_max
         if full:
             path.replace(path.with_name(f"{path.name}.1"))
