@@ -4,9 +4,9 @@ import ast
 from pathlib import Path
 
 import pytest
-from api_harness import OPERATOR, READER
+from api_harness import OPERATOR, READER, connect, head, running
 
-from cloudrc.cloud.teleop import api_tokens
+from cloudrc.cloud.teleop import api_events, api_tokens
 from cloudrc.cloud.teleop.api_tokens import Tokens
 from cloudrc.errors import BadInputError
 
@@ -133,3 +133,22 @@ def test_a_token_that_changes_while_it_is_first_read_is_followed(tmp_path, monke
     tokens = Tokens(folder)
     assert tokens.caller(f"Bearer {OPERATOR}".encode()) is None
     assert tokens.caller(b"Bearer another-token-altogether").role == "operator"
+
+
+@pytest.mark.promise("P-API-4")
+def test_a_token_that_is_taken_away_reads_no_open_stream(monkeypatch):
+    monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
+    monkeypatch.setattr(api_events, "LOOK_PERIOD", 0.01)
+    with running() as one:
+        stream, said = connect(one), b""
+        stream.sendall(head("GET", "/v1/events", token=READER))
+        while b": cloudrc" not in said:
+            said += stream.recv(4096)
+        one.token_file.with_name("reader").unlink()
+        assert one.post("/v1/missions", {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]})[0] == 201
+        said = stream.recv(4096)
+        assert said == b"0\r\n\r\n"  # the end, and no event
+        one.until(lambda: one.gate._in_flight["reader", "stream"] == 0)
+        stream.close()
+        assert one.gate.counts["failed"] == 0
+        assert one.complaints == []

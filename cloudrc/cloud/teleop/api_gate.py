@@ -149,8 +149,9 @@ class Gate:
         kind = _kind(caller, scope)
         self._in_flight[kind] += 1
         LANE.set(caller.role)
+        send = self._while_known(caller, scope, answer) if kind[1] == "stream" else answer.send
         try:
-            await self._app(scope, receive, answer.send)
+            await self._app(scope, receive, send)
             self._count("served")
             if scope["path"] in ORDERS and answer.status in REFUSED:
                 self._count(REFUSED[answer.status])
@@ -161,6 +162,20 @@ class Gate:
                 await answer.refuse(500, "the API failed; see teleop's log")
         finally:
             self._in_flight[kind] -= 1
+
+    def _while_known(self, caller: Caller, scope: Scope, answer: Answer) -> Send:
+        """Pass a stream on until its token is taken away: then it is at its end."""
+        ended = False
+
+        async def send(message: MutableMapping[str, Any]) -> None:
+            nonlocal ended
+            if ended:  # the application has yet to hear of it
+                return
+            if message["type"] == "http.response.body" and self._caller(scope) != caller:
+                ended, message = True, {"type": "http.response.body", "body": b""}
+            await answer.send(message)
+
+        return send
 
     def _count(self, outcome: str) -> int:
         """Count one; say how many there were before."""
