@@ -18,6 +18,9 @@ HEAD_LIMIT = 5.0
 SEND_LIMIT = 10.0
 """For a client to take what it is sent [s]."""
 CONNECTIONS_MAX = 256
+READ_MAX = 1_024
+"""Taken from a connection before it is another's turn [bytes]: in chunks of one byte each that is
+some 1 ms of work; asyncio's own 256 KiB would be a quarter of a second."""
 
 
 class Crowd:
@@ -47,6 +50,7 @@ class PatientProtocol(H11Protocol):
     def connection_made(self, transport: Any) -> None:
         """Somebody has come."""
         super().connection_made(transport)
+        transport.max_size = READ_MAX
         self._watch()
         if len(self.connections) > CONNECTIONS_MAX:
             next(iter(self.crowd.idle))._cut_off("busy")
@@ -64,6 +68,8 @@ class PatientProtocol(H11Protocol):
 
     def on_response_complete(self) -> None:
         """An answer is given: the next request may come."""
+        if self._has_chunks_left():  # nobody wants them, and to take them apart is work
+            self.transport.close()
         super().on_response_complete()
         self._watch()
 
@@ -79,6 +85,10 @@ class PatientProtocol(H11Protocol):
         if self._send_timer is not None:
             self._send_timer.cancel()
             self._send_timer = None
+
+    def _has_chunks_left(self) -> bool:
+        chunked = any(name == b"transfer-encoding" for name, _ in self.headers)
+        return chunked and self.cycle.more_body
 
     def _watch(self) -> None:
         """While no request is being answered, time runs."""

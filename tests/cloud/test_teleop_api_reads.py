@@ -1,0 +1,75 @@
+"""What strangers send is work for the thread that serves the emergency stop: little at a time."""
+
+import http.client
+
+import pytest
+from api_harness import connect, head, running
+
+from cloudrc.cloud.teleop import api_connections, api_server
+
+CHUNK = b"1\r\nx\r\n"
+
+
+def until_closed(connection):
+    """What the other side says before it closes."""
+    said = b""
+    try:
+        while some := connection.recv(65_536):
+            said += some
+    except ConnectionResetError:
+        pass
+    finally:
+        connection.close()
+    return said
+
+
+@pytest.mark.promise("P-API-8")
+def test_little_is_taken_from_a_connection_before_it_is_another_s_turn(monkeypatch):
+    taken, take = [], api_connections.PatientProtocol.data_received
+
+    def seen(protocol, data):
+        taken.append(len(data))
+        take(protocol, data)
+
+    monkeypatch.setattr(api_connections.PatientProtocol, "data_received", seen)
+    with running() as one:
+        chunks = CHUNK * 20_000
+        lines = f"Content-Length: {len(chunks)}"
+        connection = connect(one)
+        connection.sendall(head("POST", "/v1/missions", lines) + chunks)
+        assert b" 422 " in connection.recv(4096)
+        connection.close()
+    assert sum(taken) > len(chunks)
+    assert max(taken) == api_connections.READ_MAX <= 1024
+
+
+@pytest.mark.promise("P-API-8")
+def test_chunks_that_are_still_to_come_after_the_answer_are_not_taken_apart():
+    with running() as one:
+        connection = connect(one)
+        connection.settimeout(3.0)  # before its patience ends
+        chunked = head("POST", "/v1/missions", "Transfer-Encoding: chunked", token="nobody's")
+        connection.sendall(chunked + CHUNK)
+        assert until_closed(connection).startswith(b"HTTP/1.1 401 ")
+
+
+def test_a_body_in_chunks_that_has_come_leaves_its_connection_open():
+    with running() as one, connect(one) as connection:
+        chunked = head("POST", "/v1/hold", "Transfer-Encoding: chunked")
+        for _ in range(3):
+            connection.sendall(chunked + CHUNK + b"0\r\n\r\n")
+            answer = http.client.HTTPResponse(connection)
+            answer.begin()
+            assert answer.read()
+
+
+@pytest.mark.promise("P-API-8")
+def test_a_head_has_no_more_room_than_is_said_if_it_comes_at_once_either():
+    with running() as one:
+        with connect(one) as connection:
+            rest = api_server.HEAD_MAX - len(head("GET", "/v1/state", "X: "))
+            connection.sendall(head("GET", "/v1/state", "X: " + "y" * rest))
+            assert b" 200 " in connection.recv(65_536)
+        connection = connect(one)
+        connection.sendall(head("GET", "/v1/state", "X: " + "y" * api_server.HEAD_MAX * 2))
+        assert until_closed(connection).startswith(b"HTTP/1.1 400 ")
