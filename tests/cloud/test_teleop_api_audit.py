@@ -10,6 +10,8 @@ import time
 import pytest
 from api_harness import OPERATOR, READER, running
 
+from cloudrc.cloud.teleop import api_gate
+
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 
 
@@ -36,6 +38,25 @@ def test_commands_are_audited_with_who_and_what_became_of_them():
     assert all(w["time"].endswith("+00:00") for w in lines)
     assert OPERATOR not in text
     assert READER not in text
+
+
+@pytest.mark.promise("P-API-6")
+def test_what_a_reader_is_refused_displaces_no_command(monkeypatch):
+    monkeypatch.setattr(api_gate, "REFUSALS_NOTED", (0.0, 2))
+    with running() as api:
+        api.post("/v1/estop")
+        for _ in range(5):
+            assert api.post("/v1/hold", token=READER)[0] == 403
+        api.post("/v1/estop")
+        for _ in range(4):
+            assert api.post("/v1/hold", token=READER)[0] == 403
+        lines = api.audited()
+    who = [(w.get("role"), w.get("left_out")) for w in lines]
+    refused = ("reader", None)
+    assert who == [
+        *[("operator", None), refused, refused],
+        *[(None, 3), ("operator", None), (None, 4)],  # and what is left to say at the end
+    ]
 
 
 def test_the_audit_log_is_cut_by_size_and_a_disk_that_refuses_is_told_once(tmp_path):

@@ -2,7 +2,8 @@
 
 Requests do not wait for the disk: lines are written by a thread of its own, in order. What a slow
 disk makes too many is dropped and counted. The file is cut in two by size, so that it cannot fill
-the volume that the journal needs.
+the volume that the journal needs. What readers are refused is written down now and then only, or it
+would push what operators did out of both files.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ class Audit:
         self.dropped = 0
         self._path, self._complain, self._size_max = path, complain, size_max
         self._waiting: queue.Queue[bytes | None] = queue.Queue(WAITING_MAX)
+        self._left_out = 0
         self._troubled = False
         self._writing = 0  # lines that the disk is given just now
         self._thread = threading.Thread(target=self._write_all, name="audit", daemon=True)
@@ -57,6 +59,19 @@ class Audit:
 
     def note(self, **what: Any) -> None:
         """Write down what somebody commanded, with the time; never waits."""
+        self._tell_left_out()
+        self._put(what)
+
+    def leave_out(self) -> None:
+        """Count what is not worth a line of its own; the next line says how many there were."""
+        self._left_out += 1
+
+    def _tell_left_out(self) -> None:
+        if self._left_out:
+            self._put({"left_out": self._left_out, "outcome": "refused, and not written down each"})
+            self._left_out = 0
+
+    def _put(self, what: dict[str, Any]) -> None:
         if self._path is None:
             return
         now = datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="milliseconds")
@@ -70,6 +85,7 @@ class Audit:
         """Write what waits, and end; what a disk that hangs does not take is given up."""
         if self._path is None:
             return
+        self._tell_left_out()
         with suppress(queue.Full):
             self._waiting.put(None, timeout=STOP_LIMIT)
         self._thread.join(STOP_LIMIT)

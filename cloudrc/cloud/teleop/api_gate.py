@@ -31,6 +31,9 @@ ORDERS = ("/v1/missions", "/v1/goto")
 """Where missions are ordered, and points to fly to."""
 REFUSED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
 """What the application refuses of them, by status."""
+REFUSALS_NOTED = (1 / 60, 20)
+"""How many of a reader's refused commands are written down each: in a second, and at once. Even at
+their longest it takes them days to fill the audit log's two files."""
 ANSWER_MAX = 4_096
 """How much of a streamed answer is kept for the audit log [bytes]."""
 
@@ -100,6 +103,7 @@ class Gate:
         self._buckets = {
             role: Bucket(limits.rate_hz, limits.burst) for role in ("operator", "reader", None)
         }
+        self._noted = Bucket(*REFUSALS_NOTED)
         self._in_flight: Counter[tuple[str, str]] = Counter()  # by role and kind
         self.counts: Counter[str] = Counter()
         self.open = tokens is None
@@ -184,6 +188,9 @@ class Gate:
 
     def _note(self, caller: Caller, scope: Scope, answer: Answer) -> None:
         if self._audit is None:
+            return
+        if answer.status == 403 and not self._noted.take():
+            self._audit.leave_out()
             return
         client = scope.get("client")
         said = answer.said()
