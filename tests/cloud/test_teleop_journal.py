@@ -133,6 +133,33 @@ def test_without_a_lock_file_the_folder_is_locked(tmp_path):
     Journal(tmp_path / "journal").close()
 
 
+@pytest.mark.promise("P-JOURNAL-3")
+def test_room_for_a_lock_file_lets_no_second_teleop_in(tmp_path):
+    """The disk was full when the first one started, so it has the folder."""
+    path, taken = tmp_path / "journal", tmp_path / "journal.lock"
+    taken.mkdir()
+    with Journal(path) as first:
+        taken.rmdir()
+        with pytest.raises(JournalLockedError):
+            Journal(path)
+        first.append(SOME[0])
+        with Journal(tmp_path / "another folder" / "journal"):
+            pass
+    with Journal(path) as second:
+        assert second.entries == SOME[:1]
+
+
+def test_without_room_for_a_lock_file_none_comes_beside_who_has_one(tmp_path):
+    path = tmp_path / "journal"
+    with Journal(path):
+        (tmp_path / "journal.lock").unlink()
+        (tmp_path / "journal.lock").mkdir()
+        with pytest.raises(JournalLockedError):
+            Journal(path)
+        with Journal(tmp_path / "of another mission"):
+            pass
+
+
 def test_a_rewritten_one_goes_on(tmp_path):
     path = tmp_path / "journal"
     with Journal(path) as journal:

@@ -7,30 +7,42 @@ from __future__ import annotations
 
 import fcntl
 import os
+from contextlib import suppress
 from pathlib import Path
 
 
 class Disk:
     """The machine's own disk; every method raises OSError if the kernel refuses."""
 
+    def __init__(self) -> None:
+        """Begin without a lock."""
+        self._folders: dict[int, int] = {}  # by lock file, the folder that is locked with it
+
     def lock(self, path: Path) -> int:
         """Lock a file beside `path` for this process alone, or its folder where none can be made.
 
-        The folder is made if it is not there.
+        The folder is made if it is not there. Who has a file shares the folder.
 
         Raises:
             BlockingIOError: If another process has it.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
+        folder, file = os.open(path.parent, os.O_RDONLY), -1
         try:
-            file = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT, 0o600)
-        except OSError:
-            file = os.open(path.parent, os.O_RDONLY)
-        try:
+            with suppress(OSError):
+                file = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+            # Who has the folder alone keeps out who finds room for a lock file later, too.
+            how = fcntl.LOCK_EX if file < 0 else fcntl.LOCK_SH
+            fcntl.flock(folder, how | fcntl.LOCK_NB)
+            if file < 0:
+                return folder
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            os.close(file)
+            for each in (folder, file):
+                if each >= 0:
+                    os.close(each)
             raise
+        self._folders[file] = folder
         return file
 
     def open(self, path: Path, *, new: bool = False) -> int:
@@ -77,3 +89,5 @@ class Disk:
     def close(self, file: int) -> None:
         """Let an open file or lock go."""
         os.close(file)
+        if (folder := self._folders.pop(file, None)) is not None:
+            os.close(folder)
