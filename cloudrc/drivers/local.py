@@ -20,6 +20,7 @@ from pathlib import Path
 
 from cloudrc.drivers import flights
 from cloudrc.drivers.feed import READY, from_line
+from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import InvalidRunError, TimedOutError, in_one_line
 from cloudrc.records import Fault, Record
@@ -161,6 +162,7 @@ class LocalRun:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=errors,
+                env={**os.environ, PARENT: str(os.getpid())},
                 start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them
             )
         child = Child(name, process, log)

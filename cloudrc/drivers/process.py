@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from cloudrc.drivers.standing_check import StandingCheck
 
 
+PARENT = "CLOUDRC_PARENT"
+"""Variable of the environment in which a supervisor tells its own process id."""
+
+
 class StopSignal:
     """True once the process shall end.
 
@@ -35,7 +39,9 @@ class StopSignal:
     def __init__(self) -> None:
         """Take over SIGTERM and SIGINT, and remember who started this process."""
         self._asked = False
-        self._parent = os.getppid()
+        # As it was told by who started this: that may be gone by the time this line is reached.
+        told = os.environ.pop(PARENT, "")
+        self._parent = int(told) if told.isdecimal() else os.getppid()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._ask)
 
