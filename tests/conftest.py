@@ -53,7 +53,8 @@ def figure(request: pytest.FixtureRequest) -> Callable[..., None]:
 @pytest.fixture(autouse=True)
 def signals_stay_as_they_were() -> Iterator[None]:
     """A command that a test calls may take over signals, as a process of its own should."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    handlers = {number: signal.getsignal(number) for number in numbers}
     yield
     for number, handler in handlers.items():
         if signal.getsignal(number) is not handler:

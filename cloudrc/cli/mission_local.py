@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,6 +12,7 @@ from typing import Any
 from cloudrc.cli.mission_follow import Follower, in_words, leave_message
 from cloudrc.cli.mission_http import Api
 from cloudrc.cli.output import table, written
+from cloudrc.cli.signals import end_orderly
 from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, CloudrcError
 
@@ -43,7 +43,7 @@ def fly(options: argparse.Namespace) -> int:
     """Post a mission, follow it, end with its verdict; asked to stop, cancel it."""
     if options.api is None:
         raise BadInputError("fly needs --api; to fly by hand: cloudrc mission run FILE")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    end_orderly()
     api = Api(options.api, reader(token_file(options)))
     follower, found = Follower(api, _write), ""
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ from cloudrc.cli.cluster_flags import place, place_arguments, timeout_argument
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import is_live, output_argument, unread_is_fine, written
 from cloudrc.cli.parser import count
+from cloudrc.cli.signals import end_orderly
 from cloudrc.errors import BadInputError, CloudrcError
 
 if TYPE_CHECKING:
@@ -82,8 +82,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Fly once or many times."""
-    # An orderly end, with a report, whoever asks for it: a person or a batch system.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    end_orderly()  # with a report
     mode = options.mode or ("virtual" if options.seeds else "local")
     if options.seeds and mode != "virtual":
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")

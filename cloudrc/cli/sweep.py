@@ -72,7 +72,9 @@ def _reports(
     # Spawned, not forked: a child starts clean, whatever threads the libraries here have begun.
     context = multiprocessing.get_context("spawn")
     workers = min(os.cpu_count() or 1, len(seeds))
-    with ProcessPoolExecutor(workers, context) as pool:
+    with _born_deaf_to_interrupts():  # it begins a process that sweeps up behind the others
+        pool = ProcessPoolExecutor(workers, context)
+    with pool:
         try:
             with _born_deaf_to_interrupts():
                 futures: list[Future[dict[str, Any]]] = [
@@ -90,15 +92,17 @@ def _reports(
 
 @contextmanager
 def _born_deaf_to_interrupts() -> Iterator[None]:
-    """Let processes that begin here ignore Ctrl-C, which a terminal sends to all of a group.
+    """Let processes that begin here ignore what a terminal sends to all of a group.
 
     What ends them is their parent; a signal that is ignored stays so across the start of a program.
     """
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    numbers = (signal.SIGINT, signal.SIGHUP)
+    before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def _fly_one(experiment: str, overrides: list[str], folder: Path, seed: int) -> dict[str, Any]:

@@ -61,9 +61,9 @@ def test_an_interrupted_sweep_keeps_what_is_finished(
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_sweep_at_once(number: int, folder: Path) -> None:
-    """Ctrl-C goes to the whole group of processes, as a terminal does it; SIGTERM to one."""
+    """Ctrl-C and SIGHUP go to the whole group of processes, from a terminal; SIGTERM to one."""
     command = [sys.executable, "-m", "cloudrc", "run", "paper", "--seeds", "40", "--out", "sweep"]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
@@ -71,7 +71,7 @@ def test_a_signal_ends_a_sweep_at_once(number: int, folder: Path) -> None:
     assert process.stdout is not None
     assert "1/40" in process.stdout.readline()
     start = time.monotonic()
-    if number == signal.SIGINT:
+    if number != signal.SIGTERM:
         os.killpg(process.pid, number)
     else:
         process.send_signal(number)

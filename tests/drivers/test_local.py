@@ -61,11 +61,14 @@ def alive(pid: int) -> bool:
     return True
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_ends_all_processes_within_two_seconds_and_leaves_a_report(tmp_path, how):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
     assert set(pids) == {"relay", "world", "teleop", "cloud"}
+    words = Path(f"/proc/{pids['world']}/cmdline").read_text().split("\0")
+    (key,) = (Path(word.removeprefix("--key=")) for word in words if word.startswith("--key="))
+    assert key.exists()
     os.kill(run.pid, how)
     asked = time.monotonic()
     while any(alive(pid) for pid in pids.values()):
@@ -74,6 +77,7 @@ def test_ctrl_c_ends_all_processes_within_two_seconds_and_leaves_a_report(tmp_pa
     run.communicate(timeout=60)
     assert run.returncode == 130
     assert report(tmp_path / "run")["verdict"] == "interrupted"
+    assert not key.exists()
     assert not (tmp_path / "run" / "api.json").exists()
     assert (tmp_path / "run" / "report.html").exists()
     assert (tmp_path / "run" / "mission.mcap").stat().st_size > 1000
