@@ -9,7 +9,7 @@ import stat
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.route import version
+from cloudrc.link.route import read, version
 from cloudrc.records import Fault
 from cloudrc.tunnel.keys import KeyRing, KeySet, parse
 
@@ -82,16 +82,19 @@ class KeyFile:
 
 
 def read_keys(path: Path) -> KeySet:
-    """Read a key file.
+    """Read a key file, without waiting for anybody.
 
     Raises:
         BadInputError: What is wrong with it and what to do, without a word of it.
     """
     try:
-        with path.open("rb") as file:
-            return parse(file.read(SIZE_MAX))
+        data = read(path, SIZE_MAX)
     except OSError as error:
         raise BadInputError(f"--key {path}: {error.strerror or error}; {MAKE}") from None
+    except ValueError as error:  # which names the file
+        raise BadInputError(f"--key {error}; {MAKE}") from None
+    try:
+        return parse(data)
     except ValueError as error:
         raise BadInputError(f"--key {path}: {error}; {MAKE}") from None
 

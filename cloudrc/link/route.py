@@ -24,19 +24,23 @@ def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | 
     return status.st_mtime_ns, status.st_ino, status.st_size
 
 
-def read(path: Path) -> bytes:
+def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
     """Read a file that somebody else has written, without waiting for anybody.
+
+    Args:
+        path: The file.
+        size_max: Longest that is read [bytes].
 
     Raises:
         OSError: If it cannot be read.
-        ValueError: If it is no file, as a pipe is none, or longer than SIZE_MAX.
+        ValueError: If it is no file, as a pipe is none, or longer than that.
     """
     with open(path, "rb", opener=_at_once) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise ValueError(f"{path}: not a file")
-        data = file.read(SIZE_MAX + 1)
-    if len(data) > SIZE_MAX:
-        raise ValueError(f"{path}: longer than {SIZE_MAX} bytes")
+        data = file.read(size_max + 1)
+    if len(data) > size_max:
+        raise ValueError(f"{path}: longer than {size_max} bytes")
     return data
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cli.opened import _open_keys
+from cloudrc.drivers import keyfile
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile, is_exposed, read_keys
 from cloudrc.errors import BadInputError
 from cloudrc.tunnel.keys import Key, KeySet, parse, write
@@ -84,7 +85,7 @@ def test_a_file_that_cannot_be_read_for_a_while_is_taken_as_soon_as_it_can(
     keys = KeyFile(path, 0)
     put(path, SECOND)
     with monkeypatch.context() as forbidden:
-        forbidden.setattr(Path, "open", forbid)
+        forbidden.setattr(keyfile, "read", forbid)
         (said,) = keys.follow(PERIOD_NS)
         assert "Permission denied" in said.text
         assert keys.follow(2 * PERIOD_NS) == []
@@ -266,8 +267,26 @@ def test_other_words_about_the_key_before_are_no_new_key(path: Path) -> None:
 
 def test_a_huge_file_is_not_read_whole(tmp_path: Path) -> None:
     (tmp_path / "key").write_bytes(b"#" * 10_000_000)
-    with pytest.raises(BadInputError):
+    with pytest.raises(BadInputError, match=r"--key \S+/key: longer than 4096 bytes; make one"):
         read_keys(tmp_path / "key")
+
+
+def test_a_pipe_in_the_place_of_the_file_leaves_the_keys_and_is_not_read(path: Path) -> None:
+    """Whoever reads a pipe waits for who writes into it, and the robot with it."""
+    keys = KeyFile(path, 0)
+    keys.follow(0)
+    path.unlink()
+    os.mkfifo(path)
+    text = write(KeySet(Key(SECOND))).encode().ljust(keyfile.SIZE_MAX, b"\n")
+    pipe = os.open(path, os.O_RDWR)  # so that nobody would wait here
+    try:
+        os.write(pipe, text)
+        (said,) = keys.follow(PERIOD_NS)
+        assert said.text.startswith(f"the keys stay as they were: --key {path}: not a file; ")
+        assert os.read(pipe, 2 * len(text)) == text
+    finally:
+        os.close(pipe)
+    assert keys.ring.current == Key(FIRST)
 
 
 def test_a_key_that_cannot_be_written_names_the_file_that_was_asked_for(
