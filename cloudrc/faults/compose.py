@@ -42,8 +42,8 @@ RANGES: dict[str, tuple[float, float, float]] = {
     "teleop_paused": (5.0, 0.0, 0.0),
     "journal_torn": (8.0, 1.0, 60.0),
     "journal_rotten": (8.0, 0.0, 1.0),
-    "api_flood": (5.0, 10.0, 150.0),
-    "recorder_full": (10.0, 0.0, 200_000.0),
+    "api_flood": (5.0, 10.0, 64.0),
+    "recorder_full": (10.0, 0.0, 60_000.0),  # 14 kB at once, 33 kB/s then: two in three are full
     "recorder_slow": (10.0, 0.1, 5.0),
     "recorder_killed": (10.0, 0.0, 0.0),
     "power_cut": (10.0, 0.0, 0.0),

@@ -23,6 +23,7 @@ from cloudrc.faults.desk import Desk
 from cloudrc.faults.desk_apart import apart
 from cloudrc.faults.mortal import Clock, Mortal
 from cloudrc.faults.options import SECRET, Options, Shape
+from cloudrc.faults.walls import Wall
 from cloudrc.faults.watch import Watch
 from cloudrc.link.model import LinkDirection
 from cloudrc.messages import GuardState
@@ -56,6 +57,7 @@ class Flight:
         secrets: What their key files hold, by end.
         epoch: The newest that world has written to its disk.
         rival: The desk of another cloud, if there is one.
+        wall: Asked by a process that starts how old its key file is; None for not at all.
         listeners: Get world's new records and the instant [ns], every 100 ms.
     """
 
@@ -78,6 +80,7 @@ class Flight:
         self.secrets = {"rival": SECRET} | secrets
         self.rings: dict[str, KeyRing] = {}
         self.epoch = 0
+        self.wall: Wall | None = None
         self.rival: Desk | None = None
         self.listeners: list[Callable[[list[Record], int], None]] = []
         self.generations = {"world": 0, "cloud": 0}
@@ -240,7 +243,8 @@ class Flight:
 
     def _ring(self, end: str, now_ns: int) -> KeyRing:
         """The keys that a process reads at its start."""
-        ring = self.rings[end] = KeyRing(self.secrets[end], now_ns)
+        wall = self.wall.at(self.run.now_ns) if self.wall is not None else None
+        ring = self.rings[end] = KeyRing(self.secrets[end], now_ns, wall)
         return ring
 
     def _next_epoch(self) -> int:

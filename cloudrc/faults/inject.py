@@ -15,7 +15,7 @@ from cloudrc.faults.flight import Flight
 from cloudrc.faults.inject_way import waylay
 from cloudrc.faults.options import SECRET
 from cloudrc.faults.schedule import STALLS, Event, Schedule
-from cloudrc.faults.walls import Wall
+from cloudrc.faults.walls import TAKE_OFF, Wall
 from cloudrc.tunnel.keys import Key, KeySet
 
 NEXT_KEY = KeySet(Key(b"the next key of a fuzzed flight!"), SECRET.current, 30.0)
@@ -32,6 +32,7 @@ def inject(flight: Flight, schedule: Schedule, wall: Wall) -> None:
         schedule: What, and when.
         wall: The clock on it.
     """
+    flight.wall = wall
     for event in schedule.events:
         if not _at_an_end(flight, event) and not _at_the_desk(flight, event):
             _around(flight, event, wall)
@@ -66,8 +67,11 @@ def _around(flight: Flight, event: Event, wall: Wall) -> None:
     if event.kind == "second_cloud":
         cloud.at(event.end, lambda _: flight.send_rival_away())
     elif event.kind == "key_rotated":
-        world.at(event.at, lambda now_ns: flight.rotate("world", NEXT_KEY, now_ns))
-        cloud.at(event.end, lambda now_ns: flight.rotate("cloud", NEXT_KEY, now_ns))
+        # Made by an operator whose clock is right; that of the ends may have been stepped.
+        until = TAKE_OFF + event.at + NEXT_KEY.overlap
+        keys = NEXT_KEY._replace(until=float(round(until)))
+        world.at(event.at, lambda now_ns: flight.rotate("world", keys, now_ns))
+        cloud.at(event.end, lambda now_ns: flight.rotate("cloud", keys, now_ns))
     elif event.kind == "key_wrong":
         wrong = KeySet(WRONG_KEY, None, event.value)
         cloud.at(event.at, lambda now_ns: flight.rotate("cloud", wrong, now_ns))

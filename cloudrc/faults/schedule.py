@@ -31,7 +31,7 @@ KINDS: dict[str, str] = {
     "world_paused": "the world process stands still",
     "world_killed": "the world restarts",
     "world_throttled": "the world process runs for a share of value of each 100 ms",
-    "wall_clock": "the wall clock of both ends steps by value [s], and stays there",
+    "wall_clock": "the wall clock of both ends steps by value [s], for those that start later",
     "journal_full": "the journal refuses every entry",
     "journal_slow": "every fsync of the journal takes value [s]",
     "teleop_paused": "the teleop process stands still",

@@ -1,4 +1,8 @@
-"""A wall clock that jumps: nobody in the loop may look at it, so nothing may come of it."""
+"""A wall clock that jumps: nobody in the loop may look at it, so nothing may come of it.
+
+A process that starts asks it once, how old its key file is: in the random search this is what its
+steps reach, since nothing else in a flight of virtual time has a wall clock.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,10 @@ EPOCHS = (0.0, 3600.0, -3600.0, 4_291_747_200.0, 1e-3, 1.7e9)
 """1970, an hour on and back, 2106, and the present [s]."""
 
 
+TAKE_OFF = 1.7e9
+"""When a flight in virtual time begins, by a wall clock that is right [s since 1970]."""
+
+
 class Wall:
     """A wall clock that somebody sets.
 
@@ -19,6 +27,10 @@ class Wall:
     """
 
     offset = 0.0
+
+    def at(self, now_ns: int) -> float:
+        """What it shows at an instant [ns] of virtual time [s since 1970]."""
+        return TAKE_OFF + now_ns * 1e-9 + self.offset
 
     def step(self, by: float) -> None:
         """Set it forward, or back.

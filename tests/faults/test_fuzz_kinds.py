@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.cloud.teleop.api_bridge import WAITING_MAX
 from cloudrc.cloud.teleop.messages import Seen
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.faults import fuzz
@@ -68,6 +69,32 @@ def test_teleop_that_is_asked_to_end_pauses_and_its_successor_goes_on(kind: str)
     assert (flight.cloud.inner is None) == (kind == "pod_shut_down")
     flight.fly_mission()
     assert flight.mission.state == "done"
+
+
+@pytest.mark.promise("P-LINK-9")
+@pytest.mark.parametrize(("step", "keys"), [(0.0, 2), (60.0, 1), (-3600.0, 1)])
+def test_who_starts_asks_the_wall_clock_whether_the_key_before_is_valid(
+    step: float, keys: int
+) -> None:
+    events = (Event("key_rotated", 1.0), Event("wall_clock", 1.5, value=step))
+    flight = Flight(seed=3)
+    inject(flight, Schedule(3, events=(*events, Event("world_killed", 2.0, 0.1))), Wall())
+    flight.fly(1.8)
+    assert len(flight.rings["world"].accepted(flight.run.now_ns)) == 2, "in flight none is asked"
+    flight.fly(2.5)
+    assert flight.generations["world"] == 2
+    assert len(flight.rings["world"].accepted(flight.run.now_ns)) == keys
+
+
+def test_no_more_requests_are_drawn_than_teleop_lets_wait() -> None:
+    assert RANGES["api_flood"][2] == WAITING_MAX
+
+
+def test_the_disk_is_full_in_most_flights_that_draw_it() -> None:
+    drawn = [e for seed in range(400) for e in compose(seed).of("recorder_full")]
+    # What is recorded in a while: the head at once, then chunk after chunk.
+    full = sum(event.value < 14e3 + 33e3 * event.duration for event in drawn)
+    assert 0.6 < full / len(drawn) < 0.9
 
 
 @pytest.mark.parametrize("kind", ["teleop_shut_down", "pod_shut_down"])
