@@ -1,8 +1,9 @@
 """The epoch file: world's epochs rise through restarts, and each is on disk before it is used.
 
-A block of them is reserved at the start, so that a slow disk never meets the flight; what is left
-of it is given up at the next start. A file that is lost, or cannot be written, costs only that
-epochs begin again: the keys of a session come from fresh nonces too, so nothing old is accepted.
+A block of them is reserved at the start, and the next one only when it is used up: a slow disk
+meets the flight once in 4,096 epochs. What is left of a block is given up at the next start. A file
+that is lost, or cannot be written, costs only that epochs begin again: the keys of a session come
+from fresh nonces too, so nothing old is accepted.
 """
 
 from __future__ import annotations

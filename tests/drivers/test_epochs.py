@@ -37,13 +37,17 @@ def test_an_epoch_is_on_disk_before_it_is_used(path: Path) -> None:
         assert file.take() <= int(path.read_text())
 
 
-def test_the_disk_is_asked_at_the_start_and_not_in_flight(
+def test_the_disk_is_asked_at_the_start_and_once_in_a_block(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = EpochFile(path)
-    monkeypatch.setattr(epochs, "replace_durably", None)
+    file, asked = EpochFile(path), []
+    monkeypatch.setattr(epochs, "replace_durably", lambda path, data: asked.append(data))
     for _ in range(BLOCK):
         file.take()
+    assert asked == []
+    for _ in range(BLOCK):
+        file.take()
+    assert asked == [b"%d\n" % (2 * BLOCK)]
 
 
 def test_it_is_flushed_before_it_takes_the_old_ones_place(
