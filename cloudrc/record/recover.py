@@ -117,6 +117,7 @@ class _Copy:
         self._numbers: dict[int, int] = {}  # of a channel, there and here
         self._kept = dict.fromkeys(KEPT.values(), 0)
         self._homeless = 0
+        self._said = ""  # by the recording itself: what it lacks
         for record in scan.definitions():
             self._define(record)
 
@@ -134,6 +135,8 @@ class _Copy:
         elif isinstance(record, Metadata):
             self._start()
             self._writer.add_metadata(record.name, record.metadata)
+            if record.name == METADATA:
+                self._said = record.metadata.get(MISSING, self._said)
         else:
             self._define(record)
         kind = KEPT.get(type(record))
@@ -153,8 +156,9 @@ class _Copy:
             dropped["messages"] = lost
         kept = self._kept | {"chunks": scan.chunks, "channels": len(self._new_channels)}
         recovery = Recovery(scan.size, kept, dropped, scan.skipped, index_is_new=not scan.summary)
-        recovery.notes = self._notes(recovery)
-        if recovery.notes:
+        new = self._notes(recovery)
+        recovery.notes = [self._said, *new] if self._said else new
+        if new:  # else what was said is in the new file already
             self._writer.add_metadata(METADATA, {MISSING: "; ".join(recovery.notes)})
         self._writer.finish()
         return recovery

@@ -120,6 +120,8 @@ class Scan:
                 # Anything else of this opcode is a damaged record, not the end.
                 if self.summary is None or at == end:
                     self._end(payload)
+                    if self.summary is None:
+                        self._leave_out(at)
                     continue
             self._crc = zlib.crc32(payload, zlib.crc32(head, self._crc))
             yield from self._take(opcode, payload)
@@ -150,6 +152,25 @@ class Scan:
         crc = int.from_bytes(payload, "little")
         if crc:
             self.checked = not self._broken and crc == self._crc
+
+    def _leave_out(self, at: int) -> None:
+        """Count what lies behind the end, such as a second recording: only the first is kept."""
+        stream, start = self._stream, next_chunk(self._stream, at, self.size)
+        if start is None:
+            return
+        self.skipped += self.size - start
+        self._lost_chunk = True
+        while start + HEAD.size <= self.size:
+            stream.seek(start)
+            opcode, length = HEAD.unpack(stream.read(HEAD.size))
+            start += HEAD.size + length
+            if start > self.size or opcode not in KNOWN:
+                break
+            if opcode == Opcode.CHUNK:
+                self._note(opcode)
+            elif opcode == Opcode.MESSAGE_INDEX and length <= RECORD_MAX:
+                for _ in self._take(opcode, stream.read(length)):  # counts what was in the chunk
+                    pass
 
     def _note(self, opcode: int) -> None:
         self.dropped[NAMES.get(opcode, "records")] += 1

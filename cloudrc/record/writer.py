@@ -152,11 +152,9 @@ class McapWriter:
         DataEnd(0).write(end)
         Footer(0, 0, 0).write(end)
         first = b"" if self._whole else MCAP0_MAGIC
-        last = _bytes(end) + MCAP0_MAGIC
-        for rest in (first + _bytes(note) + last, first + last, b""):
-            with suppress(
-                OSError, ValueError
-            ):  # not even room for that: less, or just whole chunks
+        # No end without the note, even if there is room: it would pass for that of a whole file.
+        for rest in (first + _bytes(note) + _bytes(end) + MCAP0_MAGIC, b""):
+            with suppress(OSError, ValueError):  # not even room for that: just whole chunks
                 self._stream.seek(self._whole)
                 self._stream.truncate()
                 if self._stream.write(rest) == len(rest):

@@ -1,0 +1,96 @@
+"""What says itself that something is missing is never called complete, however whole it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.faults.scribe import FullDisk
+from cloudrc.record.columns import Recording
+from cloudrc.record.recorder import Recorder
+from cloudrc.record.recover import recover
+from cloudrc.record.writer import McapWriter
+from tests.record.samples import MS, open_mcap, world_records, write
+
+
+def drained(recorder: Recorder) -> Recorder:
+    """Record 20 s."""
+    for start in range(0, 20_000, 500):
+        recorder.put(world_records(50, start * MS))
+        while recorder.drain():
+            pass
+        recorder.flush(sync=False)
+    recorder.close()
+    return recorder
+
+
+def full(path: Path, room: int = 60_000) -> Path:
+    """What is left of a recording whose disk fills up."""
+    disk = FullDisk(room)
+    drained(Recorder(path, lambda _: McapWriter(disk, clock="world")))
+    path.write_bytes(disk.getvalue())
+    return path
+
+
+def ended(path: Path) -> Path:
+    """A recording that has grown to its limit."""
+    drained(Recorder(path, open_mcap, size_max=50_000))
+    return path
+
+
+def recovered(path: Path) -> Path:
+    """What was recovered of a torn one."""
+    torn = write(path.with_name("torn.mcap"), world_records(500))
+    torn.write_bytes(torn.read_bytes()[:20_000])
+    assert not recover(torn, path).complete
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (full, "recording stopped: disk full"),
+        (ended, "recording stopped: it has grown to its limit"),
+        (recovered, "cut short: the file has no end; "),
+    ],
+)
+def test_what_a_recording_says_it_lacks_is_lossy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], make: object, said: str
+) -> None:
+    assert callable(make)
+    path, new = make(tmp_path / "w.mcap"), tmp_path / "new.mcap"
+    assert main(["recover", str(path), "--to", str(new)]) == 1
+    assert f"lossy: {said}" in capsys.readouterr().out
+    assert Recording.read(new).note == Recording.read(path).note
+
+
+def test_what_was_said_before_a_file_was_torn_is_said_still(tmp_path: Path) -> None:
+    path, new = full(tmp_path / "w.mcap"), tmp_path / "new.mcap"
+    path.write_bytes(path.read_bytes()[:-50])
+    note = "recording stopped: disk full; cut short: the file has no end"
+    recover(path, new)
+    assert Recording.read(new).note == note
+
+
+@pytest.mark.parametrize("short", [1, 60, 100])
+def test_without_room_for_the_note_there_is_no_end_that_passes_for_a_whole_file(
+    tmp_path: Path, short: int
+) -> None:
+    size = full(tmp_path / "w.mcap").stat().st_size
+    path = full(tmp_path / "v.mcap", size - short)
+    assert not recover(path, tmp_path / "new.mcap").complete
+
+
+def test_a_second_recording_in_one_file_is_counted_as_left_out(tmp_path: Path) -> None:
+    path, new = write(tmp_path / "w.mcap", world_records(500)), tmp_path / "new.mcap"
+    alone = recover(path, tmp_path / "alone.mcap")
+    assert alone.complete
+    path.write_bytes(path.read_bytes() * 2)
+    recovery = recover(path, new)
+    assert not recovery.complete
+    assert recovery.kept == alone.kept
+    counts = {"chunks": alone.kept["chunks"], "messages": alone.kept["messages"]}
+    assert recovery.dropped == counts
+    assert recovery.share == pytest.approx(0.5, abs=0.02)
