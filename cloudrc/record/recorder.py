@@ -37,8 +37,8 @@ class Sink(Protocol):
     def sync(self) -> None:
         """Have what was flushed survive the machine."""
 
-    def abandon(self, reason: str) -> None:
-        """After an error: cut off what is torn and note why; never raises."""
+    def abandon(self, reason: str) -> int:
+        """After an error: cut off what is torn, note why, say how many records go with it."""
 
     def close(self) -> None:
         """End the file."""
@@ -191,4 +191,4 @@ class Recorder:
             f"{self._path}: {reason}; make room or choose another folder; the flight goes on"
         )
         if self._sink:
-            self._sink.abandon(reason)
+            self._unwritten += self._sink.abandon(reason)

@@ -64,6 +64,7 @@ class McapWriter:
             self._stream, compression=CompressionType.ZSTD, enable_data_crcs=True
         )
         self._whole = 0  # so many bytes have reached the file and end with a whole record
+        self._open_records = 0  # written since
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._latest_ns = 0
@@ -80,6 +81,7 @@ class McapWriter:
         for record in records:
             for row in rows(record):
                 self.write_row(row, row[1])
+            self._open_records += 1
 
     def write_row(self, row: Row, log_time_ns: int) -> None:
         """Record one row.
@@ -131,6 +133,7 @@ class McapWriter:
         self._chunk_start_ns = None
         self._mcap.flush()
         self._whole = self._stream.tell()
+        self._open_records = 0
 
     def sync(self) -> None:
         """Have what was flushed survive the machine; may take seconds on a slow disk."""
@@ -141,11 +144,14 @@ class McapWriter:
                 if error.errno != errno.EINVAL:  # a pipe, or a file that leads nowhere
                     raise
 
-    def abandon(self, reason: str) -> None:
+    def abandon(self, reason: str) -> int:
         """After an error: cut off what is torn, note why, end the file, as far as there is room.
 
         Args:
             reason: What a reader is told is missing.
+
+        Returns:
+            How many records of those that were taken are lost with it.
         """
         note, end = RecordBuilder(), RecordBuilder()
         Metadata(METADATA, {MISSING: reason}).write(note)
@@ -162,22 +168,26 @@ class McapWriter:
         if self._owned:
             with suppress(OSError):
                 self._stream.close()
+        return self._open_records
 
     def close(self) -> None:
-        """Write the index and close the file."""
-        try:
-            self._mcap.finish()
-            self._mcap.flush()
-            self._stream.flush()
-        finally:
-            if self._owned:
-                self._stream.close()
+        """Write the index and close the file; after an error it can be abandoned."""
+        self.flush()  # so that the last chunk is there even if there is no room for the index
+        self._mcap.finish()
+        self._mcap.flush()
+        self._stream.flush()
+        if self._owned:
+            self._stream.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.close()
+        try:
+            self.close()
+        finally:
+            if self._owned:
+                self._stream.close()
 
     def _open_channel(self, topic: str) -> int:
         ros_type = TOPICS[topic].ros_type

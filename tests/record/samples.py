@@ -142,8 +142,9 @@ class Shelf:
     def sync(self) -> None:
         pass
 
-    def abandon(self, reason: str) -> None:
+    def abandon(self, reason: str) -> int:
         self.closed = True
+        return 0
 
     def close(self) -> None:
         self.closed = True

@@ -5,17 +5,19 @@ from __future__ import annotations
 import errno
 import io
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted
-from tests.record.samples import MS, Shelf, assert_equal, counted, open_mcap, world_records
+from tests.record.samples import MS, Shelf, assert_equal, counted, open_mcap, world_records, write
 
 NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
 
@@ -191,3 +193,34 @@ def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> N
     assert recorder.dropped > 0
     assert 20_000 <= path.stat().st_size < 100_000
     assert Recording.read(path).note == "recording stopped: it has grown to its limit"
+
+
+@pytest.mark.parametrize("room", [0, 1500, *range(20_000, 60_000, 7_000)])
+def test_on_a_full_disk_every_record_is_in_the_file_or_counted(tmp_path: Path, room: int) -> None:
+    disk, records, path = Disk(room), counted(3000), tmp_path / "w.mcap"
+    recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
+    for start in range(0, len(records), 30):
+        recorder.put(records[start : start + 30])
+        while recorder.drain():
+            pass
+        if start % 90 == 0:
+            recorder.flush()
+    recorder.close()
+    path.write_bytes(disk.getvalue())
+    with suppress(BadInputError):
+        kept = 0
+        kept = len(Recording.read(path)["/count"])
+    assert (kept + recorder.dropped, kept < len(records)) == (len(records), True)
+
+
+def test_without_room_for_the_index_the_last_chunk_is_kept(tmp_path: Path) -> None:
+    path, records = tmp_path / "w.mcap", counted(20)
+    whole = write(path, records).read_bytes()
+    disk = Disk(len(whole) - 100)
+    recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
+    recorder.put(records)
+    recorder.close()
+    path.write_bytes(disk.getvalue())
+    assert "disk full" in recorder.error
+    assert len(Recording.read(path)["/count"]) == 20
+    assert recorder.dropped == 0
