@@ -44,8 +44,8 @@ def _bad_disks(seed: int) -> Outcome:
 def _full(outcome: Outcome, flight: Flight, folder: Path) -> None:
     disk = FullDisk(500_000)
     recorder = Recorder(folder / "w.mcap", lambda path: McapWriter(disk, clock="world"))
-    dropped = Dropped(recorder)
-    flight.listeners += [Scribe(recorder).hear, dropped.look]
+    dropped, scribe = Dropped(recorder), Scribe(recorder)
+    flight.listeners += [scribe.hear, dropped.look]
     flight.fly_mission()
     recorder.close()
     kept = folder / "full.mcap"
@@ -56,7 +56,10 @@ def _full(outcome: Outcome, flight: Flight, folder: Path) -> None:
     dropped.judge(outcome)
     recovery = recover(kept, folder / "full.recovered.mcap")
     outcome.same("full disk: torn chunks left", recovery.bytes_lost, 0)
-    outcome.least("full disk: messages kept", recovery.kept["messages"], 1000)
+    messages = recovery.kept["messages"]
+    outcome.least("full disk: messages kept", messages, 1000)
+    text = "full disk: records counted too many or too few"
+    outcome.same(text, scribe.miscounted(messages), 0)
     note = Recording.read(kept).note
     outcome.true("full disk: a reader is told", "disk full" in note)
 
@@ -66,11 +69,14 @@ def _read_only(outcome: Outcome, flight: Flight, folder: Path) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
 
     recorder = Recorder(folder / "ro.mcap", refuse)
-    flight.listeners.append(Scribe(recorder).hear)
+    scribe = Scribe(recorder)
+    flight.listeners.append(scribe.hear)
     flight.fly_mission()
     recorder.close()
     outcome.true("read-only disk: it is told", "disk is read-only" in recorder.error)
     outcome.least("read-only disk: records counted as dropped", recorder.dropped, 1000)
+    text = "read-only disk: records counted too many or too few"
+    outcome.same(text, scribe.miscounted(0), 0)
 
 
 def _slow(outcome: Outcome, flight: Flight, folder: Path) -> None:

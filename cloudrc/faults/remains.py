@@ -81,14 +81,19 @@ class Tape:
                 stamps = Recording.read(mended)["/ground_truth"]["stamp_ns"].tolist()
             except CloudrcError as error:
                 # A disk with no room for a single chunk leaves nothing, and has said so.
-                return "" if recorder.error else str(error)
+                return self._miscounted(0) if recorder.error else str(error)
         if recovery.bytes_lost:
             return f"{recovery.bytes_lost} torn bytes are left"
         if stamps != self._truths[: len(stamps)]:
             return "it does not hold what has happened"
         if not recorder.error and len(stamps) != len(self._truths):
             return f"{len(self._truths) - len(stamps)} samples lost without a word"
-        return ""
+        return self._miscounted(recovery.kept["messages"])
+
+    def _miscounted(self, kept: int) -> str:
+        """Whether each record is in the file or counted, "" if so."""
+        wrong = self._scribe.miscounted(kept)
+        return f"the count of lost records is wrong by {wrong}" if wrong else ""
 
     def _open(self, path: Path) -> SlowWriter:
         self._writer = SlowWriter(self._disk, self._delay)

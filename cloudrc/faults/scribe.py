@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import io
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import numpy as np
 
 from cloudrc.drivers.recording import FLUSH, SyncAge
 from cloudrc.record.recorder import Recorder
+from cloudrc.record.topics import rows
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
 
@@ -108,11 +111,26 @@ class Scribe:
 
     def __init__(self, recorder: Recorder, owed: Callable[[], float] = lambda: 0.0) -> None:
         self.recorder, self._owed = recorder, owed
+        self._put: list[Record] = []
         self._busy_until_ns = self._flushed_ns = 0
+
+    def miscounted(self, kept: int) -> int:
+        """How far the recorder's count of what is lost is from the truth; its file lacks an end.
+
+        Args:
+            kept: Messages in the file.
+        """
+        ends = list(accumulate(len(rows(record)) for record in self._put))
+        # A record that makes no message may be lost or not: nobody can tell.
+        most = bisect_right(ends, kept)
+        least = min(bisect_left(ends, kept) + 1, most) if kept else 0
+        put, dropped = len(ends), self.recorder.dropped
+        return dropped - min(max(dropped, put - most), put - least)
 
     def hear(self, records: list[Record], now_ns: int) -> None:
         """Take new records over at an instant [ns]."""
         self.recorder.put(records)
+        self._put += records
         if now_ns < self._busy_until_ns:
             return
         while self.recorder.drain():
