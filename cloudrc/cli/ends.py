@@ -39,7 +39,12 @@ def process_arguments(parser: argparse.ArgumentParser) -> None:
 def end_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what an end of the tunnel takes."""
     process_arguments(parser)
-    parser.add_argument("--record", type=Path, metavar="FILE", help="MCAP file to write")
+    parser.add_argument(
+        "--record",
+        type=Path,
+        metavar="FILE",
+        help="MCAP file to write; one that is there is kept, as NAME.before.mcap",
+    )
     parser.add_argument(
         "--record-flights",
         action="store_true",

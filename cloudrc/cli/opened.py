@@ -84,9 +84,9 @@ def open_end(options: argparse.Namespace, name: str) -> Opened:
 
     exporter = open_exporter(options, name)
     experiment, clock = load_experiment(str(options.config)), clock_id()
-    recorder = _open_recorder(options, name, clock)
-    keys = _open_keys(options)
-    return Opened(options, name, exporter, experiment, clock, recorder, keys, _open_peer(options))
+    keys, peer = _open_keys(options), _open_peer(options)
+    recorder = _open_recorder(options, name, clock)  # last: whoever cannot fly moves no recording
+    return Opened(options, name, exporter, experiment, clock, recorder, keys, peer)
 
 
 def suite() -> int:
@@ -129,11 +129,30 @@ def _open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> 
     from cloudrc.record.recorder import Recorder
     from cloudrc.record.writer import McapWriter
 
+    path: Path = options.record or Path(os.devnull)
+    before, size_max = _keep_before(path), None
+    if options.record_max:
+        room = round(0.9 * options.record_max)
+        size_max = max(room - before, room // 10)  # both together, which share a volume
     return Recorder(
-        options.record or Path(os.devnull),
+        path,
         lambda file: McapWriter(file, clock=clock, clock_id=clock_id.hex()),
-        size_max=round(0.9 * options.record_max) if options.record_max else None,
+        size_max=size_max,
     )
+
+
+def _keep_before(path: Path) -> int:
+    """Keep what the process before this one has recorded, as world.before.mcap; its size [bytes].
+
+    A container that is started again finds the volume as it was, and so what led to its end.
+    """
+    try:
+        size = path.stat().st_size if path.is_file() else 0
+        if size:
+            path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
+    except OSError:  # whoever writes meets it again, and says so
+        return 0
+    return size
 
 
 def _chosen(
