@@ -25,6 +25,8 @@ try:
 except ImportError as error:
     raise missing(error) from error
 
+CHANNELS_MAX = 65_535
+"""Of a file, whose numbers for them have 16 bits; so have those of schemas, never more of them."""
 KEPT = {Message: "messages", Attachment: "attachments", Metadata: "metadata"}
 
 
@@ -57,7 +59,7 @@ class Recovery:
     def share(self) -> float:
         """Share that was kept in [0, 1]: of the messages if their number is known, else bytes."""
         kept, lost = self.kept.get("messages", 0), self.dropped.get("messages", 0)
-        if kept and not self.bytes_lost:
+        if kept + lost and not self.bytes_lost:
             return kept / (kept + lost)
         return 1.0 - self.bytes_lost / self.size if self.size else 0.0
 
@@ -200,20 +202,25 @@ class _Copy:
         )
 
     def _open(self, there: int) -> int | None:
-        """Register a channel in the new file; None if the old one's is lost."""
+        """Register a channel in the new file; None if the old one's is lost, or too many are."""
         channel = self._channels.get(there)
         if channel is None or (channel.schema_id and channel.schema_id not in self._schemas):
             return None
         self._start()
         schema, here = self._schemas.get(channel.schema_id), 0
+        full = len(self._new_channels) >= CHANNELS_MAX
         if schema is not None:
             content = (schema.name, schema.encoding, schema.data)
             if content not in self._new_schemas:
+                if full:
+                    return None
                 self._new_schemas[content] = self._writer.register_schema(*content)
             here = self._new_schemas[content]
         values = (channel.topic, channel.message_encoding, here)
         key = (*values, *channel.metadata.items())
         if key not in self._new_channels:
+            if full:
+                return None
             self._new_channels[key] = self._writer.register_channel(*values, channel.metadata)
         number = self._numbers[there] = self._new_channels[key]
         return number

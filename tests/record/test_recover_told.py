@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from cloudrc.cli.main import main
 from cloudrc.faults.scribe import FullDisk
 from cloudrc.record.columns import Recording
+from cloudrc.record.frames import HEAD, MAGIC
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
 from cloudrc.record.writer import McapWriter
@@ -94,3 +96,42 @@ def test_a_second_recording_in_one_file_is_counted_as_left_out(tmp_path: Path) -
     counts = {"chunks": alone.kept["chunks"], "messages": alone.kept["messages"]}
     assert recovery.dropped == counts
     assert recovery.share == pytest.approx(0.5, abs=0.02)
+
+
+def test_more_channels_than_a_file_can_number_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cloudrc.record.recover.CHANNELS_MAX", 300)
+    path = tmp_path / "many.mcap"
+    path.write_bytes(hostile(350, schemas=True) + hostile(350, schemas=False)[len(MAGIC) :])
+    recovery = recover(path, tmp_path / "new.mcap")
+    assert (recovery.kept["messages"], recovery.kept["channels"]) == (300, 300)
+    assert recovery.dropped == {"messages": 400}
+
+
+def test_of_messages_none_of_which_is_kept_nothing_is(tmp_path: Path) -> None:
+    path = tmp_path / "homeless.mcap"
+    messages = record(5, struct.pack("<H", 1) + bytes(20)) * 9
+    path.write_bytes(MAGIC + record(12, text(b"a") + text(b"")) + messages)
+    recovery = recover(path, tmp_path / "new.mcap")
+    assert (recovery.share, recovery.dropped) == (0.0, {"messages": 9})
+
+
+def hostile(count: int, *, schemas: bool) -> bytes:
+    """Messages of which each has a channel of its own, under one number, and maybe a schema."""
+    parts = [MAGIC]
+    for n in range(count):
+        name, number = b"t%07d" % n, struct.pack("<H", 1)
+        if schemas:
+            parts.append(record(3, number + text(name) + text(b"ros2msg") + text(b"")))
+        channel = number + struct.pack("<H", schemas) + text(name) + text(b"cdr") + text(b"")
+        parts += [record(4, channel), record(5, number + bytes(20))]
+    return b"".join(parts)
+
+
+def record(opcode: int, payload: bytes) -> bytes:
+    return HEAD.pack(opcode, len(payload)) + payload
+
+
+def text(data: bytes) -> bytes:
+    return struct.pack("<I", len(data)) + data
