@@ -17,6 +17,7 @@ from cloudrc import __version__
 from cloudrc.errors import BadInputError
 from cloudrc.record.packages import missing
 from cloudrc.record.scan import Scan
+from cloudrc.record.sectors import SECTOR, Sectors
 from cloudrc.record.writer import METADATA, MISSING
 
 try:
@@ -76,7 +77,7 @@ def recover(source: Path, target: Path) -> Recovery:
         OSError: If the new file cannot be written.
     """
     try:
-        stream = source.open("rb")
+        stream = Sectors(source.open("rb", buffering=0))
     except OSError as error:
         raise BadInputError(
             f"{source}: cannot be read ({error.strerror}); name a recording (.mcap)"
@@ -86,7 +87,7 @@ def recover(source: Path, target: Path) -> Recovery:
         copy = _Copy(new, scan)
         for record in scan.records():
             copy.take(record)
-        recovery = copy.finish()
+        recovery = copy.finish(len(stream.bad))
         if not any(recovery.kept.values()) and not recovery.complete:
             what = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"
             raise BadInputError(f"{source}: holds nothing that can be read: it {what}")
@@ -145,7 +146,7 @@ class _Copy:
         if kind:
             self._kept[kind] += 1
 
-    def finish(self) -> Recovery:
+    def finish(self, bad_sectors: int) -> Recovery:
         """End the new file; say what is in it and what is not."""
         scan = self._scan
         self._start()
@@ -159,6 +160,8 @@ class _Copy:
         kept = self._kept | {"chunks": scan.chunks, "channels": len(self._new_channels)}
         recovery = Recovery(scan.size, kept, dropped, scan.skipped, index_is_new=not scan.summary)
         new = self._notes(recovery)
+        if bad_sectors:
+            new.append(f"{bad_sectors} sectors of {SECTOR} bytes cannot be read")
         recovery.notes = [self._said, *new] if self._said else new
         if new:  # else what was said is in the new file already
             self._writer.add_metadata(METADATA, {MISSING: "; ".join(recovery.notes)})
