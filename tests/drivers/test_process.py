@@ -40,6 +40,7 @@ def handlers() -> Iterator[None]:
 @pytest.mark.parametrize(
     ("told", "ends"),
     [(None, False), (str(os.getppid()), False), (str(os.getpid()), True), ("nobody", False)],
+    ids=["untold", "parent", "stranger", "nonsense"],  # a process number is another one each time
 )
 def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(
     told: str | None, ends: bool, monkeypatch: pytest.MonkeyPatch
