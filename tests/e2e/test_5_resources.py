@@ -12,6 +12,8 @@ from kube import CHART, EXAMPLES, NAME, NAMESPACE, cloudrc, helm, metrics, value
 PLACE = ["-n", NAMESPACE, "--release", NAME]
 SHORT = ["--set", "mission.waypoints.0.dwell_s=6"]
 """Over `hover`: long enough to be throttled, short enough for a suite."""
+PATIENCE = 480.0
+"""For a world with 15m of a CPU, which takes minutes to start where Python takes 2 s [s]."""
 VISIBLE = 10.0
 """Times as long as unconstrained a part has to be throttled."""
 
@@ -28,7 +30,8 @@ def with_values(installed: None, values: Path) -> Iterator[Callable[[str], None]
 
 
 def flown(folder: Path) -> tuple[int, dict]:
-    done = cloudrc("run", "hover", *SHORT, "--mode", "cluster", *PLACE, "--out", str(folder))
+    words = ("run", "hover", *SHORT, "--mode", "cluster", *PLACE, "--out", str(folder))
+    done = cloudrc(*words, timeout=PATIENCE)
     assert (folder / "report.json").is_file(), done.stdout + done.stderr
     return done.returncode, json.loads((folder / "report.json").read_text())
 
