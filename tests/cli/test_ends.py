@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import os
 import signal
 import socket
@@ -74,16 +73,6 @@ def test_an_address_in_use_is_named_with_its_flag(
     said = capsys.readouterr().err
     assert said.startswith(f"cloudrc: error: {flag} {taken}: cannot receive there: Address already")
     assert said.endswith("; name an address of this machine and a port that is free\n")
-
-
-@pytest.fixture
-def handlers() -> Iterator[None]:
-    """Give the signals back that a process of its own would keep."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-    gc.unfreeze()
 
 
 # Here too a socket outlives the command.

@@ -7,7 +7,6 @@ import select
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,15 +24,6 @@ print(run._children[0].process.pid, flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 CONFIG = Path(__file__).parents[2] / "cloudrc" / "experiments" / "hover.yaml"
-
-
-@pytest.fixture
-def handlers() -> Iterator[None]:
-    """Give the signals back that a process of its own would keep."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 @pytest.mark.usefixtures("handlers")

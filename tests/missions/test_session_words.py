@@ -140,3 +140,15 @@ def test_a_teleop_that_lags_starts_its_mission_in_the_session_that_it_has_seen()
     _, second, _ = teleop.epochs.values()  # the third is that of the start from the spawn
     assert changes[0].stamp_ns >= second + LAG_NS
     assert changes[-1].state is GuardState.TRACK
+
+
+def test_after_a_stall_cloud_looks_after_its_keys_once_not_for_each_second_of_it(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Looks are a second apart: an end that hears its peer with another key counts them."""
+    looks: list[int] = []
+    monkeypatch.setattr(ends.cloud._session, "tend", lambda now_ns: looks.append(now_ns) or [])
+    woken_ns = ends.run.now_ns + 60 * S
+    for late_ns in range(0, S // 2, S // 100):
+        ends.cloud.handle_deadline(woken_ns + late_ns)
+    assert 1 <= len(looks) <= 2
