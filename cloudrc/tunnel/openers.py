@@ -39,16 +39,23 @@ class Openers:
         accepted: Pre-shared keys from which they may be derived.
     """
 
-    def __init__(self, derive: Callable[[Key, int], Cipher], key: Key, now_ns: int) -> None:
+    def __init__(
+        self,
+        derive: Callable[[Key, int], Cipher],
+        key: Key,
+        accepted: tuple[Key, ...],
+        now_ns: int,
+    ) -> None:
         """Begin an epoch.
 
         Args:
             derive: Makes the cipher of a pre-shared key and a generation.
             key: That the epoch begins with.
+            accepted: Those that may follow.
             now_ns: When [ns].
         """
         self._derive = derive
-        self.accepted: tuple[Key, ...] = (key,)
+        self.accepted = accepted
         self._kept: dict[int, Opener] = {0: (derive(key, 0), key)}  # by the byte of the generation
         self._newest = 0  # generation that was opened for the first time last
         self._tried: dict[int, list[Opener]] = {}

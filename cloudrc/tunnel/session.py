@@ -116,8 +116,7 @@ class Session:
         self._rekey_total = self._sent() + REKEY_DATAGRAMS
         self._announced = None
         self._cipher = self._derive(self._key, self._sends, 0)
-        self._openers = Openers(self._derive_opening, self._key, self._tended_ns)
-        self._openers.accepted = self.accepted
+        self._openers = Openers(self._derive_opening, self._key, self.accepted, self._tended_ns)
         self._newest = dict.fromkeys(self._newest, -1)
 
     def seal(self, kind: int, body: bytes) -> bytes:

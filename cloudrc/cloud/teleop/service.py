@@ -182,7 +182,8 @@ class MissionService:
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry."""
         mission = self._current
-        self._stop.meet(seen)
+        if not self.seen:
+            self._stop.meet(seen)
         anew = self._sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
             self._watch(mission, seen, now_ns)

@@ -19,7 +19,7 @@ class Stop:
     def __init__(self, book: MissionBook, teleop: Teleop) -> None:
         """Ask again for what a teleop before this one has asked for."""
         self._book, self._teleop = book, teleop
-        self._is_released = self._is_met = False
+        self._is_released = False
         if book.stopped() is not None:
             teleop.operate(EmergencyStop(), 0)
 
@@ -39,9 +39,8 @@ class Stop:
         self._is_released = True
 
     def meet(self, seen: Seen) -> None:
-        """Take a look at the robot, before teleop does."""
-        stopped = None if self._is_met else self._book.stopped()
-        self._is_met = True
+        """Take the first look at the robot, before teleop does."""
+        stopped = self._book.stopped()
         if stopped is not None and seen.mission_id != stopped.number:
             self._teleop.requests.withdraw_stop()
 
