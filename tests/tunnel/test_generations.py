@@ -4,7 +4,7 @@ import pytest
 
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Kind
-from cloudrc.tunnel.openers import AHEAD_MAX, FAR_MAX, FAR_TRIES, SILENCE_NS
+from cloudrc.tunnel.openers import AHEAD_MAX, FAR_MAX, FAR_TRIES, KEPT, SILENCE_NS
 from cloudrc.tunnel.session import REKEY_NS, Session, pair
 
 BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
@@ -68,10 +68,41 @@ def test_what_is_heard_is_not_silent_and_what_is_repeated_is_not_heard():
     for data in (old, cloud.seal(Kind.COMMAND, BODY)):
         world.open(data)
     world.tend(SILENCE_NS)
-    for heard, silent in ((cloud.seal(Kind.COMMAND, BODY), False), (old, True)):
+    new = cloud.seal(Kind.COMMAND, BODY)
+    for heard, silent in ((new, False), (new, True), (old, True)):
         world.open(heard)
         world.tend(world._tended_ns + SILENCE_NS)
         assert world._openers._is_silent == silent
+
+
+def test_a_peer_that_has_just_been_heard_is_not_far_ahead():
+    world, cloud = after(0, silence_ns=SILENCE_NS)
+    world.open(cloud.seal(Kind.COMMAND, BODY))
+    for number in range(AHEAD_MAX + 1):
+        cloud.tend((number + 1) * REKEY_NS)
+    assert refuses(world, cloud.seal(Kind.COMMAND, BODY))
+
+
+@pytest.mark.parametrize(("rekeys", "refused"), [(FAR_MAX, False), (FAR_MAX + 1, True)])
+def test_so_far_ahead_counts_from_where_the_peer_was_heard_last(rekeys, refused):
+    """And not from the first generation, from which a month's session is as far away."""
+    world, cloud = after(AHEAD_MAX)
+    world.open(cloud.seal(Kind.COMMAND, BODY))
+    world.tend(1)
+    world.tend(1 + SILENCE_NS)
+    for number in range(rekeys + AHEAD_MAX):
+        cloud.tend((AHEAD_MAX + 1 + number) * REKEY_NS)
+    assert refuses(world, cloud.seal(Kind.COMMAND, BODY)) == refused
+
+
+def test_late_datagrams_of_the_generations_before_are_opened():
+    world, cloud = pair()
+    cloud.tend(0)
+    late = cloud.seal(Kind.COMMAND, BODY)
+    for number in range(KEPT):
+        cloud.tend((number + 1) * REKEY_NS)
+    assert not refuses(world, cloud.seal(Kind.COMMAND, BODY))
+    assert not refuses(world, late)
 
 
 def test_a_forged_generation_opens_nothing_and_keeps_little():
@@ -97,7 +128,7 @@ def test_in_a_silence_forged_generations_are_tried_a_few_times_a_second(monkeypa
         for byte in range(1, 256):
             assert refuses(world, forged(cloud, byte))
         far = len(derived) - AHEAD_MAX
-        assert far <= FAR_TRIES * (FAR_MAX // 256 + 1)
+        assert far == FAR_TRIES * FAR_MAX // 256
         derived.clear()
         world.tend(world._tended_ns + 1)
 

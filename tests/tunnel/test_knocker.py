@@ -86,6 +86,12 @@ def test_of_one_world_only_a_newer_epoch_counts(knocker, epoch, counts):
     assert (accepted(knocker, epoch, accept(), 3) is not None) == counts
 
 
+@pytest.mark.parametrize(("ahead", "counts"), [(2**31 - 1, True), (2**31, False)])
+def test_half_of_all_epochs_are_newer(knocker, ahead, counts):
+    accepted(knocker, 1, accept(), 0)
+    assert (accepted(knocker, 1 + ahead, accept(), 1) is not None) == counts
+
+
 def test_another_process_of_world_may_begin_again_from_one(knocker):
     accepted(knocker, 3, accept(), 0)
     assert accepted(knocker, 1, accept(world=b"v" * 16), 3)
