@@ -6,18 +6,32 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import sys
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from cloudrc import __version__
+from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import table
+from cloudrc.report.document import environment_document
 
 FOLDER = Path(__file__).resolve().parents[1] / "build" / "figures"
 ROUNDING = 1e-9
 """Of a number of nanoseconds that has become seconds."""
+PAGE = """\
+# The numbers of link and safety
+
+Written by `make nightly` (`python tools/figures.py --document docs/safety/numbers.md`); do not
+edit. Each row is the worst of N cases: what tests have asked for, and what they have measured.
+Times are those of the machine that it ran on. What is composed at random has pages of its own:
+[search](search.md), [adversary](adversary.md), [clean](clean.md); the faults one by one:
+[faults](faults.md).
+"""
 
 
 def note(
@@ -71,28 +85,56 @@ def holds(row: dict[str, Any]) -> bool:
     return bool(measured <= asked + ROUNDING if row["relation"] == "<=" else measured >= asked)
 
 
-def main() -> int:
+def cells(rows: list[dict[str, Any]]) -> list[tuple[str, ...]]:
+    """Lay the rows out as text, a head first."""
+    return [
+        ("number", "asked", "measured", "N", "test"),
+        *(
+            (
+                row["name"],
+                f"{row['relation']} {row['asked']:g} {row['unit']}".rstrip(),
+                f"{row['measured']:.4g} {row['unit']}".rstrip() + "  MISSED" * (not holds(row)),
+                f"{row['count']:,}",
+                row["test"].partition("::")[0],
+            )
+            for row in rows
+        ),
+    ]
+
+
+def page(rows: list[dict[str, Any]]) -> str:
+    """Lay the rows out as a page of the documentation."""
+    head, *lines = cells(rows)
+    where = environment_document()
+    return "\n".join(
+        [
+            *PAGE.splitlines(),
+            f"Measured on {where['cores']} cores ({where['processor']}), Python {where['python']}.",
+            "",
+            f"| {' | '.join(head)} |",
+            "|---|---|---|---|---|",
+            *(f"| {' | '.join(line)} |" for line in lines),
+            "",
+            f"Measured by cloudrc {__version__}; SHA-256 of its sources: `{sources()[:16]}`.",
+            "",
+        ]
+    )
+
+
+def main(arguments: Sequence[str] = ()) -> int:
     """Print the table; 1 if a number was missed, 3 if there are none."""
+    parser = argparse.ArgumentParser(description="Print what tests have measured.")
+    parser.add_argument("--document", type=Path, metavar="FILE", help="write it as a page, too")
+    options = parser.parse_args(arguments)
     rows = read()
     if not rows:
         print("no numbers yet: run make test, make process or make nightly", file=sys.stderr)
         return 3
-    cells = [("number", "asked", "measured", "N", "test")]
-    for row in rows:
-        unit = f" {row['unit']}" if row["unit"] else ""
-        missed = "" if holds(row) else "  MISSED"
-        cells.append(
-            (
-                row["name"],
-                f"{row['relation']} {row['asked']:g}{unit}",
-                f"{row['measured']:.4g}{unit}{missed}",
-                f"{row['count']:,}",
-                row["test"].partition("::")[0],
-            )
-        )
-    print(table(cells))
+    print(table(cells(rows)))
+    if options.document:
+        options.document.write_text(page(rows), encoding="utf-8")
     return 0 if all(map(holds, rows)) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

@@ -28,6 +28,15 @@ def test_of_all_cases_the_worst_is_shown(capsys: pytest.CaptureFixture[str]) -> 
     ]
 
 
+def test_a_page_of_the_documentation_says_the_same(tmp_path: Path) -> None:
+    figures.note("test_a.py::test_hold", "HOLD after", 0.251, "<=", 0.252, "s", 200)
+    figures.note("test_b.py::test_flips", "accepted", 0, "==", 0, "", 1000)
+    assert figures.main(["--document", str(tmp_path / "numbers.md")]) == 0
+    text = (tmp_path / "numbers.md").read_text(encoding="utf-8")
+    assert "| HOLD after | <= 0.252 s | 0.251 s | 200 | test_a.py |" in text.splitlines()
+    assert "| accepted | == 0 | 0 | 1,000 | test_b.py |" in text.splitlines()
+
+
 def test_a_test_that_is_run_again_replaces_what_it_noted() -> None:
     for measured in (5.0, 1.0):
         figures.note("test_a.py::test_a", "accepted", measured, "==", 0.0, "", 7)

@@ -249,7 +249,7 @@ def test_what_was_heard_in_the_epoch_before_tells_nothing_of_this_one():
     assert ends.world._key == ends.cloud._key == NEW
 
 
-@pytest.mark.promise("P-LINK-5")
+@pytest.mark.promise("P-LINK-10")
 def test_whatever_befell_the_key_files_once_they_are_the_same_both_ends_hear_each_other():
     for chance in map(random.Random, range(1500)):
         ends = Ends(overlap=chance.choice((2.0, 5.0, 30.0)))

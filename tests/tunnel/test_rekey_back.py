@@ -35,7 +35,7 @@ def look(ends, *, heard):
     return ends.world.tend(ends.now_ns)
 
 
-@pytest.mark.promise("P-LINK-5")
+@pytest.mark.promise("P-LINK-10")
 @pytest.mark.parametrize("first", ["world", "cloud"])
 def test_one_end_that_is_rolled_back_is_followed(first):
     """It knows the new key for two seconds more, the other one the old key for minutes."""
