@@ -25,9 +25,12 @@ except ImportError as error:
 
 RECORD_MAX = 64 << 20
 """Longest record that is read [bytes]."""
-CHUNK_MAX = 256 << 20
-"""Longest chunk after decompression [bytes]."""
+CHUNK_MAX = 64 << 20
+"""Longest chunk after decompression [bytes]; writers close theirs after some MB."""
+DEFINITION_MAX = 1 << 20
+"""Longest schema or channel [bytes]: the parts of one become many objects."""
 HEAD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
 MAGIC = b"\x89MCAP0\r\n"
 
 _CLASSES: dict[int, Any] = {
@@ -42,6 +45,7 @@ _CLASSES: dict[int, Any] = {
     Opcode.DATA_END: kinds.DataEnd,
     Opcode.FOOTER: kinds.Footer,
 }
+_DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _MARKS = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")
 _MARK_OFFSET = 37  # of the name of its compression, from a chunk's first byte
 _BLOCK = 1 << 20
@@ -70,14 +74,16 @@ def parse(opcode: int, payload: bytes) -> McapRecord | None:
     Raises:
         DamagedError: If it is not what it claims to be.
     """
-    stream = ReadDataStream(_Exact(payload))
     try:
         if opcode == Opcode.MESSAGE:
-            message: McapRecord = kinds.Message.read(stream, len(payload))
-            return message
+            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(payload)
+            data = payload[_MESSAGE.size :]
+            return kinds.Message(channel, log_time, data, publish_time, sequence)
         if opcode not in _CLASSES:
             return None
-        record: McapRecord = _CLASSES[opcode].read(stream)
+        if opcode in _DEFINITIONS and len(payload) > DEFINITION_MAX:
+            raise DamagedError("too long")
+        record: McapRecord = _CLASSES[opcode].read(ReadDataStream(_Exact(payload)))
     except DamagedError:
         raise
     except Exception as error:  # whatever a record of nonsense brings up in the library
@@ -89,18 +95,36 @@ def parse(opcode: int, payload: bytes) -> McapRecord | None:
     return record
 
 
-def unpack(chunk: Chunk) -> list[McapRecord]:
-    """Take a chunk apart.
+def unpack(chunk: Chunk) -> Iterator[McapRecord]:
+    """Take a chunk apart, all of which is looked at first: millions of records may be in it.
+
+    Returns:
+        Its records, each read when it is asked for.
 
     Raises:
-        DamagedError: If its checksum or anything in it is wrong, or it is longer than CHUNK_MAX.
+        DamagedError: At once, if its checksum or anything in it is wrong, or it is longer than
+            CHUNK_MAX.
     """
     data = _decompressed(chunk)
     if len(data) != chunk.uncompressed_size:
         raise DamagedError("length")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise DamagedError("checksum")
-    inside, at = [], 0
+    for opcode, start, end in _inside(data):
+        if opcode == Opcode.MESSAGE:
+            if end - start < _MESSAGE.size:
+                raise DamagedError("too short")
+        elif opcode in _DEFINITIONS:
+            parse(opcode, data[start:end])
+        elif opcode in _CLASSES:
+            raise DamagedError("a record that has no place in a chunk")
+    records = (parse(opcode, data[start:end]) for opcode, start, end in _inside(data))
+    return (record for record in records if record is not None)
+
+
+def _inside(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode, first byte and the byte after the last of each record's payload."""
+    at = 0
     while at < len(data):
         if at + HEAD.size > len(data):
             raise DamagedError("too short")
@@ -108,11 +132,8 @@ def unpack(chunk: Chunk) -> list[McapRecord]:
         at += HEAD.size
         if length > len(data) - at:
             raise DamagedError("too short")
-        record = parse(opcode, data[at : at + length])
-        if record is not None:
-            inside.append(record)
+        yield opcode, at, at + length
         at += length
-    return inside
 
 
 def _decompressed(chunk: Chunk) -> bytes:

@@ -28,6 +28,10 @@ except ImportError as error:
 
 CHANNELS_MAX = 65_535
 """Of a file, whose numbers for them have 16 bits; so have those of schemas, never more of them."""
+DEFINITIONS_MAX = 64 << 20
+"""Of all schemas and channels that are kept in mind, in bytes about; those beyond are left out."""
+ENTRY = 256
+"""Taken for one of a channel's metadata, whatever its length [bytes]."""
 KEPT = {Message: "messages", Attachment: "attachments", Metadata: "metadata"}
 
 
@@ -120,6 +124,7 @@ class _Copy:
         self._numbers: dict[int, int] = {}  # of a channel, there and here
         self._kept = dict.fromkeys(KEPT.values(), 0)
         self._homeless = 0
+        self._room = DEFINITIONS_MAX
         self._said = ""  # by the recording itself: what it lacks
         for record in scan.definitions():
             self._define(record)
@@ -189,11 +194,20 @@ class _Copy:
             self._writer.start(profile=profile, library=f"cloudrc {__version__} recover")
 
     def _define(self, record: McapRecord) -> None:
-        if isinstance(record, Schema):
-            self._schemas[record.id] = record
+        if isinstance(record, Schema) and self._schemas.get(record.id) != record:
+            self._schemas.pop(record.id, None)
+            if self._has_room(len(record.name) + len(record.encoding) + len(record.data)):
+                self._schemas[record.id] = record
         elif isinstance(record, Channel) and self._channels.get(record.id) != record:
-            self._channels[record.id] = record
+            self._channels.pop(record.id, None)
             self._numbers.pop(record.id, None)
+            entries = sum(ENTRY + len(k) + len(v) for k, v in record.metadata.items())
+            if self._has_room(len(record.topic) + len(record.message_encoding) + entries):
+                self._channels[record.id] = record
+
+    def _has_room(self, size: int) -> bool:
+        self._room -= size
+        return self._room >= 0
 
     def _message(self, message: Message) -> None:
         number = self._numbers.get(message.channel_id) or self._open(message.channel_id)

@@ -1,0 +1,87 @@
+"""What a few kilobytes that unpack to very much cost: a chunk at most; all of it is counted."""
+
+from __future__ import annotations
+
+import io
+import struct
+import tracemalloc
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+
+from cloudrc.errors import BadInputError
+from cloudrc.record.frames import DEFINITION_MAX, MAGIC
+from cloudrc.record.recover import recover
+from cloudrc.record.scan import Scan
+from tests.record.test_recover_told import record, text
+
+
+def chunk(*inside: bytes) -> bytes:
+    data = b"".join(inside)
+    packed = zstandard.compress(data)
+    head = struct.pack("<QQQI", 0, 0, len(data), 0) + text(b"zstd")
+    return record(Opcode.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
+
+
+def channel(number: int, topic: bytes = b"/t") -> bytes:
+    values = struct.pack("<HH", number, 0) + text(topic) + text(b"cdr") + text(b"")
+    return record(Opcode.CHANNEL, values)
+
+
+def message(number: int) -> bytes:
+    return record(Opcode.MESSAGE, struct.pack("<H", number) + bytes(20))
+
+
+def file(*chunks: bytes) -> bytes:
+    return MAGIC + record(Opcode.HEADER, text(b"") + text(b"")) + b"".join(chunks)
+
+
+def test_of_a_chunk_of_many_messages_one_is_held_at_a_time() -> None:
+    count, unpacked = 50_000, 50_000 * len(message(1))
+    data = file(chunk(channel(1), message(1) * count))
+    assert len(data) < 1_000
+    tracemalloc.start()
+    try:
+        assert sum(1 for _ in Scan(io.BytesIO(data)).records()) == count + 2
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 3 * unpacked
+
+
+def test_of_a_chunk_that_ends_in_nonsense_nothing_is_kept(tmp_path: Path) -> None:
+    path, new = tmp_path / "w.mcap", tmp_path / "new.mcap"
+    for torn in (message(1)[:-1], record(Opcode.MESSAGE, bytes(21)), b"\5", channel(2)[:-1]):
+        path.write_bytes(file(chunk(channel(1), message(1), torn), chunk(channel(1), message(1))))
+        recovery = recover(path, new)
+        assert (recovery.kept["messages"], recovery.dropped["chunks"]) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        record(Opcode.MESSAGE_INDEX, struct.pack("<HI", 1, 16 * 100) + bytes(16 * 100)),
+        record(Opcode.METADATA, text(b"") + text(b"")),
+        channel(1, b"t" * DEFINITION_MAX),
+    ],
+)
+def test_what_becomes_many_objects_is_not_read_in_a_chunk(tmp_path: Path, inside: bytes) -> None:
+    path = tmp_path / "w.mcap"
+    path.write_bytes(file(chunk(inside)))
+    with pytest.raises(BadInputError, match="nothing that can be read"):
+        recover(path, tmp_path / "new.mcap")
+
+
+def test_definitions_beyond_their_room_are_left_out_with_their_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cloudrc.record.recover.DEFINITIONS_MAX", 3_500)
+    path = tmp_path / "w.mcap"
+    each = [channel(n, b"%d" % n + b"t" * 1_000) + message(n) for n in range(5)]
+    again = channel(0, b"0" + b"t" * 1_000) + message(0)  # as some writers do in every chunk
+    path.write_bytes(file(chunk(*each), chunk(again)))
+    recovery = recover(path, tmp_path / "new.mcap")
+    assert (recovery.kept["messages"], recovery.kept["channels"]) == (4, 3)
+    assert recovery.dropped == {"messages": 2}
