@@ -153,8 +153,17 @@ def mission_plan(
     return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
 
-def link_profile(direction: schema.Direction) -> DirectionProfile:
-    """Convert one direction of the link to SI, its trace read in."""
+def link_profile(direction: schema.Direction, file_max: int | None = None) -> DirectionProfile:
+    """Convert one direction of the link to SI, its trace read in.
+
+    Args:
+        direction: As in a profile's file.
+        file_max: Longest trace or table that is read [bytes]; None: any.
+
+    Raises:
+        BadInputError: If one cannot be read.
+    """
+    file = direction.trace
     return DirectionProfile(
         delay=direction.delay_ms * 1e-3,
         jitter=direction.jitter_ms * 1e-3,
@@ -168,16 +177,16 @@ def link_profile(direction: schema.Direction) -> DirectionProfile:
         rate=_scaled(direction.rate_kbit, 1e3),
         queue_packets=direction.queue_packets,
         changes=tuple(_change(change) for change in direction.changes),
-        trace=None if direction.trace is None else read_trace(Path(direction.trace)),
+        trace=None if file is None else read_trace(Path(file), file_max),
         blackouts=tuple(Blackout(b.start_s, b.duration_s) for b in direction.blackouts),
-        table=_table(direction),
+        table=_table(direction, file_max),
     )
 
 
-def _table(direction: schema.Direction) -> tuple[float, ...]:
+def _table(direction: schema.Direction, file_max: int | None) -> tuple[float, ...]:
     if direction.distribution != "table" or direction.table is None:
         return ()
-    return read_table(Path(direction.table))
+    return read_table(Path(direction.table), file_max)
 
 
 def _leg(before: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: float) -> Leg:

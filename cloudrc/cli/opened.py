@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from cloudrc.record.recorder import Recorder
     from cloudrc.records import Record
 
+TRACE_MAX = 2 << 20
+"""Of a trace that the link's container names [bytes]: its own come from a ConfigMap of 1 MiB."""
+
 
 class Opened(NamedTuple):
     """What an end has before it is built, and flies with.
@@ -185,8 +188,10 @@ def _standing_check(
 
     def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
         profile = Profile.model_validate_json(json.dumps(values))
-        return link_profile(profile.uplink), link_profile(profile.downlink)
+        return link_profile(profile.uplink, file_max), link_profile(profile.downlink, file_max)
 
+    # Where the route is followed the link is a container, which may be anybody's by now.
+    file_max = TRACE_MAX if options.link is None else None
     asked = link_profile(experiment.uplink), link_profile(experiment.downlink)
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     stream = Stream(experiment.seed, uplink, kind, SIZES[kind])

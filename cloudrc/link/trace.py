@@ -14,6 +14,7 @@ from pathlib import Path
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Trace
+from cloudrc.link.route import read
 
 _TIME = "time_s"
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
@@ -21,11 +22,12 @@ _OPTIONAL = "loss"
 _HEADER = "the header is time_s,delay_ms[,loss]"
 
 
-def read_trace(path: Path) -> Trace:
+def read_trace(path: Path, size_max: int | None = None) -> Trace:
     """Read a trace from a CSV file.
 
     Args:
         path: The file.
+        size_max: Longest that is read [bytes], if somebody has named it who is not trusted.
 
     Returns:
         Times [s], delays [s] and, if there is such a column, losses in [0, 1].
@@ -33,24 +35,32 @@ def read_trace(path: Path) -> Trace:
     Raises:
         BadInputError: If it cannot be read or is not a trace; names file, line, value and remedy.
     """
-    lines = read_lines(path, f"trace {path}", "give a CSV file with the columns time_s,delay_ms")
+    remedy = "give a CSV file with the columns time_s,delay_ms"
+    lines = read_lines(path, f"trace {path}", remedy, size_max)
     try:
         return parse_trace(lines, str(path))
     except csv.Error as error:
         raise BadInputError(f"trace {path}: {error}; give a CSV file") from None
 
 
-def read_lines(path: Path, name: str, remedy: str) -> list[str]:
+def read_lines(path: Path, name: str, remedy: str, size_max: int | None = None) -> list[str]:
     """Read the lines of a text file, or raise a BadInputError that says what to give instead."""
     try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not a text file in UTF-8"
-        raise BadInputError(f"{name}: {reason}; {remedy}") from None
+        data = path.read_bytes() if size_max is None else read(path, size_max)
+        return data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        reason = "it is not a text file in UTF-8"
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+    raise BadInputError(f"{name}: {reason}; {remedy}")
 
 
-def read_table(path: Path) -> tuple[float, ...]:
+def read_table(path: Path, size_max: int | None = None) -> tuple[float, ...]:
     """Read the distribution of a trace's delays, whenever they were; lost packets have none.
+
+    Args:
+        path: The file.
+        size_max: As of `read_trace`.
 
     Returns:
         Shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,) [1].
@@ -58,7 +68,7 @@ def read_table(path: Path) -> tuple[float, ...]:
     Raises:
         BadInputError: As `read_trace`, and if all delays are the same.
     """
-    trace = read_trace(path)
+    trace = read_trace(path, size_max)
     losses = trace.losses or (0.0,) * len(trace.delays)
     delays = [delay for delay, loss in zip(trace.delays, losses, strict=True) if loss < 1.0]
     mean = fsum(delays) / max(len(delays), 1)

@@ -1,0 +1,43 @@
+"""What an end reads because the link's container names it is a file, and no longer than its own."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli import opened
+from cloudrc.config.load import load_experiment
+from cloudrc.drivers.standing_check import Asked, Load, StandingCheck
+from cloudrc.errors import BadInputError
+
+
+@pytest.fixture
+def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
+    """What the standing check reads the profile in link.json with."""
+    kept: list[Load] = []
+
+    def begin(self: StandingCheck, asked: Asked, path: Path | None, load: Load) -> None:
+        kept.append(load)
+
+    monkeypatch.setattr(StandingCheck, "begin", begin)
+    options = argparse.Namespace(link=None, route=tmp_path / "route")
+    opened._standing_check(options, load_experiment("paper"), uplink=False)
+    return kept[0]
+
+
+@pytest.mark.parametrize("key", ["trace", "table"])
+def test_what_the_link_names_as_a_trace_is_read_within_bounds(
+    tmp_path: Path, load: Load, key: str
+) -> None:
+    path, text = tmp_path / "trace.csv", "time_s,delay_ms\n0,45\n1,50\n"
+    profile = {"uplink": {key: str(path), "distribution": "table" if key == "table" else "normal"}}
+    path.write_text(text)
+    assert load(profile)[0].trace or load(profile)[0].table
+    path.write_text(text + "\n" * opened.TRACE_MAX)
+    with pytest.raises(BadInputError, match="longer than 2097152 bytes; give a CSV file"):
+        load(profile)
+    profile["uplink"][key] = "/dev/null"  # any device or pipe: one without an end takes all memory
+    with pytest.raises(BadInputError, match="not a file; give a CSV file"):
+        load(profile)
