@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import time
@@ -19,6 +20,7 @@ from cloudrc.cli import faults_page as page
 from cloudrc.cli import faults_slices as slices
 from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import paint, table, written
+from cloudrc.cli.signals import end_with
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -93,6 +95,8 @@ def _fly_all(search: Search, say: bool, stop: Callable[[], bool]) -> None:
     seeds = range(options.first, options.first + options.seeds)
     for finding in _findings(seeds, options):
         search.take(finding, say, stop)
+        if stop():  # what is printed may have no reader: a terminal that was closed
+            return
         if time.monotonic() - told > PROGRESS_PERIOD:
             told = time.monotonic()
             if options.slice is not None:
@@ -100,8 +104,6 @@ def _fly_all(search: Search, say: bool, stop: Callable[[], bool]) -> None:
             if say:
                 flown, failed = len(search.findings), len(search.failures)
                 print(f"{flown} of {options.seeds} flown, {failed} failed", flush=True)
-        if stop():
-            return
 
 
 class Search:
@@ -138,14 +140,20 @@ class Search:
 
 @contextmanager
 def stopping() -> Iterator[Callable[[], bool]]:
-    """Take SIGINT and SIGTERM for a wish to stop after the flight under way, the second at once."""
+    """Take a signal for a wish to stop after the flight under way, the second at once.
+
+    A terminal that is closed sends two, which are one wish; what `nohup` has started hears none.
+    """
     asked: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
 
     def ask(number: int, frame: FrameType | None) -> None:
         asked.append(number)
         for each in numbers:
-            signal.signal(each, signal.default_int_handler)
+            hung_up = each == signal.SIGHUP
+            signal.signal(each, signal.SIG_IGN if hung_up else signal.default_int_handler)
 
     before = [signal.signal(number, ask) for number in numbers]
     try:
@@ -181,17 +189,19 @@ def _findings(seeds: Iterable[int], options: argparse.Namespace) -> Iterator[Fin
     if options.jobs == 1:
         yield from map(_fly, work)
         return
-    pool = ProcessPoolExecutor(options.jobs, initializer=_leave_ctrl_c_to_the_first)
+    pool = ProcessPoolExecutor(options.jobs, None, _leave_signals_to, (os.getpid(),))
     try:
         yield from pool.map(_fly, work)  # one by one: so it soon ends when it is told to
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _leave_ctrl_c_to_the_first() -> None:
-    """A terminal's Ctrl-C reaches all processes: the first one says when the others end."""
+def _leave_signals_to(first: int) -> None:
+    """What a terminal sends reaches all processes: the first one says when the others end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    end_with(first)
 
 
 def _kind(options: argparse.Namespace) -> str:
@@ -239,7 +249,7 @@ def _report(finding: Finding, store: Path, say: bool, stop: Callable[[], bool]) 
     breaches = fly(smallest).breaches
     note = "\n".join(f"{b.time:.3f} s: {b.kind}: {b.text}" for b in breaches[:3])
     text = dump(smallest, f"Found by seed {finding.schedule.seed}.\n{note}")
-    if say:
+    if say and not stop():
         print(f"\n{paint('FAILED', 'red')} seed {finding.schedule.seed}\n{text}", flush=True)
     store.mkdir(parents=True, exist_ok=True)
     path = store / f"{'-'.join(sorted(kinds))}-{smallest.policy or 'seed'}-{smallest.seed}.yaml"

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.assembly import link_profile
 from cloudrc.cluster.forward import DIRECTLY
+from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.route import parse
 from cloudrc.errors import (
     BadInputError,
@@ -185,6 +186,7 @@ def _start(folder: Path, way: str, place: Place, mode: str) -> Shaping:
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
+            env={**os.environ, PARENT: str(os.getpid())},
             start_new_session=True,  # Ctrl-C reaches this process alone, which ends them
         )
     return Shaping(place, own, process)

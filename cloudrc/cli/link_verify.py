@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import place, place_arguments
 from cloudrc.cli.output import output_argument, written
+from cloudrc.cli.signals import end_orderly
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -90,6 +91,7 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"--seconds {options.seconds:g}: give a number from 1 to 3600")
     from cloudrc.cli.link_verify_text import as_document, as_text
 
+    end_orderly()  # without the namespaces and processes that it has made
     if options.ends or options.mode == "cluster":
         said = _ends(options)
     else:

@@ -17,6 +17,7 @@ from typing import Any
 from cloudrc.cli.closing import EXIT_CODES
 from cloudrc.cli.folder import new_folder
 from cloudrc.cli.output import unread_is_fine, written
+from cloudrc.cli.signals import end_with
 from cloudrc.cli.statistics import as_csv, as_table, summarise
 
 
@@ -73,7 +74,7 @@ def _reports(
     context = multiprocessing.get_context("spawn")
     workers = min(os.cpu_count() or 1, len(seeds))
     with _born_deaf_to_interrupts():  # it begins a process that sweeps up behind the others
-        pool = ProcessPoolExecutor(workers, context)
+        pool = ProcessPoolExecutor(workers, context, end_with, (os.getpid(),))
     with pool:
         try:
             with _born_deaf_to_interrupts():

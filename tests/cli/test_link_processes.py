@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from cloudrc.cli import link_processes
 from cloudrc.cli.link_processes import LOOPBACK, Place, Shaping, refuse_impossible
 from cloudrc.config.load import load_profile
+from cloudrc.drivers.process import PARENT
 from cloudrc.errors import BadInputError, CloudrcError
 
 ANY = (LOOPBACK, 9)
@@ -56,3 +58,10 @@ def test_what_netem_cannot_be_is_bad_input_and_names_the_flag() -> None:
 @pytest.mark.parametrize(("name", "mode"), [("lossy", "relay"), ("paper-p3", "netem")])
 def test_what_a_shaper_can_be_is_not_refused(name: str, mode: str) -> None:
     refuse_impossible(load_profile(name), mode)
+
+
+def test_a_links_process_is_told_whose_end_is_its_own(tmp_path: Path) -> None:
+    place = Place(ANY, ANY, ANY, inside=("printenv", PARENT))
+    one = link_processes._start(tmp_path, "uplink", place, "relay")
+    one.process.wait()
+    assert one.log.read_text().split() == [str(os.getpid())]

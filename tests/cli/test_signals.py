@@ -1,9 +1,17 @@
-"""A terminal that is closed ends a command as Ctrl-C does, unless `nohup` has started it."""
+"""A terminal that is closed ends a command as Ctrl-C does, unless `nohup` has started it.
+
+Its workers end with it, however it ends.
+"""
 
 from __future__ import annotations
 
 import os
+import select
 import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -38,6 +46,7 @@ def test_who_was_started_by_nohup_hears_of_no_hang_up() -> None:
     [
         ["run", "--seeds", "2", "--mode", "local"],
         ["mission", "fly", "--mission", "none.yaml", "--api", "http://127.0.0.1:9"],
+        ["link", "verify", "none"],
     ],
 )
 def test_who_flies_takes_a_hang_up_for_an_interrupt(
@@ -46,3 +55,31 @@ def test_who_flies_takes_a_hang_up_for_an_interrupt(
     monkeypatch.chdir(tmp_path)
     assert main(words) == 2
     assert signal.getsignal(signal.SIGHUP) is _hung_up
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "words", [["faults", "fuzz", "--seeds", "99", "--jobs", "2"], ["run", "steps", "--seeds", "9"]]
+)
+def test_workers_end_though_what_has_started_them_was_killed(
+    words: list[str], tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "cloudrc", *words]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE) as first:
+        assert first.stdout is not None
+        children = Path(f"/proc/{first.pid}/task/{first.pid}/children")
+        until = time.monotonic() + 60.0
+        while len(workers := children.read_text().split()) < 2:
+            assert first.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        time.sleep(3.0)  # they fly
+        first.kill()
+        first.wait()
+        while select.select([first.stdout], [], [], 20.0)[0]:  # nobody else can write to it
+            if not first.stdout.read1():
+                return
+    for worker in workers:
+        with suppress(ProcessLookupError):
+            os.kill(int(worker), signal.SIGKILL)
+    pytest.fail("they wait for work")

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cli import faults_slices
+from cloudrc.cli import faults_fuzz, faults_slices
 from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.main import main
 from cloudrc.faults.fuzz import Finding
@@ -140,7 +140,7 @@ def test_what_is_not_one_search_is_refused_by_name(
     assert not Path("page.md").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("at", [3, BAD])
 def test_what_was_flown_until_it_is_told_to_stop_is_a_slice(
     number: signal.Signals,
@@ -153,10 +153,12 @@ def test_what_was_flown_until_it_is_told_to_stop_is_a_slice(
         if schedule.seed == at and signal.getsignal(number) not in (
             signal.SIG_DFL,
             signal.default_int_handler,
+            signal.SIG_IGN,
         ):
             os.kill(os.getpid(), number)
         return _fly(schedule)
 
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup may have started the tests
     before = signal.getsignal(number)
     monkeypatch.setattr("cloudrc.faults.fuzz.fly", stopped)
     page = Path("page.md")
@@ -173,6 +175,20 @@ def test_what_was_flown_until_it_is_told_to_stop_is_a_slice(
     monkeypatch.setattr("cloudrc.faults.fuzz.fly", _fly)
     fuzz("b.json", at + 1, 20 - at, code=int(at < BAD))
     assert main(["faults", "merge", "a.json", "b.json"]) == 1
+
+
+def test_a_terminal_that_is_closed_says_so_twice_and_a_second_wish_ends_it_at_once() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    with faults_fuzz.stopping() as stop:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert stop()
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # by nohup
+    with faults_fuzz.stopping() as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert not stop()
 
 
 def test_without_a_name_the_slice_lies_beside_what_was_found(
@@ -245,6 +261,7 @@ def test_several_processes_stop_together_and_leave_a_slice_without_a_gap(
     def stopped(schedule: Schedule, keep: bool = False) -> Finding:
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
         if schedule.seed == 3:
             os.kill(first, signal.SIGTERM)
         time.sleep(0.05)
