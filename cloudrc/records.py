@@ -49,6 +49,7 @@ class GroundTruth(NamedTuple):
 class Arrival(NamedTuple):
     """Either end: a telemetry or command datagram arrived, late ones included.
 
+    Those that were repeated are noted up to as many as were sent; of more only the count is.
     Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
 
     Attributes:

@@ -232,7 +232,8 @@ class CloudEndpoint:
         if self._clock_is_shared:
             stamp_ns, slip_ns = codec.decode_stamps(body)
             delay = (now_ns - stamp_ns - slip_ns) * 1e-9
-        self._records.append(_new(Arrival, (now_ns, True, epoch, counter, delay, used)))
+        if outcome != REPEATED or not self._channel.is_flooded:
+            self._records.append(_new(Arrival, (now_ns, True, epoch, counter, delay, used)))
         if used:
             telemetry = codec.decode_telemetry(body)
             self.guard = telemetry.guard

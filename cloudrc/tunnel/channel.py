@@ -30,6 +30,12 @@ class Channel:
         """Forget everything: a new epoch begins."""
         self._newest = -1
         self._seen = 0  # bit k: newest - k has arrived
+        self._repeats = 0
+
+    @property
+    def is_flooded(self) -> bool:
+        """Whether more was repeated than sent, which no link does: to write it all down is work."""
+        return self._repeats > self._newest + 1
 
     def take(self, counter: int) -> str:
         """Say what becomes of the datagram with this counter: USED, LATE or REPEATED."""
@@ -39,6 +45,7 @@ class Channel:
             self._seen = ((self._seen << ahead) | 1) & _MASK if ahead < WINDOW else 1
             return USED
         if ahead <= -WINDOW or self._seen >> -ahead & 1:
+            self._repeats += 1
             return REPEATED
         self._seen |= 1 << -ahead
         return LATE if self._newest_wins else USED

@@ -261,7 +261,8 @@ class WorldEndpoint:
             outcome = "stale" if stalled else guard.offer(command, self._clock.tick_ns) or USED
         used = outcome == USED
         delay = (now_ns - command.stamp_ns) * 1e-9 if self._clock_is_shared else nan
-        self._records.append(_new(Arrival, (world_ns, False, epoch, counter, delay, used)))
+        if outcome != REPEATED or not self._channel.is_flooded:
+            self._records.append(_new(Arrival, (world_ns, False, epoch, counter, delay, used)))
         if used and guard.state is TRACK:
             self._waiting = (epoch, counter, command)
         self._counts[outcome] += 1

@@ -54,6 +54,9 @@ class Captured(VirtualRun):
         return [peek(data)[0] for data in drawn]
 
 
+FLOWING = (Kind.TELEMETRY, Kind.COMMAND)
+
+
 @pytest.fixture(scope="module")
 def first() -> Captured:
     run = Captured(b"world 1", b"cloud 1")
@@ -103,6 +106,21 @@ def test_the_same_run_replayed_while_it_lasts_is_all_repeated():
     # What was still on the link counts once, when its copy arrives first.
     assert len({(r.uplink, r.epoch, r.counter) for r in arrivals + used}) == len(arrivals + used)
     assert run.world._session.epoch == epoch
+
+
+def test_a_flood_of_what_is_repeated_is_counted_and_not_recorded_one_by_one():
+    run = Captured(b"world 1", b"cloud 1")
+    run.go(2 * SECOND_NS)
+    heard = {way: [d for d in data if peek(d)[0] in FLOWING] for way, data in run.heard.items()}
+    run.world.take_records(), run.cloud.take_records()
+    for _ in range(10):
+        for way, end in ((True, run.world), (False, run.cloud)):
+            for data in heard[way]:
+                end.receive_datagram(data, run.now_ns)
+    for way, end in ((True, run.world), (False, run.cloud)):
+        assert end._counts["repeated"] > 9 * len(heard[way])
+        told = [record for record in end.take_records() if isinstance(record, Arrival)]
+        assert 0 < len(told) <= len(heard[way]) + end._channel._newest + 2
 
 
 def test_sealed_and_unsealed_flights_are_the_same_flight():

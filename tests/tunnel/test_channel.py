@@ -54,6 +54,20 @@ def test_a_new_epoch_forgets_all_counters():
     assert channel.take(0) == USED
 
 
+def test_more_that_is_repeated_than_sent_is_a_flood():
+    channel = Channel(newest_wins=True)
+    for counter in (0, 1, 0, 1):  # a link that doubles everything
+        channel.take(counter)
+    assert not channel.is_flooded
+    channel.take(0)
+    assert channel.is_flooded
+    channel.take(2)
+    assert not channel.is_flooded
+    channel.take(2)
+    channel.reset()
+    assert not channel.is_flooded
+
+
 def expected(counter, seen, newest_wins):
     if counter in seen:
         return REPEATED
