@@ -1,6 +1,7 @@
 """What strangers send is work for the thread that serves the emergency stop: little at a time."""
 
 import http.client
+import time
 
 import pytest
 from api_harness import connect, head, running
@@ -65,6 +66,7 @@ def test_a_body_in_chunks_that_has_come_leaves_its_connection_open():
 
 @pytest.mark.promise("P-API-8")
 def test_a_head_has_no_more_room_than_is_said_if_it_comes_at_once_either():
+    assert api_server.HEAD_MAX <= 4096, "lines of four bytes each: 64 such heads take a while"
     with running() as one:
         with connect(one) as connection:
             rest = api_server.HEAD_MAX - len(head("GET", "/v1/state", "X: "))
@@ -73,3 +75,19 @@ def test_a_head_has_no_more_room_than_is_said_if_it_comes_at_once_either():
         connection = connect(one)
         connection.sendall(head("GET", "/v1/state", "X: " + "y" * api_server.HEAD_MAX * 2))
         assert until_closed(connection).startswith(b"HTTP/1.1 400 ")
+
+
+@pytest.mark.promise("P-API-8")
+def test_a_stop_that_is_there_is_served_though_very_many_come_behind_it_at_once():
+    """All of them while the server's thread is busy: it takes them when it is free again."""
+    with running() as one:
+        loop = one.server._server.servers[0].get_loop()
+        loop.call_soon_threadsafe(time.sleep, 1.0)
+        stop = connect(one)
+        stop.sendall(head("POST", "/v1/estop", "Content-Length: 0"))
+        crowd = [connect(one) for _ in range(api_connections.CONNECTIONS_MAX + 50)]
+        assert not one.alarms  # all of them wait in the kernel
+        assert b" 200 " in stop.recv(4096)
+        assert one.alarms
+        for connection in (stop, *crowd):
+            connection.close()

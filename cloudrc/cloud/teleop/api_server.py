@@ -21,8 +21,12 @@ Address: TypeAlias = tuple[str, int] | Path
 STOP_LIMIT = 1.0
 """For requests to end once the server shall stop [s]."""
 BACKLOG = 1_024
-HEAD_MAX = 16_384
-"""Length of a request's head [bytes]."""
+"""Connections that the kernel keeps until they are taken."""
+ACCEPT_MAX = 16
+"""Connections taken before those that are there are read: of more, the emergency stop's could be
+the longest without a request, and be cut off, though it is there."""
+HEAD_MAX = 4_096
+"""Length of a request's head [bytes]; one of shortest lines is 4 ms of work."""
 
 
 class ApiServer:
@@ -50,7 +54,7 @@ class ApiServer:
             )
         self._crowd, self._gate, self._bridge = Crowd(), gate, bridge
         self._socket, self.url = _bound(address)
-        self._server = uvicorn.Server(
+        self._server = _Server(
             uvicorn.Config(
                 gate,
                 loop="asyncio",
@@ -61,7 +65,7 @@ class ApiServer:
                 access_log=False,
                 server_header=False,
                 proxy_headers=False,  # the audit log names whoever connects, not whom they name
-                backlog=BACKLOG,
+                backlog=ACCEPT_MAX,
                 h11_max_incomplete_event_size=HEAD_MAX,
                 timeout_keep_alive=round(HEAD_LIMIT),
                 timeout_graceful_shutdown=1,
@@ -89,6 +93,16 @@ class ApiServer:
 
     def _run(self) -> None:
         self._server.run(sockets=[self._socket])
+
+
+class _Server(uvicorn.Server):
+    """Takes few connections at a time, and lets many wait; for asyncio both is one number."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to serve."""
+        await super().startup(sockets)
+        for each in sockets or []:
+            each.listen(BACKLOG)
 
 
 def _bound(address: Address) -> tuple[socket.socket, str]:
