@@ -191,6 +191,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
         mission, ended = cut_to_last_mission(merge(folder / "world.mcap", folder / "cloud.mcap"))
         if ended or not want_end:
             break
+    _fetch_before(release, folder, tell)
     for component in COMPONENTS:
         for fetch, suffix in ((fetch_metrics, "metrics"), (fetch_logs, "log")):
             try:
@@ -218,6 +219,20 @@ def _fetch_recordings(release: Release, folder: Path, tell: Tell) -> None:
                     raise
                 tell(f"{error}; trying again")
                 time.sleep(FLUSH)
+
+
+def _fetch_before(release: Release, folder: Path, tell: Tell) -> None:
+    """Copy what led to the end of a container, if one was started again; the report needs none."""
+    from cloudrc.cluster.fetch import fetch_before
+
+    for component in COMPONENTS:
+        path = folder / f"{component}.before.mcap"
+        try:
+            if fetch_before(release, component, path):
+                tell(f"{component} was started again; what it had recorded before is in {path}")
+        except CloudrcError as error:
+            path.unlink(missing_ok=True)
+            tell(f"{component} was started again; no recording from before: {error}")
 
 
 def shaper(folder: Path) -> str:

@@ -16,8 +16,6 @@ from cloudrc.cluster.pods import find_pod
 from cloudrc.cluster.tools import run
 
 DATA = "/var/lib/cloudrc"
-RECORDINGS = {"world": f"{DATA}/world.mcap", "cloud": f"{DATA}/cloud.mcap"}
-"""Component, which is its container's name too -> where it records."""
 METRICS = {
     "world": {"world": 9100, "link": 9102},
     "cloud": {"cloud": 9100, "teleop": 9101, "link": 9102},
@@ -34,16 +32,42 @@ def fetch_recording(release: Release, component: str, target: Path) -> None:
 
     Args:
         release: Where it flew.
-        component: "world" or "cloud".
+        component: "world" or "cloud", which is its container's name, too.
         target: File to write.
 
     Raises:
         ClusterError: If there is no such pod or file.
     """
-    pod = find_pod(release, component).metadata.name
-    arguments = [*release.flags, "exec", pod, f"--container={component}", "--"]
+    _copy(release, component, find_pod(release, component).metadata.name, "", target)
+
+
+def fetch_before(release: Release, component: str, target: Path) -> bool:
+    """Copy what the container before this one had recorded in the same pod.
+
+    Args:
+        release: Where it flew.
+        component: As of `fetch_recording`.
+        target: File to write.
+
+    Returns:
+        Whether there was one.
+
+    Raises:
+        ClusterError: If there was, and it has left no file.
+    """
+    pod = find_pod(release, component)
+    statuses = pod.status.container_statuses or []
+    if not any(status.name == component and status.restart_count for status in statuses):
+        return False
+    _copy(release, component, pod.metadata.name, ".before", target)
+    return True
+
+
+def _copy(release: Release, component: str, pod: str, which: str, target: Path) -> None:
+    path = f"{DATA}/{component}{which}.mcap"
+    arguments = [*release.flags, "exec", pod, f"--container={component}", "--", "cat", path]
     with target.open("wb") as file:
-        run("kubectl", [*arguments, "cat", RECORDINGS[component]], timeout=COPY_LIMIT, stdout=file)
+        run("kubectl", arguments, timeout=COPY_LIMIT, stdout=file)
 
 
 def fetch_metrics(release: Release, component: str) -> dict[str, str]:

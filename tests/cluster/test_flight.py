@@ -126,6 +126,29 @@ def test_a_run_in_runs_is_the_latest_one(pods: FakeApi, tmp_path: Path) -> None:
     assert (tmp_path / "runs" / "latest" / "report.json").is_file()
 
 
+@pytest.mark.parametrize("left", [True, False], ids=["left", "nothing"])
+def test_what_a_container_recorded_before_it_was_started_again_is_brought_along(
+    pods: FakeApi,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    pretend: Callable[[str, str], Path],
+    left: bool,
+) -> None:
+    (key,) = [key for key in pods.objects if key[0] == "pods" and "world" in key[2]]
+    pods.objects[key]["status"]["containerStatuses"][0]["restartCount"] = 1
+    other = (tmp_path / "bin" / "kubectl").read_text().removeprefix("#!/bin/sh\n")
+    before = "echo before; exit 0" if left else "echo 'cat: no such file' >&2; exit 1"
+    pretend("kubectl", f'case "$*" in *before*) {before} ;; esac\n{other}')
+    at_look(pods, 2, ending(pods, "Complete", 0, "mission done"))
+    assert main([*LINE, "--out", "out"]) == 6
+    out, said = tmp_path / "out", capsys.readouterr().err
+    assert not (out / "cloud.before.mcap").exists()
+    assert (out / "world.before.mcap").exists() is left
+    assert "world was started again" in said
+    if left:
+        assert (out / "world.before.mcap").read_text() == "before\n"
+
+
 def test_a_way_that_breaks_off_costs_the_metrics_and_not_the_report(
     pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Patch
 ) -> None:
