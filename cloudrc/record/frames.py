@@ -7,6 +7,7 @@ believed before it is compared with what is there and with a limit.
 from __future__ import annotations
 
 import io
+import re
 import struct
 import zlib
 from collections.abc import Iterator
@@ -46,9 +47,11 @@ _CLASSES: dict[int, Any] = {
     Opcode.FOOTER: kinds.Footer,
 }
 _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
-_MARKS = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")
+_MARK = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
+_MARK_MAX = 8
 _MARK_OFFSET = 37  # of the name of its compression, from a chunk's first byte
-_BLOCK = 1 << 20
+_BLOCK_MIN, _BLOCK_MAX = 1 << 12, 1 << 20
+"""Searched at a time [bytes]: little at first, for there may be a break after every chunk."""
 
 
 class DamagedError(ValueError):
@@ -178,16 +181,12 @@ def next_chunk(stream: IO[bytes], start: int, size: int) -> int | None:
 
 def _marks(stream: IO[bytes], start: int, size: int) -> Iterator[int]:
     """Where the names of compressions stand, in the order of the file."""
-    overlap = max(map(len, _MARKS)) - 1
+    length = _BLOCK_MIN
     while start < size:
         stream.seek(start)
-        block = stream.read(_BLOCK + overlap)
-        found = []
-        for mark in _MARKS:
-            at = block.find(mark)
-            while at >= 0:
-                if at < _BLOCK:
-                    found.append(start + at)
-                at = block.find(mark, at + 1)
-        yield from sorted(found)
-        start += _BLOCK
+        block = stream.read(length + _MARK_MAX - 1)
+        for mark in _MARK.finditer(block):
+            if mark.start() < length:
+                yield start + mark.start()
+        start += length
+        length = min(2 * length, _BLOCK_MAX)

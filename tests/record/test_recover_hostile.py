@@ -85,3 +85,29 @@ def test_definitions_beyond_their_room_are_left_out_with_their_messages(
     recovery = recover(path, tmp_path / "new.mcap")
     assert (recovery.kept["messages"], recovery.kept["channels"]) == (4, 3)
     assert recovery.dropped == {"messages": 2}
+
+
+class Counting(io.BytesIO):
+    taken = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        self.taken += len(data)
+        return data
+
+
+def test_a_break_after_every_chunk_costs_no_look_at_all_the_rest() -> None:
+    count = 300
+    stream = Counting(file(*[chunk(channel(1), message(1)) + bytes(9)] * count))
+    scan = Scan(stream)
+    assert len(list(scan.records())) == 1 + 2 * count
+    assert scan.dropped == {"records": count - 1}
+    assert stream.taken < 5_000 * count
+
+
+@pytest.mark.parametrize("gap", [4_000, 4_080, 4_095, 4_096, 12_283, 12_288, 3_000_000])
+def test_the_next_chunk_is_found_however_far_it_is(gap: int) -> None:
+    data = file(chunk(channel(1), message(1)), bytes(gap), chunk(channel(1), message(1)))
+    scan = Scan(io.BytesIO(data))
+    assert len(list(scan.records())) == 5
+    assert scan.skipped == gap
