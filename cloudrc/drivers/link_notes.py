@@ -15,7 +15,7 @@ from pathlib import Path
 
 from cloudrc.errors import in_one_line
 from cloudrc.link.route import read, version
-from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, LinkState, from_text
+from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, LinkState, from_text
 from cloudrc.records import (
     Counted,
     GuardChange,
@@ -82,7 +82,7 @@ class LinkNotes:
     def _late(self, stamp_ns: int) -> list[Record]:
         """Say how late datagrams left since the relay began; nothing where none does."""
         try:
-            told = json.loads(read(self._released))
+            told = json.loads(read(self._released, STATE_MAX))
             counts = {name: int(n) for name, n in told.items() if name in RELEASED}
         except NONSENSE:
             return []
@@ -97,7 +97,7 @@ class LinkNotes:
             return False
         self._seen = seen  # nonsense stays nonsense until it is another file
         try:
-            state = from_text(read(self._path).decode())
+            state = from_text(read(self._path, STATE_MAX).decode())
             self._note = _note(state, self._uplink, now_ns)
         except NONSENSE:
             return False

@@ -21,7 +21,7 @@ from cloudrc.drivers.standing_tally import Tally
 from cloudrc.errors import in_words
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.route import read
-from cloudrc.link.state import from_text
+from cloudrc.link.state import STATE_MAX, from_text
 from cloudrc.link.verify_block import Block
 from cloudrc.link.verify_judge import Row
 from cloudrc.link.verify_standing import RECENT, verdict_of
@@ -218,7 +218,7 @@ def _follow(
     seen, failed = "", False
     while True:
         try:
-            text = read(path).decode() if path is not None else seen
+            text = read(path, STATE_MAX).decode() if path is not None else seen
             if text != seen:
                 seen = text
                 state = from_text(text)

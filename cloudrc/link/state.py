@@ -15,6 +15,9 @@ from cloudrc.link.timeline import Timeline
 
 STATE_FILE = "link.json"
 """Name of the file, beside the route."""
+STATE_MAX = 1 << 16
+"""Longest that an end of the tunnel reads of it [bytes]: some 800 changes of a time line. What is
+wrong with a profile of 1 MiB takes 2 s to find, in which the loop would stand still."""
 RELEASED_SUFFIX = ".released"
 """Of the file beside it that tells how late a relay's datagrams left so far: names and whole
 numbers, as JSON. A file of its own, since the state is read only when the link changes."""

@@ -14,8 +14,8 @@ import pytest
 from cloudrc.drivers.feed import Feed, in_words
 from cloudrc.drivers.link_notes import LinkNotes
 from cloudrc.link.relay_errors import ReleaseErrors, in_ns
-from cloudrc.link.route import SIZE_MAX, publish
-from cloudrc.link.state import LinkState, to_text
+from cloudrc.link.route import publish
+from cloudrc.link.state import STATE_MAX, LinkState, to_text
 from cloudrc.messages import GuardState
 from cloudrc.records import Counted, GuardChange, LinkChanged, Record, SessionOpened
 
@@ -111,7 +111,7 @@ def test_a_refusal_or_a_broken_file_is_no_change(tmp_path: Path) -> None:
         {"profile": []},
         {"direction": {}},
         {"shaper": 5},
-        {"reason": "x" * SIZE_MAX},
+        {"reason": "x" * STATE_MAX},
     ],
     ids=lambda wrong: next(iter(wrong)),
 )

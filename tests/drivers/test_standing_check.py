@@ -28,6 +28,7 @@ from cloudrc.drivers.standing_check import StandingCheck
 from cloudrc.drivers.standing_tally import Tally
 from cloudrc.exposition.check import Check
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.state import STATE_MAX
 from cloudrc.link.verify_twin import WINDOW, Heard, Twin
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
@@ -143,6 +144,27 @@ def test_the_profile_is_followed_in_the_state_of_the_link_through_nonsense(tmp_p
     assert seen.wait(20.0)
     records, _ = checked(check, arrivals(slow))
     assert newest(records)["mean"].asked == pytest.approx(0.070)
+
+
+def test_a_state_of_the_link_that_would_hold_the_loop_is_not_loaded(tmp_path: Path) -> None:
+    check, path, loaded, done = downlink(PAPER), tmp_path / "link.json", list[object](), Event()
+    check.follow = lambda *given: None  # type: ignore[method-assign]
+    names = ("shaper", "reason", "mode", "direction", "since", "since_ns")
+
+    def state(profile: str, reason: str = "") -> str:
+        return json.dumps(dict.fromkeys(names, "") | {"profile": profile, "reason": reason})
+
+    def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
+        loaded.append(values)
+        done.set()
+        return PAPER, PAPER
+
+    path.write_text(state("long", "x" * STATE_MAX))
+    check.begin((PAPER, PAPER), path, load)
+    assert check._jobs is not None
+    check._jobs.put(lambda: path.write_text(state("short")))  # after the first look
+    assert done.wait(20.0)
+    assert loaded == ["short"]
 
 
 def test_a_new_session_begins_anew() -> None:
