@@ -113,7 +113,7 @@ def serve_teleop(
         peer: The socket to cloud.
         encode: Writes a message for cloud.
         decode: Reads one from cloud.
-        calls: What other threads want to be done, here and now [ns]; must not block.
+        calls: See `turn`.
         tell: Gets events and faults, at every wake that has some; must not block.
         stop: Asked at every wake.
     """
@@ -123,23 +123,50 @@ def serve_teleop(
         # Not woken by what comes: telemetry is twice as frequent, and of several the newest counts.
         time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
         now_ns = time.monotonic_ns()
-        arrived, was_blind, late_ns = peer.receive(), blind, now_ns - deadline_ns
+        late_ns = now_ns - deadline_ns
         deadline_ns += (late_ns // PERIOD_NS + 1) * PERIOD_NS
-        blind = blind_for(blind, late_ns, bool(arrived))
-        if blind:
-            continue
-        seen = _newest(arrived, decode)
-        if was_blind and seen is not None:  # first: a call may be about where the robot is
-            machine.see(seen, now_ns)
-        for call in calls():  # first: what has arrived may already show what a call asked for
-            call(now_ns)
-        if not was_blind and seen is not None:
-            machine.see(seen, now_ns)
-        machine.handle_deadline(now_ns)
-        _send_again(unsent, peer)
-        told = _send(machine.take_outputs(), unsent, peer, encode)
-        if told:
+        blind = turn(machine, peer, decode, calls, blind=blind, late_ns=late_ns, now_ns=now_ns)
+        if not blind and (told := send(machine.take_outputs(), unsent, peer, encode)):
             tell(told)
+
+
+def turn(
+    machine: Machine,
+    peer: UnixPeer,
+    decode: Decode,
+    calls: Callable[[], Iterable[Callable[[int], None]]],
+    *,
+    blind: int,
+    late_ns: int,
+    now_ns: int,
+) -> int:
+    """Do what is due at one wake of teleop.
+
+    Args:
+        machine: Sees, is asked, and gets its deadline.
+        peer: The socket to cloud.
+        decode: Reads a message from cloud.
+        calls: What other threads want to be done, here and now [ns]; must not block.
+        blind: What was returned at the wake before; 0 at first.
+        late_ns: By how much this wake is late [ns].
+        now_ns: Now [ns].
+
+    Returns:
+        For how many wakes more teleop does not look; as long as there are any, nothing is done.
+    """
+    arrived, was_blind = peer.receive(), blind
+    blind = blind_for(was_blind, late_ns, bool(arrived))
+    if blind:
+        return blind
+    seen = _newest(arrived, decode)
+    if was_blind and seen is not None:  # first: a call may be about where the robot is
+        machine.see(seen, now_ns)
+    for call in calls():  # first: what has arrived may already show what a call asked for
+        call(now_ns)
+    if not was_blind and seen is not None:
+        machine.see(seen, now_ns)
+    machine.handle_deadline(now_ns)
+    return 0
 
 
 def blind_for(before: int, late_ns: int, arrived: bool) -> int:
@@ -155,19 +182,17 @@ def blind_for(before: int, late_ns: int, arrived: bool) -> int:
     return BLIND_WAKES if late_ns > STALL_NS else 0
 
 
-def _newest(arrived: list[bytes], decode: Decode) -> Any:
-    """Decode the last datagram that is a message; None if none is."""
-    for data in reversed(arrived):
-        with suppress(ValueError):
-            return decode(data)
-    return None
-
-
-def _send(
+def send(
     outputs: Sequence[Any], unsent: deque[bytes], peer: UnixPeer, encode: Encode
 ) -> list[MissionEvent | Fault]:
-    """Send what is for cloud; return what is to be told elsewhere, too."""
+    """Send what is for cloud, first the events that still wait for it in `unsent`.
+
+    Returns:
+        What is to be told elsewhere, too.
+    """
     told: list[MissionEvent | Fault] = []
+    while unsent and peer.send(unsent[0]):
+        unsent.popleft()
     for output in outputs:
         if isinstance(output, MissionEvent | Fault):
             told.append(output)
@@ -182,6 +207,9 @@ def _send(
     return told
 
 
-def _send_again(unsent: deque[bytes], peer: UnixPeer) -> None:
-    while unsent and peer.send(unsent[0]):
-        unsent.popleft()
+def _newest(arrived: list[bytes], decode: Decode) -> Any:
+    """Decode the last datagram that is a message; None if none is."""
+    for data in reversed(arrived):
+        with suppress(ValueError):
+            return decode(data)
+    return None

@@ -14,22 +14,20 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.teleop import wire
 from cloudrc.cloud.teleop.api_bridge import WAITING_MAX, Call
 from cloudrc.cloud.teleop.journal_format import Entry
-from cloudrc.cloud.teleop.messages import Seen
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, blind_for
+from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, send, turn
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.faults.desk import Desk
 from cloudrc.faults.mortal import Mortal
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Event
 from cloudrc.messages import NEVER_NS
-from cloudrc.records import Fault, MissionEvent
 
 SOCKET_MAX = 11
 """Datagrams that wait: one more than net.unix.max_dgram_qlen, which is 10 in a new namespace."""
@@ -161,52 +159,36 @@ class Apart(Desk):
         self._host.at(self._free_ns * 1e-9, self._turn)
 
     def _turn(self, now_ns: int) -> None:
-        service = self.service
-        if service is None or self._host is None or now_ns < self._free_ns:
+        if self.service is None or self._host is None or now_ns < self._free_ns:
             return
         self._send()  # what has waited for the end of an fsync
         own_ns, turned_ns = self._host.clock.at(now_ns), self._turn_ns
         self._turn_ns = self._free_ns = now_ns
-        arrived, was_blind = self._peer.receive(), self._blind
         late_ns = now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0
-        self._blind = blind_for(was_blind, late_ns, bool(arrived))
-        if self._blind:
-            return
-        if was_blind:
-            self._look_at(arrived, own_ns)
-        self._obey(service, own_ns)
-        if not was_blind:
-            self._look_at(arrived, own_ns)
-        super().handle_deadline(own_ns)
+        self._blind = turn(
+            self,
+            self._peer,
+            wire.decode,
+            self._take_calls,
+            blind=self._blind,
+            late_ns=late_ns,
+            now_ns=own_ns,
+        )
         if self._free_ns > now_ns:
             self._turn_when_free()
         else:
             self._send()
 
-    def _obey(self, service: MissionService, own_ns: int) -> None:
-        if self._ends:
-            self._ends = False
-            service.pause(own_ns)
-        calls, self._calls = self._calls, []
-        for call in calls:
-            super().ask(call, own_ns)
-
-    def _look_at(self, arrived: list[bytes], own_ns: int) -> None:
-        if arrived:
-            seen = wire.decode(arrived[-1])
-            assert isinstance(seen, Seen), "cloud says nothing else"
-            super().see(seen, own_ns)
+    def _take_calls(self) -> list[Callable[[int], None]]:
+        ask, shut_down = super().ask, super().shut_down
+        calls: list[Callable[[int], None]] = [shut_down] if self._ends else []
+        calls += [partial(ask, call) for call in self._calls]
+        self._calls, self._ends = [], False
+        return calls
 
     def _send(self) -> None:
         """Say it to cloud: events wait for one that is there, everything else is repeated."""
-        while self._unsent and self._peer.send(self._unsent[0]):
-            self._unsent.popleft()
-        for output in self.take_outputs():
-            if isinstance(output, Fault):
-                continue  # for teleop's own log
-            data, once = wire.encode(output), isinstance(output, MissionEvent)
-            if ((once and self._unsent) or not self._peer.send(data)) and once:
-                self._unsent.append(data)
+        send(self.take_outputs(), self._unsent, self._peer, wire.encode)
 
     def _keep(self, entry: Entry) -> None:
         began_ns, life = self._free_ns, self._life
