@@ -15,6 +15,7 @@ from contextlib import suppress
 from typing import Any, Protocol
 
 from cloudrc.drivers.unix import UnixPeer
+from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
 
 PERIOD_NS = 20_000_000
@@ -65,8 +66,8 @@ class RemoteTeleop:
     def __init__(self, peer: UnixPeer, encode: Encode, decode: Decode, start_ns: int) -> None:
         """Join the socket; teleop has a second from `start_ns` [ns] to speak."""
         self._peer, self._encode, self._decode = peer, encode, decode
-        self._heard_ns, self._silent = start_ns, False
-        self._tell_ns = start_ns
+        self._heard_ns, self._silent, self._stalled = start_ns, False, False
+        self._tell_ns = self._looked_ns = start_ns
         self.outputs: list[Any] = []
         self.malformed = 0
 
@@ -77,14 +78,22 @@ class RemoteTeleop:
             self._peer.send(self._encode(seen))
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Take in what teleop has said; once it has been silent for a second, say so."""
+        """Take in what teleop has said; once it has been silent for a second, say so.
+
+        What led somewhere while cloud stood still may be taken back behind a full socket: teleop
+        says it again if it is not. Not twice in a row: a cloud that is always late flies, too.
+        """
+        self._stalled = not self._stalled and now_ns - self._looked_ns > STALL_NS
+        self._looked_ns = now_ns
         for data in self._peer.receive():
             try:
-                self.outputs.append(self._decode(data))
+                said = self._decode(data)
             except ValueError:
                 self.malformed += 1
                 continue
             self._heard_ns, self._silent = now_ns, False
+            if not (self._stalled and _leads(said)):
+                self.outputs.append(said)
         if not self._silent and now_ns - self._heard_ns > SILENCE_NS:
             self._silent = True
             text = "teleop has been silent for 1 s: the last setpoint is kept; see teleop's log"
@@ -205,6 +214,13 @@ def send(
             if once:
                 unsent.append(data)
     return told
+
+
+def _leads(said: Any) -> bool:
+    """Whether it is to start, or to fly to a waypoint; an end, a stop and a hold are neither."""
+    if isinstance(said, OperatorRequest):
+        return said.request is Request.START
+    return isinstance(said, Setpoint) and said.waypoint >= 0
 
 
 def _newest(arrived: list[bytes], decode: Decode) -> Any:

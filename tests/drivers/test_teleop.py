@@ -9,7 +9,7 @@ from cloudrc.cloud.teleop.wire import decode, encode
 from cloudrc.drivers.teleop import BLIND_WAKES, EVENTS_KEPT, STALL_NS, RemoteTeleop, serve_teleop
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.errors import BadInputError
-from cloudrc.messages import Setpoint
+from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
 
 SECOND = 1_000_000_000
@@ -76,6 +76,28 @@ def test_teleop_is_told_of_every_second_telemetry(peers):
     for number in range(10):
         teleop.see(POINT._replace(waypoint=number), 10_000_000 * number)
     assert [decode(data).waypoint for data in other.receive()] == [0, 2, 4, 6, 8]
+
+
+def request(number, what):
+    return OperatorRequest(number, what, mission_id=7)
+
+
+@pytest.mark.promise("P-GUARD-6")
+@pytest.mark.parametrize("stalled", [False, True])
+def test_after_a_stall_cloud_passes_on_what_stops_and_not_what_leads(peers, stalled):
+    """What takes it back has found the socket full."""
+    one, other = peers
+    teleop = RemoteTeleop(one, encode, decode, SECOND)
+    words = [request(n, each) for n, each in enumerate(Request, 1)]
+    words += [POINT, POINT._replace(waypoint=0), event(0)]
+    for said in words:
+        other.send(encode(said))
+    teleop.handle_deadline(SECOND + STALL_NS + stalled)
+    leads = [words[0], words[-2]] if stalled else []
+    assert teleop.take_outputs() == [said for said in words if said not in leads]
+    other.send(encode(words[0]))  # it says it again, to a cloud that is always late, too
+    teleop.handle_deadline(3 * SECOND if stalled else SECOND + STALL_NS + 10_000_000)
+    assert teleop.take_outputs() == words[:1]
 
 
 def test_what_is_no_message_is_counted(peers):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -163,10 +164,27 @@ def test_it_lives_on_while_cloud_is_away_and_what_it_says_is_lost_but_for_events
 
 
 def test_a_frozen_cloud_has_room_for_eleven_words(patch: Patch) -> None:
-    story = Story(patch, Event("cloud_paused", 8.0, 3.0), until=10.99)
+    held = Event("held", 7.5, 5.0)
+    story = Story(patch, held, Event("cloud_paused", 8.0, 3.0), until=10.99)
     assert story.of(Setpoint, 8.0, 10.99) == []
     story.flight.fly(11.005)
     assert len(story.of(Setpoint, 10.99, 11.005)) == SOCKET_MAX
+
+
+@pytest.mark.promise("P-GUARD-6")
+def test_a_frozen_cloud_passes_on_no_start_that_its_socket_has_kept() -> None:
+    """There was no room for the end behind it: the rotors turned until that was said again."""
+    flight = Flight("link.profile=ideal", seed=3, apart=True, start=False)
+    inject(flight, Schedule(3, events=(Event("cloud_paused", 8.0, 3.03),)), Wall())
+    flight.cloud.at(8.2, flight.ask_for_mission)
+    flight.cloud.at(10.0, partial(flight.desk.ask, _cancel))
+    flight.fly(13.0)
+    assert flight.mission.state == "cancelled"
+    assert flight.changes == []
+
+
+def _cancel(service: MissionService, now_ns: int) -> None:
+    service.cancel(service.book.open()[0].id, now_ns)
 
 
 def test_calls_come_before_what_has_arrived_and_those_to_the_dead_are_dropped(
