@@ -13,8 +13,9 @@ from cloudrc.errors import BadInputError
 
 DATAGRAM_MAX = 8_192
 """Longer than any message of ours [bytes]."""
-DRAIN_MAX = 256
-"""Datagrams taken per wake, so that a flood cannot keep a loop from its deadlines."""
+DRAIN_MAX = 1024
+"""Datagrams taken per wake, so that a flood cannot keep a loop from its deadlines; more than wait
+at once: systemd lets 513, so that nothing of a stall is left for the wake behind it."""
 PATH_MAX = 107
 """Bytes of a socket's path, less its end. Source: unix(7), `sun_path`."""
 

@@ -37,6 +37,20 @@ def test_a_full_socket_drops_and_never_blocks(peers):
     assert other.receive()[0] == b"0"
 
 
+def test_all_that_systemd_lets_wait_is_taken_in_one_wake(peers, monkeypatch):
+    waiting = [b"past"] * 513
+
+    class Inbox:
+        def recv(self, size):
+            if waiting:
+                return waiting.pop()
+            raise BlockingIOError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(peers[0], "_socket", Inbox())
+        assert len(peers[0].receive()) == 513
+
+
 def test_a_neighbour_that_is_away_or_new_is_no_error(peers, tmp_path):
     one, other = peers
     other.close()
