@@ -108,11 +108,10 @@ class _Ending:
 
         if not self._asked():
             return False
-        now_ns = time.monotonic_ns()
         if self._since_ns is None:
-            self._since_ns = now_ns
-            self._service.pause(now_ns)
-        return self._service.settled or now_ns - self._since_ns > PAUSE_LIMIT_NS
+            self._service.pause(time.monotonic_ns())
+            self._since_ns = time.monotonic_ns()  # its disk may have taken long
+        return self._service.settled or time.monotonic_ns() - self._since_ns > PAUSE_LIMIT_NS
 
 
 def _fly(

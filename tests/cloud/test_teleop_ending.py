@@ -4,8 +4,11 @@ import pytest
 from service_harness import ServiceFlight, flying
 from teleop_harness import AWAY, B, C
 
+from cloudrc.cli.teleop import _Ending
+from cloudrc.cloud.teleop import wire
 from cloudrc.cloud.teleop.service_book import UnavailableError
-from cloudrc.messages import GuardState, Request
+from cloudrc.drivers.teleop import serve_teleop
+from cloudrc.messages import GuardState, OperatorRequest, Request
 
 HALFWAY = (0.5, 0.0, 1.0)
 
@@ -80,6 +83,52 @@ def test_where_it_is_seen_the_robot_stays_though_its_end_is_lost():
     flight.teleop.pause(flight.now_ns)
     flight.step(seconds=0.1)
     assert flight.setpoints[-1].position == HALFWAY
+
+
+class Neighbour:
+    """Cloud, which shows where the robot is whenever teleop looks."""
+
+    def __init__(self, seen):
+        self.said, self._seen = [], wire.encode(seen)
+
+    def receive(self):
+        return [self._seen]
+
+    def send(self, data):
+        self.said.append(wire.decode(data))
+        return True
+
+
+@pytest.mark.promise("P-MISSION-4")
+@pytest.mark.parametrize("fsync_ns", [0, 600_000_000, 1_000_000_000])
+def test_it_says_that_the_robot_is_to_hold_however_long_the_disk_takes(monkeypatch, fsync_ns):
+    """The time for that was over before: the robot flew on to its waypoint."""
+    flight, _ = flying()
+    clock, write = [flight.now_ns], flight.teleop.book._backlog._write
+
+    def sleep(seconds):
+        clock[0] += round(seconds * 1e9)
+
+    def keep(entry):
+        clock[0] += fsync_ns
+        write(entry)
+
+    monkeypatch.setattr(flight.teleop.book._backlog, "_write", keep)
+    monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
+    monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
+    cloud = Neighbour(flight.teleop._sight.seen)
+    serve_teleop(
+        flight.teleop,
+        cloud,
+        wire.encode,
+        wire.decode,
+        calls=list,
+        tell=lambda told: None,
+        stop=_Ending(flight.teleop, lambda: True),
+    )
+    asked = [said.request for said in cloud.said if isinstance(said, OperatorRequest)]
+    assert asked.count(Request.END) >= 3
+    assert clock[0] - flight.now_ns < 2_000_000_000
 
 
 def test_a_teleop_that_ends_still_stops_the_rotors_and_releases_the_robot():
