@@ -9,11 +9,14 @@ import threading
 
 import pytest
 from api_harness import LIMIT, OPERATOR, READER, connect, head, running
+from service_harness import PLAN
 
-from cloudrc.cloud.teleop import api_events
+from cloudrc.cloud.teleop import api, api_events
 from cloudrc.cloud.teleop.api_bridge import LANE, WAITING_MAX, Bridge
 from cloudrc.cloud.teleop.api_gate import Limits
 from cloudrc.cloud.teleop.service_book import UnavailableError
+from cloudrc.cloud.teleop.service_mission import Order
+from cloudrc.messages import GuardState
 
 STRANGER = "no-token-that-is-known"
 TIGHT = Limits(rate_hz=0.001, burst=5, in_flight=2, streams=1)
@@ -125,3 +128,20 @@ def test_an_operators_stop_is_served_while_others_flood_its_path():
         assert statuses(one, 20, "/v1/estop", OPERATOR, "POST") == [200] * 20
         assert len(one.alarms) == 20
         assert one.get("/v1/state")["seen"], "stops take none of the operator's room"
+
+
+@pytest.mark.promise("P-API-8")
+def test_a_stop_that_teleop_does_not_answer_in_time_is_made_all_the_same(monkeypatch):
+    """The loop waits for its disk; other calls are dropped, for whoever asked looks again."""
+    monkeypatch.setattr(api, "ANSWER_LIMIT", 0.1)
+    with running() as one:
+        one.flight.teleop.create(Order(PLAN), 0)
+        one.until(lambda: one.state_of("m1") == "flying")
+        free = threading.Event()
+        one.bridge.take = lambda take=one.bridge.take: take() if free.is_set() else []
+        assert one.post("/v1/missions/m1/cancel")[0] == 503
+        assert one.post("/v1/estop")[0] == 503
+        free.set()
+        one.until(lambda: one.flight.guard is GuardState.ESTOP)
+        one.until(lambda: one.state_of("m1") == "failed")
+        assert one.flight.names("m1")[-1] == "emergency_stopped"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import dataclass
 from math import radians
 from typing import Any
@@ -90,11 +89,11 @@ def create_app(bridge: Bridge, surroundings: Surroundings) -> FastAPI:
 
 
 async def _ask(bridge: Bridge, call: Call) -> Any:
-    return await _answer(bridge.submit(call))
+    return await _answer(asyncio.wrap_future(bridge.submit(call)))
 
 
-async def _answer(future: Future[Any]) -> Any:
-    return await asyncio.wait_for(asyncio.wrap_future(future), ANSWER_LIMIT)
+async def _answer(future: asyncio.Future[Any]) -> Any:
+    return await asyncio.wait_for(future, ANSWER_LIMIT)
 
 
 async def _body(request: Request) -> bytes:
@@ -187,7 +186,7 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
             stopped = bridge.submit(lambda s, now_ns: s.stop_rotors(now_ns), urgent=True)
         finally:
             bridge.alarm()
-        mission = await _answer(stopped)
+        mission = await _answer(asyncio.shield(asyncio.wrap_future(stopped)))  # made, however late
         return JSONResponse({"id": mission.id if mission else None, "state": "stopping"})
 
     @router.post(
