@@ -82,6 +82,20 @@ def test_a_mission_is_stopped_by_the_next_teleop_too_if_nobody_has_acknowledged_
     assert flight.view(waiting)["state"] == "flying"
 
 
+def test_a_stop_in_the_first_instant_of_a_teleop_is_one_of_the_mission_under_way():
+    """It stopped nobody's mission: if the robot did not hear, the next teleop flew on."""
+    flight, mission_id = flying()
+    flight.downlink = False
+    flight.restart_teleop()
+    assert flight.teleop.stop_rotors(flight.now_ns).id == mission_id
+    flight.step(seconds=0.2)
+    flight.restart_teleop()
+    flight.downlink = True
+    flight.step(seconds=0.5)
+    assert flight.guard is GuardState.ESTOP
+    assert flight.names(mission_id)[-1] == "emergency_stopped"
+
+
 @pytest.mark.parametrize("since", ["other mission", "other world"])
 def test_a_stop_is_not_asked_again_of_a_robot_that_has_flown_since(since):
     """Somebody has acknowledged it elsewhere, or what flies was not written down."""

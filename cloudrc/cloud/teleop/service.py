@@ -114,8 +114,7 @@ class MissionService:
         mission = self.book.find(mission_id)
         if mission.ended:
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
-        if self._current is None and mission.state != missions.QUEUED:
-            self._launch(mission, missions.first_verb(mission), now_ns)  # begun before this process
+        self._take_up(now_ns)
         if mission is self._current:
             return self._operate(Cancel(), now_ns)
         verdict = missions.never_began()
@@ -156,6 +155,7 @@ class MissionService:
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once, in every state; give the mission under way, which has failed."""
+        self._take_up(now_ns)
         mission = self._current
         self._stop.ask(now_ns)
         self._collect(now_ns)
@@ -197,11 +197,9 @@ class MissionService:
     def handle_deadline(self, now_ns: int) -> None:
         """Start what waits, keep the limits of time, repeat what has to be repeated."""
         self.book.catch_up(now_ns)
-        waiting = self.book.open()
-        if self._current is None and waiting and not self._ends:
-            begun = waiting[0].state != missions.QUEUED  # by a teleop before this one: no waiting
-            if begun or (self.seen and self.book.kept and not self._stopped):
-                self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
+        if not self._ends:
+            may_begin = self.seen and self.book.kept and not self._stopped
+            self._take_up(now_ns, queued=may_begin)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
         if self._setpoint is not None and now_ns >= self._setpoint_ns:
@@ -245,6 +243,12 @@ class MissionService:
             raise ConflictError(str(error), mission.id) from None
         self._collect(now_ns)
         return mission
+
+    def _take_up(self, now_ns: int, *, queued: bool = False) -> None:
+        """Go on with what a teleop before this one has begun, or begin what is `queued`."""
+        waiting = self.book.open()
+        if self._current is None and waiting and (queued or waiting[0].state != missions.QUEUED):
+            self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
 
     def _launch(self, mission: Mission, verb: Verb, now_ns: int) -> None:
         self._current = mission
