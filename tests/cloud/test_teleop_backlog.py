@@ -97,6 +97,45 @@ def test_a_cancelled_mission_does_not_revive_although_its_end_was_never_kept():
     assert (view["state"], view["verdict"]["failures"][0]["code"]) == ("failed", "end_lost")
 
 
+@pytest.mark.promise("P-MISSION-7")
+def test_what_waits_is_cancelled_once_that_is_kept_for_the_next_teleop_would_fly_it():
+    flight, _ = flying()
+    waits = flight.create(queue=True)
+    flight.full = True
+    with pytest.raises(UnavailableError, match="m2 waits on: the journal cannot be written: No sp"):
+        flight.teleop.cancel(waits, flight.now_ns)
+    assert flight.view(waits)["state"] == "queued"
+    flight.full = False
+    flight.teleop.cancel(waits, flight.now_ns)
+    finish(flight)
+    flight.restart_teleop()
+    flight.step(seconds=0.5)
+    assert flight.view(waits)["state"] == "cancelled"
+    assert [m.id for m in flight.teleop.book.open()] == []
+
+
+@pytest.mark.promise("P-MISSION-2")
+def test_what_waits_begins_on_no_full_disk_either_though_nothing_was_refused_before():
+    """A teleop that has just begun does not know that the disk is full."""
+    flight, _ = flying()
+    waits = flight.create(queue=True)
+    flight.guard = GuardState.LAND
+    flight.step(seconds=0.1)
+    flight.restart_teleop()
+    flight.step(seconds=0.1)
+    flight.full, asked, tried = True, len(flight.requests), flight.tries
+    flight.teleop.acknowledge(flight.now_ns)
+    flight.step(seconds=3.0)
+    assert flight.view(waits)["state"] == "queued"
+    assert {request.request for request in flight.requests[asked:]} == {Request.ACKNOWLEDGE}
+    assert [fault.code for fault in flight.faults] == ["journal"]
+    assert 2 <= flight.tries - tried <= 4
+    flight.full = False
+    flight.step(seconds=1.1)
+    assert flight.view(waits)["state"] == "flying"
+    assert flight.names(waits) == ["queued", "starting", "started"]
+
+
 class DiskFlight(ServiceFlight):
     """With a real journal on a disk in memory."""
 

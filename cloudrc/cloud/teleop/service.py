@@ -110,6 +110,7 @@ class MissionService:
         Raises:
             UnknownMissionError: If there is none of this id.
             ConflictError: If it has ended.
+            UnavailableError: If it has not begun, and that it will not cannot be kept.
         """
         mission = self.book.find(mission_id)
         if mission.ended:
@@ -117,8 +118,7 @@ class MissionService:
         self._take_up(now_ns)
         if mission is self._current:
             return self._operate(Cancel(), now_ns)
-        verdict = missions.never_began()
-        self._note(mission, "cancelled", missions.NEVER_BEGAN, now_ns, verdict=verdict)
+        self.book.cancel(mission)
         return mission
 
     def hold(self, now_ns: int) -> Mission:
@@ -198,8 +198,7 @@ class MissionService:
         """Start what waits, keep the limits of time, repeat what has to be repeated."""
         self.book.catch_up(now_ns)
         if not self._ends:
-            may_begin = self.seen and self.book.kept and not self._stopped
-            self._take_up(now_ns, queued=may_begin)
+            self._take_up(now_ns, queued=self.seen and self.book.kept and not self._stopped)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
         if self._setpoint is not None and now_ns >= self._setpoint_ns:
@@ -247,8 +246,11 @@ class MissionService:
     def _take_up(self, now_ns: int, *, queued: bool = False) -> None:
         """Go on with what a teleop before this one has begun, or begin what is `queued`."""
         waiting = self.book.open()
-        if self._current is None and waiting and (queued or waiting[0].state != missions.QUEUED):
-            self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
+        if self._current is None and waiting:
+            if queued and waiting[0].state == missions.QUEUED:
+                self.book.begin(waiting[0], now_ns)
+            if waiting[0].state != missions.QUEUED:
+                self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
 
     def _launch(self, mission: Mission, verb: Verb, now_ns: int) -> None:
         self._current = mission
@@ -257,7 +259,7 @@ class MissionService:
             mission.witness = mission.witness.after_restart()
             text = "teleop has restarted; the robot is asked to go on"
             self._note(mission, "restarted", text, now_ns)
-        else:
+        elif mission.state == missions.QUEUED:
             self._note(mission, "starting", "the robot is asked to start", now_ns)
         self._collect(now_ns)
 
@@ -271,11 +273,12 @@ class MissionService:
     def _collect(self, now_ns: int) -> None:
         for output in self._teleop.take_outputs():
             if isinstance(output, Setpoint):
-                self._setpoint = output
-                self._setpoint_ns = now_ns + SETPOINT_PERIOD_NS
+                self._setpoint, self._setpoint_ns = output, now_ns + SETPOINT_PERIOD_NS
             elif isinstance(output, MissionEvent):
                 self._follow(output, now_ns)
             self._outputs.append(output)
+        if trouble := self.book.news():
+            self._outputs.append(Fault(now_ns, "journal", trouble))
 
     def _follow(self, event: MissionEvent, now_ns: int) -> None:
         mission, seen = self._current, self._sight.seen
@@ -295,5 +298,3 @@ class MissionService:
         if mission is self._current:
             changed["time_s"] = round(self._teleop.elapsed(now_ns), 3)
         self.book.note(mission, event, text, **changed)
-        if trouble := self.book.news():
-            self._outputs.append(Fault(now_ns, "journal", trouble))

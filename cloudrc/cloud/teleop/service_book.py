@@ -15,10 +15,12 @@ from cloudrc.cloud.teleop.journal_format import Entry
 from cloudrc.cloud.teleop.service_backlog import Backlog
 from cloudrc.cloud.teleop.service_mission import (
     CANCELLED,
+    NEVER_BEGAN,
     QUEUED,
     Mission,
     Order,
     from_entry,
+    never_began,
     number_of,
     order_entry,
 )
@@ -148,15 +150,28 @@ class MissionBook:
         """
         mission_id = f"m{self._numbered + 1}"
         entry = order_entry(Mission(mission_id, order, number_of(mission_id, self._salt)))
-        try:
-            self._backlog.append(entry)
-        except OSError as error:
-            raise UnavailableError(
-                f"no mission can start: the journal cannot be written: {error.strerror}; "
-                "free or mend its volume"
-            ) from error
-        self._apply(entry)
+        self._append(entry, "no mission can start")
         return self.missions[entry["mission"]]
+
+    def begin(self, mission: Mission, now_ns: int) -> None:
+        """Write down that a mission that waits is asked to start [ns]; else it waits on."""
+        if now_ns < self._keep_ns:
+            return
+        try:
+            text = "the robot is asked to start"
+            self._append(mission.entry(self._events + 1, "starting", text), f"{mission.id} waits")
+            self.trouble = self._told = ""
+        except UnavailableError as error:
+            self.trouble, self._keep_ns = str(error), now_ns + KEEP_PERIOD_NS
+
+    def cancel(self, mission: Mission) -> None:
+        """Write down that a mission that waits will not begin.
+
+        Raises:
+            UnavailableError: If it cannot be kept: a teleop after this one would fly it.
+        """
+        entry = mission.entry(self._events + 1, "cancelled", NEVER_BEGAN, verdict=never_began())
+        self._append(entry, f"{mission.id} waits on")
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
         """Write down what happens to a mission, or as soon as the disk can be written again.
@@ -190,6 +205,16 @@ class MissionBook:
         if number and self._log:  # without a number nobody has missed anything
             self.dropped += max(0, self._log[0]["id"] - number - 1)
         return list(takewhile(lambda event: event["id"] > number, reversed(self._log)))[::-1]
+
+    def _append(self, entry: Entry, refused: str) -> None:
+        try:
+            self._backlog.append(entry)
+        except OSError as error:
+            raise UnavailableError(
+                f"{refused}: the journal cannot be written: {error.strerror}; "
+                "free or mend its volume"
+            ) from error
+        self._apply(entry)
 
     def _try(self, write: Callable[[], None]) -> None:
         try:
