@@ -114,6 +114,26 @@ def test_what_waits_is_cancelled_once_that_is_kept_for_the_next_teleop_would_fly
     assert [m.id for m in flight.teleop.book.open()] == []
 
 
+@pytest.mark.promise("P-MISSION-7")
+@pytest.mark.parametrize("written", [1, 2])
+def test_a_mission_of_which_the_order_alone_was_kept_is_not_flown_twice(written):
+    flight = ServiceFlight()
+    flight.step()
+    mission_id = flight.create()
+    kept = flight.kept[:written]
+    flight.step(seconds=0.05)
+    flight.step(position=A)
+    finish(flight)
+    flight.step(seconds=0.2)
+    assert flight.onboard[1] == 3
+    flight.kept = kept  # a full disk has refused all else
+    flight.restart_teleop()
+    asked = len(flight.requests)
+    flight.step(seconds=1.0)
+    assert Request.START not in {request.request for request in flight.requests[asked:]}
+    assert flight.view(mission_id)["verdict"]["failures"][0]["code"] == "end_lost"
+
+
 @pytest.mark.promise("P-MISSION-2")
 def test_what_waits_begins_on_no_full_disk_either_though_nothing_was_refused_before():
     """A teleop that has just begun does not know that the disk is full."""

@@ -127,3 +127,17 @@ def test_missions_without_a_number_follow_each_other():
         flight.operate(Cancel())
         flight.step(seconds=0.3)
     assert flight.onboard == (0, 0)
+
+
+@pytest.mark.parametrize("in_sight", [True, False])
+@pytest.mark.parametrize("again", [True, False])
+def test_what_the_robot_knows_to_be_done_is_flown_again_by_whoever_orders_it_anew(again, in_sight):
+    """As a second run of `cloudrc cloud` does; but not by a teleop that finds it in its journal."""
+    flight = Flight()
+    flight.onboard = (ID, len(FROM_SPAWN.legs))
+    if in_sight:
+        flight.step()
+    flight.operate(StartMission(FROM_SPAWN, ID, again))
+    flight.step(seconds=0.1)
+    assert flight.state == ("FAILED" if again else "FLYING")
+    assert (Request.START in {request.request for request in flight.requests}) is not again

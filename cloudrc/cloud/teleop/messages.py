@@ -58,10 +58,12 @@ class StartMission:
     Attributes:
         plan: Checked.
         mission_id: Names it on board, where its progress is kept, too; 0 for not at all.
+        again: Whether a teleop before this one may have flown it: it is not, once it is over.
     """
 
     plan: Plan
     mission_id: int = 0
+    again: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,6 +77,7 @@ class Teleop:
         self._seen: Seen | None = None
         self._plan = NO_PLAN
         self._mission_id = 0
+        self._again = False
         self._continued: Continue | None = None  # how it stood, if a teleop before began it
         self._world = rules.ANY_WORLD  # in which it was started
         self._expected: tuple[int, ...] = ()  # missions that may be on board; any if there are none
@@ -111,8 +112,8 @@ class Teleop:
         """
         rules.refuse_unless_fitting(verb, self.state)
         match verb:
-            case StartMission(plan, mission_id):
-                self._start(plan, mission_id, now_ns)
+            case StartMission(plan, mission_id, again):
+                self._start(plan, mission_id, now_ns, again=again)
             case Continue():
                 self._go_on(verb, now_ns)
             case Hold():
@@ -146,7 +147,7 @@ class Teleop:
         if self.state not in UNDER_WAY:
             if anew or (before and before.mission_id != seen.mission_id):
                 self._find(seen)
-        elif harm := rules.harm_in(seen, self._mission_id, self._world, self._expected):
+        elif harm := rules.harm_in(seen, self._mission_id, self._world, self._expected, self._over):
             code, text = harm
             self._end(code, f"{text} {self._where()}", now_ns)
         elif started:
@@ -179,17 +180,22 @@ class Teleop:
             self.requests.ask(Request.END, after=True)
         self._aim.here()
 
-    def _start(self, plan: Plan, mission_id: int, now_ns: int) -> None:
+    def _start(self, plan: Plan, mission_id: int, now_ns: int, *, again: bool = False) -> None:
         self.state = STARTING
         self.outcome = None
         self.leg = 0
         self._plan = plan
         self._mission_id = mission_id
         self._continued = None
+        self._again = again and plan.start is Start.SPAWN  # from here, what is reached counts
         self._began_ns = now_ns
         here = None if plan.start is Start.SPAWN else self._seen
         self._world = here.world if here else rules.ANY_WORLD
         self._expected = (here.mission_id, mission_id) if here else ()
+        if self._seen and again and rules.is_over(self._seen, mission_id, self._over):
+            code, text = rules.END_LOST
+            self._end(code, f"{text} {self._where()}", now_ns)
+            return
         self.requests.report(mission_id, 0)
         self.requests.ask(Request.START, plan.start, after=True)
         self._aim.begin(plan, mission_id)
@@ -278,6 +284,12 @@ class Teleop:
             self.requests.forget()  # what flies is not ours to end
         self._aim.here()
         self._tell(code, waypoint, text, now_ns)
+
+    @property
+    def _over(self) -> int:
+        """So many waypoints known on board mean that the mission is over."""
+        before = self._again and self.state is STARTING
+        return len(self._plan.legs) if before else MISSION_OVER
 
     def _tell(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
         self.outputs.append(MissionEvent(now_ns, event, waypoint, text))

@@ -17,7 +17,7 @@ from cloudrc.cloud.teleop.messages import (
 )
 from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
-from cloudrc.messages import MISSION_OVER, GuardState, Setpoint
+from cloudrc.messages import GuardState, Setpoint
 
 WORST_GUARD = GuardState.HOLD
 ANY_WORLD = ""
@@ -29,6 +29,7 @@ NO_WAYPOINT = -1
 UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
 ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
 """By their codes; every other one is a failure."""
+END_LOST = "end_lost", "the robot knows it to be over, how it ended was not kept;"
 RESTS = tuple(state for state in State if state not in UNDER_WAY)
 
 _RULES: dict[type[Verb], tuple[str, tuple[State, ...], str]] = {
@@ -68,13 +69,18 @@ def known_on_board(seen: Seen, mission_id: int) -> int:
     return seen.reached if seen.mission_id == mission_id != 0 else 0
 
 
+def is_over(seen: Seen, mission_id: int, over: int) -> bool:
+    """Whether the robot knows a mission to be over; `over` waypoints reached mean that."""
+    return known_on_board(seen, mission_id) >= over
+
+
 def stands_ready(seen: Seen) -> bool:
     """Whether the robot stands on the ground, told of a mission: it may take off for that."""
     return seen.guard is GuardState.GROUND and seen.mission_id != 0
 
 
 def harm_in(
-    seen: Seen, mission_id: int, world: str, expected: tuple[int, ...]
+    seen: Seen, mission_id: int, world: str, expected: tuple[int, ...], over: int
 ) -> tuple[str, str] | None:
     """Say what ends a mission that is under way, if anything seen does: code and text.
 
@@ -84,13 +90,14 @@ def harm_in(
         world: In which it was started, or `ANY_WORLD`.
         expected: Missions that may be on board: this one, once the robot has been told of it, or
             before that the one that a mission from here has found; empty if it may be any.
+        over: See `is_over`.
     """
     if world not in (ANY_WORLD, seen.world):
         return "world_restarted", "world restarted"
     if expected and seen.mission_id not in expected:
         return "taken_over", "somebody else has started another mission"
-    if seen.reached == MISSION_OVER and seen.mission_id == mission_id:
-        return "end_lost", "the robot knows it to be over, how it ended was not kept;"
+    if is_over(seen, mission_id, over):
+        return END_LOST
     if seen.guard > WORST_GUARD:
         return "guard_stopped", f"guard went to {seen.guard.name}"
     return None

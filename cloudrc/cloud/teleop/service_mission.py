@@ -209,6 +209,6 @@ def first_verb(mission: Mission) -> StartMission | Continue:
     """How to begin: anew, or where a teleop before this one left off."""
     plan, number = mission.order.plan, mission.number
     if not mission.world:
-        return StartMission(plan, number)
+        return StartMission(plan, number, again=True)
     held = mission.state == HELD
     return Continue(plan, mission.waypoint, mission.elapsed, mission.world, held, number)
