@@ -10,6 +10,7 @@ from pathlib import Path
 from cloudrc.cli.ends import EPILOG as EPILOG
 from cloudrc.cli.ends import end_arguments
 from cloudrc.cli.opened import open_end, suite
+from cloudrc.cli.output import unread_is_fine
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,11 +48,12 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
-def _epochs(path: Path) -> Callable[[], int]:
+def _epochs(path: Path) -> Callable[[], int | None]:
     """Take epochs from a file; say so if they cannot be kept."""
     from cloudrc.drivers.epochs import EpochFile
 
-    epochs = EpochFile(path)
-    if epochs.trouble:
-        print(f"cloudrc: warning: {epochs.trouble}", file=sys.stderr)
-    return epochs.take
+    def say(trouble: str) -> None:
+        with unread_is_fine(sys.stderr):
+            print(f"cloudrc: warning: {trouble}", file=sys.stderr, flush=True)
+
+    return EpochFile(path, say).take

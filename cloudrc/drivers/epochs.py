@@ -1,15 +1,20 @@
 """The epoch file: world's epochs rise through restarts, and each is on disk before it is used.
 
-A block of them is reserved at the start, and the next one only when it is used up: a slow disk
-meets the flight once in 4,096 epochs. What is left of a block is given up at the next start. A file
-that is lost, or cannot be written, costs only that epochs begin again: the keys of a session come
-from fresh nonces too, so nothing old is accepted.
+A block of them is reserved at the start, and the next one by a thread when half of it is used, so
+that the flight does not wait for a slow disk. While one hangs for so long that the block is used
+up, there is no epoch. What is left of a block is given up at the next start. A file that is lost,
+or cannot be written, costs only that epochs begin again: the keys of a session come from fresh
+nonces too, so nothing old is accepted.
 """
 
 from __future__ import annotations
 
 import os
+from collections import deque
+from collections.abc import Callable
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 
 from cloudrc.tunnel.handshake import EPOCH_MAX
 
@@ -18,35 +23,50 @@ BLOCK = 4096
 
 
 class EpochFile:
-    """Hands out epochs, strictly rising.
+    """Hands out epochs, strictly rising."""
 
-    Attributes:
-        trouble: Why they are not kept through a restart, in words; "" if all is well.
-    """
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        """Read the file, and reserve the first block of this process.
 
-    def __init__(self, path: Path) -> None:
-        """Read the file, and reserve the first block of this process."""
-        self._path = path
-        self.trouble = ""
-        self._next = self._read() + 1
-        self._last = 0
-        self._reserve()
+        Args:
+            path: Of the file.
+            say: Is told why epochs are not kept through a restart; later on by a thread.
+        """
+        self._path, self._say = path, say
+        self._block = range(0)
+        self._reserved: deque[range] = deque()
+        self._used: SimpleQueue[int] = SimpleQueue()
+        self._reserve(self._read())
+        Thread(target=self._reserve_ahead, name="epochs", daemon=True).start()
 
-    def take(self) -> int:
-        """The next epoch; it is on disk that it may have been used."""
-        if self._next > self._last or self._next > EPOCH_MAX:
-            self._reserve()
-        self._next += 1
-        return self._next - 1
+    def take(self) -> int | None:
+        """The next epoch, of which it is on disk that it may have been used; never waits.
 
-    def _reserve(self) -> None:
-        if self._next + BLOCK > EPOCH_MAX:
-            self._next = 1
-        self._last = self._next + BLOCK - 1
+        None while the disk keeps the next block waiting and this one is used up.
+        """
+        if not self._block and self._reserved:
+            self._block = self._reserved.popleft()
+        if not self._block:
+            return None
+        epoch, last, self._block = self._block[0], self._block[-1], self._block[1:]
+        if len(self._block) == BLOCK // 2:
+            self._used.put(last)
+        return epoch
+
+    def _reserve_ahead(self) -> None:
+        """Do so whenever half of a block is used: waits, in a thread of its own."""
+        while True:
+            self._reserve(self._used.get())
+
+    def _reserve(self, used: int) -> None:
+        """Put on disk that a block behind the last epoch `used` may be, however long that takes."""
+        first = used + 1 if used + BLOCK < EPOCH_MAX else 1
+        block = range(first, first + BLOCK)
         try:
-            replace_durably(self._path, f"{self._last}\n".encode("ascii"))
+            replace_durably(self._path, f"{block[-1]}\n".encode("ascii"))
         except OSError as error:
             self._note(f"{error.strerror or error}; epochs are not kept through a restart")
+        self._reserved.append(block)
 
     def _read(self) -> int:
         try:
@@ -63,7 +83,7 @@ class EpochFile:
         return epoch
 
     def _note(self, what: str) -> None:
-        self.trouble = f"{self._path}: {what}"
+        self._say(f"{self._path}: {what}")
 
 
 def replace_durably(path: Path, data: bytes, mode: int = 0o600) -> None:

@@ -7,6 +7,7 @@ from cloudrc.tunnel.codec import LAST_GREETING, VERSION, peek
 
 KEY = "greetings come that our key does not fit: give both ends the same key file"
 BUSY = "another cloud controls the robot: this one waits until that is silent"
+NO_EPOCH = "no session and no mission from the spawn can begin: the disk keeps the epochs waiting"
 SILENCE = "world does not answer: is it running, is the link up, do both ends have the same key?"
 
 

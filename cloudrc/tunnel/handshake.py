@@ -112,8 +112,8 @@ class Identity(Protocol):
         """The last one before this process."""
 
     @property
-    def next_epoch(self) -> Callable[[], int] | None:
-        """Gives persisted epochs."""
+    def next_epoch(self) -> Callable[[], int | None] | None:
+        """Gives persisted epochs, or None while there is none."""
 
 
 class Door:
@@ -130,6 +130,7 @@ class Door:
         self._session = session
         self._nonce, self._clock, self._suite = identity.nonce, identity.clock_id, identity.suite
         self._next_epoch = identity.next_epoch or epochs_after(identity.last_epoch).__next__
+        self._coming: int | None = None  # the epoch to begin next, once it is asked for
         self._cookies = session.ring.current.derive(identity.nonce, b"cookies")
         self._age_max_ns = age_max_ns
         self._fresh_until_ns = -1
@@ -145,6 +146,13 @@ class Door:
     def shares_clock(self) -> bool:
         """Whether the cloud that has the session reads the same clock as world."""
         return self._incumbent.clock == self._clock
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is an epoch to begin: a disk that hangs may have none for a while."""
+        if self._coming is None:
+            self._coming = self._next_epoch()
+        return self._coming is not None
 
     def hear(self, now_ns: int) -> None:
         """Note that the incumbent is alive: a new datagram of its session has come [ns]."""
@@ -195,7 +203,9 @@ class Door:
             return self._answer("hello", BUSY, encode_busy(Busy(hello.nonce, used=True)))
         elif now_ns <= self._fresh_until_ns:
             return self._answer("busy", BUSY, encode_busy(Busy(hello.nonce, used=False)))
-        else:
+        if not self.ready:
+            return Answer("unanswered", [])
+        if hello.nonce != self._incumbent.nonce:
             self._used.append(self._incumbent.nonce)
         self._incumbent = hello
         self._fresh_until_ns = now_ns + max(GRACE_NS, self._age_max_ns)
@@ -204,7 +214,7 @@ class Door:
         return self._answer("hello", ACCEPT, self._accept(), opened=True)
 
     def move_on(self, now_ns: int) -> bytes:
-        """Open the next epoch of the same session [ns]; the datagram that tells cloud."""
+        """Open the next epoch of the same session [ns], if `ready`; the datagram to tell cloud."""
         self._begin()
         self._fresh_until_ns = now_ns + max(GRACE_NS, self._age_max_ns)  # until it can be heard
         return self._session.greet(ACCEPT, self._accept())
@@ -217,7 +227,9 @@ class Door:
             del counters[next(iter(counters))]
 
     def _begin(self, agreement: Agreement | None = None, key: Key | None = None) -> None:
-        self._session.begin(self._next_epoch(), agreement, key)
+        epoch, self._coming = self._coming or self._next_epoch(), None
+        assert epoch is not None, "ask whether it is `ready`"
+        self._session.begin(epoch, agreement, key)
         self._repeated = 0
         for window in self._windows.values():
             window.reset()

@@ -32,7 +32,7 @@ from cloudrc.records import (
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
-from cloudrc.tunnel.complaints import Complaints
+from cloudrc.tunnel.complaints import NO_EPOCH, Complaints
 from cloudrc.tunnel.handshake import Door
 from cloudrc.tunnel.unsealed import make_session
 from cloudrc.world.clock import CATCH_UP_NS, SimulationClock
@@ -220,11 +220,20 @@ class WorldEndpoint:
             raise DecodeError("stale")
         answer = self._door.knock(hello, counter, now_ns)
         self._counts[answer.outcome] += 1
+        if not answer.datagrams:
+            self._has_epoch()
         if answer.opened:
             self._clock_is_shared = self._door.shares_clock
             self._orders.number = 0
             self._begin_epoch("cloud said hello")
         self._greet(answer.datagrams)
+
+    def _has_epoch(self) -> bool:
+        """Say whether an epoch can begin; if not, the user is told."""
+        ready = self._door.ready
+        if not ready:
+            self._records += self._complaints.say("epochs", NO_EPOCH, self._clock.tick_ns)
+        return ready
 
     def _begin_epoch(self, cause: str) -> None:
         """Everything that belongs to the old epoch is forgotten."""
@@ -239,7 +248,7 @@ class WorldEndpoint:
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
         """Do as the operator asks; a mission from the spawn begins an epoch of its own."""
         tick_ns, waited = self._clock.tick_ns, now_ns == self._stalled_wake_ns
-        if not self._orders.obey(request, tick_ns, waited=waited):
+        if not self._orders.obey(request, tick_ns, waited=waited, has_epoch=self._has_epoch):
             return
         if request.start is Start.SPAWN:
             self.robot.put_on_ground(tick_ns, "mission starts from spawn")

@@ -19,8 +19,8 @@ class WorldIdentity:
         last_epoch: The last epoch handed out before this process began.
         ring: The pre-shared keys; None for an end that never leaves its process.
         suite: Cipher that this machine is fast at.
-        next_epoch: Gives epochs that are persisted before they are used; None to count on from
-            `last_epoch`.
+        next_epoch: Gives epochs that are persisted before they are used, or None as long as the
+            disk has none; None to count on from `last_epoch`.
     """
 
     clock_id: bytes
@@ -28,4 +28,4 @@ class WorldIdentity:
     last_epoch: int = 0
     ring: KeyRing | None = None
     suite: int = AES_256_GCM
-    next_epoch: Callable[[], int] | None = None
+    next_epoch: Callable[[], int | None] | None = None

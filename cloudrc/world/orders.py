@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
 
 from cloudrc.messages import OperatorRequest, Request, Start
 from cloudrc.tunnel.codec import DecodeError
@@ -38,13 +39,21 @@ class Orders:
         self.number = self.mission_id = self.reached = 0
         self.touches = Touches()
 
-    def obey(self, request: OperatorRequest, now_ns: int, *, waited: bool) -> bool:
+    def obey(
+        self,
+        request: OperatorRequest,
+        now_ns: int,
+        *,
+        waited: bool,
+        has_epoch: Callable[[], bool],
+    ) -> bool:
         """Do as is asked, but for a start, which the caller begins.
 
         Args:
             request: In the operator's name.
             now_ns: World's clock [ns].
             waited: Whether it may have waited in the socket through a stall.
+            has_epoch: Whether there is an epoch for a start from the spawn.
 
         Returns:
             Whether a mission is to be started.
@@ -61,8 +70,8 @@ class Orders:
         starts = request.request is Request.START
         if starts:
             self._refuse_unless_new(now_ns - request.basis_stamp_ns, waited)
-            if self._guard.latched:
-                # Not acted on, so not confirmed either: the operator has to acknowledge first.
+            # Not acted on, so not confirmed either: the operator has to acknowledge first.
+            if self._guard.latched or (request.start is Start.SPAWN and not has_epoch()):
                 self._counts["start_refused"] += 1
                 return False
         self.number = request.number

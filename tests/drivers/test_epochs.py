@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections import deque
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from queue import SimpleQueue
 
 import pytest
 
@@ -11,53 +14,148 @@ from cloudrc.drivers import epochs
 from cloudrc.drivers.epochs import BLOCK, EpochFile, replace_durably
 from cloudrc.tunnel.handshake import EPOCH_MAX
 
+WAIT = 10.0
+"""For what a thread is sure to do [s]."""
+
+
+class Told(deque[range]):
+    """Tells when something is appended."""
+
+    def __init__(self, blocks: Iterable[range]) -> None:
+        super().__init__(blocks)
+        self.appended: SimpleQueue[None] = SimpleQueue()
+
+    def append(self, block: range) -> None:
+        super().append(block)
+        self.appended.put(None)
+
+
+class Slow:
+    """An epoch file whose disk takes what it is given when a test lets it, and no sooner."""
+
+    def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.troubles: list[str] = []
+        self.asked: SimpleQueue[bytes] = SimpleQueue()
+        self._goes_on: SimpleQueue[None] = SimpleQueue()
+        self.file = EpochFile(path, self.troubles.append)
+        self._reserved = Told(self.file._reserved)
+        self.file._reserved = self._reserved
+        monkeypatch.setattr(epochs, "replace_durably", self._write)
+
+    def _write(self, path: Path, data: bytes) -> None:
+        self.asked.put(data)
+        self._goes_on.get(timeout=WAIT)
+        replace_durably(path, data)
+
+    def take(self, count: int) -> list[int]:
+        """So many, all of which there are."""
+        taken = [self.file.take() for _ in range(count)]
+        assert None not in taken
+        return [epoch for epoch in taken if epoch is not None]
+
+    def go_on(self) -> None:
+        """Have one block written; that is done when this returns."""
+        self._goes_on.put(None)
+        self._reserved.appended.get(timeout=WAIT)
+
+
+Opened = Callable[[Path], EpochFile]
+
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "epoch"
 
 
-def test_epochs_begin_with_one_and_rise(path: Path) -> None:
-    file = EpochFile(path)
+@pytest.fixture
+def troubles() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def opened(troubles: list[str]) -> Opened:
+    return lambda path: EpochFile(path, troubles.append)
+
+
+@pytest.fixture
+def slow(path: Path, monkeypatch: pytest.MonkeyPatch) -> Slow:
+    return Slow(path, monkeypatch)
+
+
+def test_epochs_begin_with_one_and_rise(path: Path, opened: Opened, troubles: list[str]) -> None:
+    file = opened(path)
     assert [file.take() for _ in range(3)] == [1, 2, 3]
-    assert file.trouble == ""
+    assert troubles == []
 
 
-def test_a_restart_at_any_moment_never_hands_out_an_epoch_again(path: Path) -> None:
-    used: list[int] = []
-    for taken in (3, 0, 1, BLOCK + 2, 1):
-        file = EpochFile(path)
+def test_a_restart_at_any_moment_never_hands_out_an_epoch_again(
+    path: Path, opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[int | None] = []
+    for taken in (3, 0, 1, BLOCK, 1):
+        file = opened(path)
         used += [file.take() for _ in range(taken)]
+    slow = Slow(path, monkeypatch)
+    used += slow.take(BLOCK)
+    slow.go_on()
+    used += slow.take(2)
+    monkeypatch.undo()
+    used.append(opened(path).take())
     assert used == sorted(set(used))
 
 
-def test_an_epoch_is_on_disk_before_it_is_used(path: Path) -> None:
-    file = EpochFile(path)
-    for _ in range(2 * BLOCK + 5):
-        assert file.take() <= int(path.read_text())
+def test_an_epoch_is_on_disk_before_it_is_used(path: Path, slow: Slow) -> None:
+    for taken in (BLOCK // 2, BLOCK, BLOCK):
+        for _ in range(taken):
+            assert slow.take(1)[0] <= int(path.read_text())
+        slow.go_on()
 
 
-def test_the_disk_is_asked_at_the_start_and_once_in_a_block(
-    path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_disk_is_asked_at_the_start_and_once_in_a_block_well_before_its_end(
+    slow: Slow,
 ) -> None:
-    file, asked = EpochFile(path), []
-    monkeypatch.setattr(epochs, "replace_durably", lambda path, data: asked.append(data))
-    for _ in range(BLOCK):
-        file.take()
-    assert asked == []
-    for _ in range(BLOCK):
-        file.take()
-    assert asked == [b"%d\n" % (2 * BLOCK)]
+    slow.take(BLOCK // 2 - 1)
+    assert slow.asked.empty()
+    for last in (2 * BLOCK, 3 * BLOCK):
+        slow.take(1)
+        assert slow.asked.get(timeout=WAIT) == b"%d\n" % last
+        slow.go_on()
+        slow.take(BLOCK - 1)
+        assert slow.asked.empty()
+
+
+def test_nobody_waits_for_a_disk_that_hangs_and_no_epoch_is_given_out_that_is_not_on_it(
+    path: Path, slow: Slow, opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert slow.take(BLOCK) == list(range(1, BLOCK + 1))
+    assert [slow.file.take() for _ in range(3)] == [None] * 3
+    slow.go_on()
+    assert slow.take(2) == [BLOCK + 1, BLOCK + 2]
+    assert slow.troubles == []
+    monkeypatch.undo()
+    assert opened(path).take() == 2 * BLOCK + 1
+
+
+def test_a_disk_that_fails_in_flight_is_told_and_epochs_rise_all_the_same(
+    path: Path, slow: Slow
+) -> None:
+    path.unlink()
+    path.parent.rmdir()
+    taken = slow.take(BLOCK)
+    slow.go_on()
+    assert taken + slow.take(1) == list(range(1, BLOCK + 2))
+    (trouble,) = slow.troubles
+    assert "are not kept through a restart" in trouble
 
 
 def test_it_is_flushed_before_it_takes_the_old_ones_place(
-    path: Path, monkeypatch: pytest.MonkeyPatch
+    path: Path, opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[str] = []
     fsync, replace = os.fsync, Path.replace
     monkeypatch.setattr(os, "fsync", lambda fd: (calls.append("fsync"), fsync(fd))[1])
     monkeypatch.setattr(Path, "replace", lambda a, b: (calls.append("rename"), replace(a, b))[1])
-    EpochFile(path)
+    opened(path)
     assert calls == ["fsync", "rename", "fsync"]
 
 
@@ -82,24 +180,32 @@ def test_a_crash_between_the_steps_leaves_the_old_file_whole(
     [b"", b"12x", b"-4", b"99999999999", b"9" * 5000, b"\xff\xfe"],
     ids=lambda torn: torn[:9],
 )
-def test_a_file_that_holds_no_epoch_is_told_and_epochs_begin_again(path: Path, torn: bytes) -> None:
+def test_a_file_that_holds_no_epoch_is_told_and_epochs_begin_again(
+    path: Path, opened: Opened, troubles: list[str], torn: bytes
+) -> None:
     path.write_bytes(torn)
-    file = EpochFile(path)
-    assert "epochs begin again" in file.trouble
+    file = opened(path)
+    assert "epochs begin again" in troubles[0]
     assert file.take() == 1
-    assert EpochFile(path).take() == BLOCK + 1
+    assert opened(path).take() == BLOCK + 1
 
 
-def test_a_disk_that_cannot_be_written_is_told_and_epochs_rise_all_the_same(tmp_path: Path) -> None:
-    file = EpochFile(tmp_path / "no" / "epoch")
-    assert "are not kept through a restart" in file.trouble
+def test_a_disk_that_cannot_be_written_is_told_and_epochs_rise_all_the_same(
+    tmp_path: Path, opened: Opened, troubles: list[str]
+) -> None:
+    file = opened(tmp_path / "no" / "epoch")
+    assert "are not kept through a restart" in troubles[0]
     assert [file.take(), file.take()] == [1, 2]
 
 
 @pytest.mark.parametrize("last", [EPOCH_MAX, EPOCH_MAX - 1, EPOCH_MAX - BLOCK])
-def test_after_the_last_epoch_comes_the_first(path: Path, last: int) -> None:
+def test_after_the_last_epoch_comes_the_first(
+    path: Path, last: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path.write_text(str(last))
-    file = EpochFile(path)
-    taken = [file.take() for _ in range(BLOCK + 1)]
+    slow = Slow(path, monkeypatch)
+    taken = slow.take(BLOCK // 2)
+    slow.go_on()
+    taken += slow.take(BLOCK // 2 + 1)
     assert max(taken) <= EPOCH_MAX
     assert 1 in taken

@@ -97,3 +97,19 @@ def test_whoever_is_answered_last_is_forgotten_last(step):
         step.door._remember(nonce, 0)
     assert second not in step.door._counters
     assert first in step.door._counters
+
+
+def test_without_an_epoch_a_hello_is_not_answered_and_takes_nothing_away():
+    epochs = [1]
+    step = Doorstep(next_epoch=lambda: epochs.pop() if epochs else None)
+    assert step.knock(cookie=step.cookie()).opened
+    step.now_ns += 2 * SECOND_NS
+    for _ in range(2):
+        assert step.knock(b"m" * 16, step.door._cookie(step.now_ns))[:2] == ("unanswered", [])
+    assert not step.door.ready
+    assert step.world.epoch == 1
+    assert step.knock(cookie=step.door._cookie(step.now_ns)).datagrams  # the incumbent is, still
+    epochs.append(2)
+    step.now_ns += 2 * SECOND_NS
+    assert step.knock(b"m" * 16, step.door._cookie(step.now_ns)).opened
+    assert step.world.epoch == 2
