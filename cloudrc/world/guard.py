@@ -17,7 +17,7 @@ ESTOP is reached from everywhere by the operator's word, and by a hit: what has 
 at speed, or turned over, is thrown about by its rotors. It is left for GROUND by the
 acknowledgement. LAND acknowledged in the air becomes HOLD; on something or low above it, GROUND, at
 touch-down. Both end the mission: only a start arms again. HOLD before the robot has left the ground
-is GROUND: its rotors stop, the mission goes on.
+is GROUND: its rotors stop, the mission goes on, for 60 s without the cloud as in HOLD.
 
 A command is fresh while its *basis*, the odometry it was computed from, is at most
 `command_age_max` old. HOLD after a mission's end lasts as long as the operator likes: there a robot
@@ -175,8 +175,10 @@ class Guard:
                 self.counts["limited_speed"] += 1
             if self.yaw_rate != yaw_rate:
                 self.counts["limited_yaw_rate"] += 1
-            if self.state is GROUND and self._settled(now_ns, fresh_until_ns):
-                self._enter(TRACK, now_ns, "fresh command")
+            if self.state is GROUND:
+                self._alone_ns = now_ns
+                if self._settled(now_ns, fresh_until_ns):
+                    self._enter(TRACK, now_ns, "fresh command")
             elif self.state is HOLD:
                 self._leave_hold(now_ns, fresh_until_ns)
             if self.state is TRACK:
@@ -260,8 +262,9 @@ class Guard:
             age = (now_ns - self._track_until_ns + limits.command_age_max_ns) * 1e-9
             cause = f"command age {age:.3f} s above {limits.command_age_max_ns * 1e-9:.3f} s"
             self._enter(HOLD, now_ns, "new session" if self._track_until_ns == NEVER_NS else cause)
-        elif state is HOLD and self.armed and now_ns - self._alone_ns > limits.hold_max_ns:
+        elif self.armed and now_ns - self._alone_ns > limits.hold_max_ns:  # in HOLD or GROUND
             self._enter(LAND, now_ns, f"held for {limits.hold_max_ns * 1e-9:g} s without the cloud")
+            self._flies = state is HOLD
         elif state is LAND and self._flies:
             if self._descent.may_stop(readings):
                 self._enter(HOLD, now_ns, "acknowledged before touch-down")

@@ -134,6 +134,17 @@ def test_a_downlink_that_never_comes_back_lands_and_the_run_still_ends():
     assert ends.run.now_ns < 100e9
 
 
+def test_a_robot_that_could_not_take_off_does_not_when_its_mission_is_over():
+    """The start was the last that it heard; no word of the mission's end gets through."""
+    ends, of_world, _ = fly_records(
+        "link.downlink.blackouts=[{start_s: 0.29, duration_s: 100}]", until_s=110
+    )
+    changes = [r for r in of_world if isinstance(r, GuardChange)]
+    assert [r.state for r in changes] == [GuardState.GROUND, GuardState.LAND]
+    assert changes[-1].cause == "held for 60 s without the cloud"
+    assert ends.world.robot.guard.state is GuardState.LAND
+
+
 def test_a_flight_without_faults_never_meets_the_fence():
     ends, _, _ = fly_records()
     assert dict(ends.world.robot.guard.counts) == {}

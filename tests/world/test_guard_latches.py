@@ -47,6 +47,33 @@ def test_a_mission_that_is_started_again_and_again_lands_all_the_same():
     assert guard.state is LAND
 
 
+def test_a_minute_on_the_ground_of_a_mission_without_the_cloud_is_waited_no_longer():
+    """Nobody expects it to take off any more; it needs no touch-down for that."""
+    guard = armed()
+    guard.offer(command(basis_ns=-300 * MS), SECOND)  # stale: nobody is there
+    assert run(guard, 0, 60 * SECOND + TICK)[-1] is None
+    assert (guard.state, guard.armed) == (GROUND, True)
+    assert run(guard, 60 * SECOND + TICK, 60 * SECOND + 2 * TICK) == [None]
+    (change,) = guard.take_changes()
+    assert change == (60 * SECOND + TICK, LAND, "held for 60 s without the cloud")
+    feed(guard, 61 * SECOND, 20)
+    assert (guard.state, guard.armed) == (LAND, False)
+    guard.acknowledge(62 * SECOND)
+    assert guard.state is GROUND
+
+
+def test_one_that_hears_its_cloud_waits_on_the_ground_until_it_may_take_off():
+    """Slipping along after a stop, it may not."""
+    guard = Guard(LIMITS)
+    guard.stop(0)
+    guard.acknowledge(0)
+    guard.start_mission(0)
+    for second in range(1, 120):
+        guard.offer(command(basis_ns=second * SECOND), second * SECOND)
+        run(guard, second * SECOND, second * SECOND + 3 * TICK, velocity=(0.2, 0.0, 0.0))
+    assert (guard.state, guard.armed) == (GROUND, True)
+
+
 def test_a_hold_that_goes_down_to_its_place_does_not_land():
     """As slowly as a descent, and standing still, as if on something."""
     guard = holding()

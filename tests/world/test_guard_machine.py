@@ -31,6 +31,7 @@ ALLOWED = {
     "hit": {(state, ESTOP) for state in (TRACK, HOLD, LAND)},
     "time": {
         (TRACK, HOLD),
+        (GROUND, LAND),
         (HOLD, GROUND),
         (HOLD, LAND),
         (LAND, LAND),
