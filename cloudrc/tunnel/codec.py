@@ -247,6 +247,8 @@ def encode_operator(request: OperatorRequest) -> bytes:
 def decode_operator(body: bytes) -> OperatorRequest:
     """Read the body of an OPERATOR datagram."""
     number, request, start, mission_id, reached, basis_stamp_ns = _OPERATOR.unpack(body)
+    if mission_id >> 63:  # telemetry that names such a one is in no recording
+        raise DecodeError("malformed")
     try:
         asked = Request(request), Start(start)
     except ValueError:

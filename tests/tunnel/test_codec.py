@@ -165,6 +165,14 @@ def test_a_request_that_does_not_exist_is_refused(offset, value):
         codec.decode_operator(bytes(body))
 
 
+def test_a_mission_that_no_recording_can_name_is_refused():
+    largest = OperatorRequest(1, Request.START, Start.HERE, mission_id=2**63 - 1)
+    assert codec.decode_operator(codec.encode_operator(largest)) == largest
+    for mission_id in (2**63, 2**64 - 1):
+        with pytest.raises(DecodeError, match=r"^malformed$"):
+            codec.decode_operator(codec.encode_operator(largest._replace(mission_id=mission_id)))
+
+
 def test_a_guard_state_that_does_not_exist_is_refused():
     body = bytearray(codec.BODY_SIZES[Kind.TELEMETRY])
     body[-1] = max(GuardState)
