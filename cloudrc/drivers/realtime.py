@@ -26,6 +26,9 @@ BACKLOG_MAX = 2 * RECEIVE_BUFFER // 512
 """More than can wait in the socket: Linux doubles the room, a datagram takes 768 bytes at least."""
 STALL_NS = 50_000_000
 """After a wake this late all that waits is taken at once: it came before that wake [ns]."""
+STALL_AGAIN_NS = 1_000_000_000
+"""After a wake that was itself late only one this late [ns]: a flood that takes that long to take
+in would keep the loop in it. What honest peers send in less fits into `DRAIN_MAX`."""
 SINK_PERIOD_NS = 20_000_000
 WAIT_MAX_NS = 100_000_000
 ROUTE_PERIOD_NS = 500_000_000
@@ -144,8 +147,7 @@ def serve(
         wait_ns = min(deadline_ns - time.monotonic_ns(), WAIT_MAX_NS)
         readable, _, _ = select.select([peer.socket], [], [], max(wait_ns, 0) * 1e-9)
         now_ns = time.monotonic_ns()
-        # Not twice in a row: a flood that is too much would keep the loop in it.
-        stalled = not stalled and now_ns - deadline_ns > STALL_NS
+        stalled = now_ns - deadline_ns > (STALL_AGAIN_NS if stalled else STALL_NS)
         if readable:
             for data in peer.receive(BACKLOG_MAX if stalled else DRAIN_MAX):
                 endpoint.receive_datagram(data, now_ns)

@@ -5,9 +5,18 @@ import time
 
 import pytest
 
-from cloudrc.drivers.realtime import BACKLOG_MAX, DRAIN_MAX, STALL_NS, Peer, bind, serve
+from cloudrc.drivers.realtime import (
+    BACKLOG_MAX,
+    DRAIN_MAX,
+    STALL_AGAIN_NS,
+    STALL_NS,
+    Peer,
+    bind,
+    serve,
+)
 
 MANY = 300
+MS = 1_000_000
 LONG_NS = 10 * STALL_NS
 
 
@@ -53,6 +62,28 @@ def test_what_waited_through_a_stall_is_taken_in_one_wake(late_ns, wakes):
             sender.sendto(b"waits", udp.getsockname())
         end = Late(*late_ns)
         serve(end, Peer(udp, None), end="world", sink=list, stop=lambda: len(end.wakes) == 2)
+        assert end.wakes == wakes
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "wakes"),
+    [
+        ((LONG_NS, STALL_AGAIN_NS + MS, 0), [0, MANY, 0]),
+        ((LONG_NS, STALL_AGAIN_NS - 100 * MS, 0), [0, DRAIN_MAX, MANY - DRAIN_MAX]),
+    ],
+)
+def test_so_is_what_waited_through_one_that_follows_on_a_late_wake(late_ns, wakes):
+    """As where little of a processor is left, and the process then stands still."""
+    with bind(("127.0.0.1", 0)) as udp, socket.socket(type=socket.SOCK_DGRAM) as sender:
+        end = Late(*late_ns)
+
+        def over():
+            if len(end.wakes) == 1:
+                for _ in range(MANY):
+                    sender.sendto(b"waits", udp.getsockname())
+            return len(end.wakes) == 3
+
+        serve(end, Peer(udp, None), end="world", sink=list, stop=over)
         assert end.wakes == wakes
 
 
