@@ -31,7 +31,7 @@ class Limits:
         speed_max: Largest speed [m/s].
         acceleration_max: Largest change of the reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
-        hold_max_ns: HOLD for so long in a mission ends in LAND [ns].
+        hold_max_ns: HOLD, or GROUND without the cloud, for so long in a mission ends in LAND [ns].
     """
 
     fence_low: Vector

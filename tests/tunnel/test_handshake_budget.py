@@ -110,6 +110,8 @@ def test_without_an_epoch_a_hello_is_not_answered_and_takes_nothing_away():
     assert step.world.epoch == 1
     assert step.knock(cookie=step.door._cookie(step.now_ns)).datagrams  # the incumbent is, still
     epochs.append(2)
+    assert step.door.ready
+    assert epochs == []  # it is kept for the next session
     step.now_ns += 2 * SECOND_NS
     assert step.knock(b"m" * 16, step.door._cookie(step.now_ns)).opened
     assert step.world.epoch == 2
