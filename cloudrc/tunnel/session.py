@@ -153,6 +153,8 @@ class Session:
             raise DecodeError("old_epoch")
         assert self._openers is not None, "an epoch has them"
         body, key, anew = self._openers.open(data, generation)
+        if counter >> 63:  # nobody counts as far, and what is flown by it could not be recorded
+            raise DecodeError("malformed")
         if counter > self._newest[kind]:  # what is repeated anybody can send
             self._newest[kind] = counter
             self._hear(key, anew)

@@ -47,7 +47,7 @@ requests = st.builds(
     st.integers(0, 2**32 - 1),
     st.sampled_from(Request),
     st.sampled_from(Start),
-    st.integers(0, 2**64 - 1),
+    st.integers(0, 2**63 - 1),
     st.integers(0, 2**16 - 1),
     st.integers(-1, 2**63 - 1),
     epoch=st.just(0),  # is for cloud alone

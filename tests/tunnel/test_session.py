@@ -255,3 +255,13 @@ def test_what_is_refused_changes_nothing(made, data):
 
 def test_the_suite_that_ends_agree_on_is_aes_unless_they_say_else():
     assert AGREEMENT.suite == AES_256_GCM
+
+
+def test_a_counter_that_no_recording_can_hold_is_refused():
+    world, cloud = pair()
+    cloud._counters[Kind.COMMAND] = 2**63 - 1
+    assert world.open(cloud.seal(Kind.COMMAND, BODY))[3] == 2**63 - 1
+    before = state(world)
+    with pytest.raises(DecodeError, match=r"^malformed$"):
+        world.open(cloud.seal(Kind.COMMAND, BODY))
+    assert state(world) == before
