@@ -201,7 +201,11 @@ _ENTRIES = (
         "Time in HOLD while a mission was on; told once a second.",
         (WORLD,),
     ),
-    counter("cloudrc_guard_starts_refused_total", "Starts refused in LAND or ESTOP.", (WORLD,)),
+    counter(
+        "cloudrc_guard_starts_refused_total",
+        "Starts refused in LAND or ESTOP, or for want of an epoch.",
+        (WORLD,),
+    ),
     counter(
         "cloudrc_contacts_total",
         "Times that the robot began to touch a body of the scene, by its kind.",
