@@ -145,7 +145,9 @@ class Guard(Section):
     acceleration_max_mps2: Acceleration = Field(12.0, description="Cap on its change [m/s^2]")
     yaw_rate_max_radps: YawRate = Field(1.0, description="Cap on the yaw rate [rad/s]")
     hold_max_s: Patience = Field(
-        60.0, description="HOLD for so long during a mission ends in LAND [s]"
+        60.0,
+        description="HOLD for so long during a mission ends in LAND, and so does GROUND without a "
+        "fresh command, after 10 s at least [s]",
     )
 
 

@@ -262,9 +262,9 @@ class Guard:
             age = (now_ns - self._track_until_ns + limits.command_age_max_ns) * 1e-9
             cause = f"command age {age:.3f} s above {limits.command_age_max_ns * 1e-9:.3f} s"
             self._enter(HOLD, now_ns, "new session" if self._track_until_ns == NEVER_NS else cause)
-        elif self.armed and now_ns - self._alone_ns > limits.hold_max_ns:  # in HOLD or GROUND
-            self._enter(LAND, now_ns, f"held for {limits.hold_max_ns * 1e-9:g} s without the cloud")
-            self._flies = state is HOLD
+        elif self.armed and now_ns - self._alone_ns > (max_ns := limits.alone_max_ns(self._flies)):
+            self._enter(LAND, now_ns, f"held for {max_ns * 1e-9:g} s without the cloud")
+            self._flies = state is HOLD  # not in GROUND
         elif state is LAND and self._flies:
             if self._descent.may_stop(readings):
                 self._enter(HOLD, now_ns, "acknowledged before touch-down")

@@ -14,6 +14,9 @@ from cloudrc.world.guard_rules import MARGIN, REACTION, STOPPING_DISTANCE, stopp
 
 AGE_MAX_NS = 10_000_000_000
 """Commands that are older are never flown [ns], whatever an experiment says."""
+GROUND_MIN_NS = 10_000_000_000
+"""A robot on the ground waits for a mission's first command for so long at least [ns]: it comes a
+round trip behind the start, 0.6 s by `satellite`, or some, if one end has not heard the other."""
 RANGE = 1000.0
 """Largest number of a command that is shortened to a cap, not refused [m/s, rad/s]: no controller
 asks a robot for more. One that does has a bug, and its direction is as wrong as its length. Source:
@@ -31,7 +34,7 @@ class Limits:
         speed_max: Largest speed [m/s].
         acceleration_max: Largest change of the reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
-        hold_max_ns: HOLD, or GROUND without the cloud, for so long in a mission ends in LAND [ns].
+        hold_max_ns: HOLD for so long in a mission ends in LAND [ns]; see `alone_max_ns`.
     """
 
     fence_low: Vector
@@ -64,6 +67,10 @@ class Limits:
         for low, high in zip(self.fence_low, self.fence_high, strict=True):
             if not (isfinite(low) and isfinite(high) and high - low > FLOOR_MARGIN + MARGIN):
                 raise ValueError(f"guard: a fence from {low:g} to {high:g} m leaves no room")
+
+    def alone_max_ns(self, flies: bool) -> int:
+        """How long a robot in a mission waits for its cloud before LAND [ns]."""
+        return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_MIN_NS)
 
     def inside(self) -> tuple[Vector, Vector]:
         """Give the fence's corners with the margins taken off [m], shape (3,) each."""

@@ -145,6 +145,13 @@ def test_a_robot_that_could_not_take_off_does_not_when_its_mission_is_over():
     assert ends.world.robot.guard.state is GuardState.LAND
 
 
+def test_a_robot_that_may_not_hold_for_long_still_waits_for_its_first_command():
+    """It comes a round trip behind the start."""
+    _, of_world, _ = fly_records("link.profile=satellite", "guard.hold_max_s=0.1", until_s=4)
+    changes = [r.state for r in of_world if isinstance(r, GuardChange)]
+    assert changes == [GuardState.GROUND, GuardState.TRACK]
+
+
 def test_a_flight_without_faults_never_meets_the_fence():
     ends, _, _ = fly_records()
     assert dict(ends.world.robot.guard.counts) == {}

@@ -4,11 +4,12 @@ from dataclasses import FrozenInstanceError, fields
 from math import inf, nan
 
 import pytest
-from guard_play import LIMITS
+from guard_play import LIMITS, SECOND, TICK, armed, run
 
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import FLOOR_MARGIN
+from cloudrc.messages import GuardState
 from cloudrc.world.guard_limits import Limits
 from cloudrc.world.guard_rules import MARGIN
 
@@ -38,6 +39,17 @@ def test_a_speed_that_cannot_be_stopped_from_in_time_is_refused(age_ms, fastest)
     limits(command_age_max_ns=age_ms * 1_000_000, speed_max=fastest)
     with pytest.raises(ValueError, match="speed_max"):
         limits(command_age_max_ns=age_ms * 1_000_000, speed_max=fastest + 1e-3)
+
+
+@pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (10, 10), (11, 11)])
+def test_on_the_ground_a_mission_is_waited_for_ten_seconds_at_least(hold_s, waited_s):
+    """A hold may be too short for a first command to come."""
+    guard = armed(limits(hold_max_ns=round(hold_s * SECOND)))
+    run(guard, 0, waited_s * SECOND + TICK)
+    assert guard.state is GuardState.GROUND
+    run(guard, waited_s * SECOND + TICK, waited_s * SECOND + 2 * TICK)
+    assert guard.state is GuardState.LAND
+    assert guard.take_changes()[-1].cause == f"held for {waited_s} s without the cloud"
 
 
 @pytest.mark.parametrize("axis", range(3))
