@@ -112,6 +112,20 @@ def test_a_stop_is_not_asked_again_of_a_robot_that_has_flown_since(since):
     assert Request.ESTOP not in {request.request for request in flight.requests[asked:]}
 
 
+@pytest.mark.promise("P-API-8")
+@pytest.mark.parametrize("since", ["other mission", "other world"])
+def test_a_stop_before_the_robot_is_seen_is_asked_of_whatever_it_flies(since):
+    """It was taken for one of the teleop before, which is not asked again of another robot."""
+    flight, mission_id = flying()
+    if since == "other world":
+        flight.restart()
+    flight.guard, flight.onboard = GuardState.TRACK, (ID, 1)
+    flight.restart_teleop()
+    assert flight.teleop.stop_rotors(flight.now_ns).id == mission_id
+    flight.step(seconds=0.2)
+    assert flight.guard is GuardState.ESTOP
+
+
 def test_a_stop_is_acknowledged_once_the_robot_is_seen_to_be_released():
     """Written down before, it would count for a stop that has yet to act."""
     flight, mission_id = flying()

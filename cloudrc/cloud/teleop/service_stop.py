@@ -20,7 +20,8 @@ class Stop:
         """Ask again for what a teleop before this one has asked for."""
         self._book, self._teleop = book, teleop
         self._is_released = False
-        if book.stopped() is not None:
+        self._is_inherited = book.stopped() is not None  # and nobody has asked this process
+        if self._is_inherited:
             teleop.operate(EmergencyStop(), 0)
 
     @property
@@ -30,7 +31,7 @@ class Stop:
 
     def ask(self, now_ns: int) -> None:
         """Stop the rotors at once."""
-        self._is_released = False
+        self._is_released = self._is_inherited = False
         self._teleop.operate(EmergencyStop(), now_ns)
 
     def release(self, now_ns: int) -> None:
@@ -41,7 +42,7 @@ class Stop:
     def meet(self, seen: Seen) -> None:
         """Take the first look at the robot, before teleop does."""
         stopped = self._book.stopped()
-        if stopped is not None and seen.mission_id != stopped.number:
+        if self._is_inherited and stopped is not None and seen.mission_id != stopped.number:
             self._teleop.requests.withdraw_stop()
 
     def released(self) -> Mission | None:
