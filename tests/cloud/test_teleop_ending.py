@@ -85,6 +85,28 @@ def test_where_it_is_seen_the_robot_stays_though_its_end_is_lost():
     assert flight.setpoints[-1].position == HALFWAY
 
 
+@pytest.mark.promise("P-MISSION-4")
+@pytest.mark.parametrize("state", ["flying", "held", "starting"])
+def test_asked_to_end_in_its_first_instant_it_pauses_what_it_has_found_under_way(state):
+    """The robot flew on to its waypoint, and nothing was written down."""
+    flight = idle() if state == "starting" else held() if state == "held" else flying()[0]
+    if state == "starting":
+        flight.downlink = False
+        flight.create()
+        flight.downlink = True
+    asked = len(flight.requests)
+    flight.restart_teleop()
+    flight.teleop.pause(flight.now_ns)
+    flight.step(seconds=0.5)
+    assert flight.guard in (GuardState.HOLD, GuardState.GROUND)
+    assert {request.request for request in flight.requests[asked:]} == {Request.END}
+    assert flight.kept[-1]["event"] == "paused"
+    assert flight.teleop.settled
+    flight.restart_teleop()
+    flight.step(seconds=0.5)
+    assert flight.view("m1")["state"] == ("held" if state == "held" else "flying")
+
+
 class Neighbour:
     """Cloud, which shows where the robot is whenever teleop looks."""
 

@@ -115,8 +115,7 @@ class MissionService:
         mission = self.book.find(mission_id)
         if mission.ended:
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
-        self._take_up(now_ns)
-        if mission is self._current:
+        if mission is self._take_up(now_ns):
             return self._operate(Cancel(), now_ns)
         self.book.cancel(mission)
         return mission
@@ -155,8 +154,7 @@ class MissionService:
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once, in every state; give the mission under way, which has failed."""
-        self._take_up(now_ns)
-        mission = self._current
+        mission = self._take_up(now_ns)
         self._stop.ask(now_ns)
         self._collect(now_ns)
         return mission
@@ -171,7 +169,7 @@ class MissionService:
     def pause(self, now_ns: int) -> None:
         """Before this process ends: what is flown is held, for a successor to go on with."""
         self._ends = True
-        if self._current is not None:
+        if self._take_up(now_ns) is not None:
             self._operate(Pause(), now_ns)
 
     @property
@@ -243,14 +241,15 @@ class MissionService:
         self._collect(now_ns)
         return mission
 
-    def _take_up(self, now_ns: int, *, queued: bool = False) -> None:
-        """Go on with what a teleop before this one has begun, or begin what is `queued`."""
+    def _take_up(self, now_ns: int, *, queued: bool = False) -> Mission | None:
+        """Go on with what was begun before, or begin what is `queued`; give what is under way."""
         waiting = self.book.open()
         if self._current is None and waiting:
             if queued and waiting[0].state == missions.QUEUED:
                 self.book.begin(waiting[0], now_ns)
             if waiting[0].state != missions.QUEUED:
                 self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
+        return self._current
 
     def _launch(self, mission: Mission, verb: Verb, now_ns: int) -> None:
         self._current = mission
