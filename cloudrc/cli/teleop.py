@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from cloudrc.cloud.teleop.service import MissionService
     from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
+    from cloudrc.drivers.teleop import Calls
 
 EPILOG = """\
 It talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
@@ -131,10 +132,11 @@ def _fly(
 
     feed = Feed.on_stdout(watched=options.feed)
     peer = UnixPeer(options.socket / "teleop.sock", options.socket / "cloud.sock")
-    calls: Callable[[], Iterable[Callable[[int], None]]] = list
+    calls: Calls = list
+    stops: Calls = list
     if served is not None:
         served.open(service, lambda: peer.send(wire.encode(wire.ALARM)))
-        calls = served.bridge.take
+        calls, stops = served.bridge.take, served.bridge.take_urgent
     feed.ready()
 
     def tell(told: list[Any]) -> None:
@@ -151,7 +153,9 @@ def _fly(
 
     if trouble:
         tell([Fault(0, "journal", trouble)])
-    serve_teleop(service, peer, wire.encode, wire.decode, calls=calls, tell=tell, stop=ask)
+    serve_teleop(
+        service, peer, wire.encode, wire.decode, calls=calls, stops=stops, tell=tell, stop=ask
+    )
 
 
 def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge | None) -> Journal | None:

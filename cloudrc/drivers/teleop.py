@@ -35,6 +35,8 @@ EVENTS_KEPT = 256
 Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
 """Raises ValueError for what is no message."""
+Calls = Callable[[], Iterable[Callable[[int], None]]]
+"""What other threads want to be done, here and now [ns]; must not block."""
 
 
 class Machine(Protocol):
@@ -111,7 +113,8 @@ def serve_teleop(
     encode: Encode,
     decode: Decode,
     *,
-    calls: Callable[[], Iterable[Callable[[int], None]]],
+    calls: Calls,
+    stops: Calls = list,
     tell: Callable[[list[MissionEvent | Fault]], None],
     stop: Callable[[], bool],
 ) -> None:
@@ -123,6 +126,7 @@ def serve_teleop(
         encode: Writes a message for cloud.
         decode: Reads one from cloud.
         calls: See `turn`.
+        stops: See `turn`.
         tell: Gets events and faults, at every wake that has some; must not block.
         stop: Asked at every wake.
     """
@@ -134,7 +138,9 @@ def serve_teleop(
         now_ns = time.monotonic_ns()
         late_ns = now_ns - deadline_ns
         deadline_ns += (late_ns // PERIOD_NS + 1) * PERIOD_NS
-        blind = turn(machine, peer, decode, calls, blind=blind, late_ns=late_ns, now_ns=now_ns)
+        blind = turn(
+            machine, peer, decode, calls, stops=stops, blind=blind, late_ns=late_ns, now_ns=now_ns
+        )
         if not blind and (told := send(machine.take_outputs(), unsent, peer, encode)):
             tell(told)
 
@@ -143,8 +149,9 @@ def turn(
     machine: Machine,
     peer: UnixPeer,
     decode: Decode,
-    calls: Callable[[], Iterable[Callable[[int], None]]],
+    calls: Calls,
     *,
+    stops: Calls = list,
     blind: int,
     late_ns: int,
     now_ns: int,
@@ -155,7 +162,8 @@ def turn(
         machine: Sees, is asked, and gets its deadline.
         peer: The socket to cloud.
         decode: Reads a message from cloud.
-        calls: What other threads want to be done, here and now [ns]; must not block.
+        calls: What is wanted.
+        stops: Of these the emergency stops, which are made first.
         blind: What was returned at the wake before; 0 at first.
         late_ns: By how much this wake is late [ns].
         now_ns: Now [ns].
@@ -167,6 +175,8 @@ def turn(
     blind = blind_for(was_blind, late_ns, bool(arrived))
     if blind:
         return blind
+    for stop in stops():  # first: what has arrived may already show what their alarm has done
+        stop(now_ns)
     seen = _newest(arrived, decode)
     if was_blind and seen is not None:  # first: a call may be about where the robot is
         machine.see(seen, now_ns)

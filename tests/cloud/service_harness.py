@@ -34,7 +34,11 @@ class ServiceFlight(Flight):
         self.kept.append(json.loads(json.dumps(entry)))
 
     def see(self):
-        seen = Seen(
+        self.teleop.see(self.seen, self.now_ns)
+
+    @property
+    def seen(self):
+        return Seen(
             self.epoch,
             self.position,
             self.guard,
@@ -45,7 +49,6 @@ class ServiceFlight(Flight):
             self.slip_ns,
             **self.progress(),
         )
-        self.teleop.see(seen, self.now_ns)
 
     def create(self, plan=PLAN, **order):
         mission, _ = self.teleop.create(Order(plan, **order), self.now_ns)

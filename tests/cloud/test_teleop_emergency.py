@@ -1,12 +1,17 @@
 """Emergency stop and acknowledgement: they reach the robot, and nothing passes them by."""
 
+from types import SimpleNamespace
+
 import pytest
 from service_harness import PLAN, ServiceFlight, flying
 from teleop_harness import AWAY, B, Flight
 from teleop_harness import flying as machine_flying
 
+from cloudrc.cloud.teleop import wire
+from cloudrc.cloud.teleop.api_bridge import Bridge
 from cloudrc.cloud.teleop.messages import Acknowledge, EmergencyStop, GoTo, Pause, StartMission
 from cloudrc.cloud.teleop.service_book import ConflictError
+from cloudrc.drivers.teleop import turn
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Request
 
@@ -44,6 +49,31 @@ def test_without_a_mission_it_is_asked_all_the_same():
     flight.step(seconds=0.05)
     assert flight.guard is GuardState.ESTOP
     assert asked(flight) == [Request.ESTOP]
+
+
+@pytest.mark.parametrize("stops", [1, 2])
+def test_after_a_stall_of_teleop_it_is_one_of_the_mission_that_its_alarm_has_stopped(stops):
+    """Past teleop's loop: it saw the robot stopped, and that was why the mission had failed."""
+    (flight, mission_id), bridge = flying(), Bridge()
+    bridge.open(flight.teleop)
+    asked = [
+        bridge.submit(lambda service, now_ns: service.stop_rotors(now_ns), urgent=True)
+        for _ in range(stops)
+    ]
+    looked = bridge.submit(lambda service, now_ns: service.state(now_ns)["seen"]["guard"])
+    flight.guard = GuardState.ESTOP
+    cloud = SimpleNamespace(receive=lambda: [wire.encode(flight.seen)])
+    take, now_ns = bridge.take, flight.now_ns + 5_000_000_000
+    blind = {"blind": 2, "late_ns": 0, "now_ns": now_ns}
+    turn(flight.teleop, cloud, wire.decode, take, stops=bridge.take_urgent, **blind)
+    assert [mission and mission.id for mission in (each.result() for each in asked)] == [
+        mission_id,
+        *[None] * (stops - 1),
+    ]
+    assert looked.result() == "ESTOP", "what is no stop is asked of the present"
+    flight.step(seconds=0.1)
+    assert flight.names(mission_id)[-1] == "emergency_stopped"
+    assert flight.teleop.settled
 
 
 def test_it_is_repeated_until_it_is_seen():

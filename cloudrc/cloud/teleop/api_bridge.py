@@ -74,14 +74,16 @@ class Bridge:
 
     def take(self) -> list[Callable[[int], None]]:
         """Hand over the calls that wait, operators' first, for the loop's thread to make."""
-        taken: list[Callable[[int], None]] = []
-        while self._urgent:
-            taken.append(self._bound(*self._urgent.popleft()))
+        taken = self.take_urgent()
         with self._lock:
             for lane in self._lanes.values():
                 while lane and len(taken) < WAITING_MAX:
                     taken.append(self._bound(*lane.popleft()))
         return taken
+
+    def take_urgent(self) -> list[Callable[[int], None]]:
+        """Hand over the urgent calls alone: before what they have led to is seen."""
+        return [self._bound(*self._urgent.popleft()) for _ in range(len(self._urgent))]
 
     def _bound(self, call: Call, future: Future[Any]) -> Callable[[int], None]:
         def make(now_ns: int) -> None:
