@@ -1,13 +1,16 @@
 """Tokens: read from files, followed, kept as digests, compared in constant time, never shown."""
 
 import ast
+import json
 from pathlib import Path
 
 import pytest
 from api_harness import OPERATOR, READER, connect, head, running
+from service_harness import PLAN
 
 from cloudrc.cloud.teleop import api_events, api_tokens
 from cloudrc.cloud.teleop.api_tokens import Tokens
+from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.errors import BadInputError
 
 
@@ -152,3 +155,29 @@ def test_a_token_that_is_taken_away_reads_no_open_stream(monkeypatch):
         stream.close()
         assert one.gate.counts["failed"] == 0
         assert one.complaints == []
+
+
+@pytest.mark.promise("P-API-4")
+@pytest.mark.parametrize(("revoked", "status"), [(False, b" 409 "), (True, b" 401 ")])
+def test_a_token_that_is_taken_away_while_a_body_arrives_commands_nothing(
+    monkeypatch, revoked, status
+):
+    """It may take 5 s to arrive."""
+    monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
+    body = json.dumps({"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}).encode()
+    with running() as one:
+        one.flight.teleop.create(Order(PLAN), 0)  # or it would be made
+        one.until(lambda: not one.gate._in_flight["operator", "request"])
+        slow = connect(one)
+        slow.sendall(head("POST", "/v1/missions", f"Content-Length: {len(body)}") + body[:9])
+        one.until(lambda: one.gate._in_flight["operator", "request"] == 1)
+        if revoked:
+            one.token_file.write_text("another-token-altogether")
+        slow.sendall(body[9:])
+        answer = slow.recv(4096)
+        assert status in answer
+        assert (b"www-authenticate: Bearer" in answer) == revoked
+        slow.close()
+        (line,) = one.audited()
+        assert (line["role"], line["status"]) == ("operator", int(status))
+        assert one.gate.counts["failed"] == 0

@@ -11,6 +11,7 @@ from starlette.requests import ClientDisconnect
 
 from cloudrc.cloud.teleop.api_check import RefusedError, as_json
 from cloudrc.cloud.teleop.api_models import Refusal
+from cloudrc.cloud.teleop.api_tokens import RevokedError
 from cloudrc.cloud.teleop.service_book import (
     ConflictError,
     UnavailableError,
@@ -61,6 +62,9 @@ def handle_errors(app: FastAPI) -> None:
                 return JSONResponse({"detail": str(error), "id": error.mission or None}, 409)
             case UnknownMissionError():
                 return JSONResponse({"detail": str(error)}, 404)
+            case RevokedError():
+                text = REFUSALS[401]["description"]
+                return JSONResponse({"detail": text}, 401, {"WWW-Authenticate": "Bearer"})
             case TooLargeError():
                 return JSONResponse({"detail": REFUSALS[413]["description"]}, 413)
             case TooSlowError():

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 
 from cloudrc.cloud.teleop.api_audit import Audit
 from cloudrc.cloud.teleop.api_bridge import LANE
-from cloudrc.cloud.teleop.api_tokens import LOCAL, OPERATOR, Caller, Tokens
+from cloudrc.cloud.teleop.api_tokens import LOCAL, OPERATOR, Caller, RevokedError, Tokens
 
 Scope: TypeAlias = MutableMapping[str, Any]
 Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -153,7 +153,11 @@ class Gate:
         kind = _kind(caller, scope)
         self._in_flight[kind] += 1
         LANE.set(caller.role)
-        send = self._while_known(caller, scope, answer) if kind[1] == "stream" else answer.send
+        send: Send = answer.send
+        if kind[1] == "stream":
+            send = self._while_known(caller, scope, answer)
+        else:
+            receive = self._from_known(caller, scope, receive)
         try:
             await self._app(scope, receive, send)
             self._count("served")
@@ -180,6 +184,17 @@ class Gate:
             await answer.send(message)
 
         return send
+
+    def _from_known(self, caller: Caller, scope: Scope, receive: Receive) -> Receive:
+        """Take a body in until its token is taken away: what a slow one asks for is not done."""
+
+        async def read() -> MutableMapping[str, Any]:
+            message = await receive()
+            if message["type"] == "http.request" and self._caller(scope) != caller:
+                raise RevokedError
+            return message
+
+        return read
 
     def _count(self, outcome: str) -> int:
         """Count one; say how many there were before."""

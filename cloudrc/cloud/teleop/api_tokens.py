@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, CloudrcError
 
 Role: TypeAlias = Literal["operator", "reader"]
 OPERATOR: Role = "operator"
@@ -26,6 +26,10 @@ LOOK_PERIOD = 1.0
 """Between two looks whether the files have changed [s]."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
 _BEARER = b"bearer "
+
+
+class RevokedError(CloudrcError):
+    """The token of a request is taken away while its body arrives."""
 
 
 @dataclass(frozen=True, slots=True)
