@@ -14,7 +14,7 @@ from math import nan
 from pathlib import Path
 
 from cloudrc.errors import in_one_line
-from cloudrc.link.route import read, version
+from cloudrc.link.route import TooLongError, read, version
 from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, LinkState, from_text
 from cloudrc.records import (
     Counted,
@@ -36,7 +36,7 @@ NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, Recur
 
 
 class LinkNotes:
-    """Follows the file; what cannot be read changes nothing."""
+    """Follows the file; what cannot be read changes nothing, what is too long is not noted."""
 
     def __init__(self, path: Path, *, uplink: bool) -> None:
         """Follow the file at `path`, which need not be there yet.
@@ -99,6 +99,9 @@ class LinkNotes:
         try:
             state = from_text(read(self._path, STATE_MAX).decode())
             self._note = _note(state, self._uplink, now_ns)
+        except TooLongError:  # a long time line is in force, and nothing that was noted before
+            self._note = self._since_ns = None
+            return False
         except NONSENSE:
             return False
         before_ns, self._since_ns = self._since_ns, state.since_ns

@@ -20,7 +20,7 @@ from cloudrc.drivers.standing_basis import Basis, Judged
 from cloudrc.drivers.standing_tally import Tally
 from cloudrc.errors import in_words
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.route import read
+from cloudrc.link.route import TooLongError, read
 from cloudrc.link.state import STATE_MAX, from_text
 from cloudrc.link.verify_block import Block
 from cloudrc.link.verify_judge import Row
@@ -83,6 +83,10 @@ class StandingCheck:
         self._tally.place = basis.place
         self._quiet_ns = -1  # set anew by the loop's thread
 
+    def rest(self) -> None:
+        """Judge no more until it is known again by what."""
+        self._basis = None
+
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
         """Work out on a daemon thread what to judge by.
 
@@ -135,8 +139,8 @@ class StandingCheck:
         self._quiet_ns = self._since_ns = now_ns + SETTLE_NS
         self._due_ns = self._quiet_ns + PERIOD_NS
         self._settled = False
-        if self._basis is not None:
-            self._basis.forget()
+        if (basis := self._basis) is not None:
+            basis.forget()
 
     def _see_trip(self, record: Control) -> None:
         trip = record.rtt
@@ -223,6 +227,9 @@ def _follow(
                 seen = text
                 state = from_text(text)
                 check.follow(load(state.profile), state.shaper)
+        except TooLongError:  # a long time line: what was asked before holds no more
+            seen = ""
+            check.rest()
         except Exception:  # not there yet, half written or nonsense: what was asked still holds
             pass
         try:

@@ -10,6 +10,10 @@ SIZE_MAX = 1 << 20
 """Longest that is read [bytes]: what a ConfigMap holds."""
 
 
+class TooLongError(ValueError):
+    """A file that is longer than who reads it takes."""
+
+
 def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | None:
     """Tell versions of a file apart by one system call; None while there is none.
 
@@ -33,14 +37,15 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
 
     Raises:
         OSError: If it cannot be read.
-        ValueError: If it is no file, as a pipe is none, or longer than that.
+        ValueError: If it is no file, as a pipe is none.
+        TooLongError: If it is longer than that.
     """
     with open(path, "rb", opener=_at_once) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise ValueError(f"{path}: not a file")
         data = file.read(size_max + 1)
     if len(data) > size_max:
-        raise ValueError(f"{path}: longer than {size_max} bytes")
+        raise TooLongError(f"{path}: longer than {size_max} bytes")
     return data
 
 

@@ -111,7 +111,6 @@ def test_a_refusal_or_a_broken_file_is_no_change(tmp_path: Path) -> None:
         {"profile": []},
         {"direction": {}},
         {"shaper": 5},
-        {"reason": "x" * STATE_MAX},
     ],
     ids=lambda wrong: next(iter(wrong)),
 )
@@ -128,6 +127,18 @@ def test_a_state_of_which_nothing_can_be_noted_is_no_change(
     assert again == before._replace(
         stamp_ns=400 * MS, age=pytest.approx(0.3), time_line=pytest.approx(nan, nan_ok=True)
     )
+
+
+def test_of_a_state_that_is_too_long_nothing_is_noted_nor_of_the_one_before(tmp_path: Path) -> None:
+    """A long time line was put in force: what was noted before holds no more."""
+    path = tmp_path / "link.json"
+    tell(path, STATE)
+    notes, began = LinkNotes(path, uplink=False), [SessionOpened(0, "cloud", 1, "")]
+    assert len(notes.after([], 200 * MS)) == 1
+    tell(path, replace(SET, reason="x" * STATE_MAX))
+    assert notes.after(began, 400 * MS) == []
+    tell(path, STATE)
+    assert len(notes.after([], 600 * MS)) == 1
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"released": Infinity}', '{"released": [1]}'])

@@ -167,6 +167,16 @@ def test_a_state_of_the_link_that_would_hold_the_loop_is_not_loaded(tmp_path: Pa
     assert loaded == ["short"]
 
 
+def test_by_what_held_before_a_state_that_is_too_long_nothing_is_judged(tmp_path: Path) -> None:
+    check, path, done = downlink(PAPER), tmp_path / "link.json", Event()
+    path.write_text("x" * (STATE_MAX + 1))
+    check.begin((PAPER, PAPER), path, lambda values: (PAPER, PAPER))
+    assert check._jobs is not None
+    check._jobs.put(done.set)  # after the first look
+    assert done.wait(20.0)
+    assert checked(check, arrivals(FAULTS["mean"])) == ([], [])
+
+
 def test_a_new_session_begins_anew() -> None:
     tally = Tally()
     assert tally.see(Arrival(0, False, 1, 500, 0.05, True)), "what was before is not judged"
