@@ -80,6 +80,23 @@ def test_the_audit_log_is_cut_by_size_and_a_disk_that_refuses_is_told_once(tmp_p
     assert "No such file or directory" in complaint
 
 
+def test_an_audit_log_that_cannot_be_renamed_has_no_more_room(tmp_path):
+    from cloudrc.cloud.teleop.api_audit import Audit
+
+    path, said = tmp_path / "audit.jsonl", []
+    path.with_name("audit.jsonl.1").mkdir()
+    audit = Audit(path, said.append, size_max=100)
+    for number in range(20):
+        audit.note(number=number)
+        while not audit._waiting.empty():
+            time.sleep(0.001)
+    audit.close()
+    assert len(path.read_text().splitlines()) == 20 - audit.dropped
+    assert path.stat().st_size < 300
+    (complaint,) = said
+    assert "Is a directory" in complaint
+
+
 def test_what_a_slow_disk_makes_too_many_is_dropped_and_counted(tmp_path, monkeypatch):
     from cloudrc.cloud.teleop import api_audit
 

@@ -22,7 +22,7 @@ from typing import Any
 WAITING_MAX = 1_000
 """Lines that wait for the disk."""
 SIZE_MAX = 8 << 20
-"""Of the file [bytes]; then it is renamed, in the place of the one before it."""
+"""Of the file [bytes]; then it is renamed, in the place of the one before it, or grows no more."""
 STOP_LIMIT = 1.0
 """For the last lines to be written [s]."""
 
@@ -123,6 +123,9 @@ class Audit:
             self._writing = 0
 
     def _write(self, path: Path, data: bytes) -> None:
+        with suppress(FileNotFoundError):
+            if path.stat().st_size > self._size_max:
+                path.replace(path.with_name(f"{path.name}.1"))
         # Unbuffered, since what a full disk has torn must not be tried again by `close`.
         with open(path, "ab", buffering=0, opener=_private) as file:
             began = file.tell()
@@ -134,9 +137,6 @@ class Audit:
                 with suppress(OSError):
                     file.truncate(began)  # half a line would swallow the next one
                 raise
-            full = file.tell() > self._size_max
-        if full:
-            path.replace(path.with_name(f"{path.name}.1"))
 
 
 def _private(path: str, flags: int) -> int:
