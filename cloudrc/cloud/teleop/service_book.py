@@ -65,7 +65,8 @@ class MissionBook:
     Attributes:
         missions: By id.
         trouble: Why the disk has refused the last entry; "" if it has not.
-        dropped: Events that were asked for by somebody who had some, and are forgotten.
+        dropped: Events that were asked for by somebody who had some, and are forgotten; each counts
+            once, however often it is asked for.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class MissionBook:
         self._numbered = self._events = 0
         self.missions: dict[str, Mission] = {}
         self.trouble, self._told, self._keep_ns = "", "", 0
-        self.dropped = 0
+        self.dropped, self._missed = 0, 0
         self._log: deque[dict[str, Any]] = deque(maxlen=LOGGED)
         for entry in entries:
             self._apply(entry)
@@ -203,7 +204,10 @@ class MissionBook:
         if number > self._events:  # of a journal that is gone
             number = 0
         if number and self._log:  # without a number nobody has missed anything
-            self.dropped += max(0, self._log[0]["id"] - number - 1)
+            last = self._log[0]["id"] - 1
+            if (missed := last - max(number, self._missed)) > 0:
+                self.dropped += missed
+                self._missed = last
         return list(takewhile(lambda event: event["id"] > number, reversed(self._log)))[::-1]
 
     def _append(self, entry: Entry, refused: str) -> None:
