@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import signal
 import sys
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cli import faults_page as page
 from cloudrc.cli import faults_slices as slices
 from cloudrc.cli.faults_slices import sources
-from cloudrc.cli.output import paint, table, written
+from cloudrc.cli.output import paint, table, unread_is_fine, written
 from cloudrc.cli.signals import end_with
 from cloudrc.errors import BadInputError
 
@@ -57,7 +58,8 @@ def fuzz(options: argparse.Namespace) -> int:
     if cut:
         then = page.command(document | _rest(document, options))
         told = f"stopped after {document['count']} of {options.seeds}: kept in {path}"
-        print(f"cloudrc: {told}; go on with '{then}'", file=sys.stderr)
+        with unread_is_fine(sys.stderr):  # else nothing of what follows was written to a file
+            print(f"cloudrc: {told}; go on with '{then}'", file=sys.stderr, flush=True)
     _print(document, options)
     return INTERRUPTED if cut else FAILED if search.failures else 0
 
@@ -189,7 +191,8 @@ def _findings(seeds: Iterable[int], options: argparse.Namespace) -> Iterator[Fin
     if options.jobs == 1:
         yield from map(_fly, work)
         return
-    pool = ProcessPoolExecutor(options.jobs, None, _leave_signals_to, (os.getpid(),))
+    fork = multiprocessing.get_context("fork")  # its workers are children of this process
+    pool = ProcessPoolExecutor(options.jobs, fork, _leave_signals_to, (os.getpid(),))
     try:
         yield from pool.map(_fly, work)  # one by one: so it soon ends when it is told to
     finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing.context
 import os
 import signal
 import subprocess
@@ -189,6 +190,29 @@ def test_a_terminal_that_is_closed_says_so_twice_and_a_second_wish_ends_it_at_on
     with faults_fuzz.stopping() as stop:
         os.kill(os.getpid(), signal.SIGHUP)
         assert not stop()
+
+
+def test_who_closes_the_terminal_gets_what_goes_to_a_file(
+    fuzz: Fuzz, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(schedule: Schedule, keep: bool = False) -> Finding:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return _fly(schedule)
+
+    monkeypatch.setattr("cloudrc.faults.fuzz.fly", stopped)
+    with open("/dev/full", "w") as closed:  # as such a terminal it refuses what is written
+        monkeypatch.setattr(sys, "stderr", closed)
+        assert main(["faults", "fuzz", "--seeds", "20", "-o", "json"]) == 130
+    assert json.loads(capsys.readouterr().out)["count"] == 1
+
+
+def test_workers_fly_however_this_python_starts_processes(
+    fuzz: Fuzz, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From Python 3.14 on a server forks them, whose children they are."""
+    default = multiprocessing.get_context("forkserver")
+    monkeypatch.setattr(multiprocessing.context._default_context, "_actual_context", default)
+    assert fuzz("a.json", 1, 4, "--jobs", "2")["count"] == 4
 
 
 def test_without_a_name_the_slice_lies_beside_what_was_found(
