@@ -94,7 +94,7 @@ def _two_clouds(seed: int) -> Outcome:
     crowd = flight.cloud.inner
     assert isinstance(crowd, Crowd)
     opened: list[int] = []
-    flight.world.at(at + 5.0, lambda _: opened.append(flight.epoch))
+    flight.world.at(at + 5.0, lambda _: opened.extend(asks.epochs(flight)))
 
     def leave(now_ns: int) -> None:
         crowd.members = crowd.members[1:]
