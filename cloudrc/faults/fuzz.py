@@ -19,6 +19,7 @@ from cloudrc.faults.flight import Flight
 from cloudrc.faults.inject import inject
 from cloudrc.faults.liar import tempting
 from cloudrc.faults.mortal import Clock
+from cloudrc.faults.once import Once
 from cloudrc.faults.remains import Remains
 from cloudrc.faults.schedule import Schedule, shaped
 from cloudrc.faults.walls import steppable_wall_clock
@@ -28,7 +29,7 @@ from cloudrc.records import Record
 
 BACK = 10.0
 """In so long of calm the robot must have flown [s]."""
-ALWAYS = frozenset({"fence", "cap", "stop", "stale", "error"})
+ALWAYS = frozenset({"fence", "cap", "stop", "stale", "rest", "latch", "order", "error"})
 """Invariants that are looked at in every flight."""
 PATIENCE_NS = 1_000_000_000
 """The operator does something at most this often [ns]."""
@@ -91,7 +92,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
     )
     operator = Operator(flight)
     flight.listeners.append(operator.look)
-    remains = Remains(flight, schedule)
+    remains, once = Remains(flight, schedule), Once(flight)
     with steppable_wall_clock() as wall:
         inject(flight, schedule, wall)
         try:
@@ -102,6 +103,8 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
     looked_at = judged(schedule)
     if "stuck" in looked_at:
         _ask_whether_stuck(flight, operator)
+    if "waypoint" in looked_at:
+        once.judge()
     watch, holds = flight.watch, held(flight)
     if "alarm" in looked_at:
         for hold in holds:  # nothing has gone wrong
@@ -166,11 +169,14 @@ def judged(schedule: Schedule) -> frozenset[str]:
     """Say which invariants a schedule is held to.
 
     Under a cloud that means no good a contact is no breach, and nobody has to get on; what goes
-    wrong to the end leaves no time to find back; a HOLD is a false alarm where nothing goes wrong.
+    wrong to the end leaves no time to find back; a HOLD is a false alarm where nothing goes wrong;
+    what a damaged journal has lost may be written down again.
     """
     kinds = set(ALWAYS)
     if not schedule.policy:
         kinds.add("collision")
+        if not schedule.of("journal_torn", "journal_rotten"):
+            kinds.add("waypoint")
         if schedule.duration - schedule.quiet_from >= BACK:
             kinds.add("stuck")
         if not schedule.events:

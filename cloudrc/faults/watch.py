@@ -5,16 +5,18 @@ word or a hit has stopped them, it may fall out of it, which is told, but not as
 to stay away, and they turn again only where the robot lies still, inside the fence. What is flown
 stays below the caps and can be stopped in time, before the floor, too, unless the robot lands. No
 motion on stale commands: in TRACK the newest accepted command's basis is never older than its
-limit. No collision, under an honest cloud: nothing but the arm's tip touches anything, and that the
-board. A robot that lands, since its cloud is gone for good or says what no honest one does, sinks
-where it is: the guard knows the fence, and not what lies below. What it comes down on is told, and
-no collision, also where the operator has acknowledged too late for it to stop above that.
+limit, and where TRACK ends the robot stops, within the way that this takes. What has landed or was
+stopped stays so until the operator acknowledges it. No collision, under an honest cloud: nothing
+but the arm's tip touches anything, and that the board. A robot that lands, since its cloud is gone
+for good or says what no honest one does, sinks where it is: the guard knows the fence, and not what
+lies below. What it comes down on is told, and no collision, also where the operator has
+acknowledged too late for it to stop above that.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from math import hypot, sqrt
+from math import hypot, inf, sqrt
 from typing import Any, NamedTuple
 
 from cloudrc.geometry.fence import HIGH, LOW, inside
@@ -26,11 +28,15 @@ TICK_NS = 2_000_000
 SLACK = 1e-9
 """For rounding [m/s]."""
 FLOWN = (GuardState.TRACK, GuardState.HOLD, GuardState.LAND)
+LATCHED = (GuardState.LAND, GuardState.ESTOP)
 ABOVE_GROUND = (GuardState.TRACK, GuardState.HOLD)
 REPORTED = 5
 """Of each kind."""
 STILL = 0.12
 """Slower than this a robot lies [m/s]: the guard's 0.1, and what a fall adds in a tick."""
+REST = 0.3
+"""So much farther than its way to a stop a robot goes at most that is left alone [m]; 0.1 is the
+drift in a minute."""
 FALL_MAX = 1.5
 """How far outside the fence people are told to stay [m]. Source: docs/safety/guard.md."""
 
@@ -40,8 +46,8 @@ class Breach(NamedTuple):
 
     Attributes:
         time: World's clock [s].
-        kind: "collision", "fence", "cap", "stop", "stale", "stuck", "alarm", "recording" or
-            "error".
+        kind: "collision", "fence", "cap", "stop", "stale", "rest", "latch", "order", "waypoint",
+            "stuck", "alarm", "recording" or "error".
         text: What happened.
     """
 
@@ -85,15 +91,18 @@ class Watch:
         self.landed_on: set[str] = set()
         self._hit: tuple[int, str] | None = None
         self._lands = False
+        self._left: Vector = ZERO
+        self._way = inf
 
     def attach(self, world: Any, start_ns: int) -> None:
         """Look at every step of a world that begins now, and at every command that it accepts."""
         robot = world.robot
         simulator, guard = robot.simulator, robot.guard
         step, offer, stop = simulator.step, guard.offer, guard.stop
+        acknowledge = guard.acknowledge
         now_ns, basis_ns, before = start_ns, -1, ZERO
-        flew = falls = hit = False
-        age_max_ns, flown = self._age_max_ns, FLOWN
+        flew = falls = hit = released = False
+        was, age_max_ns, flown = guard.state, self._age_max_ns, FLOWN
         tracking, landing, stopped = GuardState.TRACK, GuardState.LAND, GuardState.ESTOP
 
         def watched_offer(command: Command, when_ns: int) -> Any:
@@ -108,11 +117,21 @@ class Watch:
             falls = falls or guard.state in flown
             stop(when_ns)
 
+        def watched_acknowledge(when_ns: int) -> None:
+            nonlocal released
+            released = True
+            acknowledge(when_ns)
+
         def watched_step(rotor_speeds: Any) -> None:
-            nonlocal now_ns, before, flew, falls, hit
+            nonlocal now_ns, before, flew, falls, hit, was, released
             state, reference = guard.state, guard.reference
             position = simulator.readings.position
             flies = state in flown
+            if state is not was:
+                self._look_at_change(was, state, released, now_ns)
+                if was is tracking:
+                    self._leave_alone(position, simulator.readings.velocity, before)
+                was, released = state, False
             hit = hit or (flew and state is stopped and not falls)
             if flies and (falls or hit):
                 falls = hit = False
@@ -124,14 +143,37 @@ class Watch:
                 self._look_at_stop(position, reference, state is landing, now_ns)
                 if reference is not before:
                     self._look_at_caps(before, reference, state is tracking, now_ns)
-                if state is tracking and now_ns - basis_ns > age_max_ns:
+                if state is not tracking:
+                    self._look_at_rest(position, now_ns)
+                elif now_ns - basis_ns > age_max_ns:
                     age = (now_ns - basis_ns) * 1e-9
                     self.note(now_ns, "stale", f"TRACK on a command {age:.3f} s old")
+            elif any(rotor_speeds):
+                self.note(now_ns, "latch", f"rotors turn in {state.name}")
             before = reference
             step(rotor_speeds)
             now_ns += TICK_NS
 
         simulator.step, guard.offer, guard.stop = watched_step, watched_offer, watched_stop
+        guard.acknowledge = watched_acknowledge
+
+    def _look_at_change(
+        self, was: GuardState, state: GuardState, released: bool, now_ns: int
+    ) -> None:
+        """What has landed or was stopped stays so until the operator acknowledges it."""
+        if was in LATCHED and not released and state is not GuardState.ESTOP:
+            self.note(now_ns, "latch", f"{was.name} left for {state.name} without the operator")
+
+    def _leave_alone(self, position: Vector, velocity: Vector, reference: Vector) -> None:
+        """From here on no command is flown: the robot goes on for as far as it takes to stop."""
+        speed = max(hypot(*velocity), hypot(*reference))
+        self._left, self._way = position, speed * (0.2 + speed / 6.0) + REST
+
+    def _look_at_rest(self, position: Vector, now_ns: int) -> None:
+        """In HOLD and LAND the robot stops, and stays above where it has; a hit excuses it."""
+        dx, dy = position[0] - self._left[0], position[1] - self._left[1]
+        if dx * dx + dy * dy > self._way * self._way:
+            self.note(now_ns, "rest", f"{hypot(dx, dy):.2f} m from where the last command ended")
 
     def _look_at_take_off(self, position: Vector, velocity: Vector, now_ns: int) -> None:
         """After a stop the rotors turn again only where the robot lies still inside the fence."""
@@ -188,7 +230,7 @@ class Watch:
     def see(self, contact: Contact, guard: GuardState, honest: bool) -> None:
         """Judge a contact; under a cloud that is not honest it only explains what comes later."""
         body = contact.body
-        self._hit = (contact.stamp_ns, body)
+        self._hit, self._way = (contact.stamp_ns, body), inf
         if not honest:
             return
         low = guard not in ABOVE_GROUND

@@ -4,9 +4,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.faults.watch import Watch, stops
+from cloudrc.faults.watch import FLOWN, Watch, stops
 from cloudrc.messages import ZERO, Command, GuardState
 from cloudrc.records import Contact
+from cloudrc.world.rotors import STOPPED
 
 MS = 1_000_000
 INSIDE, OUTSIDE = (1.0, 1.0, 1.0), (9.3, 1.0, 1.0)
@@ -23,7 +24,7 @@ class World:
         self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
         self.guard = SimpleNamespace(state=TRACK, reference=ZERO)
         self.guard.offer = lambda command, now: None
-        self.guard.stop = lambda now: None
+        self.guard.stop = self.guard.acknowledge = lambda now: None
         self.robot = SimpleNamespace(simulator=self.simulator, guard=self.guard)
         self.watch.attach(self, 0)
         self.guard.offer(Command(0, 0, 0, ZERO, 0.0), 0)
@@ -31,12 +32,15 @@ class World:
     def _step(self, rotor_speeds):
         self.steps += 1
 
-    def tick(self, *references, state=TRACK, position=INSIDE):
+    def tick(self, *references, state=TRACK, position=INSIDE, turns=None, released=True):
         """Fly references, one a tick, and say what kinds of breach there were."""
         for reference in references:
+            if released:
+                self.guard.acknowledge(0)
             self.guard.state, self.guard.reference = state, reference
             self.readings.position = position
-            self.simulator.step(None)
+            turns = state in FLOWN if turns is None else turns
+            self.simulator.step((900.0,) * 4 if turns else STOPPED)
         return set(self.watch.counts)
 
 
@@ -141,6 +145,50 @@ def test_track_is_for_fresh_commands():
     world = World()
     assert world.tick(*[ZERO] * 126) == set()
     assert world.tick(ZERO) == {"stale"}
+
+
+@pytest.mark.parametrize("latched", [LAND, ESTOP])
+@pytest.mark.parametrize("after", [GROUND, TRACK, HOLD])
+def test_what_is_latched_stays_so_until_the_operator_has_said_so(latched, after):
+    for released, kinds in ((True, set()), (False, {"latch"})):
+        world = World()
+        assert world.tick(ZERO, state=latched) == set()
+        assert world.tick(ZERO, state=after, released=released) == kinds
+    world = World()
+    world.guard.acknowledge(0)  # of nothing: it counts for no landing that comes later
+    assert world.tick(ZERO, state=latched, released=False) == set()
+    assert world.tick(ZERO, state=after, released=False) == {"latch"}
+
+
+@pytest.mark.parametrize("state", [GROUND, ESTOP])
+def test_rotors_stand_still_on_the_ground_and_after_a_stop(state):
+    assert World().tick(ZERO, state=state) == set()
+    assert World().tick(ZERO, state=state, turns=True) == {"latch"}
+
+
+@pytest.mark.parametrize("state", [HOLD, LAND])
+def test_a_robot_that_is_left_alone_stops_where_it_can(state):
+    world = World()  # at rest: 0.3 m
+    world.tick(ZERO, state=state)
+    assert world.tick(ZERO, state=state, position=(1.29, 1.0, 1.0)) == set()
+    assert world.tick(ZERO, state=state, position=(1.0, 0.69, 1.0)) == {"rest"}
+    world = World()  # 2 m/s: 0.4 + 0.67 m more
+    world.readings.velocity = (0.0, 2.0, 0.0)
+    world.tick(ZERO, state=state)
+    assert world.tick(ZERO, state=state, position=(1.0, 2.36, 1.0)) == set()
+    assert world.tick(ZERO, state=TRACK, position=(1.0, 2.6, 1.0)) == set()
+    assert world.tick(ZERO, state=state, position=(1.0, 2.6, 1.0)) == set(), "flown on since"
+    assert world.tick(ZERO, state=state, position=(1.0, 3.97, 1.0)) == {"rest"}
+
+
+def test_what_was_hit_excuses_how_far_it_goes_until_it_is_flown_again():
+    world, pipe = World(), Contact(0, "pipe_1", INSIDE, ZERO, ZERO, False)
+    world.tick(ZERO, state=HOLD)
+    world.watch.see(pipe, HOLD, honest=False)
+    assert world.tick(ZERO, state=HOLD, position=(3.0, 1.0, 1.0)) == set()
+    for state in (TRACK, HOLD):
+        world.tick(ZERO, state=state, position=(3.0, 1.0, 1.0))
+    assert world.tick(ZERO, state=HOLD, position=(5.0, 1.0, 1.0)) == {"rest"}
 
 
 @pytest.mark.parametrize(
