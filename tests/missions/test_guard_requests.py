@@ -156,3 +156,20 @@ def test_what_the_robot_has_touched_is_told_until_another_mission_starts(talk):
     talk.request(4, Request.START, Start.HERE, mission_id=7)
     talk.wait(talk.now_ns + 20 * MS)
     assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == 0
+
+
+def test_what_the_cloud_before_has_said_does_not_count_for_the_next_one(talk):
+    """Nine fresh commands of one and a single one of another are no proof of a link."""
+    fly(talk, 100)
+    ask(talk, 2, Request.END)
+    talk.request(3, Request.START, Start.HERE)
+    talk.wait(talk.now_ns + 1_000 * MS)
+    fly(talk, 9)
+    assert talk.take(GuardChange)[-1].state is GuardState.HOLD
+    talk.wait(talk.now_ns + 260 * MS)
+    assert talk.hello(b"another") > 0
+    fly(talk, 2)
+    assert talk.take(GuardChange)[-1].state is GuardState.HOLD
+    fly(talk, 8)
+    talk.wait(talk.now_ns + 10 * MS)
+    assert talk.take(GuardChange)[-1].state is GuardState.TRACK
