@@ -100,15 +100,13 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         except Exception as error:  # an end has to survive whatever comes
             flight.watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
     remains.judge()
-    looked_at = judged(schedule)
+    watch, holds, looked_at = flight.watch, held(flight), judged(schedule)
     if "stuck" in looked_at:
         _ask_whether_stuck(flight, operator)
     if "waypoint" in looked_at:
         once.judge()
-    watch, holds = flight.watch, held(flight)
-    if "alarm" in looked_at:
-        for hold in holds:  # nothing has gone wrong
-            watch.note(hold.stamp_ns, "alarm", f"HOLD in a clean flight: {hold.cause}")
+    for hold in holds if "alarm" in looked_at else ():  # nothing has gone wrong
+        watch.note(hold.stamp_ns, "alarm", f"HOLD in a clean flight: {hold.cause}")
     return Finding(
         schedule,
         tuple(watch.breaches),

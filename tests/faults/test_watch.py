@@ -168,17 +168,17 @@ def test_rotors_stand_still_on_the_ground_and_after_a_stop(state):
 
 @pytest.mark.parametrize("state", [HOLD, LAND])
 def test_a_robot_that_is_left_alone_stops_where_it_can(state):
-    world = World()  # at rest: 0.3 m
+    world = World()  # at rest: 0.5 m
     world.tick(ZERO, state=state)
-    assert world.tick(ZERO, state=state, position=(1.29, 1.0, 1.0)) == set()
-    assert world.tick(ZERO, state=state, position=(1.0, 0.69, 1.0)) == {"rest"}
+    assert world.tick(ZERO, state=state, position=(1.49, 1.0, 1.0)) == set()
+    assert world.tick(ZERO, state=state, position=(1.0, 0.49, 1.0)) == {"rest"}
     world = World()  # 2 m/s: 0.4 + 0.67 m more
     world.readings.velocity = (0.0, 2.0, 0.0)
     world.tick(ZERO, state=state)
-    assert world.tick(ZERO, state=state, position=(1.0, 2.36, 1.0)) == set()
+    assert world.tick(ZERO, state=state, position=(1.0, 2.56, 1.0)) == set()
     assert world.tick(ZERO, state=TRACK, position=(1.0, 2.6, 1.0)) == set()
     assert world.tick(ZERO, state=state, position=(1.0, 2.6, 1.0)) == set(), "flown on since"
-    assert world.tick(ZERO, state=state, position=(1.0, 3.97, 1.0)) == {"rest"}
+    assert world.tick(ZERO, state=state, position=(1.0, 4.17, 1.0)) == {"rest"}
 
 
 def test_what_was_hit_excuses_how_far_it_goes_until_it_is_flown_again():
