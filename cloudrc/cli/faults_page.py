@@ -14,6 +14,7 @@ INVARIANTS = {
     "stale": "motion on stale commands",
     "rest": "motion long after the last command",
     "latch": "rotors on without the operator's word",
+    "obeyed": "emergency stops that were not obeyed",
     "order": "commands applied out of order",
     "waypoint": "waypoints reached out of order, or twice",
     "stuck": "stuck states",
@@ -66,7 +67,7 @@ def summary(document: dict[str, Any]) -> str:
         f"by {document[f'{key}_m']:.2f} m"
         for key, cause in (("fallen", "the operator's word"), ("thrown", "a hit"))
     )
-    landed = f"; {document['landed_on']} landed on something other than the floor"
+    landed = f"; {document['landed_on']} came down on something other than the floor"
     return (
         f"{document['hours']:.2f} virtual hours of {document['kind']} schedules from seed "
         f"{document['first']} on in {document['seconds']:.0f} s: "

@@ -54,6 +54,7 @@ RANGES: dict[str, tuple[float, float, float]] = {
     "values_invalid": (10.0, 1.0, 12.0),
     "values_huge": (10.0, 1.0, 4.0),
     "second_order": (0.0, 0.0, 0.0),
+    "stopped": (0.0, 0.0, 0.0),
     "held": (5.0, 0.0, 0.0),
 }
 

@@ -90,6 +90,10 @@ class Desk:
             with suppress(ConflictError, UnavailableError):
                 call(self.service, now_ns)
 
+    def stop_rotors(self, now_ns: int) -> None:
+        """An emergency stop by the API at an instant [ns] of cloud's clock."""
+        self.ask(MissionService.stop_rotors, now_ns)
+
     def shut_down(self, now_ns: int) -> None:
         """SIGTERM at an instant [ns] of cloud's clock."""
         if self.service is not None:

@@ -21,6 +21,7 @@ from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.teleop import wire
 from cloudrc.cloud.teleop.api_bridge import WAITING_MAX, Call
 from cloudrc.cloud.teleop.journal_format import Entry
+from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, send, turn
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.faults.desk import Desk
@@ -125,6 +126,12 @@ class Apart(Desk):
         if self.service is not None and len(self._calls) < WAITING_MAX:
             self._calls.append(call)
 
+    def stop_rotors(self, now_ns: int) -> None:
+        """See `Desk`; its alarm goes past teleop's loop, from the thread of the API."""
+        if self.service is not None:
+            self._stops.append(MissionService.stop_rotors)
+            self._peer.send(wire.encode(wire.ALARM))
+
     def shut_down(self, now_ns: int) -> None:
         """See `Desk`; it is asked for a signal in every turn."""
         self._ends = self.service is not None
@@ -143,6 +150,7 @@ class Apart(Desk):
     def _forget(self) -> None:
         self._at_teleop.waiting.clear()
         self._calls: list[Call] = []
+        self._stops: list[Call] = []
         self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
         self._ends, self._free_ns, self._turn_ns = False, 0, NEVER_NS
         self._blind = 0
@@ -170,6 +178,7 @@ class Apart(Desk):
             self._peer,
             wire.decode,
             self._take_calls,
+            stops=self._take_stops,
             blind=self._blind,
             late_ns=late_ns,
             now_ns=own_ns,
@@ -185,6 +194,10 @@ class Apart(Desk):
         calls += [partial(ask, call) for call in self._calls]
         self._calls, self._ends = [], False
         return calls
+
+    def _take_stops(self) -> list[Callable[[int], None]]:
+        stops, self._stops = self._stops, []
+        return [partial(super(Apart, self).ask, stop) for stop in stops]
 
     def _send(self) -> None:
         """Say it to cloud: events wait for one that is there, everything else is repeated."""

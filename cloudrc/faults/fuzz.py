@@ -31,6 +31,11 @@ BACK = 10.0
 """In so long of calm the robot must have flown [s]."""
 ALWAYS = frozenset({"fence", "cap", "stop", "stale", "rest", "latch", "order", "error"})
 """Invariants that are looked at in every flight."""
+FORGETFUL = (
+    *("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down"),
+    *("journal_torn", "journal_rotten"),
+)
+"""Kinds after which there is another robot, or a teleop that need not know of a stop."""
 PATIENCE_NS = 1_000_000_000
 """The operator does something at most this often [ns]."""
 
@@ -49,7 +54,7 @@ class Finding:
         missions: How many missions were done.
         fallen: How far outside the fence it came, its rotors stopped by the operator's word [m].
         thrown: Likewise, its rotors stopped by a hit [m].
-        landed_on: What it touched when it landed, the floor left out.
+        landed_on: What it touched when it landed or was stopped, the floor left out.
     """
 
     schedule: Schedule
@@ -90,7 +95,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         second=min((event.at for event in schedule.of("second_cloud")), default=None),
         apart=schedule.has_teleop_apart,
     )
-    operator = Operator(flight)
+    operator = Operator(flight, schedule)
     flight.listeners.append(operator.look)
     remains, once = Remains(flight, schedule), Once(flight)
     with steppable_wall_clock() as wall:
@@ -100,20 +105,27 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         except Exception as error:  # an end has to survive whatever comes
             flight.watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
     remains.judge()
-    watch, holds, looked_at = flight.watch, held(flight), judged(schedule)
+    looked_at = judged(schedule)
     if "stuck" in looked_at:
         _ask_whether_stuck(flight, operator)
     if "waypoint" in looked_at:
         once.judge()
-    for hold in holds if "alarm" in looked_at else ():  # nothing has gone wrong
-        watch.note(hold.stamp_ns, "alarm", f"HOLD in a clean flight: {hold.cause}")
+    if "obeyed" in looked_at:
+        _ask_whether_stopped(flight, operator)
+    if "alarm" in looked_at:
+        _ask_for_alarms(flight)
+    return _finding(flight, schedule, keep)
+
+
+def _finding(flight: Flight, schedule: Schedule, keep: bool) -> Finding:
+    watch = flight.watch
     return Finding(
         schedule,
         tuple(watch.breaches),
         flight.sha256() if keep else "",
         watch.margin,
         watch.speed,
-        len(holds),
+        len(held(flight)),
         sum(event.event == "done" for event in flight.desk.events),
         watch.fallen,
         watch.thrown,
@@ -135,12 +147,18 @@ def _tempt(schedule: Schedule, clock: Clock) -> Callable[[CloudEndpoint], None]:
 
 
 class Operator:
-    """Keeps missions coming, and acknowledges what is latched."""
+    """Keeps missions coming, and acknowledges what is latched.
 
-    def __init__(self, flight: Flight) -> None:
+    Attributes:
+        tracked_ns: When the robot last flew commands [ns]; -1 if it never did.
+        unmet_ns: When the operator made stops that were not seen to be obeyed [ns].
+    """
+
+    def __init__(self, flight: Flight, schedule: Schedule) -> None:
         self._flight = flight
         self._next_ns = 0
         self.tracked_ns = -1
+        self.unmet_ns = [round(event.at * 1e9) for event in schedule.of("stopped")]
 
     def look(self, records: list[Record], now_ns: int) -> None:
         """Look at the robot, every 100 ms."""
@@ -148,6 +166,8 @@ class Operator:
         state = flight.changes[-1].state if flight.changes else GuardState.GROUND
         if state is GuardState.TRACK:
             self.tracked_ns = now_ns
+        if state is GuardState.ESTOP:
+            self.unmet_ns = [at_ns for at_ns in self.unmet_ns if at_ns > now_ns]
         service = flight.desk.service
         if service is None or now_ns < self._next_ns or flight.cloud.inner is None:
             return
@@ -168,7 +188,8 @@ def judged(schedule: Schedule) -> frozenset[str]:
 
     Under a cloud that means no good a contact is no breach, and nobody has to get on; what goes
     wrong to the end leaves no time to find back; a HOLD is a false alarm where nothing goes wrong;
-    what a damaged journal has lost may be written down again.
+    what a damaged journal has lost may be written down again. A stop is asked again until it is
+    obeyed, by a teleop that lives, of the robot that was there.
     """
     kinds = set(ALWAYS)
     if not schedule.policy:
@@ -177,6 +198,8 @@ def judged(schedule: Schedule) -> frozenset[str]:
             kinds.add("waypoint")
         if schedule.duration - schedule.quiet_from >= BACK:
             kinds.add("stuck")
+            if schedule.of("stopped") and not schedule.of(*FORGETFUL):
+                kinds.add("obeyed")
         if not schedule.events:
             kinds.add("alarm")
     if schedule.of(*Remains.KINDS):
@@ -191,3 +214,15 @@ def _ask_whether_stuck(flight: Flight, operator: Operator) -> None:
         mission = flight.mission.state if flight.desk.missions else "none"
         text = f"not flown in {BACK:g} s of calm: guard {state}, mission {mission}"
         flight.watch.note(flight.run.now_ns, "stuck", text)
+
+
+def _ask_whether_stopped(flight: Flight, operator: Operator) -> None:
+    """Whatever the link, the disk and the other processes do, the robot is stopped in the end."""
+    for at_ns in operator.unmet_ns:
+        text = f"the operator's stop at {at_ns * 1e-9:.2f} s has stopped nothing"
+        flight.watch.note(flight.run.now_ns, "obeyed", text)
+
+
+def _ask_for_alarms(flight: Flight) -> None:
+    for hold in held(flight):  # nothing has gone wrong
+        flight.watch.note(hold.stamp_ns, "alarm", f"HOLD in a clean flight: {hold.cause}")

@@ -100,6 +100,8 @@ def _at_the_desk(flight: Flight, event: Event) -> bool:
             cloud.at(event.at + n * FLOOD_PERIOD, lambda now_ns: _ask(flight, call, now_ns))
     elif event.kind == "second_order":
         cloud.at(event.at, flight.ask_for_mission)
+    elif event.kind == "stopped":
+        cloud.at(event.at, lambda now_ns: desk.stop_rotors(cloud.clock.at(now_ns)))
     elif event.kind == "held":
         cloud.at(event.at, lambda now_ns: _ask(flight, MissionService.hold, now_ns))
         cloud.at(event.end, lambda now_ns: _ask(flight, MissionService.resume, now_ns))

@@ -49,6 +49,7 @@ KINDS: dict[str, str] = {
     "values_invalid": "value commands a second of an honest cloud hold NaN or infinity",
     "values_huge": "value commands a second of an honest cloud are 1e308 m/s",
     "second_order": "another mission is ordered",
+    "stopped": "the operator stops the rotors, and acknowledges that some time after",
     "held": "the operator holds the mission, resumes it after the duration",
 }
 """Every kind of fault."""

@@ -8,9 +8,9 @@ motion on stale commands: in TRACK the newest accepted command's basis is never 
 limit, and where TRACK ends the robot stops, within the way that this takes. What has landed or was
 stopped stays so until the operator acknowledges it. No collision, under an honest cloud: nothing
 but the arm's tip touches anything, and that the board. A robot that lands, since its cloud is gone
-for good or says what no honest one does, sinks where it is: the guard knows the fence, and not what
-lies below. What it comes down on is told, and no collision, also where the operator has
-acknowledged too late for it to stop above that.
+for good or says what no honest one does, sinks where it is, and one that the operator stops falls:
+the guard knows the fence, and not what lies below. What it comes down on is told, and no collision,
+also where the operator has acknowledged a landing too late for it to stop above that.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class Breach(NamedTuple):
 
     Attributes:
         time: World's clock [s].
-        kind: "collision", "fence", "cap", "stop", "stale", "rest", "latch", "order", "waypoint",
-            "stuck", "alarm", "recording" or "error".
+        kind: "collision", "fence", "cap", "stop", "stale", "rest", "latch", "obeyed", "order",
+            "waypoint", "stuck", "alarm", "recording" or "error".
         text: What happened.
     """
 
@@ -67,8 +67,8 @@ class Watch:
         fallen: How far outside the fence the base came with its rotors stopped by the operator's
             word [m]; 0 if it did not.
         thrown: Likewise, its rotors stopped by a hit [m].
-        landed_on: What was touched by a robot that landed, the floor left out, and until it flew
-            again.
+        landed_on: What was touched by a robot that landed, or was stopped by the operator's word,
+            the floor left out, and until it flew again.
     """
 
     def __init__(self, speed_max: float, acceleration_max: float, age_max_ns: int) -> None:
@@ -90,7 +90,7 @@ class Watch:
         self.fallen = self.thrown = 0.0
         self.landed_on: set[str] = set()
         self._hit: tuple[int, str] | None = None
-        self._lands = False
+        self._comes_down = False
         self._left: Vector = ZERO
         self._way = inf
 
@@ -114,6 +114,7 @@ class Watch:
         def watched_stop(when_ns: int) -> None:
             nonlocal falls
             falls = falls or guard.state in flown
+            self._comes_down = self._comes_down or falls
             stop(when_ns)
 
         def watched_step(rotor_speeds: Any) -> None:
@@ -128,7 +129,7 @@ class Watch:
             self._look_at_fence(position, falls, hit, now_ns)
             flew = flies
             if flies:
-                self._lands = state is landing
+                self._comes_down = state is landing
                 self._look_at_stop(position, reference, state is landing, now_ns)
                 if reference is not before:
                     self._look_at_caps(before, reference, state is tracking, now_ns)
@@ -251,7 +252,7 @@ class Watch:
         low = guard not in ABOVE_GROUND
         if (body == "board" and contact.tip) or (low and body == "floor"):
             return
-        if low and (self._lands or guard is GuardState.LAND):
+        if low and (self._comes_down or guard is GuardState.LAND):
             self.landed_on.add(body)
         else:
             part = "tip" if contact.tip else "body"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.cloud.operator import Alarm
 from cloudrc.cloud.teleop.api_bridge import WAITING_MAX
 from cloudrc.cloud.teleop.messages import Seen
 from cloudrc.cloud.teleop.service import MissionService
@@ -28,7 +29,7 @@ from cloudrc.tunnel.keys import KeyRing, KeySet
 Patch = pytest.MonkeyPatch
 NEW = (
     *("teleop_shut_down", "pod_shut_down", "names_lost", "key_wrong"),
-    *("values_invalid", "values_huge", *KILLED, *STALLS),
+    *("values_invalid", "values_huge", "stopped", *KILLED, *STALLS),
 )
 
 
@@ -165,6 +166,18 @@ def test_huge_numbers_that_pass_the_guard_are_found(monkeypatch: Patch) -> None:
     monkeypatch.setattr("cloudrc.world.guard.RANGE", 1e308)
     monkeypatch.setattr("cloudrc.world.guard.rules.towards", lambda start, end, step: end)
     assert "cap" in _flown(huge)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_a_stop_that_is_not_obeyed_is_found(apart: bool, monkeypatch: Patch) -> None:
+    """Also where the robot is on its way down, and where nobody flies."""
+    events = tuple(Event("stopped", at) for at in (0.05, 8.0, 11.5))
+    schedule = Schedule(3, events=events, duration=25.0, apart=apart)
+    assert fly(schedule).kinds == set()
+    monkeypatch.setattr(MissionService, "stop_rotors", lambda service, now_ns: None)
+    assert fly(schedule).kinds == (set() if apart else {"obeyed"}), "its alarm goes past teleop"
+    monkeypatch.setattr(Alarm, "sound", lambda alarm: None)
+    assert fly(schedule).kinds == {"obeyed"}
 
 
 @pytest.mark.parametrize("kind", STALLS)

@@ -236,6 +236,11 @@ def test_a_robot_that_lands_touches_what_lies_below_and_one_that_flies_again_may
         world.tick(ZERO, state=state)
         world.watch.see(pipe, state, honest=True)
     assert (set(world.watch.counts), world.watch.landed_on) == (set(), {"pipe_3"})
+    world = World()
+    world.tick(ZERO, state=TRACK)
+    world.guard.stop(0)
+    world.watch.see(pipe, ESTOP, honest=True)
+    assert (set(world.watch.counts), world.watch.landed_on) == (set(), {"pipe_3"})
     world.tick(ZERO, state=TRACK)
     for state in (TRACK, HOLD, ESTOP):
         world.watch.counts.clear()
