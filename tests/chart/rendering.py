@@ -13,10 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pytest
 import yaml
-
-gotpl_helm = pytest.importorskip("gotpl.exts.helm", reason="gotpl comes with the extra dev")
+from gotpl.exts import helm as gotpl_helm
 
 ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "charts" / "cloudrc"

@@ -174,6 +174,19 @@ def test_a_promise_is_skipped_nowhere() -> None:
     assert {name: tests for name, tests in found.items() if tests} == {}
 
 
+def test_what_the_tests_of_promises_share_skips_nothing() -> None:
+    files = [path for path in (ROOT / "tests").rglob("test_*.py") if held(path.read_text("utf-8"))]
+    shared = {
+        near
+        for path in files
+        for name in re.findall(r"^(?:from|import) (\w+)", path.read_text("utf-8"), re.MULTILINE)
+        if (near := path.with_name(f"{name}.py")).exists()
+    }
+    assert "rendering.py" in {path.name for path in shared}
+    texts = {path.name: ast.unparse(ast.parse(path.read_text("utf-8"))) for path in shared}
+    assert [name for name, text in texts.items() if re.search(r"pytest\.\w*skip", text)] == []
+
+
 MARK = '@pytest.mark.promise("P-A-1")'
 
 
