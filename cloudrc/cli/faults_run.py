@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import multiprocessing
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -11,6 +13,7 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.extras import require
 from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import paint, table, written
+from cloudrc.cli.signals import end_with
 
 if TYPE_CHECKING:
     from cloudrc.faults.document import Result
@@ -83,7 +86,8 @@ def _results(chosen: Sequence[Scenario], options: argparse.Namespace) -> Iterato
     if options.jobs == 1 or len(chosen) == 1 or _mode(options) != "virtual":
         yield from map(_run, names)
         return
-    with ProcessPoolExecutor(options.jobs) as pool:
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(options.jobs, context, end_with, (os.getpid(),)) as pool:
         yield from pool.map(_run, names)
 
 

@@ -127,7 +127,10 @@ class Apart(Desk):
             self._calls.append(call)
 
     def stop_rotors(self, now_ns: int) -> None:
-        """See `Desk`; its alarm goes past teleop's loop, from the thread of the API."""
+        """See `Desk`; its alarm goes past teleop's loop, from the thread of the API.
+
+        So it does from a process that stands still, unlike in production.
+        """
         if self.service is not None:
             self._stops.append(MissionService.stop_rotors)
             self._peer.send(wire.encode(wire.ALARM))

@@ -25,7 +25,7 @@ from cloudrc.faults.schedule import Schedule, shaped
 from cloudrc.faults.walls import steppable_wall_clock
 from cloudrc.faults.watch import Breach
 from cloudrc.messages import GuardState
-from cloudrc.records import Record
+from cloudrc.records import GuardChange, Record
 
 BACK = 10.0
 """In so long of calm the robot must have flown [s]."""
@@ -166,7 +166,8 @@ class Operator:
         state = flight.changes[-1].state if flight.changes else GuardState.GROUND
         if state is GuardState.TRACK:
             self.tracked_ns = now_ns
-        if state is GuardState.ESTOP:
+        changes = [record for record in records if isinstance(record, GuardChange)]
+        if GuardState.ESTOP in (state, *(change.state for change in changes)):
             self.unmet_ns = [at_ns for at_ns in self.unmet_ns if at_ns > now_ns]
         service = flight.desk.service
         if service is None or now_ns < self._next_ns or flight.cloud.inner is None:

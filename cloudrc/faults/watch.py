@@ -37,6 +37,8 @@ STILL = 0.12
 REST = 0.5
 """So much farther than its way to a stop a robot that is left alone may go [m]: it swings back. In
 200 flights of the search, half of them under a hostile cloud, it was 0.20 at most."""
+REELS_NS = 1_000_000_000
+"""For so long a robot that has touched something may be pushed aside [ns]."""
 FALL_MAX = 1.5
 """How far outside the fence people are told to stay [m]. Source: docs/safety/guard.md."""
 
@@ -146,26 +148,27 @@ class Watch:
     def _attach_to_states(self, simulator: Any, guard: Any, start_ns: int) -> None:
         """Look at what the guard's states promise: rotors that stand, a robot that stops."""
         step, acknowledge = simulator.step, guard.acknowledge
-        now_ns, was, before, released = start_ns, guard.state, ZERO, False
+        now_ns, was, before = start_ns, guard.state, ZERO
+        released: GuardState | None = None  # the state that was acknowledged
         tracking, flown = GuardState.TRACK, FLOWN
 
         def watched_acknowledge(when_ns: int) -> None:
             nonlocal released
-            released = True
+            released = guard.state
             acknowledge(when_ns)
 
         def watched_step(rotor_speeds: Any) -> None:
             nonlocal now_ns, was, before, released
             state = guard.state
             if state is not was:
-                self._look_at_change(was, state, released, now_ns)
+                self._look_at_change(was, state, released is was, now_ns)
                 if was is tracking:
-                    self._leave_alone(simulator.readings, before)
-                was, released = state, False
+                    self._leave_alone(simulator.readings, before, now_ns)
+                was, released = state, released if released is state else None
             if state not in flown:
                 if any(rotor_speeds):
                     self.note(now_ns, "latch", f"rotors turn in {state.name}")
-            elif state is not tracking:
+            elif state is not tracking and any(rotor_speeds):
                 self._look_at_rest(simulator.readings.position, now_ns)
             before = guard.reference
             step(rotor_speeds)
@@ -180,10 +183,12 @@ class Watch:
         if was in LATCHED and not released and state is not GuardState.ESTOP:
             self.note(now_ns, "latch", f"{was.name} left for {state.name} without the operator")
 
-    def _leave_alone(self, readings: Any, reference: Vector) -> None:
+    def _leave_alone(self, readings: Any, reference: Vector, now_ns: int) -> None:
         """From here on no command is flown: the robot goes on for as far as it takes to stop."""
         speed = max(hypot(*readings.velocity), hypot(*reference))
         self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
+        if self._hit is not None and now_ns - self._hit[0] < REELS_NS:
+            self._way = inf
 
     def _look_at_rest(self, position: Vector, now_ns: int) -> None:
         """In HOLD and LAND the robot stops, and stays above where it has; a hit excuses it."""

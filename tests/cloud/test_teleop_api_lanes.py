@@ -61,6 +61,25 @@ def test_streams_of_readers_leave_an_operator_one(monkeypatch):
             stream.close()
 
 
+@pytest.mark.promise("P-API-8")
+def test_an_acknowledgement_that_was_asked_before_a_stop_does_not_release_it():
+    """The stop passes it by while the loop waits for its disk."""
+    with running() as one:
+        free = threading.Event()
+        one.bridge.take = lambda take=one.bridge.take: take() if free.wait(LIMIT) else []
+        early, stop = connect(one), connect(one)
+        early.sendall(head("POST", "/v1/acknowledge", "Content-Length: 0"))
+        one.until(lambda: any(one.bridge._lanes.values()))
+        stop.sendall(head("POST", "/v1/estop", "Content-Length: 0"))
+        one.until(lambda: one.bridge.stops == 1)
+        free.set()
+        assert b" 409 " in early.recv(4096)
+        assert b" 200 " in stop.recv(4096)
+        for connection in (early, stop):
+            connection.close()
+        assert one.send(one.request("/v1/acknowledge", b"", OPERATOR, "POST"))[0] == 200
+
+
 def test_each_role_waits_in_a_lane_of_its_own_and_operators_first():
     bridge, made = Bridge(), []
     bridge.open(object())

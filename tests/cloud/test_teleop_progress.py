@@ -256,3 +256,17 @@ def test_hold_can_be_asked_of_the_machine_alone():
     flight.onboard = (ID, 2)
     flight.step(seconds=0.1)
     assert (flight.state, flight.teleop.leg) == ("HELD", 2)
+
+
+def test_the_last_waypoint_is_written_down_once_though_teleop_died_before_it_was_over():
+    flight, mission_id = flying()
+    flight.step(position=B, seconds=0.1)
+    flight.step(position=C, seconds=0.1)
+    events = [entry.get("event") for entry in flight.kept]
+    del flight.kept[events.index("done") :]
+    assert flight.kept[-1]["event"] == "reached"
+    flight.restart_teleop()
+    flight.step(position=C, seconds=0.5)
+    assert flight.view(mission_id)["state"] == "done"
+    reached = [entry["waypoint"] for entry in flight.kept if entry.get("event") == "reached"]
+    assert reached == [0, 1, 2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -178,6 +179,13 @@ def test_a_stop_that_is_not_obeyed_is_found(apart: bool, monkeypatch: Patch) -> 
     assert fly(schedule).kinds == (set() if apart else {"obeyed"}), "its alarm goes past teleop"
     monkeypatch.setattr(Alarm, "sound", lambda alarm: None)
     assert fly(schedule).kinds == {"obeyed"}
+
+
+def test_a_stop_that_is_released_before_anybody_looks_was_obeyed() -> None:
+    """The operator, who sees the landing still, acknowledges while the stop is on its way."""
+    invalid, silent = Event("values_invalid", 10.0, 1.0, 12.0), Event("blackout", 10.37, 1.6)
+    events = (invalid, replace(silent, way="down"), Event("stopped", 10.7))
+    assert fly(Schedule(3, "ideal", events, duration=24.0)).breaches == ()
 
 
 @pytest.mark.parametrize("kind", STALLS)

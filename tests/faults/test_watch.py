@@ -182,7 +182,7 @@ def test_a_robot_that_is_left_alone_stops_where_it_can(state):
 
 
 def test_what_was_hit_excuses_how_far_it_goes_until_it_is_flown_again():
-    world, pipe = World(), Contact(0, "pipe_1", INSIDE, ZERO, ZERO, False)
+    world, pipe = World(), Contact(-2_000_000_000, "pipe_1", INSIDE, ZERO, ZERO, False)
     world.tick(ZERO, state=HOLD)
     world.watch.see(pipe, HOLD, honest=False)
     assert world.tick(ZERO, state=HOLD, position=(3.0, 1.0, 1.0)) == set()
@@ -246,3 +246,29 @@ def test_a_robot_that_lands_touches_what_lies_below_and_one_that_flies_again_may
         world.watch.counts.clear()
         world.watch.see(pipe, state, honest=True)
         assert set(world.watch.counts) == {"collision"}
+
+
+def test_an_acknowledgement_counts_in_the_state_that_it_is_for_and_no_longer():
+    world = World()
+    world.tick(ZERO, released=False)
+    world.guard.state = LAND  # it lands and is acknowledged between two ticks
+    world.guard.acknowledge(0)
+    assert world.tick(ZERO, state=LAND, released=False) == set()
+    assert world.tick(ZERO, state=HOLD, released=False) == set()
+    world.tick(ZERO, state=LAND, released=False)
+    assert world.tick(ZERO, state=HOLD, released=False) == {"latch"}
+
+
+def test_who_has_just_been_hit_or_whose_rotors_stand_need_not_rest_where_commands_ended():
+    away = (3.0, 1.0, 1.0)
+    for hit_ns, kinds in ((0, set()), (-1_000_000_000, {"rest"})):
+        world = World()
+        world.watch.see(Contact(hit_ns + 2 * MS, "pipe_3", INSIDE, ZERO, ZERO, False), TRACK, False)
+        world.tick(ZERO)
+        world.tick(ZERO, state=HOLD)
+        assert world.tick(ZERO, state=HOLD, position=away) == kinds
+    world = World()
+    world.tick(ZERO)
+    world.tick(ZERO, state=HOLD)
+    assert world.tick(ZERO, state=LAND, position=away, turns=False) == set()
+    assert world.tick(ZERO, state=LAND, position=away) == {"rest"}

@@ -196,7 +196,7 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
         **_gives(models.Acknowledged, "The robot is told until it obeys"),
     )
     async def acknowledge() -> JSONResponse:
-        await _ask(bridge, lambda s, now_ns: s.acknowledge(now_ns))
+        await _ask(bridge, bridge.unless_stopped(lambda s, now_ns: s.acknowledge(now_ns)))
         return JSONResponse({"state": "acknowledged"})
 
     @router.post(

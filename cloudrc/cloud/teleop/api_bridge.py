@@ -17,7 +17,7 @@ from typing import Any
 
 from cloudrc.cloud.teleop.api_tokens import OPERATOR, ROLES, Role
 from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_book import UnavailableError
+from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
 
 WAITING_MAX = 64
 """Calls of each role that wait at once."""
@@ -35,11 +35,13 @@ class Bridge:
         closed: Why no call is taken, in words; "" if they are.
         alarm: Tells the robot to stop its rotors past everything else, teleop's loop included; may
             be called from any thread.
+        stops: How many urgent calls there have been.
     """
 
     def __init__(self) -> None:
         self.closed = "teleop is starting"
         self.alarm: Callable[[], object] = lambda: None
+        self.stops = 0
         self._urgent: deque[tuple[Call, Future[Any]]] = deque(maxlen=WAITING_MAX)
         self._lanes: dict[Role, deque[tuple[Call, Future[Any]]]] = {r: deque() for r in ROLES}
         self._lock = threading.Lock()
@@ -59,6 +61,7 @@ class Bridge:
             raise UnavailableError(self.closed)
         future: Future[Any] = Future()
         if urgent:
+            self.stops += 1
             self._urgent.append((call, future))
             return future
         with self._lock:
@@ -71,6 +74,17 @@ class Bridge:
                 raise UnavailableError(f"{WAITING_MAX} requests wait already; try again")
             lane.append((call, future))
         return future
+
+    def unless_stopped(self, call: Call) -> Call:
+        """Make of a call one that is refused where an urgent one has passed it by."""
+        known = self.stops
+
+        def made(service: MissionService, now_ns: int) -> Any:
+            if self.stops != known:
+                raise ConflictError("an emergency stop was asked for since; acknowledge it anew")
+            return call(service, now_ns)
+
+        return made
 
     def take(self) -> list[Callable[[int], None]]:
         """Hand over the calls that wait, operators' first, for the loop's thread to make."""

@@ -185,6 +185,8 @@ class MissionBook:
                 witness, verdict.
         """
         entry = mission.entry(self._events + 1, event, text, **changed)
+        if event == "reached" and entry["waypoint"] < len(mission.reached):
+            return  # the last one, which a teleop before has written down
         self._try(lambda: self._backlog.note(entry))
         self._apply(entry)
 
