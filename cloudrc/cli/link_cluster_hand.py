@@ -16,11 +16,12 @@ from typing import Any, TypeAlias
 
 from cloudrc.cli.link_edit import DIRECTIONS, TIME_LINES
 from cloudrc.cluster.errors import ClusterError
-from cloudrc.cluster.link import COMPONENTS, PROFILE, LinkParts, Place, hand_over
+from cloudrc.cluster.link import COMPONENTS, PROFILE, LinkParts, Place
+from cloudrc.cluster.link_hand import hand_over
 from cloudrc.config import yaml_text
 from cloudrc.config.load import FILES
 from cloudrc.errors import CloudrcError
-from cloudrc.link.sidecar_handed import Handed, write_handed
+from cloudrc.link.sidecar_handed import Handed
 from cloudrc.link.state import CHANGE_FILE, Change, LinkState, from_text, read_change
 
 WAYS = dict(zip(COMPONENTS, DIRECTIONS, strict=True))
@@ -70,7 +71,7 @@ def hand_to_both(place: Place, link: LinkParts, given: Mapping[str, Handed]) -> 
 
     def hand(part: str) -> Answer:
         try:
-            return from_text(hand_over(place, link.pods[part], write_handed(given[part])))
+            return from_text(hand_over(place, link.pods[part], given[part]))
         except CloudrcError as error:
             return error
         except ValueError as error:

@@ -39,8 +39,6 @@ examples:
 Keys are those of a profile's direction. A profile's time line counts from now;
 single values leave it as it goes. The change is recorded, and lasts until the
 next one, the end of the run, or 'helm upgrade'."""
-INSIDE = Path("/run/cloudrc")
-"""In a link container: where the chart lets route, state and what is handed over lie."""
 LOCAL_PATIENCE = 5.0
 """For the relay of a run here to take a change over [s]; it takes 0.2."""
 LOOK_PERIOD = 0.05
@@ -55,18 +53,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", metavar="NAME", help="a profile that ships, or a file")
     run_argument(parser)
     output_argument(parser)
-    parser.add_argument(
-        "--inside", type=Path, nargs="?", const=INSIDE, metavar="DIR", help=argparse.SUPPRESS
-    )
     place_arguments(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Set the link, and say what is in force then."""
-    if options.inside is not None:
-        from cloudrc.cli import link_inside
-
-        return link_inside.execute(options.inside)
     began, number = monotonic(), secrets.token_hex(4)
     folder = find_here(options, link_of, "no run flies there")
     if folder is not None:
@@ -140,7 +131,7 @@ def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
 
 def _whole_or_not_at_all(handed: HandedOver, number: str) -> list[LinkState]:
     """See that both directions have a change; what one cannot be the other does not stay."""
-    from cloudrc.cli.link_inside import PATIENCE
+    from cloudrc.cluster.link_hand import PATIENCE
 
     late = f"within {PATIENCE:g} s; see the logs of the link containers"
     try:

@@ -19,8 +19,6 @@ COMPONENTS = ("world", "cloud")
 """Whose link containers shape uplink and downlink."""
 READ_LIMIT = 15.0
 """For the API server to answer [s]."""
-HAND_LIMIT = 25.0
-"""For a container to take a change over and tell of it [s]."""
 _COMPONENT = "app.kubernetes.io/component"
 
 
@@ -85,24 +83,6 @@ def write_files(place: Place, name: str, files: Mapping[str, str]) -> None:
     """
     words = ["patch", "configmap", name, "--type=merge", "--patch-file=/dev/stdin"]
     run("kubectl", [*place.flags, *words], timeout=READ_LIMIT, given=json.dumps({"data": files}))
-
-
-def hand_over(place: Place, pod: str, document: str) -> str:
-    """Hand a change to a pod's link container, and wait until it has taken it over.
-
-    Args:
-        place: Of the release.
-        pod: Its name.
-        document: As `cloudrc.link.sidecar_handed` writes it.
-
-    Returns:
-        What the link tells of itself then, as JSON.
-
-    Raises:
-        ClusterError: If kubectl or the container refuses.
-    """
-    words = ["exec", "--stdin", pod, "--container=link", "--", "cloudrc", "link", "set", "--inside"]
-    return run("kubectl", [*place.flags, *words], timeout=HAND_LIMIT, given=document)
 
 
 def _newest(found: list[dict[str, Any]], component: str) -> str | None:

@@ -19,7 +19,7 @@ import json, pathlib, sys
 folder, words = pathlib.Path(sys.argv[1]), sys.argv[2:]
 verb = next(word for word in words if word in ("get", "patch", "exec"))
 with (folder / "asked").open("a") as asked:
-    print(" ".join(words), file=asked)
+    print(" ".join(" ".join(words).split()), file=asked)
 refused = folder / f"refuse-{verb}"
 if refused.exists():
     sys.exit(refused.read_text())

@@ -33,8 +33,9 @@ from kube import (
     value,
 )
 
-from cloudrc.cluster.link import PROFILE, Place, hand_over
-from cloudrc.link.sidecar_handed import Handed, write_handed
+from cloudrc.cluster.link import PROFILE, Place
+from cloudrc.cluster.link_hand import hand_over
+from cloudrc.link.sidecar_handed import Handed
 
 SET_WITHIN = 1.0
 """For `link set` to be in force, from its start [s]: the quickest of three, on a machine that has a
@@ -192,7 +193,7 @@ def hand_behind_its_back(component: str, profile: dict[str, Any]) -> None:
     change = {"number": str(time.time_ns()), "cause": "a seeded fault", "restart": False}
     handed = Handed(json.dumps(change), "", {PROFILE: yaml.safe_dump(profile)})
     where, name = Place(None, NAMESPACE, NAME), str(pod(component)["metadata"]["name"])
-    told = json.loads(hand_over(where, name, write_handed(handed)))
+    told = json.loads(hand_over(where, name, handed))
     assert told["change"] == change["number"], told
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import link_inside
 from cloudrc.cli.link_run import loader
-from cloudrc.errors import BadInputError
 from cloudrc.link.route import publish
 from cloudrc.link.sidecar_follow import ProfileFile
 from cloudrc.link.sidecar_handed import (
@@ -22,7 +19,6 @@ from cloudrc.link.sidecar_handed import (
     read_handed,
     write_handed,
 )
-from cloudrc.link.state import STATE_FILE, LinkState, to_text
 
 
 def note(number: str) -> str:
@@ -179,49 +175,3 @@ def test_a_link_or_somebody_elses_file_is_refused(
 def test_a_document_is_written_and_read_again() -> None:
     document = Handed(note("a1"), "b2", {"profile.yaml": up(1.0), "t.csv": "x"})
     assert read_handed(write_handed(document)) == document
-
-
-STATE = LinkState("relay", "", "relay", "uplink", {}, "", 1, change="a1")
-
-
-def test_inside_it_is_put_beside_the_route_and_the_state_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = write_handed(Handed(note("a1"), "", {"profile.yaml": up(1.0)}))
-    publish(tmp_path / STATE_FILE, to_text(STATE))
-    monkeypatch.setattr("sys.stdin", io.StringIO(text))
-    assert link_inside.execute(tmp_path) == 0
-    assert capsys.readouterr().out == to_text(STATE)
-    assert (tmp_path / HANDED_FILE).read_text() == text
-
-
-def test_inside_a_link_that_does_not_follow_is_told_as_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    clock = iter(range(100))
-    monkeypatch.setattr(link_inside, "monotonic", lambda: next(clock))
-    monkeypatch.setattr(link_inside, "sleep", lambda _: None)
-    text = write_handed(Handed(note("b2"), "", {"profile.yaml": up(1.0)}))
-    publish(tmp_path / STATE_FILE, to_text(STATE))
-    monkeypatch.setattr("sys.stdin", io.StringIO(text))
-    assert link_inside.execute(tmp_path) == 0
-    assert json.loads(capsys.readouterr().out)["change"] == "a1"
-
-
-@pytest.mark.parametrize("text", ["", "no change", "{}"])
-def test_inside_what_is_no_change_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
-) -> None:
-    monkeypatch.setattr("sys.stdin", io.StringIO(text))
-    with pytest.raises(BadInputError, match="--inside reads"):
-        link_inside.execute(tmp_path)
-    assert os.listdir(tmp_path) == []
-
-
-def test_inside_nothing_happens_where_no_link_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = write_handed(Handed(note("b2"), "", {"profile.yaml": up(1.0)}))
-    monkeypatch.setattr("sys.stdin", io.StringIO(text))
-    with pytest.raises(BadInputError, match="no link is shaped here"):
-        link_inside.execute(tmp_path / "none")

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cloudrc.cluster.link_hand import INSIDE
 from cloudrc.config.load import load_experiment
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
@@ -159,16 +160,10 @@ def test_what_is_handed_over_inside_is_in_force_when_the_command_ends(
     link = pod("uplink: {delay_ms: 300}\n").ready()
     note = json.dumps({"number": "a1", "cause": "by hand", "restart": True})
     files = {"profile.yaml": "uplink: {delay_ms: 20}\n"}
-    command = [sys.executable, "-m", "cloudrc", "link", "set", "--inside", str(link.route.parent)]
+    document = write_handed(Handed(note, "", files))
+    command = ["sh", "-c", INSIDE, "sh", str(link.route.parent), "a1", str(len(document))]
     began = time.monotonic()
-    done = subprocess.run(
-        command,
-        input=write_handed(Handed(note, "", files)),
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
+    done = subprocess.run(command, input=document, check=True, capture_output=True, text=True)
     print(f"in force after {time.monotonic() - began:.2f} s")
     told = json.loads(done.stdout)
     assert (told["change"], told["cause"], told["asked"]["delay"]) == ("a1", "by hand", 0.02)
