@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import yaml
-from cost import Usage, cost_between, later, usage
+from cost import Usage, cost_between, later, pace, usage
 from kube import (
     CHART,
     NAME,
@@ -41,10 +41,10 @@ SET_WITHIN = 1.0
 """For `link set` to be in force, from its start [s]: the quickest of three, on a machine that has a
 cluster to run as well."""
 ASKED_CPU = 0.200
-"""Of all containers of a release in flight, on an idle machine [cores]; printed beside the cost."""
+"""Of all containers of a release in flight, on an idle machine of nominal pace [cores]."""
 LIMIT_CPU = 0.300
-"""Above this something is wrong on any machine [cores]: the same release has cost from 89m to 220m
-on one and the same machine, by what a wake costs there at the time."""
+"""Up to this nothing need be wrong on any machine [cores]: the same release has cost from 89m to
+220m on one and the same machine, by what a wake costs there at the time."""
 LIMIT_MEMORY = 320 * 2**20
 """Likewise [bytes]."""
 WINDOWS = 3
@@ -142,14 +142,16 @@ def test_a_release_is_cheap(readings: list[Usage], note: Callable[[str], None]) 
     costs = [cost_between(*window) for window in pairwise(readings)]
     least = min(costs, key=lambda cost: cost.cpu)
     memory = max(cost.memory for cost in costs)
+    asked = ASKED_CPU * (slower := pace())
     note(
-        f"one release in flight: asked {ASKED_CPU * 1000:.0f}m CPU | least {least.cpu * 1000:.0f}m"
+        f"one release in flight: asked {ASKED_CPU * 1000:.0f}m CPU, at this machine's pace of"
+        f" 1 / {slower:.2f} {asked * 1000:.0f}m | least {least.cpu * 1000:.0f}m"
         f" | windows {', '.join(f'{cost.cpu * 1000:.0f}m' for cost in costs)};"
         f" asked {LIMIT_MEMORY / 2**20:.0f} MiB | most {memory / 2**20:.0f} MiB"
     )
     for name, (cpu, used) in sorted(least.containers.items()):
         note(f"  {name:<14} {cpu * 1000:4.0f}m CPU  {used / 2**20:4.0f} MiB")
-    assert least.cpu <= LIMIT_CPU
+    assert least.cpu <= max(LIMIT_CPU, asked)
     assert memory <= LIMIT_MEMORY
 
 
