@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from cloudrc.cli.link_cluster_inside import hand_over
 from cloudrc.cli.link_edit import DIRECTIONS, TIME_LINES
 from cloudrc.cluster.errors import ClusterError
 from cloudrc.cluster.link import COMPONENTS, PROFILE, LinkParts, Place
-from cloudrc.cluster.link_hand import hand_over
 from cloudrc.config import yaml_text
 from cloudrc.config.load import FILES
 from cloudrc.errors import CloudrcError

@@ -131,7 +131,7 @@ def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
 
 def _whole_or_not_at_all(handed: HandedOver, number: str) -> list[LinkState]:
     """See that both directions have a change; what one cannot be the other does not stay."""
-    from cloudrc.cluster.link_hand import PATIENCE
+    from cloudrc.cli.link_cluster_inside import PATIENCE
 
     late = f"within {PATIENCE:g} s; see the logs of the link containers"
     try:
