@@ -92,7 +92,7 @@ class Placement(Values):
 
 
 class Epochs(Values):
-    """The volume on which the number of world's last session outlives the pod."""
+    """The volume on which the highest number of a session outlives the pod."""
 
     existing_claim: Name = Field("", description="A claim to use in place of one made here")
     storage_class_name: str = Field("", description="Class of the volume; empty: the cluster's own")
@@ -103,11 +103,12 @@ class WorldPod(Placement):
     """The robot's pod."""
 
     epochs: Epochs = Field(
-        Epochs(), description="Where the number of the last session outlives the pod"
+        Epochs(), description="Where the highest number of a session outlives the pod"
     )
     resources: Resources = resources("60m", "96Mi", "1", "256Mi")
     recording_size_limit: Quantity = Field(
-        "1Gi", description="Room for the recording, which ends at nine tenths of it [bytes]"
+        "1Gi",
+        description="Room for recordings: with one kept from before, nine tenths of it [bytes]",
     )
 
 
@@ -126,7 +127,8 @@ class CloudPod(Placement):
 
     resources: Resources = resources("60m", "64Mi", "1", "192Mi")
     recording_size_limit: Quantity = Field(
-        "1Gi", description="Room for the recording, which ends at nine tenths of it [bytes]"
+        "1Gi",
+        description="Room for recordings: with one kept from before, nine tenths of it [bytes]",
     )
     background_load: BackgroundLoad = Field(BackgroundLoad(), description="CPU load beside it")
 

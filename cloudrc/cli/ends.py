@@ -54,7 +54,8 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
         "--record-max",
         type=size,
         metavar="SIZE",
-        help="end the recording at nine tenths of this: 500M, 1Gi (default: no limit)",
+        help="end the recording at nine tenths of this, one kept from before counted: 500M, 1Gi "
+        "(default: no limit)",
     )
     parser.add_argument(
         "--listen", type=address, required=True, metavar="HOST:PORT", help="where to receive"

@@ -32,7 +32,7 @@ EXTRAS = {
 """What has to be installed, by mode."""
 EPILOG = """\
 modes:
-  local    real time: world, cloud and relay as processes, UDP on 127.0.0.1
+  local    real time: four processes, UDP on 127.0.0.1
   virtual  one process, virtual time: the same flight in seconds, repeatable
   cluster  Kubernetes: installs the chart, flies by a Job, fetches the recording
 

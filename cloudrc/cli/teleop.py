@@ -173,7 +173,7 @@ def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge | None) -
                 print(f"cloudrc teleop: {error}", file=sys.stderr, flush=True)
                 said = True
             if bridge is not None:
-                bridge.closed = str(error)
+                bridge.close(str(error))
             time.sleep(LOCK_PERIOD)
             continue
         if journal.trouble:

@@ -20,7 +20,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--epochs",
         type=Path,
         metavar="FILE",
-        help="keeps the number of the last session through a restart (default: not kept)",
+        help="keeps the highest number of a session through a restart (default: not kept)",
     )
 
 

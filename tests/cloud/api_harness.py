@@ -16,7 +16,7 @@ from cloudrc import assembly
 from cloudrc.cli.mission_http import Api
 from cloudrc.cloud.teleop.api import Surroundings, create_app
 from cloudrc.cloud.teleop.api_audit import Audit
-from cloudrc.cloud.teleop.api_bridge import Bridge
+from cloudrc.cloud.teleop.api_bridge import STARTING, Bridge
 from cloudrc.cloud.teleop.api_gate import Gate, Limits
 from cloudrc.cloud.teleop.api_server import ApiServer
 from cloudrc.cloud.teleop.api_tokens import Tokens
@@ -60,7 +60,7 @@ class Running:
 
     def _fly(self):
         while not self._stopping.wait(0.002):
-            for call in self.bridge.take():
+            for call in self.bridge.take() if self.bridge.closed != STARTING else ():
                 call(self.flight.now_ns)
             self.flight.step()
 

@@ -6,6 +6,7 @@ import json
 import os
 import socket
 import stat
+import urllib.error
 import urllib.request
 
 import pytest
@@ -209,6 +210,31 @@ def test_an_alarm_goes_out_at_once_and_teleop_is_asked_before_it_can_see_its_eff
         api.bridge.closed = "another teleop flies"
         assert api.post("/v1/estop") == (503, {"detail": "another teleop flies"})
         assert steps[2:] == ["asked", "alarm"]
+
+
+@pytest.mark.promise("P-API-8")
+def test_a_stop_while_teleop_starts_is_told_as_soon_as_it_has_started():
+    """Teleop has just died, an alarm rings, and somebody hits the button: it waits for no retry."""
+    with running(ready=False) as api, concurrent.futures.ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(api.post, "/v1/estop")
+        api.until(lambda: api.bridge.stops == 1)
+        with pytest.raises(urllib.error.HTTPError, match="503"):
+            api.get("/v1/state")
+        told = len(api.alarms)
+        api.bridge.open(api.flight.teleop)
+        assert len(api.alarms) > told, "past the loop"
+        assert answer.result() == (200, {"id": None, "state": "stopping"})
+
+
+def test_a_stop_is_not_kept_for_when_another_teleop_ends():
+    with running(ready=False) as api, concurrent.futures.ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(api.post, "/v1/estop")
+        api.until(lambda: api.bridge.stops == 1)
+        api.bridge.close("another teleop flies")
+        assert answer.result() == (503, {"detail": "another teleop flies"})
+        told = len(api.alarms)
+        api.bridge.open(api.flight.teleop)
+        assert (len(api.alarms), api.bridge.take_urgent()) == (told, [])
 
 
 def test_an_emergency_stop_is_one_alarm():

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
+
+from cloudrc.cli.link_cluster_inside import INSIDE
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = [*sorted((ROOT / "cloudrc").rglob("*.py")), *sorted((ROOT / "tools").rglob("*.py"))]
@@ -20,6 +24,7 @@ LOADERS = {"load", "load_all", "full_load", "full_load_all", "unsafe_load", "uns
 SHELLS = {"os": {"system", "popen"}, "subprocess": {"getoutput", "getstatusoutput"}}
 NAMES = {"builtins": CALLS, "yaml": LOADERS, **SHELLS}
 """What is banned of modules that are not; by module."""
+SH = {"sh", "bash", "dash", "busybox", "ash", "zsh"}
 SAFE_LOADERS = {"SafeLoader", "CSafeLoader"}
 
 
@@ -96,6 +101,16 @@ def _safe_loaders(tree: ast.Module) -> set[str]:
     return found
 
 
+def shells(tree: ast.Module) -> Iterator[str]:
+    """What is given to a shell as its command."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.List | ast.Tuple):
+            words = [each.value if isinstance(each, ast.Constant) else None for each in node.elts]
+            for i, (program, option) in enumerate(pairwise(words)):
+                if str(program).rpartition("/")[2] in SH and option == "-c":
+                    yield ast.unparse(node.elts[i + 2])
+
+
 def found_in(paths: list[Path]) -> dict[str, list[str]]:
     every = {p: list(breaches(ast.parse(p.read_text())))
              for p in paths}  # fmt: skip
@@ -107,6 +122,15 @@ def test_nothing_that_ships_runs_foreign_bytes() -> None:
     """But for the bench, which times what the paper's tunnel did."""
     yardstick = YARDSTICK.relative_to(ROOT).as_posix()
     assert found_in(SHIPPED) == {yardstick: ["in a program: 2: imports pickle"]}
+
+
+@pytest.mark.promise("P-CODE-1")
+def test_a_shell_gets_one_fixed_text_that_ships() -> None:
+    """What comes from outside are its arguments, which it does not take apart."""
+    given = {text for path in SHIPPED for text in shells(ast.parse(path.read_text()))}
+    assert given == {"INSIDE"}
+    quoted = re.sub(r'"(?:\\.|[^"\\])*"', "", INSIDE)
+    assert not re.search(r"\$[0-9@*]", quoted), "an argument is one word, whatever it holds"
 
 
 @pytest.mark.promise("P-CODE-1")

@@ -64,7 +64,9 @@ class GuardMachine(RuleBasedStateMachine):
                 assert self.acknowledged
             self.acknowledged &= change.state is self.state is LAND
             assert change.stamp_ns == self.now_ns
-            if change.state in (TRACK, HOLD) and event in ("fresh", "time"):
+            if change.cause == "new session":
+                self.stamps.clear()
+            elif change.state in (TRACK, HOLD) and event in ("fresh", "time"):
                 self.stamps.append(change.stamp_ns)
             elif (self.state, change.state) != (HOLD, GROUND):
                 self.stamps.clear()

@@ -19,6 +19,7 @@ from cloudrc.cloud.teleop.api_tokens import OPERATOR, ROLES, Role
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
 
+STARTING = "teleop is starting"
 WAITING_MAX = 64
 """Calls of each role that wait at once."""
 LANE: ContextVar[Role] = ContextVar("lane", default=OPERATOR)
@@ -39,7 +40,7 @@ class Bridge:
     """
 
     def __init__(self) -> None:
-        self.closed = "teleop is starting"
+        self.closed = STARTING
         self.alarm: Callable[[], object] = lambda: None
         self.stops = 0
         self._urgent: deque[tuple[Call, Future[Any]]] = deque(maxlen=WAITING_MAX)
@@ -48,23 +49,34 @@ class Bridge:
         self._service: MissionService | None = None
 
     def open(self, service: MissionService) -> None:
-        """Take calls for this service from now on."""
+        """Take calls for this service from now on; a stop that waits is told at once."""
         self._service, self.closed = service, ""
+        if self._urgent:
+            self.alarm()
+
+    def close(self, why: str) -> None:
+        """Take no calls from now on, and refuse those that wait for the start."""
+        with self._lock:
+            self.closed = why
+            while self._urgent:
+                self._urgent.popleft()[1].set_exception(UnavailableError(why))
 
     def submit(self, call: Call, *, urgent: bool = False) -> Future[Any]:
         """Leave a call in its lane, from any thread; an urgent one is made before all others.
 
+        While teleop starts an urgent one alone is taken: it is made as the first.
+
         Raises:
             UnavailableError: If none is taken now.
         """
-        if self.closed:
-            raise UnavailableError(self.closed)
         future: Future[Any] = Future()
-        if urgent:
-            self.stops += 1
-            self._urgent.append((call, future))
-            return future
         with self._lock:
+            if self.closed and not (urgent and self.closed == STARTING):
+                raise UnavailableError(self.closed)
+            if urgent:
+                self.stops += 1
+                self._urgent.append((call, future))
+                return future
             lane = self._lanes[LANE.get()]
             if len(lane) >= WAITING_MAX:  # those that nobody waits for any more make room
                 still = [waiting for waiting in lane if not waiting[1].cancelled()]

@@ -36,7 +36,9 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
         413: f"The body is longer than {BODY_MAX // 1024} KiB",
         422: "A value cannot be used; `problems` has every one",
         429: "Too many requests; try again in a second",
-        503: "Not now: teleop is starting or ending, or another one holds the journal; try again",
+        503: "Not now: teleop starts or ends, another has the journal, it cannot be written, or "
+        "too much waits: try again. Or teleop did not answer within 2 s, and may do it yet: look. "
+        "An emergency stop is told all the same, unless another teleop flies the robot",
     }.items()
 }
 

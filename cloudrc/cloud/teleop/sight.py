@@ -32,7 +32,8 @@ ALONE = {
 """What comes next while no mission is under way, by the guard's state."""
 IN_MISSION = {
     **ALONE,
-    GROUND: f"the robot takes off with the mission's first commands, {REST}",
+    GROUND: f"the robot takes off with the mission's first commands, {REST}; without them for long "
+    "(guard.hold_max_s, 10 s at least) it is in LAND as it stands",
     TRACK: "the robot flies its mission",
     HOLD: "no fresh commands reach the robot: it goes on by itself as soon as they do, and lands "
     "if they do not for long (guard.hold_max_s)",
