@@ -32,9 +32,9 @@ examples:
 A mission is a file with 'waypoints', such as those that 'cloudrc list missions'
 names. 'run' and 'fly' end with its verdict: 0 done, 1 failed, 6 not real time.
 'estop' stops the rotors at once, whatever flies, and lets the robot fall; that
-and a landing, whatever its cause, are left by 'acknowledge'. An API that is called
-over a network asks for a token: --token-file, CLOUDRC_TOKEN_FILE, or for a
-release of the chart its Secret, read with your own rights in the cluster."""
+and a landing, whatever its cause, are left by 'acknowledge'. An API that is
+called over a network asks for a token: --token-file, CLOUDRC_TOKEN_FILE, or for
+a release of the chart its Secret, read with your own rights in the cluster."""
 
 NO_API = "no run with an API flies there; name another folder, or --api URL"
 
