@@ -149,22 +149,22 @@ class Watch:
         """Look at what the guard's states promise: rotors that stand, a robot that stops."""
         step, acknowledge = simulator.step, guard.acknowledge
         now_ns, was, before = start_ns, guard.state, ZERO
-        released: GuardState | None = None  # the state that was acknowledged
+        released = set[GuardState]()  # those acknowledged; before a step they may be several
         tracking, flown = GuardState.TRACK, FLOWN
 
         def watched_acknowledge(when_ns: int) -> None:
-            nonlocal released
-            released = guard.state
+            released.add(guard.state)
             acknowledge(when_ns)
 
         def watched_step(rotor_speeds: Any) -> None:
-            nonlocal now_ns, was, before, released
+            nonlocal now_ns, was, before
             state = guard.state
             if state is not was:
-                self._look_at_change(was, state, released is was, now_ns)
+                self._look_at_change(was, state, not released.isdisjoint(LATCHED), now_ns)
                 if was is tracking:
                     self._leave_alone(simulator.readings, before, now_ns)
-                was, released = state, released if released is state else None
+                released.intersection_update({state})
+                was = state
             if state not in flown:
                 if any(rotor_speeds):
                     self.note(now_ns, "latch", f"rotors turn in {state.name}")

@@ -259,6 +259,17 @@ def test_an_acknowledgement_counts_in_the_state_that_it_is_for_and_no_longer():
     assert world.tick(ZERO, state=HOLD, released=False) == {"latch"}
 
 
+@pytest.mark.parametrize("before", [LAND, ESTOP])
+def test_what_is_acknowledged_twice_between_two_ticks_was_released_the_first_time(before):
+    world = World()
+    world.tick(ZERO, state=before)
+    for world.guard.state in (ESTOP, GROUND):  # one that landed was stopped just then
+        world.guard.acknowledge(0)
+    assert world.tick(ZERO, state=GROUND, released=False) == set()
+    world.tick(ZERO, state=before, released=False)
+    assert world.tick(ZERO, state=GROUND, released=False) == {"latch"}
+
+
 def test_who_has_just_been_hit_or_whose_rotors_stand_need_not_rest_where_commands_ended():
     away = (3.0, 1.0, 1.0)
     for hit_ns, kinds in ((0, set()), (-1_000_000_000, {"rest"})):
