@@ -108,7 +108,7 @@ def shells(tree: ast.Module) -> Iterator[str]:
             words = [each.value if isinstance(each, ast.Constant) else None for each in node.elts]
             for i, (program, option) in enumerate(pairwise(words)):
                 if str(program).rpartition("/")[2] in SH and option == "-c":
-                    yield ast.unparse(node.elts[i + 2])
+                    yield ", ".join(map(ast.unparse, node.elts[i + 2 : i + 3]))
 
 
 def found_in(paths: list[Path]) -> dict[str, list[str]]:
