@@ -38,6 +38,36 @@ class GuardState(IntEnum):
     """Rotors stopped at once; latched until acknowledged."""
 
 
+class Cause(IntEnum):
+    """Why the guard is in its state: a number on the wire, `words` for whoever reads."""
+
+    words: str
+
+    def __new__(cls, number: int, words: str) -> Cause:
+        """Make a member of its number; the words come along."""
+        cause = int.__new__(cls, number)
+        cause._value_, cause.words = number, words
+        return cause
+
+    SPAWN = 0, "at its spawn"
+    COMMAND = 1, "fresh command"
+    COMMANDS = 2, "fresh commands again"
+    SILENCE = 3, "no fresh commands"
+    SESSION = 4, "new session"
+    ENDED = 5, "mission ended"
+    ALONE = 6, "held too long without the cloud"
+    IMPOSSIBLE = 7, "impossible commands"
+    STOPPED = 8, "emergency stop"
+    OVERTURNED = 9, "turned over"
+    SPUN = 10, "spun round by a hit"
+    JOLTED = 11, "jolted by a hit"
+    ACKNOWLEDGED = 12, "acknowledged"
+    STILL_FIRST = 13, "acknowledged, takes off once it has been still, 0.5 m inside the fence"
+    NOT_DOWN = 14, "acknowledged before touch-down"
+    DOWN = 15, "touched down, rotors stopped"
+    NOT_OFF = 16, "not off the ground yet, rotors stopped"
+
+
 class Start(IntEnum):
     """Where a mission starts from."""
 
@@ -97,6 +127,7 @@ class Telemetry(NamedTuple):
             not yet.
         mission_id: The mission started last, as OperatorRequest named it; 0 if none.
         reached: How many of its waypoints world has been told are reached, or `MISSION_OVER`.
+        cause: Why the guard is in its state; of one that has touched down in LAND, why it landed.
     """
 
     stamp_ns: int
@@ -111,6 +142,7 @@ class Telemetry(NamedTuple):
     touch_speed: float = nan
     mission_id: int = 0
     reached: int = 0
+    cause: Cause = Cause.SPAWN
 
 
 class Command(NamedTuple):

@@ -17,9 +17,6 @@ from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, CloudrcError
 
 INTERRUPTED = 130
-CAUSED = ("HOLD", "LAND", "ESTOP")
-"""States of the guard that one wants to know the cause of."""
-CAUSE_TOLD = "world's log ('guard: ...'), the screen of 'cloudrc run', the recording ('/guard')"
 
 
 def read_mission(name: str) -> dict[str, Any]:
@@ -207,10 +204,8 @@ def _say_seen(seen: dict[str, Any] | None) -> None:
         return
     where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
     rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
-    guard = f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s"
-    print(f"robot at ({where}) m, {guard}, seen {seen['age_s']:.2f} s ago{rtt}")
-    if seen["guard"] in CAUSED:
-        print(f"why: {CAUSE_TOLD}")
+    print(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
+    print(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
     print(f"next: {seen['next_step']}")
 
 

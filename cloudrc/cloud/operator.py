@@ -84,6 +84,7 @@ def seen_in(
         *delays,
         telemetry.mission_id,
         telemetry.reached,
+        telemetry.cause,
     )
     return _new(Seen, known)
 

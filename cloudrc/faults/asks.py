@@ -8,9 +8,9 @@ from math import dist, hypot, inf, nan
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.meters import reading
 from cloudrc.faults.scenario import Outcome
-from cloudrc.messages import GuardState
+from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import CommandApplied, GuardChange, SessionOpened
+from cloudrc.records import CommandApplied, GuardChange, SessionOpened, TelemetrySent
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 
@@ -75,6 +75,9 @@ def causes_told(outcome: Outcome, flight: Flight, what: str = "") -> None:
     causes = [change.cause for change in after if change.state is GuardState.TRACK]
     right = bool(causes) and all("fresh commands within" in cause for cause in causes)
     outcome.true(f"{text}each TRACK after it tells of fresh commands", right)
+    shown = {cause for state, cause in _telemetered(flight) if state is GuardState.HOLD}
+    right = Cause.SILENCE in shown <= {Cause.SILENCE, Cause.SESSION, Cause.ENDED}
+    outcome.true(f"{text}so does telemetry: {Cause.SILENCE.words}", right)
 
 
 def landing_told(outcome: Outcome, flight: Flight) -> None:
@@ -82,7 +85,18 @@ def landing_told(outcome: Outcome, flight: Flight) -> None:
     causes = [change.cause for change in flight.changes if change.state is GuardState.LAND]
     outcome.true(f"LAND tells why: {ALONE}", causes[:1] == [ALONE])
     failed, verdict = flight.mission.state == "failed", str(flight.mission.verdict)
-    outcome.true("the mission says why it failed", failed and "guard went to LAND" in verdict)
+    told = f"guard went to LAND ({Cause.ALONE.words})"
+    outcome.true("the mission says why it failed", failed and told in verdict)
+    assert flight.desk.service is not None
+    seen = flight.desk.service.state(flight.run.now_ns)["seen"]
+    right = (seen["guard"], seen["cause"]) == ("LAND", Cause.ALONE.words)
+    outcome.true(f"the status says so, too: LAND, {Cause.ALONE.words}", right)
+
+
+def _telemetered(flight: Flight) -> set[tuple[GuardState, Cause]]:
+    """Which states of the guard, and why, has telemetry told."""
+    sent = (r.telemetry for r in flight.of_world if isinstance(r, TelemetrySent))
+    return {(telemetry.guard, telemetry.cause) for telemetry in sent}
 
 
 def stopping_time(flight: Flight, since: float) -> float:

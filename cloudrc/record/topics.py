@@ -73,6 +73,7 @@ _TABLE = (
             Field("touch_speed", "float", "m/s", "tip on the board", "telemetry.touch_speed"),
             Field("mission_id", "int", "", "mission started last", "telemetry.mission_id"),
             Field("reached", "int", "", "waypoints known on board", "telemetry.reached"),
+            Field("cause", "int", "", "why; in words: /guard", "telemetry.cause"),
         ),
     ),
     Topic(
@@ -130,10 +131,7 @@ _TABLE = (
         rec.GuardChange,
         "world",
         "The guard changed its state, world's clock",
-        (
-            Field("state", "int", "", _GUARD),
-            Field("cause", "string", "", "why, in words"),
-        ),
+        (Field("state", "int", "", _GUARD), Field("cause", "string", "", "why, in words")),
     ),
     Topic(
         "/contact",

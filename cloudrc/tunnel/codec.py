@@ -19,6 +19,7 @@ from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
 from cloudrc.messages import (
+    Cause,
     Command,
     GuardState,
     Odometry,
@@ -28,8 +29,9 @@ from cloudrc.messages import (
     Telemetry,
 )
 
-VERSION = 3
-"""Of the wire, one per build; 1 had no tags, in 2 a request did not say on what it was based.
+VERSION = 4
+"""Of the wire, one per build; 1 had no tags, in 2 a request did not say on what it was based, in 3
+telemetry did not say why the guard is in its state.
 Another one is refused, never spoken."""
 DATAGRAM_MAX = 512
 """Longer than any datagram of ours [bytes]; a longer one is refused unread."""
@@ -114,7 +116,7 @@ class Busy(NamedTuple):
 
 
 _HEADER = struct.Struct("<BBIBBQ")
-_TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIdIQHB")
+_TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIdIQHBB")
 _STAMPS = struct.Struct(f"<q{struct.calcsize('<3d4d3d3ddqq')}xq")
 _COMMAND = struct.Struct("<qqq3dd")
 _OPERATOR = struct.Struct("<IBBQHq")
@@ -187,16 +189,16 @@ def peek(data: bytes) -> tuple[int, int, int]:
 
 
 def encode_telemetry(telemetry: Telemetry) -> bytes:
-    """Lay out the body of a TELEMETRY datagram; the guard's state comes last."""
+    """Lay out the body of a TELEMETRY datagram; the guard's state and its cause come last."""
     # fmt: off
     (
         stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, guard, pipes, touch,
-        mission_id, reached,
+        mission_id, reached, cause,
     ) = telemetry
     _, (px, py, pz), (qw, qx, qy, qz), (vx, vy, vz), (rx, ry, rz) = odometry
     return _TELEMETRY.pack(
         stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, force, echo_ns, hold_ns,
-        slip_ns, mission, touch, pipes, mission_id, reached, guard,
+        slip_ns, mission, touch, pipes, mission_id, reached, guard, cause,
     )
     # fmt: on
 
@@ -206,16 +208,16 @@ def decode_telemetry(body: bytes) -> Telemetry:
     # fmt: off
     (
         stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, force, echo_ns, hold_ns,
-        slip_ns, mission, touch, pipes, mission_id, reached, guard,
+        slip_ns, mission, touch, pipes, mission_id, reached, guard, cause,
     ) = _TELEMETRY.unpack(body)
-    if guard >= len(_GUARD_STATES):
+    if guard >= len(_GUARD_STATES) or cause >= len(_CAUSES):
         raise DecodeError("malformed")
     odometry = _new(
         Odometry, (stamp_ns, (px, py, pz), (qw, qx, qy, qz), (vx, vy, vz), (rx, ry, rz))
     )
     return _new(Telemetry, (
         stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, _GUARD_STATES[guard], pipes,
-        touch, mission_id, reached,
+        touch, mission_id, reached, _CAUSES[cause],
     ))
     # fmt: on
 
@@ -286,4 +288,4 @@ def decode_busy(body: bytes) -> Busy:
     return Busy(*_BUSY.unpack(body))
 
 
-_GUARD_STATES = tuple(GuardState)
+_GUARD_STATES, _CAUSES = tuple(GuardState), tuple(Cause)

@@ -202,6 +202,7 @@ class WorldEndpoint:
                 orders.touches.speed,
                 orders.mission_id,
                 orders.reached,
+                guard.cause,
             )
             telemetry = _new(Telemetry, known)
             counter = self._session.next_counter(TELEMETRY)

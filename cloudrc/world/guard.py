@@ -31,7 +31,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from math import inf
 
-from cloudrc.messages import NEVER_NS, ZERO, Command, GuardState, Vector
+from cloudrc.messages import NEVER_NS, ZERO, Cause, Command, GuardState, Vector
 from cloudrc.records import GuardChange
 from cloudrc.world import guard_rules as rules
 from cloudrc.world.guard_hits import Hits
@@ -47,6 +47,7 @@ RESUME_NS = 500_000_000
 SETTLE_NS = 1_000_000_000
 """Least time from one HOLD to the next, and from one TRACK to the next [ns]. Source: fault F5."""
 INVALID_COMMANDS = 5
+IMPOSSIBLE = f"{INVALID_COMMANDS} impossible commands within 1 s"
 INVALID_NS = 1_000_000_000
 """So many impossible commands within so long end in LAND [ns]. Source: fault F23."""
 
@@ -56,6 +57,7 @@ class Guard:
 
     Attributes:
         state: Where it is.
+        cause: Why; of one that has touched down in LAND, why it landed.
         armed: Whether a mission is on: from the operator's start to its end, LAND or ESTOP.
         reference: What the low-level controller was last told to follow [m/s], shape (3,).
         yaw_rate: Capped [rad/s]; the published low-level controller holds yaw at 0 regardless.
@@ -74,15 +76,13 @@ class Guard:
         self._hits, self._take_off = Hits(), TakeOff(limits.fence_low, limits.fence_high)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
-        self.state = GROUND
+        self.state, self.cause = GROUND, Cause.SPAWN
         self.armed = self._flies = False
-        self.reference: Vector = ZERO
-        self.yaw_rate = 0.0
-        self._wanted: Vector = ZERO
+        self.yaw_rate, self._alone_ns = 0.0, 0
+        self.reference = self._wanted = ZERO
         self._acceleration = limits.acceleration_max
         self._track_until_ns = self._steady_until_ns = NEVER_NS
         self._tracked_ns = self._held_ns = -SETTLE_NS
-        self._alone_ns = 0
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
         self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
 
@@ -105,7 +105,7 @@ class Guard:
         """The robot stands at its spawn: rotors off, nothing is remembered."""
         self.forget_commands()
         self._tracked_ns = self._held_ns = -SETTLE_NS
-        self._enter(GROUND, now_ns, cause)
+        self._enter(GROUND, now_ns, Cause.SPAWN, cause)
 
     def start_mission(self, now_ns: int) -> None:
         """The operator starts a mission: from here on fresh commands are flown.
@@ -123,17 +123,17 @@ class Guard:
         """The mission is over: hold here until the operator starts the next one."""
         self.armed = False
         if self.state is TRACK:
-            self._enter(HOLD, now_ns, "mission ended")
+            self._enter(HOLD, now_ns, Cause.ENDED)
 
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once, whatever the robot does."""
         if self.state is not ESTOP:
-            self._enter(ESTOP, now_ns, "emergency stop")
+            self._enter(ESTOP, now_ns, Cause.STOPPED)
 
     def acknowledge(self, now_ns: int) -> None:
         """The operator knows why the robot lands or was stopped; no mission is on."""
         if self.latched and not self._flies:
-            self._enter(GROUND, now_ns, f"acknowledged{self._take_off.condition}")
+            self._enter(GROUND, now_ns, self._take_off.condition)
         elif self.state is LAND:
             self._descent.acknowledged = True
 
@@ -178,7 +178,7 @@ class Guard:
             if self.state is GROUND:
                 self._alone_ns = now_ns
                 if self._settled(now_ns, fresh_until_ns):
-                    self._enter(TRACK, now_ns, "fresh command")
+                    self._enter(TRACK, now_ns, Cause.COMMAND)
             elif self.state is HOLD:
                 self._leave_hold(now_ns, fresh_until_ns)
             if self.state is TRACK:
@@ -191,8 +191,8 @@ class Guard:
         took_ns = now_ns - self._fresh_ns[0]
         enough = len(self._fresh_ns) == RESUME_COMMANDS and took_ns <= RESUME_NS
         if enough and self._settled(now_ns, fresh_until_ns):
-            cause = f"{RESUME_COMMANDS} fresh commands within {took_ns * 1e-9:.3f} s"
-            self._enter(TRACK, now_ns, cause)
+            told = f"{RESUME_COMMANDS} fresh commands within {took_ns * 1e-9:.3f} s"
+            self._enter(TRACK, now_ns, Cause.COMMANDS, told)
             self._acceleration = min(rules.BRAKE, self._acceleration)
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
@@ -206,7 +206,7 @@ class Guard:
         if len(self._invalid_ns) < INVALID_COMMANDS or now_ns - self._invalid_ns[0] > INVALID_NS:
             return
         if self.armed and self.state is not GROUND:
-            self._enter(LAND, now_ns, f"{INVALID_COMMANDS} impossible commands within 1 s")
+            self._enter(LAND, now_ns, Cause.IMPOSSIBLE, IMPOSSIBLE)
 
     def tick(self, now_ns: int, readings: Readings, dt: float) -> Vector | None:
         """Say what the low-level controller shall follow now.
@@ -258,26 +258,27 @@ class Guard:
     def _look_after_itself(self, now_ns: int, readings: Readings) -> None:
         """Change the state where no fresh command leads."""
         state, limits = self.state, self._limits
-        if state is TRACK:
-            age = (now_ns - self._track_until_ns + limits.command_age_max_ns) * 1e-9
-            cause = f"command age {age:.3f} s above {limits.command_age_max_ns * 1e-9:.3f} s"
-            self._enter(HOLD, now_ns, "new session" if self._track_until_ns == NEVER_NS else cause)
-        elif self.armed and now_ns - self._alone_ns > (max_ns := limits.alone_max_ns(self._flies)):
-            self._enter(LAND, now_ns, f"held for {max_ns * 1e-9:g} s without the cloud")
+        if state is TRACK and self._track_until_ns == NEVER_NS:
+            self._enter(HOLD, now_ns, Cause.SESSION)
+        elif state is TRACK:
+            self._enter(HOLD, now_ns, Cause.SILENCE, limits.too_old(now_ns - self._track_until_ns))
+        elif self.armed and now_ns - self._alone_ns > limits.alone_max_ns(self._flies):
+            self._enter(LAND, now_ns, Cause.ALONE, limits.left_alone(self._flies))
             self._flies = state is HOLD  # not in GROUND
         elif state is LAND and self._flies:
             if self._descent.may_stop(readings):
-                self._enter(HOLD, now_ns, "acknowledged before touch-down")
+                self._enter(HOLD, now_ns, Cause.NOT_DOWN)
             elif self._descent.is_over(now_ns, self.reference, readings):
                 state = GROUND if self._descent.acknowledged else LAND
-                self._enter(state, now_ns, "touched down, rotors stopped")
+                self._enter(state, now_ns, Cause.DOWN)
                 self._flies, self.reference = False, ZERO
                 self._take_off.forget(stopped=True)  # on a pipe, perhaps, from which it slides off
         if self.state is HOLD and self._take_off.may_end(readings):
-            self._enter(GROUND, now_ns, "not off the ground yet, rotors stopped", self.armed)
+            self._enter(GROUND, now_ns, Cause.NOT_OFF)
 
-    def _enter(self, state: GuardState, now_ns: int, cause: str, armed: bool = False) -> None:
-        """Change the state; every change is noted with its cause."""
+    def _enter(self, state: GuardState, now_ns: int, cause: Cause, told: str = "") -> None:
+        """Change the state; every change is noted with its cause, in words of its own if `told`."""
+        self.cause = self.cause if cause is Cause.DOWN and state is LAND else cause
         if self.state is not HOLD or state is not LAND:  # goes down where it has held
             self._rest.forget()
         self.state, self._flies = state, state is not GROUND and state is not ESTOP
@@ -290,10 +291,10 @@ class Guard:
             self._held_ns = self._alone_ns = now_ns
             self._fresh_ns.clear()
         else:
-            self.armed = armed
+            self.armed = self.armed and cause is Cause.NOT_OFF
             self._descent.begin(now_ns)
             if state is not LAND:
                 self.reference = ZERO
                 self._hits.forget()
                 self._take_off.forget(stopped=state is ESTOP)
-        self.changes.append(GuardChange(now_ns, state, cause))
+        self.changes.append(GuardChange(now_ns, state, told or cause.words))

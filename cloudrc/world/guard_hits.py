@@ -8,7 +8,7 @@ happens to a robot that touches nothing, whatever it is commanded: the limits ar
 
 from __future__ import annotations
 
-from cloudrc.messages import NEVER_NS, ZERO
+from cloudrc.messages import NEVER_NS, ZERO, Cause
 from cloudrc.world.readings import Readings
 
 UPSET = 0.2
@@ -33,8 +33,8 @@ class Hits:
         """What comes next is another flight."""
         self._velocity, self._seen_ns = ZERO, NEVER_NS
 
-    def felt(self, now_ns: int, readings: Readings) -> str:
-        """Say what has befallen the robot since the last call; empty if nothing has.
+    def felt(self, now_ns: int, readings: Readings) -> Cause | None:
+        """Say what has befallen the robot since the last call; None if nothing has.
 
         Args:
             now_ns: World's clock [ns].
@@ -44,12 +44,12 @@ class Hits:
         (ux, uy, uz), seen_ns = self._velocity, self._seen_ns
         self._velocity, self._seen_ns = readings.velocity, now_ns
         if axes[8] < UPSET:
-            return "turned over"
+            return Cause.OVERTURNED
         if abs(r) > SPIN_MAX or p * p + q * q > TUMBLE_MAX * TUMBLE_MAX:
-            return "spun round by a hit"
+            return Cause.SPUN
         most = JOLT + PULL * (now_ns - seen_ns)
         if seen_ns != NEVER_NS and (
             abs(vx - ux) > most or abs(vy - uy) > most or abs(vz - uz) > most
         ):
-            return "jolted by a hit"
-        return ""
+            return Cause.JOLTED
+        return None

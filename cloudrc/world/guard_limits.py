@@ -72,6 +72,15 @@ class Limits:
         """How long a robot in a mission waits for its cloud before LAND [ns]."""
         return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_MIN_NS)
 
+    def too_old(self, beyond_ns: int) -> str:
+        """Say by how much the newest command is too old, so many nanoseconds beyond the limit."""
+        age, limit = self.command_age_max_ns + beyond_ns, self.command_age_max_ns
+        return f"command age {age * 1e-9:.3f} s above {limit * 1e-9:.3f} s"
+
+    def left_alone(self, flies: bool) -> str:
+        """Say for how long it has waited."""
+        return f"held for {self.alone_max_ns(flies) * 1e-9:g} s without the cloud"
+
     def inside(self) -> tuple[Vector, Vector]:
         """Give the fence's corners with the margins taken off [m], shape (3,) each."""
         (ax, ay, az), (bx, by, bz) = self.fence_low, self.fence_high

@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import hypot, nan
 from operator import le
 
-from cloudrc.messages import Vector
+from cloudrc.messages import Cause, Vector
 from cloudrc.world.guard_rules import BRAKE, shortened, towards, within
 from cloudrc.world.readings import Readings
 
@@ -193,9 +193,9 @@ class TakeOff:
         return not self._stopped or self._still >= STILL_TICKS
 
     @property
-    def condition(self) -> str:
-        """What has yet to come before it may, in words; "" if nothing."""
-        return "" if self.allowed else ", takes off once it has been still, 0.5 m inside the fence"
+    def condition(self) -> Cause:
+        """How it is acknowledged: whether something has yet to come before a take-off."""
+        return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
         """The robot stands, or will; the next take-off is another one.

@@ -3,7 +3,7 @@
 from cloudrc.cloud.teleop.messages import Seen, StartMission
 from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import MissionEvent
 
 PERIOD_NS = 10_000_000
@@ -26,7 +26,7 @@ class Flight:
         self.world = "world 1"
         self.mission = 0
         self.onboard = (0, 0)  # mission's number and waypoints reached, as world keeps them
-        self.guard = GuardState.GROUND
+        self.guard, self.cause = GuardState.GROUND, Cause.SPAWN
         self.uplink = self.downlink = True
         self.first_shown_ns = {}  # number of a request -> when telemetry first showed it
         self.said = []
@@ -50,7 +50,8 @@ class Flight:
         self.teleop.see(seen, self.now_ns)
 
     def progress(self):
-        return dict(zip(("mission_id", "reached"), self.onboard, strict=True))
+        told = (*self.onboard, self.cause)
+        return dict(zip(("mission_id", "reached", "cause"), told, strict=True))
 
     def operate(self, verb):
         try:
@@ -108,7 +109,7 @@ class Flight:
         if request.request is not Request.START:
             stopped = self.guard in (GuardState.LAND, GuardState.ESTOP)
             if request.request is Request.ESTOP:
-                self.guard = GuardState.ESTOP
+                self.guard, self.cause = GuardState.ESTOP, Cause.STOPPED
             elif request.request is Request.ACKNOWLEDGE:
                 self.guard = GuardState.GROUND if stopped else self.guard
             elif not stopped:
@@ -121,7 +122,7 @@ class Flight:
             self.epoch += 1
             self.position = (0.0, 0.0, 0.1)
         if self.guard not in (GuardState.LAND, GuardState.ESTOP):
-            self.guard = GuardState.TRACK
+            self.guard, self.cause = GuardState.TRACK, Cause.COMMAND
 
     def _keep(self, request):
         number, reached = self.onboard

@@ -113,7 +113,8 @@ def test_while_it_is_on_its_way_and_until_it_is_acknowledged_no_mission_begins()
         flight.create(queue=True)
     flight.downlink = True
     flight.step(seconds=0.2)
-    with pytest.raises(ConflictError, match="the guard is in ESTOP and lets nothing fly"):
+    why = r"the guard is in ESTOP \(emergency stop\) and lets nothing fly"
+    with pytest.raises(ConflictError, match=why):
         flight.create(queue=True)
     assert flight.view(queued)["state"] == "queued"
     flight.teleop.acknowledge(flight.now_ns)

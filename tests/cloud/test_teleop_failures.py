@@ -9,7 +9,7 @@ from cloudrc.cloud.teleop.messages import Cancel, GoTo, Hold, Resume, Seen, Star
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.cloud.teleop.request import PREDECESSORS, Repeater
 from cloudrc.errors import BadInputError
-from cloudrc.messages import GuardState, Request, Setpoint, Start
+from cloudrc.messages import Cause, GuardState, Request, Setpoint, Start
 
 NAN, INF = float("nan"), float("inf")
 
@@ -108,9 +108,9 @@ def test_a_world_that_restarts_before_a_start_from_here_fails_it():
 @pytest.mark.parametrize("guard", [GuardState.LAND, GuardState.ESTOP])
 def test_a_guard_that_lands_or_stops_fails_the_mission(guard):
     flight = flying()
-    flight.guard = guard
+    flight.guard, flight.cause = guard, Cause.IMPOSSIBLE
     flight.step()
-    text = f"guard went to {guard.name} on the way to waypoint 1 of 3"
+    text = f"guard went to {guard.name} (impossible commands) on the way to waypoint 1 of 3"
     assert_failed(flight, "guard_stopped", text)
 
 

@@ -5,7 +5,7 @@ from service_harness import ServiceFlight, flying
 from teleop_harness import AWAY
 
 from cloudrc.cloud.teleop.sight import NOT_HEARD, SILENCE, next_step
-from cloudrc.messages import GuardState
+from cloudrc.messages import Cause, GuardState
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -44,14 +44,15 @@ def test_every_state_has_its_words():
     assert all(next_step(guard, 0.0, mission) for guard in GuardState for mission in states)
 
 
-def test_the_robot_is_shown_with_its_state_since_when_and_what_comes_next():
+def test_the_robot_is_shown_with_its_state_why_since_when_and_what_comes_next():
     flight, _ = flying()
     flight.step(seconds=0.5)
     before = seen(flight)["guard_for_s"]
     assert before > 0.5
     assert seen(flight)["next_step"] == "the robot flies its mission"
-    flight.guard, flight.downlink = HOLD, False
+    flight.guard, flight.cause, flight.downlink = HOLD, Cause.SILENCE, False
     flight.step()
+    assert seen(flight)["cause"] == "no fresh commands"
     assert (seen(flight)["guard"], seen(flight)["guard_for_s"]) == ("HOLD", 0.0)
     flight.step(seconds=3.2)
     assert seen(flight)["guard_for_s"] == pytest.approx(3.2)

@@ -17,7 +17,7 @@ from cloudrc.faults.catalogue import find
 from cloudrc.faults.mortal import Mortal
 from cloudrc.faults.watch import Watch
 from cloudrc.link.sidecar_follow import PeerName
-from cloudrc.messages import ZERO, GuardState
+from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Contact, Counted, Fault
 from cloudrc.tunnel.complaints import Complaints
@@ -58,7 +58,7 @@ def stops_its_rotors_above_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
     def hasty(guard: Guard, now_ns: int, readings: Any) -> None:
         look(guard, now_ns, readings)
         if guard.state is GuardState.LAND and guard._flies and readings.position[2] < 0.6:
-            guard._enter(GuardState.LAND, now_ns, "touched down, rotors stopped")
+            guard._enter(GuardState.LAND, now_ns, Cause.DOWN)
             guard._flies, guard.reference = False, ZERO
 
     monkeypatch.setattr(Guard, "_look_after_itself", hasty)
@@ -76,8 +76,8 @@ def touches_something(monkeypatch: pytest.MonkeyPatch) -> None:
 def tells_no_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     enter = Guard._enter
 
-    def silent(guard: Guard, state: GuardState, now_ns: int, cause: str, *armed: bool) -> None:
-        enter(guard, state, now_ns, cause if cause == "mission ended" else "", *armed)
+    def silent(guard: Guard, state: GuardState, now_ns: int, cause: Cause, told: str = "") -> None:
+        enter(guard, state, now_ns, cause, told if cause is Cause.ENDED else "-")
 
     monkeypatch.setattr(Guard, "_enter", silent)
 

@@ -11,6 +11,7 @@ from cloudrc.messages import (
     NEVER_NS,
     UPRIGHT,
     ZERO,
+    Cause,
     Command,
     GuardState,
     OperatorRequest,
@@ -37,6 +38,7 @@ def bare_robot() -> SimpleNamespace:
     """A robot that flies whatever the session lets through."""
     guard = SimpleNamespace(
         state=GuardState.TRACK,
+        cause=Cause.COMMAND,
         latched=False,
         armed=True,
         counts={},

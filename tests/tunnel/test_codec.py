@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import (
+    Cause,
     Command,
     GuardState,
     Odometry,
@@ -35,6 +36,7 @@ telemetries = st.builds(
         floats,
         st.integers(0, 2**64 - 1),
         st.integers(0, 2**16 - 1),
+        st.sampled_from(Cause),
     ),
     vectors,
     st.tuples(floats, floats, floats, floats),
@@ -92,7 +94,7 @@ def test_for_which_session_a_request_is_meant_is_not_told_to_the_robot(request_,
 
 def test_the_header_lies_where_the_design_puts_it():
     data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788, generation=9)
-    assert data == bytes([3, 1, 4, 3, 2, 1, 9, 6]) + bytes.fromhex("8877665544332211")
+    assert data == bytes([4, 1, 4, 3, 2, 1, 9, 6]) + bytes.fromhex("8877665544332211")
     assert codec.peek(data) == (Kind.COMMAND, 0x01020304, 0x1122334455667788)
 
 
@@ -173,12 +175,13 @@ def test_a_mission_that_no_recording_can_name_is_refused():
             codec.decode_operator(codec.encode_operator(largest._replace(mission_id=mission_id)))
 
 
-def test_a_guard_state_that_does_not_exist_is_refused():
+@pytest.mark.parametrize(("place", "field", "kind"), [(-2, 7, GuardState), (-1, -1, Cause)])
+def test_a_state_or_cause_of_the_guard_that_does_not_exist_is_refused(place, field, kind):
     body = bytearray(codec.BODY_SIZES[Kind.TELEMETRY])
-    body[-1] = max(GuardState)
-    assert codec.decode_telemetry(bytes(body)).guard is max(GuardState)
-    for wrong in (max(GuardState) + 1, 200):
-        body[-1] = wrong
+    body[place] = max(kind)
+    assert codec.decode_telemetry(bytes(body))[field] is max(kind)
+    for wrong in (max(kind) + 1, 200):
+        body[place] = wrong
         with pytest.raises(DecodeError, match=r"^malformed$"):
             codec.decode_telemetry(bytes(body))
 

@@ -70,12 +70,12 @@ def test_hkdf_is_that_of_rfc_5869(key, salt, info, length, result):
 
 
 def test_a_key_derives_by_hkdf_with_version_and_use():
-    label = b"cloudrc 3 use"
+    label = b"cloudrc 4 use"
     assert Key(SECRET).derive(b"salt", b"use") == derived(SECRET, b"salt", label)
 
 
 def test_a_keys_name_is_made_of_nothing_but_what_is_derived():
-    assert Key(SECRET).name == derived(SECRET, b"", b"cloudrc 3 name")[:4].hex()
+    assert Key(SECRET).name == derived(SECRET, b"", b"cloudrc 4 name")[:4].hex()
 
 
 # McGrew and Viega, "The Galois/Counter Mode of Operation", submitted to NIST: test case 16.
@@ -126,9 +126,9 @@ def test_chacha20_poly1305_is_that_of_rfc_8439():
 
 def by_hand(suite, direction, epoch, generation, kind, counter, body):
     """A sealed datagram as docs/safety/wire.md describes it."""
-    use = b"cloudrc 3 session %d %d %d %d" % (suite, direction, epoch, generation)
+    use = b"cloudrc 4 session %d %d %d %d" % (suite, direction, epoch, generation)
     key = derived(SECRET, b"cloud".ljust(16) + b"world".ljust(16), use)
-    header = struct.pack("<BBIBBQ", 3, direction, epoch, generation % 256, kind, counter)
+    header = struct.pack("<BBIBBQ", 4, direction, epoch, generation % 256, kind, counter)
     cipher = AESGCM(key) if suite == 1 else ChaCha20Poly1305(key)
     return header + cipher.encrypt(header[4:], body, header)
 
@@ -147,8 +147,8 @@ def test_a_datagram_can_be_made_from_the_description_alone(suite):
 def test_a_greeting_can_be_made_from_the_description_alone():
     session = Session(Direction.DOWNLINK, KeyRing(KeySet(Key(SECRET))))
     body = codec.encode_hello(Hello(b"n" * 16, b"c" * 16, b"k" * 16, 1))
-    data = struct.pack("<BBIBBQ", 3, 1, 0, 0, 1, 0) + body
-    tagging = derived(SECRET, b"", b"cloudrc 3 greeting")
+    data = struct.pack("<BBIBBQ", 4, 1, 0, 0, 1, 0) + body
+    tagging = derived(SECRET, b"", b"cloudrc 4 greeting")
     tag = hmac.digest(tagging, data, hashlib.sha256)[:16]
     assert session.greet(Kind.HELLO, body) == data + tag
 
@@ -158,7 +158,7 @@ def test_a_cookie_can_be_made_from_the_description_alone():
         nonce=b"w" * 16, clock_id=bytes(16), suite=1, last_epoch=0, next_epoch=None
     )
     door = Door(Session(Direction.UPLINK, KeyRing(KeySet(Key(SECRET)))), identity, age_max_ns=1)
-    cookies = derived(SECRET, b"w" * 16, b"cloudrc 3 cookies")
+    cookies = derived(SECRET, b"w" * 16, b"cloudrc 4 cookies")
     (answer,) = door.knock(Hello(bytes(16), bytes(16), bytes(16), 1), 0, 7_999_999_999).datagrams
     assert answer[16:32] == hmac.digest(cookies, b"3", hashlib.sha256)[:16]
 
@@ -175,18 +175,18 @@ def test_the_second_name_of_a_cloud_is_made_of_the_first():
 
 FROZEN = {
     (AES_256_GCM, Kind.COMMAND): (
-        "030107000000000600000000000000004140a41a65ceffbe64157a8ed922770d3395d2518d777272"
-        "e4ac86eefdf3b52bee3645687826c9cb2f4b6cef2ff66ebaeeef8b7740babe90bfcd0d5093cf14da"
-        "9016c6251a4a5af3"
+        "040107000000000600000000000000001f314829f91581996482ae646a684372586e6d05b6eceb21"
+        "97fc2b0d2b476d211fdcc2945ce7284ebba9b90f21870576da966de83ab234c8bef7b7b9b74880f4"
+        "4e666cb2af794aa9"
     ),
-    (AES_256_GCM, Kind.ALIVE): ("03010700000000080000000000000000267d35aae083cbd6c55892eb6be087f8"),
+    (AES_256_GCM, Kind.ALIVE): ("04010700000000080000000000000000a8641115625b589ee4cf6e48a9f02204"),
     (CHACHA20_POLY1305, Kind.COMMAND): (
-        "03010700000000060000000000000000d3f7694f8f3e3cb83d00abc844ec1ec9545f38d966ff1a7c"
-        "a5b0985bffe127e91a498c75cf206c8640c55a94a5aeb0182672e43efc9b7c3b7ab5f0e90a1467ba"
-        "f923b8181e7189b2"
+        "04010700000000060000000000000000cb80463dda3768886edc5fd4dac51e0c205f5887e99ae527"
+        "0ae0a7562a8d6291ed59924d8efcbc9fda5a036819c62b60d1eef35c5782aa64c92bdb13f8fc2870"
+        "1ed01f725fe39166"
     ),
     (CHACHA20_POLY1305, Kind.ALIVE): (
-        "0301070000000008000000000000000086b4897818b755c8339c367306dd0039"
+        "040107000000000800000000000000009e8c21e55b3f462ededbfa4cff713b2e"
     ),
 }
 

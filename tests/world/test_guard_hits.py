@@ -5,12 +5,12 @@ from math import cos, radians, sin
 import pytest
 from guard_play import DT, HERE, MS, SECOND, TICK, armed, command, holding, landing, run, tracking
 
-from cloudrc.messages import UPRIGHT, ZERO, GuardState
+from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState
 from cloudrc.world.guard_hits import JOLT, PULL, SPIN_MAX, TUMBLE_MAX, UPSET, Hits
 from cloudrc.world.readings import Readings
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-SPUN, JOLTED, OVER = "spun round by a hit", "jolted by a hit", "turned over"
+SPUN, JOLTED, OVER = Cause.SPUN, Cause.JOLTED, Cause.OVERTURNED
 
 
 def felt(velocity=ZERO, rate=ZERO, tilt_deg=0.0, position=HERE):
@@ -25,8 +25,8 @@ RATES = [
     ((TUMBLE_MAX + 0.01, 0.0, 0.0), SPUN),
     ((0.0, -TUMBLE_MAX - 0.01, 0.0), SPUN),
     ((0.8 * TUMBLE_MAX, -0.65 * TUMBLE_MAX, 0.0), SPUN),
-    ((0.0, 0.0, SPIN_MAX), ""),
-    ((0.8 * TUMBLE_MAX, 0.59 * TUMBLE_MAX, -SPIN_MAX), ""),
+    ((0.0, 0.0, SPIN_MAX), None),
+    ((0.8 * TUMBLE_MAX, 0.59 * TUMBLE_MAX, -SPIN_MAX), None),
 ]
 
 
@@ -35,7 +35,7 @@ def test_nothing_but_a_hit_turns_the_robot_so_fast(rate, cause):
     assert Hits().felt(0, felt(rate=rate)) == cause
 
 
-@pytest.mark.parametrize(("tilt_deg", "cause"), [(78.0, ""), (79.0, OVER), (180.0, OVER)])
+@pytest.mark.parametrize(("tilt_deg", "cause"), [(78.0, None), (79.0, OVER), (180.0, OVER)])
 def test_a_robot_on_its_side_has_turned_over(tilt_deg, cause):
     assert cos(radians(78.5)) == pytest.approx(UPSET, abs=0.001)
     assert Hits().felt(0, felt(tilt_deg=tilt_deg)) == cause
@@ -46,12 +46,12 @@ def test_a_robot_on_its_side_has_turned_over(tilt_deg, cause):
 @pytest.mark.parametrize("after_ns", [TICK, 10 * MS])
 def test_nothing_but_a_hit_changes_the_speed_so_fast(axis, sign, after_ns):
     most = JOLT + PULL * after_ns
-    for change, cause in ((most + 0.001, JOLTED), (most - 0.001, "")):
+    for change, cause in ((most + 0.001, JOLTED), (most - 0.001, None)):
         hits, velocity = Hits(), [1.0, -2.0, 0.5]
-        assert hits.felt(SECOND, felt(tuple(velocity))) == ""
+        assert hits.felt(SECOND, felt(tuple(velocity))) is None
         velocity[axis] += sign * change
         assert hits.felt(SECOND + after_ns, felt(tuple(velocity))) == cause
-        assert hits.felt(SECOND + 2 * after_ns, felt(tuple(velocity))) == ""
+        assert hits.felt(SECOND + 2 * after_ns, felt(tuple(velocity))) is None
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -60,15 +60,15 @@ def test_at_the_limits_nothing_is_felt_yet(axis):
     velocity[axis] = JOLT + PULL * TICK
     at_limit = felt(rate=(TUMBLE_MAX, 0.0, SPIN_MAX))
     at_limit = at_limit._replace(axes=(*at_limit.axes[:8], UPSET))
-    assert hits.felt(0, at_limit) == ""
-    assert hits.felt(TICK, at_limit._replace(velocity=tuple(velocity))) == ""
+    assert hits.felt(0, at_limit) is None
+    assert hits.felt(TICK, at_limit._replace(velocity=tuple(velocity))) is None
 
 
 def test_there_is_nothing_to_compare_the_first_reading_with():
     hits = Hits()
-    assert hits.felt(0, felt((5.0, 0.0, 0.0))) == ""
+    assert hits.felt(0, felt((5.0, 0.0, 0.0))) is None
     hits.forget()
-    assert hits.felt(TICK, felt((-5.0, 0.0, 0.0))) == ""
+    assert hits.felt(TICK, felt((-5.0, 0.0, 0.0))) is None
 
 
 @pytest.mark.promise("P-GUARD-3")
@@ -77,7 +77,7 @@ def test_after_a_hit_the_rotors_stop_and_the_mission_is_over(make):
     guard = make()
     now_ns = 10 * MS if make is tracking else 2 * SECOND
     assert guard.tick(now_ns, felt(tilt_deg=120.0), DT) is None
-    assert guard.take_changes()[-1] == (now_ns, ESTOP, OVER)
+    assert guard.take_changes()[-1] == (now_ns, ESTOP, OVER.words)
     assert (guard.armed, guard.latched, guard.reference) == (False, True, ZERO)
     assert guard.offer(command(basis_ns=now_ns), now_ns) is None
     assert run(guard, now_ns + TICK, now_ns + 10 * MS) == [None] * 4

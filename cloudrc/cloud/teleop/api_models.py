@@ -133,9 +133,9 @@ class Seen(_Answer):
     world: str = Field(description="Names world's process")
     position_m: list[float | None] = Field(description="Of the base, measured [m], world frame")
     guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = Field(
-        description="State of the guard on board; why it is in it tell world's log, the screen of "
-        "`cloudrc run` and the recording (`/guard`)"
+        description="State of the guard on board"
     )
+    cause: str = Field(description="Why it is in it; of a robot that has landed, why it landed")
     guard_for_s: float = Field(description="For how long it has been seen in this state [s]")
     next_step: str = Field(description="What comes next, or what the operator has to do for it")
     pipe_contacts: int = Field(description="How often a pipe has been touched so far")

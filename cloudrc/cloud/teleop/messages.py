@@ -12,7 +12,7 @@ from math import nan
 from typing import NamedTuple, TypeAlias
 
 from cloudrc.cloud.teleop.plan import Plan
-from cloudrc.messages import GuardState, OperatorRequest, Setpoint, Vector
+from cloudrc.messages import Cause, GuardState, OperatorRequest, Setpoint, Vector
 from cloudrc.records import MissionEvent
 
 
@@ -34,6 +34,7 @@ class Seen(NamedTuple):
         loop_delay: Last `now - echo_stamp`, hold included [s]; NaN likewise.
         mission_id: The mission that world was told to start last; 0 if none.
         reached: How many of its waypoints world has been told are reached, or `MISSION_OVER`.
+        cause: Why the guard is in its state.
     """
 
     epoch: int
@@ -49,6 +50,7 @@ class Seen(NamedTuple):
     loop_delay: float = nan
     mission_id: int = 0
     reached: int = 0
+    cause: Cause = Cause.SPAWN
 
 
 @dataclass(frozen=True, slots=True)

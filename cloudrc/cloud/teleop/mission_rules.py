@@ -99,5 +99,5 @@ def harm_in(
     if is_over(seen, mission_id, over):
         return END_LOST
     if seen.guard > WORST_GUARD:
-        return "guard_stopped", f"guard went to {seen.guard.name}"
+        return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
     return None

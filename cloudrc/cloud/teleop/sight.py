@@ -1,7 +1,6 @@
 """The robot as teleop sees it: telemetry comes in; its state, since when and what is next go out.
 
-Telemetry tells the guard's state and not its cause: that is in world's log, on the screen of
-`cloudrc run` and in the recording (`/guard`). What comes next follows from state and mission.
+What comes next follows from state and mission.
 """
 
 from __future__ import annotations
@@ -61,7 +60,9 @@ class Sight:
     def latched(self) -> str:
         """Why the guard lets nothing fly before it is acknowledged; "" if it does."""
         guard = self.guard
-        return f"the guard is in {guard.name} and lets nothing fly" if guard in LATCHED else ""
+        if self.seen is None or guard not in LATCHED:
+            return ""
+        return f"the guard is in {guard.name} ({self.seen.cause.words}) and lets nothing fly"
 
     def see(self, seen: Seen, now_ns: int) -> bool:
         """Take note of telemetry as it arrives [ns].
@@ -93,6 +94,7 @@ class Sight:
             "world": seen.world,
             "position_m": [_known(value) for value in seen.position],
             "guard": seen.guard.name,
+            "cause": seen.cause.words,
             "guard_for_s": (now_ns - self._guard_ns) * 1e-9,
             "next_step": next_step(seen.guard, age, mission),
             "pipe_contacts": seen.pipe_contacts,
