@@ -17,9 +17,12 @@ a Secret) and follow it while they fly. 'new' on a file that is there already
 rotates: the old key stays valid beside the new one for the overlap, counted
 by each process from the moment it reads the file, so that nothing is lost
 while the file is on its way. A process that starts later accepts the old key
-only until the instant that the file holds. 'retire' takes the old key out of
-the file: who follows it refuses that key within a second. In the cluster,
-after either:
+only until the instant that the file holds. A second 'new' within that time is
+refused: an end that has not read the file yet would share no key with one that
+has; wait, or revoke the old key at once with '--drop'. 'retire' takes the old
+key out of the file: who follows it refuses that key within a second. A key that
+has leaked: 'new', and 'retire' once both ends have read the file. In the
+cluster, after each:
   kubectl create secret generic NAME --from-file=key=FILE \\
     --dry-run=client -o yaml | kubectl apply -f -"""
 
@@ -35,6 +38,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         default=None,
         metavar="SECONDS",
         help="how long the old key stays valid after a rotation (default: 300)",
+    )
+    new.add_argument(
+        "--drop",
+        action="store_true",
+        help="revoke the old key of a rotation that is not over yet, at once",
     )
     retire = verbs.add_parser("retire", help="drop the old key of a rotation before its time")
     retire.add_argument("file", type=Path, metavar="FILE", help="made by 'new'")
@@ -56,14 +64,31 @@ def _make(options: argparse.Namespace) -> int:
     there, secret = path.exists(), os.urandom(KEY_SIZE)
     if not there and options.overlap is not None:
         raise BadInputError(f"--overlap: {path} is not there, so there is no old key to keep")
+    if not there and options.drop:
+        raise BadInputError(f"--drop: {path} is not there, so there is no old key to revoke")
     if there:
-        keys = read_keys(path).rotated(secret, time.time(), options.overlap or OVERLAP)
+        keys, wall = read_keys(path), time.time()
+        if not options.drop:
+            _refuse_if_promised(path, keys, wall)
+        keys = keys.rotated(secret, wall, options.overlap or OVERLAP)
     else:
         keys = KeySet(Key(secret))
     _replace(path, keys)
     before = f", beside {keys.previous.name} for {keys.overlap:g} s" if keys.previous else ""
     print(f"key {keys.current.name}{before}: {path}")
     return 0
+
+
+def _refuse_if_promised(path: Path, keys: KeySet, wall: float) -> None:
+    """A file has room for one old key: for whoever knows only that one, it stays its time."""
+    import math
+
+    if keys.previous is not None and keys.until is not None and wall < keys.until:
+        left = math.ceil(keys.until - wall)
+        raise BadInputError(
+            f"{path}: key {keys.previous.name}, the one before, is valid for {left} s more; wait, "
+            "or revoke it at once: cloudrc key new FILE --drop"
+        )
 
 
 def _retire(path: Path) -> int:

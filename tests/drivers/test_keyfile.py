@@ -155,7 +155,7 @@ def test_the_command_rotates_a_key(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["key", "new", str(path), "--overlap", "60"]) == 0
     keys = parse(path.read_bytes())
     assert (keys.previous, keys.overlap) == (Key(FIRST), 60.0)
-    assert main(["key", "new", str(path)]) == 0
+    assert main(["key", "new", str(path), "--drop"]) == 0
     again = parse(path.read_bytes())
     assert (again.previous, again.overlap) == (keys.current, 300.0)
     assert keys.current.text() not in capsys.readouterr().out

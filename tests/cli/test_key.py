@@ -1,0 +1,70 @@
+"""`cloudrc key`: what was promised of the key before is kept, and so is a link."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile, read_keys
+from cloudrc.tunnel.keys import Key, KeySet, write
+
+FIRST, SECOND = b"1" * 32, b"2" * 32
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    (tmp_path / "key").write_bytes(FIRST)
+    return tmp_path / "key"
+
+
+@pytest.mark.promise("P-LINK-5")
+def test_a_second_rotation_within_the_overlap_is_refused_so_that_no_end_is_left_behind(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    early, late = KeyFile(path, 0), KeyFile(path, 0)
+    wall = [1_800_000_000.0]
+    monkeypatch.setattr(time, "time", lambda: wall[0])
+    assert main(["key", "new", str(path)]) == 0
+    assert early.follow(PERIOD_NS)
+    rotated = path.read_bytes()
+    for later, left in ((0.0, 300), (299.5, 1)):
+        wall[0] += later
+        capsys.readouterr()
+        assert main(["key", "new", str(path), "--overlap", "60"]) == 2
+        said = f"key {Key(FIRST).name}, the one before, is valid for {left} s more; wait, or revoke"
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"cloudrc: error: {path}: {said}")
+        assert "cloudrc key new FILE --drop" in line
+        assert path.read_bytes() == rotated
+    assert not early.follow(2 * PERIOD_NS)
+    assert late.ring.current in early.ring.accepted(2 * PERIOD_NS)
+    second = read_keys(path).current
+    wall[0] += 0.5
+    assert main(["key", "new", str(path)]) == 0
+    assert read_keys(path).previous == second
+
+
+def test_a_key_is_revoked_before_its_time_by_a_flag(path: Path) -> None:
+    assert main(["key", "new", str(path)]) == 0
+    follower, second = KeyFile(path, 0), read_keys(path).current
+    assert main(["key", "new", str(path), "--drop"]) == 0
+    keys = read_keys(path)
+    assert keys.previous == second
+    follower.follow(PERIOD_NS)
+    assert follower.ring.accepted(PERIOD_NS) == (keys.current, second)
+
+
+def test_the_flag_needs_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["key", "new", str(tmp_path / "none"), "--drop"]) == 2
+    assert "there is no old key to revoke" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_file_that_says_no_time_can_be_rotated(path: Path) -> None:
+    """Nobody could tell for how long to wait."""
+    path.write_text(write(KeySet(Key(SECOND), Key(FIRST))))
+    assert main(["key", "new", str(path)]) == 0
+    assert read_keys(path).previous == Key(SECOND)
