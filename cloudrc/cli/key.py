@@ -105,11 +105,14 @@ def _retire(path: Path) -> int:
 
 
 def _replace(path: Path, keys: KeySet) -> None:
+    """Put them into the file that a link leads to: there is who follows it by another name."""
+    import os
+
     from cloudrc.drivers.epochs import replace_durably
     from cloudrc.tunnel.keys import write
 
     try:
-        replace_durably(path, write(keys).encode("ascii"))
+        replace_durably(Path(os.path.realpath(path)), write(keys).encode("ascii"))
     except OSError as error:
         remedy = "name a file in a folder that is there and that you may write in"
         raise BadInputError(f"{path}: {error.strerror or error}; {remedy}") from None

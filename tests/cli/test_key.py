@@ -68,3 +68,20 @@ def test_a_file_that_says_no_time_can_be_rotated(path: Path) -> None:
     path.write_text(write(KeySet(Key(SECOND), Key(FIRST))))
     assert main(["key", "new", str(path)]) == 0
     assert read_keys(path).previous == Key(SECOND)
+
+
+def test_a_link_stays_one_and_what_it_leads_to_gets_the_key(path: Path) -> None:
+    link = path.with_name("link")
+    link.symlink_to("key")
+    follower = KeyFile(path, 0)
+    assert main(["key", "new", str(link)]) == 0
+    assert link.is_symlink()
+    assert read_keys(path).previous == Key(FIRST)
+    follower.follow(PERIOD_NS)
+    assert follower.ring.current == read_keys(link).current
+    assert main(["key", "retire", str(link)]) == 0
+    assert link.is_symlink()
+    assert read_keys(path).previous is None
+    path.unlink()
+    assert main(["key", "new", str(link)]) == 0
+    assert read_keys(path).previous is None
