@@ -15,7 +15,7 @@ from cloudrc.cli.here import nobody_here
 from cloudrc.cli.mission_check import check_on, parse
 from cloudrc.cli.mission_http import Api
 from cloudrc.cli.mission_local import read_mission
-from cloudrc.cli.output import table, written
+from cloudrc.cli.output import harmless, table, written
 from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
@@ -60,7 +60,7 @@ def _run(options: argparse.Namespace) -> int:
         print(f"Job {job.name} flies on; end it: {end}", file=sys.stderr)
         raise
     if ended.exit_code is None:
-        print(ended.message)
+        _write(ended.message)
     return 1 if ended.exit_code is None else ended.exit_code
 
 
@@ -104,7 +104,7 @@ def _cancel(options: argparse.Namespace) -> int:
     from cloudrc.cluster.cancel import cancel
 
     path = token_file(options)
-    print(cancel(release, options.id, reader(path)() if path else None))
+    _write(cancel(release, options.id, reader(path)() if path else None))
     return 0
 
 
@@ -123,7 +123,7 @@ def _logs(options: argparse.Namespace) -> int:
         follow(release, job, _write, timeout=86_400.0)
         return 0
     for line in logs(release, job):
-        print(line)
+        _write(line)
     return 0
 
 
@@ -145,7 +145,7 @@ def _place(options: argparse.Namespace) -> Release:
 
 
 def _row(job: JobStatus) -> tuple[str, ...]:
-    return job.name, job.state, job.created, job.message
+    return job.name, job.state, job.created, harmless(job.message)
 
 
 def _print(jobs: list[dict[str, object]], form: str) -> int:
@@ -154,4 +154,5 @@ def _print(jobs: list[dict[str, object]], form: str) -> int:
 
 
 def _write(line: str) -> None:
-    print(line, flush=True)
+    """Print a line with words from a pod."""
+    print(harmless(line), flush=True)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from cloudrc.cli.output import harmless
 from cloudrc.errors import BadInputError, CloudrcError
 
 ANSWER_LIMIT = 10.0
@@ -140,10 +141,12 @@ def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcEr
         said = json.loads(answer.read())
     except (OSError, ValueError, http.client.HTTPException):
         said = {}
-    detail = str(said.get("detail") or f"the API answered {answer.status} {answer.reason}")
+    detail = said.get("detail") or f"the API answered {answer.status} {answer.reason}"
+    detail = harmless(str(detail))
     problems = said.get("problems") or []
     if len(problems) > 1:
-        lines = [": ".join(p[k] for k in ("path", "value", "reason") if p[k]) for p in problems]
+        told = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)
+        lines = [harmless(": ".join(words)) for words in told]
         detail = "\n  ".join([f"the mission has {len(lines)} problems:", *lines])
     if answer.status in (400, 413, 422):
         return BadInputError(detail)

@@ -11,7 +11,7 @@ from typing import Any
 
 from cloudrc.cli.mission_follow import Follower, in_words, leave_message
 from cloudrc.cli.mission_http import Api
-from cloudrc.cli.output import table, written
+from cloudrc.cli.output import harmless, table, written
 from cloudrc.cli.signals import end_orderly
 from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, CloudrcError
@@ -70,9 +70,10 @@ def _run(options: argparse.Namespace, api: Api) -> int:
     try:
         verdict = follower.follow(mission_id)
     except KeyboardInterrupt:
-        print(f"mission {mission_id} flies on; end it: cloudrc mission cancel", file=sys.stderr)
+        flies_on = f"mission {harmless(mission_id)} flies on; end it: cloudrc mission cancel"
+        print(flies_on, file=sys.stderr)
         raise
-    print(in_words(verdict))
+    _write(in_words(verdict))
     return int(verdict["exit_code"])
 
 
@@ -91,7 +92,8 @@ def _list(options: argparse.Namespace, api: Api) -> int:
 def _row(mission: dict[str, Any]) -> tuple[str, ...]:
     done = f"{len(mission['reached'])}/{mission['waypoints']}"
     verdict = in_words(mission["verdict"]) if mission["verdict"] else ""
-    return mission["id"], mission["name"], mission["state"], done, verdict
+    row = mission["id"], mission["name"], mission["state"], done, verdict
+    return tuple(map(harmless, row))
 
 
 def _status(options: argparse.Namespace, api: Api) -> int:
@@ -110,7 +112,7 @@ def _status(options: argparse.Namespace, api: Api) -> int:
     else:
         print("no mission is under way")
     if state["queue"]:
-        print(f"waiting: {', '.join(state['queue'])}")
+        _write(f"waiting: {', '.join(state['queue'])}")
     _say_seen(state["seen"])
     return 0
 
@@ -161,7 +163,7 @@ def _estop(options: argparse.Namespace, api: Api) -> int:
     mission = api.post("/v1/estop")["id"]
     print("emergency stop: the robot is told to stop its rotors until it has", flush=True)
     if mission:
-        print(f"mission {mission} has failed")
+        _write(f"mission {mission} has failed")
     return 0
 
 
@@ -194,7 +196,7 @@ def _say(mission: dict[str, Any]) -> None:
     where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
     name = f" ({mission['name']})" if mission["name"] else ""
     verdict = f"; {in_words(mission['verdict'])}" if mission["verdict"] else ""
-    print(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
+    _write(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
 
 
 def _say_seen(seen: dict[str, Any] | None) -> None:
@@ -204,14 +206,14 @@ def _say_seen(seen: dict[str, Any] | None) -> None:
         return
     where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
     rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
-    print(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
-    print(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
-    print(f"next: {seen['next_step']}")
+    _write(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
+    _write(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
+    _write(f"next: {seen['next_step']}")
 
 
 def _print_events(events: list[dict[str, Any]]) -> None:
     for event in events:
-        print(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}", flush=True)
+        _write(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}")
 
 
 def _print(document: dict[str, Any], form: str) -> int:
@@ -220,9 +222,10 @@ def _print(document: dict[str, Any], form: str) -> int:
 
 
 def _write(line: str) -> None:
-    print(line, flush=True)
+    """Print a line with words from the API, which may be anybody's."""
+    print(harmless(line), flush=True)
 
 
 def _end(text: str) -> None:
     _write(text)
-    leave_message(text)
+    leave_message(harmless(text))

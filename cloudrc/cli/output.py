@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from typing import TextIO
@@ -23,8 +24,8 @@ def output_argument(parser: argparse.ArgumentParser, what: str = "") -> None:
 def written(document: object, form: str) -> str:
     """Write plain values for programs, as "json" or "yaml"."""
     text = json.dumps(document, indent=2, ensure_ascii=False)
-    if form == "json":
-        return text
+    if form == "json":  # the same string, but no terminal obeys what is in it
+        return re.sub("[\x7f-\x9f]", lambda found: f"\\u{ord(found[0]):04x}", text)
     from cloudrc.config import yaml_text
 
     return yaml_text.write(json.loads(text)).rstrip("\n")
@@ -90,6 +91,11 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
         ]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def harmless(text: str) -> str:
+    """Write foreign words so that they stay in their line and a terminal does nothing but show."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def number(value: float) -> str:

@@ -1,0 +1,112 @@
+"""`cloudrc mission`: words that come from elsewhere stay in their line, and steer no terminal."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from api_harness import Running, running
+from teleop_harness import B
+
+from cloudrc.cli import mission_cluster, mission_follow, mission_http, mission_local
+from cloudrc.cli.main import main
+from cloudrc.cli.output import harmless
+from cloudrc.cluster import follow, jobs
+from cloudrc.cluster.jobs import JobStatus
+from cloudrc.errors import BadInputError
+
+NAME = "far\x1b[2J\nm9  forged\r\x9b31m\x7f\u202e"
+SHOWN = r"far\x1b[2J\nm9  forged\r\x9b31m\x7f\u202e"
+
+
+@pytest.fixture
+def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
+    monkeypatch.chdir(tmp_path)
+    with running(unix=True) as one:
+        one.post_local("/v1/missions", {"name": NAME, "waypoints": [{"position_m": B}]})
+        yield one
+
+
+def test_what_can_be_shown_stays_as_it_is() -> None:
+    assert harmless("Zur Tür, 3 µm - 門") == "Zur Tür, 3 µm - 門"
+    assert harmless("\ud800\u2028\0") == r"\ud800\u2028\x00"
+
+
+@pytest.mark.parametrize("words", ["list", "status", "status m1", "cancel", "hold"])
+def test_a_missions_name_is_shown_and_does_nothing(
+    words: str, api: Running, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["mission", *words.split(), "--api", api.url])
+    said = capsys.readouterr().out
+    assert SHOWN in said
+    assert [c for c in said if not c.isprintable() and c != "\n"] == []
+    assert [line for line in said.splitlines() if line.startswith("m9")] == []
+
+
+@pytest.mark.parametrize("form", ["json", "yaml"])
+def test_programs_get_the_name_as_it_is_in_a_form_that_a_terminal_may_show(
+    form: str, api: Running, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["mission", "list", "--api", api.url, "-o", form]) == 0
+    said = capsys.readouterr().out
+    assert [c for c in said if (c != "\n" and ord(c) < 32) or 127 <= ord(c) < 160] == []
+    read = json.loads if form == "json" else yaml.safe_load
+    assert read(said)["missions"][0]["name"] == NAME
+
+
+class Hostile:
+    """An API that says what it likes."""
+
+    def post(self, path: str, body: object = None) -> dict[str, object]:
+        return {"id": NAME, "state": NAME, "waypoints": 1}
+
+    def get(self, path: str) -> dict[str, object]:
+        event = {"id": 1, "mission": NAME, "time_s": 1.0, "text": NAME}
+        failure = {"code": NAME, "text": NAME}
+        verdict = {"outcome": NAME, "exit_code": 1, "failures": [failure]}
+        return {"events": [event], "verdict": verdict}
+
+
+def test_events_and_verdicts_are_shown_and_do_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "termination-log"
+    log.touch()
+    monkeypatch.setattr(mission_follow.leave_message, "__defaults__", (log,))
+    for module in (mission_local, mission_http):
+        monkeypatch.setattr(module, "Api", lambda *_: Hostile())
+    assert main(["mission", "fly", "--mission", "pipes", "--api", "unix:there"]) == 1
+    assert main(["mission", "run", "pipes", "--api", "unix:there"]) == 1
+    assert main(["mission", "logs", "m1", "--api", "unix:there"]) == 0
+    for said, lines in ((capsys.readouterr().out, 7), (log.read_text(), 1)):
+        assert len(said.splitlines()) == lines
+        assert SHOWN in said
+        assert [c for c in said if not c.isprintable() and c != "\n"] == []
+
+
+def test_what_a_pod_has_said_is_shown_and_does_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    job = JobStatus("job-1", "uid", "failed", "now", 1, NAME)
+    monkeypatch.setattr(mission_cluster, "_place", lambda options: None)
+    monkeypatch.setattr(jobs, "list_jobs", lambda release: [job])
+    monkeypatch.setattr(follow, "logs", lambda release, name: [NAME])
+    options = argparse.Namespace(id=None, output="table", follow=False)
+    for verb, lines in (("list", 2), ("logs", 1)):
+        assert mission_cluster.VERBS[verb](options) == 0
+        said = capsys.readouterr().out
+        assert len(said.splitlines()) == lines
+        assert SHOWN in said
+
+
+def test_what_the_api_refuses_it_says_in_words_that_do_nothing(api: Running) -> None:
+    point = {"position_m": [99.0, 0.0, 1.0], NAME: 1}
+    with pytest.raises(BadInputError) as refused:
+        api.post_local("/v1/missions", {NAME: 2, "waypoints": [point]})
+    lines = str(refused.value).split("\n")
+    assert [line for line in lines if not line.isprintable()] == []
+    assert SHOWN in str(refused.value)
