@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cloudrc.cli.mission_http import Api, UnreachableError
+from cloudrc.cli.mission_http import Api, UnreachableError, path_of
 from cloudrc.errors import CloudrcError
 
 PERIOD = 0.5
@@ -62,7 +62,7 @@ class Follower:
             Its verdict, as the API gives it.
         """
         while True:
-            view = self._insist(lambda: self._api.get(f"/v1/missions/{mission_id}"))
+            view = self._insist(lambda: self._api.get(path_of(mission_id)))
             for event in view["events"]:
                 if event["id"] > self._told:
                     self._told = event["id"]

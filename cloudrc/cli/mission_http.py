@@ -12,7 +12,7 @@ import socket
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 from cloudrc.cli.output import harmless
 from cloudrc.errors import BadInputError, CloudrcError
@@ -123,6 +123,11 @@ class Api:
         secure = parts.scheme == "https"
         kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
         return kind(parts.hostname or "", parts.port, timeout=limit)
+
+
+def path_of(mission_id: str) -> str:
+    """Where a mission is, whatever somebody has typed for its id."""
+    return f"/v1/missions/{quote(mission_id, safe='', errors='surrogateescape')}"
 
 
 class _UnixConnection(http.client.HTTPConnection):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.mission_follow import Follower, in_words, leave_message
-from cloudrc.cli.mission_http import Api
+from cloudrc.cli.mission_http import Api, path_of
 from cloudrc.cli.output import harmless, table, written
 from cloudrc.cli.signals import end_orderly
 from cloudrc.cli.token import reader, token_file
@@ -51,7 +51,7 @@ def fly(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         if found:
             with suppress(CloudrcError):
-                api.post(f"/v1/missions/{found}/cancel")
+                api.post(f"{path_of(found)}/cancel")
         _end("INTERRUPTED: the Job was stopped, its mission is cancelled")
         return INTERRUPTED
     except CloudrcError as error:
@@ -98,7 +98,7 @@ def _row(mission: dict[str, Any]) -> tuple[str, ...]:
 
 def _status(options: argparse.Namespace, api: Api) -> int:
     if options.id:
-        mission = api.get(f"/v1/missions/{options.id}")
+        mission = api.get(path_of(options.id))
         if options.output != "table":
             return _print(mission, options.output)
         _say(mission)
@@ -124,17 +124,17 @@ def _cancel(options: argparse.Namespace, api: Api) -> int:
         if mission is None:
             raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
         mission_id = mission["id"]
-    _say(api.post(f"/v1/missions/{mission_id}/cancel"))
+    _say(api.post(f"{path_of(mission_id)}/cancel"))
     return 0
 
 
 def _logs(options: argparse.Namespace, api: Api) -> int:
     if not options.follow and options.id:
-        _print_events(api.get(f"/v1/missions/{options.id}")["events"])
+        _print_events(api.get(path_of(options.id))["events"])
         return 0
     if not options.follow:
         missions = [m["id"] for m in api.get("/v1/missions")["missions"]]
-        events = [e for m in missions for e in api.get(f"/v1/missions/{m}")["events"]]
+        events = [e for m in missions for e in api.get(path_of(m))["events"]]
         _print_events(sorted(events, key=lambda event: int(event["id"])))
         return 0
     for event in api.events():

@@ -110,3 +110,17 @@ def test_what_the_api_refuses_it_says_in_words_that_do_nothing(api: Running) -> 
     lines = str(refused.value).split("\n")
     assert [line for line in lines if not line.isprintable()] == []
     assert SHOWN in str(refused.value)
+
+
+@pytest.mark.parametrize("verb", ["status", "cancel", "logs"])
+@pytest.mark.parametrize(
+    "given", ["\x1b[31m", "m1?x", "m 1", "..", "a/b", "tür", "\udcff", "%", "m1#"]
+)
+def test_an_id_that_is_none_is_no_mission(
+    verb: str, given: str, api: Running, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["mission", verb, given, "--api", api.url]) == 5
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.isprintable()
+    shown = {"a/b": "Not Found", "\udcff": "no mission '\ufffd'"}
+    assert shown.get(given, f"no mission '{harmless(given)}'") in line
