@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import output_argument
-from cloudrc.cli.parser import COUNT_MAX, count
+from cloudrc.cli.parser import COUNT_MAX, count, read_from
 from cloudrc.errors import BadInputError
 
 EPILOG = """\
@@ -47,12 +47,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     _run_arguments(parsers["run"])
     _fuzz_arguments(parsers["fuzz"])
     merge = parsers["merge"]
-    merge.add_argument("slices", type=Path, nargs="+", metavar="SLICE", help="of fuzz --slice")
+    merge.add_argument("slices", type=read_from, nargs="+", metavar="SLICE", help="of fuzz --slice")
     text = "write the result as text"
     merge.add_argument("--document", type=written_to, metavar="FILE", help=text)
     text = "keep the sum as a slice, to which further ones can be added"
     merge.add_argument("--slice", type=written_to, metavar="FILE", help=text)
-    parsers["replay"].add_argument("file", type=Path, metavar="FILE", help="a schedule (.yaml)")
+    parsers["replay"].add_argument(
+        "file", type=read_from, metavar="FILE", help="a schedule (.yaml)"
+    )
 
 
 def seed(text: str) -> int:

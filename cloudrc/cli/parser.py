@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
+import os
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import NoReturn
 
 from cloudrc import __version__
@@ -84,6 +86,13 @@ def count(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= COUNT_MAX:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 1 to {COUNT_MAX}")
     return int(text)
+
+
+def read_from(text: str) -> Path:
+    """Read the name of a file, as argparse calls it: who opens a pipe waits for who writes."""
+    if os.path.exists(text) and not os.path.isfile(text):
+        raise argparse.ArgumentTypeError(f"{text}: not a regular file")
+    return Path(text)
 
 
 def build(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import output_argument, written
+from cloudrc.cli.parser import read_from
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ exit codes: 0 complete, 1 something is lost (it says what), 2 nothing readable""
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap)")
+    parser.add_argument("file", type=read_from, metavar="FILE", help="a recording (.mcap)")
     parser.add_argument(
         "-t",
         "--to",

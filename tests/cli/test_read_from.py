@@ -1,0 +1,59 @@
+"""Files that commands read: no pipe, which might never be written to; a redirected one is fine."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.faults.schedule import Schedule, dump
+from tests.record.samples import world_records, write
+
+
+@pytest.fixture
+def patience() -> Iterator[None]:
+    """Let whoever waits for a pipe fail, and go on."""
+
+    def give_up(number: int, frame: FrameType | None) -> None:
+        raise TimeoutError("it waits")
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(5)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("words", ["recover", "faults replay", "faults merge"])
+@pytest.mark.parametrize("what", ["pipe", "/dev/null", "."])
+def test_what_is_no_file_is_refused_and_not_waited_for(
+    words: str,
+    what: str,
+    tmp_path: Path,
+    patience: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    assert main([*words.split(), what]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{what}: not a regular file; see 'cloudrc {words} --help'" in line
+    assert os.listdir() == ["pipe"]
+
+
+def test_a_file_that_is_handed_over_is_read(tmp_path: Path) -> None:
+    """As `/dev/stdin` is one behind '<'."""
+    run = write(tmp_path / "run.mcap", world_records(50))
+    with run.open("rb") as handed:
+        words = ["recover", f"/dev/fd/{handed.fileno()}", "--to", str(tmp_path / "new.mcap")]
+        assert main(words) == 0
+    schedule = tmp_path / "schedule.yaml"
+    schedule.write_text(dump(Schedule(1, duration=0.5)))
+    with schedule.open("rb") as handed:
+        assert main(["faults", "replay", f"/dev/fd/{handed.fileno()}"]) == 0
