@@ -24,8 +24,8 @@ examples:
 
 exit codes: 0 no check failed, 1 one did, 2 bad input,
   3 or 5 no cluster or no release there (--cluster), 130 interrupted"""
-SEED_MAX = 2**63 - 1 - COUNT_MAX
-"""Of the first one: those counted from it fit into 64 bits, too."""
+SEED_MAX = 2**53 - 1 - COUNT_MAX
+"""Of the first one: an experiment takes those counted from it, too, which are below 2^53."""
 ACTIONS = {
     "list": "all faults, what is done and what has to follow",
     "run": "bring faults about and check what follows",

@@ -11,7 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.cli.faults import SEED_MAX, seed
 from cloudrc.cli.main import main
+from cloudrc.cli.parser import COUNT_MAX
+from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.faults import asks, document
 from cloudrc.faults.catalogue import find, scenarios
@@ -258,6 +261,12 @@ def test_without_a_name_or_an_action_it_says_what_is_missing(
         ("run F12 --real", 2, "try: cloudrc faults run jitter"),
         ("run F37 --seed -1", 2, "'-1' is not a whole number"),
         ("run F37 --seed 1e9", 2, "'1e9' is not a whole number"),
+        ("run F1 --seed 9007199254740992", 2, "argument --seed: '9007199254740992' is not a whole"),
+        (
+            "fuzz --first 9223372036854675807 --seeds 3",
+            2,
+            "argument --first: '9223372036854675807'",
+        ),
         ("fuzz --first -5 --seeds 1", 2, "'-5' is not a whole number"),
         ("run F37 --junit none/x.xml", 2, "no file can be written there"),
         ("run F37 --document /", 2, "no file can be written there"),
@@ -279,3 +288,9 @@ def test_what_cannot_be_done_is_said_at_once_and_in_one_line(
     out, err = capsys.readouterr()
     assert said in err
     assert (out, err.count("\n")) == ("", 1)
+
+
+def test_an_experiment_takes_the_last_seed_that_is_counted_from_the_largest_one() -> None:
+    last = SEED_MAX + COUNT_MAX - 1
+    assert load_experiment("paper", [f"seed={last}"]).seed == last
+    assert seed(str(SEED_MAX)) == SEED_MAX
