@@ -129,7 +129,22 @@ def _load(path: Path) -> Document:
         raise BadInputError(f"{path}: cannot be read as a slice: {text}") from error
     if not (isinstance(told, dict) and _is_slice(told)):
         raise BadInputError(f"{path}: is no slice; write one by 'cloudrc faults fuzz --slice FILE'")
+    if problem := _contradiction(told):
+        raise BadInputError(f"{path}: {problem}; fly it anew: cloudrc faults fuzz --slice FILE")
     return told
+
+
+def _contradiction(told: Document) -> str:
+    """What cannot be of flights that were flown, in words; "" if all can."""
+    if told["first"] < 0:
+        return f"its first seed is {told['first']}, below 0"
+    most = max(each["judged"] for each in told["invariants"].values())
+    if most != told["count"]:  # some invariants are looked at in every flight
+        return f"count {told['count']}, but its invariants were looked at in {most} flights"
+    for kind, each in told["invariants"].items():
+        if not 0 <= (each["broken"] or 0) <= each["judged"]:
+            return f"{kind}: broken in {each['broken']} of {each['judged']} flights"
+    return ""
 
 
 def _is_slice(told: Document) -> bool:
