@@ -9,7 +9,7 @@ import stat
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.route import read, version
+from cloudrc.files import read, version
 from cloudrc.records import Fault
 from cloudrc.tunnel.keys import KeyRing, KeySet, parse
 

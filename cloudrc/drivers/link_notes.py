@@ -14,7 +14,7 @@ from math import nan
 from pathlib import Path
 
 from cloudrc.errors import in_one_line
-from cloudrc.link.route import TooLongError, read, version
+from cloudrc.files import TooLongError, read, version
 from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, LinkState, from_text
 from cloudrc.records import (
     Counted,

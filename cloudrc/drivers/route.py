@@ -10,7 +10,7 @@ from __future__ import annotations
 from ipaddress import AddressValueError, IPv4Address
 from pathlib import Path
 
-from cloudrc.link.route import read, version
+from cloudrc.files import read, version
 
 Address = tuple[str, int]
 

@@ -19,8 +19,8 @@ from pathlib import Path
 from cloudrc.drivers.standing_basis import Basis, Judged
 from cloudrc.drivers.standing_tally import Tally
 from cloudrc.errors import in_words
+from cloudrc.files import TooLongError, read
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.route import TooLongError, read
 from cloudrc.link.state import STATE_MAX, from_text
 from cloudrc.link.verify_block import Block
 from cloudrc.link.verify_judge import Row

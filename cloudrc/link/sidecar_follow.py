@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.errors import BadInputError
+from cloudrc.files import version
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.route import version
 from cloudrc.link.state import CHANGE_FILE, Change, read_change
 
 if TYPE_CHECKING:

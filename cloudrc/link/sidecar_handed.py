@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.route import version
+from cloudrc.files import version
 from cloudrc.link.sidecar_follow import Load, Loaded, ProfileFile
 from cloudrc.link.state import Change, read_change
 

@@ -13,8 +13,8 @@ from math import fsum, sqrt
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
+from cloudrc.files import read
 from cloudrc.link.profile import Trace
-from cloudrc.link.route import read
 
 _TIME = "time_s"
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
