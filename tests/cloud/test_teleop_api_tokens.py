@@ -2,6 +2,7 @@
 
 import ast
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,38 @@ def test_tokens_that_cannot_be_used_are_refused_and_not_shown(tmp_path, tokens, 
     with pytest.raises(BadInputError, match=said) as refused:
         Tokens(token_folder(tmp_path / "t", **tokens))
     assert not [text for text in tokens.values() if text and text in str(refused.value)]
+
+
+def spoilt(path, how):
+    """In the place of a token file stands what never ends, as a pipe does, or is far too long."""
+    path.unlink(missing_ok=True)
+    if how == "pipe":
+        os.mkfifo(path)
+    else:
+        path.write_text(OPERATOR + "\n" * api_tokens.SIZE_MAX)
+
+
+@pytest.mark.parametrize(("how", "said"), [("pipe", "not a file"), ("long", "longer than 4096")])
+@pytest.mark.parametrize("role", ["operator", "reader"])
+def test_what_is_no_token_file_is_refused_and_not_waited_for(tmp_path, role, how, said):
+    folder = token_folder(tmp_path / "t", operator=OPERATOR, reader=READER)
+    spoilt(folder / role, how)
+    with pytest.raises(BadInputError, match=f"{role}: {said}.*; remove it and make one: openssl"):
+        Tokens(folder)
+
+
+@pytest.mark.promise("P-API-4")
+@pytest.mark.parametrize("how", ["pipe", "long"])
+def test_what_becomes_no_token_file_in_flight_admits_nobody(tmp_path, monkeypatch, how):
+    monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
+    folder = token_folder(tmp_path / "t", operator=OPERATOR)
+    tokens, header = Tokens(folder), f"Bearer {OPERATOR}".encode()
+    assert tokens.caller(header).role == "operator"
+    spoilt(folder / "operator", how)
+    assert tokens.caller(header) is None
+    (folder / "operator").unlink()
+    token_folder(folder, operator=OPERATOR)
+    assert tokens.caller(header).role == "operator"
 
 
 @pytest.mark.promise("P-API-3")

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.files import read, version
 
 Role: TypeAlias = Literal["operator", "reader"]
 OPERATOR: Role = "operator"
@@ -24,6 +25,8 @@ ROLES: tuple[Role, ...] = (OPERATOR, READER)
 
 LOOK_PERIOD = 1.0
 """Between two looks whether the files have changed [s]."""
+SIZE_MAX = 4096
+"""Of a token file [bytes]: whitespace around the token is passed over."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
 _BEARER = b"bearer "
 
@@ -92,7 +95,7 @@ class Tokens:
             self._known = ()
 
     def _look(self) -> list[tuple[int, int, int] | None]:
-        return [_stamp(self._folder / role) for role in ROLES]
+        return [version(self._folder / role) for role in ROLES]
 
     def _read(self) -> tuple[tuple[bytes, Caller], ...]:
         known = []
@@ -108,23 +111,15 @@ class Tokens:
 
 
 def _read_token(path: Path) -> bytes:
+    make = f"make one: openssl rand -hex 32 > {path}"
     try:
-        token = path.read_bytes().strip()
+        token = read(path, SIZE_MAX).strip()
     except OSError as error:
-        raise BadInputError(
-            f"--tokens: {path}: {error.strerror}; make one: openssl rand -hex 32 > {path}"
-        ) from None
+        raise BadInputError(f"--tokens: {path}: {error.strerror}; {make}") from None
+    except ValueError as error:  # which names the file
+        raise BadInputError(f"--tokens: {error}; remove it and {make}") from None
     if not _TOKEN.fullmatch(token):
         raise BadInputError(
-            f"--tokens: {path}: a token is 16 to 512 visible ASCII characters; "
-            f"make one: openssl rand -hex 32 > {path}"
+            f"--tokens: {path}: a token is 16 to 512 visible ASCII characters; {make}"
         )
     return token
-
-
-def _stamp(path: Path) -> tuple[int, int, int] | None:
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_mtime_ns, found.st_ino, found.st_size
