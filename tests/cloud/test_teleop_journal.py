@@ -1,10 +1,14 @@
 """The journal on a real disk: exact, whole after a crash at any byte, one process at a time."""
 
 import os
+import re
+import resource
+from pathlib import Path
 
 import pytest
 from journal_disks import SOME, records, whole
 
+from cloudrc.cloud.teleop import journal_disk
 from cloudrc.cloud.teleop.journal import Journal, JournalLockedError
 from cloudrc.cloud.teleop.journal_disk import Disk
 from cloudrc.cloud.teleop.journal_format import HEAD, MAGIC
@@ -109,6 +113,52 @@ def test_another_file_is_not_touched(tmp_path):
         with pytest.raises(BadInputError, match=r"--journal .*precious: is no journal; name an"):
             Journal(path)
     assert path.read_bytes() == b"my thesis"
+
+
+def refused(path, said):
+    """It is said what to do, nothing is waited for, and no lock stays."""
+    for _ in range(2):
+        with pytest.raises(BadInputError, match=f"^--journal {re.escape(str(path))}: {said}$"):
+            Journal(path)
+
+
+def test_what_is_no_file_is_refused_and_no_lock_lies_beside_it(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("/dev/null")
+    for path in (tmp_path / "pipe", tmp_path / "link", Path("/dev/null")):
+        refused(path, "not a file; move it away, or name another file")
+        assert not path.with_name(f"{path.name}.lock").exists()
+
+
+def test_a_pipe_that_comes_into_its_place_is_not_waited_for(tmp_path):
+    class Late(Disk):
+        def open(self, path, *, new=False):
+            os.mkfifo(path)
+            return super().open(path, new=new)
+
+    with pytest.raises(BadInputError, match=r"journal: not a file; move it away"):
+        Journal(tmp_path / "journal", Late())
+
+
+def test_one_beyond_the_limit_is_refused_and_not_cut(tmp_path, monkeypatch):
+    path = tmp_path / "journal"
+    path.write_bytes(whole(SOME))
+    monkeypatch.setattr(journal_disk, "SIZE_MAX", path.stat().st_size)
+    with Journal(path) as journal:
+        assert journal.entries == SOME
+        journal.append(SOME[0])
+    refused(path, r"longer than \d+ bytes; move it away, or name another file")
+    assert path.read_bytes() == whole([*SOME, SOME[0]])
+
+
+def test_an_endless_one_takes_no_memory(tmp_path):
+    path = tmp_path / "journal"
+    path.write_bytes(MAGIC)
+    os.truncate(path, 8 << 30)  # a sparse file: on the disk it takes nothing
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    refused(path, "longer than 1073741824 bytes; move it away, or name another file")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # [kB]
+    assert path.stat().st_size == 8 << 30
 
 
 @pytest.mark.promise("P-JOURNAL-3")

@@ -44,7 +44,7 @@ class Journal:
 
         Raises:
             JournalLockedError: If another process has it.
-            BadInputError: If the file is something else.
+            BadInputError: If the file is something else, or longer than any journal.
             OSError: If there is no journal and none can be made.
         """
         self._path, self._disk = path, disk or Disk()
@@ -56,6 +56,8 @@ class Journal:
             raise JournalLockedError(
                 f"{path}: another teleop has this journal open; waiting until it ends"
             ) from None
+        except ValueError as error:
+            raise _refused(error) from None
         try:
             found = self._read()
             self._mend(found)
@@ -129,7 +131,13 @@ class Journal:
             if error.errno not in REFUSED:
                 raise
             self._complain(f"{self._path}: {error.strerror}: missions are refused until it is not")
-        return parse(self._disk.read(self._path))
+        return parse(self._bytes())
+
+    def _bytes(self) -> bytes:
+        try:
+            return self._disk.read(self._path)
+        except ValueError as error:
+            raise _refused(error) from None
 
     def _opened(self) -> int:
         """The file, open to be written; tried again where the disk refused before."""
@@ -167,7 +175,7 @@ class Journal:
         self._complain(f"journal repaired: {self._path}: {what}; see {copy}")
         file = self._disk.open(copy, new=True)
         try:
-            self._write(file, self._disk.read(self._path))
+            self._write(file, self._bytes())
         finally:
             self._disk.close(file)
         self.rewrite(self.entries)
@@ -180,3 +188,8 @@ class Journal:
 
     def _complain(self, text: str) -> None:
         self.trouble = "; ".join(filter(None, (self.trouble, text)))
+
+
+def _refused(error: ValueError) -> BadInputError:
+    """Say what to do about a path that is not read; the error names it."""
+    return BadInputError(f"--journal {error}; move it away, or name another file")
