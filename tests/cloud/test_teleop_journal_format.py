@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from journal_disks import SOME, records, whole
 
-from cloudrc.cloud.teleop.journal_format import HEAD, LENGTH_MAX, MAGIC, MARK, parse
+from cloudrc.cloud.teleop.journal_format import HEAD, LENGTH_MAX, MAGIC, MARK, parse, to_record
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -96,6 +96,31 @@ def forged(payload, length=None):
 )
 def test_a_record_that_is_no_entry_is_left_out(record):
     assert parse(MAGIC + record) == ([], 0, len(MAGIC), len(record), 0, True)
+
+
+@pytest.mark.parametrize("long", [0, 100_000])
+def test_forged_records_in_each_other_take_no_longer_than_others(monkeypatch, long):
+    """Each says that it goes to the end, or as far as a record may."""
+    summed, count = [], 5_000
+    heads = [
+        MARK + (long or (count - n) * HEAD).to_bytes(4, "little") + n.to_bytes(8, "little")
+        for n in range(1, count + 1)
+    ]
+    data = MAGIC + b"".join(head.ljust(HEAD, b"?") for head in heads) + b" " * long
+    with monkeypatch.context() as patch:
+        crc32 = zlib.crc32
+        patch.setattr(
+            zlib, "crc32", lambda part, *more: summed.append(len(part)) or crc32(part, *more)
+        )
+        assert parse(data) == ([], 0, len(MAGIC), len(data) - len(MAGIC), 0, True)
+    assert sum(summed) <= 2 * len(data)
+
+
+def test_marks_in_a_records_head_do_not_hide_it():
+    number = int.from_bytes(MARK, "little")
+    record = to_record(number, SOME[0])
+    assert record.count(MARK) == 2
+    assert (parse(MAGIC + record).entries, parse(MAGIC + record).number) == (SOME[:1], number)
 
 
 def test_the_longest_record_counts():
