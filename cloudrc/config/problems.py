@@ -100,6 +100,9 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: Path) -> Prob
         return Problem(prefix + path, "", str(detail["ctx"]["error"]))
     if kind == "too_long":
         return Problem(prefix + path, "", f"at most {detail['ctx']['max_length']} entries")
+    if kind == "string_too_long":
+        longest = detail["ctx"]["max_length"]
+        return Problem(prefix + path, value, f"must be text of at most {longest} characters")
     if kind == "literal_error":
         return Problem(prefix + path, value, describe.nearest_choice(detail))
     if kind == "string_pattern_mismatch":

@@ -36,6 +36,16 @@ def test_a_query_that_cannot_be_used_is_refused_like_a_body(idle: Running, value
     assert refusal["detail"].startswith("after: ")
 
 
+@pytest.mark.parametrize("key", ["name", "key"])
+def test_a_text_that_is_too_long_is_told_how_long_it_may_be(idle: Running, key: str) -> None:
+    waypoints = [{"position_m": [0.5, 0.0, 0.7]}]
+    status, refusal = idle.post("/v1/missions", {key: "x" * 201, "waypoints": waypoints})
+    (problem,) = refusal["problems"]
+    assert (status, problem["path"]) == (422, key)
+    assert problem["value"].startswith("'xxx")
+    assert problem["reason"] == "must be text of at most 200 characters"
+
+
 @pytest.mark.parametrize("body", [{}, {"waypoints": []}, {"name": "nothing"}])
 def test_nothing_is_offered_that_the_api_does_not_take(
     idle: Running, body: dict[str, object]
