@@ -103,6 +103,8 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: Path) -> Prob
     if kind == "string_too_long":
         longest = detail["ctx"]["max_length"]
         return Problem(prefix + path, value, f"must be text of at most {longest} characters")
+    if kind == "unprintable":
+        return Problem(prefix + path, value, detail["msg"])
     if kind == "literal_error":
         return Problem(prefix + path, value, describe.nearest_choice(detail))
     if kind == "string_pattern_mismatch":

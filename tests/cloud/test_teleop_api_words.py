@@ -46,6 +46,37 @@ def test_a_text_that_is_too_long_is_told_how_long_it_may_be(idle: Running, key: 
     assert problem["reason"] == "must be text of at most 200 characters"
 
 
+@pytest.mark.parametrize("key", ["name", "key"])
+@pytest.mark.parametrize("sign", ["\x1b[2J", "\n", "\0", "\x7f", "\x9b", "\u2028", "\u202e"])
+def test_a_text_that_would_steer_a_terminal_is_refused(idle: Running, key: str, sign: str) -> None:
+    waypoints = [{"position_m": [0.5, 0.0, 0.7]}]
+    before = idle.get("/v1/missions")
+    status, refusal = idle.post("/v1/missions", {key: f"to {sign}", "waypoints": waypoints})
+    models.Refusal.model_validate(refusal)
+    assert status == 422
+    assert refusal["detail"] == f"{key}: {f'to {sign}'!r}: must be one line of printable characters"
+    (problem,) = refusal["problems"]
+    assert (problem["path"], problem["reason"]) == (key, "must be one line of printable characters")
+    assert refusal["detail"].isprintable()
+    assert idle.get("/v1/missions") == before
+
+
+def test_the_description_says_what_a_text_may_hold(idle: Running) -> None:
+    post = idle.get("/openapi.json")["paths"]["/v1/missions"]["post"]
+    texts = post["requestBody"]["content"]["application/json"]["schema"]["properties"]
+    for key in ("name", "key"):
+        assert texts[key]["maxLength"] == 200
+        assert "printable" in texts[key]["description"]
+    status, made = idle.post(
+        "/v1/missions",
+        {
+            "name": "zum Brett, \N{RIGHTWARDS ARROW} 板",
+            "waypoints": [{"position_m": [0.5, 0.0, 0.7]}],
+        },
+    )
+    assert (status, made["name"]) == (201, "zum Brett, \N{RIGHTWARDS ARROW} 板")
+
+
 @pytest.mark.parametrize("body", [{}, {"waypoints": []}, {"name": "nothing"}])
 def test_nothing_is_offered_that_the_api_does_not_take(
     idle: Running, body: dict[str, object]

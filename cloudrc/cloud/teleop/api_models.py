@@ -7,13 +7,23 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
 
 from cloudrc.config.fields import Finite, Positive, Section
 from cloudrc.config.schema import MAX_WAYPOINTS, Waypoint
 
 Position = tuple[Finite, Finite, Finite]
-Text = Annotated[str, Field(max_length=200)]
+
+
+def _printable(text: str) -> str:
+    """Refuse what would steer the terminals, or break the lines, of all who are shown it."""
+    if not text.isprintable():
+        raise PydanticCustomError("unprintable", "must be one line of printable characters")
+    return text
+
+
+Text = Annotated[str, Field(max_length=200), AfterValidator(_printable)]
 
 MISSION_EXAMPLE = {
     "name": "to the board",
@@ -29,7 +39,7 @@ MISSION_EXAMPLE = {
 class MissionRequest(Section):
     """A mission to fly."""
 
-    name: Text = Field("", description="For people")
+    name: Text = Field("", description="For people: one line of printable characters")
     description: str = Field("", description="One line, not kept")
     start: Literal["spawn", "here"] = Field("spawn", description="Where the mission starts")
     time_limit_s: Positive | None = Field(
@@ -43,7 +53,11 @@ class MissionRequest(Section):
         description="Whether the arm has to touch the board; "
         "default: if the experiment asks for it and the waypoints lead there",
     )
-    key: Text = Field("", description="A second mission under the same key is not made")
+    key: Text = Field(
+        "",
+        description="A second mission under the same key is not made; "
+        "one line of printable characters",
+    )
     queue: bool = Field(False, description="Wait for the mission under way, if there is one")
 
 
