@@ -5,62 +5,74 @@ Run by itself it is a coverage-guided fuzzer (libFuzzer's flags):
     python tests/tunnel/hostile.py -atheris_runs=10000000 [CORPUS]
 
 Four ways to be hostile, in turns: bytes as they come; a sealed frame of the session with some bytes
-changed; one cut short or made longer; one sealed properly, with a key that is not ours.
+changed; one cut short or made longer; one sealed properly, with a key that is not ours. Now and
+then time passes, by a step that the fuzzer's bytes choose, and both ends do what is due: they hear
+each other, or nothing but what somebody has captured and sends again.
 """
 
 from __future__ import annotations
 
 import resource
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 sys.path += [str(Path(__file__).parents[1] / "missions"), str(Path(__file__).parents[2])]
 
-from bare_world import Bare, BareCloud, bare_cloud, ring
+from bare_world import MS, Bare, BareCloud, bare_cloud, ring
 
+from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
 from cloudrc.tunnel.session import pair
 
 LONGEST = 2048
+STEPS_NS = tuple(round(ms * MS) for ms in (1, 30, 400, 1_500, 6_000, 150_000))
+"""By which time passes; a peer is silent after 5 s, and moves on to new keys after 120 s."""
+TOLD_MAX = 256
+"""Complaints of a cloud that hears nobody: other versions, and the wrong key, each once."""
 DOWNLINK = (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE)
 
 
 class Target:
     """A world and a cloud in a session, with every frame that was ever valid between them."""
 
-    def __init__(self) -> None:
+    def __init__(self, pace: int = 5_000) -> None:
+        """Begin; time passes after every `pace` datagrams that are tried."""
+        self.pace, self.now_ns = pace, 0
         self.bare = Bare(ring())
         self.world = self.bare.world
         self.cloud = bare_cloud(b"c" * 16, ring())
         self.frames: list[bytes] = []
         for _ in range(40):  # until both are in one session
             self.cloud.handle_deadline(self.cloud.next_deadline_ns())
-            for data in self.cloud.take_datagrams():
-                self.give(data, self.world)
-            for data in self.world.take_datagrams():
-                self.give(data, self.cloud)
+            for source, target in ((self.cloud, self.world), (self.world, self.cloud)):
+                datagrams = source.take_datagrams()
+                self.frames += datagrams
+                self.give(datagrams, target)
         assert self.cloud._session.epoch == self.world._session.epoch == 1
+        self.captured = tuple(self.frames)
         talker = BareCloud(b"other", None)
         talker.session = self.cloud._session
         self.frames += [talker.command(), talker.start(1), talker.session.seal(Kind.ALIVE, b"")]
         telemetry = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
         self.frames += [self.world._session.seal(Kind.TELEMETRY, telemetry) for _ in range(3)]
-        self.known = frozenset(self.frames)
+        self.known, self.first = frozenset(self.frames), tuple(self.frames)
         self.strangers = pair(1, b"s" * 32)
         for end in (self.world, self.cloud):
             end.take_records()
             end.take_datagrams()
         self.before = self.state()
-        self.tried = 0
+        self.tried = self.asked = self.told = 0
 
-    def give(self, data: bytes, end: object) -> None:
-        self.frames.append(data)
-        end.receive_datagram(data, 0)
+    def give(self, datagrams: Iterable[bytes], end: object) -> None:
+        for data in datagrams:
+            end.receive_datagram(data, self.now_ns)
 
     def state(self) -> tuple:
         """All that a datagram that is let through would change."""
-        accepted = ("used", "late", "repeated", "hello", "busy", "accept_ignored", "unanswered")
+        accepted = ("used", "late", "repeated", "stale", "hello", "busy", "accept_ignored",
+                    "unanswered")  # fmt: skip
         ends = (self.world, self.cloud)
         return (
             [[end._counts[name] for name in accepted] for end in ends],
@@ -80,15 +92,53 @@ class Target:
         if data in self.known:
             return
         self.tried += 1
-        self.world.receive_datagram(data, 0)
-        self.cloud.receive_datagram(data, 0)
+        self.world.receive_datagram(data, self.now_ns)
+        self.cloud.receive_datagram(data, self.now_ns)
         if self.tried % 1000 == 0:
             self.check()
+        if self.tried % self.pace == 0:
+            self.check()
+            self.pass_time(int.from_bytes(program[-2:], "little"))
+            self.before = self.state()
+
+    def pass_time(self, choice: int) -> None:
+        """Let both ends do what is due after a step; they hear each other, or what is old."""
+        self.asked = 0
+        step, heard = divmod(choice, 2)
+        self.now_ns += STEPS_NS[step % len(STEPS_NS)]
+        said = self.due(self.world)
+        if heard:
+            self.give(said, self.cloud)
+        answers = self.due(self.cloud)
+        if heard:
+            self.give(answers, self.world)
+            self.frames = [*self.first, *said[-1:], *answers[-1:]]
+            self.known = frozenset(self.frames)
+        else:
+            before = self.state()[1:]
+            for end in (self.world, self.cloud):
+                self.give(self.captured, end)
+            assert self.state()[1:] == before, "what was captured was let through again"
+        for end in (self.world, self.cloud):
+            end.take_records()
+            end.take_datagrams()
+
+    def due(self, end: object) -> list[bytes]:
+        """What an end sends now."""
+        end.handle_deadline(self.now_ns)
+        return end.take_datagrams()
 
     def check(self) -> None:
         assert self.state() == self.before, "a hostile datagram was let through"
-        assert self.world.take_datagrams() == self.cloud.take_datagrams() == []
-        assert self.world.take_records() == self.cloud.take_records() == []
+        assert self.world.take_datagrams() == self.world.take_records() == []
+        asked = [codec.peek(data)[0] for data in self.cloud.take_datagrams()]
+        self.asked += len(asked)
+        assert self.asked <= 1, "more than a hello in 100 ms"  # world may have moved on, it thinks
+        assert set(asked) <= {Kind.HELLO}
+        told = self.cloud.take_records()
+        self.told += len(told)
+        assert self.told <= TOLD_MAX, "the user is told the same again"
+        assert all(isinstance(one, Fault) and one.code in ("version", "key") for one in told)
 
     def make(self, program: bytes) -> bytes:
         if len(program) < 4:

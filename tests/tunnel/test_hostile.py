@@ -7,11 +7,14 @@ import random
 import re
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hostile import LONGEST, Target, memory
+
+from cloudrc.tunnel.openers import Openers
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +35,30 @@ def test_hostile_datagrams_are_not_accepted(target: Target) -> None:
     assert target.tried > 25_000
 
 
+def test_time_passes_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: Counter[tuple[bool, bool]] = Counter()
+    generations = Openers._generations
+
+    def counted(openers: Openers, byte: int) -> range:
+        found = generations(openers, byte)
+        looked[openers is target.world._session._openers, len(found) > 1] += 1
+        return found
+
+    monkeypatch.setattr(Openers, "_generations", counted)
+    target = Target(pace=300)
+    flood(target, 30_000, seed=4)
+    assert min(looked[at_world, far] for at_world in (True, False) for far in (True, False)) > 30
+    assert target.world._counts["unanswered"] > 0
+    assert target.now_ns > 1000e9
+
+
 def test_every_truncation_and_every_longer_version_is_refused(target: Target) -> None:
     for frame in {frame[6:8]: frame for frame in target.frames}.values():
         for length in range(LONGEST + 1):
             if length != len(frame):
                 data = frame[:length].ljust(length, b"\0")
-                target.world.receive_datagram(data, 0)
-                target.cloud.receive_datagram(data, 0)
+                target.world.receive_datagram(data, target.now_ns)
+                target.cloud.receive_datagram(data, target.now_ns)
     target.check()
 
 
