@@ -41,7 +41,7 @@ def field_at(model: type[BaseModel], path: Path) -> FieldInfo | None:
     field = None
     models = [model]
     for key in path:
-        if key.isdigit():
+        if key.isdecimal():
             continue
         found = [inner.model_fields[key] for inner in models if key in inner.model_fields]
         if not found:
@@ -56,7 +56,7 @@ def expectation(model: type[BaseModel], path: Path) -> str:
     field = field_at(model, path)
     if field is None:
         return "is not valid"
-    inside_list = path[-1].isdigit()
+    inside_list = path[-1].isdecimal()
     if get_origin(field.annotation) is Literal:
         return f"must be one of {', '.join(map(repr, get_args(field.annotation)))}"
     words = [_TYPES[kind] for kind in dict.fromkeys(_types(field.annotation)) if kind in _TYPES]

@@ -157,7 +157,8 @@ def resumed_after(flight: Flight, back: float) -> float:
 def busiest_second(flight: Flight) -> int:
     """Most changes of the guard between TRACK and HOLD within any second."""
     flown = (GuardState.TRACK, GuardState.HOLD)
-    times_ns = [change.stamp_ns for change in flight.changes if change.state in flown]
+    changes = pairwise(flight.changes)
+    times_ns = [b.stamp_ns for a, b in changes if a.state in flown and b.state in flown]
     return max((sum(t <= u < t + WINDOW_NS for u in times_ns) for t in times_ns), default=0)
 
 

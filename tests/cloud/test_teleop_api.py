@@ -165,6 +165,13 @@ def test_a_value_that_cannot_be_used_is_named(idle, body, path, index, words):
     assert idle.get("/v1/missions")["missions"] == []
 
 
+def test_a_key_of_a_digit_that_is_no_number_is_refused_like_any_other(idle):
+    """Superscripts are digits to `str.isdigit`, and `int` reads none of them."""
+    status, refusal = idle.post("/v1/missions", {"waypoints": [], "\u00b3": 1})
+    assert status == 422
+    assert {"\u00b3", "waypoints"} >= {problem["path"] for problem in refusal["problems"]}
+
+
 def test_a_point_is_checked_like_a_waypoint(idle):
     status, refusal = idle.post("/v1/goto", {"position_m": [0, 0, 99]})
     assert status == 422

@@ -77,7 +77,7 @@ def leads_to_board(mission: Mission, scene: Scene) -> bool:
 
 def as_json(problem: Problem) -> dict[str, str | int | None]:
     """Show a problem as the API does."""
-    index = next((int(key) for key in problem.path if key.isdigit()), None)
+    index = next((int(key) for key in problem.path if key.isdecimal()), None)
     return {
         "path": ".".join(problem.path),
         "index": index if problem.path[:1] == ("waypoints",) else None,
