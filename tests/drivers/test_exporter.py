@@ -8,6 +8,7 @@ import time
 
 import pytest
 from flying import records
+from pace import here
 from prometheus_client.parser import text_string_to_metric_families
 
 from cloudrc import __version__
@@ -172,13 +173,13 @@ def test_a_shaper_takes_the_place_of_the_one_before() -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("end", ENDS)
 def test_a_record_costs_less_than_a_microsecond(end: str, flight: Flight) -> None:
-    """On the loop's thread; the least of some repeats, for the machine may be busy."""
+    """On the loop's thread, at the machine's pace; the least of some repeats: it may be busy."""
     chunks = [flight[end][i : i + 4] for i in range(0, len(flight[end]), 4)]
     least = float("inf")
     for _ in range(15):
         made = Exporter(end)
-        began = time.perf_counter()
+        began = time.process_time()
         for chunk in chunks:
             made.see(chunk)
-        least = min(least, time.perf_counter() - began)
-    assert least / len(flight[end]) < 1e-6
+        least = min(least, time.process_time() - began)
+    assert least / len(flight[end]) < 1e-6 * here()

@@ -8,20 +8,7 @@ from datetime import datetime
 from functools import cache
 
 from kube import NAMESPACE, command, eventually, kubectl, pod
-
-WORK = """
-from time import process_time
-def work():
-    table = {}
-    began = process_time()
-    for i in range(2_000_000):
-        table[i & 1023] = i * i % 977
-    return process_time() - began
-print(min(work() for _ in range(5)))
-"""
-NOMINAL = 0.100
-"""What WORK takes where a release in flight costs 138m to 148m [s]. Where it took 0.17 to 0.21 s
-the same release cost 228m to 300m, all of its containers alike."""
+from pace import WORK, slower
 
 
 @dataclass
@@ -86,7 +73,7 @@ def later(before: Usage) -> Usage:
 def pace() -> float:
     """How much slower than nominal the release's own interpreter is at its own work; at least 1."""
     words = ("exec", pod("world")["metadata"]["name"], "--container=world", "--")
-    return max(1.0, float(kubectl(*words, "python", "-c", WORK)) / NOMINAL)
+    return slower(kubectl(*words, "python", "-c", WORK))
 
 
 def _is_later(one: Usage, other: Usage) -> bool:
