@@ -188,11 +188,18 @@ def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> Mi
     from contextlib import suppress
 
     from cloudrc.cloud.teleop.service import MissionService
+    from cloudrc.errors import BadInputError
 
     limit, salt = experiment.criteria.contact_speed_max_mps, os.urandom(SALT_SIZE)
     if journal is None:
         return MissionService(limit, salt=salt)
-    service = MissionService(limit, journal.append, journal.entries, salt=salt)
+    try:
+        service = MissionService(limit, journal.append, journal.entries, salt=salt)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise BadInputError(
+            "--journal: it holds whole entries that this version cannot read: was it written by "
+            "another one? Move it away, or name another file"
+        ) from error
     known = [entry for entry in journal.entries if service.book.knows(entry)]
     if len(known) < len(journal.entries):
         with suppress(OSError):  # a full disk: it is done at the next start
