@@ -20,7 +20,7 @@ WINDOW_NS = 1_000_000_000
 """In which transitions are counted [ns]."""
 ALONE = "held for 60 s without the cloud"
 """The cause of a LAND that ends a long HOLD."""
-ENDED = "mission ended"
+ENDED = Cause.ENDED.words
 """The cause of a HOLD that the operator's end has asked for."""
 
 

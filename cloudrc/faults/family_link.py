@@ -11,7 +11,7 @@ from cloudrc.faults.held import AGE_MAX
 from cloudrc.faults.options import Shape, blackouts
 from cloudrc.faults.scenario import Outcome, Scenario, generator
 from cloudrc.link.profile import GilbertElliott
-from cloudrc.messages import GuardState
+from cloudrc.messages import Cause, GuardState
 
 HOUR_NS = 3_600_000_000_000
 
@@ -99,7 +99,7 @@ def _silent(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     outcome.most(f"{where}: speed at last", hypot(*path[-1].odometry.velocity), 0.01, "m/s")
     rotor = max(flight.robot.simulator._rotors.speeds)
     outcome.most(f"{where}: fastest rotor", rotor, 1.0, "rad/s")
-    told = flight.changes[-1].cause == "touched down, rotors stopped"
+    told = flight.changes[-1].cause == Cause.DOWN.words
     outcome.true(f"{where}: the last change says so", told)
     flown = [t for t in asks.changes_into(flight, GuardState.TRACK) if t > landed]
     outcome.true(f"{where}: it stays down until the operator acknowledges", not flown)
