@@ -197,8 +197,8 @@ def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> Mi
         service = MissionService(limit, journal.append, journal.entries, salt=salt)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise BadInputError(
-            "--journal: it holds whole entries that this version cannot read: was it written by "
-            "another one? Move it away, or name another file"
+            f"--journal {journal.path}: it holds whole entries that this version cannot read: was "
+            "it written by another one? Move it away, or name another file"
         ) from error
     known = [entry for entry in journal.entries if service.book.knows(entry)]
     if len(known) < len(journal.entries):

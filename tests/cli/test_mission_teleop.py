@@ -36,7 +36,7 @@ def test_a_journal_of_another_shape_is_refused_and_stays_as_it_is(
     file.write_bytes(to_bytes([entry]))
     before = file.read_bytes()
     journal = Journal(file)
-    with pytest.raises(BadInputError, match=r"cannot read.*name another file"):
+    with pytest.raises(BadInputError, match=rf"{file}: .* name another file"):
         teleop._open_service(load_experiment("hover"), journal)
     journal.close()
     assert file.read_bytes() == before

@@ -30,6 +30,7 @@ class Journal:
     """An open journal, locked until it is closed or its process ends.
 
     Attributes:
+        path: Of its file.
         entries: Those that were there when it was opened, oldest first.
         trouble: What was wrong with the file and what has been done about it; "" if nothing.
         repaired: Whether something was cut off or left out.
@@ -47,7 +48,7 @@ class Journal:
             BadInputError: If the file is something else, or longer than any journal.
             OSError: If there is no journal and none can be made.
         """
-        self._path, self._disk = path, disk or Disk()
+        self.path, self._disk = path, disk or Disk()
         self._file, self._named = NO_FILE, False
         self.trouble = ""
         try:
@@ -93,13 +94,13 @@ class Journal:
         Raises:
             OSError: If the disk refuses; the journal is then as before.
         """
-        disk, new = self._disk, self._path.with_name(f"{self._path.name}.new")
+        disk, new = self._disk, self.path.with_name(f"{self.path.name}.new")
         entries = list(entries)
         data = to_bytes(entries)
         file = disk.open(new, new=True)
         try:
             self._write(file, data)
-            disk.replace(new, self._path)
+            disk.replace(new, self.path)
         except OSError:
             disk.close(file)
             with suppress(OSError):
@@ -130,28 +131,28 @@ class Journal:
         except OSError as error:
             if error.errno not in REFUSED:
                 raise
-            self._complain(f"{self._path}: {error.strerror}: missions are refused until it is not")
+            self._complain(f"{self.path}: {error.strerror}: missions are refused until it is not")
         return parse(self._bytes())
 
     def _bytes(self) -> bytes:
         try:
-            return self._disk.read(self._path)
+            return self._disk.read(self.path)
         except ValueError as error:
             raise _refused(error) from None
 
     def _opened(self) -> int:
         """The file, open to be written; tried again where the disk refused before."""
         if self._file == NO_FILE:
-            self._file = self._disk.open(self._path)
+            self._file = self._disk.open(self.path)
         if not self._named:  # a name survives the machine once its folder is written
-            self._disk.sync_folder(self._path.parent)
+            self._disk.sync_folder(self.path.parent)
             self._named = True
         return self._file
 
     def _mend(self, found: Parsed) -> None:
         """Cut a torn end; where more is damaged keep a copy, and write what is whole anew."""
         if not (found.known or found.entries):
-            raise BadInputError(f"--journal {self._path}: is no journal; name another file")
+            raise BadInputError(f"--journal {self.path}: is no journal; name another file")
         self.entries, self._number = found.entries, found.number
         self._size = found.end
         damaged = found.lost or not found.known
@@ -160,7 +161,7 @@ class Journal:
             if damaged:
                 self._leave_out(found)
             elif found.torn:
-                text = f"{self._path}: {found.torn} bytes of a torn entry were cut off"
+                text = f"{self.path}: {found.torn} bytes of a torn entry were cut off"
                 self._complain(f"journal repaired: {text}")
                 file = self._opened()
                 self._disk.truncate(file, self._size)
@@ -169,10 +170,10 @@ class Journal:
             self._complain(f"it could not be written: {error.strerror}")
 
     def _leave_out(self, found: Parsed) -> None:
-        copy = self._path.with_name(f"{self._path.name}.damaged")
+        copy = self.path.with_name(f"{self.path.name}.damaged")
         lost = f"{found.lost} damaged entries were left out"
         what = lost if found.lost else "its head was damaged"
-        self._complain(f"journal repaired: {self._path}: {what}; see {copy}")
+        self._complain(f"journal repaired: {self.path}: {what}; see {copy}")
         file = self._disk.open(copy, new=True)
         try:
             self._write(file, self._bytes())
