@@ -16,10 +16,13 @@ from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
 
+from cloudrc.files import read
 from cloudrc.tunnel.handshake import EPOCH_MAX
 
 BLOCK = 4096
 """Epochs reserved at once; a restart every minute uses them up in two years."""
+SIZE_MAX = 64
+"""Longest file that is read [bytes]; the largest epoch has 10 digits."""
 
 
 class EpochFile:
@@ -70,17 +73,18 @@ class EpochFile:
 
     def _read(self) -> int:
         try:
-            text = self._path.read_text(encoding="ascii").strip()
-            epoch = int(text) if text.isdecimal() else -1  # no number may have 4301 digits
+            text = read(self._path, SIZE_MAX).decode("ascii").strip()
         except FileNotFoundError:
             return 0
-        except (OSError, ValueError) as error:
-            self._note(f"{error}; epochs begin again")
+        except OSError as error:
+            self._note(f"{error.strerror or error}; epochs begin again")
             return 0
-        if not 0 <= epoch <= EPOCH_MAX:
+        except ValueError:  # no file, too long or no text
+            text = ""
+        if not text.isdecimal() or int(text) > EPOCH_MAX:
             self._note("it holds no epoch; epochs begin again")
             return 0
-        return epoch
+        return int(text)
 
     def _note(self, what: str) -> None:
         self._say(f"{self._path}: {what}")

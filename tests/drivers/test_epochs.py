@@ -185,9 +185,26 @@ def test_a_file_that_holds_no_epoch_is_told_and_epochs_begin_again(
 ) -> None:
     path.write_bytes(torn)
     file = opened(path)
-    assert "epochs begin again" in troubles[0]
+    assert troubles[0] == f"{path}: it holds no epoch; epochs begin again"
     assert file.take() == 1
     assert opened(path).take() == BLOCK + 1
+
+
+def test_a_pipe_in_the_place_of_the_file_is_not_waited_for(
+    path: Path, opened: Opened, troubles: list[str]
+) -> None:
+    os.mkfifo(path)
+    assert opened(path).take() == 1
+    assert troubles[0] == f"{path}: it holds no epoch; epochs begin again"
+
+
+def test_a_file_that_cannot_be_read_is_told_and_epochs_begin_again(
+    path: Path, opened: Opened, troubles: list[str]
+) -> None:
+    path.mkdir()
+    assert opened(path).take() == 1
+    assert troubles[0].startswith(f"{path}: ")
+    assert "epochs begin again" in troubles[0]
 
 
 def test_a_disk_that_cannot_be_written_is_told_and_epochs_rise_all_the_same(
