@@ -13,6 +13,7 @@ import time
 
 from cloudrc.cluster.access import Release
 from cloudrc.cluster.deploy import wait_ready
+from cloudrc.cluster.errors import ClusterError
 from cloudrc.cluster.jobs import read_job
 from cloudrc.cluster.pods import find_pod, list_pods
 from cloudrc.cluster.tools import program
@@ -127,7 +128,13 @@ def _rotated(seed: int) -> Outcome:
     outcome, release = Outcome(), release_there()
     secret = _key_secret(release)
     found = json.loads(kubectl(release, "get", "secret", secret, "--output=json"))
-    new = parse(base64.b64decode(found["data"]["key"])).rotated(os.urandom(KEY_SIZE), time.time())
+    old, wall = parse(base64.b64decode(found["data"]["key"])), time.time()
+    if old.previous is not None and old.left(wall) > 0.0:
+        raise ClusterError(
+            f"Secret {secret}: key {old.previous.name}, the one before, is valid for "
+            f"{old.left(wall):.0f} s more; run this again when it is not"
+        )
+    new = old.rotated(os.urandom(KEY_SIZE), wall)
     encoded = base64.b64encode(write(new).encode()).decode()
     kubectl(release, "patch", "secret", secret, f"--patch={json.dumps({'data': {'key': encoded}})}")
     before = holds(recording(release, "world"))
