@@ -14,6 +14,7 @@ INVARIANTS = {
     "stale": "motion on stale commands",
     "rest": "motion long after the last command",
     "latch": "rotors on without the operator's word",
+    "tick": "steps without the guard",
     "obeyed": "emergency stops that were not obeyed",
     "order": "commands applied out of order",
     "waypoint": "waypoints reached out of order, or twice",

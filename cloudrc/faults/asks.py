@@ -203,6 +203,7 @@ def safe(outcome: Outcome, flight: Flight) -> None:
         outcome.same("collisions", counts["collision"], 0)
     outcome.same("breaches of the fence, a cap or the stop rule", breaches, 0)
     outcome.same("ticks flown on stale commands", counts["stale"], 0)
+    outcome.same("steps without the guard's tick", counts["tick"], 0)
     outcome.flown(flight.sha256())
 
 

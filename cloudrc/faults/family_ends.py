@@ -138,7 +138,7 @@ def _world_overloaded(seed: int) -> Outcome:
         flight.world.at(at + 0.1 * n, lambda now_ns: flight.world.freeze(now_ns, 0.09))
     flight.fly_mission()
     asks.safe(outcome, flight)
-    outcome.true("no tick is skipped", _gapless(flight.trajectory()))
+    outcome.true("simulated time has no gap", _gapless(flight.trajectory()))
     slip = flight.world.inner.slip_ns * 1e-9  # type: ignore[union-attr]
     outcome.least("simulated time slows: slip", slip, 3.0, "s")
     meters.moves(outcome, flight, "world", "world_slip_seconds_total", since=at)
@@ -156,7 +156,7 @@ def _world_paused(seed: int) -> Outcome:
     flight.fly_mission()
     asks.safe(outcome, flight)
     asks.done(outcome, flight)
-    outcome.true("no tick is skipped", _gapless(flight.trajectory()))
+    outcome.true("simulated time has no gap", _gapless(flight.trajectory()))
     outcome.true("commands applied in order, none twice", asks.applied_in_order(flight))
     slip = flight.world.inner.slip_ns * 1e-9  # type: ignore[union-attr]
     outcome.most("slip", slip, 0.2, "s")

@@ -29,7 +29,7 @@ from cloudrc.records import GuardChange, Record
 
 BACK = 10.0
 """In so long of calm the robot must have flown [s]."""
-ALWAYS = frozenset({"fence", "cap", "stop", "stale", "rest", "latch", "order", "error"})
+ALWAYS = frozenset({"fence", "cap", "stop", "stale", "rest", "latch", "tick", "order", "error"})
 """Invariants that are looked at in every flight."""
 FORGETFUL = (
     *("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down"),

@@ -19,12 +19,12 @@ from collections import Counter
 from math import hypot, inf, sqrt
 from typing import Any, NamedTuple
 
+from cloudrc.faults import ticks
+from cloudrc.faults.ticks import TICK_NS
 from cloudrc.geometry.fence import HIGH, LOW, inside
 from cloudrc.messages import ZERO, Command, GuardState, Vector
 from cloudrc.records import Contact
 
-TICK_NS = 2_000_000
-"""Of the physics [ns]."""
 SLACK = 1e-9
 """For rounding [m/s]."""
 FLOWN = (GuardState.TRACK, GuardState.HOLD, GuardState.LAND)
@@ -48,8 +48,8 @@ class Breach(NamedTuple):
 
     Attributes:
         time: World's clock [s].
-        kind: "collision", "fence", "cap", "stop", "stale", "rest", "latch", "obeyed", "order",
-            "waypoint", "stuck", "alarm", "recording" or "error".
+        kind: "collision", "fence", "cap", "stop", "stale", "rest", "latch", "tick", "obeyed",
+            "order", "waypoint", "stuck", "alarm", "recording" or "error".
         text: What happened.
     """
 
@@ -144,6 +144,7 @@ class Watch:
 
         simulator.step, guard.offer, guard.stop = watched_step, watched_offer, watched_stop
         self._attach_to_states(simulator, guard, start_ns)
+        ticks.attach(robot, start_ns, self.note)
 
     def _attach_to_states(self, simulator: Any, guard: Any, start_ns: int) -> None:
         """Look at what the guard's states promise: rotors that stand, a robot that stops."""

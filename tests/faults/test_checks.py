@@ -21,7 +21,10 @@ from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Contact, Counted, Fault
 from cloudrc.tunnel.complaints import Complaints
+from cloudrc.world.clock import STEP_NS
 from cloudrc.world.guard import Guard
+from cloudrc.world.robot import Robot
+from cloudrc.world.rotors import STOPPED
 
 
 def forgets_the_peer(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,6 +89,19 @@ def never_complains(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Complaints, "say", lambda complaints, code, text, now_ns: [])
 
 
+def catches_up_without_the_guard(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What there is to catch up is flown by nobody."""
+    run = Robot.run
+
+    def hasty(robot: Robot, tick_ns: int, until_ns: int) -> int:
+        while until_ns - tick_ns > 2 * STEP_NS:
+            robot.simulator.step(STOPPED)
+            tick_ns += STEP_NS
+        return run(robot, tick_ns, until_ns)
+
+    monkeypatch.setattr(Robot, "run", hasty)
+
+
 def ends_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(MissionService, "pause", lambda service, now_ns: None)
 
@@ -146,6 +162,7 @@ BROKEN: list[tuple[str, Broken, str]] = [
     ("F14", touches_something, "collisions"),
     ("F15", tells_no_cause, "each HOLD tells the age of its command"),
     ("F15", tells_no_cause, "each TRACK after it tells of fresh commands"),
+    ("F18", catches_up_without_the_guard, "steps without the guard's tick"),
     ("F19", counts_the_tenth_failure_first, "metric dns_errors_total moves"),
     ("F19", forgets_the_peer, "no name is resolved for 30 s of flight: the same path"),
     ("F24", never_complains, "it is told once: peer speaks v"),
@@ -162,6 +179,7 @@ BROKEN: list[tuple[str, Broken, str]] = [
     ("F33", ends_without_a_word, "they say: paused by shutdown"),
     ("F38", never_complains, "wrong key: cloud tells once"),
     ("F38", takes_a_missing_file_for_a_new_key, "gone in flight: the keys stay"),
+    ("F39", catches_up_without_the_guard, "steps without the guard's tick"),
     ("F40", tells_no_cause, "each HOLD tells the age of its command"),
     ("F40", never_freezes("cloud"), "metric loop_missed_periods_total moves"),
     ("F40", never_freezes("world"), "metric world_slip_seconds_total moves"),

@@ -24,7 +24,7 @@ class World:
         self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
         self.guard = SimpleNamespace(state=TRACK, reference=ZERO)
         self.guard.offer = lambda command, now: None
-        self.guard.stop = self.guard.acknowledge = lambda now: None
+        self.guard.stop = self.guard.acknowledge = self.guard.tick = lambda now: None
         self.robot = SimpleNamespace(simulator=self.simulator, guard=self.guard)
         self.watch.attach(self, 0)
         self.guard.offer(Command(0, 0, 0, ZERO, 0.0), 0)
@@ -32,7 +32,9 @@ class World:
     def _step(self, rotor_speeds):
         self.steps += 1
 
-    def tick(self, *references, state=TRACK, position=INSIDE, turns=None, released=True):
+    def tick(
+        self, *references, state=TRACK, position=INSIDE, turns=None, released=True, ruled=True
+    ):
         """Fly references, one a tick, and say what kinds of breach there were."""
         for reference in references:
             if released:
@@ -40,6 +42,8 @@ class World:
             self.guard.state, self.guard.reference = state, reference
             self.readings.position = position
             turns = state in FLOWN if turns is None else turns
+            if ruled:
+                self.guard.tick(self.steps * 2 * MS)
             self.simulator.step((900.0,) * 4 if turns else STOPPED)
         return set(self.watch.counts)
 
@@ -145,6 +149,12 @@ def test_track_is_for_fresh_commands():
     world = World()
     assert world.tick(*[ZERO] * 126) == set()
     assert world.tick(ZERO) == {"stale"}
+
+
+def test_every_step_is_ruled_by_a_tick_of_the_guard():
+    world = World()
+    assert world.tick(ZERO, ZERO) == set()
+    assert world.tick(ZERO, ruled=False) == {"tick"}
 
 
 @pytest.mark.parametrize("latched", [LAND, ESTOP])
