@@ -64,6 +64,26 @@ def test_an_unsealed_one_is_as_long_and_is_opened_by_no_sealed_end():
         world.open(data)
 
 
+def test_what_is_no_datagram_of_ours_costs_no_cryptography(monkeypatch):
+    world, cloud = pair()
+    data = cloud.seal(Kind.COMMAND, BODY)
+    longest = codec.DATAGRAM_MAX + 1  # what an end reads of a longer one
+    other = bytes([data[0] ^ 1]) + data[1:]
+
+    def tried(*given):
+        raise AssertionError("cryptography")
+
+    monkeypatch.setattr(world._openers, "open", tried)
+    monkeypatch.setattr(world, "_open_greeting", tried)
+    cut = [data[:size] for size in range(len(data))]
+    grown = [data.ljust(size, b"x") for size in range(len(data) + 1, longest + 1)]
+    for each in (*cut, *grown, bytes(longest), other):
+        with pytest.raises(DecodeError, match=r"^(malformed|version)$"):
+            world.open(each)
+    with pytest.raises(AssertionError, match="cryptography"):
+        world.open(data)
+
+
 def test_an_end_without_keys_is_not_sealed():
     assert not make_session(Direction.UPLINK, None).sealed
     assert make_session(Direction.UPLINK, KeyRing(KeySet(Key(bytes(32))))).sealed
