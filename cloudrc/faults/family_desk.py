@@ -142,7 +142,8 @@ SCENARIOS = (
         32,
         "slow-reader",
         "a reader of the event stream does not read for 5,000 events",
-        "the oldest are dropped for that reader alone; memory stays bounded",
+        "the oldest are dropped for that reader alone; memory stays bounded (by a number and not "
+        "by 1 s: who was away for a minute is to miss none)",
         "its events",
         "a gap in the numbers of its events; cloudrc_stream_dropped_events_total",
         _slow_reader,

@@ -33,7 +33,8 @@ KEPT = 100
 KEEP_PERIOD_NS = 1_000_000_000
 """Between two tries to write what the disk has refused [ns]."""
 LOGGED = 5_000
-"""Events, of all missions together, that can still be asked for."""
+"""Events, of all missions together, that can still be asked for: a number and not a time, since a
+mission has some ten, and a reader who was away for a minute is to miss none."""
 
 
 class UnknownMissionError(CloudrcError):
