@@ -1,0 +1,74 @@
+"""What each container mounts, exactly: who owns one of them has what it mounts and no more."""
+
+from __future__ import annotations
+
+import pytest
+from rendering import Object, a_namespace, containers, pod_specs, render
+
+END = {"experiment ro", "secret ro", "run", "data"}
+LINK = {"experiment ro", "link ro", "run"}
+MISSION = {"mission ro", "tokens ro"}
+MOUNTS = {
+    "world": {"link": LINK, "world": END | {"epochs"}},
+    "cloud": {
+        "link": LINK,
+        "cloud": END | {"teleop"},
+        "teleop": {"experiment ro", "teleop", "tokens ro", "journal"},
+        "load": set(),
+    },
+    "mission": {"mission": MISSION},
+    "test": {"test": MISSION},
+    "test-link": {"test-link": set()},
+}
+each_mode = pytest.mark.parametrize("mode", ["relay", "netem", "auto"])
+
+
+def pods(mode: str) -> dict[str, Object]:
+    load = {"backgroundLoad": {"enabled": True}}
+    values = {"link": {"mode": mode}, "mission": {"enabled": True}, "cloud": load}
+    return pod_specs(render(values, lookup=a_namespace()))
+
+
+def mounts(container: Object) -> set[str]:
+    """Volumes by name, with "ro" if it may only read them."""
+    found = container.get("volumeMounts", [])
+    return {mount["name"] + " ro" * mount.get("readOnly", False) for mount in found}
+
+
+@each_mode
+def test_a_container_mounts_what_it_needs_and_no_more(mode: str) -> None:
+    assert MOUNTS == {
+        pod: {name: mounts(container) for name, container in containers(spec).items()}
+        for pod, spec in pods(mode).items()
+    }
+
+
+@pytest.mark.promise("P-CHART-4")
+@each_mode
+def test_who_owns_a_link_has_neither_key_nor_token_nor_the_sockets_of_teleop(mode: str) -> None:
+    found = pods(mode)
+    for end in ("world", "cloud"):
+        volumes = {volume["name"]: volume for volume in found[end]["volumes"]}
+        link = containers(found[end])["link"]
+        kinds = {m["name"]: set(volumes[m["name"]]) - {"name"} for m in link["volumeMounts"]}
+        assert kinds == {"experiment": {"configMap"}, "link": {"configMap"}, "run": {"emptyDir"}}
+        assert not found[end].get("shareProcessNamespace"), "/proc/PID/root is another way in"
+    cloud = containers(found["cloud"])
+    (folder,) = (a.split("=")[1] for a in cloud["cloud"]["args"] if a.startswith("--teleop="))
+    assert f"--socket={folder}" in cloud["teleop"]["args"]
+    for name in ("cloud", "teleop"):
+        where = {m["mountPath"]: m["name"] for m in cloud[name]["volumeMounts"]}
+        assert where[folder] == "teleop", "no folder above it, which a link may mount"
+
+
+def test_what_lies_in_memory_is_small() -> None:
+    memory = {
+        pod: {v["name"]: v["emptyDir"] for v in spec.get("volumes", ()) if "emptyDir" in v}
+        for pod, spec in pods("relay").items()
+    }
+    run = {"medium": "Memory", "sizeLimit": "4Mi"}
+    for pod in ("world", "cloud"):
+        assert memory[pod].pop("data").keys() == {"sizeLimit"}
+    assert memory.pop("cloud") == {"run": run, "teleop": {"medium": "Memory", "sizeLimit": "1Mi"}}
+    assert memory.pop("world") == {"run": run}
+    assert not any(memory.values())
