@@ -20,6 +20,16 @@ MOUNTS = {
     "test": {"test": MISSION},
     "test-link": {"test-link": set()},
 }
+KEY = {"secretName": "demo-cloudrc-tunnel", "defaultMode": 0o440}
+TOKENS = {"secretName": "demo-cloudrc-tokens", "defaultMode": 0o440}
+OPERATOR = {**TOKENS, "items": [{"key": "operator", "path": "operator"}]}
+SECRETS = {
+    "world": {"secret": KEY},
+    "cloud": {"secret": KEY, "tokens": TOKENS},
+    "mission": {"tokens": OPERATOR},
+    "test": {"tokens": OPERATOR},
+    "test-link": {},
+}
 each_mode = pytest.mark.parametrize("mode", ["relay", "netem", "auto"])
 
 
@@ -39,6 +49,14 @@ def mounts(container: Object) -> set[str]:
 def test_a_container_mounts_what_it_needs_and_no_more(mode: str) -> None:
     assert MOUNTS == {
         pod: {name: mounts(container) for name, container in containers(spec).items()}
+        for pod, spec in pods(mode).items()
+    }
+
+
+@each_mode
+def test_a_secret_is_read_by_its_owner_and_the_pods_group_alone(mode: str) -> None:
+    assert SECRETS == {
+        pod: {v["name"]: v["secret"] for v in spec.get("volumes", ()) if "secret" in v}
         for pod, spec in pods(mode).items()
     }
 
