@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from rendering import CI_VALUES, METADATA, containers, of_kind, pod_specs, render, values_of
+from rendering import CHART, CI_VALUES, METADATA, containers, of_kind, pod_specs, render, values_of
 
 import cloudrc
 
@@ -145,6 +145,21 @@ def test_cloud_and_teleop_are_two_containers() -> None:
     loaded = {"cloud": {"backgroundLoad": {"enabled": True, "workers": 3}}}
     load = containers(pod_specs(render(loaded))["cloud"])["load"]
     assert "seq 3" in load["command"][-1]
+
+
+def test_the_role_of_link_set_changes_the_links_config_map_alone() -> None:
+    """The experiment's holds the guard's limits."""
+    role = values_of(CHART / "examples" / "link-set-role.yaml")
+    changing = [rule for rule in role["rules"] if set(rule["verbs"]) - {"get", "list", "create"}]
+    assert changing == [
+        {
+            "apiGroups": [""],
+            "resources": ["configmaps"],
+            "resourceNames": ["cloudrc-link"],
+            "verbs": ["get", "patch"],
+        }
+    ]
+    assert "cloudrc-link" in of_kind(render(release="cloudrc"), "ConfigMap")
 
 
 def test_every_mount_has_its_volume_and_every_volume_its_object() -> None:
