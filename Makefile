@@ -6,6 +6,8 @@ bin := $(VENV)/bin
 VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' cloudrc/__init__.py)
 # Put before the images' names, with a slash at its end: make images REGISTRY=ghcr.io/me/
 REGISTRY ?=
+# What the images stand on, if not their Dockerfiles' tag: BASE=python:3.11-slim-bookworm@sha256:...
+BASE :=
 CLUSTER ?= cloudrc
 IMAGES := world cloud
 SCRIPTS := .ci/run
@@ -17,7 +19,7 @@ STORE := --store tests/faults/regressions
 SLOW := %_any_input.py %_falls.py %_flight.py %_machine.py %_proof.py %_hostile.py
 CORE := $(filter-out $(SLOW),$(wildcard \
 	tests/world/test_guard*.py tests/tunnel/test_*.py tests/cloud/test_teleop_journal*.py))
-BUILD_ARGS := --build-arg VERSION=$(VERSION) \
+BUILD_ARGS := $(BASE:%=--build-arg BASE=%) --build-arg VERSION=$(VERSION) \
 	--build-arg SOURCE=$(or $(filter https://%,$(shell git config remote.origin.url)),unpublished) \
 	--build-arg REVISION=$(or $(shell git rev-parse HEAD 2>/dev/null),unknown)
 # Universal in the processor: the hashes of all wheels for Linux are in the lock.

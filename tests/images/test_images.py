@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -114,6 +115,19 @@ def test_make_images_tags_with_the_version() -> None:
     )
     assert f"cloudrc/$role:{cloudrc.__version__}" in plan.stdout
     assert "for role in world cloud;" in plan.stdout
+
+
+def test_make_images_takes_a_base_that_is_pinned() -> None:
+    digest = "sha256:" + "0" * 64
+    pinned = f"BASE=python:3.11-slim-bookworm@{digest}"
+    for given, builds in (([pinned], f"--build-arg {pinned} "), ([], "")):
+        command = ["make", "-n", "images", *given]
+        environ = {**os.environ, "BASE": "somebody-elses"}
+        plan = subprocess.run(
+            command, cwd=ROOT, capture_output=True, text=True, check=True, env=environ
+        )
+        assert ("--build-arg BASE=" in plan.stdout) == bool(given)
+        assert builds in plan.stdout
 
 
 @pytest.mark.parametrize(
