@@ -183,6 +183,12 @@ _ENTRIES = (
         "cloudrc_position_meters", "True position of the base, world frame.", (WORLD,), axis=AXES
     ),
     gauge("cloudrc_tip_force_newtons", "Force on the touch sensor at the arm's tip.", (WORLD,)),
+    delay(
+        "cloudrc_command_age_seconds",
+        "Age of the command that is flown, in every period of TRACK: since the odometry it was"
+        " computed from, by world's own clock, as the guard judges it.",
+        (WORLD,),
+    ),
     gauge("cloudrc_guard_state", f"State of the guard: {numbered(GUARD_STATES)}.", (WORLD,)),
     counter(
         "cloudrc_guard_transitions_total",

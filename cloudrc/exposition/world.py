@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections import deque
 
 from cloudrc.exposition.end import End
-from cloudrc.exposition.labels import BODIES, DIRECTIONS, GUARD_STATES, LIMITS
+from cloudrc.exposition.histogram import Histogram
+from cloudrc.exposition.labels import BODIES, DELAY_BUCKETS, DIRECTIONS, GUARD_STATES, LIMITS
 from cloudrc.exposition.part import Handlers, Readings, by, per_axis, plain
 from cloudrc.messages import NEVER_NS, GuardState
 from cloudrc.records import (
+    CommandApplied,
     Contact,
     GroundTruth,
     GuardChange,
@@ -36,6 +38,7 @@ class WorldEnd(End):
         self._changes = dict.fromkeys(GUARD_STATES, 0)
         self._contacts = dict.fromkeys(BODIES, 0)
         self._slip_ns = self._admitted = 0
+        self._basis_ns, self._command_age = NEVER_NS, Histogram(DELAY_BUCKETS)
         # Instants of world's clock and of the machine's [ns].
         self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
         self._instant_ns = NEVER_NS
@@ -46,6 +49,7 @@ class WorldEnd(End):
             **super().handlers(),
             GroundTruth: self._see_truth,
             TelemetrySent: self._see_telemetry,
+            CommandApplied: self._see_command,
             GuardChange: self._see_guard,
             Contact: self._see_contact,
         }
@@ -62,8 +66,13 @@ class WorldEnd(End):
     def _see_truth(self, record: GroundTruth) -> None:
         self._truth = record
 
+    def _see_command(self, record: CommandApplied) -> None:
+        self._basis_ns = record.basis_stamp_ns
+
     def _see_telemetry(self, record: TelemetrySent) -> None:
         self._see_age(record.stamp_ns)
+        if record.telemetry.guard is GuardState.TRACK:  # nowhere else a command is in use
+            self._command_age.observe((record.stamp_ns - self._basis_ns) * 1e-9)
 
     def _see_guard(self, record: GuardChange) -> None:
         if record.state != self._guard or record.state is GuardState.GROUND:
@@ -88,6 +97,7 @@ class WorldEnd(End):
         readings |= {
             "cloudrc_clouds_admitted_total": plain(self._admitted),
             "cloudrc_sessions_refused_total": plain(self._counts.get("busy", 0)),
+            "cloudrc_command_age_seconds": self._command_age,
             "cloudrc_guard_state": plain(self._guard),
             "cloudrc_guard_transitions_total": by(self._changes),
             "cloudrc_guard_limited_total": by(

@@ -16,6 +16,9 @@ from cloudrc.link.profile import Change
 from cloudrc.messages import Command
 from cloudrc.records import Arrival, Control
 
+AGE = "command_age_seconds"
+"""How old the command in use is, by world's own clock."""
+
 
 def _disorder(seed: int) -> Outcome:
     outcome = Outcome()
@@ -123,21 +126,35 @@ def _asymmetry(seed: int) -> Outcome:
 
 def _jitter(seed: int) -> Outcome:
     outcome = Outcome()
+    steady: Shape = lambda profile: replace(profile, jitter=0.0)  # noqa: E731
+    wild: Shape = lambda profile: replace(profile, delay=0.15, jitter=0.15)  # noqa: E731
+    without = Flight("link.profile=paper-p3", seed=seed, uplink=steady, downlink=steady)
     flight = Flight("link.profile=paper-p3", seed=seed).fly_mission()
     asks.safe(outcome, flight)
     asks.done(outcome, flight)
     outcome.same("jitter 40 ms: HOLDs", len(asks.held(flight)), 0)
-    age = "age_of_information_seconds"
-    young = meters.share_within("world", flight.of_world, age, 0.25)
-    outcome.least(f"metric {age}: share that is at most 0.25 s", young, 0.99)
-    wild: Shape = lambda profile: replace(profile, delay=0.15, jitter=0.15)  # noqa: E731
+    young, old = _ages(without.fly_mission())
+    outcome.most(f"without jitter: metric {AGE}: outside 0.1 to 0.15 s", young + old, 0.01)
+    young, old = _ages(flight)
+    outcome.least(f"jitter 40 ms: metric {AGE}: share that is at most 0.1 s", young, 0.05)
+    outcome.least(f"jitter 40 ms: metric {AGE}: share above 0.15 s", old, 0.05)
     flight = Flight(seed=seed, uplink=wild, downlink=wild).fly(60.0)
     asks.safe(outcome, flight)
     meters.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=0.0)
+    _, old = _ages(flight)
+    outcome.least(f"jitter 150 ms: metric {AGE}: share above 0.15 s", old, 0.25)
+    flown = meters.share_within("world", flight.of_world, AGE, 0.25)
+    outcome.same(f"jitter 150 ms: metric {AGE}: share that is at most 0.25 s", flown, 1.0)
     outcome.most(
         "jitter 150 ms: changes of the guard in any second", asks.busiest_second(flight), 2
     )
     return outcome
+
+
+def _ages(flight: Flight) -> tuple[float, float]:
+    """Which share [1] of the commands flown was at most 0.1 s old, and which above 0.15 s."""
+    within = [meters.share_within("world", flight.of_world, AGE, each) for each in (0.1, 0.15)]
+    return within[0], 1.0 - within[1]
 
 
 SCENARIOS = (
@@ -184,7 +201,7 @@ SCENARIOS = (
         "jitter of 40 ms, then of 150 ms about 150 ms",
         "first TRACK, then HOLD and TRACK without chatter: <= 2 changes in any second",
         "none",
-        "cloudrc_age_of_information_seconds, cloudrc_guard_transitions_total",
+        "cloudrc_command_age_seconds, cloudrc_guard_transitions_total",
         _jitter,
     ),
 )

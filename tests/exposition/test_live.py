@@ -15,6 +15,7 @@ from cloudrc.exposition.live import Live
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.records import (
     Arrival,
+    CommandApplied,
     Contact,
     Counted,
     GuardChange,
@@ -22,6 +23,7 @@ from cloudrc.records import (
     MissionEvent,
     Record,
     SessionOpened,
+    TelemetrySent,
 )
 
 Flight = tuple[list[Record], list[Record]]
@@ -75,8 +77,29 @@ def test_without_a_shared_clock_one_way_delays_are_absent() -> None:
     for role, of_end in zip(labels.ENDS, both, strict=True):
         live = Live(role)
         live.see(of_end)
-        assert not any("_age_" in name or "link_delay" in name for name in live.read())
+        assert not any("age_of" in name or "link_delay" in name for name in live.read())
     assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] > 100  # needs no shared clock
+
+
+@pytest.mark.parametrize("offset_ns", [0, 7_000_000_000])
+def test_the_age_of_a_command_is_that_of_its_basis_while_it_is_flown(offset_ns: int) -> None:
+    """It takes no shared clock; on the ground and in HOLD no command is in use."""
+    of_world, _ = records(load_experiment("hover", ["link.profile=paper-p2"]), offset_ns=offset_ns)
+    basis_ns, ages, others = 0, [], 0
+    for record in of_world:
+        if isinstance(record, CommandApplied):
+            basis_ns = record.basis_stamp_ns
+        elif isinstance(record, TelemetrySent):
+            in_use = record.telemetry.guard is GuardState.TRACK
+            others += not in_use
+            ages += [(record.stamp_ns - basis_ns) * 1e-9] if in_use else []
+    assert others > 1
+    live = Live("world")
+    live.see(of_world)
+    age = histogram(live, "cloudrc_command_age_seconds")
+    assert age.cumulative()[-1] == len(ages) > 500
+    assert age.total == pytest.approx(sum(ages))
+    assert 0.05 < min(ages) < max(ages) < 0.25
 
 
 def test_a_round_trip_is_counted_once_per_echo() -> None:
