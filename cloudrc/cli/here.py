@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
+import os
 import socket
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
-from urllib.parse import urlsplit
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
@@ -103,31 +102,27 @@ def link_of(run: Path) -> Path | None:
 
 
 def url_of(run: Path) -> str | None:
-    """Find where the API of the run in this folder is; None if none flies there."""
-    from cloudrc.drivers.local import API_FILE
+    """Find where the API of this user's run in this folder is; None if none flies there.
 
-    try:
-        url = str(json.loads((run / API_FILE).read_text(encoding="utf-8"))["url"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return None if _is_gone(url) else url
+    What the folder says of that is not believed: the operator's word goes to no server that
+    somebody else has named.
+    """
+    from cloudrc.drivers.flights import under_way
+
+    url = under_way().get(Path(os.path.realpath(run)), "")
+    return url if url and not _is_gone(url) else None
 
 
 def _is_gone(url: str) -> bool:
-    """Say whether nobody listens: a run that was killed leaves its file behind."""
+    """Say whether nobody listens: a run is announced before its API is there."""
     from cloudrc.cli.mission_http import UNIX
 
     try:
-        if url.startswith(UNIX):
-            with socket.socket(socket.AF_UNIX) as listening:
-                listening.settimeout(CONNECT_LIMIT)
-                listening.connect(url.removeprefix(UNIX))
-        else:
-            parts = urlsplit(url)
-            where = parts.hostname or "", parts.port or 0
-            socket.create_connection(where, CONNECT_LIMIT).close()
+        with socket.socket(socket.AF_UNIX) as listening:
+            listening.settimeout(CONNECT_LIMIT)
+            listening.connect(url.removeprefix(UNIX))
     except (ConnectionRefusedError, FileNotFoundError):
         return True
-    except (OSError, ValueError):
+    except OSError:
         return False  # whatever it is, the verb itself says it better
     return False

@@ -34,7 +34,8 @@ names. 'run' and 'fly' end with its verdict: 0 done, 1 failed, 6 not real time.
 'estop' stops the rotors at once, whatever flies, and lets the robot fall; that
 and a landing, whatever its cause, are left by 'acknowledge'. An API that is
 called over a network asks for a token: --token-file, CLOUDRC_TOKEN_FILE, or for
-a release of the chart its Secret, read with your own rights in the cluster."""
+a release of the chart its Secret, read with your own rights in the cluster. A
+run that is found here is sent none."""
 
 NO_API = "no run with an API flies there; name another folder, or --api URL"
 
@@ -97,12 +98,13 @@ def execute(options: argparse.Namespace) -> int:
     verb: str = options.verb
     if verb == "fly":
         return mission_local.fly(options)
-    url = options.api or find_here(options, url_of, NO_API)
-    if url is None and verb in mission_cluster.VERBS:
+    of_api: Callable[[argparse.Namespace, Api], int] = mission_local.VERBS[verb]
+    if options.api:
+        return of_api(options, Api(options.api, reader(token_file(options))))
+    if (url := find_here(options, url_of, NO_API)) is not None:
+        return of_api(options, Api(url))  # it asks for no token, and so gets none
+    if verb in mission_cluster.VERBS:
         in_cluster: Callable[[argparse.Namespace], int] = mission_cluster.VERBS[verb]
         return in_cluster(options)
-    of_api: Callable[[argparse.Namespace, Api], int] = mission_local.VERBS[verb]
-    if url is None:
-        with mission_cluster.api(options) as forwarded:
-            return of_api(options, forwarded)
-    return of_api(options, Api(url, reader(token_file(options))))
+    with mission_cluster.api(options) as forwarded:
+        return of_api(options, forwarded)

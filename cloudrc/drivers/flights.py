@@ -1,7 +1,8 @@
 """Flights under way on this machine: each says where it is, so that its operator need not know.
 
-A small file per flight, in a folder that is this user's alone. It is locked for as long as the
-flight lasts: what a killed one has left behind is known by that, and taken away.
+A small file per flight, in a folder that is this user's alone: what stands in it is believed, which
+a run's folder, that may have come from anywhere, is not. It is locked for as long as the flight
+lasts: what a killed one has left behind is known by that, and taken away.
 """
 
 from __future__ import annotations
@@ -32,18 +33,22 @@ def places() -> list[Path]:
 
 
 @contextlib.contextmanager
-def announced(run: Path) -> Iterator[None]:
-    """Tell of the flight of a run's folder for as long as the block lasts.
+def announced(run: Path, api: str = "") -> Iterator[bool]:
+    """Tell of the flight of a run's folder for as long as the block lasts; say whether it is told.
 
-    Where no such file can be written it flies all the same, and is found by its folder alone.
+    Where no such file can be written it flies all the same.
+
+    Args:
+        run: Its folder.
+        api: Address of its operator's API; "" without one.
     """
     path, lock = None, -1
     for place in places():
         with contextlib.suppress(OSError):
-            path, lock = _write(place, run)
+            path, lock = _write(place, run, api)
             break
     try:
-        yield
+        yield path is not None
     finally:
         if path is not None:
             with contextlib.suppress(OSError):
@@ -51,8 +56,11 @@ def announced(run: Path) -> Iterator[None]:
             os.close(lock)
 
 
-def under_way() -> list[Path]:
-    """Folders of the runs of this user that fly now, the newest first."""
+def under_way() -> dict[Path, str]:
+    """Folders of the runs of this user that fly now, the newest first, with their APIs' addresses.
+
+    A run without an API has "" there.
+    """
     found = []
     for place in places():
         if not _is_ours(place):
@@ -60,12 +68,12 @@ def under_way() -> list[Path]:
         for path in place.glob("*.json"):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
                 begun = path.stat().st_mtime_ns
-                if (run := _read(path)) is not None:
-                    found.append((begun, run))
-    return [run for _, run in sorted(found, reverse=True)]
+                if _is_ours(path) and (flight := _read(path)) is not None:
+                    found.append((begun, *flight))
+    return {run: api for _, run, api in sorted(found, reverse=True)}
 
 
-def _write(place: Path, run: Path) -> tuple[Path, int]:
+def _write(place: Path, run: Path, api: str) -> tuple[Path, int]:
     """Make the file, locked from the moment that it has its name."""
     place.mkdir(mode=PRIVATE, parents=True, exist_ok=True)
     if not _is_ours(place):
@@ -75,7 +83,8 @@ def _write(place: Path, run: Path) -> tuple[Path, int]:
     lock = os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        os.write(lock, json.dumps({"schemaVersion": 1, "run": str(run.resolve())}).encode() + b"\n")
+        told = {"schemaVersion": 1, "run": str(run.resolve()), "api": api}
+        os.write(lock, json.dumps(told).encode() + b"\n")
         new.rename(path)
     except OSError:
         os.close(lock)
@@ -84,19 +93,20 @@ def _write(place: Path, run: Path) -> tuple[Path, int]:
     return path, lock
 
 
-def _read(path: Path) -> Path | None:
-    """Read where a flight is; None if it is over, and then its file is taken away."""
+def _read(path: Path) -> tuple[Path, str] | None:
+    """Read where a flight and its API are; None if it is over: then its file is taken away."""
     with path.open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
-            return Path(json.loads(file.read())["run"])
+            told = json.loads(file.read())
+            return Path(told["run"]), str(told.get("api", ""))
     path.unlink(missing_ok=True)
     return None
 
 
 def _is_ours(place: Path) -> bool:
-    """Say whether it is a folder that nobody else can put anything into."""
+    """Say whether it is this user's, and nobody else can look into it or write to it."""
     try:
         state = place.stat()
     except OSError:

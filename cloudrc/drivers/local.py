@@ -35,9 +35,14 @@ SILENCE_LIMIT = 5.0
 """A process that has told something and then nothing for so long hangs [s]."""
 LOOPBACK = "127.0.0.1"
 API_FILE = "api.json"
-"""In the folder of a run that flies: where its operator's API is."""
+"""In the folder of a run that flies: where its operator's API is, for other programs. Ours take
+that from the user's own `flights`: a folder may have come from anywhere, and say anything."""
 AUDIT_FILE = "audit.jsonl"
 """Likewise, and afterwards, too: who commanded what over it, if anybody did."""
+UNANNOUNCED = (
+    "no folder for the file by which 'cloudrc mission' finds this run (XDG_STATE_HOME); give it "
+    "--api {}"
+)
 LINK_FOLDER = "link"
 """Likewise: where its relay tells what it does, and is told to do otherwise."""
 
@@ -85,7 +90,8 @@ class LocalRun:
         Args:
             folder: Of the run; has config.yaml, gets world.mcap, cloud.mcap and four logs.
             see: Gets the records that the processes tell about.
-            api: Whether the operator gets an API while it flies; api.json then says where.
+            api: Whether the operator gets an API while it flies; it is announced, and api.json
+                says where.
         """
         self._folder, self._see, self._api = folder, see, api
         self._key = folder  # until there is one
@@ -107,8 +113,10 @@ class LocalRun:
         # Nobody else may look into this one, which holds the key of this run alone, too.
         with (
             tempfile.TemporaryDirectory(prefix="cloudrc-") as sockets,
-            flights.announced(self._folder),
+            flights.announced(self._folder, url := self._url(sockets)) as told,
         ):
+            if url and not told:
+                self._see([Fault(0, "unannounced", UNANNOUNCED.format(url))])
             self._key = Path(sockets) / "key"
             self._key.touch(0o600)
             self._key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
@@ -142,11 +150,15 @@ class LocalRun:
         ways = (f"--listen={listen}", f"--peer={peer}", f"--link={link}", f"--key={self._key}")
         self._start(name, *ways, f"--record={record}", *options)
 
+    def _url(self, sockets: str) -> str:
+        """Where the operator's API is, below the folder of the sockets; "" without one."""
+        return f"unix:{sockets}/api.sock" if self._api else ""
+
     def _start_teleop(self, sockets: str) -> None:
         api: list[str] = []
         if self._api:  # a socket file that this user alone can open: no token is needed
             api = [
-                f"--api=unix:{sockets}/api.sock",
+                f"--api={self._url(sockets)}",
                 f"--api-file={self._folder / API_FILE}",
                 f"--audit={self._folder / AUDIT_FILE}",
             ]

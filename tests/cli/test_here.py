@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,8 +37,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def flying(folder: Path) -> Iterator[Running]:
     """A run that flies in this folder."""
     folder.mkdir(parents=True)
-    with running(unix=True) as api, flights.announced(folder):
-        (folder / "api.json").write_text(json.dumps({"url": api.url}))
+    with running(unix=True) as api, flights.announced(folder, api.url):
         yield api
 
 
@@ -72,17 +72,49 @@ def test_the_newest_run_of_this_folder_comes_first(
         assert capsys.readouterr().err == ""
 
 
-def test_runs_that_were_killed_or_have_no_api_are_not_asked_about(
+def test_runs_whose_api_is_not_up_or_that_have_none_are_not_asked_about(
     tmp_path: Path, elsewhere: Path
 ) -> None:
     with flying(tmp_path / "out") as api:
-        with running(unix=True) as dead:
-            url = dead.url
-        (elsewhere / "runs" / "latest").mkdir(parents=True)
-        (elsewhere / "runs" / "latest" / "api.json").write_text(json.dumps({"url": url}))
-        with flights.announced(tmp_path / "without an API"):
+        not_yet = f"unix:{tmp_path / 'api.sock'}"
+        with (
+            flights.announced(elsewhere / "runs" / "latest", not_yet),
+            flights.announced(tmp_path / "without an API"),
+        ):
             assert main(["mission", "estop"]) == 0
         assert len(api.alarms) == 1
+
+
+@pytest.mark.promise("P-API-14")
+@pytest.mark.parametrize("folder", ["runs/latest", "foreign"])
+def test_the_operators_word_goes_to_no_server_that_a_folder_names(
+    elsewhere: Path, capsys: Printed, folder: str
+) -> None:
+    (elsewhere / folder).mkdir(parents=True)
+    with socket.create_server(("127.0.0.1", 0)) as stranger:
+        stranger.setblocking(False)
+        url = f"http://127.0.0.1:{stranger.getsockname()[1]}"
+        (elsewhere / folder / "api.json").write_text(json.dumps({"url": url}))
+        named = [] if folder == "runs/latest" else ["--run", folder]
+        assert main(["mission", "estop", *named]) in (2, 3)
+        assert "flies" in capsys.readouterr().err
+        with pytest.raises(BlockingIOError):
+            stranger.accept()
+
+
+@pytest.mark.promise("P-API-14")
+@pytest.mark.parametrize("by", ["flag", "environment"])
+def test_a_run_here_is_sent_no_token_not_even_one_that_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str
+) -> None:
+    unread = str(tmp_path / "there is none")  # to send it one would have to read it
+    words = ["--token-file", unread] if by == "flag" else []
+    monkeypatch.setenv("CLOUDRC_TOKEN_FILE", unread)
+    with flying(tmp_path / "out") as api:
+        assert main(["mission", "estop", *words]) == 0
+        assert main(["mission", "estop", *words, "--run", str(tmp_path / "out")]) == 0
+        assert len(api.alarms) == 2
+        assert main(["mission", "estop", "--api", api.url]) == 2
 
 
 def test_where_none_flies_one_is_told_how_to_name_it(capsys: Printed) -> None:

@@ -16,6 +16,7 @@ from cloudrc.cli import mission_follow, mission_local
 from cloudrc.cli.main import main
 from cloudrc.cli.mission_http import Api
 from cloudrc.cli.token import reader
+from cloudrc.drivers import flights
 
 FILE = """
 description: Two points
@@ -38,6 +39,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(mission_follow, "PERIOD", 0.02)
     monkeypatch.setattr(mission_follow, "PATIENCE", 0.5)
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "two.yaml").write_text(FILE)
     return tmp_path
 
@@ -204,12 +206,11 @@ def test_the_run_that_flies_here_is_found_by_itself_and_wants_no_token(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with running(unix=True) as api:
-        (folder / "runs" / "latest").mkdir(parents=True)
-        (folder / "runs" / "latest" / "api.json").write_text(json.dumps({"url": api.url}))
-        assert main(["mission", "status"]) == 0
-        assert "no mission is under way" in capsys.readouterr().out
-        api.post_local("/v1/missions", {"waypoints": [{"position_m": [-1.0, -4.0, 1.0]}]})
-        assert main(["mission", "estop"]) == 0
+        with flights.announced(folder / "runs" / "latest", api.url):
+            assert main(["mission", "status"]) == 0
+            assert "no mission is under way" in capsys.readouterr().out
+            api.post_local("/v1/missions", {"waypoints": [{"position_m": [-1.0, -4.0, 1.0]}]})
+            assert main(["mission", "estop"]) == 0
         said = capsys.readouterr().out
         assert said.splitlines() == [
             "emergency stop: the robot is told to stop its rotors until it has",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import socket
 import sys
 from collections.abc import Iterator
@@ -12,34 +11,36 @@ import pytest
 from fake_api import FakeApi
 
 from cloudrc.cli.main import main
+from cloudrc.drivers import flights
 
 Printed = pytest.CaptureFixture[str]
 IN_CLUSTER = "no missions in namespace 'demo'"
 
 
 @pytest.fixture(autouse=True)
-def api_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "runs" / "latest").mkdir(parents=True)
-    return tmp_path / "runs" / "latest" / "api.json"
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
 @pytest.fixture
-def flies_here(api_file: Path) -> Iterator[None]:
-    """Somebody listens where the run's file says, and never answers."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        url = f"http://127.0.0.1:{server.getsockname()[1]}"
-        api_file.write_text(json.dumps({"url": url}))
-        yield
+def flies_here(tmp_path: Path) -> Iterator[None]:
+    """Somebody listens where the run says, and never answers."""
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(f"{tmp_path}/silent.sock")
+        server.listen()
+        with flights.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
+            yield
 
 
 @pytest.fixture
-def was_killed(api_file: Path) -> str:
+def was_killed(tmp_path: Path) -> None:
     """A run that could not clean up after itself."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    api_file.write_text(json.dumps({"url": f"http://127.0.0.1:{port}"}))
-    return str(port)
+    with flights.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
+        (file,) = flights.places()[0].iterdir()
+        left = file.read_text()
+    file.write_text(left)
+    file.chmod(0o600)
 
 
 @pytest.fixture
@@ -52,7 +53,7 @@ def test_the_run_here_is_meant_unless_something_says_otherwise(
     running: FakeApi, capsys: Printed
 ) -> None:
     assert main(["mission", "list"]) == 5
-    assert "127.0.0.1" in capsys.readouterr().err
+    assert "silent.sock" in capsys.readouterr().err
     assert running.seen == []
 
 
@@ -75,14 +76,14 @@ def test_the_plugin_of_kubectl_means_the_cluster(
 
 
 def test_a_run_that_was_killed_is_not_in_the_way(
-    running: FakeApi, was_killed: str, capsys: Printed
+    running: FakeApi, was_killed: None, capsys: Printed
 ) -> None:
     assert main(["mission", "list"]) == 0
     assert IN_CLUSTER in capsys.readouterr().out
 
 
 def test_without_a_cluster_a_run_that_was_killed_is_no_run(
-    was_killed: str, capsys: Printed, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    was_killed: None, capsys: Printed, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     nowhere = str(tmp_path / "none")
     monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", nowhere)

@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 
 from cloudrc.drivers import flights
+from cloudrc.drivers.local import LocalRun
+from cloudrc.records import Record
 
 KILLED = """
 import os, signal, sys
@@ -36,11 +38,11 @@ def test_a_flight_is_found_while_it_lasts_and_leaves_nothing(
     tmp_path: Path, places: list[Path]
 ) -> None:
     with flights.announced(tmp_path / "a"):
-        assert flights.under_way() == [tmp_path / "a"]
-        with flights.announced(tmp_path / "b"):
-            assert set(flights.under_way()) == {tmp_path / "a", tmp_path / "b"}
-        assert flights.under_way() == [tmp_path / "a"]
-    assert flights.under_way() == []
+        assert flights.under_way() == {tmp_path / "a": ""}
+        with flights.announced(tmp_path / "b", "unix:/b.sock"):
+            assert flights.under_way() == {tmp_path / "b": "unix:/b.sock", tmp_path / "a": ""}
+        assert list(flights.under_way()) == [tmp_path / "a"]
+    assert flights.under_way() == {}
     assert list(places[0].iterdir()) == []
 
 
@@ -48,13 +50,13 @@ def test_it_is_told_by_its_whole_path(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(tmp_path)
     with flights.announced(Path("runs/hover-1")):
         monkeypatch.chdir("/")
-        assert flights.under_way() == [tmp_path / "runs" / "hover-1"]
+        assert list(flights.under_way()) == [tmp_path / "runs" / "hover-1"]
 
 
 def test_a_flight_that_fails_is_over(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), flights.announced(tmp_path):
         raise KeyboardInterrupt
-    assert flights.under_way() == []
+    assert flights.under_way() == {}
 
 
 @pytest.mark.process
@@ -65,7 +67,7 @@ def test_a_flight_that_is_killed_is_over_and_is_cleared_away(
     assert ended.returncode == -signal.SIGKILL
     (left,) = places[0].glob("*.json")
     assert json.loads(left.read_text())["run"] == str(tmp_path)
-    assert flights.under_way() == []
+    assert flights.under_way() == {}
     assert not left.exists()
 
 
@@ -87,7 +89,7 @@ def test_where_others_may_write_or_nobody_may_the_second_place_is_taken(
         places[0].chmod(mode)
     with flights.announced(tmp_path):
         assert len(list(places[1].iterdir())) == 1
-        assert flights.under_way() == [tmp_path]
+        assert list(flights.under_way()) == [tmp_path]
 
 
 def test_what_somebody_else_could_have_written_is_not_read(
@@ -95,18 +97,40 @@ def test_what_somebody_else_could_have_written_is_not_read(
 ) -> None:
     with flights.announced(tmp_path):
         places[0].chmod(0o777)
-        assert flights.under_way() == []
+        assert flights.under_way() == {}
+        places[0].chmod(0o700)
+        (file,) = places[0].iterdir()
+        file.chmod(0o640)
+        assert flights.under_way() == {}
+        file.chmod(0o600)
+        assert list(flights.under_way()) == [tmp_path]
 
 
 def test_where_nothing_can_be_written_it_flies_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(flights, "places", lambda: [Path("/proc/nowhere")])
-    with flights.announced(tmp_path):
-        assert flights.under_way() == []
+    with flights.announced(tmp_path) as told:
+        assert not told
+        assert flights.under_way() == {}
+
+
+@pytest.mark.parametrize("api", [True, False])
+def test_a_flight_that_no_command_finds_says_by_which_flag_it_is_commanded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, api: bool
+) -> None:
+    monkeypatch.setattr(LocalRun, "_fly", lambda *_: None)
+    said: list[Record] = []
+    LocalRun(tmp_path, said.extend, api=api).fly(1.0)
+    assert said == []
+    monkeypatch.setattr(flights, "places", list)
+    LocalRun(tmp_path, said.extend, api=api).fly(1.0)
+    assert ["--api unix:/" in str(record) for record in said] == [True] * api
 
 
 def test_a_file_that_says_nothing_is_no_flight(places: list[Path]) -> None:
     places[0].mkdir(parents=True, mode=0o700)
-    (places[0] / "1.json").write_text("[]")
-    assert flights.under_way() == []
+    with flights.announced(Path("a")):
+        (file,) = places[0].iterdir()
+        file.write_text("[]")
+        assert flights.under_way() == {}

@@ -108,9 +108,8 @@ def test_the_processes_end_when_the_one_that_started_them_is_killed(tmp_path):
 
 
 def operate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    url = json.loads((folder / "api.json").read_text())["url"]
     verb, *rest = words
-    command = [sys.executable, "-m", "cloudrc", "mission", verb, "--api", url, *rest]
+    command = [sys.executable, "-m", "cloudrc", "mission", verb, "--run", str(folder), *rest]
     return subprocess.run(command, capture_output=True, text=True)
 
 
@@ -119,6 +118,7 @@ def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
     folder = tmp_path / "run"
     run = start(folder)
     wait_until_flying(run)
+    assert json.loads((folder / "api.json").read_text())["url"] == flights.under_way()[folder]
     assert operate(folder, "run", "hover").returncode == 5  # one flies already
     assert "held" in operate(folder, "hold").stdout
     assert operate(folder, "goto", "0", "0", "99").returncode == 2
@@ -141,7 +141,7 @@ def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
     done = [("missions", 409), ("hold", 200), ("goto", 422), ("goto", 200), ("resume", 200)]
     assert said[:5] == [(action, status, "local") for action, status in done]
     assert said[5][0] == "cancel"
-    assert flights.under_way() == []
+    assert flights.under_way() == {}
 
 
 def test_without_fastapi_it_flies_without_an_api_and_says_so(tmp_path):
