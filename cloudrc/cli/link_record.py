@@ -54,7 +54,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.cli.link_source import from_log, from_run, is_run
 
     source: Path = options.source
-    if not source.exists():
+    if not (source.is_dir() or source.is_file()):
         raise BadInputError(f"{source}: no such file or folder; name a run, a log or a CSV file")
     halve: bool = options.halve_rtt
     if not is_run(source):

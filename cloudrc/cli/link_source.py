@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from cloudrc.record.columns import Recording, Table
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
+UNPACKED_MAX = 64 << 20
+"""Longest log that is unpacked [bytes], 10 min of irtt at 100 Hz; a small file may hold any."""
 SETTLING_NS = 2_000_000_000
 """What was sent this long before its session's last datagram [ns] and did not arrive is lost."""
 TOPICS = {
@@ -82,7 +84,11 @@ def _lines(path: Path) -> list[str]:
     if path.suffix != ".gz":
         return []
     try:
-        return gzip.decompress(path.read_bytes()).decode().splitlines()
+        with gzip.open(path) as file:
+            data = file.read(UNPACKED_MAX + 1)
+        if len(data) > UNPACKED_MAX:
+            raise OSError(f"it holds more than {UNPACKED_MAX >> 20} MiB")
+        return data.decode().splitlines()
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
         raise BadInputError(f"{path}: cannot be unpacked: {error}; give the file itself") from None
 

@@ -23,6 +23,8 @@ Direction: TypeAlias = Literal["uplink", "downlink"]
 _STAMP = re.compile(r"\[(\d+(?:\.\d+)?)\] ")
 _REPLY = re.compile(r"icmp_seq=(\d+) .*\btime[=<](\d+(?:\.\d+)?) ms")
 _WRAP = 1 << 16
+_MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
+"""What JSON of any other shape raises."""
 _HALVE = (
     "a trace is one way; if both directions are alike, take half of each round trip with "
     "--halve-rtt, else measure one way with irtt between synchronised clocks"
@@ -131,7 +133,7 @@ def read_irtt(text: str, name: str, direction: Direction, *, halve: bool) -> Pac
         )
     except _NoStampsError:
         raise refusal(f"{name} (irtt's server sent no stamps)") from None
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+    except _MISSHAPEN as error:
         raise BadInputError(
             f"{name}: not a log of irtt ({type(error).__name__}: {error}); "
             "give the file that 'irtt client -o FILE.json' writes"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gzip
+import os
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from cloudrc.cli import link_source
 from cloudrc.cli.link import ACTIONS
 from cloudrc.cli.link_verify import find
 from cloudrc.cli.main import main
@@ -118,6 +120,33 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     assert says in message
     assert message.count("\n") == 1
     assert not (here / "t.csv").exists()
+
+
+def test_a_small_file_that_unpacks_to_any_size_is_not_unpacked_whole(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link_source, "UNPACKED_MAX", 1 << 20)
+    most = 0
+
+    class Counted(gzip.GzipFile):
+        def read(self, size: int | None = -1) -> bytes:
+            nonlocal most
+            data = super().read(size)
+            most = max(most, len(data))
+            return data
+
+    monkeypatch.setattr(gzip, "open", Counted)
+    (here / "bomb.json.gz").write_bytes(gzip.compress(bytes(8 << 20)))
+    assert main(["link", "record", "bomb.json.gz", "-o", "t.csv"]) == 2
+    said = "cannot be unpacked: it holds more than 1 MiB; give the file itself"
+    assert capsys.readouterr().err == f"cloudrc: error: bomb.json.gz: {said}\n"
+    assert most == (1 << 20) + 1
+
+
+def test_a_pipe_is_not_waited_for(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo(here / "pipe")
+    assert main(["link", "record", "pipe", "-o", "t.csv"]) == 2
+    assert "pipe: no such file or folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,21 @@ def test_clocks_that_differ_are_noticed() -> None:
         read_irtt(text, "x", "uplink", halve=False)
 
 
-@pytest.mark.parametrize("text", ["{", "{}", '{"round_trips": [{}]}', '{"round_trips": 3}', "[]"])
+ENDLESS = {"lost": "false", "timestamps": {"client": {"send": {"wall": float("inf")}}}}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "{}",
+        '{"round_trips": [{}]}',
+        '{"round_trips": 3}',
+        "[]",
+        "[" * 100_000,
+        json.dumps({"round_trips": [ENDLESS]}),
+    ],
+)
 def test_other_json_is_refused(text: str) -> None:
     with pytest.raises(BadInputError, match="not a log of irtt"):
         read_irtt(text, "x", "uplink", halve=False)
