@@ -35,15 +35,16 @@ def execute(options: argparse.Namespace) -> int:
 
     from cloudrc import assembly
     from cloudrc.cloud.endpoint import CloudIdentity
+    from cloudrc.drivers.teleop import LastWord
     from cloudrc.messages import GuardState
 
     opened = open_end(options, "cloud")
     identity = CloudIdentity(opened.clock, os.urandom(16), opened.keys.ring, suite())
     teleop = _join(options.teleop) if options.teleop else None
     cloud = assembly.build_cloud(opened.experiment, identity, time.monotonic_ns, teleop)
-    opened.fly(
-        cloud, stop, lambda: cloud.guard is GuardState.TRACK, over=lambda: cloud.mission_over
-    )
+    flies = lambda: cloud.guard is GuardState.TRACK  # noqa: E731
+    ends = LastWord(stop, flies) if teleop else stop
+    opened.fly(cloud, ends, flies, over=lambda: cloud.mission_over)
     return 0
 
 

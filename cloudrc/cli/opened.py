@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.drivers.keyfile import KeyFile
-    from cloudrc.drivers.process import StopSignal
     from cloudrc.drivers.realtime import Peer
     from cloudrc.drivers.standing_check import StandingCheck
     from cloudrc.endpoint import Endpoint
@@ -53,7 +52,7 @@ class Opened(NamedTuple):
     def fly(
         self,
         endpoint: Endpoint,
-        stop: StopSignal,
+        stop: Callable[[], bool],
         flies: Callable[[], bool],
         *,
         over: Callable[[], bool] = lambda: False,

@@ -77,7 +77,7 @@ def run_end(
     recorder: Takes,
     *,
     end: str,
-    stop: StopSignal,
+    stop: Callable[[], bool],
     over: Callable[[], bool] = lambda: False,
     slip_ns: Callable[[], int] = lambda: 0,
     exporter: Exporter | None = None,

@@ -31,6 +31,9 @@ SILENCE_NS = 1_000_000_000
 """Teleop speaks at 10 Hz; without a word for so long it is taken to be away [ns]."""
 EVENTS_KEPT = 256
 """Events that wait for a cloud that is away."""
+LAST_WORD_NS = 800_000_000
+"""For teleop's last word to stop the robot, through a cloud that is to end as well [ns]: longer
+than teleop repeats it, and short enough for a process that has 1.5 s to end."""
 
 Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
@@ -105,6 +108,37 @@ class RemoteTeleop:
         """Hand over what teleop has said since the last call."""
         outputs, self.outputs = self.outputs, []
         return outputs
+
+
+class LastWord:
+    """Lets cloud end: a moment later if the robot flies, for that is for teleop to hold.
+
+    A pod asks all its containers to end at once; what teleop then says has no way but cloud's.
+    """
+
+    def __init__(
+        self,
+        asked: Callable[[], bool],
+        flies: Callable[[], bool],
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Wait for nothing yet.
+
+        Args:
+            asked: Whether cloud is to end.
+            flies: Whether the robot is seen to follow commands.
+            clock: Own clock [ns].
+        """
+        self._asked, self._flies, self._clock = asked, flies, clock
+        self._until_ns: int | None = None
+
+    def __call__(self) -> bool:
+        """Whether cloud may end now; asked at every wake."""
+        if not self._asked():
+            return False
+        if self._until_ns is None:
+            self._until_ns = self._clock() + LAST_WORD_NS
+        return not self._flies() or self._clock() >= self._until_ns
 
 
 def serve_teleop(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from math import nan
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from cloudrc.cloud.teleop.api_gate import Receive, Scope, Send
 from cloudrc.cloud.teleop.journal_format import Entry, parse
 from cloudrc.cloud.teleop.service_book import LOGGED, UnavailableError
 from cloudrc.cloud.teleop.service_mission import Order
+from cloudrc.drivers.teleop import LastWord
 from cloudrc.faults import asks, gate, meters
 from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
@@ -20,8 +22,10 @@ from cloudrc.messages import GuardState
 
 PER_PERIOD = 10
 """Requests in every 10 ms: 1,000 in a second."""
-ENDED = 1.0
-"""How long the pod lives after SIGTERM [s]; its robot has to hold before, at its word."""
+AWAY = 6.0
+"""How long there is no pod [s]: longer than a metric may take to show that its mission is held."""
+WAKE = 0.01
+"""Between two wakes of cloud, at which it is asked whether it ends [s]."""
 
 
 def _flood(seed: int) -> Outcome:
@@ -93,24 +97,20 @@ def _gapless(numbers: list[int]) -> bool:
 
 
 def _shutdown(seed: int) -> Outcome:
-    """SIGTERM of the cloud pod: teleop holds the mission, writes it down; a new pod goes on."""
+    """SIGTERM of the cloud pod: teleop and cloud, each a process, are asked at once."""
     outcome, at, left = Outcome(), instant(seed, 6.0, 20.0), list[Entry]()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "missions.journal"
-        flight = Flight(seed=seed, journal=path)
+        flight = Flight(seed=seed, journal=path, apart=True)
 
-        def ask(now_ns: int) -> None:
-            assert flight.desk.service is not None
-            flight.desk.service.pause(now_ns)
-
-        def end(now_ns: int) -> None:
-            flight.kill_cloud_pod(now_ns, 3.0)
+        def gone(now_ns: int) -> None:
+            flight.kill_cloud_pod(now_ns, AWAY)
             left.extend(parse(path.read_bytes()).entries)
 
-        flight.cloud.at(at, ask)
-        flight.cloud.at(at + ENDED, end)
+        ended = _shut_down(flight, at, gone)
         flight.fly_mission()
         asks.safe(outcome, flight)
+        outcome.most("cloud ends after", min(ended, default=nan) - at, 2.0, "s")
         changes = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
         held = next((c for c in changes if c.state is GuardState.HOLD), None)
         after = held.stamp_ns * 1e-9 - at if held is not None else nan
@@ -125,6 +125,39 @@ def _shutdown(seed: int) -> Outcome:
         outcome.true("each waypoint reached once, in order", asks.waypoints_in_order(flight))
         flight.desk.kill()
     return outcome
+
+
+def _shut_down(flight: Flight, at: float, gone: Callable[[int], None]) -> list[float]:
+    """SIGTERM of both processes at an instant [s]; cloud ends as production lets it.
+
+    Args:
+        flight: Whose.
+        at: When [s].
+        gone: Called at the instant [ns] at which cloud has ended.
+
+    Returns:
+        Gets that instant [s].
+    """
+    cloud, ended = flight.cloud, list[float]()
+
+    def flies() -> bool:
+        return getattr(cloud.inner, "guard", None) is GuardState.TRACK
+
+    ends = LastWord(lambda: True, flies, lambda: flight.run.now_ns)
+
+    def ask(now_ns: int) -> None:
+        flight.desk.shut_down(now_ns)
+        look(now_ns)
+
+    def look(now_ns: int) -> None:
+        if ends():
+            ended.append(now_ns * 1e-9)
+            gone(now_ns)
+        else:
+            cloud.at(now_ns * 1e-9 + WAKE, look)
+
+    cloud.at(at, ask)
+    return ended
 
 
 SCENARIOS = (
@@ -151,8 +184,8 @@ SCENARIOS = (
     Scenario(
         33,
         "shutdown",
-        "SIGTERM of the cloud pod in a mission, a new one 3 s later",
-        "HOLD in 0.5 s; the journal is written; the new pod goes on",
+        "SIGTERM of cloud and teleop at once in a mission, new ones 6 s later",
+        "both end in 2 s, HOLD in 0.5 s by their word; the journal is written; the new pod goes on",
         "none",
         "paused by shutdown, cloudrc_mission_state",
         _shutdown,

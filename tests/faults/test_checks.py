@@ -10,6 +10,7 @@ import pytest
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.service_book import MissionBook
 from cloudrc.drivers.keyfile import KeyFile
+from cloudrc.drivers.teleop import LastWord
 from cloudrc.drivers.wall_clock import WallClock
 from cloudrc.exposition.live import Live
 from cloudrc.faults import meters
@@ -106,6 +107,10 @@ def ends_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(MissionService, "pause", lambda service, now_ns: None)
 
 
+def ends_before_the_last_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LastWord, "__call__", lambda word: word._asked())
+
+
 def never_freezes(name: str) -> Callable[[pytest.MonkeyPatch], None]:
     freeze = Mortal.freeze
 
@@ -177,6 +182,7 @@ BROKEN: list[tuple[str, Broken, str]] = [
     ("F32", loses_an_event_of_a_reader, "its events have no gap"),
     ("F33", ends_without_a_word, "HOLD after"),
     ("F33", ends_without_a_word, "they say: paused by shutdown"),
+    ("F33", ends_before_the_last_word, "by a word, not for want of it"),
     ("F38", never_complains, "wrong key: cloud tells once"),
     ("F38", takes_a_missing_file_for_a_new_key, "gone in flight: the keys stay"),
     ("F39", catches_up_without_the_guard, "steps without the guard's tick"),

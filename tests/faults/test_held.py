@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.faults.held import age_at_hold, holds
+from cloudrc.faults.held import age_at_hold, holds, words
 from cloudrc.faults.real.processes import throttled
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.record.columns import Recording
@@ -32,6 +32,11 @@ def test_only_a_hold_for_want_of_commands_counts() -> None:
     assert holds(recording) == 2
     assert holds(recording, 0.5, 1.5) == 1
     assert age_at_hold(recording) == pytest.approx(0.252)
+
+
+def test_a_hold_by_a_word_counts_apart() -> None:
+    assert words(flown(WANT, "mission ended", "new session", "mission ended")) == 2
+    assert words(flown(WANT)) == 0
 
 
 def test_without_such_a_hold_there_is_no_age() -> None:

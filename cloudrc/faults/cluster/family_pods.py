@@ -32,7 +32,7 @@ from cloudrc.faults.cluster.release import (
     set_link,
     until,
 )
-from cloudrc.faults.held import holds
+from cloudrc.faults.held import holds, words
 from cloudrc.faults.scenario import Mode, Outcome, Scenario
 from cloudrc.messages import GuardState
 from cloudrc.tunnel.keys import KEY_SIZE, parse, write
@@ -65,13 +65,15 @@ def _pod_killed(seed: int) -> Outcome:
 
 
 def _pod_deleted(seed: int) -> Outcome:
+    """Deleted with its grace: its processes get SIGTERM at once, and hold the robot."""
     outcome, release = Outcome(), release_there()
-    before, name = holds(recording(release, "world")), flying(release, 2)
+    before, name = words(recording(release, "world")), flying(release, 2)
     delete(release, "cloud")
     held = until("the robot holds", lambda: guard(release) is GuardState.HOLD, 60.0)
     outcome.most("HOLD after it was deleted, its grace included", held, 60.0, "s")
-    flown = finish(outcome, release, name)
-    outcome.least("HOLDs for want of commands", holds(flown) - before, 1)
+    said = words(recording(release, "world")) - before
+    outcome.least("HOLDs by the word of a teleop that ends", said, 1)
+    finish(outcome, release, name)
     return outcome
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from cloudrc.faults.held import AGE_MAX, age_at_hold, holds
 from cloudrc.faults.real.processes import Processes, release, throttle, throttled
 from cloudrc.faults.scenario import Mode, Outcome, Scenario
-from cloudrc.messages import GuardState
+from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
 
 WORKING = 3
@@ -154,17 +154,22 @@ def _longest_stall(flown: Recording, since_ns: int) -> tuple[float, float]:
 
 
 def _shutdown(seed: int) -> Outcome:
+    """SIGTERM of both at once, as a pod's containers get it; cloud first, which has to wait."""
     outcome = Outcome()
     with Processes(seed=seed) as run:
         run.reached(WORKING)
-        outcome.most("teleop ends after", run.end("teleop"), 2.0, "s")
-        outcome.same("its exit code", run.running["teleop"].returncode, 0)
-        outcome.most("cloud ends after", run.end("cloud"), 2.0, "s")
-        outcome.same("its exit code", run.running["cloud"].returncode, 0)
+        asked = time.monotonic() - run.slip()
+        for name, took in run.end("cloud", "teleop").items():
+            outcome.most(f"{name} ends after", took, 2.0, "s")
+            outcome.same(f"exit code of {name}", run.running[name].returncode, 0)
         outcome.true("the journal says so", "paused" in run.events())
         run.start("teleop")
         run.start("cloud")
-        finish(outcome, run)
+        guard = finish(outcome, run)["/guard"]
+        stamps, causes = guard["stamp_ns"] * 1e-9, guard["cause"].tolist()
+        first = int(np.searchsorted(stamps, asked))
+        outcome.most("HOLD after", float(stamps[first]) - asked, 0.5, "s")
+        outcome.true("by their word, not for want of it", causes[first] == Cause.ENDED.words)
     return outcome
 
 
@@ -213,8 +218,9 @@ SCENARIOS = (
     Scenario(
         33,
         "shutdown",
-        "SIGTERM of teleop and cloud in a mission, then new ones",
-        "both end in 2 s with exit code 0; the journal is written; the mission goes on",
+        "SIGTERM of cloud and teleop at once in a mission, then new ones",
+        "both end in 2 s with exit code 0, HOLD in 0.5 s by their word; the journal is written; "
+        "the mission goes on",
         "none",
         "paused by shutdown",
         _shutdown,

@@ -101,12 +101,16 @@ class Processes:
         self.running[name].wait(LIMIT)
         return killed
 
-    def end(self, name: str) -> float:
-        """SIGTERM; return how long it took until the process had ended [s]."""
+    def end(self, *names: str) -> dict[str, float]:
+        """SIGTERM of all at once; return within how long each had ended [s]."""
         began = time.monotonic()
-        self.send(name, signal.SIGTERM)
-        self.running[name].wait(LIMIT)
-        return time.monotonic() - began
+        for name in names:
+            self.send(name, signal.SIGTERM)
+        took = {}
+        for name in names:
+            self.running[name].wait(LIMIT)
+            took[name] = time.monotonic() - began
+        return took
 
     def events(self) -> list[str]:
         """What has happened to the mission, as the journal has it."""
