@@ -8,9 +8,10 @@ Classes as ROS 1 generates them, an Odometry of the same numbers, as large as a 
 from __future__ import annotations
 
 import subprocess
-import sys
 import timeit
 from typing import NamedTuple
+
+from cloudrc.drivers.interpreter import interpreter
 
 CALLS = 400
 REFERENCE_CALLS = 40
@@ -103,7 +104,7 @@ def measure_wire(rounds: int = ROUNDS) -> WireCost:
         return timeit.timeit(there, number=CALLS) / CALLS
 
     costs = []
-    words = [sys.executable, "-c", REFERENCE, str(REFERENCE_CALLS)]
+    words = interpreter("-c", REFERENCE, str(REFERENCE_CALLS))
     with subprocess.Popen(words, stdin=-1, stdout=-1, text=True) as child:
         assert child.stdin is not None
         assert child.stdout is not None

@@ -17,6 +17,7 @@ from typing import Literal
 from cloudrc.cli import checks_cluster
 from cloudrc.cli.check import CLUSTER, FLYING, Check
 from cloudrc.cli.extras import EXTRAS, missing
+from cloudrc.drivers.interpreter import interpreter
 
 # What a control loop of 10 ms can bear; a quiet desktop stays far below [s].
 LATE_SLEEP = 2e-3
@@ -72,7 +73,7 @@ def packages(extra: str) -> Check:
 
 def mujoco_steps() -> Check:
     """Load MuJoCo and make one step, in a process of its own: a bad library can abort."""
-    answer = subprocess.run([sys.executable, "-c", STEP], capture_output=True, text=True)
+    answer = subprocess.run(interpreter("-c", STEP), capture_output=True, text=True)
     if answer.returncode == 0:
         return Check("physics", "ok", "MuJoCo loads and steps", "", FLYING)
     lines = answer.stderr.strip().splitlines() or [f"exit code {answer.returncode}"]

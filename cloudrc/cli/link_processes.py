@@ -10,7 +10,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.assembly import link_profile
 from cloudrc.cluster.forward import DIRECTLY
+from cloudrc.drivers.interpreter import interpreter
 from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.route import parse
 from cloudrc.errors import (
@@ -103,7 +103,7 @@ class Shaping:
                 "import urllib.request as u; ask = u.build_opener(u.ProxyHandler({})).open; "
                 f"print(ask('http://{host}:{port}/metrics', timeout=3).read().decode())"
             )
-            words = [*self.place.inside, sys.executable, "-c", reader]
+            words = [*self.place.inside, *interpreter("-c", reader)]
             done = subprocess.run(words, capture_output=True, text=True, check=False)
             return done.stdout
         try:
@@ -170,7 +170,7 @@ def _start(folder: Path, way: str, place: Place, mode: str) -> Shaping:
     own.mkdir()
     command: Sequence[str] = (
         *place.inside,
-        *(sys.executable, "-m", "cloudrc", "link", "run"),
+        *interpreter("-m", "cloudrc", "link", "run"),
         f"--config={folder / 'experiment.yaml'}",
         f"--profile={folder / 'profile.yaml'}",
         f"--direction={way}",

@@ -86,7 +86,7 @@ def resolve(name: str) -> list[str]:
 
 
 def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> Machine:
-    from cloudrc.config.load import load_experiment
+    from cloudrc.config.load import read_experiment
     from cloudrc.link.model import LinkDirection
     from cloudrc.link.netem import Netem
     from cloudrc.link.netem_tc import may_shape, try_netem
@@ -96,7 +96,7 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
     from cloudrc.link.sidecar import Machine
     from cloudrc.tunnel.codec import peek
 
-    seed = load_experiment(str(options.config)).seed
+    seed = read_experiment(str(options.config)).seed
     clock = time.monotonic_ns
 
     def relay(profile: DirectionProfile, origin_ns: int) -> RelayShaper:

@@ -139,11 +139,11 @@ def _ends(options: argparse.Namespace) -> Said:
 def find(target: str, settings: list[str]) -> ResolvedExperiment:
     """Find the experiment that is meant: a profile's name or file stands for its link alone."""
     from cloudrc.config import shipped
-    from cloudrc.config.load import load_experiment
+    from cloudrc.config.load import read_experiment
     from cloudrc.config.schema import Experiment, Profile
 
     if target in shipped.names("experiment"):
-        return load_experiment(target, settings)
+        return read_experiment(target, settings)
     is_profile = target in shipped.names("profile")
     if shipped.is_path(target):
         tree = shipped.read("profile", target, _here()).tree
@@ -153,8 +153,8 @@ def find(target: str, settings: list[str]) -> ResolvedExperiment:
         raise BadInputError(f"no profile or experiment named '{target}'; available: {names}")
     if is_profile:
         name = str(_here() / target) if shipped.is_path(target) else target
-        return load_experiment(DEFAULT, [f"link.profile={name}", *settings])
-    return load_experiment(target, settings)
+        return read_experiment(DEFAULT, [f"link.profile={name}", *settings])
+    return read_experiment(target, settings)
 
 
 def _here() -> Path:

@@ -55,7 +55,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Forward."""
     from cloudrc import assembly
-    from cloudrc.config.load import load_experiment
+    from cloudrc.config.load import read_experiment
     from cloudrc.drivers.feed import Feed
     from cloudrc.drivers.process import StopSignal
     from cloudrc.link.relay import Relay
@@ -63,7 +63,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.tunnel.codec import peek
 
     stop, exporter = StopSignal(), open_exporter(options, "link")
-    experiment = load_experiment(str(options.config))
+    experiment = read_experiment(str(options.config))
     uplink, downlink = assembly.build_links(experiment)
     settle()
     if options.fifo:  # before the relay is made, which looks whether it has it

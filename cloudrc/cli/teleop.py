@@ -67,14 +67,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Fly missions."""
-    from cloudrc.config.load import load_experiment
+    from cloudrc.config.load import read_experiment
     from cloudrc.drivers.process import StopSignal
     from cloudrc.records import Counted
 
     if options.api:
         require("the API of teleop", ("api",))
     stop, exporter = StopSignal(), open_exporter(options, "teleop")
-    experiment = load_experiment(str(options.config))
+    experiment = read_experiment(str(options.config))
     served = serve_api(options, experiment) if options.api else None
     journal = None
     try:

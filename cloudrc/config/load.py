@@ -33,7 +33,7 @@ FILES: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read
 
 
 def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment.
+    """Load an experiment whose cloud is to be flown: the plug-ins that it names are imported.
 
     Args:
         name: Of a shipped experiment, or the path of a file.
@@ -45,29 +45,16 @@ def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedE
     Raises:
         BadInputError: One line, or a summary and one line for each thing that is wrong.
     """
-    document = shipped.read("experiment", str(name), Path())
-    changes = overrides.parse(settings)
-    _default(document, ("name",), Path(name).stem)
-    before = [change for change in changes if not change.inside_name]
-    if any(change.path in (("link",), ("link", "profile")) for change in before):
-        _forget_profile(document)
-    overrides.apply(document, before)
-    for key in ("world", "guard", "link", "cloud"):
-        _default(document, (key,), {})
-    found = [*_inline_mission(document), *_inline_profile(document)]
-    overrides.apply(document, [change for change in changes if change.inside_name])
-    for key in parameters.KINDS:
-        _default(document, ("cloud", key), Experiment().cloud.model_dump()[key])
-    found += [*parameters.resolve(document), *_resolve_traces(document, ("link",))]
-    found += _check_files(document)
-    experiment = _validate(document, ResolvedExperiment, str(name), found)
-    scene = load_scene(experiment.world.scene)
-    wrong = [
-        Problem(("mission", *problem.path), problem.value, problem.reason)
-        for problem in check_mission(experiment.mission, scene)
-    ]
-    problems.refuse(document, wrong, str(name))
-    return experiment
+    return _load_experiment(str(name), settings, parameters.resolve)
+
+
+def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
+    """Load an experiment of which nothing is run, as whoever flies no cloud does.
+
+    As `load_experiment`, but its plug-ins are left as it names them: neither imported nor checked,
+    and with those parameters alone that it gives. A run's own config.yaml gives all of them.
+    """
+    return _load_experiment(str(name), settings, parameters.leave)
 
 
 def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
@@ -96,6 +83,34 @@ def dump(experiment: ResolvedExperiment) -> str:
     keeps the text may copy a trace beside it and name it relative to it.
     """
     return yaml_text.write(experiment.model_dump(mode="json"))
+
+
+def _load_experiment(
+    name: str, settings: Iterable[str], plug_ins: Callable[[Document], list[Problem]]
+) -> ResolvedExperiment:
+    document = shipped.read("experiment", name, Path())
+    changes = overrides.parse(settings)
+    _default(document, ("name",), Path(name).stem)
+    before = [change for change in changes if not change.inside_name]
+    if any(change.path in (("link",), ("link", "profile")) for change in before):
+        _forget_profile(document)
+    overrides.apply(document, before)
+    for key in ("world", "guard", "link", "cloud"):
+        _default(document, (key,), {})
+    found = [*_inline_mission(document), *_inline_profile(document)]
+    overrides.apply(document, [change for change in changes if change.inside_name])
+    for key in parameters.KINDS:
+        _default(document, ("cloud", key), Experiment().cloud.model_dump()[key])
+    found += [*plug_ins(document), *_resolve_traces(document, ("link",))]
+    found += _check_files(document)
+    experiment = _validate(document, ResolvedExperiment, name, found)
+    scene = load_scene(experiment.world.scene)
+    wrong = [
+        Problem(("mission", *problem.path), problem.value, problem.reason)
+        for problem in check_mission(experiment.mission, scene)
+    ]
+    problems.refuse(document, wrong, name)
+    return experiment
 
 
 def _load_profile(name: str, folder: Path) -> tuple[Document, Profile]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+from collections.abc import Iterator
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
@@ -29,17 +30,8 @@ def resolve(document: Document) -> list[Problem]:
         What is wrong with names and parameters; those of a wrong form are left to the schema.
     """
     found: list[Problem] = []
-    for key, kind in KINDS.items():
-        path = ("cloud", key)
-        choice = document.get(*path)
-        given = {"name": choice} if isinstance(choice, str) else choice
-        if not isinstance(given, dict) or not isinstance(given.get("name"), str):
-            continue
-        name_source = document.source((*path, "name"))
-        name = str(given["name"])
-        if plugins.is_path(name):
-            name = str((name_source.folder / name).resolve())
-        parameters = {key: value for key, value in given.items() if key != "name"}
+    for key, name, parameters in _choices(document):
+        kind, path = KINDS[key], ("cloud", key)
         try:
             complete = _complete(kind, name, parameters)
         except ValidationError as error:
@@ -50,6 +42,16 @@ def resolve(document: Document) -> list[Problem]:
             # Completed in place: what was given keeps the line it was written in.
             document.tree["cloud"][key] = {"name": name, **complete}
     return found
+
+
+def leave(document: Document) -> list[Problem]:
+    """Turn every plug-in into a mapping as `resolve` does, but with what is given alone.
+
+    Nothing is imported: the file may be somebody else's, and so may be what it names.
+    """
+    for key, name, parameters in _choices(document):
+        document.tree["cloud"][key] = {"name": name, **parameters}
+    return []
 
 
 def build(kind: str, choice: PlugIn) -> Any:
@@ -79,6 +81,20 @@ def parameter_model(kind: str, name: str) -> type[BaseModel]:
     )  # fmt: skip
     model: type[BaseModel] = create_model("parameters", __config__=config, **fields)
     return model
+
+
+def _choices(document: Document) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Give key, name and parameters of every plug-in that is named; the name of a file absolute."""
+    for key in KINDS:
+        path = ("cloud", key)
+        choice = document.get(*path)
+        given = {"name": choice} if isinstance(choice, str) else choice
+        if not isinstance(given, dict) or not isinstance(given.get("name"), str):
+            continue
+        name = str(given["name"])
+        if plugins.is_path(name):
+            name = str((document.source((*path, "name")).folder / name).resolve())
+        yield key, name, {key: value for key, value in given.items() if key != "name"}
 
 
 def _complete(kind: str, name: str, parameters: dict[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,6 @@ import os
 import selectors
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from pathlib import Path
 
 from cloudrc.drivers import flights
 from cloudrc.drivers.feed import READY, from_line
+from cloudrc.drivers.interpreter import interpreter
 from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import InvalidRunError, TimedOutError, in_one_line
@@ -167,7 +167,7 @@ class LocalRun:
     def _start(self, name: str, *options: str) -> None:
         log = self._folder / f"{name}.log"
         config = f"--config={self._folder / 'config.yaml'}"
-        command = [sys.executable, "-m", "cloudrc", name, config, "--feed", *options]
+        command = interpreter("-m", "cloudrc", name, config, "--feed", *options)
         with log.open("wb") as errors:
             process = subprocess.Popen(
                 command,

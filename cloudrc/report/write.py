@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cloudrc.config.load import load_experiment
+from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.scene import load_scene
@@ -124,7 +124,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     """
     if not (folder / "config.yaml").is_file():
         raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
-    experiment = load_experiment(folder / "config.yaml")
+    experiment = read_experiment(folder / "config.yaml")
     recording = _read_recording(folder)
     return recording, experiment, _read_run(folder, recording)
 

@@ -12,7 +12,7 @@ from cloudrc.config.schema import Blackout, Change, Direction
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.records import Control, GuardChange
-from cloudrc.report.figures import NAMES, flight
+from cloudrc.report.figures import NAMES, draw_all, flight
 from cloudrc.report.figures.events import LEGEND, legend, mark_events
 from cloudrc.report.figures.solids import WALL_COLOUR, is_swallowed, pipe_faces
 from cloudrc.report.figures.style import RC, new_figure
@@ -91,3 +91,13 @@ def test_waypoints_are_where_the_setpoint_was_when_they_were_new() -> None:
 
     log.change(Control, fly_to)
     assert subject_of(log).waypoints == {0: (0.0, 2.0, 3.0), 1: (1.0, 2.0, 3.0)}
+
+
+def test_figures_have_no_settings_but_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """matplotlib reads those of the working folder, which may be a run got from somebody else."""
+    monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
+    (picture,) = draw_all(subject_of(flown()))
+    theirs = {"text.usetex": True, "axes.facecolor": "red", "lines.linestyle": ":"}
+    with matplotlib.rc_context(theirs):
+        assert draw_all(subject_of(flown())) == [picture]
+        assert matplotlib.rcParams["text.usetex"], "put back"

@@ -47,7 +47,10 @@ def draw_all(subject: Subject) -> list[Picture]:
     matplotlib reads its settings from one place of the process: draw in one thread at a time.
     """
     pictures = []
-    with matplotlib.rc_context(RC):
+    with matplotlib.rc_context():
+        # matplotlib has read a matplotlibrc of the working folder, which may be anybody's run.
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(RC)
         for name in NAMES:
             drawing = importlib.import_module(f"{__name__}.{name}")
             figure = drawing.draw(subject)

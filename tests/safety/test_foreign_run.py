@@ -1,0 +1,129 @@
+"""A run's folder got from somebody else: whatever lies in it, to read it runs none of that."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli import opened
+from cloudrc.cli.link_verify import find
+from cloudrc.cli.main import main
+from cloudrc.config.load import dump, load_experiment, read_experiment
+from cloudrc.config.schema import PlugIn
+from cloudrc.drivers.interpreter import interpreter
+from cloudrc.record.merge import write_mission
+from tests.metrics.flights import flown
+
+pytestmark = pytest.mark.promise("P-CODE-1")
+PACKAGE = Path(opened.__file__).parents[1]
+CONFIG = """\
+cloud:
+  estimator: {spy}
+  predictor: ./spy.py
+  controller: {{name: ../run/spy.py, share: 2.5}}
+"""
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> Path:
+    """The file that is there once anything of the run was run."""
+    return tmp_path / "told"
+
+
+@pytest.fixture
+def spy(told: Path) -> str:
+    """A program that gives itself away."""
+    return f"from pathlib import Path\nPath({str(told)!r}).touch()\ndef build(): ...\n"
+
+
+@pytest.fixture
+def run(tmp_path: Path, spy: str) -> Path:
+    """A run whose configuration names a program that lies beside it."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "spy.py").write_text(spy)
+    (folder / "config.yaml").write_text(CONFIG.format(spy=folder / "spy.py"))
+    log = flown()
+    records = (sorted(part, key=lambda record: record.stamp_ns) for part in (log.world, log.cloud))
+    write_mission(folder / "mission.mcap", *records)
+    return folder
+
+
+def test_a_report_runs_nothing_of_the_run(
+    run: Path, told: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cloudrc.report.page.b64encode", lambda svg: b"")  # a lighter page
+    assert main(["report", str(run)]) == 1
+    assert not told.exists()
+    assert json.loads((run / "report.json").read_text())["experiment"] == "config"
+    assert f"<dd>{run / 'spy.py'}</dd>" in (run / "report.html").read_text(), "named all the same"
+
+
+def test_a_link_is_verified_without_what_flies_over_it(run: Path, told: Path) -> None:
+    experiment = find(str(run / "config.yaml"), ["link.uplink.delay_ms=200"])
+    assert experiment.uplink.delay_ms == 200
+    # What its processes are started with says where the file lies, and they read it likewise.
+    (run / "again.yaml").write_text(dump(experiment))
+    assert read_experiment(run / "again.yaml") == experiment
+    assert not told.exists()
+
+
+def test_what_is_read_is_what_the_file_says(run: Path) -> None:
+    spy = str(run / "spy.py")
+    controller = PlugIn.model_validate({"name": spy, "share": 2.5})
+    assert read_experiment(run / "config.yaml").cloud.controller == controller
+    flown = load_experiment("paper")
+    (run / "config.yaml").write_text(dump(flown))
+    assert read_experiment(run / "config.yaml") == flown, "a run's own names all parameters"
+
+
+@pytest.mark.parametrize(("end", "imports"), [("world", False), ("cloud", True)])
+def test_of_the_ends_cloud_alone_imports_what_flies_it(
+    run: Path, told: Path, monkeypatch: pytest.MonkeyPatch, end: str, imports: bool
+) -> None:
+    for name in ("_open_keys", "_open_peer", "_open_recorder", "open_exporter"):
+        monkeypatch.setattr(opened, name, lambda *words: None)
+    (run / "config.yaml").write_text("cloud: {predictor: ./spy.py}")
+    opened.open_end(argparse.Namespace(config=run / "config.yaml"), end)
+    assert told.exists() == imports
+
+
+def test_only_what_flies_imports_plug_ins() -> None:
+    """Whoever else needs an experiment reads it."""
+    flies = {"cli/run.py", "cli/sweep.py", "cli/opened.py", "cli/bench.py"}
+    flies |= {"faults/flight.py", "faults/real/processes.py"}
+    imports = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in PACKAGE.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom)
+        if "load_experiment" in [alias.name for alias in node.names]
+    }
+    assert imports == flies
+
+
+def test_a_process_of_its_own_takes_no_python_from_the_working_folder(
+    run: Path, told: Path, spy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("cloudrc.py", "yaml.py", "argparse.py"):
+        (run / name).write_text(spy)
+    monkeypatch.chdir(run)
+    done = subprocess.run(interpreter("-m", "cloudrc", "list"), capture_output=True, check=False)
+    assert (done.returncode, told.exists()) == (0, False), done.stderr
+    monkeypatch.syspath_prepend(str(run))
+    assert "-P" not in interpreter("-m", "cloudrc"), "it is where this process looks, too"
+
+
+def test_every_process_is_started_so() -> None:
+    """But for those of a fault suite, which fly in a new folder of their own."""
+    starts = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in PACKAGE.rglob("*.py")
+        if "sys.executable" in path.read_text()
+    }
+    assert {name for name in starts if not name.startswith("faults/")} == {"drivers/interpreter.py"}
