@@ -113,7 +113,7 @@ def _status(options: argparse.Namespace, api: Api) -> int:
         print("no mission is under way")
     if state["queue"]:
         _write(f"waiting: {', '.join(state['queue'])}")
-    _say_seen(state["seen"])
+    _say_seen(state["seen"], state["cloud_age_s"])
     return 0
 
 
@@ -199,15 +199,26 @@ def _say(mission: dict[str, Any]) -> None:
     _write(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
 
 
-def _say_seen(seen: dict[str, Any] | None) -> None:
-    """Say where the robot is, how, since when, and what comes next."""
+def _say_seen(seen: dict[str, Any] | None, cloud_age: float | None) -> None:
+    """Say where the robot is, how, since when, and what comes next; what is past is said so.
+
+    Args:
+        seen: The newest telemetry.
+        cloud_age: Since cloud was heard [s]; None if it never was.
+    """
+    heard = "never" if cloud_age is None else f"{cloud_age:.1f} s ago"
     if seen is None:
-        print("the robot has not been seen yet; is the link up?")
+        print(f"the robot has not been seen yet; is the link up? cloud heard {heard}")
         return
     where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
-    rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
-    _write(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
-    _write(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
+    if seen["guard_for_s"] is None:
+        then = f"robot not heard for {seen['age_s']:.1f} s (guard {seen['guard']} then)"
+        _write(f"{then}; cloud heard {heard}")
+        _write(f"last seen at ({where}) m: {seen['cause']}")
+    else:
+        rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
+        _write(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
+        _write(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
     _write(f"next: {seen['next_step']}")
 
 

@@ -146,7 +146,7 @@ def _fly(
 
     def ask() -> bool:
         if exporter is not None:
-            exporter.ready(service.seen)
+            exporter.ready(service.sight.seen is not None)
             if served is not None:
                 exporter.see(served.counted())
         return stop()

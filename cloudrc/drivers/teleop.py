@@ -22,6 +22,8 @@ PERIOD_NS = 20_000_000
 """Between two deadlines of teleop's machine [ns]."""
 TELL_NS = PERIOD_NS - 5_000_000
 """Teleop is told what is seen no more often than this [ns]: every second telemetry."""
+ALIVE_NS = 200_000_000
+"""Without telemetry teleop is told so often that cloud lives, by an empty datagram [ns]."""
 STALL_NS = 100_000_000
 """After a wake this late what waits in the socket shows the past, for it has no room for more than
 the beginning of a stall: the present comes with one of the next wakes [ns]."""
@@ -44,6 +46,9 @@ Calls = Callable[[], Iterable[Callable[[int], None]]]
 
 class Machine(Protocol):
     """What teleop's process runs."""
+
+    def hear(self, now_ns: int) -> None:
+        """Take note that cloud lives."""
 
     def see(self, seen: Any, now_ns: int) -> None:
         """Take note of the newest telemetry."""
@@ -72,22 +77,26 @@ class RemoteTeleop:
         """Join the socket; teleop has a second from `start_ns` [ns] to speak."""
         self._peer, self._encode, self._decode = peer, encode, decode
         self._heard_ns, self._silent, self._stalled = start_ns, False, False
-        self._tell_ns = self._looked_ns = start_ns
+        self._tell_ns = self._looked_ns = self._alive_ns = start_ns
         self.outputs: list[Any] = []
         self.malformed = 0
 
     def see(self, seen: Any, now_ns: int) -> None:
         """Tell teleop what is seen, if it listens; as often as it looks."""
         if now_ns >= self._tell_ns:
-            self._tell_ns = now_ns + TELL_NS
+            self._tell_ns, self._alive_ns = now_ns + TELL_NS, now_ns + ALIVE_NS
             self._peer.send(self._encode(seen))
 
     def handle_deadline(self, now_ns: int) -> None:
         """Take in what teleop has said; once it has been silent for a second, say so.
 
+        Where there is no telemetry to tell, tell teleop that cloud lives.
         What led somewhere while cloud stood still may be taken back behind a full socket: teleop
         says it again if it is not. Not twice in a row: a cloud that is always late flies, too.
         """
+        if now_ns >= self._alive_ns:
+            self._alive_ns = now_ns + ALIVE_NS
+            self._peer.send(b"")
         self._stalled = not self._stalled and now_ns - self._looked_ns > STALL_NS
         self._looked_ns = now_ns
         for data in self._peer.receive():
@@ -206,12 +215,15 @@ def turn(
         For how many wakes more teleop does not look; as long as there are any, nothing is done.
     """
     arrived, was_blind = peer.receive(), blind
-    blind = blind_for(was_blind, late_ns, bool(arrived))
+    told = [data for data in arrived if data]  # what is empty shows nothing, past or present
+    blind = blind_for(was_blind, late_ns, bool(told))
     if blind:
         return blind
+    if arrived:
+        machine.hear(now_ns)
     for stop in stops():  # first: what has arrived may already show what their alarm has done
         stop(now_ns)
-    seen = _newest(arrived, decode)
+    seen = _newest(told, decode)
     if was_blind and seen is not None:  # first: a call may be about where the robot is
         machine.see(seen, now_ns)
     for call in calls():  # first: what has arrived may already show what a call asked for

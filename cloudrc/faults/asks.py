@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from itertools import pairwise
 from math import dist, hypot, inf, nan
+from typing import Any
 
+from cloudrc.cloud.teleop.sight import NO_CLOUD, NOT_HEARD
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.meters import reading
 from cloudrc.faults.scenario import Outcome
@@ -91,6 +93,45 @@ def landing_told(outcome: Outcome, flight: Flight) -> None:
     seen = flight.desk.service.state(flight.run.now_ns)["seen"]
     right = (seen["guard"], seen["cause"]) == ("LAND", Cause.ALONE.words)
     outcome.true(f"the status says so, too: LAND, {Cause.ALONE.words}", right)
+
+
+def look(flight: Flight, at: float) -> dict[str, Any]:
+    """Ask teleop how things are, as its API shows it, at an instant [s]; the flight fills it in."""
+    state: dict[str, Any] = {}
+
+    def ask(now_ns: int) -> None:
+        assert flight.desk.service is not None
+        state.update(flight.desk.service.state(flight.cloud.clock.at(now_ns)))
+
+    flight.cloud.at(at, ask)
+    return state
+
+
+def silence_told(
+    outcome: Outcome, state: dict[str, Any], silent: float, *, cloud: bool, what: str
+) -> None:
+    """Check that the status in a silence shows no past as present, and tells who is silent.
+
+    Args:
+        outcome: Of the scenario.
+        state: As it was shown.
+        silent: How long the robot had not been heard, but for the way of the last telemetry [s].
+        cloud: Whether cloud was to be heard.
+        what: Tells this silence of a scenario from its others.
+    """
+    seen, cloud_age = state["seen"], state["cloud_age_s"]
+    wrong = abs(seen["age_s"] - silent)
+    outcome.most(f"{what}: the status says for how long, wrong by", wrong, 0.2, "s")
+    outcome.true(f"{what}: it shows the guard's state as past", seen["guard_for_s"] is None)
+    if cloud:
+        outcome.most(f"{what}: it says that cloud was heard before", cloud_age, 0.25, "s")
+    else:
+        outcome.least(
+            f"{what}: it says that cloud is silent, too, for", cloud_age, silent - 0.2, "s"
+        )
+    who = "the robot, not cloud" if cloud else "cloud"
+    right = seen["next_step"] == (NOT_HEARD if cloud else NO_CLOUD)
+    outcome.true(f"{what}: its next step is to look after {who}", right)
 
 
 def _telemetered(flight: Flight) -> set[tuple[GuardState, Cause]]:

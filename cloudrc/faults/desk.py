@@ -123,6 +123,11 @@ class Desk:
         """See `cloudrc.cloud.operator.Operator`."""
         return self._outputs
 
+    def hear(self, now_ns: int) -> None:
+        """Take note that cloud lives."""
+        if self.service is not None:
+            self.service.hear(now_ns)
+
     def see(self, seen: Seen, now_ns: int) -> None:
         """See `cloudrc.cloud.operator.Operator`."""
         if self.service is not None:

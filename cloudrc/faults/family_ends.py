@@ -64,12 +64,14 @@ def _evicted_for_long(seed: int) -> Outcome:
 
 def _cloud_paused(seed: int) -> Outcome:
     outcome, at = Outcome(), instant(seed)
-    flight = Flight(seed=seed)
+    flight = Flight(seed=seed, apart=True)
     flight.cloud.at(at, lambda now_ns: flight.cloud.freeze(now_ns, 5.0))
+    shown = asks.look(flight, at + 4.0)
     flight.fly_mission()
     asks.safe(outcome, flight)
     asks.done(outcome, flight)
     outcome.most("HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
+    asks.silence_told(outcome, shown, 4.0, cloud=False, what="cloud stalled")
     asks.causes_told(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > AGE_MAX * 1e9]
@@ -196,8 +198,8 @@ SCENARIOS = (
         "SIGSTOP of the cloud process for 5 s",
         "HOLD; of what it computed before nothing is applied",
         "none",
-        "guard HOLD with its cause, cloudrc_guard_transitions_total, then "
-        "cloudrc_loop_missed_periods_total",
+        "guard HOLD with its cause; in the status: cloud not heard, nor the robot; "
+        "cloudrc_guard_transitions_total, then cloudrc_loop_missed_periods_total",
         _cloud_paused,
     ),
     Scenario(

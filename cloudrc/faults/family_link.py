@@ -50,7 +50,10 @@ def _silence(seed: int) -> Outcome:
             seed=seed,
             uplink=cut,
             downlink=cut,
-        ).fly_mission(150.0)
+            apart=True,
+        )
+        shown = asks.look(flight, at + 0.9 * duration)
+        flight.fly_mission(150.0)
         asks.safe(outcome, flight)
         asks.done(outcome, flight)
         began = next(iter(asks.changes_into(flight, GuardState.HOLD)), at)
@@ -63,6 +66,7 @@ def _silence(seed: int) -> Outcome:
                 f"{what}: below 0.05 m/s after", asks.stopping_time(flight, began), 1.0, "s"
             )
             outcome.most(f"{what}: drift", asks.drift(flight, began + 2.0, back), 0.10, "m")
+            asks.silence_told(outcome, shown, 0.9 * duration, cloud=True, what=what)
         meters.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=at)
         meters.moves(outcome, flight, "cloud", "commands_frozen_total", since=at)
         outcome.most(f"{what}: resumed after", asks.resumed_after(flight, back), 1.0, "s")
@@ -85,8 +89,11 @@ def _long_silence(seed: int) -> Outcome:
 def _silent(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     """Silence that begins somewhere, and lasts: the robot lands and lies, its rotors off."""
     cut = blackouts((at, 75.0))
-    flight = Flight("criteria.time_limit_s=200", seed=seed, uplink=cut, downlink=cut).fly(at + 80.0)
+    flight = Flight("criteria.time_limit_s=200", seed=seed, uplink=cut, downlink=cut, apart=True)
+    shown = asks.look(flight, at + 70.0)
+    flight.fly(at + 80.0)
     asks.safe(outcome, flight)
+    asks.silence_told(outcome, shown, 70.0, cloud=True, what=where)
     held = next(iter(asks.changes_into(flight, GuardState.HOLD)), -1.0)
     lands = asks.changes_into(flight, GuardState.LAND)
     landed = lands[0] if lands else nan
@@ -167,7 +174,8 @@ SCENARIOS = (
         "both directions silent for 0.5, 3 and 20 s",
         "HOLD at 252 ms, below 0.05 m/s in 1 s, drift <= 0.10 m, resumes <= 1 s after return",
         "samples in the gap",
-        "guard HOLD with its cause, cloudrc_guard_transitions_total",
+        "guard HOLD with its cause; in the status: robot not heard, cloud heard; "
+        "cloudrc_guard_transitions_total",
         _silence,
     ),
     Scenario(
@@ -176,7 +184,8 @@ SCENARIOS = (
         "both directions silent for 75 s, over the floor and amid the pipes",
         "HOLD, LAND after 60 s at 0.5 m/s, rotors stop on what lies below, latched",
         "the mission, which says so",
-        "guard LAND with its cause, cloudrc_guard_state",
+        "guard LAND with its cause; in the status: robot not heard, cloud heard; "
+        "cloudrc_guard_state",
         _long_silence,
     ),
     Scenario(

@@ -172,8 +172,8 @@ class Operator:
         service = flight.desk.service
         if service is None or now_ns < self._next_ns or flight.cloud.inner is None:
             return
-        seen = service.seen
-        if not seen or (flight.desk.missions and not flight.mission.ended):
+        unseen = service.sight.seen is None
+        if unseen or (flight.desk.missions and not flight.mission.ended):
             return
         self._next_ns = now_ns + PATIENCE_NS
         # What the operator sees: a world that was restarted is in GROUND, and changes nothing.

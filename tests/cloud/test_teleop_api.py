@@ -120,6 +120,7 @@ def test_the_state_is_told_and_unknown_numbers_are_null(idle):
     state = idle.get("/v1/state")
     models.StateView.model_validate(state)
     assert state["mission"] is None
+    assert state["cloud_age_s"] >= 0.0
     assert state["seen"]["guard"] == "GROUND"
     assert state["seen"]["rtt_s"] is None
     assert state["seen"]["guard_for_s"] >= 0.0

@@ -138,7 +138,7 @@ def test_it_says_that_the_robot_is_to_hold_however_long_the_disk_takes(monkeypat
     monkeypatch.setattr(flight.teleop.book._backlog, "_write", keep)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
-    cloud = Neighbour(flight.teleop._sight.seen)
+    cloud = Neighbour(flight.teleop.sight.seen)
     serve_teleop(
         flight.teleop,
         cloud,

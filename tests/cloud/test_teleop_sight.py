@@ -4,7 +4,7 @@ import pytest
 from service_harness import ServiceFlight, flying
 from teleop_harness import AWAY
 
-from cloudrc.cloud.teleop.sight import NOT_HEARD, SILENCE, next_step
+from cloudrc.cloud.teleop.sight import NO_CLOUD, NOT_HEARD, SILENCE, next_step
 from cloudrc.messages import Cause, GuardState
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -34,14 +34,16 @@ def texts(flight, mission_id, event):
     ],
 )  # fmt: skip
 def test_what_comes_next_follows_from_the_guard_and_the_mission(guard, mission, said):
-    assert said in next_step(guard, 0.01, mission)
-    assert said in next_step(guard, SILENCE, mission)
-    assert next_step(guard, SILENCE + 0.01, mission) == NOT_HEARD
+    past = SILENCE + 0.01
+    assert said in next_step(guard, 0.01, 0.01, mission)
+    assert said in next_step(guard, SILENCE, SILENCE, mission)
+    assert next_step(guard, past, SILENCE, mission) == NOT_HEARD
+    assert next_step(guard, past, past, mission) == NO_CLOUD
 
 
 def test_every_state_has_its_words():
     states = (None, "queued", "starting", "flying", "held")
-    assert all(next_step(guard, 0.0, mission) for guard in GuardState for mission in states)
+    assert all(next_step(guard, 0.0, 0.0, mission) for guard in GuardState for mission in states)
 
 
 def test_the_robot_is_shown_with_its_state_why_since_when_and_what_comes_next():
@@ -65,8 +67,6 @@ def test_since_when_goes_on_through_a_silence_and_a_new_session_and_not_into_ano
     flight.step(seconds=1.0)
     flight.uplink = False
     flight.step(seconds=2.0)
-    assert seen(flight)["next_step"] == NOT_HEARD
-    assert seen(flight)["age_s"] == pytest.approx(2.0)
     flight.uplink = True
     flight.restart_cloud()
     flight.step()
@@ -75,6 +75,41 @@ def test_since_when_goes_on_through_a_silence_and_a_new_session_and_not_into_ano
     flight.guard = HOLD
     flight.step()
     assert seen(flight)["guard_for_s"] == 0.0
+
+
+def test_a_robot_that_is_not_heard_is_not_shown_as_if_it_were_so_now():
+    flight, _ = flying()
+    flight.guard, flight.cause = HOLD, Cause.SILENCE
+    flight.step(seconds=0.5)
+    flight.uplink = False
+    flight.step(seconds=1.0)
+    assert seen(flight)["guard_for_s"] == pytest.approx(1.49)
+    flight.step(seconds=1.0)
+    shown = seen(flight)
+    assert shown["guard_for_s"] is None
+    assert (shown["guard"], shown["cause"]) == ("HOLD", "no fresh commands")
+    assert shown["age_s"] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("cloud", [True, False])
+def test_a_robot_that_is_silent_is_told_from_a_cloud_that_is(cloud):
+    flight, _ = flying()
+    flight.uplink = False
+    for _ in range(10):
+        flight.step(seconds=0.2)
+        if cloud:
+            flight.teleop.hear(flight.now_ns)
+    age = flight.teleop.state(flight.now_ns + 50_000_000)["cloud_age_s"]
+    assert age == pytest.approx(0.05 if cloud else 2.05)
+    assert seen(flight)["next_step"] == (NOT_HEARD if cloud else NO_CLOUD)
+
+
+def test_a_cloud_is_heard_before_the_robot_is_seen():
+    flight = ServiceFlight()
+    assert flight.teleop.state(0)["cloud_age_s"] is None
+    flight.teleop.hear(1_000_000_000)
+    assert flight.teleop.state(3_000_000_000)["cloud_age_s"] == 2.0
+    assert seen(flight) is None
 
 
 def test_nothing_is_shown_of_a_robot_that_has_not_been_seen():

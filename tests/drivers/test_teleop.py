@@ -20,15 +20,6 @@ def event(number):
     return MissionEvent(number, "reached", number, "there")
 
 
-@pytest.fixture
-def peers(tmp_path):
-    paths = tmp_path / "a.sock", tmp_path / "b.sock"
-    pair = UnixPeer(*paths), UnixPeer(*reversed(paths))
-    yield pair
-    for peer in pair:
-        peer.close()
-
-
 def test_a_full_socket_drops_and_never_blocks(peers):
     one, other = peers
     for number in range(5000):
@@ -129,6 +120,9 @@ class Machine:
 
     def __init__(self):
         self.outputs, self.seen, self.deadlines = [], [], 0
+
+    def hear(self, now_ns):
+        self.heard_ns = now_ns
 
     def see(self, seen, now_ns):
         self.seen.append(seen)

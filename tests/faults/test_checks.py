@@ -120,6 +120,14 @@ def never_freezes(name: str) -> Callable[[pytest.MonkeyPatch], None]:
     return lambda monkeypatch: monkeypatch.setattr(Mortal, "freeze", unfrozen)
 
 
+def never_says_that_cloud_lives(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cloudrc.drivers.teleop.ALIVE_NS", 1 << 60)
+
+
+def shows_the_past_as_present(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cloudrc.cloud.teleop.sight.SILENCE", 1e9)
+
+
 def says_nothing_of_the_wall_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     init = WallClock.__init__
     monkeypatch.setattr(WallClock, "__init__", lambda clock, say: init(clock))
@@ -155,6 +163,8 @@ def counts_no_more_than_1000_lost_records(monkeypatch: pytest.MonkeyPatch) -> No
 Broken = Callable[[pytest.MonkeyPatch], None]
 BROKEN: list[tuple[str, Broken, str]] = [
     ("F2", tells_no_cause, "each HOLD tells the age of its command"),
+    ("F2", never_says_that_cloud_lives, "3 s of silence: it says that cloud was heard before"),
+    ("F3", never_says_that_cloud_lives, "its next step is to look after the robot, not cloud"),
     ("F3", stops_its_rotors_above_the_ground, "descent"),
     ("F3", tells_no_cause, "LAND tells why"),
     ("F3", touches_something, "collisions"),
@@ -167,6 +177,8 @@ BROKEN: list[tuple[str, Broken, str]] = [
     ("F14", touches_something, "collisions"),
     ("F15", tells_no_cause, "each HOLD tells the age of its command"),
     ("F15", tells_no_cause, "each TRACK after it tells of fresh commands"),
+    ("F15", shows_the_past_as_present, "it shows the guard's state as past"),
+    ("F15", shows_the_past_as_present, "its next step is to look after cloud"),
     ("F18", catches_up_without_the_guard, "steps without the guard's tick"),
     ("F19", counts_the_tenth_failure_first, "metric dns_errors_total moves"),
     ("F19", forgets_the_peer, "no name is resolved for 30 s of flight: the same path"),

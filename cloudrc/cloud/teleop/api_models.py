@@ -150,7 +150,10 @@ class Seen(_Answer):
         description="State of the guard on board"
     )
     cause: str = Field(description="Why it is in it; of a robot that has landed, why it landed")
-    guard_for_s: float = Field(description="For how long it has been seen in this state [s]")
+    guard_for_s: float | None = Field(
+        description="For how long it has been seen in this state [s]; null once it has not been "
+        "heard for 1 s: state, cause and all else are those of then"
+    )
     next_step: str = Field(description="What comes next, or what the operator has to do for it")
     pipe_contacts: int = Field(description="How often a pipe has been touched so far")
     touch_speed_mps: float | None = Field(description="Of the tip at the board [m/s]")
@@ -164,6 +167,10 @@ class StateView(_Answer):
 
     mission: MissionSummary | None = Field(description="The one under way")
     queue: list[str] = Field(description="Ids of those that wait")
+    cloud_age_s: float | None = Field(
+        description="Since cloud was heard [s], which says at least every 0.2 s that it lives; "
+        "null if it never was"
+    )
     seen: Seen | None = Field(description="Null until the robot has been seen")
 
 

@@ -62,7 +62,7 @@ class MissionService:
         """
         self._contact_speed_max = contact_speed_max
         self._outputs: list[Output | Fault] = []
-        self._sight = Sight()
+        self.sight = Sight()
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
@@ -75,11 +75,6 @@ class MissionService:
     def over(self) -> bool:
         """Whether there was something to fly, all of it has ended, and the robot holds."""
         return bool(self.book.missions) and not self.book.open() and self._teleop.settled
-
-    @property
-    def seen(self) -> bool:
-        """Whether the robot has been in sight."""
-        return self._sight.seen is not None
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
         """Take an order; it is started at once or waits.
@@ -177,12 +172,16 @@ class MissionService:
         """Whether the robot is seen to have acted on the last request."""
         return self._teleop.settled
 
+    def hear(self, now_ns: int) -> None:
+        """Take note that cloud lives."""
+        self.sight.hear(now_ns)
+
     def see(self, seen: Seen, now_ns: int) -> None:
         """Take note of the newest telemetry."""
         mission = self._current
-        if not self.seen:
+        if self.sight.seen is None:
             self._stop.meet(seen)
-        anew = self._sight.see(seen, now_ns)
+        anew = self.sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
             self._watch(mission, seen, now_ns)
             if anew:
@@ -196,7 +195,8 @@ class MissionService:
         """Start what waits, keep the limits of time, repeat what has to be repeated."""
         self.book.catch_up(now_ns)
         if not self._ends:
-            self._take_up(now_ns, queued=self.seen and self.book.kept and not self._stopped)
+            in_sight = self.sight.seen is not None
+            self._take_up(now_ns, queued=in_sight and self.book.kept and not self._stopped)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
         if self._setpoint is not None and now_ns >= self._setpoint_ns:
@@ -214,7 +214,8 @@ class MissionService:
         return {
             "mission": mission.summary() if mission is not None else None,
             "queue": [waits.id for waits in self.book.open() if waits is not mission],
-            "seen": self._sight.show(now_ns, None if mission is None else mission.state),
+            "cloud_age_s": self.sight.cloud_age(now_ns),
+            "seen": self.sight.show(now_ns, None if mission is None else mission.state),
         }
 
     @property
@@ -222,7 +223,7 @@ class MissionService:
         """Why nothing can fly before the operator acknowledges it; "" if it can."""
         if self._stop.is_asked:
             return "an emergency stop is on its way to the robot"
-        return self._sight.latched
+        return self.sight.latched
 
     def _refuse_to_fly(self) -> None:
         if self._ends:  # the robot is asked to hold
@@ -280,7 +281,7 @@ class MissionService:
             self._outputs.append(Fault(now_ns, "journal", trouble))
 
     def _follow(self, event: MissionEvent, now_ns: int) -> None:
-        mission, seen = self._current, self._sight.seen
+        mission, seen = self._current, self.sight.seen
         assert mission is not None, "events are of missions only"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:

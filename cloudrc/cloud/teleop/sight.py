@@ -15,12 +15,11 @@ GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED = (LAND, ESTOP)
 """States of the guard that only the operator's acknowledgement leads out of."""
 SILENCE = 1.0
-"""Telemetry that is older tells no more how the robot is [s]."""
+"""Telemetry that is older tells no more how the robot is, nor a word of cloud that it lives [s]."""
 REST = "after a stop or a touch-down only once it has been still, 0.5 m inside the fence"
-NOT_HEARD = (
-    "the robot is not heard: look at the link and at world; without commands it holds where it "
-    "flies, then lands, by itself"
-)
+BY_ITSELF = "without commands the robot holds where it flies, then lands, by itself"
+NOT_HEARD = f"the robot is not heard, though cloud is: look at the link and at world; {BY_ITSELF}"
+NO_CLOUD = f"cloud is not heard, and so the robot is not: look at cloud's process; {BY_ITSELF}"
 ALONE = {
     GROUND: f"the robot waits for a mission; it takes off, {REST}",
     TRACK: "the robot is being told that its mission is over, and holds then",
@@ -50,6 +49,7 @@ class Sight:
     def __init__(self) -> None:
         self.seen: Seen | None = None
         self._seen_ns = self._guard_ns = 0
+        self._heard_ns: int | None = None
 
     @property
     def guard(self) -> GuardState:
@@ -64,6 +64,18 @@ class Sight:
             return ""
         return f"the guard is in {guard.name} ({self.seen.cause.words}) and lets nothing fly"
 
+    def hear(self, now_ns: int) -> None:
+        """Take note that cloud lives, whether it has telemetry or not [ns]."""
+        self._heard_ns = now_ns
+
+    def cloud_age(self, now_ns: int) -> float | None:
+        """Say how long cloud has not been heard [s]; None if it never was.
+
+        Args:
+            now_ns: Own clock [ns].
+        """
+        return None if self._heard_ns is None else (now_ns - self._heard_ns) * 1e-9
+
     def see(self, seen: Seen, now_ns: int) -> bool:
         """Take note of telemetry as it arrives [ns].
 
@@ -71,6 +83,7 @@ class Sight:
             Whether the same robot is seen in another session than before.
         """
         before, self.seen, self._seen_ns = self.seen, seen, now_ns
+        self.hear(now_ns)
         if before is None or before.world != seen.world:
             self._guard_ns = now_ns
             return False
@@ -85,8 +98,8 @@ class Sight:
             now_ns: Own clock [ns].
             mission: State of the one under way, in a word; None if there is none.
         """
-        seen, age = self.seen, (now_ns - self._seen_ns) * 1e-9
-        if seen is None:
+        seen, age, cloud_age = self.seen, (now_ns - self._seen_ns) * 1e-9, self.cloud_age(now_ns)
+        if seen is None or cloud_age is None:
             return None
         return {
             "age_s": age,
@@ -95,8 +108,8 @@ class Sight:
             "position_m": [_known(value) for value in seen.position],
             "guard": seen.guard.name,
             "cause": seen.cause.words,
-            "guard_for_s": (now_ns - self._guard_ns) * 1e-9,
-            "next_step": next_step(seen.guard, age, mission),
+            "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
+            "next_step": next_step(seen.guard, age, cloud_age, mission),
             "pipe_contacts": seen.pipe_contacts,
             "touch_speed_mps": _known(seen.touch_speed),
             "horizon_s": _known(seen.horizon),
@@ -105,16 +118,17 @@ class Sight:
         }
 
 
-def next_step(guard: GuardState, age: float, mission: str | None) -> str:
+def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
     """Say what comes next, or what the operator has to do for it.
 
     Args:
         guard: State of the guard.
         age: Of the telemetry that says so [s].
+        cloud_age: How long cloud has not been heard [s], which tells of telemetry.
         mission: State of the one under way, in a word; None if there is none.
     """
     if age > SILENCE:
-        return NOT_HEARD
+        return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
     if mission == "held" and guard is TRACK:
         return HELD
     return (ALONE if mission is None else IN_MISSION)[guard]
