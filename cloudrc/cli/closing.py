@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.output import paint, table
+from cloudrc.cli.output import harmless, paint, say, table
 
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
@@ -40,7 +40,7 @@ def show(report: Mapping[str, Any], folder: Path) -> None:
     if faults:
         print(paint(f"  faults noted in flight: {faults:.0f}, see the report", "yellow"))
     print()
-    print(folder / "report.html")
+    say(str(folder / "report.html"))
 
 
 def verdict(report: Mapping[str, Any]) -> str:
@@ -50,13 +50,14 @@ def verdict(report: Mapping[str, Any]) -> str:
     failures = report["failures"]
     if not failures:
         return f"{word}: every waypoint reached, every criterion met"
-    return "\n".join([f"{word}: {failures[0]['text']}", *(_line(f) for f in failures[1:])])
+    first, *others = failures
+    return "\n".join([f"{word}: {harmless(first['text'])}", *map(_line, others)])
 
 
 def _line(failure: Mapping[str, Any]) -> str:
     time = failure.get("time")
     when = f" (at {time:.2f} s)" if time is not None else ""
-    return f"  also: {failure['text']}{when}"
+    return harmless(f"  also: {failure['text']}{when}")
 
 
 def main_numbers(report: Mapping[str, Any]) -> str:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cli import faults_page as page
 from cloudrc.cli import faults_slices as slices
 from cloudrc.cli.faults_slices import sources
-from cloudrc.cli.output import paint, table, unread_is_fine, written
+from cloudrc.cli.output import paint, say, table, unread_is_fine, written
 from cloudrc.cli.signals import end_with
 from cloudrc.errors import BadInputError
 
@@ -181,7 +181,7 @@ def replay(options: argparse.Namespace) -> int:
         print(written(document, options.output))
     else:
         for breach in finding.breaches:
-            print(f"{breach.time:8.3f} s  {breach.kind}: {breach.text}")
+            say(f"{breach.time:8.3f} s  {breach.kind}: {breach.text}")
         print(f"{'FAILED' if breaches else 'passed'}  records {finding.sha256[:16]}")
     return FAILED if breaches else 0
 

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import Any
 
+from cloudrc.cli.output import harmless
+
 INVARIANTS = {
     "collision": "collisions",
     "fence": "fence breaches",
@@ -113,7 +115,8 @@ def markdown(document: dict[str, Any], written_by: str, slices: Sequence[Slice] 
     head, *lines = rows(document)
     kind = document["kind"]
     return "\n".join(
-        [
+        harmless(line)
+        for line in (
             f"# The search for faults: {kind} schedules",
             "",
             f"Written by `{written_by}`;",
@@ -135,5 +138,5 @@ def markdown(document: dict[str, Any], written_by: str, slices: Sequence[Slice] 
             f"Flown by cloudrc {document['version']}; SHA-256 of its sources: "
             f"`{document['sources'][:16]}`.",
             "",
-        ]
+        )
     )

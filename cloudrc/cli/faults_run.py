@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.faults_slices import sources
-from cloudrc.cli.output import paint, table, written
+from cloudrc.cli.output import harmless, paint, table, written
 from cloudrc.cli.signals import end_with
 
 if TYPE_CHECKING:
@@ -112,9 +112,9 @@ def _say(result: Result, briefly: bool, say: Callable[[str], object]) -> None:
     sha = f"  {outcome.sha256[:12]}" if outcome.sha256 else ""
     say(f"{word:8} {scenario.id:4} {scenario.name:26} {result.seconds:6.1f} s{sha}")
     for reason in filter(None, (result.error, outcome.skipped)):
-        say(f"           {reason}")
+        say(f"           {harmless(reason)}")
     shown: Iterable[str] = (
-        f"         {'' if check.passed else 'x '}{check.show()}"
+        f"         {'' if check.passed else 'x '}{harmless(check.show())}"
         for check in outcome.checks
         if not (briefly and check.passed)
     )

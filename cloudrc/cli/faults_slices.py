@@ -159,6 +159,8 @@ def _is_slice(told: Document) -> bool:
         and isinstance(told.get("failures"), list)
         and all(name in told for name in SAME)
         and told["kind"] in tuple(PROMISES)
+        and isinstance(told["version"], str)
+        and isinstance(told["sources"], str)
         and isinstance(judged, dict)
         and judged.keys() == INVARIANTS.keys()
         and all(

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from cloudrc.cli.output import say
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 _Found = TypeVar("_Found")
@@ -64,7 +65,7 @@ def find_here(
     if not others:
         return None
     ((run, found),) = others
-    print(f"cloudrc: the run that flies in {run}", file=sys.stderr, flush=True)
+    say(f"cloudrc: the run that flies in {run}", sys.stderr)
     return found
 
 

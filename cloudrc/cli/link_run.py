@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.ends import open_exporter, warn_if_exposed
+from cloudrc.cli.output import say
 from cloudrc.drivers.process import StopSignal
 from cloudrc.records import Counted
 
@@ -59,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
 
 def log(line: str) -> None:
     """Say one line to people."""
-    print(f"cloudrc link: {line}", file=sys.stderr, flush=True)
+    say(f"cloudrc link: {line}", sys.stderr)
 
 
 def loader(direction: str) -> Load:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.cluster_flags import place, place_arguments
 from cloudrc.cli.here import find_here, link_of, nobody_here, run_argument
-from cloudrc.cli.output import output_argument, written
+from cloudrc.cli.output import output_argument, say, written
 from cloudrc.cluster.errors import ClusterError
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
 
@@ -71,7 +71,7 @@ def execute(options: argparse.Namespace) -> int:
         took = monotonic() - began
         handed.keep()
     for note in edit.notes:
-        print(f"cloudrc: note: {note}", file=sys.stderr)
+        say(f"cloudrc: note: {note}", sys.stderr)
     if options.output != "table":
         print(written(_document(states, number, took), options.output))
     else:

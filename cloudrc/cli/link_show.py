@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
+from cloudrc.cli.output import harmless, say, table
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -73,11 +74,11 @@ def execute(options: argparse.Namespace) -> int:
     counted: dict[str, Numbers] = {}
     for name in ("uplink",) if _is_trace(options.profile) else WAYS:
         ways[name], counted[name] = _way(getattr(profile, name), name, options)
-    title = ": ".join(filter(None, (Path(options.profile).stem, profile.description)))
+    title = harmless(": ".join(filter(None, (Path(options.profile).stem, profile.description))))
     output.write_bytes(picture(title, ways["uplink"], ways.get("downlink"), output.suffix[1:]))
     print(title)
     print(_table(counted))
-    print(output)
+    say(str(output))
     return 0
 
 
@@ -151,8 +152,6 @@ def stream(
 
 
 def _table(counted: dict[str, Numbers]) -> str:
-    from cloudrc.cli.output import table
-
     both = list(counted.values())
 
     def row(name: str, unit: str, values: list[float], scale: float = 1.0) -> list[str]:

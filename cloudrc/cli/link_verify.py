@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import place, place_arguments
-from cloudrc.cli.output import output_argument, written
+from cloudrc.cli.output import harmless, output_argument, written
 from cloudrc.cli.signals import end_orderly
 from cloudrc.errors import BadInputError
 
@@ -164,4 +164,4 @@ def _here() -> Path:
 def _progress(line: str) -> None:
     """Say what is going on, on a terminal only, in place."""
     if sys.stderr.isatty():
-        print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+        print(f"\r\x1b[K{harmless(line)}", end="", file=sys.stderr, flush=True)

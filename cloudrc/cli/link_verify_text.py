@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import inf, isfinite, isnan
 from typing import Any
 
-from cloudrc.cli.output import paint, table
+from cloudrc.cli.output import harmless, paint, table
 from cloudrc.link.verify_causes import Cause, Findings
 from cloudrc.link.verify_judge import Row
 
@@ -79,16 +79,20 @@ def as_text(said: Said) -> str:
         rows += [_cells(row) for row in found.rows]
     lines = table(rows, right=[1, 2, 3, 4]).splitlines()
     verdicts = iter([row.verdict for found in said.findings.values() for row in found.rows])
-    painted, index = [f"{said.title}: {said.shaper}"], 0
+    painted, index = [harmless(f"{said.title}: {said.shaper}")], 0
     for way, found in said.findings.items():
-        painted += ["", paint(lines[index], "bold"), paint(f"  {said.probes[way]}", "dim")]
+        painted += [
+            "",
+            paint(lines[index], "bold"),
+            paint(harmless(f"  {said.probes[way]}"), "dim"),
+        ]
         for line in lines[index + 1 : index + 1 + len(found.rows)]:
             verdict = next(verdicts)
             cut = line.rindex(verdict)
             painted.append(line[:cut] + paint(verdict, COLOURS[verdict]))
         index += 1 + len(found.rows)
-    painted += ["", *said.notes] if said.notes else [""]
-    painted += [f"  {cause.way}: {cause.text}  [{cause.code}]" for cause in said.causes]
+    painted += ["", *map(harmless, said.notes)] if said.notes else [""]
+    painted += [harmless(f"  {cause.way}: {cause.text}  [{cause.code}]") for cause in said.causes]
     return "\n".join([*painted, _last_line(said)])
 
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import TextIO
 
-from cloudrc.cli.output import columns, is_live, paint, unread_is_fine
+from cloudrc.cli.output import columns, harmless, is_live, paint, unread_is_fine
 from cloudrc.drivers.feed import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import (
@@ -120,6 +120,7 @@ class FlightView:
 
     def _event(self, text: str) -> None:
         """Write a line that stays; where it fits also where and how late that was."""
+        text = harmless(text)
         width = columns(self._stream) if self._live else FILE_COLUMNS
         lines = [_joined((f"  {text:<44}", self._place(), late)) for late in (self._late(), "")]
         fitting = [line for line in lines if len(line) <= width]

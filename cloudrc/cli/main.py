@@ -6,7 +6,7 @@ import errno
 import sys
 from collections.abc import Sequence
 
-from cloudrc.cli.output import silence
+from cloudrc.cli.output import harmless, silence
 from cloudrc.cli.parser import COMMANDS, build, unknown
 from cloudrc.errors import BadInputError, CloudrcError
 
@@ -47,7 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if "--debug" in given:
             raise
         message, code = _explain(error)
-        print(f"cloudrc: error: {message}", file=sys.stderr)
+        # Names in it may be foreign. Lines of ours behind the first begin with two blanks.
+        shown = "\n  ".join(map(harmless, message.split("\n  ")))
+        print(f"cloudrc: error: {shown}", file=sys.stderr)
         return code
 
 

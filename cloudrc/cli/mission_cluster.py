@@ -15,7 +15,7 @@ from cloudrc.cli.here import nobody_here
 from cloudrc.cli.mission_check import check_on, parse
 from cloudrc.cli.mission_http import Api
 from cloudrc.cli.mission_local import read_mission
-from cloudrc.cli.output import harmless, table, written
+from cloudrc.cli.output import say, table, written
 from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
@@ -50,17 +50,17 @@ def _run(options: argparse.Namespace) -> int:
     require_release(release)
     limit = check_on(release, options.mission, request)
     # An install that was not waited for is a matter of seconds: the link is up last.
-    wait_ready(release, timeout=options.timeout, tell=_write)
+    wait_ready(release, timeout=options.timeout, tell=say)
     job = run_job(release, mission, limit=limit, queue=options.queue)
     print(f"Job {job.name} in namespace '{release.namespace}'", flush=True)
     try:
-        ended = follow(release, job.name, _write, timeout=patience(limit, options.queue))
+        ended = follow(release, job.name, say, timeout=patience(limit, options.queue))
     except KeyboardInterrupt:
         end = f"cloudrc mission cancel {job.name} {' '.join(release.cloudrc_flags)}"
         print(f"Job {job.name} flies on; end it: {end}", file=sys.stderr)
         raise
     if ended.exit_code is None:
-        _write(ended.message)
+        say(ended.message)
     return 1 if ended.exit_code is None else ended.exit_code
 
 
@@ -104,7 +104,7 @@ def _cancel(options: argparse.Namespace) -> int:
     from cloudrc.cluster.cancel import cancel
 
     path = token_file(options)
-    _write(cancel(release, options.id, reader(path)() if path else None))
+    say(cancel(release, options.id, reader(path)() if path else None))
     return 0
 
 
@@ -120,10 +120,10 @@ def _logs(options: argparse.Namespace) -> int:
             raise BadInputError(f"no missions {release.where}")
         job = jobs[-1].name
     if options.follow:
-        follow(release, job, _write, timeout=86_400.0)
+        follow(release, job, say, timeout=86_400.0)
         return 0
     for line in logs(release, job):
-        _write(line)
+        say(line)
     return 0
 
 
@@ -145,14 +145,9 @@ def _place(options: argparse.Namespace) -> Release:
 
 
 def _row(job: JobStatus) -> tuple[str, ...]:
-    return job.name, job.state, job.created, harmless(job.message)
+    return job.name, job.state, job.created, job.message
 
 
 def _print(jobs: list[dict[str, object]], form: str) -> int:
     print(written({"schemaVersion": 1, "jobs": jobs}, form))
     return 0
-
-
-def _write(line: str) -> None:
-    """Print a line with words from a pod."""
-    print(harmless(line), flush=True)

@@ -11,7 +11,7 @@ from typing import Any
 
 from cloudrc.cli.mission_follow import Follower, in_words, leave_message
 from cloudrc.cli.mission_http import Api, path_of
-from cloudrc.cli.output import harmless, table, written
+from cloudrc.cli.output import harmless, say, table, written
 from cloudrc.cli.signals import end_orderly
 from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, CloudrcError
@@ -42,7 +42,7 @@ def fly(options: argparse.Namespace) -> int:
         raise BadInputError("fly needs --api; to fly by hand: cloudrc mission run FILE")
     end_orderly()
     api = Api(options.api, reader(token_file(options)))
-    follower, found = Follower(api, _write), ""
+    follower, found = Follower(api, say), ""
     try:
         mission = read_mission(options.mission)
         order = {**mission, "key": options.key, "queue": options.queue}
@@ -65,15 +65,14 @@ def _run(options: argparse.Namespace, api: Api) -> int:
     mission = read_mission(options.mission)
     if options.name:
         mission["name"] = options.name
-    follower = Follower(api, _write, patience=10.0)
+    follower = Follower(api, say, patience=10.0)
     mission_id = follower.post({**mission, "queue": options.queue})["id"]
     try:
         verdict = follower.follow(mission_id)
     except KeyboardInterrupt:
-        flies_on = f"mission {harmless(mission_id)} flies on; end it: cloudrc mission cancel"
-        print(flies_on, file=sys.stderr)
+        say(f"mission {mission_id} flies on; end it: cloudrc mission cancel", sys.stderr)
         raise
-    _write(in_words(verdict))
+    say(in_words(verdict))
     return int(verdict["exit_code"])
 
 
@@ -92,8 +91,7 @@ def _list(options: argparse.Namespace, api: Api) -> int:
 def _row(mission: dict[str, Any]) -> tuple[str, ...]:
     done = f"{len(mission['reached'])}/{mission['waypoints']}"
     verdict = in_words(mission["verdict"]) if mission["verdict"] else ""
-    row = mission["id"], mission["name"], mission["state"], done, verdict
-    return tuple(map(harmless, row))
+    return mission["id"], mission["name"], mission["state"], done, verdict
 
 
 def _status(options: argparse.Namespace, api: Api) -> int:
@@ -112,7 +110,7 @@ def _status(options: argparse.Namespace, api: Api) -> int:
     else:
         print("no mission is under way")
     if state["queue"]:
-        _write(f"waiting: {', '.join(state['queue'])}")
+        say(f"waiting: {', '.join(state['queue'])}")
     _say_seen(state["seen"], state["cloud_age_s"])
     return 0
 
@@ -163,7 +161,7 @@ def _estop(options: argparse.Namespace, api: Api) -> int:
     mission = api.post("/v1/estop")["id"]
     print("emergency stop: the robot is told to stop its rotors until it has", flush=True)
     if mission:
-        _write(f"mission {mission} has failed")
+        say(f"mission {mission} has failed")
     return 0
 
 
@@ -196,7 +194,7 @@ def _say(mission: dict[str, Any]) -> None:
     where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
     name = f" ({mission['name']})" if mission["name"] else ""
     verdict = f"; {in_words(mission['verdict'])}" if mission["verdict"] else ""
-    _write(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
+    say(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
 
 
 def _say_seen(seen: dict[str, Any] | None, cloud_age: float | None) -> None:
@@ -213,18 +211,18 @@ def _say_seen(seen: dict[str, Any] | None, cloud_age: float | None) -> None:
     where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
     if seen["guard_for_s"] is None:
         then = f"robot not heard for {seen['age_s']:.1f} s (guard {seen['guard']} then)"
-        _write(f"{then}; cloud heard {heard}")
-        _write(f"last seen at ({where}) m: {seen['cause']}")
+        say(f"{then}; cloud heard {heard}")
+        say(f"last seen at ({where}) m: {seen['cause']}")
     else:
         rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
-        _write(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
-        _write(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
-    _write(f"next: {seen['next_step']}")
+        say(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
+        say(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
+    say(f"next: {seen['next_step']}")
 
 
 def _print_events(events: list[dict[str, Any]]) -> None:
     for event in events:
-        _write(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}")
+        say(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}")
 
 
 def _print(document: dict[str, Any], form: str) -> int:
@@ -232,11 +230,6 @@ def _print(document: dict[str, Any], form: str) -> int:
     return 0
 
 
-def _write(line: str) -> None:
-    """Print a line with words from the API, which may be anybody's."""
-    print(harmless(line), flush=True)
-
-
 def _end(text: str) -> None:
-    _write(text)
+    say(text)
     leave_message(harmless(text))

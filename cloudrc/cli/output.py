@@ -76,12 +76,13 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     """Align rows in columns.
 
     Args:
-        rows: Cells, as text; all rows of one length.
+        rows: Cells, as text, whoever wrote it; all rows of one length.
         right: Indices of the columns that are aligned to the right: numbers.
 
     Returns:
         Lines without trailing blanks, joined by newlines.
     """
+    rows = [[harmless(cell) for cell in row] for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = []
     for row in rows:
@@ -96,6 +97,11 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
 def harmless(text: str) -> str:
     """Write foreign words so that they stay in their line and a terminal does nothing but show."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def say(line: str, stream: TextIO | None = None) -> None:
+    """Print a line that has foreign words in it, and at once (default: on stdout)."""
+    print(harmless(line), file=stream, flush=True)
 
 
 def number(value: float) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import output_argument, written
+from cloudrc.cli.output import output_argument, say, written
 from cloudrc.cli.parser import read_from
 from cloudrc.errors import BadInputError
 
@@ -63,7 +63,7 @@ def _show(recovery: Recovery, target: Path) -> None:
     kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)
     print(f"kept {recovery.share:.1%}: {kept or 'nothing'}")
     for note in recovery.notes:
-        print(f"lossy: {note}")
+        say(f"lossy: {note}")
     if recovery.complete and recovery.index_is_new:
         print("its index was missing or damaged and has been written anew; nothing is lost")
-    print(target)
+    say(str(target))

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.link_run import loader
+from cloudrc.cli.output import say
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.route import publish
 from cloudrc.link.sidecar_follow import PROFILE_PERIOD, Loaded, ProfileFile
@@ -173,4 +174,4 @@ class RelayControl:
 
 
 def _log(line: str) -> None:
-    print(f"cloudrc relay: {line}", file=sys.stderr, flush=True)
+    say(f"cloudrc relay: {line}", sys.stderr)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.cli.cluster_flags import place, place_arguments, timeout_argument
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import is_live, output_argument, unread_is_fine, written
+from cloudrc.cli.output import is_live, output_argument, say, unread_is_fine, written
 from cloudrc.cli.parser import count
 from cloudrc.cli.signals import end_orderly
 from cloudrc.errors import BadInputError, CloudrcError
@@ -115,16 +115,15 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
     waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
     if not for_programs:
         with unread_is_fine(stream):
-            print(
+            say(
                 f"{name}: mode {mode}, seed {experiment.seed}, link {experiment.link.profile},"
-                f" {waypoints} waypoint{'s' if waypoints != 1 else ''}",
-                flush=True,
+                f" {waypoints} waypoint{'s' if waypoints != 1 else ''}"
             )
     try:
         report = flight(folder, stream, waypoints)
     except (CloudrcError, KeyboardInterrupt):
         if not (late and discard(folder)):
-            print(f"what was recorded is in {folder}", file=sys.stderr)
+            say(f"what was recorded is in {folder}", sys.stderr)
         raise
     finally:
         if late and options.out is None and folder.exists():
@@ -169,7 +168,7 @@ def _in_cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> 
 
     def flight(folder: Path, stream: TextIO, waypoints: int) -> dict[str, Any]:
         def tell(text: str) -> None:
-            print(f"  {text}", file=stream, flush=True)
+            say(f"  {text}", stream)
 
         return fly_in_cluster(experiment, folder, release, options.timeout, tell)
 

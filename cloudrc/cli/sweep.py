@@ -16,7 +16,7 @@ from typing import Any
 
 from cloudrc.cli.closing import EXIT_CODES
 from cloudrc.cli.folder import new_folder
-from cloudrc.cli.output import unread_is_fine, written
+from cloudrc.cli.output import say, unread_is_fine, written
 from cloudrc.cli.signals import end_with
 from cloudrc.cli.statistics import as_csv, as_table, summarise
 
@@ -62,8 +62,7 @@ def _tell(options: argparse.Namespace, report: dict[str, Any], count: str) -> No
     if options.output == "table" or stream.isatty():
         failures = "".join(f": {f['text']}" for f in report["failures"][:1])
         with unread_is_fine(stream):
-            line = f"{count:>7}  seed {report['seed']}  {report['verdict']}{failures}"
-            print(line, file=stream, flush=True)
+            say(f"{count:>7}  seed {report['seed']}  {report['verdict']}{failures}", stream)
 
 
 def _reports(

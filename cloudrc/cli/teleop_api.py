@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.ends import Address, address, warn_if_exposed
+from cloudrc.cli.output import say
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -100,7 +101,7 @@ def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> Se
 
 def complain(text: str) -> None:
     """Write a line into the process's log; from any thread."""
-    print(f"cloudrc teleop: {text}", file=sys.stderr, flush=True)
+    say(f"cloudrc teleop: {text}", sys.stderr)
 
 
 def api_address(text: str) -> Address | Path:

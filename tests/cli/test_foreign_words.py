@@ -1,0 +1,141 @@
+"""Whatever a foreign file says or is called, a terminal shows it and does nothing else."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from cloudrc.cli import closing
+from cloudrc.cli.faults_page import INVARIANTS
+from cloudrc.cli.faults_slices import document, keep
+from cloudrc.cli.link_verify_text import Said, as_text
+from cloudrc.cli.live import FlightView
+from cloudrc.cli.main import main
+from cloudrc.cli.output import say, table
+from cloudrc.link.verify_causes import Cause, Evidence, Findings
+from cloudrc.link.verify_judge import Row
+from cloudrc.record.writer import MISSING, McapWriter
+from cloudrc.records import Fault
+from tests.record.samples import world_records
+
+EVIL = "x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
+SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
+
+Printed = pytest.CaptureFixture[str]
+Printing = Callable[[], str]
+
+pytestmark = pytest.mark.promise("P-CODE-3")
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def printed(capsys: Printed) -> Printing:
+    """What was printed, once it is known to hold the words, and nothing that a terminal obeys."""
+
+    def check() -> str:
+        out, err = capsys.readouterr()
+        assert_harmless(out + err)
+        return out + err
+
+    return check
+
+
+def assert_harmless(text: str) -> None:
+    assert SHOWN in text
+    assert [c for c in text if not c.isprintable() and c != "\n"] == []
+    assert [line for line in text.splitlines() if line.startswith("cloudrc: all")] == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["run"], ["report"], ["recover"], ["link", "show"], ["link", "verify"], ["faults", "run"]],
+)
+def test_a_name_in_an_error(words: list[str], printed: Printing) -> None:
+    assert main([*words, EVIL]) != 0
+    (line,) = printed().splitlines()
+    assert line.startswith("cloudrc: error: ")
+
+
+def test_names_in_an_error_of_several_lines(here: Path, printed: Printing) -> None:
+    (here / "a.yaml").write_text(yaml.safe_dump({EVIL: 1, "seed": EVIL}))
+    assert main(["run", "./a.yaml"]) == 2
+    head, *lines = printed().splitlines()
+    assert head.endswith("a.yaml has 2 problems:")
+    assert [line.startswith("  ./a.yaml:") for line in lines] == [True, True]
+
+
+def test_what_a_recording_says_that_it_lacks(here: Path, printed: Printing) -> None:
+    with McapWriter(here / "a.mcap", clock="world") as writer:
+        writer.write(world_records(5))
+        writer.note({MISSING: EVIL})
+    assert main(["recover", "a.mcap"]) == 1
+    assert f"lossy: {SHOWN}\n" in printed()
+
+
+def test_the_description_of_a_profile(here: Path, printed: Printing) -> None:
+    (here / "a.yaml").write_text(yaml.safe_dump({"description": EVIL, "uplink": {"delay_ms": 1}}))
+    assert main(["link", "show", "./a.yaml", "--packets", "10", "-o", "a.svg"]) == 0
+    assert printed().startswith(f"a: {SHOWN}\n")
+
+
+def test_why_a_run_has_failed(printed: Printing) -> None:
+    failures = [{"code": "x", "text": EVIL}] * 2
+    report = {"verdict": "failure", "failures": failures, "numbers": {}}
+    closing.show(report, Path(EVIL))
+    assert printed().count(SHOWN) == 3
+
+
+def test_what_happens_in_a_flight() -> None:
+    stream = io.StringIO()
+    FlightView(stream, 1).see([Fault(0, "bad", EVIL)])
+    assert_harmless(stream.getvalue())
+
+
+def found(version: str) -> dict[str, Any]:
+    what = {"kind": "random", "first": 1, "seconds": 1.0, "sources": "ab"}
+    flight = {
+        **{"judged": INVARIANTS, "kinds": (), "margin": 0.1, "speed": 1.0, "holds": 0},
+        **{"missions": 1, "fallen": 0.0, "thrown": 0.0, "landed_on": False, "duration": 60.0},
+    }
+    return document([flight], [], **what) | {"version": version}
+
+
+def test_a_page_and_an_error_of_a_search(here: Path, printed: Printing) -> None:
+    keep(found("1"), here / "a.json")
+    keep(found(EVIL) | {"first": 2}, here / "b.json")
+    assert main(["faults", "merge", "a.json", "b.json"]) == 2
+    assert printed().count("\n") == 1
+    assert main(["faults", "merge", "b.json", "--document", "page.md"]) == 0
+    assert_harmless((here / "page.md").read_text())
+
+
+def test_a_slice_without_words_where_words_belong(here: Path, capsys: Printed) -> None:
+    keep(found("1") | {"sources": 3}, here / "a.json")
+    assert main(["faults", "merge", "a.json", "--document", "page.md"]) == 2
+    assert "a.json: is no slice" in capsys.readouterr().err
+
+
+def test_what_a_link_container_tells_of_itself() -> None:
+    cause = Cause("wrong_interface", "uplink", EVIL)
+    row = Row("mean", "s", 0.1, 0.1, 0.1, 0.1, 0.1, "ok")
+    ways, probes = {"uplink": Findings([row], Evidence("relay"))}, {"uplink": EVIL}
+    text = as_text(Said(EVIL, EVIL, ways, probes, [EVIL], [cause]))
+    assert_harmless(text)
+    assert text.count(SHOWN) == 5
+
+
+def test_a_cell_of_a_table_and_a_line(printed: Printing) -> None:
+    print(table([["name", "value"], [EVIL, "1"]]))
+    assert printed().count("\n") == 2
+    say(EVIL)
+    assert printed() == f"{SHOWN}\n"
