@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 from math import dist, hypot, inf, nan
 from typing import Any
@@ -12,7 +13,14 @@ from cloudrc.faults.meters import reading
 from cloudrc.faults.scenario import Outcome
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import CommandApplied, GuardChange, SessionOpened, TelemetrySent
+from cloudrc.records import (
+    CommandApplied,
+    Fault,
+    GuardChange,
+    Record,
+    SessionOpened,
+    TelemetrySent,
+)
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 
@@ -93,6 +101,11 @@ def landing_told(outcome: Outcome, flight: Flight) -> None:
     seen = flight.desk.service.state(flight.run.now_ns)["seen"]
     right = (seen["guard"], seen["cause"]) == ("LAND", Cause.ALONE.words)
     outcome.true(f"the status says so, too: LAND, {Cause.ALONE.words}", right)
+
+
+def told(records: Iterable[Record], code: str) -> list[Fault]:
+    """Find what an end has told under a code."""
+    return [each for each in records if isinstance(each, Fault) and each.code == code]
 
 
 def look(flight: Flight, at: float) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 from math import hypot, nan
 
@@ -11,7 +12,7 @@ from cloudrc.faults.flight import Flight
 from cloudrc.faults.held import AGE_MAX
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.messages import GuardState
-from cloudrc.records import CommandApplied, Fault, GroundTruth
+from cloudrc.records import CommandApplied, Fault, GroundTruth, Lateness
 
 
 def _cloud_killed(seed: int) -> Outcome:
@@ -98,13 +99,9 @@ def _throttled(seed: int) -> Outcome:
         missed = flight.count("missed_periods", "cloud")
         outcome.least(f"{what}: missed periods counted", missed, 100)
         meters.moves(outcome, flight, "cloud", "loop_lateness_seconds", since=at)
-        told = [r.stamp_ns * 1e-9 - at for r in _late(flight)]
+        told = [r.stamp_ns * 1e-9 - at for r in asks.told(flight.of_cloud, "late")]
         outcome.most(f"{what}: it says that it is late after", min(told, default=nan), 2.0, "s")
     return outcome
-
-
-def _late(flight: Flight) -> list[Fault]:
-    return [r for r in flight.of_cloud if isinstance(r, Fault) and r.code == "late"]
 
 
 def _world_restarted(seed: int) -> Outcome:
@@ -147,6 +144,7 @@ def _world_overloaded(seed: int) -> Outcome:
     seen = meters.seen_by(flight, "world", at + meters.SOON)
     factor = meters.reading("world", seen, "real_time_factor")
     outcome.most("metric real_time_factor", factor, 0.95)
+    _slow_told(outcome, flight, at)
     outcome.true("mission done", flight.mission.state == "done")
     return outcome
 
@@ -165,7 +163,34 @@ def _world_paused(seed: int) -> Outcome:
     outcome.least("slip told", slip, 0.1, "s")
     meters.moves(outcome, flight, "world", "world_slip_seconds_total", since=at)
     meters.moves(outcome, flight, "world", "loop_lateness_seconds", since=at)
+    _slow_told(outcome, flight, at)
     return outcome
+
+
+def _slow_told(outcome: Outcome, flight: Flight, at: float) -> None:
+    """Check that world has said once, and soon after an instant [s], how slow it was."""
+    told = asks.told(flight.of_world, "late")
+    outcome.same("faults told: late", len(told), 1)
+    after = min((fault.stamp_ns * 1e-9 - at for fault in told), default=nan)
+    outcome.least("not before it happens: after", after, 0.0, "s")
+    outcome.most("by world's clock within", after, 2.0, "s")
+    wrong = max((abs(_told_factor(f) - _factor(flight, f.stamp_ns)) for f in told), default=nan)
+    outcome.most("the real-time factor that it tells is wrong by", wrong, 0.05)
+
+
+def _told_factor(fault: Fault) -> float:
+    told = re.match(r"real-time factor (\d\.\d\d) over ", fault.text)
+    return float(told[1]) if told else nan
+
+
+def _factor(flight: Flight, stamp_ns: int) -> float:
+    """Real-time factor of the second before an instant [ns, world's clock], by world's wakes."""
+    wakes = [r for r in flight.of_world if isinstance(r, Lateness)]
+    ends_ns = (stamp_ns - 1_000_000_000, stamp_ns)
+    before_ns, slip_ns = (
+        max((r.slip_ns for r in wakes if r.stamp_ns <= end_ns), default=0) for end_ns in ends_ns
+    )
+    return 1.0 / (1.0 + (slip_ns - before_ns) * 1e-9)
 
 
 def _gapless(path: list[GroundTruth]) -> bool:
@@ -227,7 +252,8 @@ SCENARIOS = (
         "the world gets less CPU than real time needs, for 10 s",
         "simulated time slows, no guard tick is skipped",
         "none",
-        "cloudrc_world_slip_seconds_total, cloudrc_real_time_factor",
+        "fault 'late' in world: real-time factor 0.72 ...; cloudrc_world_slip_seconds_total, "
+        "cloudrc_real_time_factor",
         _world_overloaded,
     ),
     Scenario(
@@ -236,7 +262,7 @@ SCENARIOS = (
         "the world process stands still for 200 ms",
         "it catches up in simulated time, no command is applied twice",
         "none",
-        "cloudrc_world_slip_seconds_total, cloudrc_loop_lateness_seconds",
+        "fault 'late' in world; cloudrc_world_slip_seconds_total, cloudrc_loop_lateness_seconds",
         _world_paused,
     ),
 )

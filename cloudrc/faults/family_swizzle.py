@@ -72,6 +72,8 @@ def _chain(outcome: Outcome, flight: Flight, spans: dict[str, Span]) -> None:
         ("world", "guard_transitions_total", "hold"),
     ):
         meters.moves(outcome, flight, role, *metric, since=since, over=over)
+    for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
+        outcome.least(f"times that {end} tells: late", len(asks.told(records, "late")), 1)
     restarted = [entry for entry in flight.desk.entries if entry.get("event") == "restarted"]
     outcome.least("the journal tells: restarted", len(restarted), 1)
 
@@ -84,6 +86,7 @@ SCENARIOS = (
         "always a safe state; the mission goes on",
         "as above",
         "guard HOLD with its cause, cloudrc_guard_transitions_total; of each that was frozen: "
+        "fault 'late' of both ends, "
         "cloudrc_datagrams_lost_total both ways, cloudrc_loop_missed_periods_total, "
         "cloudrc_world_slip_seconds_total, mission restarted",
         _swizzle,

@@ -38,6 +38,7 @@ from cloudrc.tunnel.unsealed import make_session
 from cloudrc.world.clock import CATCH_UP_NS, SimulationClock
 from cloudrc.world.identity import WorldIdentity as WorldIdentity
 from cloudrc.world.orders import Orders
+from cloudrc.world.pace import Pace
 from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 
@@ -73,7 +74,7 @@ class WorldEndpoint:
             start_ns: The monotonic clock now [ns].
         """
         self.robot, self._sensors, self._identity = robot, sensors, identity
-        self._clock = SimulationClock(start_ns)
+        self._clock, self._pace = SimulationClock(start_ns), Pace()
         self._session = make_session(Direction.UPLINK, identity.ring, start_ns)
         self._door = Door(self._session, identity, age_max_ns=command_age_max_ns)
         self._channel = Channel(newest_wins)
@@ -213,6 +214,7 @@ class WorldEndpoint:
             self._counts["held_seconds"] += guard.armed and guard.state is HOLD
             for name, count in sorted((self._counts | guard.counts).items()):
                 records.append(Counted(now_ns, "world", name, count))
+            records += self._pace.look(now_ns, self._clock.slip_ns)
         self._odometry_ns += ODOMETRY_PERIOD_NS
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:

@@ -120,6 +120,10 @@ def never_freezes(name: str) -> Callable[[pytest.MonkeyPatch], None]:
     return lambda monkeypatch: monkeypatch.setattr(Mortal, "freeze", unfrozen)
 
 
+def keeps_up_by_its_own_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cloudrc.world.pace.REAL_TIME_FACTOR_MIN", 0.0)
+
+
 def never_says_that_cloud_lives(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cloudrc.drivers.teleop.ALIVE_NS", 1 << 60)
 
@@ -180,6 +184,7 @@ BROKEN: list[tuple[str, Broken, str]] = [
     ("F15", shows_the_past_as_present, "it shows the guard's state as past"),
     ("F15", shows_the_past_as_present, "its next step is to look after cloud"),
     ("F18", catches_up_without_the_guard, "steps without the guard's tick"),
+    ("F18", keeps_up_by_its_own_word, "faults told: late"),
     ("F19", counts_the_tenth_failure_first, "metric dns_errors_total moves"),
     ("F19", forgets_the_peer, "no name is resolved for 30 s of flight: the same path"),
     ("F24", never_complains, "it is told once: peer speaks v"),
@@ -198,9 +203,11 @@ BROKEN: list[tuple[str, Broken, str]] = [
     ("F38", never_complains, "wrong key: cloud tells once"),
     ("F38", takes_a_missing_file_for_a_new_key, "gone in flight: the keys stay"),
     ("F39", catches_up_without_the_guard, "steps without the guard's tick"),
+    ("F39", keeps_up_by_its_own_word, "the real-time factor that it tells"),
     ("F40", tells_no_cause, "each HOLD tells the age of its command"),
     ("F40", never_freezes("cloud"), "metric loop_missed_periods_total moves"),
     ("F40", never_freezes("world"), "metric world_slip_seconds_total moves"),
+    ("F40", keeps_up_by_its_own_word, "times that world tells: late"),
 ]
 QUICK = ("F15", "F25", "F33", "F40")
 
