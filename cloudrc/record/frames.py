@@ -26,8 +26,8 @@ except ImportError as error:
 
 RECORD_MAX = 64 << 20
 """Longest record that is read [bytes]."""
-CHUNK_MAX = 64 << 20
-"""Longest chunk after decompression [bytes]; writers close theirs after some MB."""
+CHUNK_MAX = 16 << 20
+"""Longest chunk after decompression [bytes]; ours are closed after 1 MiB, those of others 4."""
 DEFINITION_MAX = 1 << 20
 """Longest schema or channel [bytes]: the parts of one become many objects."""
 HEAD = struct.Struct("<BQ")

@@ -7,12 +7,14 @@ what is damaged is left out (`cloudrc/record/scan.py`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
+from typing import IO
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, in_one_line
 from cloudrc.record.packages import missing
 from cloudrc.record.ros_types import is_known
-from cloudrc.record.scan import Scan
+from cloudrc.record.scan import Scan, TooMuchError
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import MISSING
 
@@ -49,20 +51,21 @@ def read_contents(path: Path) -> Contents:
         All messages of whole chunks.
 
     Raises:
-        BadInputError: If nothing in it can be read.
+        BadInputError: If nothing in it can be read, or it unpacks to more than recordings do.
     """
-    reading = _Reading()
     try:
         with path.open("rb") as stream:
-            scan = Scan(stream)
-            for record in scan.definitions():
-                reading.take(record)
-            for record in scan.records():
-                reading.take(record)
+            reading = _Reading()
+            scan = reading.pass_over(stream)
+            if reading.came_late:
+                reading = _Reading(reading)
+                scan = reading.pass_over(stream)
     except OSError as error:
         raise BadInputError(
             f"{path}: cannot be read ({error.strerror}); name a recording (.mcap)"
         ) from error
+    except TooMuchError as error:
+        raise BadInputError(f"{path}: {error}") from error
     contents = reading.finish(scan)
     if not scan.ended and not contents.messages:
         reason = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"
@@ -73,19 +76,37 @@ def read_contents(path: Path) -> Contents:
 
 
 class _Reading:
-    """Takes MCAP records in, one after the other, and gathers what they hold."""
+    """Takes MCAP records in, one after the other, and gathers what they hold.
 
-    def __init__(self) -> None:
+    Attributes:
+        contents: What was gathered.
+        came_late: Whether a channel was defined behind messages of its own: those are left out, and
+            read by a second pass that knows the channels of the first.
+    """
+
+    def __init__(self, before: _Reading | None = None) -> None:
         self.contents = Contents()
+        self.came_late = False
         self._foreign: set[str] = set()
         self._types: dict[int, tuple[str, str]] = {}
-        self._topics: dict[int, str] = {}
-        self._messages: list[Message] = []
+        self._topics: dict[int, str] = dict(before._topics) if before else {}
+        self._homeless: set[int] = set()
+
+    def pass_over(self, stream: IO[bytes]) -> Scan:
+        """Take all of a file in."""
+        scan = Scan(stream)
+        for record in chain(scan.definitions(), scan.records()):
+            self.take(record)
+        return scan
 
     def take(self, record: McapRecord) -> None:
         contents = self.contents
         if isinstance(record, Message):
-            self._messages.append(record)
+            topic = self._topics.get(record.channel_id)
+            if topic is None:
+                self._homeless.add(record.channel_id)
+            else:
+                contents.messages.append((topic, record.log_time, record.data))
         elif isinstance(record, Schema):
             self._types[record.id] = record.name, record.data.decode("utf-8", "replace")
         elif isinstance(record, Channel):
@@ -101,19 +122,14 @@ class _Reading:
         known = topic is not None and topic.ros_type == ros_type and is_known(ros_type, text)
         if known:
             self._topics[channel.id] = channel.topic
+            self.came_late |= channel.id in self._homeless
         else:
+            self._topics.pop(channel.id, None)
             self._foreign.add(channel.topic)
 
     def finish(self, scan: Scan) -> Contents:
         """Add the note to what was gathered."""
-        # Only now, since a channel may be defined after a damaged chunk.
-        topics = self._topics
-        self.contents.messages = messages = [
-            (topics[message.channel_id], message.log_time, message.data)
-            for message in self._messages
-            if message.channel_id in topics
-        ]
-        notes = []
+        messages, notes = self.contents.messages, []
         if not scan.ended:
             until = messages[-1][1] * 1e-9 if messages else 0.0
             notes.append(
@@ -127,8 +143,8 @@ class _Reading:
         if scan.checked is False and not scan.dropped:
             notes.append("a byte outside the chunks is wrong")
         if self._foreign:
-            names = ", ".join(sorted(self._foreign))
+            names = in_one_line(", ".join(sorted(self._foreign)))
             notes.append(f"topics of another layout were left out: {names}")
-        notes.append(self.contents.metadata.get(MISSING, ""))
+        notes.append(in_one_line(self.contents.metadata.get(MISSING, "")))
         self.contents.note = "; ".join(filter(None, notes))
         return self.contents

@@ -16,7 +16,7 @@ from typing import IO, Any
 from cloudrc import __version__
 from cloudrc.errors import BadInputError
 from cloudrc.record.packages import missing
-from cloudrc.record.scan import Scan
+from cloudrc.record.scan import Scan, TooMuchError
 from cloudrc.record.sectors import SECTOR, Sectors
 from cloudrc.record.writer import METADATA, MISSING
 
@@ -89,8 +89,11 @@ def recover(source: Path, target: Path) -> Recovery:
     with stream, _in_one_step(target) as new:
         scan = Scan(stream)
         copy = _Copy(new, scan)
-        for record in scan.records():
-            copy.take(record)
+        try:
+            for record in scan.records():
+                copy.take(record)
+        except TooMuchError as error:
+            raise BadInputError(f"{source}: {error}") from error
         recovery = copy.finish(len(stream.bad))
         if not any(recovery.kept.values()) and not recovery.complete:
             what = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"

@@ -6,6 +6,8 @@ for each field; the others are ROS's own. rosbags parses, encodes and hashes the
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 from cloudrc.record.packages import missing
 from cloudrc.record.schema import Kind
 from cloudrc.record.topics import TOPICS
@@ -38,6 +40,8 @@ def _own_definition(ros_type: str) -> str:
 
 _OWN = {t.ros_type: _own_definition(t.ros_type) for t in TOPICS.values() if _OURS in t.ros_type}
 
+TEXT_MAX = 1 << 16
+"""Longest definition that is compared [characters]; ours and ROS's own have some thousand."""
 STORE = get_typestore(Stores.ROS2_JAZZY)
 """Rosbags' types, ours among them."""
 for _name, _text in _OWN.items():
@@ -80,6 +84,7 @@ def type_hash(ros_type: str) -> str:
     return _HASHES[ros_type]
 
 
+@lru_cache(maxsize=256)
 def is_known(ros_type: str, text: str) -> bool:
     """Tell whether a definition found in a file has the layout that `decode` expects.
 
@@ -89,6 +94,8 @@ def is_known(ros_type: str, text: str) -> bool:
     """
     if text == definition(ros_type):
         return True
+    if len(text) > TEXT_MAX:  # its parser takes its time
+        return False
     try:
         found = get_types_from_msg(text, ros_type)
     except Exception:  # rosbags' parser of a foreign text: whatever it raises, it is not ours

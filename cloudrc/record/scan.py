@@ -39,6 +39,13 @@ NAMES: dict[int, str] = {
     Opcode.METADATA: "metadata",
     Opcode.MESSAGE: "messages",
 }
+ROOM_MIN, ROOM_SHARE = 16 << 20, 64
+"""So much is unpacked of any file [bytes], and so many times the size of a longer one [1].
+
+A writer's index alone takes 16 bytes of the file for each message, of which the longest has 750.
+"""
+RECORD_COST = 128
+"""Taken for each record beside its bytes: in memory it is an object [bytes]."""
 OF_THE_END = (DataEnd, Footer, Statistics)
 """Kinds that have no place in the data."""
 DATA_END_SIZE = 4
@@ -59,6 +66,10 @@ class Summary:
     start: int
     definitions: list[McapRecord] = field(default_factory=list)
     messages: int | None = None
+
+
+class TooMuchError(ValueError):
+    """A file that unpacks to more than any recording does."""
 
 
 class Scan:
@@ -90,6 +101,7 @@ class Scan:
         self.checked: bool | None = None
         self.chunks = 0
         self.summary = self._read_summary()
+        self._room = max(ROOM_MIN, ROOM_SHARE * self.size)
         self._crc = 0
         self._broken = self._lost_chunk = False
 
@@ -98,7 +110,11 @@ class Scan:
         return self.summary.definitions if self.summary else []
 
     def records(self) -> Iterator[McapRecord]:
-        """Give every whole record of the data, those in chunks included, in their order."""
+        """Give every whole record of the data, those in chunks included, in their order.
+
+        Raises:
+            TooMuchError: If it is made to fill the memory.
+        """
         stream, at = self._stream, len(MAGIC)
         stream.seek(0)
         magic = stream.read(at)
@@ -134,7 +150,10 @@ class Scan:
                 inside = unpack(record)
                 self._lost_chunk = False
                 self.chunks += 1
-                yield from inside
+                self._take_room(record.uncompressed_size)
+                for each in inside:
+                    self._take_room(RECORD_COST)
+                    yield each
                 return
         except DamagedError:
             self._note(opcode)
@@ -146,6 +165,14 @@ class Scan:
             self._note(opcode)
         elif record is not None:
             yield record
+
+    def _take_room(self, size: int) -> None:
+        self._room -= size
+        if self._room < 0:
+            raise TooMuchError(
+                f"its {self.size} bytes unpack to more than those of any recording; it is made to "
+                "fill the memory, use another one"
+            )
 
     def _end(self, payload: bytes) -> None:
         self.ended = True

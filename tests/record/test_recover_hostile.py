@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
 import tracemalloc
 from pathlib import Path
@@ -13,8 +14,14 @@ from mcap.opcode import Opcode
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.frames import DEFINITION_MAX, MAGIC
+from cloudrc.record.reader import read_contents
 from cloudrc.record.recover import recover
-from cloudrc.record.scan import Scan
+from cloudrc.record.ros_types import definition
+from cloudrc.record.scan import RECORD_COST, ROOM_SHARE, Scan
+from cloudrc.record.topics import TOPICS
+from cloudrc.record.writer import McapWriter
+from cloudrc.records import TelemetrySent
+from tests.record.samples import world_records
 from tests.record.test_recover_told import record, text
 
 
@@ -49,6 +56,73 @@ def test_of_a_chunk_of_many_messages_one_is_held_at_a_time() -> None:
     finally:
         tracemalloc.stop()
     assert peak < 3 * unpacked
+
+
+def defined(topic: str = "/telemetry") -> bytes:
+    """A topic of ours, as its own writer defines it."""
+    name = TOPICS[topic].ros_type
+    schema = struct.pack("<H", 1) + text(name.encode()) + text(b"ros2msg")
+    schema += text(definition(name).encode())
+    values = struct.pack("<HH", 1, 1) + text(topic.encode()) + text(b"cdr") + text(b"")
+    return record(Opcode.SCHEMA, schema) + record(Opcode.CHANNEL, values)
+
+
+@pytest.mark.promise("P-RECORD-4")
+@pytest.mark.parametrize("size", [0, 1 << 20])
+def test_a_file_that_unpacks_to_more_than_a_recording_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
+    """Its chunks are as a writer's own, its topics known; there are many, of few bytes each."""
+    monkeypatch.setattr("cloudrc.record.scan.ROOM_MIN", room := 3 << 20)
+    one = record(Opcode.MESSAGE, struct.pack("<H", 1) + bytes(20 + size))
+    path, new = tmp_path / "w.mcap", tmp_path / "new.mcap"
+    path.write_bytes(file(chunk(defined()), *[chunk(one * ((1 << 20) // len(one) + 1))] * 9))
+    assert path.stat().st_size * ROOM_SHARE < room
+    reason = f"w.mcap: its {path.stat().st_size} bytes unpack to more than those of any recording"
+    tracemalloc.start()
+    try:
+        with pytest.raises(BadInputError, match=reason) as caught:
+            read_contents(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 5 * room
+    assert "\n" not in str(caught.value)
+    with pytest.raises(BadInputError, match=reason):
+        recover(path, new)
+    assert os.listdir(tmp_path) == ["w.mcap"]
+
+
+@pytest.mark.promise("P-RECORD-4")
+def test_messages_of_topics_that_nobody_asked_for_are_not_kept(tmp_path: Path) -> None:
+    path = tmp_path / "w.mcap"
+    path.write_bytes(file(chunk(defined(), message(1)), chunk(channel(2), message(2) * 20_000)))
+    tracemalloc.start()
+    try:
+        assert [message[0] for message in read_contents(path).messages] == ["/telemetry"]
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 4 * 20_000 * len(message(2))
+
+
+def test_a_topic_that_is_defined_behind_its_messages_is_read(tmp_path: Path) -> None:
+    """As behind a chunk that is damaged."""
+    path = tmp_path / "w.mcap"
+    path.write_bytes(file(chunk(message(1) * 3), chunk(defined(), message(1))))
+    assert len(read_contents(path).messages) == 4
+
+
+def test_an_idle_recording_is_far_from_what_is_too_much(tmp_path: Path) -> None:
+    """Where nothing changes but the time it is packed as tightly as it gets."""
+    (telemetry,) = [r for r in world_records(1) if isinstance(r, TelemetrySent)]
+    path = tmp_path / "idle.mcap"
+    with McapWriter(path, clock="world") as writer:
+        for number in range(8_000):
+            writer.write([telemetry._replace(stamp_ns=10_000_000 * number)])
+    room = path.stat().st_size * ROOM_SHARE
+    taken = sum(len(data) + 31 + RECORD_COST for *_, data in read_contents(path).messages)
+    assert 2 * taken < room
 
 
 def test_of_a_chunk_that_ends_in_nonsense_nothing_is_kept(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.frames import HEAD, MAGIC
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
-from cloudrc.record.writer import McapWriter
+from cloudrc.record.writer import MISSING, McapWriter
 from tests.record.samples import MS, open_mcap, world_records, write
 
 
@@ -115,6 +115,17 @@ def test_of_messages_none_of_which_is_kept_nothing_is(tmp_path: Path) -> None:
     path.write_bytes(MAGIC + record(12, text(b"a") + text(b"")) + messages)
     recovery = recover(path, tmp_path / "new.mcap")
     assert (recovery.share, recovery.dropped) == (0.0, {"messages": 9})
+
+
+def test_what_a_recording_says_does_not_steer_a_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run.mcap"
+    with McapWriter(path, clock="world") as writer:
+        writer.write(world_records(5))
+        writer.note({MISSING: "\x1b[2J all"})
+    assert main(["recover", str(path)]) == 1
+    assert "lossy: \\x1b[2J all\n" in capsys.readouterr().out
 
 
 def hostile(count: int, *, schemas: bool) -> bytes:
