@@ -41,12 +41,15 @@ class ProbeServer(socketserver.ThreadingTCPServer):
     """Serves pages until it is closed.
 
     Not `http.server.HTTPServer`, which asks the name service for its own name, and may wait for it.
+    A flood of connections fills the queue of those that wait to be taken, and behind a full one the
+    kernel drops kubelet's, too: tried again after 1 s, perhaps in vain, its probe fails after 2 s or
+    5 s, though nothing is wrong. So the queue is as long as that of the API.
     """
 
     allow_reuse_address = True
     daemon_threads = True
     block_on_close = False
-    request_queue_size = 64
+    request_queue_size = 1_024
 
     def __init__(self, address: tuple[str, int], pages: Pages) -> None:
         """Bind and begin to answer.
