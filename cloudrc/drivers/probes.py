@@ -42,7 +42,7 @@ class ProbeServer(socketserver.ThreadingTCPServer):
 
     Not `http.server.HTTPServer`, which asks the name service for its own name, and may wait for it.
     A flood of connections fills the queue of those that wait to be taken, and behind a full one the
-    kernel drops kubelet's, too: tried again after 1 s, perhaps in vain, its probe fails after 2 s or
+    kernel drops kubelet's, too: tried again after 1 s, perhaps in vain, its probe fails after 2 or
     5 s, though nothing is wrong. So the queue is as long as that of the API.
     """
 
