@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -75,7 +76,9 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
         help="the tunnel's pre-shared key; followed while it flies ('cloudrc key new FILE')",
     )
     target = parser.add_mutually_exclusive_group(required=True)
-    target.add_argument("--peer", type=address, metavar="HOST:PORT", help="where to send")
+    target.add_argument(
+        "--peer", type=address, metavar="HOST:PORT", help="where to send; a name is resolved once"
+    )
     target.add_argument(
         "--route",
         type=Path,
@@ -91,6 +94,31 @@ def address(text: str) -> Address:
     if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
         raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT")
     return host, int(port)
+
+
+def resolve(name: str) -> list[str]:
+    """Give the IPv4 addresses of a name; raises an OSError if there is none."""
+    try:
+        found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_DGRAM)
+    except UnicodeError as error:  # a label that is empty or too long
+        raise OSError(f"not a name: {error}") from error
+    return [str(entry[4][0]) for entry in found]
+
+
+def resolved(flag: str, where: Address) -> Address:
+    """Give an address in numbers, once and before the loop: that cannot wait for a name server.
+
+    Raises:
+        BadInputError: If its host cannot be resolved; names the flag.
+    """
+    host, port = where
+    try:
+        return resolve(host)[0], port
+    except OSError as error:
+        raise BadInputError(
+            f"{flag} {host}:{port}: {host} cannot be resolved ({error.strerror or error}); name a"
+            " host that has an IPv4 address, or the address itself"
+        ) from error
 
 
 def size(text: str) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import random
-import socket
 import sys
 import threading
 import time
@@ -14,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.ends import open_exporter, warn_if_exposed
+from cloudrc.cli.ends import open_exporter, resolve, warn_if_exposed
 from cloudrc.cli.output import say
 from cloudrc.drivers.process import StopSignal
 from cloudrc.records import Counted
@@ -75,15 +74,6 @@ def loader(direction: str) -> Load:
         return Loaded(link_profile(getattr(profile, direction)), values)
 
     return load
-
-
-def resolve(name: str) -> list[str]:
-    """Give the IPv4 addresses of a name; raises an OSError if there is none."""
-    try:
-        found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_DGRAM)
-    except UnicodeError as error:  # a label that is empty or too long
-        raise OSError(f"not a name: {error}") from error
-    return [str(entry[4][0]) for entry in found]
 
 
 def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> Machine:

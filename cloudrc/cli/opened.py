@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from cloudrc.cli.ends import listening, open_exporter, warn_if_exposed
+from cloudrc.cli.ends import listening, open_exporter, resolved, warn_if_exposed
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
@@ -120,12 +120,11 @@ def _open_peer(options: argparse.Namespace) -> Peer:
     from cloudrc.drivers.route import Route
 
     warn_if_exposed(options.listen)
+    where = resolved("--peer", options.peer) if options.route is None else Route(options.route)
+    if options.route is not None and not options.route.exists():
+        print(f"cloudrc: nothing is sent until there is {options.route}", file=sys.stderr)
     with listening("--listen", options.listen):
-        if options.route is None:
-            return Peer.bind(options.listen, options.peer)
-        if not options.route.exists():
-            print(f"cloudrc: nothing is sent until there is {options.route}", file=sys.stderr)
-        return Peer.bind(options.listen, Route(options.route))
+        return Peer.bind(options.listen, where)
 
 
 def _open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:

@@ -15,6 +15,7 @@ from cloudrc.cli.ends import (
     listening,
     open_exporter,
     process_arguments,
+    resolved,
     warn_if_exposed,
 )
 
@@ -29,8 +30,8 @@ WAYS = ("uplink", "downlink")
 ADDRESSES = {
     "--world-side": "where to receive from world",
     "--cloud-side": "where to receive from cloud",
-    "--world": "where world receives",
-    "--cloud": "where cloud receives",
+    "--world": "where world receives; a name is resolved once",
+    "--cloud": "where cloud receives; likewise",
 }
 
 
@@ -65,6 +66,7 @@ def execute(options: argparse.Namespace) -> int:
     stop, exporter = StopSignal(), open_exporter(options, "link")
     experiment = read_experiment(str(options.config))
     uplink, downlink = assembly.build_links(experiment)
+    world, cloud = resolved("--world", options.world), resolved("--cloud", options.cloud)
     settle()
     if options.fifo:  # before the relay is made, which looks whether it has it
         _run_first()
@@ -74,8 +76,8 @@ def execute(options: argparse.Namespace) -> int:
         peek,
         world_side=_side("--world-side", options.world_side),
         cloud_side=_side("--cloud-side", options.cloud_side),
-        world_peer=options.world,
-        cloud_peer=options.cloud,
+        world_peer=world,
+        cloud_peer=cloud,
     )
     ask: Callable[[], bool] = stop
     if options.link:

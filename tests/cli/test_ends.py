@@ -13,9 +13,11 @@ from typing import Any
 import pytest
 
 from cloudrc import assembly
-from cloudrc.cli.ends import open_exporter, size
+from cloudrc.cli.ends import open_exporter, resolved, size
 from cloudrc.cli.main import main
+from cloudrc.cli.opened import _open_peer
 from cloudrc.config.shipped import FOLDERS
+from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent
 
 CONFIG = ["--config", str(FOLDERS["experiment"] / "hover.yaml")]
@@ -73,6 +75,64 @@ def test_an_address_in_use_is_named_with_its_flag(
     said = capsys.readouterr().err
     assert said.startswith(f"cloudrc: error: {flag} {taken}: cannot receive there: Address already")
     assert said.endswith("; name an address of this machine and a port that is free\n")
+
+
+def no_such_name(*asked: object) -> None:
+    raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+
+@pytest.mark.parametrize(
+    ("command", "flag", "others"),
+    [
+        ("world", "--peer", ["--listen", FREE, "--key", "KEY"]),
+        ("cloud", "--peer", ["--listen", FREE, "--key", "KEY"]),
+        ("relay", "--world", ["--world-side", FREE, "--cloud-side", FREE, "--cloud", FREE]),
+        ("relay", "--cloud", ["--world-side", FREE, "--cloud-side", FREE, "--world", FREE]),
+    ],
+)
+def test_a_name_that_cannot_be_resolved_is_said_at_the_start(
+    command: str,
+    flag: str,
+    others: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "key").write_bytes(bytes(32))
+    (tmp_path / "key").chmod(0o600)
+    others = [str(tmp_path / "key") if word == "KEY" else word for word in others]
+    look_up = socket.getaddrinfo
+    monkeypatch.setattr(
+        socket, "getaddrinfo", lambda *a: no_such_name() if a[0] == "nowhere" else look_up(*a)
+    )
+    assert main([command, *CONFIG, flag, "nowhere:7400", *others]) == 2
+    assert capsys.readouterr().err == (
+        f"cloudrc: error: {flag} nowhere:7400: nowhere cannot be resolved (Name or service not"
+        " known); name a host that has an IPv4 address, or the address itself\n"
+    )
+
+
+def test_a_label_that_is_too_long_is_no_name() -> None:
+    with pytest.raises(BadInputError, match=r"cannot be resolved \(not a name"):
+        resolved("--peer", ("x" * 64 + ".test", 1))
+
+
+def test_the_name_of_a_peer_is_asked_for_once_and_never_by_the_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With every datagram a name server was asked, and the control loop waited for it."""
+    asked: list[object] = []
+
+    def look_up(name: str, *rest: object) -> list[tuple[Any, ...]]:
+        asked.append(name)
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.9", 0))]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "getaddrinfo", look_up)
+        options = argparse.Namespace(listen=("127.0.0.1", 0), peer=("cloud", 7400), route=None)
+        peer = _open_peer(options)
+    with peer.socket:
+        assert (peer.address, asked) == (("127.0.0.9", 7400), ["cloud"])
 
 
 # Here too a socket outlives the command.
