@@ -23,7 +23,7 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
-from cloudrc.link.trace import read_table, read_trace
+from cloudrc.link.trace import SIZE_MAX, read_table, read_trace
 from cloudrc.messages import Start
 
 if TYPE_CHECKING:
@@ -153,12 +153,12 @@ def mission_plan(
     return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
 
-def link_profile(direction: schema.Direction, file_max: int | None = None) -> DirectionProfile:
+def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
     """Convert one direction of the link to SI, its trace read in.
 
     Args:
         direction: As in a profile's file.
-        file_max: Longest trace or table that is read [bytes]; None: any.
+        file_max: Longest trace or table that is read [bytes].
 
     Raises:
         BadInputError: If one cannot be read.
@@ -183,7 +183,7 @@ def link_profile(direction: schema.Direction, file_max: int | None = None) -> Di
     )
 
 
-def _table(direction: schema.Direction, file_max: int | None) -> tuple[float, ...]:
+def _table(direction: schema.Direction, file_max: int) -> tuple[float, ...]:
     if direction.distribution != "table" or direction.table is None:
         return ()
     return read_table(Path(direction.table), file_max)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+from io import BufferedReader, FileIO
 from pathlib import Path
 
 SIZE_MAX = 1 << 20
@@ -40,16 +41,28 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
         ValueError: If it is no file, as a pipe is none.
         TooLongError: If it is longer than that.
     """
-    with open(path, "rb", opener=_at_once) as file:
+    with BufferedReader(open_file(path)) as file:
         status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise ValueError(f"{path}: not a file")
         # As much memory is asked for at once: no more than there is to read, and room to grow.
         long = status.st_size > size_max
         data = b"" if long else file.read(min(size_max, status.st_size + SIZE_MAX) + 1)
     if long or len(data) > size_max:
         raise TooLongError(f"{path}: longer than {size_max} bytes")
     return data
+
+
+def open_file(path: Path) -> FileIO:
+    """Open a file that somebody else has written, without waiting for anybody; it has no buffer.
+
+    Raises:
+        OSError: If it cannot be opened.
+        ValueError: If it is no file, as a pipe is none.
+    """
+    file = FileIO(path, opener=_at_once)
+    if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        return file
+    file.close()
+    raise ValueError(f"{path}: not a file")
 
 
 def _at_once(path: str, flags: int) -> int:

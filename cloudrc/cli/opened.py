@@ -183,6 +183,7 @@ def _standing_check(
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
     from cloudrc.drivers.standing_check import StandingCheck
+    from cloudrc.link.trace import SIZE_MAX
     from cloudrc.link.verify_twin import Stream
     from cloudrc.tunnel.codec import SIZES, Kind
 
@@ -191,7 +192,7 @@ def _standing_check(
         return link_profile(profile.uplink, file_max), link_profile(profile.downlink, file_max)
 
     # Where the route is followed the link is a container, which may be anybody's by now.
-    file_max = TRACE_MAX if options.link is None else None
+    file_max = TRACE_MAX if options.link is None else SIZE_MAX
     asked = link_profile(experiment.uplink), link_profile(experiment.downlink)
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     stream = Stream(experiment.seed, uplink, kind, SIZES[kind])

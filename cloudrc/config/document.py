@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from cloudrc import files
 from cloudrc.config import yaml_text
 from cloudrc.config.schema import MAX_WAYPOINTS
 from cloudrc.errors import BadInputError
 
+SIZE_MAX = 8 << 20
+"""Longest file that is read [bytes]: as many waypoints as may be, spelled out, are a quarter."""
 SETTING = "--set"
 """Label of what was set over a file."""
 
@@ -25,6 +29,10 @@ class Source:
 
     label: str
     folder: Path
+
+    def absolute(self, path: str) -> Path:
+        """Say which file is meant by a path that stands there; of no home or loop nothing comes."""
+        return Path(os.path.realpath(self.folder / os.path.expanduser(path)))
 
 
 @dataclass(slots=True)
@@ -96,11 +104,14 @@ def read(path: Path, name: str) -> Document:
         BadInputError: If it cannot be read, is not such YAML, or is absurdly large.
     """
     try:
-        text = path.read_text("utf-8")
+        text = files.read(path, SIZE_MAX).decode("utf-8")
     except OSError as error:
         raise BadInputError(f"{name}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise BadInputError(f"{name}: is not UTF-8 text") from error
+    except ValueError as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        raise BadInputError(f"{name}: cannot be read: {reason}; name a file of YAML") from error
     # Counted in the text: to parse and check a hundred thousand points takes half a minute.
     points = text.count("position_m")
     if points > MAX_WAYPOINTS:

@@ -173,7 +173,7 @@ def _inline_profile(document: Document) -> list[Problem]:
     except BadInputError as error:
         return [Problem(("link", "profile"), "", str(error))]
     if shipped.is_path(name):
-        document.graft(("link", "profile"), str((source.folder / name).resolve()), source)
+        document.graft(("link", "profile"), str(source.absolute(name)), source)
     for key in _DIRECTIONS:
         if isinstance(given[key], dict | None):
             _lay_under(document, ("link", key), file, key)
@@ -236,7 +236,7 @@ def _resolve_traces(document: Document, above: yaml_text.Path) -> list[Problem]:
         if not isinstance(given, str):
             continue
         source = document.source(path)
-        absolute = (source.folder / Path(given).expanduser()).resolve()
+        absolute = source.absolute(given)
         document.graft(path, str(absolute), source)
         try:
             FILES[path[-1]](absolute)

@@ -93,7 +93,7 @@ def _choices(document: Document) -> Iterator[tuple[str, str, dict[str, Any]]]:
             continue
         name = str(given["name"])
         if plugins.is_path(name):
-            name = str((document.source((*path, "name")).folder / name).resolve())
+            name = str(document.source((*path, "name")).absolute(name))
         yield key, name, {key: value for key, value in given.items() if key != "name"}
 
 

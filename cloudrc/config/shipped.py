@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from pathlib import Path
 
 from cloudrc.config import document
@@ -44,8 +45,8 @@ def read(kind: str, name: str, folder: Path) -> Document:
         BadInputError: If there is no such file, or it cannot be read.
     """
     if is_path(name):
-        path = folder / Path(name).expanduser()
-        if not path.exists():
+        path = folder / os.path.expanduser(name)
+        if not os.path.exists(path):  # which says no to a name that no file can have
             raise BadInputError(f"no such file: {path}; {_shipped_instead(kind, path.stem)}")
         return document.read(path, name)
     check_name(kind, name)

@@ -31,6 +31,8 @@ _SCALARS = (
 
 _MAX_DEPTH = 50
 _MAX_VALUES = 300_000
+_MAX_EVENTS = 3 * _MAX_VALUES
+"""Of a value: the ends of a list or mapping, or itself; and its key."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -70,7 +72,7 @@ def parse(text: str, name: str) -> tuple[Any, dict[Path, int]]:
     """
     try:
         loader = _Loader(text)
-        _check_depth(text)
+        _check_bounds(text)
         lines: dict[Path, int] = {}
         return _value(loader, loader.get_single_node(), (), lines, ()), lines
     except yaml.MarkedYAMLError as error:
@@ -90,10 +92,12 @@ def write(value: Any) -> str:
     )  # fmt: skip
 
 
-def _check_depth(text: str) -> None:
-    """Refuse what would overflow the stack of libyaml's composer, which is recursive."""
+def _check_bounds(text: str) -> None:
+    """Refuse what would overflow the stack of libyaml's composer, which is recursive, or memory."""
     depth = 0
-    for event in yaml.parse(text, Loader=_Loader):
+    for count, event in enumerate(yaml.parse(text, Loader=_Loader)):
+        if count > _MAX_EVENTS:
+            raise _refuse(event, f"more than {_MAX_VALUES} values")
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > _MAX_DEPTH:
@@ -123,6 +127,8 @@ def _value(
     value = loader.construct_object(node)
     if value is not None and not isinstance(value, bool | int | float | str):
         raise _refuse(node, f"{node.tag} is not a plain value")
+    if isinstance(value, str) and "\0" in value:
+        raise _refuse(node, "a text with the character NUL, which no path can have")
     return value
 
 

@@ -16,18 +16,20 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import read
 from cloudrc.link.profile import Trace
 
+SIZE_MAX = 64 << 20
+"""Longest file that is read [bytes]: half a day at 100 packets a second."""
 _TIME = "time_s"
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _OPTIONAL = "loss"
 _HEADER = "the header is time_s,delay_ms[,loss]"
 
 
-def read_trace(path: Path, size_max: int | None = None) -> Trace:
+def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
     """Read a trace from a CSV file.
 
     Args:
         path: The file.
-        size_max: Longest that is read [bytes], if somebody has named it who is not trusted.
+        size_max: Longest that is read [bytes].
 
     Returns:
         Times [s], delays [s] and, if there is such a column, losses in [0, 1].
@@ -43,19 +45,18 @@ def read_trace(path: Path, size_max: int | None = None) -> Trace:
         raise BadInputError(f"trace {path}: {error}; give a CSV file") from None
 
 
-def read_lines(path: Path, name: str, remedy: str, size_max: int | None = None) -> list[str]:
+def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:
     """Read the lines of a text file, or raise a BadInputError that says what to give instead."""
     try:
-        data = path.read_bytes() if size_max is None else read(path, size_max)
-        return data.decode("utf-8-sig").splitlines()
+        return read(path, size_max).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         reason = "it is not a text file in UTF-8"
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
+        reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
     raise BadInputError(f"{name}: {reason}; {remedy}")
 
 
-def read_table(path: Path, size_max: int | None = None) -> tuple[float, ...]:
+def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
     """Read the distribution of a trace's delays, whenever they were; lost packets have none.
 
     Args:

@@ -7,11 +7,13 @@ what is damaged is left out (`cloudrc/record/scan.py`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from io import BufferedReader
 from itertools import chain
 from pathlib import Path
 from typing import IO
 
 from cloudrc.errors import BadInputError, in_one_line
+from cloudrc.files import open_file
 from cloudrc.record.packages import missing
 from cloudrc.record.ros_types import is_known
 from cloudrc.record.scan import Scan, TooMuchError
@@ -54,7 +56,7 @@ def read_contents(path: Path) -> Contents:
         BadInputError: If nothing in it can be read, or it unpacks to more than recordings do.
     """
     try:
-        with path.open("rb") as stream:
+        with BufferedReader(open_file(path)) as stream:
             reading = _Reading()
             scan = reading.pass_over(stream)
             if reading.came_late:
@@ -66,6 +68,8 @@ def read_contents(path: Path) -> Contents:
         ) from error
     except TooMuchError as error:
         raise BadInputError(f"{path}: {error}") from error
+    except ValueError as error:
+        raise BadInputError(f"{error}; name a recording (.mcap)") from error
     contents = reading.finish(scan)
     if not scan.ended and not contents.messages:
         reason = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+from pydantic import BaseModel
 
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.files import read
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import METRIC_NOTE, Flight, Number, measure_all
 from cloudrc.record.columns import Recording
@@ -21,6 +23,9 @@ from cloudrc.report.document import (
     write_json,
 )
 from cloudrc.report.verdict import Verdict, judge
+
+BEFORE_MAX = 16 << 20
+"""Longest report.json that is read [bytes]; notes may be many."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,16 @@ class Assessment:
     verdict: Verdict
     notes: tuple[str, ...]
     document: dict[str, Any]
+
+
+class _Before(BaseModel):
+    """What is taken over from a report that was written before, whoever wrote it."""
+
+    mode: Literal["virtual", "local", "cluster"]
+    shaper: str
+    records_sha256: str | None = None
+    verdict: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def assess(recording: Recording, experiment: ResolvedExperiment, run: Run) -> Assessment:
@@ -154,15 +169,15 @@ def _read_recording(folder: Path) -> Recording:
 def _read_run(folder: Path, recording: Recording) -> Run:
     """Learn what the recording does not say from the report that was written before, if any."""
     try:
-        before = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-        run = Run(str(before["mode"]), str(before["shaper"]), before.get("records_sha256"))
-    except (OSError, ValueError, KeyError, TypeError):
+        before = _Before.model_validate_json(read(folder / "report.json", BEFORE_MAX))
+    except (OSError, ValueError):
         # Only in real time do the drivers note how late they are.
         real_time = len(recording["/lateness"]) > 0
         return Run("local", "relay") if real_time else Run("virtual", "virtual")
     # What metrics had to say they say again, unless they have been mended since.
-    notes = tuple(n for n in before.get("notes", ()) if not n.startswith(METRIC_NOTE))
-    return replace(run, interrupted=before.get("verdict") == "interrupted", notes=notes)
+    notes = tuple(note for note in before.notes if not note.startswith(METRIC_NOTE))
+    interrupted = before.verdict == "interrupted"
+    return Run(before.mode, before.shaper, before.records_sha256, interrupted, notes)
 
 
 def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any]) -> None:
