@@ -270,6 +270,24 @@ def test_nothing_but_http_gets_an_answer(idle):
     assert idle.send(upgrade)[0] == 200
 
 
+@pytest.mark.promise("P-API-6")
+def test_the_audit_log_names_whoever_connects_and_not_whom_they_name():
+    """uvicorn would believe anybody on this machine that he is a proxy."""
+    named = {"X-Forwarded-For": "203.0.113.7", "X-Forwarded-Proto": "https"}
+    with running() as api:
+        assert api.send(api.request("/v1/hold", b"", headers=named, method="POST"))[0] == 409
+        (line,) = api.audited()
+        assert line["client"].rpartition(":")[0] == "127.0.0.1"
+
+
+def test_no_web_socket_is_opened(idle):
+    """uvicorn would open one if a library for that is installed; the gate knows HTTP alone."""
+    names = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+    key = {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="}
+    assert idle.send(idle.request("/v1/state", headers=names | key))[0] == 200
+    assert idle.server._server.config.ws_protocol_class is None
+
+
 def test_a_proxy_is_never_asked(monkeypatch):
     monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
     with running() as api:

@@ -106,6 +106,18 @@ def test_what_somebody_else_could_have_written_is_not_read(
         assert list(flights.under_way()) == [tmp_path]
 
 
+def test_what_belongs_to_somebody_else_is_neither_read_nor_written_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with flights.announced(tmp_path / "a"):
+        assert list(flights.under_way()) == [tmp_path / "a"]
+        monkeypatch.setattr(os, "getuid", lambda: os.stat(tmp_path).st_uid + 1)
+        assert flights.under_way() == {}
+        (tmp_path / "state" / "cloudrc" / "flights").mkdir(parents=True, mode=0o700)
+        with flights.announced(tmp_path / "b") as told:
+            assert not told
+
+
 def test_where_nothing_can_be_written_it_flies_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

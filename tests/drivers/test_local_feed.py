@@ -1,12 +1,15 @@
-"""What the supervisor of a local run makes of the lines that its processes write."""
+"""The supervisor of a local run: what its processes write, and the key that it makes for them."""
 
 from __future__ import annotations
 
 import os
 import selectors
+import stat
 import subprocess
 from pathlib import Path
 from typing import cast
+
+import pytest
 
 from cloudrc.drivers.feed import to_line
 from cloudrc.drivers.local import Child, LocalRun
@@ -30,3 +33,23 @@ def test_a_line_that_is_no_record_is_said_once_and_ends_no_flight(tmp_path: Path
     run._selector.close()
     os.close(reader)
     os.close(writer)
+
+
+def test_the_key_of_a_run_is_for_its_user_alone_and_goes_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[Path, int, int]] = []
+
+    def look(run: LocalRun, *_: object) -> None:
+        key = run._key
+        seen.append((key, key.stat().st_mode, key.parent.stat().st_mode))
+
+    monkeypatch.setattr(LocalRun, "_fly", look)
+    before = os.umask(0)  # of a user who shares everything
+    try:
+        LocalRun(tmp_path, lambda records: None).fly(1.0)
+    finally:
+        os.umask(before)
+    ((key, mode, folder),) = seen
+    assert (stat.S_IMODE(mode), stat.S_IMODE(folder)) == (0o600, 0o700)
+    assert not key.exists()

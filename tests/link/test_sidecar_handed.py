@@ -13,6 +13,7 @@ from cloudrc.link.route import publish
 from cloudrc.link.sidecar_follow import ProfileFile
 from cloudrc.link.sidecar_handed import (
     HANDED_FILE,
+    SIZE_MAX,
     Handed,
     HandedProfile,
     Profiles,
@@ -154,6 +155,16 @@ def test_what_is_no_profile_is_refused_in_one_line(pod: Pod, text: str) -> None:
     (line,) = pod.log
     assert "refused" in line
     assert os.listdir(pod.run) == [HANDED_FILE]
+
+
+def test_a_document_that_is_too_long_is_refused_and_not_cut(pod: Pod) -> None:
+    pod.first()
+    whole = write_handed(Handed(note("a1"), "", {"profile.yaml": up(120.0)}))
+    publish(pod.run / HANDED_FILE, whole.ljust(SIZE_MAX + 1))
+    assert pod.poll() is None
+    assert "it is too long" in pod.log[0]
+    publish(pod.run / HANDED_FILE, whole.ljust(SIZE_MAX))
+    assert pod.poll() == (0.12, "a1")
 
 
 def test_a_link_or_somebody_elses_file_is_refused(

@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 import zstandard
 from mcap.opcode import Opcode
+from mcap.records import Chunk
 
 from cloudrc.errors import BadInputError
-from cloudrc.record.frames import DEFINITION_MAX, MAGIC
+from cloudrc.record.frames import DEFINITION_MAX, MAGIC, DamagedError, unpack
 from cloudrc.record.reader import read_contents
 from cloudrc.record.recover import recover
 from cloudrc.record.ros_types import definition
@@ -43,6 +44,35 @@ def message(number: int) -> bytes:
 
 def file(*chunks: bytes) -> bytes:
     return MAGIC + record(Opcode.HEADER, text(b"") + text(b"")) + b"".join(chunks)
+
+
+@pytest.mark.parametrize("compression", ["", "zstd"])
+@pytest.mark.parametrize(("beyond", "read"), [(0, [1, 1]), (1, None), (-1, None)])
+def test_a_chunk_is_as_long_as_it_says_or_is_none(
+    compression: str, beyond: int, read: list[int] | None
+) -> None:
+    """One that holds more is no full one, though what it says is there."""
+    whole = message(1) * 2
+    held = (whole + message(1))[: len(whole) + beyond]
+    data = zstandard.compress(held) if compression else held
+    said = Chunk(compression, data, 0, 0, 0, len(whole))
+    if read is None:
+        with pytest.raises(DamagedError, match="length"):
+            unpack(said)
+    else:
+        assert [each.channel_id for each in unpack(said)] == read  # type: ignore[attr-defined]
+
+
+def test_of_a_chunk_that_unpacks_to_more_than_it_says_no_more_is_unpacked() -> None:
+    bomb = Chunk("zstd", zstandard.compress(bytes(64 << 20)), 0, 0, 0, 1_000)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DamagedError, match="length"):
+            unpack(bomb)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 1 << 20
 
 
 def test_of_a_chunk_of_many_messages_one_is_held_at_a_time() -> None:

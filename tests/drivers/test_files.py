@@ -1,0 +1,50 @@
+"""Files that somebody else has written: read whole or not at all, and never waited for."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from cloudrc import files
+
+LIMIT = 10.0
+"""For what takes no time [s]."""
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    """On a thread: a reader that waits for a writer does so for ever, and this test shall fail."""
+    pipe, refused = tmp_path / "pipe", threading.Event()
+    os.mkfifo(pipe)
+
+    def read() -> None:
+        with pytest.raises(ValueError, match="pipe: not a file"):
+            files.read(pipe)
+        refused.set()
+
+    thread = threading.Thread(target=read, daemon=True)
+    thread.start()
+    in_time = refused.wait(LIMIT)
+    os.close(os.open(pipe, os.O_RDWR | os.O_NONBLOCK))  # whoever waits has a writer now
+    thread.join(LIMIT)
+    assert in_time
+
+
+@pytest.mark.parametrize("size", [0, 1, 99, 100])
+def test_what_is_within_the_limit_is_read_whole(tmp_path: Path, size: int) -> None:
+    (tmp_path / "a").write_bytes(bytes(size))
+    assert files.read(tmp_path / "a", 100) == bytes(size)
+
+
+def test_what_is_beyond_the_limit_is_refused_and_not_cut(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(bytes(101))
+    with pytest.raises(files.TooLongError, match="a: longer than 100 bytes"):
+        files.read(tmp_path / "a", 100)
+
+
+def test_what_says_that_it_is_empty_and_is_not_is_refused_likewise() -> None:
+    """As every file of /proc does, and one that grows while it is read."""
+    with pytest.raises(files.TooLongError):
+        files.read(Path("/proc/self/status"), 100)
