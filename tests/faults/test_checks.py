@@ -9,6 +9,7 @@ import pytest
 
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.service_book import MissionBook
+from cloudrc.cloud.teleop.service_mission import Mission, Order
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.teleop import LastWord
 from cloudrc.drivers.wall_clock import WallClock
@@ -101,6 +102,21 @@ def catches_up_without_the_guard(monkeypatch: pytest.MonkeyPatch) -> None:
         return run(robot, tick_ns, until_ns)
 
     monkeypatch.setattr(Robot, "run", hasty)
+
+
+def forgets_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MissionBook, "with_key", lambda book, key: None)
+
+
+def makes_another_mission_of_what_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under the same key, and with nobody told: it is flown after the first one."""
+    create = MissionService.create
+
+    def twice(service: MissionService, order: Order, now_ns: int) -> tuple[Mission, bool]:
+        mission, new = create(service, order, now_ns)
+        return (mission, new) if new else (service.book.add(order), False)
+
+    monkeypatch.setattr(MissionService, "create", twice)
 
 
 def ends_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,6 +216,10 @@ BROKEN: list[tuple[str, Broken, str]] = [
     ("F33", ends_without_a_word, "HOLD after"),
     ("F33", ends_without_a_word, "they say: paused by shutdown"),
     ("F33", ends_before_the_last_word, "by a word, not for want of it"),
+    ("F35", forgets_keys, "missions made by 4 orders"),
+    ("F35", forgets_keys, "orders that end with done"),
+    ("F35", makes_another_mission_of_what_is_known, "missions in the journal"),
+    ("F35", makes_another_mission_of_what_is_known, "missions that they were answered with"),
     ("F38", never_complains, "wrong key: cloud tells once"),
     ("F38", takes_a_missing_file_for_a_new_key, "gone in flight: the keys stay"),
     ("F39", catches_up_without_the_guard, "steps without the guard's tick"),

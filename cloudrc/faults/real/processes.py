@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cloudrc.cloud.teleop.service_mission import ENDED, STATES
@@ -41,12 +41,13 @@ class Processes:
         running: The process of each name that was started last.
     """
 
-    def __init__(self, *settings: str, seed: int = 1) -> None:
-        """Start all three; the experiment's mission begins by itself.
+    def __init__(self, *settings: str, seed: int = 1, teleop: Sequence[str] = ("--start",)) -> None:
+        """Start all three.
 
         Args:
             settings: Over the experiment `paper`, as `--set` takes them.
             seed: Of the experiment.
+            teleop: Flags of the first teleop; by default it begins the experiment's mission.
         """
         self._temporary = tempfile.TemporaryDirectory(prefix="cloudrc-")
         self.folder = Path(self._temporary.name)
@@ -56,9 +57,9 @@ class Processes:
         self.ports = dict(zip(("world", "cloud"), free_ports(2), strict=True))
         self.metrics = dict(zip(NAMES, free_ports(len(NAMES), socket.SOCK_STREAM), strict=True))
         self.running: dict[str, subprocess.Popen[bytes]] = {}
-        self._all: list[subprocess.Popen[bytes]] = []
+        self._all: list[subprocess.Popen[bytes] | subprocess.Popen[str]] = []
         self._recordings = 0
-        self.start("teleop", "--start")
+        self.start("teleop", *teleop)
         self.start("world")
         self.start("cloud")
 
@@ -89,6 +90,20 @@ class Processes:
             )
         self.running[name] = process
         self._all.append(process)
+
+    def order(self, *flags: str) -> subprocess.Popen[str]:
+        """Start what a mission's Job runs, to fly the paper's mission; it tells what happens."""
+        command = [sys.executable, "-m", "cloudrc", "mission", "fly", "--mission", "pipes", *flags]
+        process = subprocess.Popen(
+            command,
+            cwd=self.folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._all.append(process)
+        return process
 
     def send(self, name: str, number: signal.Signals) -> None:
         """Send a signal to a process."""
