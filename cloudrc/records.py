@@ -207,7 +207,7 @@ class Fault(NamedTuple):
     Attributes:
         stamp_ns: [ns], own clock.
         code: One word: "estimator_failed", "predictor_failed", "controller_failed", "recorder",
-            "link_check", "late", which cloud says of its periods and world of its clock.
+            "link_check", "wall_clock", "late": cloud in its periods, world behind real time.
         text: What, where, what to do.
     """
 

@@ -148,11 +148,7 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
 
     warn_if_exposed(options.metrics)
     elsewhere = getattr(options, "teleop", None) is not None
-
-    def say(line: str) -> None:
-        print(f"cloudrc {role}: {line}", file=sys.stderr, flush=True)
-
-    exporter = Exporter(role, missions=not elsewhere, say=say)
+    exporter = Exporter(role, missions=not elsewhere)
     exporter.serve(options.metrics)
     return exporter
 

@@ -20,9 +20,8 @@ from prometheus_client.metrics_core import Metric as Family
 from cloudrc import __version__
 from cloudrc.drivers.cgroup import read_throttling
 from cloudrc.drivers.probes import Answer, ProbeServer
-from cloudrc.drivers.wall_clock import WallClock
 from cloudrc.exposition.histogram import Histogram
-from cloudrc.exposition.labels import ENDS, Labels
+from cloudrc.exposition.labels import Labels
 from cloudrc.exposition.live import Live
 from cloudrc.exposition.metric import Kind, Metric
 from cloudrc.exposition.part import Readings, plain
@@ -39,23 +38,15 @@ STILL_MAX = 5.0
 class Exporter:
     """The metrics of one process."""
 
-    def __init__(
-        self,
-        role: str,
-        *,
-        missions: bool = True,
-        say: Callable[[str], None] = lambda line: None,
-    ) -> None:
+    def __init__(self, role: str, *, missions: bool = True) -> None:
         """Begin with nothing seen, served or ready.
 
         Args:
             role: "world", "cloud", "teleop" or "link".
             missions: Whether they are told here; False in a cloud whose teleop tells them.
-            say: Gets a line for people when a scrape finds that the wall clock was set.
         """
         self._role, self._metrics = role, of_role(role)
         self._live = Live(role, missions=missions)
-        self._wall = WallClock(say)
         self._sync_age: Callable[[], float | None] = lambda: None
         self._said_ready = False
         self._seen_at: float | None = None  # no loop is alive or dead before it has begun
@@ -148,8 +139,6 @@ class Exporter:
             "cloudrc_build_info": {(__version__, self._role): 1.0},
             "cloudrc_ready": plain(self.is_ready),
         }
-        if self._role in ENDS:
-            readings["cloudrc_clock_steps_total"] = plain(self._wall.steps())
         if (age := self._sync_age()) is not None:
             readings["cloudrc_recorder_sync_age_seconds"] = plain(age)
         throttling = read_throttling()

@@ -18,6 +18,7 @@ from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.link_notes import LinkNotes
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.drivers.recording import Recorder, RecordingThread
+from cloudrc.drivers.wall_clock import told
 from cloudrc.endpoint import Endpoint
 from cloudrc.records import Counted, Fault, Record
 
@@ -108,7 +109,7 @@ def run_end(
         True if it was done by itself, False if it was stopped.
     """
     feed, thread = Feed.on_stdout(watched=watched), RecordingThread(recorder)
-    watch = _Watch(end, link, check, keys, slip_ns)
+    watch = _Watch(end, link, check, keys, slip_ns, thread.take_steps)
     taps = _Taps(end, recorder, feed, exporter, choose, watch)
     if exporter is not None:
         exporter.recording(thread.sync_age)
@@ -123,7 +124,7 @@ def run_end(
 
 
 class _Watch:
-    """What an end notes beside its flight: new keys, a changed link, whether that is as asked."""
+    """What an end notes beside its flight: new keys, the link, a wall clock that was set."""
 
     def __init__(
         self,
@@ -132,14 +133,16 @@ class _Watch:
         check: StandingCheck | None,
         keys: KeyFile | None,
         slip_ns: Callable[[], int],
+        clock_steps: Callable[[], list[float]],
     ) -> None:
+        self._clock_steps = clock_steps
         self._notes = LinkNotes(link, uplink=end == "world") if link is not None else None
         self._check, self._keys, self._slip_ns = check, keys, slip_ns
 
     def after(self, records: list[Record]) -> list[Record]:
         """Say what is to be noted after these records."""
-        noted: list[Record] = []
         now_ns, slip_ns = time.monotonic_ns(), self._slip_ns()
+        noted: list[Record] = [told(step, now_ns - slip_ns) for step in self._clock_steps()]
         if self._keys is not None:
             noted += self._keys.follow(now_ns)
         if self._notes is not None:

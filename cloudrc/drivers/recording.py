@@ -1,18 +1,21 @@
 """The recording of a process in real time: a thread that empties the recorder into its file.
 
 It takes a few records at a time and rests in between, so that the loop, which shares the
-interpreter with it, is never kept waiting for longer than a fraction of a millisecond. A second
-thread waits for the disk: one that takes seconds keeps nothing from the operating system, which
-keeps what it has when the process is killed.
+interpreter with it, is never kept waiting for longer than a fraction of a millisecond. With each
+flush it looks whether the wall clock was set, at which the loop may not look. A second thread waits
+for the disk: one that takes seconds keeps nothing from the operating system, which keeps what it
+has when the process is killed.
 """
 
 from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
+from cloudrc.drivers.wall_clock import WallClock
 from cloudrc.records import (
     Arrival,
     CommandApplied,
@@ -112,6 +115,7 @@ class RecordingThread:
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._flushed, self._over = threading.Event(), False
         self._age = SyncAge()
+        self._wall, self._steps = WallClock(), deque[float]()
         self._syncing = threading.Thread(target=self._sync, name="recording-sync", daemon=True)
 
     def start(self) -> None:
@@ -122,6 +126,10 @@ class RecordingThread:
     def sync_age(self) -> float | None:
         """Say for how long what is recorded is not safe yet [s]; None if nothing is."""
         return self._age.read(time.monotonic())
+
+    def take_steps(self) -> list[float]:
+        """Hand over by how much the wall clock was set, each time since the last call [s]."""
+        return [self._steps.popleft() for _ in range(len(self._steps))]
 
     def stop(self, timeout: float = 1.5) -> bool:
         """Write out the rest, end the file and wait for that.
@@ -146,6 +154,8 @@ class RecordingThread:
                 recorder.flush(sync=False)
                 self._flushed.set()
                 flushed = now
+                if step := self._wall.step():
+                    self._steps.append(step)
         recorder.close()
         self._over = True
         self._flushed.set()

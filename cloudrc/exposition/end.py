@@ -19,8 +19,10 @@ from cloudrc.exposition.labels import (
 from cloudrc.exposition.part import Handlers, Readings, chosen, plain
 from cloudrc.exposition.streams import Stream
 from cloudrc.messages import NEVER_NS
-from cloudrc.records import Arrival, Counted, Lateness, LinkChecked, SessionOpened
+from cloudrc.records import Arrival, Counted, Fault, Lateness, LinkChecked, SessionOpened
 
+CLOCK_SET = "wall_clock"
+"""Code of the fault that tells that the wall clock was set; see `cloudrc.drivers.wall_clock`."""
 SILENCE_NS = 2_000_000_000
 """An end that has heard nothing for so long has no peer [ns]."""
 
@@ -43,6 +45,7 @@ class End:
         self._one_way, self._age = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
         self._period, self._lateness = Histogram(PERIOD_BUCKETS), Histogram(LATENESS_BUCKETS)
         self._busy = 0.0
+        self._clock_steps = 0
         self._sessions, self._epoch, self._opened_ns = 0, 0, NEVER_NS
         self._heard_ns = self._woke_ns = self._deadline_ns = NEVER_NS
         self._silent = True  # no telemetry or command has arrived in this session
@@ -54,6 +57,7 @@ class End:
         return {
             Arrival: self._see_arrival,
             Counted: self._see_count,
+            Fault: self._see_fault,
             Lateness: self._see_wake,
             SessionOpened: self._see_session,
             LinkChecked: self.check.see,
@@ -75,6 +79,9 @@ class End:
 
     def _see_count(self, record: Counted) -> None:
         self._counts[record.name] = record.total
+
+    def _see_fault(self, record: Fault) -> None:
+        self._clock_steps += record.code == CLOCK_SET
 
     def _see_session(self, record: SessionOpened) -> None:
         self._sessions += 1
@@ -114,6 +121,7 @@ class End:
             "cloudrc_loop_period_seconds": self._period,
             "cloudrc_loop_lateness_seconds": self._lateness,
             "cloudrc_loop_busy_seconds_total": plain(self._busy),
+            "cloudrc_clock_steps_total": plain(self._clock_steps),
             "cloudrc_recorder_dropped_records_total": plain(counts.get("recorder_dropped", 0)),
         }
         if self._one_way.cumulative()[-1]:  # a delay that nobody can know is absent, never zero

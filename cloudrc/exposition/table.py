@@ -268,8 +268,8 @@ _ENTRIES = (
     ),
     counter(
         "cloudrc_clock_steps_total",
-        "Times that the wall clock was found to have been set since the scrape before; nothing that"
-        " flies looks at it.",
+        "Times that the wall clock was found to have been set, each told with its size as a fault;"
+        " nothing that flies looks at it.",
         ENDS,
     ),
     *MISSIONS,

@@ -9,8 +9,8 @@ from contextlib import redirect_stderr
 from math import nan
 from pathlib import Path
 
-from cloudrc.drivers.exporter import Exporter
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile
+from cloudrc.drivers.wall_clock import WallClock, told
 from cloudrc.errors import BadInputError
 from cloudrc.faults import asks, meters
 from cloudrc.faults.crowd import Crowd
@@ -66,26 +66,20 @@ def _wall_clocks(seed: int) -> Outcome:
 
 
 def _stepped(outcome: Outcome) -> None:
-    """Set the wall clock of a process whose metrics are scraped before and after it."""
-    said: list[str] = []
+    """Set the wall clock of an end between two looks of its recording's thread, of four."""
     with steppable_wall_clock() as wall:
-        exporter = Exporter("world", say=said.append)
-        before = _clock_steps(exporter)
+        clock = WallClock()
+        steps = [clock.step()]
         wall.step(-3600.0)
-        moved = _clock_steps(exporter) - before
-        again = _clock_steps(exporter) - before
-    outcome.same("metric clock_steps_total rises at the next scrape by", moved, 1)
-    outcome.same("and at the one after that by", again - moved, 0)
-    told = [re.match(r"wall clock stepped by (\S+) s", line) for line in said]
-    outcome.same("lines in the log: wall clock stepped", len(told), 1)
-    by = min((float(match[1]) for match in told if match), default=nan)
+        steps += [clock.step() for _ in range(3)]
+    faults = [told(step, 0) for step in steps if step]
+    outcome.same("faults told: wall_clock", len(faults), 1)
+    said = [re.match(r"wall clock stepped by (\S+) s", fault.text) for fault in faults]
+    by = min((float(match[1]) for match in said if match), default=nan)
     outcome.most("what it says differs from what it was set by", abs(by + 3600.0), 1.0, "s")
-
-
-def _clock_steps(exporter: Exporter) -> float:
-    """Scrape how often the wall clock has been set."""
-    found = [family for family in exporter.collect() if family.name == "cloudrc_clock_steps"]
-    return float(found[0].samples[0].value)
+    for role in ("world", "cloud"):
+        shown = meters.reading(role, faults, "clock_steps_total")
+        outcome.same(f"metric clock_steps_total of {role}", shown, 1)
 
 
 def _two_clouds(seed: int) -> Outcome:
@@ -229,7 +223,7 @@ SCENARIOS = (
         "apart, one drifts by 500 ppm",
         "the same flight, bit by bit; drift is flown in TRACK",
         "none",
-        "one line in the log at the next scrape: wall clock stepped; cloudrc_clock_steps_total",
+        "fault 'wall_clock' with the size of the step; cloudrc_clock_steps_total",
         _wall_clocks,
     ),
     Scenario(

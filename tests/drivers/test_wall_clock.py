@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import re
 import time
-from argparse import Namespace
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.ends import open_exporter
-from cloudrc.drivers.wall_clock import WallClock
+from cloudrc.drivers.exporter import Exporter
+from cloudrc.drivers.process import _Watch
+from cloudrc.drivers.recording import RecordingThread
+from cloudrc.drivers.wall_clock import WallClock, told
 from cloudrc.faults.walls import Wall, steppable_wall_clock
+from cloudrc.record.recorder import Recorder
+from cloudrc.records import Fault
+from tests.record.samples import Shelf
 
 
 @pytest.fixture
@@ -21,39 +26,48 @@ def wall() -> Iterator[Wall]:
 
 
 @pytest.mark.parametrize("by", [3600.0, -3600.0, 1.0, -1.0])
-def test_each_step_is_counted_once(wall: Wall, by: float) -> None:
+def test_each_step_is_noticed_once_with_its_size(wall: Wall, by: float) -> None:
     seen = WallClock()
-    assert seen.steps() == 0
-    wall.step(by)
-    assert [seen.steps(), seen.steps()] == [1, 1]
-    wall.step(by)
-    assert seen.steps() == 2
+    assert seen.step() == 0.0
+    for _ in range(2):
+        wall.step(by)
+        assert [seen.step(), seen.step()] == [pytest.approx(by, abs=0.1), 0.0]
 
 
 @pytest.mark.parametrize("by", [3600.0, -60.0])
-def test_each_step_is_said_once_with_its_size(wall: Wall, by: float) -> None:
-    lines: list[str] = []
-    seen = WallClock(lines.append)
-    wall.step(by)
-    for _ in range(3):
-        seen.steps()
-    (line,) = lines
-    said = re.match(r"wall clock stepped by ([+-]\S+) s: ", line)
+def test_it_is_told_in_one_line(by: float) -> None:
+    fault = told(by, 7)
+    assert (fault.stamp_ns, fault.code) == (7, "wall_clock")
+    said = re.match(r"wall clock stepped by ([+-]\S+) s: ", fault.text)
     assert said
-    assert float(said[1]) == pytest.approx(by, abs=1.0)
+    assert float(said[1]) == by
+    assert "\n" not in fault.text
 
 
-def test_a_process_that_is_scraped_says_it_in_its_log(
-    wall: Wall, capsys: pytest.CaptureFixture[str]
-) -> None:
-    exporter = open_exporter(Namespace(metrics=("127.0.0.1", 0)), "cloud")
-    assert exporter
-    try:
-        wall.step(60.0)
-        assert "cloudrc_clock_steps_total 1.0" in exporter.text()
-    finally:
-        exporter.close()
-    assert capsys.readouterr().err.startswith("cloudrc cloud: wall clock stepped by +")
+def test_the_thread_of_the_recording_notices_it_whether_anybody_scrapes_or_not(wall: Wall) -> None:
+    thread = RecordingThread(Recorder(Path("x"), lambda path: Shelf()))
+    thread.start()
+    wall.step(-60.0)
+    steps, until = list[float](), time.monotonic() + 10.0
+    while not steps and time.monotonic() < until:
+        time.sleep(0.01)
+        steps = thread.take_steps()
+    assert steps == [pytest.approx(-60.0, abs=0.1)]
+    assert thread.take_steps() == []
+    assert thread.stop(10.0)
+
+
+def test_an_end_records_it_on_its_own_clock_and_counts_it() -> None:
+    steps = [[60.0, -1.0], []]
+    watch = _Watch("world", None, None, None, lambda: 5_000_000_000, lambda: steps.pop(0))
+    began_ns = time.monotonic_ns() - 5_000_000_000
+    records = watch.after([])
+    assert [type(record) for record in records] == [Fault, Fault]
+    assert 0 <= records[0].stamp_ns - began_ns < 1_000_000_000
+    assert watch.after([]) == []
+    exporter = Exporter("world")
+    exporter.see([Fault(0, "late", "..."), *records])
+    assert "cloudrc_clock_steps_total 2.0" in exporter.text()
 
 
 def test_a_clock_that_drifts_has_not_been_set(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,4 +77,25 @@ def test_a_clock_that_drifts_has_not_been_set(monkeypatch: pytest.MonkeyPatch) -
     seen = WallClock()
     for later in (1.0, 60.0, 3600.0, 86_400.0):
         boot.append(later)
-        assert seen.steps() == 0
+        assert seen.step() == 0.0
+
+
+@pytest.mark.parametrize("stopped_before", [True, False])
+def test_nor_has_one_whose_looker_was_stopped_in_the_middle(
+    stopped_before: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By SIGSTOP or a quota, for a second between one clock and the other."""
+    true = [0.0]
+    stops = iter([False, True])
+
+    def look() -> float:
+        stop = next(stops, False)
+        true[0] += stop and stopped_before
+        shown = 1.7e9 + true[0]
+        true[0] += stop and not stopped_before
+        return shown
+
+    monkeypatch.setattr(time, "clock_gettime", lambda clock: true[0])
+    monkeypatch.setattr(time, "time", look)
+    seen = WallClock()
+    assert [seen.step(), seen.step()] == [0.0, 0.0]
