@@ -24,6 +24,7 @@ from kube import (
 
 from cloudrc.cluster.deploy import wait_ready
 from cloudrc.config.load import load_mission
+from cloudrc.faults.cluster.family_kills import COMMANDS_IN, ENDS_IN, POD_START
 
 PIPES = [waypoint.model_dump(mode="json") for waypoint in load_mission("pipes").waypoints]
 LINGER = 12
@@ -70,8 +71,8 @@ def test_a_deleted_cloud_is_replaced_and_the_mission_goes_on(
     fly_until("bereft", "waypoint 2 of 7 reached")
     began, old = time.monotonic(), delete("cloud")
     eventually(lambda: new_pod("cloud", old), "a new cloud pod")
-    eventually(lambda: guard() == "HOLD", "the robot holds", 10.0, every=0.1)
-    eventually(lambda: guard() == "TRACK", "the new cloud flies it", 60.0)
+    eventually(lambda: guard() == "HOLD", "the robot holds", ENDS_IN, every=0.1)
+    eventually(lambda: guard() == "TRACK", "the new cloud flies it", COMMANDS_IN + POD_START)
     note(f"cloud pod deleted in flight: flown again after {time.monotonic() - began:.1f} s")
     check_resumed(job_end("bereft"))
 

@@ -1,4 +1,4 @@
-"""Faults in a Kubernetes cluster: pods deleted, a partition, a loaded cloud, a rotated Secret.
+"""Faults in a Kubernetes cluster: a partition, a loaded cloud, a lost world, a rotated Secret.
 
 They need a release that flies nothing; the command line says where it is.
 """
@@ -32,7 +32,7 @@ from cloudrc.faults.cluster.release import (
     set_link,
     until,
 )
-from cloudrc.faults.held import holds, words
+from cloudrc.faults.held import holds
 from cloudrc.faults.scenario import Mode, Outcome, Scenario
 from cloudrc.messages import GuardState
 from cloudrc.tunnel.keys import KEY_SIZE, parse, write
@@ -49,32 +49,6 @@ child and os.waitpid(child, 0)
 """
 THROTTLED = "cpu_throttled_periods_total"
 LAST_WORD = "INTERRUPTED"
-
-
-def _pod_killed(seed: int) -> Outcome:
-    """Deleted by force: its processes get SIGKILL at once."""
-    outcome, release = Outcome(), release_there()
-    before, name = holds(recording(release, "world")), flying(release, 2)
-    delete(release, "cloud", "--force", "--grace-period=0")
-    until("the robot holds", lambda: guard(release) is GuardState.HOLD, 15.0)
-    back = until("the new cloud flies it", lambda: guard(release) is GuardState.TRACK)
-    outcome.most("flown again after", back, 60.0, "s")
-    flown = finish(outcome, release, name)
-    outcome.least("HOLDs for want of commands", holds(flown) - before, 1)
-    return outcome
-
-
-def _pod_deleted(seed: int) -> Outcome:
-    """Deleted with its grace: its processes get SIGTERM at once, and hold the robot."""
-    outcome, release = Outcome(), release_there()
-    before, name = words(recording(release, "world")), flying(release, 2)
-    delete(release, "cloud")
-    held = until("the robot holds", lambda: guard(release) is GuardState.HOLD, 60.0)
-    outcome.most("HOLD after it was deleted, its grace included", held, 60.0, "s")
-    said = words(recording(release, "world")) - before
-    outcome.least("HOLDs by the word of a teleop that ends", said, 1)
-    finish(outcome, release, name)
-    return outcome
 
 
 def _world_deleted(seed: int) -> Outcome:
@@ -195,26 +169,6 @@ SCENARIOS = (
         "samples",
         "guard HOLD",
         _partition,
-        CLUSTER,
-    ),
-    Scenario(
-        13,
-        "cloud-killed",
-        "the cloud pod is deleted by force, without grace",
-        "HOLD by 252 ms, the new pod takes the mission up where it was",
-        "cloud's memory",
-        "mission resumed",
-        _pod_killed,
-        CLUSTER,
-    ),
-    Scenario(
-        14,
-        "cloud-evicted",
-        "the cloud pod is deleted with its grace",
-        "HOLD, the new pod takes the mission up where it was",
-        "none",
-        "mission resumed",
-        _pod_deleted,
         CLUSTER,
     ),
     Scenario(

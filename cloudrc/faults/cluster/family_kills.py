@@ -1,0 +1,116 @@
+"""Cloud dies or is evicted in a Kubernetes cluster: its container alone, and its whole pod."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+
+from cloudrc.cluster.access import Release
+from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.pods import find_pod
+from cloudrc.faults.cluster.family_pods import CLUSTER
+from cloudrc.faults.cluster.release import (
+    delete,
+    finish,
+    flying,
+    guard,
+    kubectl,
+    reading,
+    recording,
+    release_there,
+    until,
+)
+from cloudrc.faults.held import holds, words
+from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.messages import GuardState
+
+KILL = "import resource; resource.prlimit(1, resource.RLIMIT_CPU, (1, 1))"
+"""SIGKILL of a container's first process from within, which no other process in it may send: the
+kernel does once the CPU time of a process [s] is over its limit, and cloud's has long been."""
+ENDS_IN = 2.0
+"""For a pod that is asked to end, and its robot to hold [s]. Source: fault F33."""
+COMMANDS_IN = 2.0
+"""For a new cloud to command [s]. Source: fault F13."""
+POD_START = 10.0
+"""Kubernetes' own part of it where the image is on the node [s]: from the pod's deletion to the
+flight 6.3 s were measured on kind with 2 CPUs (docs/safety/faults-cluster.md), twice that is
+allowed."""
+CONTAINER_START = 5.0
+"""Likewise in a pod that stays [s]: the kubelet looks for what has ended once a second. Killed a
+second time within 10 minutes a container has to wait for 10 s, but here its pod goes next."""
+
+
+def _cloud_killed(seed: int) -> Outcome:
+    outcome = _killed("container", _kill_container, CONTAINER_START)
+    outcome.add(_killed("pod", _kill_pod, POD_START))
+    return outcome
+
+
+def _killed(what: str, kill: Callable[[Release], None], start: float) -> Outcome:
+    """Fly a mission in which cloud gets SIGKILL; `start` is Kubernetes' time for a new one [s]."""
+    outcome, release = Outcome(), release_there()
+    before, name = holds(recording(release, "world")), flying(release, 2)
+    sessions = _sessions(release)
+    kill(release)
+    back = until("a new cloud has a session", lambda: _sessions(release) > sessions)
+    back += until("it flies the robot", lambda: guard(release) is GuardState.TRACK)
+    outcome.most(f"{what}: flown again after", back, COMMANDS_IN + start, "s")
+    flown = finish(outcome, release, name)
+    outcome.least(f"{what}: HOLDs for want of commands", holds(flown) - before, 1)
+    return outcome
+
+
+def _kill_container(release: Release) -> None:
+    """SIGKILL of cloud's own process: its pod, teleop and the link stay."""
+    pod = find_pod(release, "cloud").metadata.name
+    with suppress(ClusterError):  # what says it is killed, too
+        kubectl(release, "exec", pod, "--container=cloud", "--", "python", "-c", KILL)
+
+
+def _kill_pod(release: Release) -> None:
+    """Deleted by force: its processes get SIGKILL at once."""
+    delete(release, "cloud", "--force", "--grace-period=0")
+
+
+def _sessions(release: Release) -> float:
+    return reading(release, "world", "session_epoch")
+
+
+def _pod_deleted(seed: int) -> Outcome:
+    """Deleted with its grace: its processes get SIGTERM at once, and hold the robot."""
+    outcome, release = Outcome(), release_there()
+    before, name = words(recording(release, "world")), flying(release, 2)
+    delete(release, "cloud")
+    held = until("the robot holds", lambda: guard(release) is GuardState.HOLD)
+    outcome.most("HOLD after", held, ENDS_IN, "s")
+    back = until("the new cloud flies it", lambda: guard(release) is GuardState.TRACK)
+    outcome.most("flown again after", held + back, ENDS_IN + COMMANDS_IN + POD_START, "s")
+    said = words(finish(outcome, release, name)) - before
+    outcome.least("HOLDs by teleop's word, that at the mission's end included", said, 2)
+    return outcome
+
+
+SCENARIOS = (
+    Scenario(
+        13,
+        "cloud-killed",
+        "SIGKILL of cloud's container alone; in another mission the cloud pod is deleted by force",
+        "HOLD by 252 ms, the new one commands in 2 s and what Kubernetes needs to start it; the "
+        "mission goes on where it was",
+        "cloud's memory",
+        "mission resumed",
+        _cloud_killed,
+        CLUSTER,
+    ),
+    Scenario(
+        14,
+        "cloud-evicted",
+        "the cloud pod is deleted with its grace",
+        "HOLD in 2 s by teleop's last word, the new pod commands in 2 s and what Kubernetes needs "
+        "to start it; the mission goes on where it was",
+        "none",
+        "mission resumed",
+        _pod_deleted,
+        CLUSTER,
+    ),
+)
