@@ -1,11 +1,14 @@
-"""Files that somebody else has written: told apart by version, read whole, never waited for."""
+"""Files where somebody else writes, too: read whole and never waited for, written in one step."""
 
 from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BufferedReader, FileIO
 from pathlib import Path
+from typing import IO
 
 SIZE_MAX = 1 << 20
 """Longest that is read [bytes]: what a ConfigMap holds."""
@@ -63,6 +66,38 @@ def open_file(path: Path) -> FileIO:
         return file
     file.close()
     raise ValueError(f"{path}: not a file")
+
+
+@contextmanager
+def draft(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
+    """Make a file that gets its name when it is whole; what had that name till then is replaced.
+
+    The folder may be somebody else's: a link that lies there is replaced, too, and not followed,
+    and no name of a draft can be known before.
+
+    Args:
+        path: The file.
+        mode: Of the new one from its beginning, less what the process masks.
+
+    Raises:
+        OSError: If it cannot be written; then what was there before is as it was.
+    """
+    new = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
+    alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+    file = open(os.open(new, alone, mode), "wb")
+    try:
+        with file:
+            yield file
+        new.replace(path)
+    except BaseException:
+        new.unlink(missing_ok=True)
+        raise
+
+
+def put(path: Path, data: bytes) -> None:
+    """Write a whole file by a `draft`."""
+    with draft(path) as file:
+        file.write(data)
 
 
 def _at_once(path: str, flags: int) -> int:

@@ -12,6 +12,7 @@ from typing import Any
 from cloudrc import __version__
 from cloudrc.cli.faults_page import INVARIANTS, PROMISES, command
 from cloudrc.errors import BadInputError
+from cloudrc.files import put
 
 PACKAGE = Path(__file__).resolve().parents[1]
 READ = (".py", ".xml", ".yaml")
@@ -82,9 +83,7 @@ def document(findings: Sequence[Document], failures: Sequence[Document], **what:
 def keep(told: Document, path: Path) -> None:
     """Write a slice in one step: whoever is killed meanwhile leaves the one before."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
-    part.replace(path)
+    put(path, f"{json.dumps(told, indent=2)}\n".encode())
 
 
 def merged(paths: Sequence[Path]) -> tuple[Document, list[tuple[Path, Document]]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,7 +45,7 @@ def execute(options: argparse.Namespace) -> int:
 
     source: Path = options.file
     target = options.to or source.with_name(f"{source.stem}.recovered{source.suffix}")
-    if target.exists():
+    if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")
     recovery = recover(source, target)
     if options.output == "table":

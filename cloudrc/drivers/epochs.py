@@ -16,7 +16,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
 
-from cloudrc.files import read
+from cloudrc.files import draft, read
 from cloudrc.tunnel.handshake import EPOCH_MAX
 
 BLOCK = 4096
@@ -96,17 +96,10 @@ def replace_durably(path: Path, data: bytes, mode: int = 0o600) -> None:
     Raises:
         OSError: If it cannot; then the old file is as it was.
     """
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
-    except OSError:
-        draft.unlink(missing_ok=True)
-        raise
+    with draft(path, mode) as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)

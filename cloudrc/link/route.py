@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
+
+from cloudrc.files import put
 
 
 def publish(path: Path, text: str) -> None:
@@ -13,9 +14,7 @@ def publish(path: Path, text: str) -> None:
         path: The file; its folder exists.
         text: What stands in it from now on.
     """
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(path)
+    put(path, text.encode("utf-8"))
 
 
 def publish_route(path: Path, route: tuple[str, int]) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from cloudrc.errors import BadInputError
+from cloudrc.files import draft
 from cloudrc.record.cdr import shifted
 from cloudrc.record.columns import Recording
 from cloudrc.record.offset import SAME_CLOCK, ClockOffset, clock_offset
@@ -47,14 +48,15 @@ class Mission:
         """Write it to an MCAP file.
 
         Args:
-            target: Overwritten if it exists.
+            target: Replaced in one step if it exists.
             attachments: Files to put into it, by name, beside those of both ends.
 
         Raises:
             OSError: If the file cannot be written.
         """
         metadata = self.contents.metadata
-        with McapWriter(target, clock=metadata["clock"], clock_id=metadata["clock_id"]) as writer:
+        clock, clock_id = metadata["clock"], metadata["clock_id"]
+        with draft(target) as file, McapWriter(file, clock=clock, clock_id=clock_id) as writer:
             writer.note(metadata)
             for topic, log_time_ns, data in self.contents.messages:
                 writer.write_message(topic, log_time_ns, data)
@@ -125,7 +127,7 @@ def write_mission(
     """Write the records of both ends as one mission on world's clock, without files in between.
 
     Args:
-        target: Overwritten if it exists.
+        target: Replaced in one step if it exists.
         world_records: Oldest first, on world's clock.
         cloud_records: Oldest first, on cloud's clock.
         offset: World's clock minus cloud's; in virtual time both are the same.
@@ -134,7 +136,7 @@ def write_mission(
     Raises:
         OSError: If the file cannot be written.
     """
-    with McapWriter(target, clock="world") as writer:
+    with draft(target) as file, McapWriter(file, clock="world") as writer:
         writer.note(offset.metadata())
         for log_time_ns, row in merged(world_records, cloud_records, offset.offset_ns):
             writer.write_row(row, log_time_ns)

@@ -7,14 +7,13 @@ note that says so to whoever reads it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
 from cloudrc import __version__
 from cloudrc.errors import BadInputError
+from cloudrc.files import draft
 from cloudrc.record.packages import missing
 from cloudrc.record.scan import Scan, TooMuchError
 from cloudrc.record.sectors import SECTOR, Sectors
@@ -86,7 +85,7 @@ def recover(source: Path, target: Path) -> Recovery:
         raise BadInputError(
             f"{source}: cannot be read ({error.strerror}); name a recording (.mcap)"
         ) from error
-    with stream, _in_one_step(target) as new:
+    with stream, draft(target) as new:
         scan = Scan(stream)
         copy = _Copy(new, scan)
         try:
@@ -99,18 +98,6 @@ def recover(source: Path, target: Path) -> Recovery:
             what = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"
             raise BadInputError(f"{source}: holds nothing that can be read: it {what}")
     return recovery
-
-
-@contextmanager
-def _in_one_step(target: Path) -> Iterator[IO[bytes]]:
-    """A file that gets its name only when it is whole."""
-    part = target.with_name(f".{target.name}.part")
-    try:
-        with part.open("wb") as new:
-            yield new
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 class _Copy:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.files import put
 from cloudrc.metrics import Number
 from cloudrc.report.verdict import Failure, Verdict
 
@@ -123,7 +124,7 @@ def environment_document() -> dict[str, Any]:
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a document for people and programs; numbers that are not finite are refused."""
     text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")
+    put(path, f"{text}\n".encode())
 
 
 def _failure(failure: Failure) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.files import read
+from cloudrc.files import put, read
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import METRIC_NOTE, Flight, Number, measure_all
 from cloudrc.record.columns import Recording
@@ -193,10 +193,13 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
     experiment = assessment.experiment
     subject = Subject(assessment.flight, experiment.uplink, experiment.downlink)
     pictures = draw_all(subject)
-    (folder / "figures").mkdir(exist_ok=True)
+    figures = folder / "figures"
+    if figures.is_symlink():  # of a run got from somebody else: it may lead anywhere
+        raise BadInputError(f"{figures}: is a link; remove it, figures are kept with their run")
+    figures.mkdir(exist_ok=True)
     for picture in pictures:
-        (folder / "figures" / f"{picture.name}.png").write_bytes(picture.png)
-        (folder / "figures" / f"{picture.name}.svg").write_bytes(picture.svg)
+        put(figures / f"{picture.name}.png", picture.png)
+        put(figures / f"{picture.name}.svg", picture.svg)
     text = render(
         assessment.run,
         experiment,
@@ -207,4 +210,4 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
         pictures,
         environment,
     )
-    (folder / "report.html").write_text(text, encoding="utf-8")
+    put(folder / "report.html", text.encode("utf-8"))

@@ -1,0 +1,142 @@
+"""What is written into a folder got from somebody else follows no link that lies there."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.faults_slices import keep
+from cloudrc.cli.main import main
+from cloudrc.drivers.epochs import replace_durably
+from cloudrc.errors import BadInputError
+from cloudrc.files import draft, put
+from cloudrc.link.route import publish
+from cloudrc.record.columns import Recording
+from cloudrc.record.merge import write_mission
+from cloudrc.record.recover import recover
+from cloudrc.report.document import write_json
+from cloudrc.report.write import read_run, write_report
+from tests.record.samples import world_records, write
+
+pytestmark = pytest.mark.promise("P-CODE-5")
+HEX = b"\xab" * 8
+
+
+@pytest.fixture(autouse=True)
+def umask() -> Iterator[None]:
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    """A file of the user's that nobody may touch."""
+    path = tmp_path / "mine"
+    path.write_text("mine")
+    return path
+
+
+@pytest.fixture
+def theirs(tmp_path: Path) -> Path:
+    """A folder got from somebody else."""
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    return folder
+
+
+def recovered(path: Path) -> None:
+    recover(write(path.with_name("torn.mcap"), world_records(20)), path)
+
+
+WRITERS: list[Callable[[Path], object]] = [
+    lambda path: put(path, b"new"),
+    lambda path: replace_durably(path, b"new"),
+    lambda path: publish(path, "new"),
+    lambda path: write_json(path, {}),
+    lambda path: keep({}, path),
+    lambda path: write_mission(path, world_records(20), ()),
+    recovered,
+]
+
+
+@pytest.mark.parametrize("writes", WRITERS)
+def test_a_link_is_replaced_and_what_it_leads_to_stays(
+    theirs: Path, mine: Path, monkeypatch: pytest.MonkeyPatch, writes: Callable[[Path], object]
+) -> None:
+    path = theirs / "file"
+    path.symlink_to(mine)
+    for guess in (f".file.{os.getpid()}", ".file.part"):
+        (theirs / guess).symlink_to(mine)
+    writes(path)
+    assert mine.read_text() == "mine"
+    assert not path.is_symlink()
+    assert path.stat().st_size
+    # Even who knows the name of the draft has it refused, not followed.
+    monkeypatch.setattr(os, "urandom", lambda size: HEX)
+    (theirs / f".file.{HEX.hex()}").symlink_to(mine)
+    with pytest.raises(FileExistsError):
+        writes(path)
+    assert mine.read_text() == "mine"
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o644])
+def test_a_secret_has_its_mode_from_the_beginning(theirs: Path, mode: int) -> None:
+    path = theirs / "key"
+    path.touch(0o644)
+    path.with_name(f".key.{os.getpid()}").touch(0o666)  # whose mode the draft once had
+    with draft(path, mode) as file:
+        assert stat.S_IMODE(os.fstat(file.fileno()).st_mode) == mode
+    assert stat.S_IMODE(path.stat().st_mode) == mode
+    assert main(["key", "new", str(theirs / "new")]) == 0
+    assert stat.S_IMODE((theirs / "new").stat().st_mode) == 0o600
+
+
+def test_what_fails_leaves_neither_draft_nor_damage(theirs: Path) -> None:
+    put(theirs / "file", b"old")
+    with suppress(KeyboardInterrupt), draft(theirs / "file") as file:
+        file.write(b"half")
+        raise KeyboardInterrupt
+    assert os.listdir(theirs) == ["file"]
+    assert (theirs / "file").read_bytes() == b"old"
+
+
+def test_recover_refuses_a_link_that_leads_nowhere(
+    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torn = write(theirs / "run.mcap", world_records(20))
+    (theirs / "run.recovered.mcap").symlink_to(tmp_path / "nothing")
+    assert main(["recover", str(torn)]) == 2
+    assert "already there; name another file with --to" in capsys.readouterr().err
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_a_report_is_written_through_no_link(
+    theirs: Path, mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
+    (theirs / "config.yaml").write_text("seed: 1")
+    write(theirs / "world.mcap", world_records(20))
+    (theirs / "cloud.mcap").write_bytes((theirs / "world.mcap").read_bytes())
+    names = ("report.json", "environment.json", "report.html", "mission.mcap")
+    for name in names:
+        (theirs / name).symlink_to(mine)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (theirs / "figures").symlink_to(elsewhere)
+    with pytest.raises(BadInputError, match="figures: is a link; remove it"):
+        write_report(theirs, *read_run(theirs))
+    (theirs / "figures").unlink()
+    (theirs / "figures").mkdir()
+    (theirs / "figures" / "error.png").symlink_to(mine)
+    write_report(theirs, *read_run(theirs))
+    assert mine.read_text() == "mine"
+    assert not any(elsewhere.iterdir())
+    assert not any((theirs / name).is_symlink() for name in names)
+    assert (theirs / "figures" / "error.png").read_bytes().startswith(b"\x89PNG")
+    assert Recording.read(theirs / "mission.mcap").complete
