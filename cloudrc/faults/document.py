@@ -117,9 +117,9 @@ The hashes of the records are those of
 # Faults with real processes, signals and sockets
 
 Written by `make nightly` (`cloudrc faults run --all --real --document docs/safety/faults-real.md`);
-do not edit. {result} Each is one command: `cloudrc faults run F13 --real`.
-Times are those of the machine that it ran on. Some are run before every change lands, too. The
-others, in virtual time: [faults](faults.md).
+do not edit. {result} Each is one command:
+`cloudrc faults run F13 --real`. Times are those of the machine that it ran on. Some are run before
+every change lands, too. The others, in virtual time: [faults](faults.md).
 """,
     "cluster": """\
 # Faults in a Kubernetes cluster

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import socket
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import pytest
 
@@ -33,7 +36,10 @@ def get(port: int, path: str) -> tuple[int, str]:
             return error.code, error.read().decode()
 
 
-def test_metrics_and_probes_are_on_one_port(served: tuple[Exporter, int]) -> None:
+def test_metrics_and_probes_are_on_one_port(
+    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 0.0)
     exporter, port = served
     assert get(port, "/healthz") == (200, "alive\n")
     assert get(port, "/readyz") == (503, "no peer yet\n")
@@ -43,6 +49,44 @@ def test_metrics_and_probes_are_on_one_port(served: tuple[Exporter, int]) -> Non
     assert "cloudrc_ready 1.0" in get(port, "/metrics?name=any")[1]
     exporter.ready(False)
     assert get(port, "/readyz")[0] == 503
+
+
+@pytest.mark.promise("P-METRIC-2")
+def test_however_often_it_is_scraped_a_page_is_made_four_times_a_second(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each tells what was known a quarter of a second ago at most."""
+    now, made = [1000.0], []
+    monkeypatch.setattr("cloudrc.drivers.exporter.time", SimpleNamespace(monotonic=lambda: now[0]))
+    exporter = Exporter("link")
+    monkeypatch.setattr(exporter, "text", lambda: made.append(now[0]) or f"{now[0]}")
+    for tick in range(3000):
+        now[0] = 1000.0 + tick / 1024
+        assert now[0] - float(exporter._page().content) < 0.25
+    assert made == [1000.0 + quarter / 4 for quarter in range(12)]
+
+
+@pytest.mark.promise("P-METRIC-2")
+def test_scrapers_that_come_at_once_have_one_page_made(
+    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exporter, port = served
+    monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 60.0)
+    write, calls, all_wait = exporter.text, [], threading.Event()
+
+    def slowly() -> str:
+        calls.append(1)
+        assert all_wait.wait(10.0)
+        return write()
+
+    monkeypatch.setattr(exporter, "text", slowly)
+    with ThreadPoolExecutor(8) as scrapers:
+        answers = [scrapers.submit(get, port, "/metrics") for _ in range(8)]
+        while threading.active_count() < 16:  # eight ask, eight answer
+            assert get(port, "/healthz")[0] == 200  # probes do not wait with them
+        all_wait.set()
+        pages = {each.result() for each in answers}
+    assert (len(pages), len(calls)) == (1, 1)
 
 
 def test_a_loop_that_stands_still_is_not_alive(

@@ -1,21 +1,15 @@
-"""Faults with real sockets and files: a flood of garbage, slow scrapers, a killed recorder."""
+"""Faults with real sockets and files: a flood of garbage, a killed recorder."""
 
 from __future__ import annotations
 
-import socket
 import time
 from math import nan
 
-import numpy as np
-
 from cloudrc.faults.held import holds
 from cloudrc.faults.real.family_processes import REAL, WORKING, finish
-from cloudrc.faults.real.processes import LOOPBACK, Processes, flood
+from cloudrc.faults.real.processes import Processes, flood
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.faults.toll import REFUSED
-
-SLOW = 40
-"""Clients of each process that never end their request."""
 
 
 def _garbage(seed: int) -> Outcome:
@@ -63,41 +57,6 @@ def _recorder_killed(seed: int) -> Outcome:
     return outcome
 
 
-def _scrape_time(run: Processes, name: str) -> float:
-    """How long the metrics of a process take to be read [s]; NaN if they cannot be."""
-    began = time.monotonic()
-    try:
-        run.scrape(name, timeout=1.0)
-    except OSError:
-        return nan
-    return time.monotonic() - began
-
-
-def _slow_scrapers(seed: int) -> Outcome:
-    outcome = Outcome()
-    with Processes(seed=seed) as run:
-        run.reached(1)
-        since = time.monotonic()
-        ports = [port for port in run.metrics.values() for _ in range(SLOW)]
-        slow = [socket.create_connection((LOOPBACK, port)) for port in ports]
-        for each in slow:
-            each.sendall(b"GET /metrics HTTP/1.1\r\n")  # and never an end
-        took: dict[str, list[float]] = {name: [] for name in run.metrics}
-        for _ in range(20):
-            for name, times in took.items():
-                times.append(_scrape_time(run, name))
-            time.sleep(0.2)
-        until = time.monotonic()
-        for each in slow:
-            each.close()
-        for name, times in took.items():
-            text = f"longest scrape of {name} beside {SLOW} slow ones"
-            outcome.most(text, float(np.max(times)), 1.0, "s")
-        flown = finish(outcome, run)
-        outcome.same("HOLDs meanwhile", holds(flown, since, until), 0)
-    return outcome
-
-
 SCENARIOS = (
     Scenario(
         20,
@@ -118,17 +77,6 @@ SCENARIOS = (
         "at most 0.5 s",
         "cloudrc recover; before, cloudrc_recorder_sync_age_seconds",
         _recorder_killed,
-        REAL,
-    ),
-    Scenario(
-        31,
-        "slow-scrapers",
-        f"{SLOW} clients that never end their request, at the metrics of each process",
-        "a scrape is answered in < 1 s; no HOLD",
-        "none",
-        "nothing: every scrape is answered; if none were for two minutes, alert CloudrcAbsent "
-        "(tests/e2e/alerts.yaml tries it)",
-        _slow_scrapers,
         REAL,
     ),
 )
