@@ -104,6 +104,7 @@ nightly: $(VENV)/dev ## run every test and number, 500 hours of faults, e2e-full
 	$(bin)/pytest -n auto -m 'not process and not e2e and not netem'
 	$(bin)/pytest -m process
 	$(bin)/cloudrc faults run --all --real --document docs/safety/faults-real.md
+	CLOUDRC_FLOOD_SECONDS=600 $(bin)/cloudrc faults run garbage-flood --real
 	$(bin)/cloudrc faults fuzz --clean --seeds 600 --jobs $(JOBS) \
 		--document docs/safety/clean.md $(STORE)
 	$(bin)/cloudrc faults fuzz --adversarial --seeds 5000 --jobs $(JOBS) \

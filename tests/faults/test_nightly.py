@@ -31,6 +31,7 @@ LINES = (
     "-n auto -m 'not process and not e2e and not netem'",
     "pytest -m process",
     "faults run --all --real --document docs/safety/faults-real.md",
+    "CLOUDRC_FLOOD_SECONDS=600 $(bin)/cloudrc faults run garbage-flood --real",
     "faults fuzz --clean --seeds 600 --jobs $(JOBS) --document docs/safety/clean.md ",
     "faults fuzz --adversarial --seeds 5000 --jobs $(JOBS) --document docs/safety/adversary.md ",
     "faults fuzz --seeds 30000 --jobs $(JOBS) --document docs/safety/search.md ",

@@ -14,8 +14,10 @@ from typing import Any
 import pytest
 
 from cloudrc.cluster.errors import ClusterError
+from cloudrc.errors import BadInputError
 from cloudrc.faults.catalogue import find, scenarios
 from cloudrc.faults.cluster import family_pods
+from cloudrc.faults.real.family_wire import FLOOD_SECONDS, flood_seconds
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.messages import GuardState
 from cloudrc.tunnel.keys import Key, KeySet, write
@@ -60,6 +62,25 @@ def test_what_is_listed_for_a_mode_can_be_run_there() -> None:
         listed = document["faults"]
         assert [each["name"] for each in listed] == [each.name for each in scenarios(mode)]  # type: ignore[arg-type]
         assert {each["mode"] for each in listed} == {mode}
+
+
+@pytest.mark.parametrize(("told", "seconds"), [(None, 20), ("600", 600)])
+def test_a_flood_lasts_as_long_as_the_environment_says(
+    told: str | None, seconds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(FLOOD_SECONDS, raising=False)
+    if told is not None:
+        monkeypatch.setenv(FLOOD_SECONDS, told)
+    assert flood_seconds() == seconds
+
+
+@pytest.mark.parametrize("told", ["", "0", "-1", "1.5", "10 min"])
+def test_and_not_for_what_is_no_number_of_seconds(
+    told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(FLOOD_SECONDS, told)
+    with pytest.raises(BadInputError, match="give whole seconds, such as 600"):
+        flood_seconds()
 
 
 KUBECTL = """#!/bin/sh

@@ -21,6 +21,7 @@ from cloudrc.faults.options import SECRET
 from cloudrc.record.columns import Recording
 from cloudrc.record.recover import Recovery, recover
 from cloudrc.tunnel import codec
+from cloudrc.tunnel.codec import Direction, Kind
 from cloudrc.tunnel.keys import write
 
 LIMIT = 60.0
@@ -212,7 +213,7 @@ FLOOD = """
 import os, random, socket, struct, sys, time
 port, rate, seconds, version, direction, kind, size = map(int, sys.argv[1:])
 udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-def noise(n):  # pure; behind a right head, too short; as long as a command, for early epochs
+def noise(n):  # pure; behind a right head, too short; as long as an honest one, of an early epoch
     if n % 3 == 0:
         return os.urandom(16 + n % 200)
     epoch, generation = 1 + n % 2, n // 2 % 2
@@ -229,10 +230,17 @@ print(sent)
 """
 
 
-def flood(port: int, rate: int, seconds: int) -> subprocess.Popen[bytes]:
-    """Send garbage to a port of the loopback, so many datagrams a second, for so long [s]."""
-    kind = int(codec.Kind.COMMAND)
-    form = (codec.VERSION, int(codec.Direction.DOWNLINK), kind, codec.SIZES[kind])
+def flood(port: int, way: Direction, rate: int, seconds: int) -> subprocess.Popen[bytes]:
+    """Send garbage to a port of the loopback.
+
+    Args:
+        port: Of an end.
+        way: That honest datagrams go to get there; a part of the garbage looks like them.
+        rate: Datagrams per second [1/s].
+        seconds: For so long [s].
+    """
+    kind = Kind.COMMAND if way is Direction.DOWNLINK else Kind.TELEMETRY
+    form = (codec.VERSION, int(way), int(kind), codec.SIZES[kind])
     command = [sys.executable, "-c", FLOOD, *map(str, (port, rate, seconds, *form))]
     return subprocess.Popen(command, stdout=subprocess.PIPE)
 
