@@ -21,8 +21,10 @@ from cloudrc.link.trace_packets import Packets, in_order
 Direction: TypeAlias = Literal["uplink", "downlink"]
 
 _STAMP = re.compile(r"\[(\d+(?:\.\d+)?)\] ")
-_REPLY = re.compile(r"icmp_seq=(\d+) .*\btime[=<](\d+(?:\.\d+)?) ms")
+_REPLY = re.compile(r"icmp_seq=(\d{1,12}) .*\btime[=<](\d+(?:\.\d+)?) ms")
 _WRAP = 1 << 16
+_PACKETS_MAX = 10_000_000
+"""More than ping sends in three weeks at five a second; forged numbers would fill the memory."""
 _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
 """What JSON of any other shape raises."""
 _HALVE = (
@@ -55,7 +57,8 @@ def read_ping(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
         Packets, half a round trip each.
 
     Raises:
-        BadInputError: If there are no replies or no stamps, or if `halve` is not set.
+        BadInputError: If there are no replies or no stamps, or too many packets between the first
+            and the last, or if `halve` is not set.
     """
     if not halve:
         raise BadInputError(f"{name}: ping measures round trips; {_HALVE}")
@@ -63,6 +66,11 @@ def read_ping(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
     if not replies:
         raise BadInputError(f"{name}: no replies in it; give the output of: ping -D HOST")
     first, last = min(replies), max(replies)
+    if last - first >= _PACKETS_MAX:
+        raise BadInputError(
+            f"{name}: its numbers span {last - first + 1} packets, more than {_PACKETS_MAX}; "
+            "give the output of one ping"
+        )
     period = (replies[last][0] - replies[first][0]) / max(last - first, 1)
     entries: list[tuple[float, float | None]] = []
     sent = replies[first][0] - period

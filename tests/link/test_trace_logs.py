@@ -63,6 +63,11 @@ def test_a_ping_that_cannot_be_used_is_refused(text: str, says: str) -> None:
         read_ping([text], "x", halve=True)
 
 
+def test_forged_numbers_of_ping_fill_no_memory() -> None:
+    with pytest.raises(BadInputError, match="span 999999999999 packets"):
+        read_ping([reply(1, 1.0), reply(999_999_999_999, 2.0)], "x", halve=True)
+
+
 def trip(number: int, lost: Any = False, send: int = 30, receive: int = 20) -> dict[str, Any]:
     """One round trip as irtt 0.9 writes it; delays in [ms], one packet every 10 ms."""
     sent = 1_700_000_000_000_000_000 + number * 10_000_000
