@@ -9,6 +9,7 @@ from cloudrc.exposition.histogram import Histogram
 from cloudrc.exposition.labels import (
     DELAY_BUCKETS,
     DIRECTIONS,
+    GAP_BUCKETS,
     LATENESS_BUCKETS,
     ONLY_CLOUD,
     ONLY_WORLD,
@@ -43,6 +44,7 @@ class End:
         self._stream = Stream()
         self.check = Check(incoming)
         self._one_way, self._age = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
+        self._gap = Histogram(GAP_BUCKETS)
         self._period, self._lateness = Histogram(PERIOD_BUCKETS), Histogram(LATENESS_BUCKETS)
         self._busy = 0.0
         self._clock_steps = 0
@@ -71,6 +73,8 @@ class End:
     def _see_arrival(self, record: Arrival) -> None:
         stamp_ns, _, epoch, counter, delay, used = record
         if self._stream.take(epoch, counter):  # those that are repeated anybody can send
+            if not self._silent:
+                self._gap.observe((stamp_ns - self._heard_ns) * 1e-9)
             self._heard_ns, self._silent = stamp_ns, False
         if delay == delay:  # not NaN: both ends share a clock
             self._one_way.observe(delay)
@@ -118,6 +122,7 @@ class End:
             "cloudrc_datagrams_expected_total": {incoming: stream.expected},
             "cloudrc_datagrams_lost_total": {incoming: stream.lost},
             "cloudrc_datagrams_reordered_total": {incoming: stream.reordered},
+            "cloudrc_link_gap_seconds": self._gap,
             "cloudrc_loop_period_seconds": self._period,
             "cloudrc_loop_lateness_seconds": self._lateness,
             "cloudrc_loop_busy_seconds_total": plain(self._busy),

@@ -63,6 +63,9 @@ SHAPERS = ("relay", "netem")
 LINK_MODES = ("auto", "relay", "netem")
 
 DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
+GAP_BUCKETS = (0.05, 0.25)
+"""More than jitter makes of a period of 10 ms, and the age at which the guard holds; only two, for
+a pod has less than 200 series."""
 PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
 """Around the 10 ms of both loops."""
 LATENESS_BUCKETS = (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1)

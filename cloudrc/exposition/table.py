@@ -15,6 +15,7 @@ from cloudrc.exposition.labels import (
     CLOUD,
     DIRECTIONS,
     ENDS,
+    GAP_BUCKETS,
     GUARD_STATES,
     LATENESS_BUCKETS,
     LIMITS,
@@ -90,6 +91,13 @@ _ENTRIES = (
         "Telemetry or command datagrams that arrived after a newer one.",
         ENDS,
         direction=DIRECTIONS,
+    ),
+    Metric(
+        "cloudrc_link_gap_seconds",
+        Kind.HISTOGRAM,
+        "Time from one telemetry (at cloud) or command (at world) to the next that arrived.",
+        ENDS,
+        buckets=GAP_BUCKETS,
     ),
     delay(
         "cloudrc_uplink_delay_seconds",

@@ -28,16 +28,39 @@ def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
 
 
 def _short_silence(seed: int) -> Outcome:
+    """Both ways amid the jitter; one way without it, where every longer gap is the silence."""
     outcome, at = Outcome(), instant(seed)
     cut = blackouts((at, 0.1))
-    flight = Flight(seed=seed, uplink=cut, downlink=cut).fly_mission()
-    asks.safe(outcome, flight)
-    asks.done(outcome, flight)
-    outcome.same("HOLDs", len(asks.held(flight)), 0)
-    meters.moves(outcome, flight, "world", "datagrams_lost_total", "downlink", since=at)
-    for name, link in (("uplink", flight.uplink), ("downlink", flight.downlink)):
-        outcome.most(f"datagrams lost, {name}", link.counts()["blackout"], 11)
+    steady: Shape = lambda profile: replace(profile, jitter=0.0)  # noqa: E731
+    silent: Shape = lambda profile: steady(cut(profile))  # noqa: E731
+    for what, up, down in (
+        ("both ways", cut, cut),
+        ("up", silent, steady),
+        ("down", steady, silent),
+    ):
+        flight = Flight(seed=seed, uplink=up, downlink=down).fly_mission()
+        asks.safe(outcome, flight)
+        asks.done(outcome, flight)
+        outcome.same(f"silent {what}: HOLDs", len(asks.held(flight)), 0)
+        ends = ("cloud", "uplink", flight.uplink, up), ("world", "downlink", flight.downlink, down)
+        for role, way, link, shape in ends:
+            lost, gaps = link.counts()["blackout"], _gaps(flight, role, at)
+            text = f"silent {what}: metric link_gap_seconds of {role}: gaps above 50 ms"
+            if shape is steady:
+                outcome.same(text, gaps, 0)
+                outcome.same(f"silent {what}: datagrams lost, {way}", lost, 0)
+                continue
+            outcome.least(text, gaps, 1)
+            outcome.most(f"silent {what}: datagrams lost, {way}", lost, 11)
+            meters.moves(outcome, flight, role, "datagrams_lost_total", way, since=at)
     return outcome
+
+
+def _gaps(flight: Flight, role: str, at: float) -> int:
+    """How many gaps above 50 ms an end has shown within 5 s of a fault that begins `at` [s]."""
+    sights = [meters.seen_by(flight, role, until) for until in (at, at + meters.SOON)]
+    before, after = (meters.above(role, seen, "link_gap_seconds", 0.05) for seen in sights)
+    return after - before
 
 
 def _silence(seed: int) -> Outcome:
@@ -162,10 +185,10 @@ SCENARIOS = (
     Scenario(
         1,
         "short-blackout",
-        "both directions silent for 0.1 s",
+        "both directions silent for 0.1 s; one of them alone",
         "stays in TRACK, no step above the acceleration cap",
-        "at most 11 samples per direction",
-        "cloudrc_datagrams_lost_total",
+        "at most 11 samples per direction, none in one that is not silent",
+        "cloudrc_link_gap_seconds and cloudrc_datagrams_lost_total of who hears nothing",
         _short_silence,
     ),
     Scenario(

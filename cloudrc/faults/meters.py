@@ -42,12 +42,31 @@ def share_within(role: str, records: Iterable[Record], name: str, bound: float) 
         name: Of the metric, without its prefix.
         bound: Of one of its buckets [unit of the metric].
     """
+    within, values = _within(role, records, name, bound)
+    return within / values if values else nan
+
+
+def above(role: str, records: Iterable[Record], name: str, bound: float) -> int:
+    """Read how many values of a histogram are above a bound of its buckets.
+
+    Args:
+        role: Of the process.
+        records: That it has seen, oldest first.
+        name: Of the metric, without its prefix.
+        bound: Of one of its buckets [unit of the metric].
+    """
+    within, values = _within(role, records, name, bound)
+    return values - within
+
+
+def _within(role: str, records: Iterable[Record], name: str, bound: float) -> tuple[int, int]:
+    """How many values of a histogram are at most a bound of its buckets, and how many there are."""
     live = Live(role)
     live.see(records)
     shown = live.read()[f"cloudrc_{name}"]
     assert isinstance(shown, Histogram)
     counts = shown.cumulative()
-    return counts[shown.bounds.index(bound)] / counts[-1] if counts[-1] else nan
+    return counts[shown.bounds.index(bound)], counts[-1]
 
 
 def shown(flight: Flight, role: str) -> dict[str, object]:

@@ -227,6 +227,19 @@ def test_a_datagram_that_is_sent_again_is_no_sign_of_life(
     assert heard(role, opened, first, newest, again, wake(2500)) == hears
 
 
+@pytest.mark.parametrize("role", labels.ENDS)
+def test_a_gap_lies_between_two_arrivals_of_a_session_and_nobody_hides_it(role: str) -> None:
+    live = Live(role)
+    live.see([SessionOpened(0, role, 1, "")])
+    for at_ms, counter in ((500, 0), (510, 2), (550, 1), (600, 2), (750, 3)):  # 2 is sent again
+        live.see([Arrival(at_ms * MS, role == "cloud", 1, counter, math.nan, True)])
+    live.see([SessionOpened(900 * MS, role, 2, "")])
+    live.see([Arrival(990 * MS, role == "cloud", 2, 0, math.nan, True)])
+    gap = histogram(live, "cloudrc_link_gap_seconds")
+    assert gap.cumulative() == [2, 3, 3]
+    assert gap.total == pytest.approx(0.01 + 0.04 + 0.2)
+
+
 def test_world_waits_for_the_first_command_of_a_cloud_that_has_none_yet() -> None:
     assert heard("world", SessionOpened(0, "world", 1, ""), wake(60_000))
     assert not heard("cloud", SessionOpened(0, "cloud", 1, ""), wake(60_000))
