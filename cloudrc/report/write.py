@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.errors import BadInputError, MissingPrerequisiteError, in_words
 from cloudrc.files import put, read
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import METRIC_NOTE, Flight, Number, measure_all
@@ -192,7 +192,13 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
 
     experiment = assessment.experiment
     subject = Subject(assessment.flight, experiment.uplink, experiment.downlink)
-    pictures = draw_all(subject)
+    try:
+        pictures = draw_all(subject)
+    except ValueError as error:  # matplotlib's, of values that no flight has
+        raise BadInputError(
+            f"{folder}: what is recorded cannot be drawn ({in_words(error)}); report.json is "
+            "written, look into the recording"
+        ) from error
     figures = folder / "figures"
     if figures.is_symlink():  # of a run got from somebody else: it may lead anywhere
         raise BadInputError(f"{figures}: is a link; remove it, figures are kept with their run")

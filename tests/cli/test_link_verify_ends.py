@@ -76,8 +76,7 @@ def release(monkeypatch: pytest.MonkeyPatch) -> Iterator[Release]:
         made = Release(world, cloud, {"uplink": up, "downlink": down}, pods)
         made.count(0.0)
         monkeypatch.setattr(link_verify_ends.time, "sleep", made.count)
-        # Nor does time pass for pages that are kept: each look is to find what was counted last.
-        monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 0.0)
+        monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 0.0)  # since no time passes
         yield made
 
 
@@ -133,8 +132,7 @@ def test_counters_at_both_ends_show_a_bypass(release: Release) -> None:
     release.hears("world", "off")
     release.hears("cloud", "off")
     release.looks = 1
-    said = ask(release)
-    assert {cause.code for cause in said.causes} == {"bypassed"}
+    assert {cause.code for cause in ask(release).causes} == {"bypassed"}
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 from collections.abc import Callable, Iterator
+from math import nan
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -19,9 +20,11 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import open_file
 from cloudrc.link import trace
 from cloudrc.link.trace import read_trace
+from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.record.merge import write_mission
 from cloudrc.record.reader import read_contents
-from cloudrc.report.write import read_run
+from cloudrc.records import GroundTruth
+from cloudrc.report.write import read_run, write_report
 from tests.metrics.flights import flown
 
 pytestmark = pytest.mark.promise("P-CODE-4")
@@ -132,6 +135,19 @@ def test_a_report_that_was_there_before_is_believed_whole_or_not_at_all(
     assert read_run(run)[2] == anew
     (run / "report.json").write_text(json.dumps(GOOD))
     assert read_run(run)[2].notes == ("seen",)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_what_cannot_be_drawn_is_told_in_one_line(run: Path) -> None:
+    nowhere = Odometry(1, (nan, nan, nan), UPRIGHT, ZERO, ZERO)
+    world = [
+        record._replace(odometry=nowhere) if isinstance(record, GroundTruth) else record
+        for record in flown().world
+    ]
+    write_mission(run / "mission.mcap", sorted(world, key=lambda each: each.stamp_ns), ())
+    with pytest.raises(BadInputError, match=r"^[^\n]*cannot be drawn \(ValueError: [^\n]*$"):
+        write_report(run, *read_run(run))
+    assert json.loads((run / "report.json").read_text())["verdict"] == "failure"
 
 
 def test_a_report_of_a_folder_of_pipes_waits_for_none(
