@@ -50,9 +50,10 @@ def _copies(seed: int) -> Outcome:
 
 
 def _delay_step(seed: int) -> Outcome:
+    """With a jitter of 1 ms: of round trips that are the same bit by bit the metric shows one."""
     outcome, at = Outcome(), instant(seed)
     shape: Shape = lambda profile: replace(  # noqa: E731
-        profile, delay=0.01, jitter=0.0, changes=(Change(at, delay=0.1),)
+        profile, delay=0.01, jitter=0.001, changes=(Change(at, delay=0.1),)
     )
     flight = Flight("cloud.estimator=split", seed=seed, uplink=shape, downlink=shape).fly_mission()
     asks.safe(outcome, flight)
@@ -65,10 +66,12 @@ def _delay_step(seed: int) -> Outcome:
     outcome.most("delay estimate off after 0.5 s, share", max(late, default=float("nan")), 0.2)
     outcome.same("HOLDs", len(asks.held(flight)), 0)
     meters.moves(outcome, flight, "cloud", "delay_estimate_seconds", since=at)
-    shown = meters.reading(
-        "cloud", meters.seen_by(flight, "cloud", at + meters.SOON), "delay_estimate_seconds"
-    )
+    before, after = (meters.seen_by(flight, "cloud", at + later) for later in (0.0, meters.SOON))
+    shown = meters.reading("cloud", after, "delay_estimate_seconds")
     outcome.least("metric delay_estimate_seconds", shown, 0.15, "s")
+    long, longer = (meters.above("cloud", seen, "rtt_seconds", 0.15) for seen in (before, after))
+    outcome.same("metric rtt_seconds: round trips above 0.15 s before the step", long, 0)
+    outcome.least("metric rtt_seconds: round trips above 0.15 s within 5 s of it", longer, 200)
     for age_max, least in ((0.25, 5.0), (1.0, 3.5)):
         _hasty(outcome, seed, shape, age_max, least)
     return outcome
@@ -183,7 +186,7 @@ SCENARIOS = (
         "estimator `split` within 20 % in 0.5 s; no HOLD; the caps, which are those of the oldest "
         "command that may be flown, hold at full speed",
         "none",
-        "cloudrc_delay_estimate_seconds",
+        "cloudrc_rtt_seconds, cloudrc_delay_estimate_seconds",
         _delay_step,
     ),
     Scenario(
