@@ -42,12 +42,12 @@ def show(options: argparse.Namespace) -> int:
 def run(options: argparse.Namespace) -> int:
     """Run one fault or all of them; 1 if a check did not pass."""
     from cloudrc.faults import document
-    from cloudrc.faults.catalogue import find, scenarios
+    from cloudrc.faults.catalogue import called, scenarios
 
     mode = _mode(options)
     if mode == "cluster":
         _look_for_release(options)
-    chosen = scenarios(mode) if options.all else [find(options.name, mode)]
+    chosen = scenarios(mode) if options.all else called(options.name, mode)
     say = print if options.output == "table" else _silent
     results = []
     for result in _results(chosen, options):

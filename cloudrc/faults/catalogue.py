@@ -29,15 +29,23 @@ def scenarios(mode: Mode | None = None) -> list[Scenario]:
 
 
 def find(name: str, mode: Mode) -> Scenario:
-    """Give a fault by its number (F13) or name (cloud-killed).
+    """Give a fault by its name (cloud-killed), or the first of a number (F13).
+
+    Raises:
+        BadInputError: If there is none in this mode; names those that there are.
+    """
+    return called(name, mode)[0]
+
+
+def called(name: str, mode: Mode) -> list[Scenario]:
+    """Give the fault of a name, or all of a number: F31 with real processes are two.
 
     Raises:
         BadInputError: If there is none in this mode; names those that there are.
     """
     there = scenarios(mode)
-    for each in there:
-        if name.lower() in (each.id.lower(), each.name):
-            return each
+    if found := [each for each in there if name.lower() in (each.id.lower(), each.name)]:
+        return found
     for other in scenarios():
         if name.lower() in (other.id.lower(), other.name):
             flag = "" if other.mode == "virtual" else f" --{other.mode}"

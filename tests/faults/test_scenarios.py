@@ -17,7 +17,7 @@ from cloudrc.cli.parser import COUNT_MAX
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.faults import asks, document
-from cloudrc.faults.catalogue import find, scenarios
+from cloudrc.faults.catalogue import called, find, scenarios
 from cloudrc.faults.document import Result
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Check, Mode, Outcome, Scenario
@@ -122,6 +122,10 @@ def test_one_seed_is_one_run(name: str) -> None:
 def test_an_unknown_fault_is_bad_input() -> None:
     with pytest.raises(BadInputError, match="no fault 'F99' in mode virtual; there are: F1 "):
         find("F99", "virtual")
+
+
+def test_a_number_stands_for_all_its_faults() -> None:
+    assert [each.name for each in called("f31", "real")] == ["slow-scrapers", "fast-scrapers"]
 
 
 @pytest.mark.parametrize(
