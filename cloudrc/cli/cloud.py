@@ -42,7 +42,10 @@ def execute(options: argparse.Namespace) -> int:
     identity = CloudIdentity(opened.clock, os.urandom(16), opened.keys.ring, suite())
     teleop = _join(options.teleop) if options.teleop else None
     cloud = assembly.build_cloud(opened.experiment, identity, time.monotonic_ns, teleop)
-    flies = lambda: cloud.guard is GuardState.TRACK  # noqa: E731
+
+    def flies() -> bool:
+        return cloud.guard is GuardState.TRACK
+
     ends = LastWord(stop, flies) if teleop else stop
     opened.fly(cloud, ends, flies, over=lambda: cloud.mission_over)
     return 0

@@ -70,6 +70,7 @@ WANT, WORD = "command age 0.252 s above 0.250 s", "mission ended"
     [
         ("F13", 3.0, [WANT, WORD], []),
         ("F13", 3.0, [WORD], ["container: HOLDs for want", "pod: HOLDs for want"]),
+        ("F13", 3.0, [WORD, WORD], ["container: HOLDs for want"]),
         ("F13", 3.6, [WANT, WORD], ["container: flown again"]),
         ("F13", 6.1, [WANT, WORD], ["container: flown again", "pod: flown again"]),
         ("F14", 1.9, [WORD, WORD], []),
