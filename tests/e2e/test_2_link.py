@@ -166,7 +166,7 @@ def set_link(*words: str) -> dict[str, Any]:
 def test_the_link_is_set_by_hand_and_read_back(flight: None, note: Callable[[str], None]) -> None:
     took = []
     try:
-        for delay in (80, 120):
+        for delay in (80, 120, 80, 120):
             told = set_link(f"downlink.delay_ms={delay}", "downlink.jitter_ms=0")
             took.append(told["seconds"])
         assert told["links"]["downlink"]["asked"]["delay"] == 0.12
