@@ -13,6 +13,9 @@ from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
 from cloudrc.records_link import LinkChanged as LinkChanged
 from cloudrc.records_link import LinkChecked as LinkChecked
 
+REAL_TIME_FACTOR_MIN = 0.95
+"""Below it a run that was to be in real time is invalid. Source: DESIGN, section 9."""
+
 
 class TelemetrySent(NamedTuple):
     """World: telemetry left. Topics /odometry and /telemetry.

@@ -21,9 +21,8 @@ import numpy as np
 from cloudrc.messages import GuardState, Vector
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics._contact import first_touch
+from cloudrc.records import REAL_TIME_FACTOR_MIN
 
-REAL_TIME_FACTOR_MIN = 0.95
-"""Below it a run that was to be in real time is invalid."""
 SLIP_MAX = 0.25
 """World's clock may lose so much in a flight [s]: the guard's usual limit on a command's age, above
 which a slow machine and not the network would decide what the guard does."""

@@ -7,10 +7,8 @@ while it flies, and the metric goes on telling.
 from __future__ import annotations
 
 from cloudrc.messages import NEVER_NS
-from cloudrc.records import Fault
+from cloudrc.records import REAL_TIME_FACTOR_MIN, Fault
 
-REAL_TIME_FACTOR_MIN = 0.95
-"""Source: DESIGN, section 9."""
 QUIET_NS = 10_000_000_000
 """It is told again once it has kept up for so long [ns]."""
 

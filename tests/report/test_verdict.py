@@ -10,6 +10,7 @@ from cloudrc import plugins
 from cloudrc.messages import GuardState
 from cloudrc.metrics import Flight, Number
 from cloudrc.records import (
+    REAL_TIME_FACTOR_MIN,
     Arrival,
     Contact,
     Control,
@@ -18,7 +19,7 @@ from cloudrc.records import (
     MissionEvent,
     SessionOpened,
 )
-from cloudrc.report.verdict import REAL_TIME_FACTOR_MIN, SLIP_MAX, Verdict, judge
+from cloudrc.report.verdict import SLIP_MAX, Verdict, judge
 from tests.metrics.flights import ONE_PIPE, SECOND, Log, at, flown, touch
 
 
