@@ -5,7 +5,9 @@ Kernel stamps at both ends: how late Python is woken here changes nothing.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -77,18 +79,25 @@ def test_a_relay_run_draws_the_virtual_sequence(tmp_path: Path, name: str) -> No
 
 
 def check(folder: Path, links: Links, seconds: float, *, exact: bool) -> None:
-    """What no machine may change holds in every try; how late it makes a relay, in one of them."""
+    """What no machine may change holds in every try; how late it makes a relay, in one of them.
+
+    The order is a machine's, too: what a relay that is held up takes in late may have been due
+    before what has left.
+    """
     worst = [_check(folder, links, seconds, exact=exact)]
     while exact and max(worst[-1]) > 1.0 and len(worst) < TRIES:
         worst.append(_check(folder, links, seconds, exact=exact))
-    print("errors in units of what is allowed, worst mean and deviation of each try:", worst)
+    print("in units of what is allowed, worst mean and deviation, any out of order:", worst)
     assert not exact or min(max(one) for one in worst) <= 1.0
 
 
-def _check(folder: Path, links: Links, seconds: float, *, exact: bool) -> tuple[float, float]:
-    """Sound them once; give the worst mean and deviation in units of what is allowed."""
+Worst: TypeAlias = tuple[float, float, float]
+
+
+def _check(folder: Path, links: Links, seconds: float, *, exact: bool) -> Worst:
+    """Sound them once; give the worst mean, deviation and order in units of what is allowed."""
     fifo = fifo_allowed()
-    mean = deviation = 0.0
+    mean = deviation = order = 0.0
     for row in measure(folder, links, seconds, fifo=fifo):
         judged, where = row.judged, f"{row.name} {row.direction}"
         assert judged.wrongly_lost == judged.wrongly_arrived == 0, where
@@ -96,13 +105,13 @@ def _check(folder: Path, links: Links, seconds: float, *, exact: bool) -> tuple[
         assert np.median(judged.errors) < (AT_ONCE if fifo else PATIENCE), where
         assert judged.swapped <= SWAPPED * judged.errors.size, where
         if exact:
-            assert judged.swapped == 0, where
+            order = max(order, math.inf if judged.swapped else 0.0)
             mean = max(mean, float(judged.errors.mean()) / 0.3e-3)
             deviation = max(deviation, float(judged.errors.std()) / 0.5e-3)
         if row.name == "trace":
             trace = profiles_of(folder, links["trace"])[0]
             assert correlation(judged, trace) >= 0.98, where
-    return mean, deviation
+    return mean, deviation, order
 
 
 def replay(folder: Path) -> dict[str, object]:
