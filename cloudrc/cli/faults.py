@@ -23,7 +23,9 @@ examples:
   cloudrc faults merge a.json b.json         two slices as one search
 
 exit codes: 0 no check failed, 1 one did, 2 bad input,
-  3 or 5 no cluster or no release there (--cluster), 130 interrupted"""
+  3 or 5 no cluster or no release there (--cluster),
+  6 a worker was killed, 130 interrupted"""
+JOBS = "at once, one a core at most (default: 1)"
 SEED_MAX = 2**53 - 1 - COUNT_MAX
 """Of the first one: an experiment takes those counted from it, too, which are below 2^53."""
 ACTIONS = {
@@ -86,7 +88,7 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--all", action="store_true", help="every fault of the mode")
     _modes(parser)
     parser.add_argument("--seed", type=seed, default=1, metavar="N", help="default: 1")
-    parser.add_argument("--jobs", type=count, default=1, metavar="J", help="at once (default: 1)")
+    parser.add_argument("--jobs", type=count, default=1, metavar="J", help=JOBS)
     parser.add_argument(
         "--junit", type=written_to, metavar="FILE", help="write the results as JUnit"
     )
@@ -99,7 +101,7 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
 def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=count, default=200, metavar="N", help="default: 200")
     parser.add_argument("--first", type=seed, default=1, metavar="N", help="default: 1")
-    parser.add_argument("--jobs", type=count, default=1, metavar="J", help="at once (default: 1)")
+    parser.add_argument("--jobs", type=count, default=1, metavar="J", help=JOBS)
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument(
         "--adversarial", action="store_true", help="the cloud holds valid keys and wants a breach"

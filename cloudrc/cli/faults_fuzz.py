@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +17,7 @@ from cloudrc.cli import faults_page as page
 from cloudrc.cli import faults_slices as slices
 from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import paint, say, table, unread_is_fine, written
+from cloudrc.cli.pool import WorkerDiedError, in_order
 from cloudrc.cli.signals import end_with
 from cloudrc.errors import BadInputError
 
@@ -37,19 +34,20 @@ PROGRESS_PERIOD = 10.0
 
 
 def fuzz(options: argparse.Namespace) -> int:
-    """Fly many random schedules; 1 if an invariant broke, 130 if it was told to stop."""
+    """Fly many random schedules; 1 if an invariant broke, 130 if told to stop, 6 if killed."""
     say = options.output == "table"
     search = Search(options, sources())
+    cause, code = "stopped", INTERRUPTED
     with stopping() as stop:
         try:
             _fly_all(search, say, stop)
-        except BrokenProcessPool:
-            if not stop():
-                raise
+        except WorkerDiedError as error:
+            if not stop():  # else it was the same wish that has ended the worker
+                cause, code = str(error), error.exit_code
     document, cut = search.document(), len(search.findings) < options.seeds
     if cut and not search.findings:
-        print("cloudrc: stopped before the first schedule was flown", file=sys.stderr)
-        return INTERRUPTED
+        print(f"cloudrc: {cause}; not one schedule was flown", file=sys.stderr)
+        return code
     if path := options.slice or (options.store / SLICE.format(**document) if cut else None):
         slices.keep(document, path)
     if options.document is not None and not cut:
@@ -57,11 +55,11 @@ def fuzz(options: argparse.Namespace) -> int:
         options.document.write_text(page.markdown(document, by), encoding="utf-8")
     if cut:
         then = page.command(document | _rest(document, options))
-        told = f"stopped after {document['count']} of {options.seeds}: kept in {path}"
+        told = f"{cause}; {document['count']} of {options.seeds} are kept in {path}"
         with unread_is_fine(sys.stderr):  # else nothing of what follows was written to a file
             print(f"cloudrc: {told}; go on with '{then}'", file=sys.stderr, flush=True)
     _print(document, options)
-    return INTERRUPTED if cut else FAILED if search.failures else 0
+    return code if cut else FAILED if search.failures else 0
 
 
 def merge(options: argparse.Namespace) -> int:
@@ -188,15 +186,7 @@ def replay(options: argparse.Namespace) -> int:
 
 def _findings(seeds: Iterable[int], options: argparse.Namespace) -> Iterator[Finding]:
     work = [(seed, _kind(options)) for seed in seeds]
-    if options.jobs == 1:
-        yield from map(_fly, work)
-        return
-    fork = multiprocessing.get_context("fork")  # its workers are children of this process
-    pool = ProcessPoolExecutor(options.jobs, fork, _leave_signals_to, (os.getpid(),))
-    try:
-        yield from pool.map(_fly, work)  # one by one: so it soon ends when it is told to
-    finally:
-        pool.shutdown(cancel_futures=True)
+    return in_order(_fly, work, options.jobs, _leave_signals_to)
 
 
 def _leave_signals_to(first: int) -> None:

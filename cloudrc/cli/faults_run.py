@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import harmless, paint, table, written
-from cloudrc.cli.signals import end_with
+from cloudrc.cli.pool import in_order
 
 if TYPE_CHECKING:
     from cloudrc.faults.document import Result
@@ -83,12 +80,8 @@ def _mode(options: argparse.Namespace) -> Mode:
 
 def _results(chosen: Sequence[Scenario], options: argparse.Namespace) -> Iterator[Result]:
     names = [(each.name, each.mode, options.seed) for each in chosen]
-    if options.jobs == 1 or len(chosen) == 1 or _mode(options) != "virtual":
-        yield from map(_run, names)
-        return
-    context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(options.jobs, context, end_with, (os.getpid(),)) as pool:
-        yield from pool.map(_run, names)
+    jobs = options.jobs if _mode(options) == "virtual" else 1
+    return in_order(_run, names, jobs)
 
 
 def _run(which: tuple[str, Mode, int]) -> Result:

@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Generator, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 from cloudrc.cli.closing import EXIT_CODES
 from cloudrc.cli.folder import new_folder
 from cloudrc.cli.output import say, unread_is_fine, written
+from cloudrc.cli.pool import KILLED, WorkerDiedError
 from cloudrc.cli.signals import end_with
 from cloudrc.cli.statistics import as_csv, as_table, summarise
 
@@ -24,7 +26,7 @@ from cloudrc.cli.statistics import as_csv, as_table, summarise
 def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
     """Fly seeds 1 to N; exit 0 only if each of them succeeds.
 
-    Who interrupts gets the table of the seeds that are finished.
+    Who interrupts gets the table of the seeds that are finished; so does who loses a worker.
     """
     from cloudrc.config.load import load_experiment
 
@@ -33,28 +35,27 @@ def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
     folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds")
     seeds = range(1, options.seeds + 1)
     reports: list[dict[str, Any]] = []
-    interrupted = False
+    code = 0
     try:
         with closing(_reports(options.experiment, overrides, folder, seeds)) as finished:
             for report in finished:
                 reports.append(report)
                 _tell(options, report, f"{len(reports)}/{len(seeds)}")
-    except KeyboardInterrupt:
-        interrupted = True
-        count = f"{len(reports)} of {len(seeds)} seeds are finished"
+    except (KeyboardInterrupt, BrokenProcessPool) as error:
+        killed = isinstance(error, BrokenProcessPool)
+        code = WorkerDiedError.exit_code if killed else EXIT_CODES["interrupted"]
+        told = f"{KILLED if killed else 'interrupted'}: {len(reports)} of {len(seeds)} seeds"
         with unread_is_fine(sys.stderr):
-            print(f"\ncloudrc: interrupted: {count}", file=sys.stderr, flush=True)
+            print(f"\ncloudrc: {told} are finished", file=sys.stderr, flush=True)
     reports.sort(key=lambda report: int(report["seed"]))
-    summary = _write(folder, name, reports, interrupted)
+    summary = _write(folder, name, reports, bool(code))
     with unread_is_fine(sys.stdout):
         if options.output != "table":
             document = json.loads((folder / "sweep.json").read_text())
             print(written(document, options.output), flush=True)
         else:
             print(f"\n{as_table(summary)}\n\n{folder / 'sweep.json'}", flush=True)
-    if interrupted:
-        return EXIT_CODES["interrupted"]
-    return max(EXIT_CODES[report["verdict"]] for report in reports)
+    return code or max(EXIT_CODES[report["verdict"]] for report in reports)
 
 
 def _tell(options: argparse.Namespace, report: dict[str, Any], count: str) -> None:

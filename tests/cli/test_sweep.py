@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -40,19 +41,30 @@ def test_many_seeds_become_one_table(folder: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("finished", [0, 2])
+@pytest.mark.parametrize(
+    ("error", "code", "word"),
+    [(KeyboardInterrupt, 130, "interrupted"), (BrokenProcessPool, 6, "a worker was killed")],
+)
 def test_an_interrupted_sweep_keeps_what_is_finished(
-    finished: int, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    error: type[BaseException],
+    code: int,
+    word: str,
+    finished: int,
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def reports(*arguments: object) -> Iterator[dict[str, Any]]:
         for seed in range(1, finished + 1):
             numbers = {"duration": {"value": float(seed), "unit": "s"}}
             yield {"seed": seed, "verdict": "success", "failures": [], "numbers": numbers}
-        raise KeyboardInterrupt
+        raise error
 
     monkeypatch.setattr(sweep, "_reports", reports)
-    assert main(["run", "steps", "--seeds", "9", "--out", "sweep"]) == 130
+    assert main(["run", "steps", "--seeds", "9", "--out", "sweep"]) == code
     captured = capsys.readouterr()
-    assert f"interrupted: {finished} of 9 seeds are finished" in captured.err
+    assert f"cloudrc: {word}" in captured.err
+    assert f": {finished} of 9 seeds are finished\n" in captured.err
     assert captured.out.splitlines()[-1] == "sweep/sweep.json"
     document = json.loads((folder / "sweep/sweep.json").read_text())
     assert [run["seed"] for run in document["runs"]] == list(range(1, finished + 1))
@@ -60,16 +72,21 @@ def test_an_interrupted_sweep_keeps_what_is_finished(
     assert len((folder / "sweep/sweep.csv").read_text().splitlines()) == 1 + finished
 
 
-@pytest.mark.process
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_a_sweep_at_once(number: int, folder: Path) -> None:
-    """Ctrl-C and SIGHUP go to the whole group of processes, from a terminal; SIGTERM to one."""
+def _begin_sweep() -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "cloudrc", "run", "paper", "--seeds", "40", "--out", "sweep"]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     assert process.stdout is not None
     assert "1/40" in process.stdout.readline()
+    return process
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_sweep_at_once(number: int, folder: Path) -> None:
+    """Ctrl-C and SIGHUP go to the whole group of processes, from a terminal; SIGTERM to one."""
+    process = _begin_sweep()
     start = time.monotonic()
     if number != signal.SIGTERM:
         os.killpg(process.pid, number)
@@ -79,6 +96,21 @@ def test_a_signal_ends_a_sweep_at_once(number: int, folder: Path) -> None:
     assert time.monotonic() - start < 3.0
     assert process.returncode == 130
     assert "Traceback" not in errors
+    document = json.loads((folder / "sweep/sweep.json").read_text())
+    assert document["interrupted"]
+    assert 1 <= document["count"] < 40
+
+
+@pytest.mark.process
+def test_a_sweep_that_loses_a_worker_keeps_what_is_finished(folder: Path) -> None:
+    process = _begin_sweep()
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    workers = [pid for pid in children if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]
+    os.kill(int(workers[0]), signal.SIGKILL)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 6
+    assert "Traceback" not in errors
+    assert "cloudrc: a worker was killed" in errors
     document = json.loads((folder / "sweep/sweep.json").read_text())
     assert document["interrupted"]
     assert 1 <= document["count"] < 40

@@ -38,6 +38,7 @@ def _fly(schedule: Schedule, keep: bool = False) -> Finding:
 def fuzz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fuzz:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cloudrc.faults.fuzz.fly", _fly)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
 
     def run(name: str, first: int, seeds: int, *flags: str, code: int = 0) -> dict[str, Any]:
         line = ["faults", "fuzz", f"--first={first}", f"--seeds={seeds}", f"--slice={name}"]
@@ -170,7 +171,7 @@ def test_what_was_flown_until_it_is_told_to_stop_is_a_slice(
     assert len(told["failures"]) == (at == BAD), "not shrunk, but told"
     assert page.read_text() == "of a longer one"
     rest = f"cloudrc faults fuzz --first {at + 1} --seeds {20 - at}"
-    assert f"stopped after {at} of 20: kept in a.json; go on with '{rest}'" in (
+    assert f"stopped; {at} of 20 are kept in a.json; go on with '{rest}'" in (
         capsys.readouterr().err
     )
     monkeypatch.setattr("cloudrc.faults.fuzz.fly", _fly)

@@ -1,0 +1,99 @@
+"""Work on several cores: its order, how many processes it takes, and one that is killed."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.cli.pool import WorkerDiedError, in_order
+from cloudrc.faults.fuzz import Finding
+from cloudrc.faults.schedule import Schedule
+
+KILLED = 5
+"""The seed whose flight kills its process."""
+
+
+@pytest.fixture(autouse=True)
+def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+
+
+def _slow_first(number: int) -> int:
+    time.sleep(0.2 * (number == 0))
+    return number
+
+
+def _who(number: int) -> int:
+    return os.getpid()
+
+
+def _end_one(number: int) -> int:
+    if number == KILLED:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def test_results_come_in_the_order_of_the_work() -> None:
+    assert list(in_order(_slow_first, range(6), 2)) == list(range(6))
+
+
+def test_there_are_no_more_processes_than_cores_however_many_are_asked_for() -> None:
+    done = in_order(_who, range(6), 100_000)
+    pids = {next(done)}
+    assert len(multiprocessing.active_children()) == 2
+    assert os.getpid() not in pids.union(done)
+    assert multiprocessing.active_children() == []
+
+
+@pytest.mark.parametrize(("pieces", "jobs"), [(1, 100_000), (6, 1), (0, 2)])
+def test_where_one_is_enough_it_is_this_one(pieces: int, jobs: int) -> None:
+    assert list(in_order(_who, range(pieces), jobs)) == [os.getpid()] * pieces
+
+
+def test_a_process_that_is_killed_is_told_of() -> None:
+    with pytest.raises(WorkerDiedError, match=r"a worker was killed.*fewer '--jobs'"):
+        list(in_order(_end_one, range(9), 2))
+    assert multiprocessing.active_children() == []
+
+
+def _fly(schedule: Schedule, keep: bool = False) -> Finding:
+    if schedule.seed == KILLED:
+        time.sleep(0.5)  # until those before are told
+    _end_one(schedule.seed)
+    return Finding(schedule, (), "", 1.0, 1.0, 0, 0, 0.0)
+
+
+def test_a_search_that_loses_a_process_keeps_what_was_flown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("cloudrc.faults.fuzz.fly", _fly)
+    assert main("faults fuzz --seeds 9 --jobs 2 --slice a.json".split()) == 6
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert error.startswith("cloudrc: a worker was killed")
+    count = json.loads(Path("a.json").read_text())["count"]
+    assert 1 <= count < KILLED
+    assert f"{count} of 9 are kept in a.json" in error
+    assert f"go on with 'cloudrc faults fuzz --first {count + 1} --seeds {9 - count}'" in error
+    assert main(f"faults fuzz --first {KILLED} --seeds 2 --jobs 2".split()) == 6
+    assert "; not one schedule was flown" in capsys.readouterr().err
+
+
+def test_faults_that_lose_a_process_say_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("cloudrc.cli.faults_run._run", _kill)
+    assert main("faults run --all --jobs 2".split()) == 6
+    assert capsys.readouterr().err.startswith("cloudrc: error: a worker was killed")
+
+
+def _kill(which: tuple[str, str, int]) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
