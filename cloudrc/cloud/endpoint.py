@@ -12,11 +12,12 @@ from collections import defaultdict
 from math import nan
 
 from cloudrc.cloud.identity import CloudIdentity as CloudIdentity
+from cloudrc.cloud.lateness import Lateness
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Alarm, is_meant_for, seen_in
 from cloudrc.cloud.operator import Operator as Operator
 from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
-from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
+from cloudrc.records import Arrival, Counted, MissionEvent, Record, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
@@ -37,8 +38,6 @@ ALIVE_PERIOD_NS = 100_000_000
 PATIENCE_NS = 5_000_000_000
 """So long without a session is worth telling [ns]."""
 COUNT_PERIOD_NS = 1_000_000_000
-MISSED_MAX = 50
-"""So many missed periods are a fault worth telling; a few happen on any machine."""
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 _new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
 
@@ -77,7 +76,7 @@ class CloudEndpoint:
         self._world = ""  # names the process that has accepted the session
         self.guard = GuardState.GROUND  # as telemetry last told
         self._delays = (nan, nan, nan)  # horizon, round trip and loop of the last command [s]
-        self._alarm = Alarm()
+        self._alarm, self._lateness = Alarm(), Lateness()
         self._asked = 0  # the highest number of an operator's request
         self._tick_ns = start_ns
         self._hello_ns = start_ns
@@ -121,7 +120,8 @@ class CloudEndpoint:
             return
         missed = (now_ns - self._tick_ns) // PERIOD_NS
         if missed:
-            self._count_missed(missed, now_ns)
+            self._counts["missed_periods"] += missed
+            self._records += self._lateness.miss(missed, now_ns)
         self._tick_ns += (missed + 1) * PERIOD_NS
         if self._asks(now_ns):
             self._say_hello_if_due(now_ns)
@@ -172,16 +172,6 @@ class CloudEndpoint:
             self._say_hello_if_due(now_ns)  # world may have moved on, its accept lost
         elif self._asks(now_ns):
             self._records += self._complaints.about(outcome, data, now_ns)
-
-    def _count_missed(self, missed: int, now_ns: int) -> None:
-        before = self._counts["missed_periods"]
-        self._counts["missed_periods"] += missed
-        if before < MISSED_MAX <= before + missed:
-            text = (
-                f"cloud has let {before + missed} periods of 10 ms pass without a command: "
-                "a plug-in is slow or the machine is busy"
-            )
-            self._records.append(Fault(now_ns, "late", text))
 
     def _say_hello_if_due(self, now_ns: int) -> None:
         if now_ns < self._hello_ns:
