@@ -291,7 +291,8 @@ class Flight:
 def _watch(experiment: ResolvedExperiment) -> Watch:
     guard = experiment.guard
     age_max_ns = round(guard.command_age_max_ms * 1e6)
-    return Watch(guard.speed_max_mps, guard.acceleration_max_mps2, age_max_ns)
+    caps = guard.speed_max_mps, guard.acceleration_max_mps2, guard.yaw_rate_max_radps
+    return Watch(*caps, age_max_ns)
 
 
 def _link(experiment: ResolvedExperiment, shape: Shape | None, up: bool) -> LinkDirection:

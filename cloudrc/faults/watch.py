@@ -73,19 +73,22 @@ class Watch:
             the floor left out, and until it flew again.
     """
 
-    def __init__(self, speed_max: float, acceleration_max: float, age_max_ns: int) -> None:
+    def __init__(
+        self, speed_max: float, acceleration_max: float, yaw_rate_max: float, age_max_ns: int
+    ) -> None:
         """Learn the limits, from the configuration and not from the guard.
 
         Args:
             speed_max: Cap on the reference [m/s].
             acceleration_max: Cap on its change [m/s^2].
+            yaw_rate_max: Cap on the yaw rate [rad/s].
             age_max_ns: Of a command's basis [ns].
         """
         self._speed_max, self._step_max = (
             speed_max + SLACK,
             acceleration_max * TICK_NS * 1e-9 + SLACK,
         )
-        self._age_max_ns = age_max_ns
+        self._age_max_ns, self._yaw_rate_max = age_max_ns, yaw_rate_max
         self.breaches: list[Breach] = []
         self.counts: Counter[str] = Counter()
         self.margin, self.speed = 9.0, 0.0
@@ -103,7 +106,7 @@ class Watch:
         step, offer, stop = simulator.step, guard.offer, guard.stop
         now_ns, basis_ns, before = start_ns, -1, ZERO
         flew = falls = hit = False
-        age_max_ns, flown = self._age_max_ns, FLOWN
+        age_max_ns, yaw_rate_max, flown = self._age_max_ns, self._yaw_rate_max, FLOWN
         tracking, landing, stopped = GuardState.TRACK, GuardState.LAND, GuardState.ESTOP
 
         def watched_offer(command: Command, when_ns: int) -> Any:
@@ -133,6 +136,8 @@ class Watch:
             if flies:
                 self._comes_down = state is landing
                 self._look_at_stop(position, reference, state is landing, now_ns)
+                if not abs(guard.yaw_rate) <= yaw_rate_max:  # NaN is no rate either
+                    self.note(now_ns, "cap", f"reference turns by {guard.yaw_rate:.3f} rad/s")
                 if reference is not before:
                     self._look_at_caps(before, reference, state is tracking, now_ns)
                 if state is tracking and now_ns - basis_ns > age_max_ns:

@@ -203,7 +203,7 @@ def test_the_watch_judges_by_its_own_fence(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_the_watch_counts_the_age_of_commands_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cloudrc.faults.flight._watch", lambda _: Watch(6.0, 12.0, 50_000_000))
+    monkeypatch.setattr("cloudrc.faults.flight._watch", lambda _: Watch(6.0, 12.0, 1.0, 50_000_000))
     assert fly(Schedule(1, "paper-p2", duration=5.0)).kinds == {"stale"}
 
 

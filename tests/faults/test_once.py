@@ -20,7 +20,7 @@ def _flight(*entries: tuple[str, str, int]) -> Any:
     kept = [{"mission": m, "event": e, "waypoint": w} for m, e, w in entries]
     return SimpleNamespace(
         listeners=[],
-        watch=Watch(6.0, 12.0, 250_000_000),
+        watch=Watch(6.0, 12.0, 1.0, 250_000_000),
         desk=SimpleNamespace(entries=[{"kind": "mission", "mission": "m1"}, *kept]),
         run=SimpleNamespace(now_ns=0),
     )

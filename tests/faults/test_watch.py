@@ -1,5 +1,6 @@
 """The watch itself: what it calls a breach, and what not."""
 
+from math import nan
 from types import SimpleNamespace
 
 import pytest
@@ -20,9 +21,9 @@ class World:
     def __init__(self):
         self.readings = SimpleNamespace(position=INSIDE, velocity=ZERO)
         self.state, self.reference, self.steps = TRACK, ZERO, 0
-        self.watch = Watch(6.0, 12.0, 250 * MS)
+        self.watch = Watch(6.0, 12.0, 1.0, 250 * MS)
         self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
-        self.guard = SimpleNamespace(state=TRACK, reference=ZERO)
+        self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=0.0)
         self.guard.offer = lambda command, now: None
         self.guard.stop = self.guard.acknowledge = self.guard.tick = lambda now: None
         self.robot = SimpleNamespace(simulator=self.simulator, guard=self.guard)
@@ -121,6 +122,17 @@ def test_a_breach_says_how_long_before_something_was_hit():
 )
 def test_the_reference_grows_no_faster_than_the_cap(reference, kinds):
     assert World().tick(reference) == kinds
+
+
+@pytest.mark.parametrize(
+    ("yaw_rate", "kinds"),
+    [(1.0, set()), (-1.0, set()), (1.001, {"cap"}), (-1.001, {"cap"}), (nan, {"cap"})],
+)
+def test_it_turns_no_faster_than_the_cap(yaw_rate, kinds):
+    world = World()
+    world.guard.yaw_rate = yaw_rate
+    assert world.tick(ZERO) == kinds
+    assert world.tick(ZERO, state=GROUND) == kinds, "on the ground nothing turns"
 
 
 def test_it_may_slow_down_at_once_and_is_not_held_to_the_cap_while_it_brakes():
@@ -229,7 +241,7 @@ def test_under_an_honest_cloud_nothing_but_the_tip_touches_and_that_the_board(
     body, tip, state, kinds
 ):
     for honest, found in ((True, kinds), (False, set())):
-        watch = Watch(6.0, 12.0, 250 * MS)
+        watch = Watch(6.0, 12.0, 1.0, 250 * MS)
         watch.see(Contact(0, body, INSIDE, ZERO, ZERO, tip), state, honest)
         assert set(watch.counts) == found
 
