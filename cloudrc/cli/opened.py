@@ -81,13 +81,15 @@ class Opened(NamedTuple):
 
 def open_end(options: argparse.Namespace, name: str) -> Opened:
     """Open what the "world" or the "cloud" needs; what cannot be had is said by its flag."""
-    from cloudrc.config.load import load_experiment, read_experiment
+    from cloudrc.config.load import fingerprint, load_experiment, read_experiment
     from cloudrc.drivers.machine import clock_id
 
     exporter, load = open_exporter(options, name), read_experiment
     if name == "cloud":  # which alone flies by plug-ins
         load = load_experiment
     experiment, clock = load(str(options.config)), clock_id()
+    if exporter is not None:
+        exporter.runs(fingerprint(experiment))
     keys, peer = _open_keys(options), _open_peer(options)
     recorder = _open_recorder(options, name, clock)  # last: whoever cannot fly moves no recording
     return Opened(options, name, exporter, experiment, clock, recorder, keys, peer)

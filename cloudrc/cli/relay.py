@@ -56,7 +56,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Forward."""
     from cloudrc import assembly
-    from cloudrc.config.load import read_experiment
+    from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.feed import Feed
     from cloudrc.drivers.process import StopSignal
     from cloudrc.link.relay import Relay
@@ -92,6 +92,7 @@ def execute(options: argparse.Namespace) -> int:
             show_asked(exporter, experiment)
         for way in WAYS:
             exporter.shaped("relay", way, "relay")
+        exporter.runs(fingerprint(experiment))
         exporter.ready(True)
         relay.run(_counting(ask, relay, exporter))
     counts = ", ".join(f"{name} {count:g}" for name, count in relay.counts().items())

@@ -67,7 +67,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Fly missions."""
-    from cloudrc.config.load import read_experiment
+    from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.process import StopSignal
     from cloudrc.records import Counted
 
@@ -75,6 +75,8 @@ def execute(options: argparse.Namespace) -> int:
         require("the API of teleop", ("api",))
     stop, exporter = StopSignal(), open_exporter(options, "teleop")
     experiment = read_experiment(str(options.config))
+    if exporter is not None:
+        exporter.runs(fingerprint(experiment))
     served = serve_api(options, experiment) if options.api else None
     journal = None
     try:

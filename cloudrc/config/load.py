@@ -8,6 +8,7 @@ is said at once, each with the line it stands in.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -83,6 +84,15 @@ def dump(experiment: ResolvedExperiment) -> str:
     keeps the text may copy a trace beside it and name it relative to it.
     """
     return yaml_text.write(experiment.model_dump(mode="json"))
+
+
+def fingerprint(experiment: ResolvedExperiment) -> str:
+    """Hash all that an experiment sets: two with the same one are flown alike.
+
+    Returns:
+        SHA-256 of what `dump` writes, in hexadecimal digits.
+    """
+    return hashlib.sha256(dump(experiment).encode()).hexdigest()
 
 
 def _load_experiment(

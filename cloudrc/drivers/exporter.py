@@ -37,6 +37,8 @@ JSON = "application/json"
 KEPT = 0.25
 """A page is shown to whoever asks within this time [s]. To make one takes 1.4 ms, for which the
 loop may have to wait: four a second are less than one wake in a hundred."""
+CONFIG_DIGITS = 12
+"""Of the configuration's hash, as git shortens one; report.json has all of it."""
 STILL_MAX = 5.0
 """A loop that has said nothing for so long stands still [s]; each says something every second."""
 
@@ -54,7 +56,7 @@ class Exporter:
         self._role, self._metrics = role, of_role(role)
         self._live = Live(role, missions=missions)
         self._sync_age: Callable[[], float | None] = lambda: None
-        self._said_ready = False
+        self._said_ready, self._config = False, ""
         self._seen_at: float | None = None  # no loop is alive or dead before it has begun
         self._server: ProbeServer | None = None
         self._making = threading.Lock()
@@ -72,6 +74,10 @@ class Exporter:
         """Say whether this process is ready; world and cloud need not, their records tell."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
+
+    def runs(self, fingerprint: str) -> None:
+        """Say the hash of the configuration by which this process runs."""
+        self._config = fingerprint[:CONFIG_DIGITS]
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
         """Say who shapes a direction of the link from now on; only with the role "link".
@@ -144,7 +150,7 @@ class Exporter:
 
     def _of_process(self) -> Readings:
         readings: Readings = {
-            "cloudrc_build_info": {(__version__, self._role): 1.0},
+            "cloudrc_build_info": {(__version__, self._role, self._config): 1.0},
             "cloudrc_ready": plain(self.is_ready),
         }
         if (age := self._sync_age()) is not None:

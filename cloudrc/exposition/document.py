@@ -14,11 +14,12 @@ HEAD = """\
 
 <!-- Written by `make docs` from cloudrc/exposition/table.py: edit that. -->
 
-Every process serves `/metrics` for Prometheus, `/healthz` (200 while its own loop moves) and
-`/readyz` (200 once it hears its peer) where `--metrics HOST:PORT` says; in the cluster that is
-port 9100 of `world` and `cloud`, 9101 of `teleop` and 9102 of `link`. All values are in base
-units, all labels have closed sets of values, and a value that cannot be known is absent, never
-zero [P-METRIC-1]. A page is made at most four times a second, whoever asks, and tells what was
+Every process serves `/metrics` for Prometheus, `/healthz` (200 while its own loop has moved in the
+last 5 s) and `/readyz` (200 once it hears its peer) where `--metrics HOST:PORT` says; in the
+cluster that is port 9100 of `world` and `cloud`, 9101 of `teleop` and 9102 of `link`. All values
+are in base units, all labels have closed sets of values but for the two of `cloudrc_build_info`
+that name a version and a configuration, and a value that cannot be known is absent, never zero
+[P-METRIC-1]. A page is made at most four times a second, whoever asks, and tells what was
 known 0.25 s ago at most [P-METRIC-2]. Beside these there are the usual `process_*` metrics: CPU,
 memory, file descriptors.
 """
@@ -46,8 +47,17 @@ QUERIES = {
         '1 - sum by (instance) (rate(cloudrc_loop_lateness_seconds_bucket{le="0.001"}[1m]))'
         " / sum by (instance) (rate(cloudrc_loop_lateness_seconds_count[1m]))"
     ),
+    "Processes by configuration; a release has one, link containers none": (
+        "count by (config) (cloudrc_build_info)"
+    ),
     "World slower than real time": "cloudrc_real_time_factor < 0.95",
 }
+OPEN = {
+    "version": "the version",
+    "config": "the first 12 digits of `config_sha256` in report.json, the SHA-256 of the whole "
+    "configuration as a run's config.yaml has it; empty where a process has none",
+}
+"""What is said of labels whose values are not listed."""
 
 
 def page() -> str:
@@ -71,8 +81,7 @@ def _table(metrics: Iterable[Metric]) -> str:
 def _labels(metric: Metric) -> str:
     """Name the labels with their values."""
     sets = [
-        f"`{label}`: {', '.join(values) or 'the version'}"
-        for label, values in metric.labels.items()
+        f"`{label}`: {', '.join(values) or OPEN[label]}" for label, values in metric.labels.items()
     ]
     return f" Labels: {'; '.join(sets)}." if sets else ""
 

@@ -36,9 +36,10 @@ _ENTRIES = (
     Metric(
         "cloudrc_build_info",
         Kind.GAUGE,
-        "1; its labels say which process of which version this is.",
+        "1; its labels say which process of which version this is, and by which configuration it "
+        "runs: two ends that differ in it were told different things.",
         ROLES,
-        {"version": (), "role": ROLES},
+        {"version": (), "role": ROLES, "config": ()},
     ),
     gauge("cloudrc_ready", "1 while this process hears its peer, else 0.", ROLES),
     counter(

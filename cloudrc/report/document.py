@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from cloudrc.config.load import fingerprint
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.files import put
 from cloudrc.metrics import Number
@@ -77,6 +78,7 @@ def report_document(
         "verdict": verdict.outcome,
         "failures": [_failure(failure) for failure in verdict.failures],
         "experiment": experiment.name,
+        "config_sha256": fingerprint(experiment),
         "mode": run.mode,
         "seed": experiment.seed,
         "shaper": run.shaper,

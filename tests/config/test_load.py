@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,13 @@ from hypothesis import strategies as st
 
 from cloudrc.assembly import link_profile
 from cloudrc.config import shipped, yaml_text
-from cloudrc.config.load import dump, load_experiment, load_profile
+from cloudrc.config.load import (
+    dump,
+    fingerprint,
+    load_experiment,
+    load_profile,
+    read_experiment,
+)
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError
 
@@ -179,8 +186,9 @@ def test_a_mission_by_path(tmp_path: Path) -> None:
     assert load_experiment(mine).mission == mission
 
 
-# PyYAML itself turns Unicode's other line ends into line feeds.
-texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\x85\u2028\u2029"))
+# PyYAML itself turns Unicode's other line ends into line feeds; NUL is refused.
+ODD = "\0\x85\u2028\u2029"
+texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters=ODD))
 plain = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | texts,
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
@@ -230,3 +238,16 @@ def test_another_profile_on_a_resolved_file_brings_its_own_limits(tmp_path: Path
 def test_a_heading_that_would_not_be_flown_is_refused() -> None:
     with pytest.raises(BadInputError, match="holds yaw at 0"):
         load_experiment("paper", ["mission.waypoints.2.yaw_deg=90"])
+
+
+@pytest.mark.parametrize("settings", [[], ["link.profile=satellite", "seed=7"]])
+def test_a_configuration_has_the_hash_of_its_own_file_whoever_reads_it(
+    settings: list[str], tmp_path: Path
+) -> None:
+    experiment, path = load_experiment("paper", settings), tmp_path / "config.yaml"
+    path.write_text(dump(experiment), "utf-8")
+    expected = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert fingerprint(experiment) == expected
+    assert fingerprint(load_experiment(path)) == expected
+    assert fingerprint(read_experiment(str(path))) == expected
+    assert fingerprint(load_experiment(path, ["guard.speed_max_mps=1.4"])) != expected

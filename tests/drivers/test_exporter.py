@@ -117,7 +117,7 @@ def test_labels_keep_to_their_sets(role: str, flight: Flight) -> None:
             if metric is not None and metric.kind is not Kind.HISTOGRAM:
                 assert set(sample.labels) == set(metric.labels)
                 for name, value in sample.labels.items():
-                    assert value in (metric.labels[name] or (__version__,))
+                    assert value in (metric.labels[name] or (__version__, ""))
 
 
 @pytest.mark.promise("P-METRIC-1")
@@ -158,8 +158,12 @@ def test_nothing_says_when_it_was_created(role: str, flight: Flight) -> None:
 
 
 def test_the_build_is_named_once(flight: Flight) -> None:
-    lines = [line for line in series(exporter("world", flight).text()) if "build_info" in line]
-    assert lines == [f'cloudrc_build_info{{role="world",version="{__version__}"}} 1.0']
+    world = exporter("world", flight)
+    for config in ("", "0123456789ab"):
+        lines = [line for line in series(world.text()) if "build_info" in line]
+        text = f'config="{config}",role="world",version="{__version__}"'
+        assert lines == [f"cloudrc_build_info{{{text}}} 1.0"]
+        world.runs("0123456789ab" + "f" * 52)
 
 
 def test_a_shaper_takes_the_place_of_the_one_before() -> None:

@@ -148,6 +148,15 @@ def test_promtool_has_nothing_to_say_about_the_metrics(first: FirstFlight, compo
         assert promtool("check", "metrics", given=text) == "", container
 
 
+def test_all_who_run_by_a_configuration_run_by_the_same(first: FirstFlight) -> None:
+    texts = scrapes("world") | scrapes("cloud")
+    found = {name: re.findall(r'build_info{config="(\w*)"', text) for name, text in texts.items()}
+    assert found.pop("link") == [""]
+    assert set(found) == {"world", "cloud", "teleop"}
+    assert len({tuple(config) for config in found.values()}) == 1, found
+    assert len(found["world"][0]) == 12
+
+
 def test_promtool_accepts_the_alerts(prometheus: None) -> None:
     said = promtool("check", "rules", "/dev/stdin", given=(CHART / "files/rules.yaml").read_text())
     assert "SUCCESS" in said

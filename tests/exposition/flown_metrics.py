@@ -52,7 +52,7 @@ def scrapes(flight: Flight, role: str, times: range) -> Iterator[Readings]:
         seen = len(records)
         ready = live.end is None or live.end.has_peer
         yield live.read() | {
-            "cloudrc_build_info": {("1", role): 1.0},
+            "cloudrc_build_info": {("1", role, "c"): 1.0},
             "cloudrc_ready": {(): float(ready)},
         }
 

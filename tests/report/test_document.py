@@ -24,7 +24,7 @@ def document() -> dict[str, object]:
 def test_names() -> None:
     assert set(document()) == {
         *("schemaVersion", "verdict", "failures", "experiment", "mode", "seed", "shaper"),
-        *("records_sha256", "numbers", "complete", "notes"),
+        *("config_sha256", "records_sha256", "numbers", "complete", "notes"),
     }
 
 
