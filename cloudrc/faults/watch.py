@@ -84,10 +84,8 @@ class Watch:
             yaw_rate_max: Cap on the yaw rate [rad/s].
             age_max_ns: Of a command's basis [ns].
         """
-        self._speed_max, self._step_max = (
-            speed_max + SLACK,
-            acceleration_max * TICK_NS * 1e-9 + SLACK,
-        )
+        self._speed_max = speed_max + SLACK
+        self._step_max = acceleration_max * TICK_NS * 1e-9 + SLACK
         self._age_max_ns, self._yaw_rate_max = age_max_ns, yaw_rate_max
         self.breaches: list[Breach] = []
         self.counts: Counter[str] = Counter()
@@ -106,7 +104,7 @@ class Watch:
         step, offer, stop = simulator.step, guard.offer, guard.stop
         now_ns, basis_ns, before = start_ns, -1, ZERO
         flew = falls = hit = False
-        age_max_ns, yaw_rate_max, flown = self._age_max_ns, self._yaw_rate_max, FLOWN
+        age_max_ns, flown = self._age_max_ns, FLOWN
         tracking, landing, stopped = GuardState.TRACK, GuardState.LAND, GuardState.ESTOP
 
         def watched_offer(command: Command, when_ns: int) -> Any:
@@ -136,8 +134,7 @@ class Watch:
             if flies:
                 self._comes_down = state is landing
                 self._look_at_stop(position, reference, state is landing, now_ns)
-                if not abs(guard.yaw_rate) <= yaw_rate_max:  # NaN is no rate either
-                    self.note(now_ns, "cap", f"reference turns by {guard.yaw_rate:.3f} rad/s")
+                self._look_at_turning(guard.yaw_rate, now_ns)
                 if reference is not before:
                     self._look_at_caps(before, reference, state is tracking, now_ns)
                 if state is tracking and now_ns - basis_ns > age_max_ns:
@@ -253,6 +250,10 @@ class Watch:
         jump = sqrt(_growth(ux, vx) ** 2 + _growth(uy, vy) ** 2 + _growth(uz, vz) ** 2)
         if ramped and not jump <= self._step_max:
             self.note(now_ns, "cap", f"reference grows by {jump:.9f} m/s in a tick")
+
+    def _look_at_turning(self, yaw_rate: float, now_ns: int) -> None:
+        if not abs(yaw_rate) <= self._yaw_rate_max:  # NaN is no rate either
+            self.note(now_ns, "cap", f"reference turns by {yaw_rate:.3f} rad/s")
 
     def see(self, contact: Contact, guard: GuardState, honest: bool) -> None:
         """Judge a contact; under a cloud that is not honest it only explains what comes later."""
