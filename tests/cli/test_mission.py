@@ -164,10 +164,10 @@ def test_the_operators_verbs(
     assert "no mission is under way" in capsys.readouterr().out
     assert mission("cancel") == 2
     assert mission("hold") == 5
-    api.post("/v1/missions", {"name": "far", "waypoints": [{"position_m": [-1.0, -4.0, 1.0]}]})
+    api.post("/v1/missions", {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]})
     api.until(lambda: api.state_of("m1") == "flying")
     for verb, word in (("hold", "held"), ("goto", "held"), ("resume", "flying")):
-        points = ["-2.5", "0", "1.2"] if verb == "goto" else []
+        points = ["0.5", "-1", "1.2"] if verb == "goto" else []
         assert mission(verb, *points) == 0
         assert f"mission m1 (far): {word}" in capsys.readouterr().out
     assert mission("goto", "0.5", "0", "1") == 5  # it flies
@@ -181,7 +181,7 @@ def test_list_status_and_logs(
 ) -> None:
     assert mission("list") == 0
     assert capsys.readouterr().out == "no missions yet\n"
-    api.post("/v1/missions", {"name": "far", "waypoints": [{"position_m": [-1.0, -4.0, 1.0]}]})
+    api.post("/v1/missions", {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]})
     api.until(lambda: api.state_of("m1") == "flying")
     assert mission("list") == 0
     assert capsys.readouterr().out.splitlines()[1].split() == ["m1", "far", "flying", "0/1"]
@@ -209,7 +209,7 @@ def test_the_run_that_flies_here_is_found_by_itself_and_wants_no_token(
         with flights.announced(folder / "runs" / "latest", api.url):
             assert main(["mission", "status"]) == 0
             assert "no mission is under way" in capsys.readouterr().out
-            api.post_local("/v1/missions", {"waypoints": [{"position_m": [-1.0, -4.0, 1.0]}]})
+            api.post_local("/v1/missions", {"waypoints": [{"position_m": [0.5, -2.0, 1.0]}]})
             assert main(["mission", "estop"]) == 0
         said = capsys.readouterr().out
         assert said.splitlines() == [

@@ -21,7 +21,13 @@ from starlette.concurrency import run_in_threadpool
 from cloudrc import __version__
 from cloudrc.cloud.teleop import api_models as models
 from cloudrc.cloud.teleop.api_bridge import Bridge, Call
-from cloudrc.cloud.teleop.api_check import leads_to_board, read_goto, read_mission
+from cloudrc.cloud.teleop.api_check import (
+    check_first_way,
+    check_way,
+    leads_to_board,
+    read_goto,
+    read_mission,
+)
 from cloudrc.cloud.teleop.api_errors import (
     BODY_LIMIT,
     BODY_MAX,
@@ -33,7 +39,7 @@ from cloudrc.cloud.teleop.api_errors import (
 from cloudrc.cloud.teleop.api_events import last_event_id, stream
 from cloudrc.cloud.teleop.plan import Plan
 from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_mission import Mission, Order
+from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.config.schema import Mission as MissionSection
 from cloudrc.geometry.scene import Scene
 
@@ -83,6 +89,7 @@ def create_app(bridge: Bridge, surroundings: Surroundings) -> FastAPI:
     router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUSALS)
     _add_missions(router, bridge, surroundings)
     _add_operator(router, bridge, surroundings)
+    _add_stops(router, bridge)
     _add_views(router, bridge)
     app.include_router(router)
     return app
@@ -140,6 +147,7 @@ def _add_missions(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
         order = await run_in_threadpool(_order, body, surroundings)
 
         def call(service: MissionService, now_ns: int) -> tuple[dict[str, Any], bool]:
+            check_first_way(service, order, surroundings.scene)
             mission, new = service.create(order, now_ns)
             return mission.as_json(), new
 
@@ -170,11 +178,38 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
         return JSONResponse(await _ask(bridge, lambda s, now_ns: s.hold(now_ns).as_json()))
 
     @router.post(
-        "/resume", summary="Go on with what is held", **_gives(models.MissionView, "It flies")
+        "/resume",
+        summary="Go on with what is held",
+        description="Straight on to its next waypoint: a pipe's wall in the way is refused (409).",
+        **_gives(models.MissionView, "It flies"),
     )
     async def resume() -> JSONResponse:
-        return JSONResponse(await _ask(bridge, lambda s, now_ns: s.resume(now_ns).as_json()))
+        def call(service: MissionService, now_ns: int) -> Any:
+            check_way(service, None, surroundings.scene)
+            return service.resume(now_ns).as_json()
 
+        return JSONResponse(await _ask(bridge, call))
+
+    @router.post(
+        "/goto",
+        summary="Fly to a point",
+        description="A mission of its own, or another place for a mission that is held. The way "
+        "there is straight: a pipe's wall in it is refused (409).",
+        openapi_extra=_takes(models.GoToRequest, {"position_m": [0.0, 0.0, 1.2], "yaw_deg": 0.0}),
+        **_gives(models.MissionView, "On its way"),
+    )
+    async def go_to(request: Request) -> JSONResponse:
+        body = await _body(request)
+        point = await run_in_threadpool(read_goto, body, surroundings.scene)
+
+        def call(service: MissionService, now_ns: int) -> Any:
+            check_way(service, point.position_m, surroundings.scene)
+            return service.go_to(point.position_m, radians(point.yaw_deg), now_ns).as_json()
+
+        return JSONResponse(await _ask(bridge, call))
+
+
+def _add_stops(router: APIRouter, bridge: Bridge) -> None:
     @router.post(
         "/estop",
         summary="Stop the rotors at once",
@@ -198,22 +233,6 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
     async def acknowledge() -> JSONResponse:
         await _ask(bridge, bridge.unless_stopped(lambda s, now_ns: s.acknowledge(now_ns)))
         return JSONResponse({"state": "acknowledged"})
-
-    @router.post(
-        "/goto",
-        summary="Fly to a point",
-        description="A mission of its own, or another place for a mission that is held.",
-        openapi_extra=_takes(models.GoToRequest, {"position_m": [0.0, 0.0, 1.2], "yaw_deg": 0.0}),
-        **_gives(models.MissionView, "On its way"),
-    )
-    async def go_to(request: Request) -> JSONResponse:
-        body = await _body(request)
-        point = await run_in_threadpool(read_goto, body, surroundings.scene)
-
-        def call(service: MissionService, now_ns: int) -> Mission:
-            return service.go_to(point.position_m, radians(point.yaw_deg), now_ns)
-
-        return JSONResponse(await _ask(bridge, lambda s, now_ns: call(s, now_ns).as_json()))
 
 
 def _add_views(router: APIRouter, bridge: Bridge) -> None:

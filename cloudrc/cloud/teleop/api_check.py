@@ -8,17 +8,23 @@ from __future__ import annotations
 from math import cos, radians, sin
 from typing import TypeVar
 
+import numpy as np
 from pydantic import ValidationError
 from pydantic_core import from_json
 
 from cloudrc.cloud.teleop.api_models import GoToRequest, MissionRequest
+from cloudrc.cloud.teleop.service import MissionService
+from cloudrc.cloud.teleop.service_book import ConflictError
+from cloudrc.cloud.teleop.service_mission import HELD, Order
 from cloudrc.config.fields import Section
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem, from_pydantic
 from cloudrc.config.schema import MAX_WAYPOINTS, Mission, Waypoint
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.placement import crossed_pipe
 from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
+from cloudrc.messages import Start, Vector
 
 PROBLEMS_MAX = 50
 """Of one request, that are put into words."""
@@ -60,6 +66,41 @@ def read_goto(body: bytes, scene: Scene) -> GoToRequest:
     problems = check_mission(Mission(start="here", waypoints=(waypoint,)), scene)
     _refuse([Problem(problem.path[2:], problem.value, problem.reason) for problem in problems])
     return request
+
+
+def check_way(service: MissionService, target: Vector | None, scene: Scene) -> None:
+    """Refuse to fly straight from where the robot is seen through the wall of a pipe.
+
+    Args:
+        service: In its own thread.
+        target: Where to [m], world frame, shape (3,); None: to the next waypoint of what is held.
+        scene: With the pipes.
+
+    Raises:
+        ConflictError: If a wall is in the way; says which.
+    """
+    seen, waiting = service.sight.seen, service.book.open()
+    mission = waiting[0] if waiting else None
+    if target is None and mission is not None:
+        legs, count = mission.order.plan.legs, len(mission.reached)
+        target = legs[count].position if count < len(legs) else None
+    if seen is None or target is None or (mission is not None and mission.state != HELD):
+        return  # what else is in the way is for others to say
+    through = int(crossed_pipe(scene, np.array([seen.position]), np.array([target]))[0])
+    if through >= 0:
+        here, there = (f"[{', '.join(f'{v:.2f}' for v in p)}]" for p in (seen.position, target))
+        reason = (
+            f"the straight way from where the robot is, {here}, to {there} leads through the wall "
+            f"of {scene.pipes[through].name}; go round it first, by 'cloudrc mission goto'"
+        )
+        raise ConflictError(reason, mission.id if mission else "")
+
+
+def check_first_way(service: MissionService, order: Order, scene: Scene) -> None:
+    """Likewise of the way to the first waypoint, where a new mission begins from here and now."""
+    begins = not service.book.open() and service.book.with_key(order.key) is None
+    if begins and order.plan.start is Start.HERE:
+        check_way(service, order.plan.legs[0].position, scene)
 
 
 def leads_to_board(mission: Mission, scene: Scene) -> bool:
