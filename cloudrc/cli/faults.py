@@ -74,6 +74,15 @@ def written_to(text: str) -> Path:
     return path
 
 
+def folder(text: str) -> Path:
+    """Read the name of a folder that is made when something is found: said now, if it cannot be."""
+    path = Path(text)
+    there = next(each for each in (path, *path.absolute().parents) if each.exists())
+    if not (there.is_dir() and os.access(there, os.W_OK)):
+        raise argparse.ArgumentTypeError(f"{text}: no folder can be made there")
+    return path
+
+
 def _modes(parser: argparse.ArgumentParser) -> None:
     mode = parser.add_mutually_exclusive_group()
     text = "with real processes, signals and sockets on this machine"
@@ -115,7 +124,7 @@ def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--slice", type=written_to, metavar="FILE", help=text)
     parser.add_argument(
         "--store",
-        type=Path,
+        type=folder,
         default=Path("faults-found"),
         metavar="DIR",
         help="where a failing schedule is kept, once it is shrunk (default: ./faults-found)",
@@ -125,7 +134,9 @@ def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Do what the action says."""
     if options.action is None:
-        raise BadInputError("an action is missing: list, run, fuzz; see 'cloudrc faults --help'")
+        raise BadInputError(
+            "an action is missing: list, run, fuzz, merge, replay; see 'cloudrc faults --help'"
+        )
     require("the fault suite", ("world", "record"))
     from cloudrc.cli import faults_fuzz, faults_run
 

@@ -18,7 +18,6 @@ from cloudrc.cli import faults_slices as slices
 from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import paint, say, table, unread_is_fine, written
 from cloudrc.cli.pool import WorkerDiedError, in_order
-from cloudrc.cli.signals import end_with
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ PROGRESS_PERIOD = 10.0
 
 def fuzz(options: argparse.Namespace) -> int:
     """Fly many random schedules; 1 if an invariant broke, 130 if told to stop, 6 if killed."""
+    _refuse_to_replace(options.slice)
     say = options.output == "table"
     search = Search(options, sources())
     cause, code = "stopped", INTERRUPTED
@@ -60,6 +60,12 @@ def fuzz(options: argparse.Namespace) -> int:
             print(f"cloudrc: {told}; go on with '{then}'", file=sys.stderr, flush=True)
     _print(document, options)
     return code if cut else FAILED if search.failures else 0
+
+
+def _refuse_to_replace(path: Path | None) -> None:
+    """A slice may have taken hours."""
+    if path is not None and path.exists() and path.stat().st_size:
+        raise BadInputError(f"--slice {path}: is there already; name another file, or remove it")
 
 
 def merge(options: argparse.Namespace) -> int:
@@ -186,15 +192,7 @@ def replay(options: argparse.Namespace) -> int:
 
 def _findings(seeds: Iterable[int], options: argparse.Namespace) -> Iterator[Finding]:
     work = [(seed, _kind(options)) for seed in seeds]
-    return in_order(_fly, work, options.jobs, _leave_signals_to)
-
-
-def _leave_signals_to(first: int) -> None:
-    """What a terminal sends reaches all processes: the first one says when the others end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    end_with(first)
+    return in_order(_fly, work, options.jobs)
 
 
 def _kind(options: argparse.Namespace) -> str:

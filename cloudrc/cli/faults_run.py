@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
@@ -10,14 +11,14 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.extras import require
 from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import harmless, paint, table, written
-from cloudrc.cli.pool import in_order
+from cloudrc.cli.pool import WorkerDiedError, in_order
 
 if TYPE_CHECKING:
     from cloudrc.faults.document import Result
     from cloudrc.faults.scenario import Mode, Scenario
 
 COLOURS = {"passed": "green", "FAILED": "red", "skipped": "yellow"}
-FAILED = 1
+FAILED, INTERRUPTED = 1, 130
 
 
 def show(options: argparse.Namespace) -> int:
@@ -37,7 +38,7 @@ def show(options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run one fault or all of them; 1 if a check did not pass."""
+    """Run one fault or all of them; 1 if a check did not pass, 130 if interrupted."""
     from cloudrc.faults import document
     from cloudrc.faults.catalogue import called, scenarios
 
@@ -46,13 +47,18 @@ def run(options: argparse.Namespace) -> int:
         _look_for_release(options)
     chosen = scenarios(mode) if options.all else called(options.name, mode)
     say = print if options.output == "table" else _silent
-    results = []
-    for result in _results(chosen, options):
-        results.append(result)
-        _say(result, options.all, say)
+    results, cause, code = [], "", 0
+    try:
+        for result in _results(chosen, options):
+            results.append(result)
+            _say(result, options.all, say)
+    except KeyboardInterrupt:
+        cause, code = "interrupted", INTERRUPTED
+    except WorkerDiedError as error:
+        cause, code = str(error), error.exit_code
     if options.junit is not None:
         options.junit.write_text(document.as_junit(results, options.seed), encoding="utf-8")
-    if options.document is not None:
+    if options.document is not None and not cause:
         of = sources() if mode == "virtual" else sources(apart=())
         text = document.as_markdown(results, options.seed, mode, of)
         options.document.write_text(text, encoding="utf-8")
@@ -61,7 +67,10 @@ def run(options: argparse.Namespace) -> int:
     failed = sum(result.failed for result in results)
     passed = sum(result.passed for result in results)
     say(f"\nseed {options.seed}: {passed} of {len(results)} passed, {failed} failed")
-    return FAILED if failed else 0
+    if cause:
+        told = f"cloudrc: {cause}; {len(results)} of {len(chosen)} were run before"
+        print(told, file=sys.stderr, flush=True)
+    return code or (FAILED if failed else 0)
 
 
 def _look_for_release(options: argparse.Namespace) -> None:

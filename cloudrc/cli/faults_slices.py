@@ -11,7 +11,7 @@ from typing import Any
 
 from cloudrc import __version__
 from cloudrc.cli.faults_page import INVARIANTS, PROMISES, command
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, in_one_line
 from cloudrc.files import put
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -124,7 +124,7 @@ def _load(path: Path) -> Document:
     try:
         told = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        text = " ".join(str(error).split())
+        text = getattr(error, "strerror", None) or in_one_line(str(error))
         raise BadInputError(f"{path}: cannot be read as a slice: {text}") from error
     if not (isinstance(told, dict) and _is_slice(told)):
         raise BadInputError(f"{path}: is no slice; write one by 'cloudrc faults fuzz --slice FILE'")

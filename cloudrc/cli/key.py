@@ -6,7 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cloudrc.cli.output import say
 from cloudrc.errors import BadInputError
+
+REMEDY = "name a key file; 'cloudrc key new FILE' makes one where there is no file yet"
 
 if TYPE_CHECKING:
     from cloudrc.tunnel.keys import KeySet
@@ -67,7 +70,7 @@ def _make(options: argparse.Namespace) -> int:
     if not there and options.drop:
         raise BadInputError(f"--drop: {path} is not there, so there is no old key to revoke")
     if there:
-        keys, wall = read_keys(path), time.time()
+        keys, wall = read_keys(path, "", REMEDY), time.time()
         if not options.drop:
             _refuse_if_promised(path, keys, wall)
         keys = keys.rotated(secret, wall, options.overlap or OVERLAP)
@@ -75,7 +78,7 @@ def _make(options: argparse.Namespace) -> int:
         keys = KeySet(Key(secret))
     _replace(path, keys)
     before = f", beside {keys.previous.name} for {keys.overlap:g} s" if keys.previous else ""
-    print(f"key {keys.current.name}{before}: {path}")
+    say(f"key {keys.current.name}{before}: {path}")
     return 0
 
 
@@ -95,12 +98,12 @@ def _retire(path: Path) -> int:
     from cloudrc.drivers.keyfile import read_keys
     from cloudrc.tunnel.keys import KeySet
 
-    keys = read_keys(path)
+    keys = read_keys(path, "", REMEDY)
     if keys.previous is None:
-        print(f"key {keys.current.name} was alone already: {path}")
+        say(f"key {keys.current.name} was alone already: {path}")
         return 0
     _replace(path, KeySet(keys.current))
-    print(f"key {keys.current.name} alone, {keys.previous.name} is dropped: {path}")
+    say(f"key {keys.current.name} alone, {keys.previous.name} is dropped: {path}")
     return 0
 
 

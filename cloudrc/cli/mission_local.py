@@ -70,7 +70,9 @@ def _run(options: argparse.Namespace, api: Api) -> int:
     try:
         verdict = follower.follow(mission_id)
     except KeyboardInterrupt:
-        say(f"mission {mission_id} flies on; end it: cloudrc mission cancel", sys.stderr)
+        goes_on = "waits or flies on" if options.queue else "flies on"
+        end = f"cloudrc mission cancel {mission_id}"
+        say(f"mission {mission_id} {goes_on}; end it: {end}", sys.stderr)
         raise
     say(in_words(verdict))
     return int(verdict["exit_code"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -23,18 +24,14 @@ class WorkerDiedError(InvalidRunError):
 
 
 def in_order(
-    function: Callable[[Work], Result],
-    work: Sequence[Work],
-    jobs: int,
-    begin: Callable[[int], None] = end_with,
+    function: Callable[[Work], Result], work: Sequence[Work], jobs: int
 ) -> Iterator[Result]:
-    """Do all of it, some at once. Who stops listening waits only for what is under way.
+    """Do all of it, some at once. Who stops listening waits for what is under way, no more.
 
     Args:
         function: Of a module: it is called in other processes.
         work: Its arguments.
         jobs: How many at once; more than there are cores or work would only take memory.
-        begin: Called first in each process, with the id of this one.
 
     Yields:
         What the function gives for each.
@@ -47,13 +44,25 @@ def in_order(
         yield from map(function, work)
         return
     fork = multiprocessing.get_context("fork")  # its workers are children of this process
-    pool = ProcessPoolExecutor(workers, fork, begin, (os.getpid(),))
+    pool = ProcessPoolExecutor(workers, fork, _begin, (os.getpid(),))
     try:
         # Not `map`: where a worker has died, it cancels what the pool marks as failed just then.
         futures = deque(pool.submit(function, each) for each in work)
         while futures:
             yield futures.popleft().result()
+    except KeyboardInterrupt:  # who presses Ctrl-C does not want to wait
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
     except BrokenProcessPool as error:
         raise WorkerDiedError(f"{KILLED}: try fewer '--jobs'") from error
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _begin(first: int) -> None:
+    """What a terminal sends reaches all processes: the first one says when the others end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    end_with(first)

@@ -12,8 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
+from cloudrc.files import read
 
 VARIABLE = "CLOUDRC_TOKEN_FILE"
+SIZE_MAX = 4096
+"""Longest token file that is read [bytes]; it may end in blanks."""
 _TOKEN = re.compile(r"[!-~]{16,512}")
 
 
@@ -41,7 +44,7 @@ def reader(path: Path | None) -> Callable[[], str]:
 
 def _read(path: Path) -> str:
     try:
-        token = path.read_text(encoding="ascii").strip()
+        token = read(path, SIZE_MAX).decode("ascii").strip()
     except OSError as error:
         raise BadInputError(f"--token-file {path}: {error.strerror}; name a file") from None
     except ValueError:

@@ -82,9 +82,18 @@ class EpochFile:
         except ValueError:  # no file, too long or no text
             text = ""
         if not text.isdecimal() or int(text) > EPOCH_MAX:
-            self._note("it holds no epoch; epochs begin again")
+            self._note(f"it holds no epoch{self._set_aside()}; epochs begin again")
             return 0
         return int(text)
+
+    def _set_aside(self) -> str:
+        """Keep what may be somebody's, named by mistake; say so."""
+        aside = self._path.with_name(f"{self._path.name}.no-epoch")
+        try:
+            self._path.replace(aside)
+        except OSError:
+            return ""  # nor will it be written
+        return f" and is kept as {aside.name}"
 
     def _note(self, what: str) -> None:
         self._say(f"{self._path}: {what}")

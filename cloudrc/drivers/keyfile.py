@@ -81,8 +81,13 @@ class KeyFile:
         return [Fault(now_ns, "key", text)]
 
 
-def read_keys(path: Path) -> KeySet:
+def read_keys(path: Path, named: str = "--key ", remedy: str = MAKE) -> KeySet:
     """Read a key file, without waiting for anybody.
+
+    Args:
+        path: Of the file.
+        named: By which flag.
+        remedy: What to do if it holds no key.
 
     Raises:
         BadInputError: What is wrong with it and what to do, without a word of it.
@@ -90,13 +95,13 @@ def read_keys(path: Path) -> KeySet:
     try:
         data = read(path, SIZE_MAX)
     except OSError as error:
-        raise BadInputError(f"--key {path}: {error.strerror or error}; {MAKE}") from None
+        raise BadInputError(f"{named}{path}: {error.strerror or error}; {remedy}") from None
     except ValueError as error:  # which names the file
-        raise BadInputError(f"--key {error}; {MAKE}") from None
+        raise BadInputError(f"{named}{error}; {remedy}") from None
     try:
         return parse(data)
     except ValueError as error:
-        raise BadInputError(f"--key {path}: {error}; {MAKE}") from None
+        raise BadInputError(f"{named}{path}: {error}; {remedy}") from None
 
 
 def is_exposed(path: Path) -> bool:

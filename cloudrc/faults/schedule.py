@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, in_one_line
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 
 KINDS: dict[str, str] = {
@@ -203,13 +203,16 @@ def load(path: Path) -> Schedule:
     """
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if not isinstance(document, dict):
+            raise _none(path, "it has no keys")
         schedule = _SCHEDULE.validate_python(document)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"]))
         raise _none(path, f"{place}: {first['msg']}" if place else first["msg"]) from error
     except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
-        raise _none(path, " ".join(str(error).split())) from error
+        text = getattr(error, "strerror", None) or in_one_line(str(error))
+        raise _none(path, text) from error
     if problem := _problem(schedule):
         raise _none(path, problem)
     return schedule

@@ -63,6 +63,22 @@ def test_the_flag_needs_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.parametrize("verb", ["new", "retire"])
+def test_a_file_that_holds_no_key_is_left_alone_and_told_in_a_line(
+    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "odd\x1b[31m"
+    path.write_bytes(b"my thesis")
+    assert main(["key", verb, str(path)]) == 2
+    error = capsys.readouterr().err
+    assert path.read_bytes() == b"my thesis"
+    assert (error.count("\n"), error.isprintable(), "--key" in error) == (1, False, False)
+    assert "\x1b" not in error
+    path.write_bytes(FIRST)
+    assert main(["key", verb, str(path)]) == 0
+    assert "\x1b" not in capsys.readouterr().out
+
+
 def test_a_file_that_says_no_time_can_be_rotated(path: Path) -> None:
     """Nobody could tell for how long to wait."""
     path.write_text(write(KeySet(Key(SECOND), Key(FIRST))))

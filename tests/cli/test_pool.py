@@ -13,7 +13,10 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cli.pool import WorkerDiedError, in_order
+from cloudrc.faults.catalogue import find
+from cloudrc.faults.document import Result
 from cloudrc.faults.fuzz import Finding
+from cloudrc.faults.scenario import Outcome
 from cloudrc.faults.schedule import Schedule
 
 KILLED = 5
@@ -87,13 +90,61 @@ def test_a_search_that_loses_a_process_keeps_what_was_flown(
     assert "; not one schedule was flown" in capsys.readouterr().err
 
 
-def test_faults_that_lose_a_process_say_so(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("cloudrc.cli.faults_run._run", _kill)
-    assert main("faults run --all --jobs 2".split()) == 6
-    assert capsys.readouterr().err.startswith("cloudrc: error: a worker was killed")
-
-
 def _kill(which: tuple[str, str, int]) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _interrupt(which: tuple[str, str, int]) -> Result:
+    name, mode, _ = which
+    scenario = find(name, "virtual")
+    if scenario.number > 1:
+        raise KeyboardInterrupt
+    return Result(scenario, Outcome(), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("how", "jobs", "code", "word", "flown"),
+    [(_kill, 2, 6, "a worker was killed", 0), (_interrupt, 1, 130, "interrupted", 1)],
+)
+def test_faults_that_are_cut_off_keep_what_was_run(
+    how: object,
+    jobs: int,
+    code: int,
+    word: str,
+    flown: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("cloudrc.cli.faults_run._run", how)
+    line = f"faults run --all --jobs {jobs} --junit f.xml --document f.md -o json"
+    assert main(line.split()) == code
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"cloudrc: {word}")
+    assert f"; {flown} of " in captured.err
+    assert len(json.loads(captured.out)["faults"]) == flown
+    assert Path("f.xml").read_text().count("<testcase") == flown
+    assert not Path("f.md").exists(), "a page is of all of them"
+
+
+def test_ctrl_c_ends_the_processes_at_once() -> None:
+    started = time.monotonic()
+    done = in_order(time.sleep, [0.0, 60.0, 60.0], 2)
+    next(done)
+    with pytest.raises(KeyboardInterrupt):
+        done.throw(KeyboardInterrupt)
+    assert time.monotonic() - started < 30.0
+    assert multiprocessing.active_children() == []
+
+
+def test_a_slice_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a.json").write_text("of hours")
+    assert main("faults fuzz --seeds 1 --slice a.json".split()) == 2
+    assert "--slice a.json: is there already" in capsys.readouterr().err
+    assert Path("a.json").read_text() == "of hours"
+    assert main("faults fuzz --seeds 1 --store a.json/found".split()) == 2
+    assert "no folder can be made there" in capsys.readouterr().err

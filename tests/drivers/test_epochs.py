@@ -185,7 +185,11 @@ def test_a_file_that_holds_no_epoch_is_told_and_epochs_begin_again(
 ) -> None:
     path.write_bytes(torn)
     file = opened(path)
-    assert troubles[0] == f"{path}: it holds no epoch; epochs begin again"
+    kept = path.with_name("epoch.no-epoch")
+    assert troubles[0] == (
+        f"{path}: it holds no epoch and is kept as {kept.name}; epochs begin again"
+    )
+    assert kept.read_bytes() == torn
     assert file.take() == 1
     assert opened(path).take() == BLOCK + 1
 
@@ -195,7 +199,7 @@ def test_a_pipe_in_the_place_of_the_file_is_not_waited_for(
 ) -> None:
     os.mkfifo(path)
     assert opened(path).take() == 1
-    assert troubles[0] == f"{path}: it holds no epoch; epochs begin again"
+    assert troubles[0].startswith(f"{path}: it holds no epoch and is kept as ")
 
 
 def test_a_file_that_cannot_be_read_is_told_and_epochs_begin_again(
