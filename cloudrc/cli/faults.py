@@ -134,9 +134,8 @@ def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Do what the action says."""
     if options.action is None:
-        raise BadInputError(
-            "an action is missing: list, run, fuzz, merge, replay; see 'cloudrc faults --help'"
-        )
+        names = ", ".join(ACTIONS)
+        raise BadInputError(f"an action is missing: {names}; see 'cloudrc faults --help'")
     require("the fault suite", ("world", "record"))
     from cloudrc.cli import faults_fuzz, faults_run
 

@@ -95,8 +95,7 @@ def _kill(which: tuple[str, str, int]) -> None:
 
 
 def _interrupt(which: tuple[str, str, int]) -> Result:
-    name, mode, _ = which
-    scenario = find(name, "virtual")
+    scenario = find(which[0], "virtual")
     if scenario.number > 1:
         raise KeyboardInterrupt
     return Result(scenario, Outcome(), 0.0)
