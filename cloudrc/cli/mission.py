@@ -78,7 +78,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     logs.add_argument("-f", "--follow", action="store_true", help="and what happens from now on")
     goto = add("goto", "fly to a point, or hold a held mission there")
     for axis in "XYZ":
-        goto.add_argument(axis.lower(), type=float, metavar=axis, help="[m], world frame")
+        goto.add_argument(axis.lower(), type=_metres, metavar=axis, help="[m], world frame")
     add("hold", "stop the robot where it is, 0.35 m up at least")
     add("resume", "go on with the mission that is held")
     add("estop", "stop the rotors at once: the robot falls, and its mission has failed")
@@ -108,3 +108,11 @@ def execute(options: argparse.Namespace) -> int:
         return in_cluster(options)
     with mission_cluster.api(options) as forwarded:
         return of_api(options, forwarded)
+
+
+def _metres(text: str) -> float:
+    """Read a coordinate, as argparse calls it; how far away it may be is the API's to say."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is no number of metres") from None

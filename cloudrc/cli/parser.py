@@ -52,7 +52,7 @@ examples:
 
 exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
   3 missing prerequisite, 4 timeout, 5 cluster or API error,
-  6 run invalid (not real time), 130 interrupted"""
+  6 run invalid (not real time), 70 internal error, 130 interrupted"""
 
 _CHOICE = re.compile(r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)\)")
 

@@ -47,7 +47,11 @@ def execute(options: argparse.Namespace) -> int:
     target = options.to or source.with_name(f"{source.stem}.recovered{source.suffix}")
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")
-    recovery = recover(source, target)
+    try:
+        recovery = recover(source, target)
+    except OSError as error:  # which names a draft
+        reason = error.strerror or error
+        raise BadInputError(f"{target}: {reason}; name another file with --to") from error
     if options.output == "table":
         _show(recovery, target)
     else:

@@ -281,6 +281,8 @@ def test_a_missing_verb_or_point_is_refused(capsys: pytest.CaptureFixture[str]) 
     assert main(["mission", "goto", "1", "2"]) == 2
     assert main(["mission", "holt"]) == 2
     assert "hold" in capsys.readouterr().err
+    assert main(["mission", "goto", "1", "2", "up"]) == 2
+    assert "'up' is no number of metres" in capsys.readouterr().err
 
 
 def test_events_can_be_followed(api: Running) -> None:

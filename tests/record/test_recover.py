@@ -232,6 +232,9 @@ def test_the_command_says_what_is_kept_and_lost(
     assert main(["recover", str(torn), "-t", str(tmp_path / "y.mcap"), "-o", "yaml"]) == 1
     document, _ = yaml_text.parse(capsys.readouterr().out, "stdout")
     assert document["bytes_lost"] == account["bytes_lost"]
+    nowhere = tmp_path / "none" / "n.mcap"
+    assert main(["recover", str(torn), "--to", str(nowhere)]) == 2
+    assert f"error: {nowhere}: No such file or directory; name" in capsys.readouterr().err
     torn.write_bytes(b"PK not a recording")
     assert main(["recover", str(torn), "--to", str(tmp_path / "n.mcap")]) == 2
     assert "is not an MCAP file" in capsys.readouterr().err
