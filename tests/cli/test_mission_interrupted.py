@@ -1,0 +1,45 @@
+"""`cloudrc mission run`, interrupted: what it says next ends that mission and no other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from api_harness import running
+
+from cloudrc.cli import mission_follow
+from cloudrc.cli.main import main
+from cloudrc.cli.mission_http import Api
+
+FILE = "name: one\nstart: here\nwaypoints: [{position_m: [0.5, 0.0, 1.0]}]\n"
+
+
+def _interrupted(*arguments: object) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(("flags", "word"), [([], "flies on"), (["--queue"], "waits or flies on")])
+def test_the_advice_ends_the_mission_that_was_ordered(
+    flags: list[str],
+    word: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "one.yaml"
+    path.write_text(FILE)
+    monkeypatch.setattr(mission_follow.Follower, "follow", _interrupted)
+    with running(unix=True) as api:
+        others = ["m1"] if flags else []
+        for _ in others:
+            api.post_local("/v1/missions", {"waypoints": [{"position_m": [0.5, -1.0, 1.0]}]})
+        assert main(["mission", "run", str(path), "--api", api.url, *flags]) == 130
+        mine = f"m{1 + len(others)}"
+        (advice,) = (
+            line for line in capsys.readouterr().err.splitlines() if line.startswith("mission")
+        )
+        assert advice == f"mission {mine} {word}; end it: cloudrc mission cancel {mine}"
+        assert main([*advice.split("cloudrc ")[1].split(), "--api", api.url]) == 0
+        states = {each["id"]: each["state"] for each in Api(api.url).get("/v1/missions")["missions"]}
+        assert states.pop(mine) == "cancelled"
+        assert [states[other] in ("starting", "flying") for other in others] == [True] * len(others)
