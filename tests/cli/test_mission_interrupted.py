@@ -40,6 +40,7 @@ def test_the_advice_ends_the_mission_that_was_ordered(
         )
         assert advice == f"mission {mine} {word}; end it: cloudrc mission cancel {mine}"
         assert main([*advice.split("cloudrc ")[1].split(), "--api", api.url]) == 0
-        states = {each["id"]: each["state"] for each in Api(api.url).get("/v1/missions")["missions"]}
+        missions = Api(api.url).get("/v1/missions")["missions"]
+        states = {each["id"]: each["state"] for each in missions}
         assert states.pop(mine) == "cancelled"
         assert [states[other] in ("starting", "flying") for other in others] == [True] * len(others)
