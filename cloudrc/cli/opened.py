@@ -89,7 +89,8 @@ def open_end(options: argparse.Namespace, name: str) -> Opened:
         load = load_experiment
     experiment, clock = load(str(options.config)), clock_id()
     if exporter is not None:
-        exporter.runs(fingerprint(experiment))
+        # As all read it: what it leaves to the plug-ins cloud alone could add.
+        exporter.runs(fingerprint(read_experiment(str(options.config))))
     keys, peer = _open_keys(options), _open_peer(options)
     recorder = _open_recorder(options, name, clock)  # last: whoever cannot fly moves no recording
     return Opened(options, name, exporter, experiment, clock, recorder, keys, peer)

@@ -54,8 +54,9 @@ QUERIES = {
 }
 OPEN = {
     "version": "the version",
-    "config": "the first 12 digits of `config_sha256` in report.json, the SHA-256 of the whole "
-    "configuration as a run's config.yaml has it; empty where a process has none",
+    "config": "the first 12 digits of the SHA-256 of the configuration that the process was given, "
+    "its defaults written out, those of plug-ins left open (a run on one machine gives all: of it "
+    "`config_sha256` in report.json has the same digits); empty where a process has none",
 }
 """What is said of labels whose values are not listed."""
 

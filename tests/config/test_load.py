@@ -251,3 +251,15 @@ def test_a_configuration_has_the_hash_of_its_own_file_whoever_reads_it(
     assert fingerprint(load_experiment(path)) == expected
     assert fingerprint(read_experiment(str(path))) == expected
     assert fingerprint(load_experiment(path, ["guard.speed_max_mps=1.4"])) != expected
+
+
+def test_a_configuration_that_leaves_parameters_to_plug_ins_has_the_hash_of_what_it_gives(
+    tmp_path: Path,
+) -> None:
+    """The chart's is such a one, and cloud alone could fill it up."""
+    path = tmp_path / "short.yaml"
+    path.write_text("seed: 5\n")
+    given = fingerprint(read_experiment(str(path)))
+    assert given != fingerprint(load_experiment(path))
+    path.write_text(dump(load_experiment(path)))
+    assert fingerprint(read_experiment(str(path))) == fingerprint(load_experiment(path)) != given
