@@ -84,13 +84,12 @@ def open_end(options: argparse.Namespace, name: str) -> Opened:
     from cloudrc.config.load import fingerprint, load_experiment, read_experiment
     from cloudrc.drivers.machine import clock_id
 
-    exporter, load = open_exporter(options, name), read_experiment
-    if name == "cloud":  # which alone flies by plug-ins
-        load = load_experiment
-    experiment, clock = load(str(options.config)), clock_id()
+    exporter, path, clock = open_exporter(options, name), str(options.config), clock_id()
+    given = read_experiment(path)
+    # Cloud alone flies by plug-ins, which fill in what the file leaves to them.
+    experiment = load_experiment(path) if name == "cloud" else given
     if exporter is not None:
-        # As all read it: what it leaves to the plug-ins cloud alone could add.
-        exporter.runs(fingerprint(read_experiment(str(options.config))))
+        exporter.runs(fingerprint(given))
     keys, peer = _open_keys(options), _open_peer(options)
     recorder = _open_recorder(options, name, clock)  # last: whoever cannot fly moves no recording
     return Opened(options, name, exporter, experiment, clock, recorder, keys, peer)
