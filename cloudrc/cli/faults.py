@@ -103,8 +103,9 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
     )
     text = "write the documentation's table"
     parser.add_argument("--document", type=written_to, metavar="FILE", help=text)
-    parser.add_argument("--namespace", "-n", default="default", help="with --cluster")
-    parser.add_argument("--release", default="cloudrc", help="with --cluster (default: cloudrc)")
+    text = "with --cluster (default: the context's, or default)"
+    parser.add_argument("--namespace", "-n", metavar="NAME", help=text)
+    parser.add_argument("--release", metavar="NAME", help="with --cluster (default: cloudrc)")
 
 
 def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,6 +12,7 @@ from cloudrc.cli.extras import require
 from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import harmless, paint, table, written
 from cloudrc.cli.pool import WorkerDiedError, in_order
+from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.faults.document import Result
@@ -45,6 +46,8 @@ def run(options: argparse.Namespace) -> int:
     mode = _mode(options)
     if mode == "cluster":
         _look_for_release(options)
+    elif options.namespace or options.release:
+        raise BadInputError("--namespace and --release say which robot of a cluster: add --cluster")
     chosen = scenarios(mode) if options.all else called(options.name, mode)
     say = print if options.output == "table" else _silent
     results, cause, code = [], "", 0
@@ -79,7 +82,7 @@ def _look_for_release(options: argparse.Namespace) -> None:
     from cloudrc.cluster.pods import find_pod
     from cloudrc.faults.cluster.release import place, release_there
 
-    place.update(namespace=options.namespace, release=options.release)
+    place.update(namespace=options.namespace or "", release=options.release or place["release"])
     find_pod(release_there(), "world")
 
 

@@ -11,6 +11,7 @@ from cloudrc.cli.ends import EPILOG as EPILOG
 from cloudrc.cli.ends import end_arguments
 from cloudrc.cli.opened import open_end, suite
 from cloudrc.cli.output import unread_is_fine
+from cloudrc.cli.parser import read_from
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,7 +19,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     end_arguments(parser)
     parser.add_argument(
         "--epochs",
-        type=Path,
+        type=read_from,
         metavar="FILE",
         help="keeps the highest number of a session through a restart (default: not kept)",
     )

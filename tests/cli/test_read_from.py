@@ -47,6 +47,13 @@ def test_what_is_no_file_is_refused_and_not_waited_for(
     assert os.listdir() == ["pipe"]
 
 
+def test_a_device_keeps_no_epochs(capsys: pytest.CaptureFixture[str]) -> None:
+    """What holds no epoch is set aside under another name: root would have lost its /dev/null."""
+    assert main(["world", "--config", "none.json", "--listen", ":0", "--epochs", "/dev/null"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--epochs: /dev/null: not a regular file" in line
+
+
 def test_a_file_that_is_handed_over_is_read(tmp_path: Path) -> None:
     """As `/dev/stdin` is one behind '<'."""
     run = write(tmp_path / "run.mcap", world_records(50))

@@ -275,6 +275,7 @@ def test_without_a_name_or_an_action_it_says_what_is_missing(
         ("run F37 --junit none/x.xml", 2, "no file can be written there"),
         ("run F37 --document /", 2, "no file can be written there"),
         ("fuzz --seeds 1 --document none/x.md", 2, "no file can be written there"),
+        ("run F13 --real -n lab", 2, "say which robot of a cluster: add --cluster"),
         ("run --all --cluster", 3, "no cluster is configured"),
         ("run F13 --cluster", 3, "no cluster is configured"),
     ],

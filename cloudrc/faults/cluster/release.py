@@ -29,8 +29,8 @@ LIMIT = 150.0
 PERIOD = 0.2
 """Between two looks at whether something has come about [s]."""
 ENDS = ("complete", "failed")
-place: dict[str, str] = {"namespace": "default", "release": "cloudrc"}
-"""Where the release is; the command line puts it here."""
+place: dict[str, str] = {"namespace": "", "release": "cloudrc"}
+"""Where the release is, "" being the context's own; the command line puts it here."""
 
 
 def release_there() -> Release:
