@@ -73,12 +73,13 @@ coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and journal i
 	$(bin)/python -m coverage report
 
 # mutmut writes where it runs; docs/safety/mutants.md says why each of those that survive may.
-mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways; print what no test notices
+mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways; 1 if the page lists other ones
 	rm -rf build/mutants && mkdir -p build/mutants
 	cp -r cloudrc tests tools pyproject.toml build/mutants
 	find build/mutants/tests -name 'test_*.py' -delete && cp --parents $(CORE) build/mutants
 	cd build/mutants && $(abspath $(bin))/python -m mutmut run $(MUTANTS)
-	cd build/mutants && $(abspath $(bin))/python -m mutmut results
+	cd build/mutants && $(abspath $(bin))/python -m mutmut results --all true > results.txt
+	$(bin)/python tools/mutants.py < build/mutants/results.txt
 
 # The long numbers, and the tests that reach them; the seeds and the real floods are lines below.
 #   10^7 hostile datagrams, coverage-guided    test_coverage_guided_ones
