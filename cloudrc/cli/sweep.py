@@ -73,11 +73,11 @@ def _reports(
     # Spawned, not forked: a child starts clean, whatever threads the libraries here have begun.
     context = multiprocessing.get_context("spawn")
     workers = min(os.cpu_count() or 1, len(seeds))
-    with _born_deaf_to_interrupts():  # it begins a process that sweeps up behind the others
+    with _born_apart():  # it begins a process that sweeps up behind the others
         pool = ProcessPoolExecutor(workers, context, end_with, (os.getpid(),))
     with pool:
         try:
-            with _born_deaf_to_interrupts():
+            with _born_apart():
                 futures: list[Future[dict[str, Any]]] = [
                     pool.submit(_fly_one, experiment, overrides, folder, seed) for seed in seeds
                 ]
@@ -92,16 +92,24 @@ def _reports(
 
 
 @contextmanager
-def _born_deaf_to_interrupts() -> Iterator[None]:
-    """Let processes that begin here ignore what a terminal sends to all of a group.
+def _born_apart() -> Iterator[None]:
+    """Let processes that begin here be disturbed by nobody but their parent, which ends them.
 
-    What ends them is their parent; a signal that is ignored stays so across the start of a program.
+    They ignore what a terminal sends to all of a group: a signal that is ignored stays so across
+    the start of a program. Until they have their parent's path, they take no Python from the
+    working folder, which may be a run got from somebody else.
     """
     numbers = (signal.SIGINT, signal.SIGHUP)
     before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
+    safe = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
     try:
         yield
     finally:
+        if safe is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = safe
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
 

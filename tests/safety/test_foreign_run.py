@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import ast
 import json
+import os
 import subprocess
 from pathlib import Path
 
@@ -117,6 +118,18 @@ def test_a_process_of_its_own_takes_no_python_from_the_working_folder(
     assert (done.returncode, told.exists()) == (0, False), done.stderr
     monkeypatch.syspath_prepend(str(run))
     assert "-P" not in interpreter("-m", "cloudrc"), "it is where this process looks, too"
+
+
+def test_nor_does_a_process_of_a_sweep(
+    run: Path, told: Path, spy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It loads the pool's own modules before it has its parent's path."""
+    (run / "pickle.py").write_text(spy)
+    monkeypatch.chdir(run)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    assert main(["run", "hover", "--seeds", "1", "--out", "sweep"]) == 0
+    assert not told.exists()
+    assert "PYTHONSAFEPATH" not in os.environ
 
 
 def test_every_process_is_started_so() -> None:
