@@ -22,7 +22,7 @@ NOTICED = ("killed", "timeout", "caught by type check")
 """A mutant that never ends is ended: that is noticed, too."""
 
 _RESULT = re.compile(r"\s*(?P<name>\S+\.x\S+__mutmut_\d+): (?P<status>.+)")
-_ROW = re.compile(r"\| `(?P<where>[\w.]+)` \| (?P<mutants>.*?)(?: \((?P<count>\d+)\))? \| .+ \|")
+_ROW = re.compile(r"\| `(?P<where>[\w.]+)` \| .*?(?: \((?P<count>\d+)\))? \| .+ \|")
 
 Counts = Counter[tuple[str, str]]
 """How many mutants, by the section of the page and the function."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 
 import pytest
@@ -65,6 +66,18 @@ def test_a_function_is_told_by_its_class_and_its_package() -> None:
     assert where("cloudrc.tunnel.keys.x_parse__mutmut_1") == ("Tunnel", "parse")
     with pytest.raises(ValueError, match="has no section for it"):
         where("cloudrc.link.model.x_parse__mutmut_1")
+
+
+def test_every_function_of_the_page_is_there() -> None:
+    there = set()
+    for section, package in PACKAGES.items():
+        for path in (PAGE.parents[2] / package.replace(".", "/")).glob("*.py"):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                there.add((section, getattr(node, "name", "")))
+                if isinstance(node, ast.ClassDef):
+                    methods = [part for part in node.body if isinstance(part, ast.FunctionDef)]
+                    there.update((section, f"{node.name}.{part.name}") for part in methods)
+    assert set(listed(PAGE.read_text(encoding="utf-8"))) - there == set()
 
 
 @pytest.mark.parametrize("section", PACKAGES)
