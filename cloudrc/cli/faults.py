@@ -6,6 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
+from cloudrc.cli.cluster_flags import place_arguments
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import output_argument
 from cloudrc.cli.parser import COUNT_MAX, count, read_from
@@ -87,7 +88,7 @@ def _modes(parser: argparse.ArgumentParser) -> None:
     mode = parser.add_mutually_exclusive_group()
     text = "with real processes, signals and sockets on this machine"
     mode.add_argument("--real", action="store_true", help=text)
-    text = "on a release in the cluster of the current context; F38 rotates its key"
+    text = "on a release in a cluster; F38 rotates its key"
     mode.add_argument("--cluster", action="store_true", help=text)
 
 
@@ -103,9 +104,7 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
     )
     text = "write the documentation's table"
     parser.add_argument("--document", type=written_to, metavar="FILE", help=text)
-    text = "with --cluster (default: the context's, or default)"
-    parser.add_argument("--namespace", "-n", metavar="NAME", help=text)
-    parser.add_argument("--release", metavar="NAME", help="with --cluster (default: cloudrc)")
+    place_arguments(parser)
 
 
 def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 COLOURS = {"passed": "green", "FAILED": "red", "skipped": "yellow"}
 FAILED, INTERRUPTED = 1, 130
+PLACE = ("context", "namespace", "release")
+"""Flags that name a place in a cluster."""
 
 
 def show(options: argparse.Namespace) -> int:
@@ -46,8 +48,9 @@ def run(options: argparse.Namespace) -> int:
     mode = _mode(options)
     if mode == "cluster":
         _look_for_release(options)
-    elif options.namespace or options.release:
-        raise BadInputError("--namespace and --release say which robot of a cluster: add --cluster")
+    elif any(_place(options).values()):
+        flags = ", ".join(f"--{name}" for name in PLACE)
+        raise BadInputError(f"{flags} say which robot of a cluster: add --cluster")
     chosen = scenarios(mode) if options.all else called(options.name, mode)
     say = print if options.output == "table" else _silent
     results, cause, code = [], "", 0
@@ -82,8 +85,12 @@ def _look_for_release(options: argparse.Namespace) -> None:
     from cloudrc.cluster.pods import find_pod
     from cloudrc.faults.cluster.release import place, release_there
 
-    place.update(namespace=options.namespace or "", release=options.release or place["release"])
+    place.update(_place(options))
     find_pod(release_there(), "world")
+
+
+def _place(options: argparse.Namespace) -> dict[str, str | None]:
+    return {name: getattr(options, name) for name in PLACE}
 
 
 def _mode(options: argparse.Namespace) -> Mode:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from cloudrc.cluster.access import Release, connect
+from cloudrc.cluster.access import DEFAULT_RELEASE, Release, connect
 from cloudrc.cluster.errors import ClusterError
 from cloudrc.cluster.fetch import fetch_metrics, fetch_recording
 from cloudrc.cluster.follow import logs
@@ -29,13 +29,14 @@ LIMIT = 150.0
 PERIOD = 0.2
 """Between two looks at whether something has come about [s]."""
 ENDS = ("complete", "failed")
-place: dict[str, str] = {"namespace": "", "release": "cloudrc"}
-"""Where the release is, "" being the context's own; the command line puts it here."""
+place: dict[str, str | None] = {}
+"""Where the release is: context, namespace, release; the command line puts it here."""
 
 
 def release_there() -> Release:
     """Connect to the release that the command line named."""
-    return connect(None, place["namespace"], place["release"])
+    release = place.get("release") or DEFAULT_RELEASE
+    return connect(place.get("context"), place.get("namespace"), release)
 
 
 def flying(release: Release, number: int) -> str:
