@@ -3,7 +3,7 @@
 import pytest
 from doorstep import MS, NONCE, SECOND_NS, Doorstep
 
-from cloudrc.tunnel.handshake import ANSWERS_MAX, CHALLENGE_NS, COOKIE_NS, USED_MAX
+from cloudrc.tunnel.handshake import ANSWERS_MAX, CHALLENGE_NS, COOKIE_NS, REPEATS_MAX, USED_MAX
 from cloudrc.tunnel.knocker import NO_COOKIE
 
 
@@ -72,6 +72,17 @@ def test_a_hello_with_a_cookie_is_answered_once(step):
     assert step.knock(cookie=cookie, counter=8).datagrams
     step.now_ns += 2 * SECOND_NS
     assert step.knock(b"m" * 16, step.cookie(), counter=0).opened
+
+
+def test_an_incumbent_that_asks_too_often_keeps_its_epoch_until_it_is_not_fresh(step):
+    step.knock(cookie=step.cookie())
+    step.door.hear(step.now_ns)
+    for _ in range(REPEATS_MAX):
+        assert not step.knock(cookie=step.door._cookie(step.now_ns)).opened
+    step.now_ns += 250 * MS
+    assert not step.knock(cookie=step.door._cookie(step.now_ns)).opened
+    step.now_ns += 1  # to the nanosecond
+    assert step.knock(cookie=step.door._cookie(step.now_ns)).opened
 
 
 def test_what_is_remembered_is_bounded(step):

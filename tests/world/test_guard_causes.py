@@ -76,6 +76,12 @@ def test_a_stop_and_how_it_is_left():
     assert told(guard) == (GROUND, Cause.ACKNOWLEDGED)
 
 
+def test_carried_back_to_where_missions_start():
+    guard = tracking()
+    guard.put_on_ground(SECOND, "mission starts from spawn")
+    assert told(guard) == (GROUND, Cause.SPAWN)
+
+
 @pytest.mark.parametrize("cause", Cause)
 def test_every_cause_has_words(cause: Cause):
     assert cause.words

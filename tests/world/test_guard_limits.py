@@ -4,7 +4,7 @@ from dataclasses import FrozenInstanceError, fields
 from math import inf, nan
 
 import pytest
-from guard_play import LIMITS, SECOND, TICK, armed, run
+from guard_play import LIMITS, MS, SECOND, TICK, armed, run, tracking
 
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
@@ -50,6 +50,14 @@ def test_on_the_ground_a_mission_is_waited_for_ten_seconds_at_least(hold_s, wait
     run(guard, waited_s * SECOND + TICK, waited_s * SECOND + 2 * TICK)
     assert guard.state is GuardState.LAND
     assert guard.take_changes()[-1].cause == f"held for {waited_s} s without the cloud"
+
+
+@pytest.mark.parametrize("hold_s", [2, 10, 11])
+def test_in_flight_a_hold_lasts_no_longer_than_it_may(hold_s):
+    guard = tracking(limits=limits(hold_max_ns=hold_s * SECOND))
+    run(guard, 0, 12 * SECOND)
+    land = (hold_s * SECOND + 254 * MS, GuardState.LAND, f"held for {hold_s} s without the cloud")
+    assert land in guard.take_changes()
 
 
 @pytest.mark.parametrize("axis", range(3))
