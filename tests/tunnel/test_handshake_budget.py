@@ -126,3 +126,9 @@ def test_without_an_epoch_a_hello_is_not_answered_and_takes_nothing_away():
     step.now_ns += 2 * SECOND_NS
     assert step.knock(b"m" * 16, step.door._cookie(step.now_ns)).opened
     assert step.world.epoch == 2
+
+
+def test_without_a_first_epoch_no_hello_is_answered():
+    step = Doorstep(next_epoch=lambda: None)
+    assert step.knock(cookie=step.cookie())[:2] == ("unanswered", [])
+    assert not step.door.ready
