@@ -52,14 +52,18 @@ def test_time_passes_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
     assert target.now_ns > 1000e9
 
 
-def test_every_truncation_and_every_longer_version_is_refused(target: Target) -> None:
-    for frame in {frame[6:8]: frame for frame in target.frames}.values():
+def test_every_truncation_and_every_longer_version_is_refused(
+    target: Target, figure: Callable[..., None]
+) -> None:
+    kinds = {frame[6:8]: frame for frame in target.frames}
+    for frame in kinds.values():
         for length in range(LONGEST + 1):
             if length != len(frame):
                 data = frame[:length].ljust(length, b"\0")
                 target.world.receive_datagram(data, target.now_ns)
                 target.cloud.receive_datagram(data, target.now_ns)
     target.check()
+    figure("frames cut short or made longer: accepted", 0, "==", 0, count=LONGEST * len(kinds))
 
 
 def test_the_check_notices_what_is_let_through() -> None:
@@ -70,6 +74,19 @@ def test_the_check_notices_what_is_let_through() -> None:
         target.check()
 
 
+needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux: /proc")
+
+
+@needs_linux
+def test_what_leaks_is_noticed_below_a_peak_too() -> None:
+    peak = b"x" * (64 << 20)
+    del peak
+    before = memory()
+    leak = b"x" * (16 << 20)
+    assert memory() - before == pytest.approx(len(leak) / 2**20, abs=1.0)
+
+
+@needs_linux
 @pytest.mark.process
 def test_a_million_hostile_datagrams(target: Target, figure: Callable[..., None]) -> None:
     tried = target.tried
