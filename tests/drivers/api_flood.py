@@ -28,7 +28,7 @@ class Flood:
     """Connections that are kept, and asked on in turns without waiting for answers."""
 
     def __init__(self, address, token):
-        self.address, self.sent, self.answers = address, 0, Counter()
+        self.address, self.asked, self.sent, self.answers = address, 0, 0, Counter()
         self.selector = selectors.DefaultSelector()
         look, none = request("GET", "/v1/state", token), request("GET", "/v1/state", "")
         self.requests = [look, none, look, request("POST", "/v1/resume", token)]
@@ -41,16 +41,18 @@ class Flood:
         return connection
 
     def ask(self):
-        self.sent += 1
+        self.asked += 1
         try:
             connection = self.free.pop() if self.free else self.connect()
         except OSError:
             self.answers["no connection"] += 1
             return
         try:
-            connection.sendall(self.requests[self.sent % len(self.requests)])
+            connection.sendall(self.requests[self.asked % len(self.requests)])
         except OSError:
             self.forget(connection)
+            return
+        self.sent += 1
 
     def listen(self, wait):
         for key, _ in self.selector.select(wait):
@@ -89,7 +91,7 @@ def main():
     flood = Flood((host, int(port)), token)
     began = dawdled = time.monotonic()
     while (now := time.monotonic()) - began < seconds:
-        for _ in range(min(50, int((now - began) * rate) - flood.sent)):
+        for _ in range(min(50, int((now - began) * rate) - flood.asked)):
             flood.ask()
         flood.listen(0.002)
         if now - dawdled > 0.5:

@@ -10,6 +10,8 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -27,6 +29,8 @@ from cloudrc.tunnel.codec import Kind
 pytestmark = [pytest.mark.process, pytest.mark.full]
 
 RATE, SECONDS = 10_000, 20
+PAIRS = 3
+"""Of a calm flight and one under the flood; the median of the differences counts."""
 FLOODER = """
 import sys
 sys.path[:0] = {path!r}
@@ -61,8 +65,24 @@ def flood(target: tuple[str, int], rate: int, seconds: float) -> None:
     print(sent)
 
 
-def fly(folder: Path, *, flooded: bool) -> tuple[Flight, int]:
-    """Hover for 25 s over an ideal link; what was recorded, and how much garbage was sent."""
+class Hover(NamedTuple):
+    """A flight of 25 s over an ideal link.
+
+    Attributes:
+        flight: As recorded.
+        began_ns: When the flood began, or where it would have [ns], world's clock.
+        ended_ns: Likewise its end.
+        sent: How much garbage was sent.
+    """
+
+    flight: Flight
+    began_ns: int
+    ended_ns: int
+    sent: int
+
+
+def fly(folder: Path, *, flooded: bool) -> Hover:
+    """Hover, under a flood or not."""
     command = [sys.executable, "-m", "cloudrc", "run", "hover", "--mode", "local"]
     for setting in ("mission.waypoints.0.dwell_s=23", "link.profile=ideal"):
         command += ["--set", setting]
@@ -71,15 +91,18 @@ def fly(folder: Path, *, flooded: bool) -> tuple[Flight, int]:
     for line in run.stdout:
         if "mission started" in line:
             break
-    sent = 0
+    sent, began_ns = 0, time.monotonic_ns()
     if flooded:
         here = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
         program = FLOODER.format(path=here, port=port_of_world(run.pid), rate=RATE, seconds=SECONDS)
         done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
         sent = int(done.stdout)
+    else:
+        time.sleep(SECONDS)
+    ended_ns = time.monotonic_ns()
     run.communicate(timeout=90)
     recording = Recording.read(folder / "mission.mcap")
-    return Flight(recording, Criteria(), 1, load_scene("empty")), sent
+    return Hover(Flight(recording, Criteria(), 1, load_scene("empty")), began_ns, ended_ns, sent)
 
 
 def port_of_world(parent: int) -> int:
@@ -95,10 +118,13 @@ def port_of_world(parent: int) -> int:
     raise AssertionError("no world")
 
 
-def done_p99(flight: Flight) -> float:
+def done_p99(hover: Hover) -> float:
     """How long after its deadline world was done with a tick, whatever it drained before [s]."""
-    woken = wakes(flight, "world")
-    return float(np.percentile(woken["lateness"] + woken["busy"], 99.0))
+    woken = wakes(hover.flight, "world")
+    stamps = woken["stamp_ns"]
+    meanwhile = (stamps >= hover.began_ns) & (stamps < hover.ended_ns)
+    assert meanwhile.sum() >= 0.95 * 100 * SECONDS
+    return float(np.percentile((woken["lateness"] + woken["busy"])[meanwhile], 99.0))
 
 
 def refused(flight: Flight) -> int:
@@ -116,23 +142,30 @@ def honest(flight: Flight) -> int:
     return sum(int((one <= settled_ns).sum()) for one in stamps)
 
 
-def test_ten_thousand_a_second_for_twenty_seconds(
-    tmp_path: Path, figure: Callable[..., None]
-) -> None:
-    calm, _ = fly(tmp_path / "calm", flooded=False)
-    stormy, sent = fly(tmp_path / "stormy", flooded=True)
-    grown = done_p99(stormy) - done_p99(calm)
-    counted = refused(stormy) / sent
-    losses, count = [loss(stormy, topic) for topic in SENT], honest(stormy)
+def check_flood(folder: Path, figure: Callable[..., None]) -> float:
+    """One pair: nothing is lost; by how much the flood makes the 99th percentile grow [s]."""
+    calm, stormy = fly(folder / "calm", flooded=False), fly(folder / "stormy", flooded=True)
+    flight, sent = stormy.flight, stormy.sent
+    counted = refused(flight) / sent
+    losses, count = [loss(flight, topic) for topic in SENT], honest(flight)
     print(f"p99 {done_p99(calm) * 1e3:.2f} ms calm, {done_p99(stormy) * 1e3:.2f} ms flooded;"
           f" lost {losses} of {count}; refused {counted:.4f} of {sent}")  # fmt: skip
-    figure("garbage flood on the real port: sent", sent, ">=", 0.98 * RATE * SECONDS)
-    figure("garbage flood: counted as refused, share", counted, ">=", 0.98, count=sent)
-    figure("garbage flood: honest datagrams lost, share", max(losses), "==", 0.0, count=count)
-    figure("garbage flood: guard tick done, p99 grows by", grown * 1e3, "<=", 1.0, "ms")
+    kind = f"garbage flood, {folder.name}"
+    figure(f"{kind}: sent to the real port", sent, ">=", 0.98 * RATE * SECONDS)
+    figure(f"{kind}: counted as refused, share", counted, ">=", 0.98, count=sent)
+    figure(f"{kind}: honest datagrams lost, share", max(losses), "==", 0.0, count=count)
     assert sent >= 0.98 * RATE * SECONDS
     assert counted >= 0.98, "not all of it has come to world's port"
     assert losses == [0.0, 0.0]
     assert count >= 0.95 * 2 * 100 * SECONDS
-    assert hold_count.measure(stormy) == hold_count.measure(calm)
+    assert hold_count.measure(flight) == hold_count.measure(calm.flight)
+    return done_p99(stormy) - done_p99(calm)
+
+
+def test_ten_thousand_a_second_for_twenty_seconds(
+    tmp_path: Path, figure: Callable[..., None]
+) -> None:
+    grown = median(check_flood(tmp_path / f"pair {n + 1}", figure) for n in range(PAIRS))
+    name = f"garbage flood, median of {PAIRS} pairs: guard tick done, p99 grows by"
+    figure(name, grown * 1e3, "<=", 1.0, "ms", count=PAIRS)
     assert grown <= 0.001

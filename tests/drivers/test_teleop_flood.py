@@ -23,6 +23,8 @@ waypoints:
 RATE = 1000.0
 TRIES = 3
 """The best of so many counts: a machine that does something else, too, is late by itself."""
+DAWDLERS, DAWDLED = 50, 15.0
+"""So many clients send a byte now and then, and are cut off before so long [s]."""
 COMMAND = "/cmd_vel"
 PERIOD = 0.010
 
@@ -70,18 +72,23 @@ def flood(folder: Path, seconds: float):
     return json.loads(flooded.stdout), errors(folder, calm, began), errors(folder, began, ended)
 
 
-def is_undisturbed(folder: Path, seconds: float, figure, is_last: bool):
+def is_undisturbed(folder: Path, seconds: float, figure, tries: int, is_last: bool):
     """Whether the loop noticed nothing of a flood; the answers are as promised anyway."""
     answers, quiet, loud = flood(folder, seconds)
     assert answers.get("429", 0) > 0
+    assert seconds < DAWDLED or answers.get("cut off", 0) >= DAWDLERS
     assert not [status for status in answers if status.startswith("5")]
-    sent = answers["sent"] / (seconds * RATE)
+    answered = sum(count for status, count in answers.items() if status.isdigit())
+    sent, answered = (count / (seconds * RATE) for count in (answers["sent"], answered))
     calm_p99, flood_p99 = (float(np.percentile(each, 99)) * 1e3 for each in (quiet, loud))
     grown = flood_p99 - calm_p99
-    good = sent >= 0.95 and grown <= 2.0
+    good = min(sent, answered) >= 0.95 and grown <= 2.0
     if good or is_last:
-        figure("API flood: share of the requests that was sent", sent, ">=", 0.95)
-        figure("API flood: control period error p99 grows by", grown, "<=", 2.0, "ms")
+        best = f", best of {tries}" if tries > 1 else ""
+        kind, count = f"API flood of {seconds:g} s{best}", answers["sent"]
+        figure(f"{kind}: share of the requests that was sent", sent, ">=", 0.95, count=count)
+        figure(f"{kind}: share that was answered", answered, ">=", 0.95, count=count)
+        figure(f"{kind}: control period error p99 grows by", grown, "<=", 2.0, "ms")
     if is_last:
         found = {"requests": answers, "calm_p99_ms": calm_p99, "flood_p99_ms": flood_p99}
         assert good, {**found, "processors": os.cpu_count()}
@@ -90,10 +97,11 @@ def is_undisturbed(folder: Path, seconds: float, figure, is_last: bool):
 
 @pytest.mark.promise("P-API-12")
 def test_a_slice_of_such_a_flood_does_not_disturb_it(tmp_path, figure):
-    assert any(is_undisturbed(tmp_path / str(n), 5.0, figure, n == TRIES - 1) for n in range(TRIES))
+    turns = ((tmp_path / str(n), n == TRIES - 1) for n in range(TRIES))
+    assert any(is_undisturbed(folder, 5.0, figure, TRIES, is_last) for folder, is_last in turns)
 
 
 @pytest.mark.full
 @pytest.mark.promise("P-API-12")
 def test_a_thousand_requests_a_second_do_not_disturb_the_control_loop(tmp_path, figure):
-    assert is_undisturbed(tmp_path / "long", 20.0, figure, True)
+    assert is_undisturbed(tmp_path / "long", 20.0, figure, 1, True)
