@@ -105,7 +105,7 @@ def cells(rows: list[dict[str, Any]]) -> list[tuple[str, ...]]:
 def page(rows: list[dict[str, Any]]) -> str:
     """Lay the rows out as a page of the documentation."""
     head, *lines = cells(rows)
-    where = environment_document()
+    where, flown = environment_document(), sources(apart=())
     return "\n".join(
         [
             *PAGE.splitlines(),
@@ -115,7 +115,7 @@ def page(rows: list[dict[str, Any]]) -> str:
             "|---|---|---|---|---|",
             *(f"| {' | '.join(line)} |" for line in lines),
             "",
-            f"Measured by cloudrc {__version__}; SHA-256 of its sources: `{sources()[:16]}`.",
+            f"Measured by cloudrc {__version__}; SHA-256 of its sources: `{flown[:16]}`.",
             "",
         ]
     )

@@ -23,6 +23,9 @@ FLIGHT_S = 27.0
 """Until shortly before the board is touched; there the robot presses on it."""
 INSTANTS = [round(1.5 + k * (FLIGHT_S - 1.5) / 199, 3) for k in range(200)]
 """At which the cloud falls silent, or is killed [s]."""
+DAILY = INSTANTS[13::40]
+"""Those that are not left to the night."""
+REST = [start_s for start_s in INSTANTS if start_s not in DAILY]
 
 
 class Instant(NamedTuple):
@@ -45,7 +48,7 @@ class Silence(NamedTuple):
         drift: Farthest from where the robot first came to rest [m], up to the link's return.
         resumed_after: From the link's return to TRACK.
         speed: When HOLD began [m/s].
-        touched: Pipes and floor touched.
+        touched: What was touched, but for the board by the arm's tip.
     """
 
     outcome: str
@@ -74,7 +77,8 @@ def fly_through(
     outcome = ends.cloud.teleop.outcome
     changes = [r for r in records if isinstance(r, GuardChange) and r.stamp_ns >= begin_ns]
     held = next((c for c in changes if c.state is GuardState.HOLD), None)
-    touched = [r.body for r in records if isinstance(r, Contact) and r.body != "board"]
+    contacts = [r for r in records if isinstance(r, Contact)]
+    touched = [r.body for r in contacts if r.body != "board" or not r.tip]
     code = outcome.code if outcome else "none"
     if held is None or held.cause == "mission ended":
         return Silence(code, None, 0.0, 0.0, 0.0, None, 0.0, touched)

@@ -75,12 +75,14 @@ def accepted(run: Captured) -> dict[str, int]:
 @pytest.mark.promise("P-LINK-2")
 @pytest.mark.parametrize("last_epoch", [0, 2, 4096], ids=["epochs lost", "kept", "kept in blocks"])
 @pytest.mark.parametrize("seconds", [0, 0.05, 1, 3])
-def test_a_run_replayed_after_both_restarts_is_not_accepted(first, last_epoch, seconds):
+def test_a_run_replayed_after_both_restarts_is_not_accepted(first, last_epoch, seconds, figure):
     run = Captured(b"world 2", b"cloud 2", last_epoch)
     run.go(round(seconds * SECOND_NS))
     before = accepted(run)
     drawn = run.replay(first)
     assert accepted(run) == before
+    count = sum(map(len, first.heard.values()))
+    figure("a run replayed after both restarts: accepted", 0, "==", 0, count=count)
     # A challenge tells nothing, and a hello that answers an old one asks for nothing new.
     assert set(drawn) <= {Kind.CHALLENGE, Kind.HELLO}
     assert len(drawn) <= 4, "a captured run of seconds makes nobody talk"

@@ -3,7 +3,7 @@
 from math import hypot
 
 import pytest
-from silence import INSTANTS, SLOW
+from silence import DAILY, REST, SLOW
 
 from cloudrc.faults import asks
 from cloudrc.faults.flight import Flight
@@ -66,12 +66,12 @@ def check_kill(figure, at):
 
 
 @pytest.mark.promise("P-GUARD-1")
-@pytest.mark.parametrize("at", INSTANTS[13::40])
+@pytest.mark.parametrize("at", DAILY)
 def test_when_its_cloud_is_killed_the_robot_stops_and_a_new_one_flies_on(at, figure):
     check_kill(figure, at)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("at", INSTANTS)
+@pytest.mark.parametrize("at", REST)
 def test_killed_at_any_instant_a_new_cloud_flies_on(at, figure):
     check_kill(figure, at)

@@ -72,8 +72,9 @@ def beyond(simulator, seed):
 def check_falls(simulator, seeds, figure, share_max, farthest_max):
     excess = [side for seed in seeds for side in beyond(simulator, seed)]
     share = sum(side > 0.0 for side in excess) / len(excess)
-    figure("after a fall, beyond what the fence counts on", share, "<=", share_max, "")
-    figure("after a fall, farther than that by", max(excess), "<=", farthest_max, "m")
+    kind, count = f"after one of {len(seeds):,} falls", len(excess)
+    figure(f"{kind}: share beyond what the fence counts on", share, "<=", share_max, count=count)
+    figure(f"{kind}: farther than that by", max(excess), "<=", farthest_max, "m", count=count)
     assert share <= share_max
     assert max(excess) <= farthest_max
 
@@ -124,8 +125,10 @@ def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence(simulator, see
 def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence_in_four_hundred(
     simulator, figure
 ):
-    nearest = min(scrapes(simulator, seed, TAKE_OFF_MARGIN) for seed in range(400))
-    figure("taken off 0.5 m from the fence: nearest to it", nearest, ">=", 0.02, "m")
+    seeds = range(400)
+    nearest = min(scrapes(simulator, seed, TAKE_OFF_MARGIN) for seed in seeds)
+    name = "taken off 0.5 m from the fence: nearest to it"
+    figure(name, nearest, ">=", 0.02, "m", count=len(seeds))
     assert nearest > 0.02
 
 
