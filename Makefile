@@ -113,6 +113,7 @@ nightly: $(VENV)/dev ## run every test and number, 500 hours of faults, e2e-full
 	$(bin)/cloudrc faults fuzz --seeds 30000 --jobs $(JOBS) \
 		--document docs/safety/search.md $(STORE)
 	$(bin)/python tools/figures.py --document docs/safety/numbers.md
+	$(MAKE) mutants
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 	@if unshare --net tc qdisc add dev lo root netem delay 1ms; then $(MAKE) test-netem-full; \
 		else echo "no sch_netem for this user here: 'make test-netem-full' is left out"; fi

@@ -33,6 +33,10 @@ NOTES = {
         "In half of the schedules teleop is a process of its own, as in production: it looks every",
         "20 ms, its sockets take 11 datagrams, and while its journal waits for the disk it neither",
         "hears nor speaks.",
+        "",
+        "What does not fit into a minute, or is no matter of what comes together, has scenarios of",
+        "its own, by [name](faults.md): a link that stays silent (F3), bad orders, slow readers of",
+        "the API and the metrics, orders that come twice (F27, F28, F31, F32, F35, F37).",
     ),
     "adversarial": (
         "",

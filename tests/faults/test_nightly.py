@@ -35,6 +35,7 @@ LINES = (
     "faults fuzz --clean --seeds 600 --jobs $(JOBS) --document docs/safety/clean.md ",
     "faults fuzz --adversarial --seeds 5000 --jobs $(JOBS) --document docs/safety/adversary.md ",
     "faults fuzz --seeds 30000 --jobs $(JOBS) --document docs/safety/search.md ",
+    "$(MAKE) mutants",
     "$(MAKE) test-netem-full",
     "$(MAKE) e2e-full",
 )

@@ -19,7 +19,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 YARDSTICK = ROOT / "cloudrc" / "cli" / "bench_wire.py"
 
 MODULES = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "jsonpickle"}
-CALLS = {"eval", "exec", "__import__"}
+CALLS = {"eval", "exec", "compile", "__import__"}
 LOADERS = {"load", "load_all", "full_load", "full_load_all", "unsafe_load", "unsafe_load_all"}
 SHELLS = {"os": {"system", "popen"}, "subprocess": {"getoutput", "getstatusoutput"}}
 NAMES = {"builtins": CALLS, "yaml": LOADERS, **SHELLS}
