@@ -139,6 +139,7 @@ class Descent:
             speed_max: Of the descent, if it is below LAND_SPEED [m/s].
         """
         self._floor, self.speed = floor, min(LAND_SPEED, speed_max)
+        self._still = min(STILL, 0.2 * self.speed)
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
@@ -158,7 +159,7 @@ class Descent:
             reference: As followed so far [m/s], world frame, shape (3,).
             readings: Of the sensors on board.
         """
-        if reference[2] > -0.5 * self.speed or abs(readings.velocity[2]) >= STILL:
+        if reference[2] > -0.5 * self.speed or abs(readings.velocity[2]) >= self._still:
             self._moved_ns = now_ns
         return now_ns - self._moved_ns >= TOUCH_DOWN_NS
 

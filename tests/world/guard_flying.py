@@ -20,8 +20,8 @@ UP = (0.0, 0.0, 1.0)
 class Flight:
     """A robot in free air, commanded at 100 Hz."""
 
-    def __init__(self, simulator):
-        self.guard = Guard(LIMITS)
+    def __init__(self, simulator, limits=LIMITS):
+        self.guard = Guard(limits)
         self.robot = Robot(simulator, LowLevel(), self.guard)
         self.robot.put_on_ground(0, "test")
         self.guard.start_mission(0)

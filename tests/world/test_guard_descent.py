@@ -1,15 +1,18 @@
 """The guard: a landing that the operator acknowledges before the robot stands."""
 
+from dataclasses import replace
 from math import nan
 
 import pytest
-from guard_play import HERE, MS, SECOND, command, feed, landing, run
+from guard_flying import Flight
+from guard_play import HERE, LIMITS, MS, SECOND, command, feed, landing, run
 
 from cloudrc.geometry import fence
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard_limits import Limits
 from cloudrc.world.guard_rest import LAND_SPEED
+from cloudrc.world.simulator import Simulator
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -79,3 +82,28 @@ def test_a_robot_that_lands_near_the_fence_touches_down_though_it_is_pulled_inwa
     stood = run(guard, 2 * SECOND, 4 * SECOND, place)
     assert None in stood
     assert guard.take_changes()[-1].cause == "touched down, rotors stopped"
+
+
+@pytest.mark.parametrize("speed_max", [0.01, 0.05, 0.19, 0.2, 0.25, 6.0])
+def test_a_robot_that_sinks_slowly_by_its_cap_has_not_touched_down(speed_max):
+    guard = landing(replace(LIMITS, speed_max=speed_max))
+    sinks = (0.0, 0.0, -0.5 * min(LAND_SPEED, 0.5 * speed_max))
+    assert None not in run(guard, 2 * SECOND, 5 * SECOND, velocity=sinks)
+    assert None in run(guard, 5 * SECOND, 6 * SECOND)
+
+
+def test_with_the_lowest_cap_it_lands_on_the_floor_and_falls_onto_nothing():
+    flight = Flight(Simulator("pelican", "empty"), replace(LIMITS, speed_max=0.1))
+    flight.fly(6.0, (0.0, 0.0, 0.1))
+    height = flight.readings.position[2]
+    for _ in range(5):
+        flight.guard.offer(command((nan, 0.0, 0.0), flight.now_ns), flight.now_ns)
+    assert flight.guard.state is LAND
+    fastest = 0.0
+    for _ in range(400):
+        flight.fly(0.1)
+        fastest = min(fastest, flight.readings.velocity[2])
+    assert flight.guard.take_changes()[-1].cause == "touched down, rotors stopped"
+    assert height > 0.4
+    assert flight.readings.position[2] < 0.15
+    assert fastest > -0.1
