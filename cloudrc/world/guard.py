@@ -80,8 +80,8 @@ class Guard:
         self.armed = self._flies = False
         self.yaw_rate, self._alone_ns = 0.0, 0
         self.reference = self._wanted = ZERO
-        self._acceleration = limits.acceleration_max
-        self._track_until_ns = self._steady_until_ns = NEVER_NS
+        self._acceleration_max = limits.acceleration_max
+        self._track_until_ns = self._steady_until_ns = self._ramp_until_ns = NEVER_NS
         self._tracked_ns = self._held_ns = -SETTLE_NS
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
         self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
@@ -193,7 +193,7 @@ class Guard:
         if enough and self._settled(now_ns, fresh_until_ns):
             told = f"{RESUME_COMMANDS} fresh commands within {took_ns * 1e-9:.3f} s"
             self._enter(TRACK, now_ns, Cause.COMMANDS, told)
-            self._acceleration = min(rules.BRAKE, self._acceleration)
+            self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
         """Whether TRACK may be, and it and the next HOLD keep their distance from the last ones."""
@@ -227,9 +227,9 @@ class Guard:
         elif not self._take_off.over:
             self._take_off.look(readings, self._flies)
         if now_ns <= self._track_until_ns:
-            reference = rules.towards(self.reference, self._wanted, self._acceleration * dt)
-            if reference is self._wanted:
-                self._acceleration = self._limits.acceleration_max
+            reference = rules.towards(self.reference, self._wanted, self._acceleration_max * dt)
+            if now_ns < self._ramp_until_ns:
+                reference = rules.held_back(self.reference, reference, rules.BRAKE * dt)
         else:
             self._look_after_itself(now_ns, readings)
             if not self._flies:
@@ -251,7 +251,7 @@ class Guard:
             inside = rules.fenced(reference, position, self._low, self._high)
             if inside != reference:
                 self.counts["limited_fence"] += 1
-                inside = rules.held_back(self.reference, inside, self._limits.acceleration_max * dt)
+                inside = rules.held_back(self.reference, inside, self._acceleration_max * dt)
                 reference = rules.shortened(inside, self._speed_max)
         self.reference = reference
 
@@ -286,7 +286,6 @@ class Guard:
         self._low = (*self._low[:2], -inf if state is LAND else self._floor)
         if state is TRACK:
             self._tracked_ns = now_ns
-            self._acceleration = self._limits.acceleration_max
         elif state is HOLD:
             self._held_ns = self._alone_ns = now_ns
             self._fresh_ns.clear()

@@ -10,13 +10,15 @@ from math import isfinite
 
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import Vector
-from cloudrc.world.guard_rules import MARGIN, REACTION, STOPPING_DISTANCE, stopping_distance
+from cloudrc.world.guard_rules import BRAKE, MARGIN, REACTION, STOPPING_DISTANCE, stopping_distance
 
 AGE_MAX_NS = 10_000_000_000
 """Commands that are older are never flown [ns], whatever an experiment says."""
 GROUND_MIN_NS = 10_000_000_000
 """A robot on the ground waits for a mission's first command for so long at least [ns]: it comes a
 round trip behind the start, 0.6 s by `satellite`, or some, if one end has not heard the other."""
+RAMP_MIN = 1.0
+"""Out of HOLD the reference is led slowly for so long at least [s]."""
 RANGE = 1000.0
 """Largest number of a command that is shortened to a cap, not refused [m/s, rad/s]: no controller
 asks a robot for more. One that does has a bug, and its direction is as wrong as its length. Source:
@@ -67,6 +69,15 @@ class Limits:
         for low, high in zip(self.fence_low, self.fence_high, strict=True):
             if not (isfinite(low) and isfinite(high) and high - low > FLOOR_MARGIN + MARGIN):
                 raise ValueError(f"guard: a fence from {low:g} to {high:g} m leaves no room")
+
+    @property
+    def ramp_ns(self) -> int:
+        """How long the reference grows by no more than BRAKE after a HOLD [ns]: to the cap.
+
+        By time alone: the first commands after a silence rest, and a ramp that ended where the
+        reference has caught up with them would be none. Source: DESIGN, section 5.
+        """
+        return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
 
     def alone_max_ns(self, flies: bool) -> int:
         """How long a robot in a mission waits for its cloud before LAND [ns]."""

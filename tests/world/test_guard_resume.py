@@ -1,9 +1,11 @@
 """The guard: how it leaves HOLD, and that it does not chatter."""
 
-import pytest
-from guard_play import MS, SECOND, armed, command, feed, holding, run, tracking
+from dataclasses import replace
 
-from cloudrc.messages import GuardState
+import pytest
+from guard_play import LIMITS, MS, SECOND, armed, command, feed, holding, run, tracking
+
+from cloudrc.messages import ZERO, GuardState
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -75,16 +77,34 @@ def test_commands_from_before_a_hold_do_not_count():
     assert resume(guard, 2100 * MS, 9) is HOLD
 
 
-def test_after_a_hold_the_reference_rises_slowly_until_it_has_caught_up():
+def test_after_a_hold_the_reference_rises_slowly():
     guard = holding()
     now_ns = feed(guard, 2 * SECOND, 10, (1.0, 0.0, 0.0))
     start = guard.reference[0]
     feed(guard, now_ns, 10, (1.0, 0.0, 0.0))
     assert guard.reference[0] - start == pytest.approx(3.0 * 0.1)
-    now_ns = feed(guard, now_ns + 100 * MS, 40, (1.0, 0.0, 0.0))
-    assert guard.reference[0] == 1.0
-    feed(guard, now_ns, 1, (2.0, 0.0, 0.0))
-    assert guard.reference[0] == pytest.approx(1.0 + 12.0 * 0.01)
+
+
+@pytest.mark.parametrize(("speed_max", "ramp_s"), [(6.0, 2.0), (4.5, 1.5), (1.5, 1.0)])
+def test_it_rises_slowly_for_as_long_as_it_takes_to_the_cap(speed_max, ramp_s):
+    """What a cloud says first, that it rests or has been caught up with, ends nothing."""
+    guard = holding(replace(LIMITS, speed_max=speed_max))
+    feed(guard, 2 * SECOND, 10, ZERO)
+    assert guard.state is TRACK
+    ends_ns = 2 * SECOND + 90 * MS + round(ramp_s * SECOND)
+    for begin_ns, rate in ((ends_ns - 20 * MS, 3.0), (ends_ns, 12.0)):
+        feed(guard, begin_ns - 10 * MS, 1, ZERO)
+        assert guard.reference == ZERO
+        feed(guard, begin_ns, 1, (1.0, 0.0, 0.0))
+        assert guard.reference[0] == pytest.approx(rate * 0.01)
+
+
+def test_slowing_down_is_as_fast_as_ever_after_a_hold():
+    guard = holding()
+    now_ns = feed(guard, 2 * SECOND, 30, (1.0, 0.0, 0.0))
+    before = guard.reference[0]
+    feed(guard, now_ns, 1, (0.0, 0.0, 0.0))
+    assert before - guard.reference[0] == pytest.approx(12.0 * 0.01)
 
 
 def test_a_link_that_comes_and_goes_does_not_chatter():
