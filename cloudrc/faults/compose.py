@@ -13,6 +13,9 @@ DURATION = 60.0
 """Of a flight [s]."""
 PROFILES = ("ideal", "wifi", "lte", "5g", "lossy", "paper-p1", "paper-p2", "paper-p3")
 PAPER = PROFILES[-3:]
+HOLDS = 1.0, 8.0
+"""Shortest and longest HOLD that is drawn [s]."""
+HOLD_MAX = Schedule(0).hold_max
 ONCE = ("second_cloud", "key_rotated")
 """Kinds that happen at most once in a flight."""
 
@@ -80,6 +83,8 @@ def compose(seed: int) -> Schedule:
         cloud_drift=int(rng.integers(-500, 501)) if rng.random() < 0.3 else 0,
         duration=DURATION,
         apart=bool(rng.random() < 0.5),
+        # In every third schedule shorter than its silences: the robot lands amid the other faults.
+        hold_max=round(float(rng.uniform(*HOLDS)), 1) if rng.random() < 1 / 3 else HOLD_MAX,
     )
 
 

@@ -85,6 +85,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
     clock = Clock(round((schedule.cloud_offset + 1e6) * 1e9), schedule.cloud_drift)
     flight = Flight(
         f"link.profile={schedule.profile}",
+        f"guard.hold_max_s={schedule.hold_max:g}",
         seed=schedule.seed,
         cloud_clock=clock if offset else None,
         uplink=lambda profile: shaped(schedule, profile, "up"),

@@ -109,6 +109,7 @@ class Schedule:
         policy: Of an adversary in the place of cloud; "" for an honest cloud.
         duration: Of the flight [s].
         apart: Whether teleop is a process of its own, as in production.
+        hold_max: HOLD for so long in a mission ends in LAND [s].
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -122,6 +123,7 @@ class Schedule:
     policy: str = ""
     duration: float = 60.0
     apart: bool = False
+    hold_max: float = 60.0
 
     @property
     def has_teleop_apart(self) -> bool:
@@ -234,6 +236,7 @@ def _problem(schedule: Schedule) -> str:
         "reorder": (schedule.reorder, 0.0, 1.0),
         "cloud_offset": (schedule.cloud_offset, -OFFSET_MAX, OFFSET_MAX),
         "cloud_drift": (schedule.cloud_drift, -100_000, 100_000),
+        "hold_max": (schedule.hold_max, 0.1, 3600.0),
     }
     for n, event in enumerate(schedule.events):
         if event.kind not in KINDS:

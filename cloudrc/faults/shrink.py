@@ -49,7 +49,8 @@ def _ddmin(schedule: Schedule, fails: Fails) -> tuple[Event, ...]:
 def _simpler(schedule: Schedule) -> Iterator[Schedule]:
     """Schedules with one thing less."""
     plain = Schedule(schedule.seed)
-    for name in ("duplicate", "reorder", "cloud_offset", "cloud_drift", "profile", "apart"):
+    for name in ("duplicate", "reorder", "cloud_offset", "cloud_drift", "profile", "apart",
+                 "hold_max"):  # fmt: skip
         yield replace(schedule, **{name: getattr(plain, name)})
     if not schedule.events:
         return

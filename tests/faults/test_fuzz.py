@@ -128,7 +128,7 @@ def test_every_kind_of_fault_is_composed_and_ends_before_the_calm() -> None:
 
 def test_a_schedule_is_what_its_file_says(tmp_path: Path) -> None:
     path = tmp_path / "schedule.yaml"
-    for schedule in (compose(8), choose(3), Schedule(2), Schedule(2, apart=True)):
+    for schedule in (compose(8), choose(3), Schedule(2), Schedule(2, apart=True, hold_max=2.5)):
         path.write_text(dump(schedule, "a note\nof two lines"))
         assert load(path) == schedule
 

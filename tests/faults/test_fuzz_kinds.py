@@ -257,3 +257,16 @@ def test_an_adversary_may_have_a_bug_as_well() -> None:
     bug = Event("values_invalid", 3.0, 4.0, 3.0)
     schedule = Schedule(4, policy="random", events=(bug,), duration=10.0)
     assert fuzz.fly(schedule).breaches == ()
+
+
+def test_in_some_schedules_a_hold_is_shorter_than_a_silence() -> None:
+    drawn = [compose(seed).hold_max for seed in range(300)]
+    assert 70 < sum(hold_max <= 8.0 for hold_max in drawn) < 130
+    assert {hold_max for hold_max in drawn if hold_max > 8.0} == {60.0}
+
+
+def test_a_robot_that_lands_since_its_hold_was_short_flies_again() -> None:
+    silence = Schedule(8, "ideal", (Event("blackout", 20.0, 6.0),))
+    flown = [fly(replace(silence, hold_max=limit), keep=True) for limit in (2.5, 60.0)]
+    assert [finding.breaches for finding in flown] == [(), ()]
+    assert flown[0].sha256 != flown[1].sha256
