@@ -18,6 +18,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.endpoint import Endpoint
+from cloudrc.faults import states
 from cloudrc.faults.crowd import Crowd
 from cloudrc.faults.desk import Desk
 from cloudrc.faults.desk_apart import apart
@@ -35,9 +36,6 @@ from cloudrc.world.identity import WorldIdentity
 
 SHARED = b"one clock for all"[:16]
 OTHER = b"another clock..."
-LAND = GuardState.LAND
-BRAKES_NS = 200_000_000
-"""Within which a descent is stopped that the operator has acknowledged [ns]; DESIGN's 0.2 s."""
 
 
 class Flight:
@@ -215,6 +213,7 @@ class Flight:
             next_epoch=self._next_epoch,
         )
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
+        self._born_ns = start_ns
         self.watch.attach(world, start_ns)
         return world
 
@@ -268,20 +267,12 @@ class Flight:
             if kind is GuardChange:
                 self.changes.append(record)  # type: ignore[arg-type]
             elif kind is Contact:
-                stamp_ns = record.stamp_ns
-                state = self.state_at(stamp_ns)
-                if state is GuardState.HOLD and self.state_at(stamp_ns - BRAKES_NS) is LAND:
-                    state = LAND  # acknowledged right above a pipe that it was about to land on
+                state = states.state_before(self.changes, record.stamp_ns, self._born_ns)
                 self.watch.see(record, state, self.honest)  # type: ignore[arg-type]
 
     def state_at(self, stamp_ns: int) -> GuardState:
         """The guard's state at an instant [ns, world's clock]."""
-        state = GuardState.GROUND
-        for change in self.changes:
-            if change.stamp_ns > stamp_ns:
-                break
-            state = change.state
-        return state
+        return states.state_at(self.changes, stamp_ns, self._born_ns)
 
     def events(self, *names: str) -> list[MissionEvent]:
         """What has happened to missions, by name."""

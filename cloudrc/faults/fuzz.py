@@ -22,6 +22,7 @@ from cloudrc.faults.mortal import Clock
 from cloudrc.faults.once import Once
 from cloudrc.faults.remains import Remains
 from cloudrc.faults.schedule import Schedule, shaped
+from cloudrc.faults.states import seen_now
 from cloudrc.faults.walls import steppable_wall_clock
 from cloudrc.faults.watch import Breach
 from cloudrc.messages import GuardState
@@ -164,7 +165,7 @@ class Operator:
     def look(self, records: list[Record], now_ns: int) -> None:
         """Look at the robot, every 100 ms."""
         flight = self._flight
-        state = flight.changes[-1].state if flight.changes else GuardState.GROUND
+        state, _ = seen_now(flight.world.inner)
         if state is GuardState.TRACK:
             self.tracked_ns = now_ns
         changes = [record for record in records if isinstance(record, GuardChange)]
@@ -211,10 +212,9 @@ def judged(schedule: Schedule) -> frozenset[str]:
 
 def _ask_whether_stuck(flight: Flight, operator: Operator) -> None:
     if flight.run.now_ns - operator.tracked_ns > BACK * 1e9:
-        change = flight.changes[-1] if flight.changes else None
-        state = f"{change.state.name} ({change.cause})" if change else "GROUND"
+        state, cause = seen_now(flight.world.inner)
         mission = flight.mission.state if flight.desk.missions else "none"
-        text = f"not flown in {BACK:g} s of calm: guard {state}, mission {mission}"
+        text = f"not flown in {BACK:g} s of calm: guard {state.name} ({cause}), mission {mission}"
         flight.watch.note(flight.run.now_ns, "stuck", text)
 
 
