@@ -6,7 +6,8 @@ to stay away, and they turn again only where the robot lies still, inside the fe
 stays below the caps and can be stopped in time, before the floor, too, unless the robot lands. No
 motion on stale commands: in TRACK the newest accepted command's basis is never older than its
 limit, and where TRACK ends the robot stops, within the way that this takes. What has landed or was
-stopped stays so until the operator acknowledges it. No collision, under an honest cloud: nothing
+stopped stays so until the operator acknowledges it; only what was started is in TRACK, and a HOLD
+is left for it on ten fresh commands. No collision, under an honest cloud: nothing
 but the arm's tip touches anything, and that the board. A robot that lands, since its cloud is gone
 for good or says what no honest one does, sinks where it is, and one that the operator stops falls:
 the guard knows the fence, and not what lies below. What it comes down on is told, and no collision,
@@ -19,7 +20,7 @@ from collections import Counter
 from math import hypot, inf, sqrt
 from typing import Any, NamedTuple
 
-from cloudrc.faults import ticks
+from cloudrc.faults import ticks, word
 from cloudrc.faults.ticks import TICK_NS
 from cloudrc.geometry.fence import HIGH, LOW, inside
 from cloudrc.messages import ZERO, Command, GuardState, Vector
@@ -28,7 +29,6 @@ from cloudrc.records import Contact
 SLACK = 1e-9
 """For rounding [m/s]."""
 FLOWN = (GuardState.TRACK, GuardState.HOLD, GuardState.LAND)
-LATCHED = (GuardState.LAND, GuardState.ESTOP)
 ABOVE_GROUND = (GuardState.TRACK, GuardState.HOLD)
 REPORTED = 5
 """Of each kind."""
@@ -147,26 +147,19 @@ class Watch:
         simulator.step, guard.offer, guard.stop = watched_step, watched_offer, watched_stop
         self._attach_to_states(simulator, guard, start_ns)
         ticks.attach(robot, start_ns, self.note)
+        word.attach(robot, start_ns, self.note)
 
     def _attach_to_states(self, simulator: Any, guard: Any, start_ns: int) -> None:
         """Look at what the guard's states promise: rotors that stand, a robot that stops."""
-        step, acknowledge = simulator.step, guard.acknowledge
-        now_ns, was, before = start_ns, guard.state, ZERO
-        released = set[GuardState]()  # those acknowledged; before a step they may be several
+        step, now_ns, was, before = simulator.step, start_ns, guard.state, ZERO
         tracking, flown = GuardState.TRACK, FLOWN
-
-        def watched_acknowledge(when_ns: int) -> None:
-            released.add(guard.state)
-            acknowledge(when_ns)
 
         def watched_step(rotor_speeds: Any) -> None:
             nonlocal now_ns, was, before
             state = guard.state
             if state is not was:
-                self._look_at_change(was, state, not released.isdisjoint(LATCHED), now_ns)
                 if was is tracking:
                     self._leave_alone(simulator.readings, before, now_ns)
-                released.intersection_update({state})
                 was = state
             if state not in flown:
                 if any(rotor_speeds):
@@ -177,14 +170,7 @@ class Watch:
             step(rotor_speeds)
             now_ns += TICK_NS
 
-        simulator.step, guard.acknowledge = watched_step, watched_acknowledge
-
-    def _look_at_change(
-        self, was: GuardState, state: GuardState, released: bool, now_ns: int
-    ) -> None:
-        """What has landed or was stopped stays so until the operator acknowledges it."""
-        if was in LATCHED and not released and state is not GuardState.ESTOP:
-            self.note(now_ns, "latch", f"{was.name} left for {state.name} without the operator")
+        simulator.step = watched_step
 
     def _leave_alone(self, readings: Any, reference: Vector, now_ns: int) -> None:
         """From here on no command is flown: the robot goes on for as far as it takes to stop."""

@@ -1,51 +1,15 @@
 """The watch itself: what it calls a breach, and what not."""
 
-from types import SimpleNamespace
-
 import pytest
 
-from cloudrc.faults.watch import FLOWN, Watch, stops
-from cloudrc.messages import ZERO, Command, GuardState
+from cloudrc.faults.watch import Watch, stops
+from cloudrc.messages import ZERO, GuardState
 from cloudrc.records import Contact
-from cloudrc.world.rotors import STOPPED
+from tests.faults.watched import World
 
 MS = 1_000_000
 INSIDE, OUTSIDE = (1.0, 1.0, 1.0), (9.3, 1.0, 1.0)
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-
-
-class World:
-    """A robot that is wherever a test puts it."""
-
-    def __init__(self, yaw_rate=0.0):
-        self.readings = SimpleNamespace(position=INSIDE, velocity=ZERO)
-        self.state, self.reference, self.steps = TRACK, ZERO, 0
-        self.watch = Watch(6.0, 12.0, 1.0, 250 * MS)
-        self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
-        self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
-        self.guard.offer = lambda command, now: None
-        self.guard.stop = self.guard.acknowledge = self.guard.tick = lambda now: None
-        self.robot = SimpleNamespace(simulator=self.simulator, guard=self.guard)
-        self.watch.attach(self, 0)
-        self.guard.offer(Command(0, 0, 0, ZERO, 0.0), 0)
-
-    def _step(self, rotor_speeds):
-        self.steps += 1
-
-    def tick(
-        self, *references, state=TRACK, position=INSIDE, turns=None, released=True, ruled=True
-    ):
-        """Fly references, one a tick, and say what kinds of breach there were."""
-        for reference in references:
-            if released:
-                self.guard.acknowledge(0)
-            self.guard.state, self.guard.reference = state, reference
-            self.readings.position = position
-            turns = state in FLOWN if turns is None else turns
-            if ruled:
-                self.guard.tick(self.steps * 2 * MS)
-            self.simulator.step((900.0,) * 4 if turns else STOPPED)
-        return set(self.watch.counts)
 
 
 @pytest.mark.promise("P-GUARD-3")
@@ -162,19 +126,6 @@ def test_every_step_is_ruled_by_a_tick_of_the_guard():
     assert world.tick(ZERO, ruled=False) == {"tick"}
 
 
-@pytest.mark.parametrize("latched", [LAND, ESTOP])
-@pytest.mark.parametrize("after", [GROUND, TRACK, HOLD])
-def test_what_is_latched_stays_so_until_the_operator_has_said_so(latched, after):
-    for released, kinds in ((True, set()), (False, {"latch"})):
-        world = World()
-        assert world.tick(ZERO, state=latched) == set()
-        assert world.tick(ZERO, state=after, released=released) == kinds
-    world = World()
-    world.guard.acknowledge(0)  # of nothing: it counts for no landing that comes later
-    assert world.tick(ZERO, state=latched, released=False) == set()
-    assert world.tick(ZERO, state=after, released=False) == {"latch"}
-
-
 @pytest.mark.parametrize("state", [GROUND, ESTOP])
 def test_rotors_stand_still_on_the_ground_and_after_a_stop(state):
     assert World().tick(ZERO, state=state) == set()
@@ -261,28 +212,6 @@ def test_a_robot_that_lands_touches_what_lies_below_and_one_that_flies_again_may
         world.watch.counts.clear()
         world.watch.see(pipe, state, honest=True)
         assert set(world.watch.counts) == {"collision"}
-
-
-def test_an_acknowledgement_counts_in_the_state_that_it_is_for_and_no_longer():
-    world = World()
-    world.tick(ZERO, released=False)
-    world.guard.state = LAND  # it lands and is acknowledged between two ticks
-    world.guard.acknowledge(0)
-    assert world.tick(ZERO, state=LAND, released=False) == set()
-    assert world.tick(ZERO, state=HOLD, released=False) == set()
-    world.tick(ZERO, state=LAND, released=False)
-    assert world.tick(ZERO, state=HOLD, released=False) == {"latch"}
-
-
-@pytest.mark.parametrize("before", [LAND, ESTOP])
-def test_what_is_acknowledged_twice_between_two_ticks_was_released_the_first_time(before):
-    world = World()
-    world.tick(ZERO, state=before)
-    for world.guard.state in (ESTOP, GROUND):  # one that landed was stopped just then
-        world.guard.acknowledge(0)
-    assert world.tick(ZERO, state=GROUND, released=False) == set()
-    world.tick(ZERO, state=before, released=False)
-    assert world.tick(ZERO, state=GROUND, released=False) == {"latch"}
 
 
 def test_who_has_just_been_hit_or_whose_rotors_stand_need_not_rest_where_commands_ended():
