@@ -214,7 +214,7 @@ class Flight:
         )
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self._born_ns = start_ns
-        self.watch.attach(world, start_ns)
+        self.watch.attach(world, start_ns, honest=self.honest)
         return world
 
     def _build_cloud(self, start_ns: int) -> Endpoint:

@@ -190,9 +190,9 @@ def judged(schedule: Schedule) -> frozenset[str]:
     """Say which invariants a schedule is held to.
 
     Under a cloud that means no good a contact is no breach, and nobody has to get on; what goes
-    wrong to the end leaves no time to find back; a HOLD is a false alarm where nothing goes wrong;
-    what a damaged journal has lost may be written down again. A stop is asked again until it is
-    obeyed, by a teleop that lives, of the robot that was there.
+    wrong to the end leaves no time to find back; a HOLD, LAND or ESTOP is a false alarm where
+    nothing goes wrong; what a damaged journal has lost may be written down again. A stop is asked
+    again until it is obeyed, by a teleop that lives, of the robot that was there.
     """
     kinds = set(ALWAYS)
     if not schedule.policy:
@@ -226,5 +226,7 @@ def _ask_whether_stopped(flight: Flight, operator: Operator) -> None:
 
 
 def _ask_for_alarms(flight: Flight) -> None:
-    for hold in held(flight):  # nothing has gone wrong
-        flight.watch.note(hold.stamp_ns, "alarm", f"HOLD in a clean flight: {hold.cause}")
+    latched = [change for change in flight.changes if change.state in LATCHED]
+    for change in (*held(flight), *latched):  # nothing has gone wrong
+        text = f"{change.state.name} in a clean flight: {change.cause}"
+        flight.watch.note(change.stamp_ns, "alarm", text)

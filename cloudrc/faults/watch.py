@@ -5,11 +5,12 @@ word or a hit has stopped them, it may fall out of it, which is told, but not as
 to stay away, and they turn again only where the robot lies still, inside the fence. What is flown
 stays below the caps and can be stopped in time, before the floor, too, unless the robot lands. No
 motion on stale commands: in TRACK the newest accepted command's basis is never older than its
-limit, and where TRACK ends the robot stops, within the way that this takes. What has landed or was
-stopped stays so until the operator acknowledges it; only what was started is in TRACK, and a HOLD
-is left for it on ten fresh commands. No collision, under an honest cloud: nothing
-but the arm's tip touches anything, and that the board. A robot that lands, since its cloud is gone
-for good or says what no honest one does, sinks where it is, and one that the operator stops falls:
+limit, and where TRACK ends the robot stops, within the way that this takes; its rotors turn until
+it stands. What has landed or was stopped stays so until the operator acknowledges it; only what was
+started is in TRACK, and a HOLD is left for it on ten fresh commands. No collision, under an honest
+cloud: nothing but the arm's tip touches anything, and that the board, and no hit is felt without a
+touch. A robot that lands, since its cloud is gone for good or says what no honest one does, sinks
+where it is, and one that the operator stops falls:
 the guard knows the fence, and not what lies below. What it comes down on is told, and no collision,
 also where the operator has acknowledged a landing too late for it to stop above that.
 """
@@ -20,7 +21,8 @@ from collections import Counter
 from math import hypot, inf, sqrt
 from typing import Any, NamedTuple
 
-from cloudrc.faults import ticks, word
+from cloudrc.faults import halts, ticks, word
+from cloudrc.faults.halts import REELS_NS
 from cloudrc.faults.ticks import TICK_NS
 from cloudrc.geometry.fence import HIGH, LOW, inside
 from cloudrc.messages import ZERO, Command, GuardState, Vector
@@ -37,8 +39,6 @@ STILL = 0.12
 REST = 0.5
 """So much farther than its way to a stop a robot that is left alone may go [m]: it swings back. In
 200 flights of the search, half of them under a hostile cloud, it was 0.20 at most."""
-REELS_NS = 1_000_000_000
-"""For so long a robot that has touched something may be pushed aside [ns]."""
 FALL_MAX = 1.5
 """How far outside the fence people are told to stay [m]. Source: docs/safety/guard.md."""
 
@@ -97,8 +97,14 @@ class Watch:
         self._left: Vector = ZERO
         self._way = inf
 
-    def attach(self, world: Any, start_ns: int) -> None:
-        """Look at every step of a world that begins now, and at every command that it accepts."""
+    def attach(self, world: Any, start_ns: int, *, honest: bool = False) -> None:
+        """Look at every step of a world that begins now, and at every command that it accepts.
+
+        Args:
+            world: Which.
+            start_ns: Instant of the first step [ns].
+            honest: Whether its cloud is, so that a hit is its failure or the guard's.
+        """
         robot = world.robot
         simulator, guard = robot.simulator, robot.guard
         step, offer, stop = simulator.step, guard.offer, guard.stop
@@ -148,6 +154,7 @@ class Watch:
         self._attach_to_states(simulator, guard, start_ns)
         ticks.attach(robot, start_ns, self.note)
         word.attach(robot, start_ns, self.note)
+        halts.attach(robot, start_ns, self.note, honest=honest)
 
     def _attach_to_states(self, simulator: Any, guard: Any, start_ns: int) -> None:
         """Look at what the guard's states promise: rotors that stand, a robot that stops."""

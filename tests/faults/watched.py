@@ -14,11 +14,12 @@ TRACK = GuardState.TRACK
 class World:
     """A robot that is wherever a test puts it."""
 
-    def __init__(self, yaw_rate=0.0, refusal=None):
+    def __init__(self, yaw_rate=0.0, refusal=None, honest=False):
         self.readings = SimpleNamespace(position=INSIDE, velocity=ZERO)
         self.state, self.reference, self.steps = TRACK, ZERO, 0
         self.watch = Watch(6.0, 12.0, 1.0, 250 * MS)
         self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
+        self.simulator._steps, self.simulator._last_touch = 0, {}
         self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
         self.guard.offer = lambda command, now: refusal
         for word in ("stop", "acknowledge", "tick", "start_mission", "end_mission"):
@@ -26,7 +27,7 @@ class World:
         self.guard.put_on_ground = lambda now, cause: None
         self.guard.forget_commands = lambda: None
         self.robot = SimpleNamespace(simulator=self.simulator, guard=self.guard)
-        self.watch.attach(self, 0)
+        self.watch.attach(self, 0, honest=honest)
         self.guard.start_mission(0)
         self.offer(1)
 
@@ -36,6 +37,7 @@ class World:
 
     def _step(self, rotor_speeds):
         self.steps += 1
+        self.simulator._steps += 1
 
     def tick(
         self, *references, state=TRACK, position=INSIDE, turns=None, released=True, ruled=True
