@@ -106,7 +106,14 @@ class Watch:
             honest: Whether its cloud is, so that a hit is its failure or the guard's.
         """
         robot = world.robot
-        simulator, guard = robot.simulator, robot.guard
+        self._attach_to_flight(robot.simulator, robot.guard, start_ns)
+        self._attach_to_states(robot.simulator, robot.guard, start_ns)
+        ticks.attach(robot, start_ns, self.note)
+        word.attach(robot, start_ns, self.note)
+        halts.attach(robot, start_ns, self.note, honest=honest)
+
+    def _attach_to_flight(self, simulator: Any, guard: Any, start_ns: int) -> None:
+        """Look at where it is, and at what it flies by."""
         step, offer, stop = simulator.step, guard.offer, guard.stop
         now_ns, basis_ns, before = start_ns, -1, ZERO
         flew = falls = hit = False
@@ -151,10 +158,6 @@ class Watch:
             now_ns += TICK_NS
 
         simulator.step, guard.offer, guard.stop = watched_step, watched_offer, watched_stop
-        self._attach_to_states(simulator, guard, start_ns)
-        ticks.attach(robot, start_ns, self.note)
-        word.attach(robot, start_ns, self.note)
-        halts.attach(robot, start_ns, self.note, honest=honest)
 
     def _attach_to_states(self, simulator: Any, guard: Any, start_ns: int) -> None:
         """Look at what the guard's states promise: rotors that stand, a robot that stops."""
