@@ -127,7 +127,7 @@ def markdown(document: dict[str, Any], written_by: str, slices: Sequence[Slice] 
             "invariants are looked at in every step of 2 ms. The bound is by the rule of three:",
             "0 events in N runs, p < 3/N with 95 % confidence. N counts the schedules in which an",
             "invariant is looked at: under a cloud that means no good a contact is no breach, and",
-            "only where nothing goes wrong a HOLD is a false alarm. The promise is "
+            "only where nothing goes wrong a HOLD, LAND or ESTOP is a false alarm. The promise is "
             f"[{PROMISES[kind]}].",
             *NOTES.get(kind, ()),
             "",
