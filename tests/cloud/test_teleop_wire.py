@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from cloudrc.cloud.teleop.messages import Seen
 from cloudrc.cloud.teleop.wire import decode, encode
-from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.messages import MISSION_OVER, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
+from cloudrc.tunnel.codec import NUMBER_MAX, encode_operator
 
 numbers = st.floats(allow_nan=False)
 vectors = st.tuples(numbers, numbers, numbers)
@@ -28,6 +29,8 @@ messages = st.one_of(
         horizon=numbers,
         rtt=numbers,
         loop_delay=numbers,
+        mission_id=counts,
+        reached=counts,
     ),
     st.builds(Setpoint, vectors, numbers, st.integers(-1, 9999), counts),
     st.builds(
@@ -36,7 +39,8 @@ messages = st.one_of(
         request=st.sampled_from(Request),
         start=st.sampled_from(Start),
         mission_id=counts,
-        reached=counts,
+        reached=st.integers(0, MISSION_OVER),
+        basis_stamp_ns=counts,
         epoch=counts,
     ),
     st.builds(MissionEvent, counts, st.text(max_size=20), st.integers(-1, 9999), st.text()),
@@ -69,6 +73,14 @@ def test_what_is_not_known_comes_back_unknown():
         b'["Setpoint", [["a", 0, 0], 0, 0]]',
         b'["Setpoint", [[0, 0], 0, 0]]',
         b'["OperatorRequest", [1, 9, 0]]',
+        b'["OperatorRequest", [-1, 1, 0, 0, 0]]',
+        b'["OperatorRequest", [1, 1, 0, -1, 0]]',
+        b'["OperatorRequest", [1, 1, 0, 9223372036854775808, 0]]',
+        b'["OperatorRequest", [1, 1, 0, 0, -1]]',
+        b'["OperatorRequest", [1, 1, 0, 0, 65536]]',
+        b'["OperatorRequest", [1, 1, 0, 0, 0, 9223372036854775808]]',
+        b'["Setpoint", [[0, 0, 0], 0, 9223372036854775808]]',
+        b'["MissionEvent", [-9223372036854775809, "held", 0, ""]]',
         b"[" * 5000,
         b"\xff\xfe",
         encode(Fault(0, "x", "y")),
@@ -84,3 +96,21 @@ def test_what_is_no_message_is_refused(data):
 def test_bytes_that_are_no_message_are_refused_in_one_way(data):
     with pytest.raises(ValueError, match="not a message"):
         decode(data)
+
+
+integers = st.integers(-(2**70), 2**70)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.tuples(
+        integers, st.sampled_from(Request), st.sampled_from(Start), integers, integers, integers
+    )
+)
+def test_a_request_that_is_let_pass_fits_in_the_tunnel(fields):
+    """Cloud drops, and counts, what has a number that no datagram has room for."""
+    try:
+        said = decode(encode(OperatorRequest(*fields)))
+    except ValueError:
+        return
+    encode_operator(said._replace(number=min(said.number, NUMBER_MAX)))
