@@ -108,10 +108,10 @@ class MissionService:
             UnavailableError: If it has not begun, and that it will not cannot be kept.
         """
         mission = self.book.find(mission_id)
-        if mission.ended:
-            raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
-        if mission is self._take_up(now_ns):
+        if not mission.ended and mission is self._take_up(now_ns):
             return self._operate(Cancel(), now_ns)
+        if mission.ended:  # perhaps as it was taken up: in another world
+            raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         self.book.cancel(mission)
         return mission
 
