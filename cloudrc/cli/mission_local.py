@@ -102,7 +102,7 @@ def _status(options: argparse.Namespace, api: Api) -> int:
         if options.output != "table":
             return _print(mission, options.output)
         _say(mission)
-        _print_events(mission["events"])
+        _print_history(mission)
         return 0
     state = api.get("/v1/state")
     if options.output != "table":
@@ -130,7 +130,7 @@ def _cancel(options: argparse.Namespace, api: Api) -> int:
 
 def _logs(options: argparse.Namespace, api: Api) -> int:
     if not options.follow and options.id:
-        _print_events(api.get(path_of(options.id))["events"])
+        _print_history(api.get(path_of(options.id)))
         return 0
     if not options.follow:
         missions = [m["id"] for m in api.get("/v1/missions")["missions"]]
@@ -220,6 +220,12 @@ def _say_seen(seen: dict[str, Any] | None, cloud_age: float | None) -> None:
         say(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
         say(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
     say(f"next: {seen['next_step']}")
+
+
+def _print_history(mission: dict[str, Any]) -> None:
+    if left_out := mission.get("events_left_out", 0):
+        say(f"{mission['id']:<4}{left_out} earlier events are not shown")
+    _print_events(mission["events"])
 
 
 def _print_events(events: list[dict[str, Any]]) -> None:

@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 from service_harness import ServiceFlight, flying
 from teleop_harness import AWAY, A, B, C
 
+from cloudrc.cloud.teleop import api_models as models
 from cloudrc.cloud.teleop.journal_format import parse, to_record
 from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook
+from cloudrc.cloud.teleop.service_mission import SHOWN
 from cloudrc.messages import MISSION_OVER, GuardState, Request, Start
 
 
@@ -112,6 +114,18 @@ def test_a_world_that_restarts_fails_the_mission(teleop_too):
     assert view["verdict"]["failures"][0]["code"] == "world_restarted"
 
 
+def test_a_cancel_does_not_hide_that_the_mission_has_failed_with_its_world():
+    flight, mission_id = flying()
+    flight.restart()
+    flight.restart_teleop()
+    flight.see()
+    with pytest.raises(ConflictError, match=f"mission {mission_id} has ended: failed"):
+        flight.teleop.cancel(mission_id, flight.now_ns)
+    view = flight.view(mission_id)
+    assert (view["state"], view["events"][-1]["event"]) == ("failed", "world_restarted")
+    assert view["verdict"]["failures"][0]["code"] == "world_restarted"
+
+
 def test_a_mission_that_had_not_started_begins_anew_in_whatever_world_there_is():
     flight = ServiceFlight()
     flight.step()
@@ -137,6 +151,26 @@ def test_a_held_mission_stays_held():
     flight.teleop.resume(flight.now_ns)
     flight.step()
     assert flight.setpoints[-1].position == B
+
+
+def test_of_very_many_events_the_newest_are_shown_and_all_are_kept():
+    flight, mission_id = flying()
+    before = len(flight.names(mission_id))
+    flight.teleop.hold(flight.now_ns)
+    for _ in range(SHOWN + 20):
+        flight.teleop.go_to(AWAY, 0.0, flight.now_ns)
+    view = flight.view(mission_id)
+    models.MissionView.model_validate(view)
+    assert flight.names(mission_id) == ["goto"] * SHOWN
+    assert view["events_left_out"] == before + 1 + 20
+    assert sum(entry["kind"] == "event" for entry in flight.kept) == before + 1 + SHOWN + 20
+    flight.restart_teleop()
+    assert flight.view(mission_id) == view
+    flight.step(seconds=0.05)
+    flight.teleop.stop_rotors(flight.now_ns)
+    for _ in range(SHOWN):  # its other events are not shown any more
+        flight.teleop.book.note(flight.teleop.book.find(mission_id), "new_session", "")
+    assert flight.teleop.book.stopped().id == mission_id
 
 
 def test_a_held_mission_stays_held_through_two_restarts():

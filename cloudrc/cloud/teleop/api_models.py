@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
+from cloudrc.cloud.teleop.service_mission import SHOWN
 from cloudrc.config.fields import Finite, Positive, Section
 from cloudrc.config.schema import MAX_WAYPOINTS, Waypoint
 
@@ -130,7 +131,8 @@ class MissionSummary(_Answer):
 class MissionView(MissionSummary):
     """A mission with everything that has happened to it."""
 
-    events: list[Event] = Field(description="Oldest first")
+    events: list[Event] = Field(max_length=SHOWN, description="The newest of them, oldest first")
+    events_left_out: int = Field(description="How many there were before those")
 
 
 class MissionList(_Answer):

@@ -105,7 +105,7 @@ class MissionBook:
     def stopped(self) -> Mission | None:
         """Give the mission that the operator has stopped, and not acknowledged since, if any."""
         for mission in reversed(self.missions.values()):
-            events = [event["event"] for event in mission.events]
+            events = mission.happened
             if "started" in events or "emergency_stopped" in events:
                 waits = "emergency_stopped" in events and "acknowledged" not in events
                 return mission if waits else None

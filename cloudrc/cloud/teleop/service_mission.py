@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter, deque
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -15,6 +16,9 @@ from cloudrc.messages import Start
 QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
 DONE, FAILED, CANCELLED = "done", "failed", "cancelled"
 ENDED = (DONE, FAILED, CANCELLED)
+SHOWN = 100
+"""Events of a mission that are shown, the newest: a mission has some ten, but one that is held can be
+sent elsewhere without end, and every answer has them all. The journal keeps the others."""
 NEVER_BEGAN = "mission cancelled before it began"
 
 STATES = {
@@ -67,7 +71,8 @@ class Mission:
         world: Names the world in which it was started; "" before that.
         elapsed: How long it had lasted at its last event [s].
         reached: Index of each waypoint reached and when [s].
-        events: What has happened, as the API shows it.
+        events: The newest of what has happened, as the API shows it.
+        happened: How often each event has, the older ones counted.
         witness: What the robot has touched.
         verdict: As the API shows it; None until it has ended.
     """
@@ -79,7 +84,8 @@ class Mission:
     world: str = ""
     elapsed: float = 0.0
     reached: list[dict[str, Any]] = field(default_factory=list)
-    events: list[dict[str, Any]] = field(default_factory=list)
+    events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=SHOWN))
+    happened: Counter[str] = field(default_factory=Counter)
     witness: Witness = field(default_factory=Witness)
     verdict: dict[str, Any] | None = None
 
@@ -97,6 +103,7 @@ class Mission:
         """Take in an entry of kind "event"."""
         event = {k: entry[k] for k in ("id", "mission", "event", "waypoint", "text", "time_s")}
         self.events.append(event)
+        self.happened[entry["event"]] += 1
         self.state = STATES.get(entry["event"], self.state)
         self.elapsed, self.world = entry["time_s"], entry["world"]
         self.witness = Witness(**entry["witness"])
@@ -158,8 +165,9 @@ class Mission:
         }
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, as the API shows it."""
-        return {**self.summary(), "events": list(self.events)}
+        """Everything, but no more than `SHOWN` events, as the API shows it."""
+        left_out = self.happened.total() - len(self.events)
+        return {**self.summary(), "events": list(self.events), "events_left_out": left_out}
 
 
 def order_entry(mission: Mission) -> Entry:
