@@ -19,6 +19,10 @@ Speed = Annotated[float, Field(ge=0.01, le=10, allow_inf_nan=False)]
 Acceleration = Annotated[float, Field(ge=0.1, le=100, allow_inf_nan=False)]
 YawRate = Annotated[float, Field(ge=0.01, le=10, allow_inf_nan=False)]
 Patience = Annotated[float, Field(ge=0.1, le=3600, allow_inf_nan=False)]
+DURATION_MAX = 1_000_000
+"""Longest that a mission, a leg of it or a stay may be told to last [s]: eleven days."""
+Stay = Annotated[float, Field(ge=0, le=DURATION_MAX, allow_inf_nan=False)]
+Limit = Annotated[float, Field(gt=0, le=DURATION_MAX, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 

@@ -15,11 +15,13 @@ from cloudrc.config.fields import (
     Acceleration,
     CommandAge,
     Finite,
+    Limit,
     NotNegative,
     Patience,
     Positive,
     Section,
     Speed,
+    Stay,
     YawRate,
 )
 from cloudrc.config.network import (
@@ -65,8 +67,8 @@ class Waypoint(Section):
     position_m: tuple[Finite, Finite, Finite] = Field(description="Base position [m], world frame")
     yaw_deg: Finite = Field(0.0, description="Heading [deg]")
     tolerance_m: Positive = Field(0.10, description="Distance that counts as there [m]")
-    dwell_s: NotNegative = Field(0.5, description="How long to stay within the tolerance [s]")
-    time_limit_s: Positive | None = Field(
+    dwell_s: Stay = Field(0.5, description="How long to stay within the tolerance [s]")
+    time_limit_s: Limit | None = Field(
         None,
         description="Time allowed for this leg, in which the robot is seen to fly on commands [s]; "
         "default: 3 times what it is expected to take",
@@ -77,7 +79,7 @@ class Steps(Section):
     """Seeded random setpoints, one after the other: for judging predictors."""
 
     count: Annotated[int, Field(ge=1, le=1000)] = Field(10, description="Number of steps")
-    period_s: Positive = Field(4.0, description="Time between two steps [s]")
+    period_s: Limit = Field(4.0, description="Time between two steps [s]")
     centre_m: tuple[Finite, Finite, Finite] = Field((0.0, 0.0, 1.2), description="Centre [m]")
     range_m: tuple[NotNegative, NotNegative, NotNegative] = Field(
         (1.0, 1.0, 0.7), description="Largest distance from the centre per axis [m]"
@@ -194,7 +196,7 @@ class Criteria(Section):
 
     contact: bool = Field(True, description="The tip has to touch the board")
     contact_speed_max_mps: Positive = Field(0.25, description="Tip speed allowed there [m/s]")
-    time_limit_s: Positive = Field(60.0, description="Since the mission began [s]")
+    time_limit_s: Limit = Field(60.0, description="Since the mission began [s]")
 
 
 class Experiment(Section):

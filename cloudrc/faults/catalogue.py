@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import pkgutil
 from typing import get_args
@@ -54,4 +55,6 @@ def called(name: str, mode: Mode) -> list[Scenario]:
                 f" cloudrc faults run {other.name}{flag}"
             )
     names = ", ".join(f"{each.id} {each.name}" for each in there) or "none"
-    raise BadInputError(f"no fault '{name}' in mode {mode}; there are: {names}")
+    near = difflib.get_close_matches(name.lower(), [each.name for each in there], n=1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    raise BadInputError(f"no fault '{name}' in mode {mode}; there are: {names}{hint}")

@@ -11,6 +11,7 @@ import pytest
 from api_harness import DIRECT, OPERATOR, Running, running
 
 from cloudrc.cloud.teleop import api_models as models
+from cloudrc.errors import BadInputError
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +85,26 @@ def test_nothing_is_offered_that_the_api_does_not_take(
     status, refusal = idle.post("/v1/missions", body)
     assert status == 422
     assert refusal["detail"] == "waypoints: none given; give at least one"
+
+
+@pytest.mark.parametrize("key", ["waypoints.0.dwell_s", "waypoints.0.time_limit_s", "time_limit_s"])
+def test_no_time_is_so_long_that_a_limit_made_of_it_is_none(idle: Running, key: str) -> None:
+    point = {"position_m": [0.5, 0.0, 0.7]}
+    name = key.rpartition(".")[2]
+    here = {"waypoints": [point | {name: 1e308}]} if "." in key else {name: 1e308}
+    status, refusal = idle.post("/v1/missions", {"waypoints": [point]} | here)
+    (problem,) = refusal["problems"]
+    assert (status, problem["path"]) == (422, key)
+    assert "and <= 1000000" in problem["reason"]
+
+
+def test_what_the_plan_refuses_is_the_senders_fault(
+    idle: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*args: object, **kwargs: object) -> None:
+        raise BadInputError("time limit inf s: has to be finite and above 0")
+
+    monkeypatch.setattr("cloudrc.cloud.teleop.api.check_way", refuse)
+    status, refusal = idle.post("/v1/goto", {"position_m": [0.5, 0.0, 0.7]})
+    models.Refusal.model_validate(refusal)
+    assert (status, refusal["detail"]) == (422, "time limit inf s: has to be finite and above 0")

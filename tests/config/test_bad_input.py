@@ -84,6 +84,11 @@ def test_a_profile_cannot_take_the_guards_limit_away(tmp_path: Path) -> None:
             load_profile(path)
 
 
+def test_no_dwell_is_so_long_that_its_leg_has_no_limit(mine: Path) -> None:
+    text = refused(mine, "mission: {waypoints: [{position_m: [0, 0, 1], dwell_s: 1.0e+308}]}\n")
+    assert "dwell_s: 1e+308: must be a number >= 0 and <= 1000000 [s]" in text
+
+
 def test_thousands_of_problems_are_not(mine: Path) -> None:
     points = ", ".join(["{position_m: [0, 0, 1], dwell_s: -1}"] * 2000)
     text = refused(mine, f"mission: {{waypoints: [{points}]}}\n")

@@ -18,7 +18,7 @@ from cloudrc.cloud.teleop.service_book import (
     UnknownMissionError,
 )
 from cloudrc.config.problems import Problem, in_words
-from cloudrc.errors import CloudrcError
+from cloudrc.errors import BadInputError, CloudrcError
 
 BODY_MAX = 256 * 1024
 """Length of a request's body [bytes]."""
@@ -60,6 +60,8 @@ def handle_errors(app: FastAPI) -> None:
             case RefusedError():
                 problems = [as_json(problem) for problem in error.problems]
                 return JSONResponse({"detail": str(error), "problems": problems}, 422)
+            case BadInputError():
+                return JSONResponse({"detail": str(error)}, 422)
             case ConflictError():
                 return JSONResponse({"detail": str(error), "id": error.mission or None}, 409)
             case UnknownMissionError():

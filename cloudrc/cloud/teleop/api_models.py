@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
 from cloudrc.cloud.teleop.service_mission import SHOWN
-from cloudrc.config.fields import Finite, Positive, Section
+from cloudrc.config.fields import Finite, Limit, Section
 from cloudrc.config.schema import MAX_WAYPOINTS, Waypoint
 
 Position = tuple[Finite, Finite, Finite]
@@ -43,7 +43,7 @@ class MissionRequest(Section):
     name: Text = Field("", description="For people: one line of printable characters")
     description: str = Field("", description="One line, not kept")
     start: Literal["spawn", "here"] = Field("spawn", description="Where the mission starts")
-    time_limit_s: Positive | None = Field(
+    time_limit_s: Limit | None = Field(
         None, description="For the whole mission, held time counted [s]; default: the experiment's"
     )
     waypoints: tuple[Waypoint, ...] = Field(

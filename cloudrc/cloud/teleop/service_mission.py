@@ -17,8 +17,8 @@ QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
 DONE, FAILED, CANCELLED = "done", "failed", "cancelled"
 ENDED = (DONE, FAILED, CANCELLED)
 SHOWN = 100
-"""Events of a mission that are shown, the newest: a mission has some ten, but one that is held can be
-sent elsewhere without end, and every answer has them all. The journal keeps the others."""
+"""Events of a mission that are shown, the newest: a mission has some ten, but one that is held can
+be sent elsewhere without end, and every answer has them. The journal keeps the others, too."""
 NEVER_BEGAN = "mission cancelled before it began"
 
 STATES = {
