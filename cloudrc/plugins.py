@@ -108,9 +108,14 @@ def is_path(name: str) -> bool:
 
 def unknown(what: str, name: str, available: list[str]) -> str:
     """Word the refusal of a name: what there is, and what may have been meant."""
+    there = ", ".join(available) or "none"
+    return f"no {what} named {name!r}; available: {there}{meant(name, available)}"
+
+
+def meant(name: str, available: list[str]) -> str:
+    """Say which name may have been meant, to be put behind a refusal; "" if none is near."""
     near = difflib.get_close_matches(name, available, n=1)
-    hint = f"; did you mean {near[0]}?" if near else ""
-    return f"no {what} named {name!r}; available: {', '.join(available) or 'none'}{hint}"
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _build(kind: str, name: str) -> Callable[..., Any]:

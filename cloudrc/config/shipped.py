@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from pathlib import Path
 
 from cloudrc.config import document
 from cloudrc.config.document import Document
 from cloudrc.errors import BadInputError
-from cloudrc.plugins import unknown
+from cloudrc.plugins import meant, unknown
 
 _PACKAGE = Path(__file__).parents[1]
 FOLDERS = {
@@ -63,9 +62,8 @@ def check_name(kind: str, name: str) -> None:
 def _shipped_instead(kind: str, name: str) -> str:
     """Say how the shipped files are named, to one who gave a path that leads nowhere."""
     available = names(kind)
-    near = difflib.get_close_matches(name, available, n=1)
-    hint = f"; did you mean {near[0]}?" if near else ""
-    return f"shipped {kind}s go by their names: {', '.join(available)}{hint}"
+    there = ", ".join(available)
+    return f"shipped {kind}s go by their names: {there}{meant(name, available)}"
 
 
 def is_path(name: str) -> bool:

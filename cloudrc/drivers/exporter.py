@@ -38,7 +38,8 @@ KEPT = 0.25
 """A page is shown to whoever asks within this time [s]. To make one takes 1.4 ms, for which the
 loop may have to wait: four a second are less than one wake in a hundred."""
 CONFIG_DIGITS = 12
-"""Of the configuration's hash, as git shortens one; report.json has all of it."""
+"""Of the hash of the configuration that the process was given, as git shortens one. A run on one
+machine gives all, whose whole hash report.json has; in a cluster each process is given its part."""
 STILL_MAX = 5.0
 """A loop that has said nothing for so long stands still [s]; each says something every second."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import pkgutil
 from typing import get_args
@@ -10,6 +9,7 @@ from typing import get_args
 import cloudrc.faults
 from cloudrc.errors import BadInputError
 from cloudrc.faults.scenario import Mode, Scenario
+from cloudrc.plugins import meant
 
 FAMILY = ".family_"
 MODES = get_args(Mode)
@@ -55,6 +55,5 @@ def called(name: str, mode: Mode) -> list[Scenario]:
                 f" cloudrc faults run {other.name}{flag}"
             )
     names = ", ".join(f"{each.id} {each.name}" for each in there) or "none"
-    near = difflib.get_close_matches(name.lower(), [each.name for each in there], n=1)
-    hint = f"; did you mean {near[0]}?" if near else ""
+    hint = meant(name.lower(), [each.name for each in there])
     raise BadInputError(f"no fault '{name}' in mode {mode}; there are: {names}{hint}")

@@ -122,6 +122,8 @@ def test_one_seed_is_one_run(name: str) -> None:
 def test_an_unknown_fault_is_bad_input() -> None:
     with pytest.raises(BadInputError, match="no fault 'F99' in mode virtual; there are: F1 "):
         find("F99", "virtual")
+    with pytest.raises(BadInputError, match=r"; did you mean cloud-killed\?$"):
+        find("cloud-kiled", "virtual")
 
 
 def test_a_number_stands_for_all_its_faults() -> None:
