@@ -39,7 +39,8 @@ KEPT = 0.25
 loop may have to wait: four a second are less than one wake in a hundred."""
 CONFIG_DIGITS = 12
 """Of the hash of the configuration that the process was given, as git shortens one. A run on one
-machine gives all, whose whole hash report.json has; in a cluster each process is given its part."""
+machine gives all, and report.json has the whole hash of that; in a cluster its hash may be another,
+for there what plug-ins fill in is left open."""
 STILL_MAX = 5.0
 """A loop that has said nothing for so long stands still [s]; each says something every second."""
 
