@@ -228,3 +228,16 @@ def test_a_point_that_is_none_is_refused_and_changes_nothing():
     with pytest.raises(BadInputError, match="finite"):
         flight.operate(GoTo((0.0, 0.0, NAN)))
     assert (flight.state, flight.said) == ("HELD", before)
+
+
+def test_a_wait_for_take_off_does_not_use_up_the_first_leg():
+    """Once released the robot takes off only when it has been still."""
+    flight = flying(Plan((Leg(A, time_limit=1.0),), Start.HERE))
+    flight.guard = GuardState.GROUND
+    flight.step(seconds=2.5)
+    assert flight.state == "FLYING"
+    flight.guard = GuardState.TRACK
+    flight.step(seconds=0.9)
+    assert flight.state == "FLYING"
+    flight.step(seconds=0.2)
+    assert flight.teleop.outcome.code == "leg_timed_out"

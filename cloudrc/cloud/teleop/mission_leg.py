@@ -1,7 +1,7 @@
 """One leg as it is flown: the robot as seen comes in; whether it is there, or late, goes out.
 
 Only time in which the robot is seen to fly on the cloud's commands counts: while the link is silent
-or the guard holds, it does not do what the leg is for, and waits.
+or the guard holds, and on the ground, it does not do what the leg is for, and waits.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ GAP_MAX_NS = 500_000_000
 """Of a longer silence between two telemetries only so much counts as flown [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
 """After a longer one nobody knows where the robot was meanwhile [ns]."""
-HOLD = GuardState.HOLD  # looked up with every telemetry
+GROUND, HOLD = GuardState.GROUND, GuardState.HOLD  # looked up with every telemetry
 
 
 class LegWatch:
@@ -52,7 +52,8 @@ class LegWatch:
             self._near_since_ns = NEVER_NS
             return False
         if before_ns >= 0:
-            self._flown_ns += min(now_ns - before_ns, GAP_MAX_NS)
+            if seen.guard is not GROUND:  # where it waits until it may take off
+                self._flown_ns += min(now_ns - before_ns, GAP_MAX_NS)
             if now_ns - before_ns > UNSEEN_MAX_NS:
                 self._near_since_ns = NEVER_NS  # where it was meanwhile nobody knows
         if dist(seen.position, leg.position) > leg.tolerance:
