@@ -15,6 +15,7 @@ from teleop_harness import PLAN
 from cloudrc.cli import mission_cluster, mission_follow, mission_http, mission_local
 from cloudrc.cli.main import main
 from cloudrc.cli.output import harmless
+from cloudrc.cloud.teleop.service_mission import SHOWN as EVENTS
 from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.cluster import follow, jobs
 from cloudrc.cluster.jobs import JobStatus
@@ -127,3 +128,20 @@ def test_an_id_that_is_none_is_no_mission(
     assert line.isprintable()
     shown = {"a/b": "Not Found", "\udcff": "no mission '\ufffd'"}
     assert shown.get(given, f"no mission '{harmless(given)}'") in line
+
+
+@pytest.mark.parametrize("words", ["status m1", "logs m1"])
+def test_events_that_are_left_out_are_told_of(
+    words: str, api: Running, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mission = api.flight.teleop.book.find("m1")
+    before = mission.happened.total()
+    for _ in range(EVENTS):
+        noted = api.bridge.submit(lambda service, _: service.book.note(mission, "goto", "there"))
+        noted.result(10.0)
+    assert main(["mission", *words.split(), "--api", api.url]) == 0
+    said = capsys.readouterr().out
+    left_out = mission.happened.total() - EVENTS
+    assert left_out >= before
+    assert f"m1  {left_out} earlier events are not shown\n" in said
+    assert said.count("\nm1 ") >= EVENTS
