@@ -10,6 +10,7 @@ from cloudrc.records import Control, GuardChange, MissionEvent
 
 LONG = ("guard.hold_max_s=100",)
 FEW = (INSTANTS[71], INSTANTS[115])
+"""Those that are not left to the night, uncapped."""
 
 
 def check_minute(figure, start_s, calm_within, *settings):
