@@ -63,16 +63,25 @@ class ProfileFile:
         return self._read()
 
     def poll(self) -> Loaded | None:
-        """Read the file if it has changed; None if not, or if it is refused, which is logged."""
+        """Read the file if it has changed; None if not, or if it is refused, which is logged.
+
+        A file that changes while it is read is being written, and is read again: half of it may
+        be valid, too, and the whole would be a second change.
+        """
         seen = version(self._place)
         if seen == self._seen:
             return None
-        self._seen = seen
+        loaded, refusal = None, ""
         try:
-            return self._read()
+            loaded = self._read()
         except (BadInputError, OSError) as error:
-            self._log(f"the new profile is refused, the old one stays: {error}")
+            refusal = str(error)
+        if version(self._place) != seen:
             return None
+        self._seen = seen
+        if refusal:
+            self._log(f"the new profile is refused, the old one stays: {refusal}")
+        return loaded
 
     def _read(self) -> Loaded:
         loaded = self._load(self._path)

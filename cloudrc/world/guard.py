@@ -80,7 +80,6 @@ class Guard:
         self.armed = self._flies = False
         self.yaw_rate, self._alone_ns = 0.0, 0
         self.reference = self._wanted = ZERO
-        self._acceleration_max = limits.acceleration_max
         self._track_until_ns = self._steady_until_ns = self._ramp_until_ns = NEVER_NS
         self._tracked_ns = self._held_ns = -SETTLE_NS
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
@@ -227,7 +226,8 @@ class Guard:
         elif not self._take_off.over:
             self._take_off.look(readings, self._flies)
         if now_ns <= self._track_until_ns:
-            reference = rules.towards(self.reference, self._wanted, self._acceleration_max * dt)
+            change_max = self._limits.acceleration_max * dt
+            reference = rules.towards(self.reference, self._wanted, change_max)
             if now_ns < self._ramp_until_ns:
                 reference = rules.held_back(self.reference, reference, rules.BRAKE * dt)
         else:
@@ -251,7 +251,7 @@ class Guard:
             inside = rules.fenced(reference, position, self._low, self._high)
             if inside != reference:
                 self.counts["limited_fence"] += 1
-                inside = rules.held_back(self.reference, inside, self._acceleration_max * dt)
+                inside = rules.held_back(self.reference, inside, self._limits.acceleration_max * dt)
                 reference = rules.shortened(inside, self._speed_max)
         self.reference = reference
 

@@ -24,6 +24,9 @@ STILL = 0.1
 """Slower than this the robot counts as come to rest [m/s]."""
 LAND_SPEED = 0.5
 """Of the descent [m/s]. Source: DESIGN, section 5."""
+STILL_SHARE = 0.2
+"""A descent slower than this share of its speed stands, where that is below STILL: with a low cap
+every descent is slower than STILL, and would count as touched down in the air."""
 TOUCH_DOWN_NS = 400_000_000
 """A descent that has stood still for so long has touched down [ns]."""
 STILL_TICKS = 200
@@ -139,7 +142,7 @@ class Descent:
             speed_max: Of the descent, if it is below LAND_SPEED [m/s].
         """
         self._floor, self.speed = floor, min(LAND_SPEED, speed_max)
-        self._still = min(STILL, 0.2 * self.speed)
+        self._still = min(STILL, STILL_SHARE * self.speed)
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:

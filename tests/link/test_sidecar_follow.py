@@ -12,7 +12,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Change, DirectionProfile
 from cloudrc.link.route import publish_route, withdraw
-from cloudrc.link.sidecar_follow import PeerName, ProfileFile
+from cloudrc.link.sidecar_follow import Loaded, PeerName, ProfileFile
 from cloudrc.link.state import Change as Note
 
 
@@ -98,6 +98,29 @@ def test_a_file_that_goes_and_comes_back(config_map: ConfigMap) -> None:
     (config_map.file.parent / "..data").unlink()
     assert file.poll() is None
     assert len(log) == 1
+
+
+def test_a_file_that_is_written_while_it_is_read_is_read_again_and_is_one_change(
+    tmp_path: Path,
+) -> None:
+    place, log = tmp_path / "profile.yaml", list[str]()
+    halves = ["", "uplink: {delay_ms: 12}\n", "uplink: {delay_ms: 120}\n"]
+    load = loader("uplink")
+
+    def load_while_written(path: Path) -> Loaded:
+        """As an editor does that empties the file first."""
+        try:
+            return load(path)
+        finally:
+            if halves:
+                place.write_text(halves.pop(0))
+
+    place.write_text("uplink: {delay_ms: 60}\n")
+    file = ProfileFile(place, load_while_written, log.append)
+    file.first()
+    read = [file.poll() for _ in range(5)]
+    assert [one.direction.delay for one in read if one] == [pytest.approx(0.12)]
+    assert log == []
 
 
 class Names:
