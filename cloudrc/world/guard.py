@@ -228,8 +228,6 @@ class Guard:
         if now_ns <= self._track_until_ns:
             change_max = self._limits.acceleration_max * dt
             reference = rules.towards(self.reference, self._wanted, change_max)
-            if now_ns < self._ramp_until_ns:
-                reference = rules.held_back(self.reference, reference, rules.BRAKE * dt)
         else:
             self._look_after_itself(now_ns, readings)
             if not self._flies:
@@ -253,6 +251,8 @@ class Guard:
                 self.counts["limited_fence"] += 1
                 inside = rules.held_back(self.reference, inside, self._limits.acceleration_max * dt)
                 reference = rules.shortened(inside, self._speed_max)
+        if now_ns < self._ramp_until_ns:
+            reference = rules.held_back(self.reference, reference, rules.BRAKE * dt)
         self.reference = reference
 
     def _look_after_itself(self, now_ns: int, readings: Readings) -> None:
@@ -282,7 +282,7 @@ class Guard:
         if self.state is not HOLD or state is not LAND:  # goes down where it has held
             self._rest.forget()
         self.state, self._flies = state, state is not GROUND and state is not ESTOP
-        self._track_until_ns = self._steady_until_ns = NEVER_NS
+        self._track_until_ns = self._steady_until_ns = self._ramp_until_ns = NEVER_NS
         self._low = (*self._low[:2], -inf if state is LAND else self._floor)
         if state is TRACK:
             self._tracked_ns = now_ns

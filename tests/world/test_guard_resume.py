@@ -1,9 +1,11 @@
 """The guard: how it leaves HOLD, and that it does not chatter."""
 
 from dataclasses import replace
+from itertools import pairwise
+from math import dist
 
 import pytest
-from guard_play import LIMITS, MS, SECOND, armed, command, feed, holding, run, tracking
+from guard_play import DT, LIMITS, MS, SECOND, armed, command, feed, holding, run, tracking
 
 from cloudrc.messages import ZERO, GuardState
 
@@ -97,6 +99,30 @@ def test_it_rises_slowly_for_as_long_as_it_takes_to_the_cap(speed_max, ramp_s):
         assert guard.reference == ZERO
         feed(guard, begin_ns, 1, (1.0, 0.0, 0.0))
         assert guard.reference[0] == pytest.approx(rate * 0.01)
+
+
+def test_coming_back_from_the_fence_is_as_slow_after_a_hold():
+    """Whoever says so: the reference, the cloud, or the guard where the robot is in the margin."""
+    guard = holding()
+    outside = (LIMITS.inside()[1][0] + 0.15, 1.0, 2.0)
+    now_ns = feed(guard, 2 * SECOND, 10, ZERO, position=outside)
+    guard.reference = ZERO
+    guard.counts.clear()
+    flown = [ZERO, *run(guard, now_ns, now_ns + 20 * MS, outside)]
+    assert guard.counts["limited_fence"] == 10
+    for before, after in pairwise(flown):
+        assert dist(before, after) == pytest.approx(3.0 * DT)
+        assert after[0] < before[0]
+
+
+def test_a_robot_that_was_put_on_the_ground_knows_of_no_hold():
+    guard = holding()
+    now_ns = feed(guard, 2 * SECOND, 20)
+    guard.put_on_ground(now_ns, "from spawn")
+    guard.start_mission(now_ns)
+    feed(guard, now_ns, 1, (0.0, 0.0, 1.0))
+    assert guard.state is TRACK
+    assert guard.reference[2] == pytest.approx(12.0 * 0.01)
 
 
 def test_slowing_down_is_as_fast_as_ever_after_a_hold():
