@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cloudrc.faults.scenario import generator
-from cloudrc.faults.schedule import KINDS, WAYS, Event, Schedule
+from cloudrc.faults.schedule import KINDS, WALL_MAX, WAYS, Event, Schedule
 
 CALM = 45.0
 """From here on nothing new happens: the robot has to find back [s]."""
@@ -13,7 +13,7 @@ DURATION = 60.0
 """Of a flight [s]."""
 PROFILES = ("ideal", "wifi", "lte", "5g", "lossy", "paper-p1", "paper-p2", "paper-p3")
 PAPER = PROFILES[-3:]
-HOLDS = 1.0, 8.0
+HOLDS = 0.5, 3.0
 """Shortest and longest HOLD that is drawn [s]."""
 HOLD_MAX = Schedule(0).hold_max
 ONCE = ("second_cloud", "key_rotated")
@@ -39,7 +39,7 @@ RANGES: dict[str, tuple[float, float, float]] = {
     "world_paused": (1.0, 0.0, 0.0),
     "world_killed": (3.0, 0.0, 0.0),
     "world_throttled": (8.0, 0.1, 0.95),
-    "wall_clock": (0.0, -4e9, 4e9),
+    "wall_clock": (0.0, -WALL_MAX, WALL_MAX),
     "journal_full": (10.0, 0.0, 0.0),
     "journal_slow": (10.0, 0.05, 3.0),
     "teleop_paused": (5.0, 0.0, 0.0),
@@ -83,7 +83,7 @@ def compose(seed: int) -> Schedule:
         cloud_drift=int(rng.integers(-500, 501)) if rng.random() < 0.3 else 0,
         duration=DURATION,
         apart=bool(rng.random() < 0.5),
-        # In every third schedule shorter than its silences: the robot lands amid the other faults.
+        # In every third schedule shorter than many a silence: the robot lands amid other faults.
         hold_max=round(float(rng.uniform(*HOLDS)), 1) if rng.random() < 1 / 3 else HOLD_MAX,
     )
 

@@ -283,7 +283,7 @@ def _watch(experiment: ResolvedExperiment) -> Watch:
     guard = experiment.guard
     age_max_ns = round(guard.command_age_max_ms * 1e6)
     caps = guard.speed_max_mps, guard.acceleration_max_mps2, guard.yaw_rate_max_radps
-    return Watch(*caps, age_max_ns)
+    return Watch(*caps, age_max_ns, round(guard.hold_max_s * 1e9))
 
 
 def _link(experiment: ResolvedExperiment, shape: Shape | None, up: bool) -> LinkDirection:

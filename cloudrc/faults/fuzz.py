@@ -30,7 +30,9 @@ from cloudrc.records import GuardChange, Record
 
 BACK = 10.0
 """In so long of calm the robot must have flown [s]."""
-ALWAYS = frozenset({"fence", "cap", "stop", "stale", "rest", "latch", "tick", "order", "error"})
+ALWAYS = frozenset(
+    {"fence", "cap", "stop", "stale", "rest", "latch", "hold", "tick", "order", "error"}
+)
 """Invariants that are looked at in every flight."""
 FORGETFUL = (
     *("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down"),

@@ -62,6 +62,8 @@ SHARES = (
 )
 """Kinds whose value is a share, in [0, 1]."""
 VALUE_MAX = 1e9
+WALL_MAX = 4e9
+"""Of a step of the wall clock, both ways [s]: beyond both ends of what 32 bits count."""
 DURATION_MAX = 86_400.0
 """Of a flight, and of everything in it [s]."""
 OFFSET_MAX = 1e6
@@ -245,10 +247,15 @@ def _problem(schedule: Schedule) -> str:
             return f"events.{n}.way: '{event.way}' is none of {', '.join(WAYS)}"
         numbers[f"events.{n}.at"] = (event.at, 0.0, DURATION_MAX)
         numbers[f"events.{n}.duration"] = (event.duration, 0.0, DURATION_MAX)
-        lowest = -VALUE_MAX if event.kind == "wall_clock" else 0.0
-        highest = 1.0 if event.kind in SHARES else VALUE_MAX
-        numbers[f"events.{n}.value"] = (event.value, lowest, highest)
+        numbers[f"events.{n}.value"] = (event.value, *_range(event.kind))
     for place, (value, low, high) in numbers.items():
         if not low <= value <= high:  # NaN is not, either
             return f"{place}: {value:g} is not between {low:g} and {high:g}"
     return ""
+
+
+def _range(kind: str) -> tuple[float, float]:
+    """Lowest and highest value of a kind of fault."""
+    if kind == "wall_clock":
+        return -WALL_MAX, WALL_MAX
+    return 0.0, 1.0 if kind in SHARES else VALUE_MAX

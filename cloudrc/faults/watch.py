@@ -7,12 +7,12 @@ stays below the caps and can be stopped in time, before the floor, too, unless t
 motion on stale commands: in TRACK the newest accepted command's basis is never older than its
 limit, and where TRACK ends the robot stops, within the way that this takes; its rotors turn until
 it stands. What has landed or was stopped stays so until the operator acknowledges it; only what was
-started is in TRACK, and a HOLD is left for it on ten fresh commands. No collision, under an honest
-cloud: nothing but the arm's tip touches anything, and that the board, and no hit is felt without a
-touch. A robot that lands, since its cloud is gone for good or says what no honest one does, sinks
-where it is, and one that the operator stops falls:
-the guard knows the fence, and not what lies below. What it comes down on is told, and no collision,
-also where the operator has acknowledged a landing too late for it to stop above that.
+started is in TRACK; how a HOLD ends is told in `hold_end`. No collision, under an honest cloud:
+nothing but the arm's tip touches anything, and that the board, and no hit is felt without a touch.
+A robot that lands, since its cloud is gone for good or says what no honest one does, sinks where it
+is, and one that the operator stops falls: the guard knows the fence, and not what lies below. What
+it comes down on is told, and no collision, also where the operator has acknowledged a landing too
+late for it to stop above that.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from collections import Counter
 from math import hypot, inf, sqrt
 from typing import Any, NamedTuple
 
-from cloudrc.faults import halts, ticks, word
+from cloudrc.faults import halts, hold_end, ticks, word
 from cloudrc.faults.halts import REELS_NS
+from cloudrc.faults.hold_end import Patience, growth
 from cloudrc.faults.ticks import TICK_NS
 from cloudrc.geometry.fence import HIGH, LOW, inside
 from cloudrc.messages import ZERO, Command, GuardState, Vector
@@ -48,8 +49,8 @@ class Breach(NamedTuple):
 
     Attributes:
         time: World's clock [s].
-        kind: "collision", "fence", "cap", "stop", "stale", "rest", "latch", "tick", "obeyed",
-            "order", "waypoint", "stuck", "alarm", "recording" or "error".
+        kind: "collision", "fence", "cap", "stop", "stale", "rest", "latch", "hold", "tick",
+            "obeyed", "order", "waypoint", "stuck", "alarm", "recording" or "error".
         text: What happened.
     """
 
@@ -74,7 +75,12 @@ class Watch:
     """
 
     def __init__(
-        self, speed_max: float, acceleration_max: float, yaw_rate_max: float, age_max_ns: int
+        self,
+        speed_max: float,
+        acceleration_max: float,
+        yaw_rate_max: float,
+        age_max_ns: int,
+        hold_max_ns: int = 60_000_000_000,
     ) -> None:
         """Learn the limits, from the configuration and not from the guard.
 
@@ -83,7 +89,9 @@ class Watch:
             acceleration_max: Cap on its change [m/s^2].
             yaw_rate_max: Cap on the yaw rate [rad/s].
             age_max_ns: Of a command's basis [ns].
+            hold_max_ns: HOLD in a mission ends in LAND after it [ns].
         """
+        self._patience = Patience(speed_max, hold_max_ns)
         self._speed_max = speed_max + SLACK
         self._step_max = acceleration_max * TICK_NS * 1e-9 + SLACK
         self._age_max_ns, self._yaw_rate_max = age_max_ns, yaw_rate_max
@@ -109,7 +117,8 @@ class Watch:
         self._attach_to_flight(robot.simulator, robot.guard, start_ns)
         self._attach_to_states(robot.simulator, robot.guard, start_ns)
         ticks.attach(robot, start_ns, self.note)
-        word.attach(robot, start_ns, self.note)
+        operator = word.attach(robot, start_ns, self.note)
+        hold_end.attach(robot, start_ns, self.note, operator, self._patience)
         halts.attach(robot, start_ns, self.note, honest=honest)
 
     def _attach_to_flight(self, simulator: Any, guard: Any, start_ns: int) -> None:
@@ -236,16 +245,16 @@ class Watch:
             self.note(now_ns, "stop", f"reference {text}")
 
     def _look_at_caps(self, before: Vector, reference: Vector, ramped: bool, now_ns: int) -> None:
-        (ux, uy, uz), (vx, vy, vz) = before, reference
+        vx, vy, vz = reference
         speed = sqrt(vx * vx + vy * vy + vz * vz)
         if speed > self.speed:
             self.speed = speed
         if not speed <= self._speed_max:  # NaN is no speed either
             self.note(now_ns, "cap", f"reference {speed:.3f} m/s")
         # Slowing down may be as hard as it must: at the fence, or when something was hit.
-        jump = sqrt(_growth(ux, vx) ** 2 + _growth(uy, vy) ** 2 + _growth(uz, vz) ** 2)
-        if ramped and not jump <= self._step_max:
-            self.note(now_ns, "cap", f"reference grows by {jump:.9f} m/s in a tick")
+        grown = growth(before, reference)
+        if ramped and not grown <= self._step_max:
+            self.note(now_ns, "cap", f"reference grows by {grown:.9f} m/s in a tick")
 
     def _look_at_turning(self, yaw_rate: float, now_ns: int) -> None:
         if not abs(yaw_rate) <= self._yaw_rate_max:  # NaN is no rate either
@@ -286,10 +295,3 @@ def stops(speed: float, below: float, above: float) -> bool:
     if speed > 0.0:
         return speed * (0.2 + speed / 6.0) <= above - 0.1 + SLACK
     return speed == 0.0 or speed * (speed / 6.0 - 0.2) <= below - 0.1 + SLACK
-
-
-def _growth(before: float, after: float) -> float:
-    """By how much a component leads further away from rest than before [m/s]."""
-    if before * after < 0.0:
-        return abs(after)
-    return max(abs(after) - abs(before), 0.0)

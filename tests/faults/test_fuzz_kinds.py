@@ -14,7 +14,8 @@ from cloudrc.cloud.teleop.api_bridge import WAITING_MAX
 from cloudrc.cloud.teleop.messages import Seen
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.faults import fuzz
-from cloudrc.faults.compose import RANGES, compose
+from cloudrc.faults.adversary import choose
+from cloudrc.faults.compose import RANGES, calm, compose
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.fuzz import fly, judged
 from cloudrc.faults.inject import inject
@@ -49,6 +50,16 @@ def test_it_is_drawn_kept_in_a_file_and_flown(kind: str, tmp_path: Path) -> None
     assert load(path) == schedule
     assert "stuck" in judged(schedule)
     assert fly(schedule).breaches == ()
+
+
+@pytest.mark.parametrize("draw", [compose, calm, choose])
+def test_whatever_is_drawn_can_be_kept_and_flown_again(
+    draw: Callable[[int], Schedule], tmp_path: Path
+) -> None:
+    path = tmp_path / "schedule.yaml"
+    for seed in range(200):
+        path.write_text(dump(draw(seed)))
+        assert load(path) == draw(seed)
 
 
 @pytest.mark.parametrize("kind", NEW)

@@ -16,12 +16,12 @@ class World:
 
     def __init__(self, yaw_rate=0.0, refusal=None, honest=False):
         self.readings = SimpleNamespace(position=INSIDE, velocity=ZERO)
-        self.state, self.reference, self.steps = TRACK, ZERO, 0
+        self.refusal, self.steps = refusal, 0
         self.watch = Watch(6.0, 12.0, 1.0, 250 * MS)
         self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
         self.simulator._steps, self.simulator._last_touch = 0, {}
         self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
-        self.guard.offer = lambda command, now: refusal
+        self.guard.offer = lambda command, now: self.refusal
         for word in ("stop", "acknowledge", "tick", "start_mission", "end_mission"):
             setattr(self.guard, word, lambda now: None)
         self.guard.put_on_ground = lambda now, cause: None
@@ -35,6 +35,12 @@ class World:
         for _ in range(count):
             self.guard.offer(Command(0, 0, 0, ZERO, 0.0), 0)
 
+    def say_what_is_impossible(self):
+        """Five times, which has a robot land."""
+        refusal, self.refusal = self.refusal, "range"
+        self.offer(5)
+        self.refusal = refusal
+
     def _step(self, rotor_speeds):
         self.steps += 1
         self.simulator._steps += 1
@@ -47,6 +53,8 @@ class World:
             if released:
                 self.guard.acknowledge(0)
                 self.offer(10)
+            if state is GuardState.LAND:
+                self.say_what_is_impossible()
             self.guard.state, self.guard.reference = state, reference
             if released:
                 self.guard.start_mission(0)
