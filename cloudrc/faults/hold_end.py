@@ -188,7 +188,13 @@ class HoldEnd:
             self._alone_ns = now_ns
 
     def look_at_ramp(self, before: Vector, reference: Vector, now_ns: int) -> None:
-        """Out of HOLD the robot is led slowly."""
+        """Out of HOLD the robot is led slowly.
+
+        Args:
+            before: Reference a tick ago [m/s], shape (3,).
+            reference: Now [m/s], shape (3,).
+            now_ns: World's clock [ns].
+        """
         grown = growth(before, reference)
         if not grown <= RAMP * TICK_NS * 1e-9 + SLACK:
             self._note(now_ns, "cap", f"reference grows by {grown:.9f} m/s in a tick after a HOLD")
