@@ -24,6 +24,8 @@ from cloudrc.records import (
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 
+OTHERS = ("rest", "latch", "hold", "order", "error")
+"""Kinds of breach that no scenario asks for on its own."""
 STANDS = 0.05
 """Below this speed the robot counts as standing [m/s]."""
 WINDOW_NS = 1_000_000_000
@@ -256,6 +258,8 @@ def safe(outcome: Outcome, flight: Flight) -> None:
     if flight.honest:
         outcome.same("collisions", counts["collision"], 0)
     outcome.same("breaches of the fence, a cap or the stop rule", breaches, 0)
+    others = sum(counts[kind] for kind in OTHERS)
+    outcome.same("breaches of what else the search judges in every flight", others, 0)
     outcome.same("ticks flown on stale commands", counts["stale"], 0)
     outcome.same("steps without the guard's tick", counts["tick"], 0)
     outcome.flown(flight.sha256())

@@ -13,8 +13,8 @@ DURATION = 60.0
 """Of a flight [s]."""
 PROFILES = ("ideal", "wifi", "lte", "5g", "lossy", "paper-p1", "paper-p2", "paper-p3")
 PAPER = PROFILES[-3:]
-HOLDS = 0.5, 3.0
-"""Shortest and longest HOLD that is drawn [s]."""
+HOLDS = 0.8, 3.0
+"""Shortest and longest HOLD that is drawn [s]: 0.75 s are needed to fly on."""
 HOLD_MAX = Schedule(0).hold_max
 ONCE = ("second_cloud", "key_rotated")
 """Kinds that happen at most once in a flight."""

@@ -57,6 +57,7 @@ def _evicted_for_long(seed: int) -> Outcome:
     held = next(iter(asks.changes_into(flight, GuardState.HOLD)), nan)
     landed = next(iter(asks.changes_into(flight, GuardState.LAND)), nan)
     outcome.most("away for 6 min: LAND after HOLD", landed - held, 60.01, "s")
+    outcome.least("away for 6 min: LAND not before", landed - held, 60.0, "s")
     asks.landing_told(outcome, flight)
     again = [time for time in asks.changes_into(flight, GuardState.TRACK) if time > landed]
     outcome.same("flown again without the operator", len(again), 0)

@@ -50,7 +50,13 @@ def _corruption(seed: int) -> Outcome:
     asks.safe(outcome, flight)
     asks.done(outcome, flight)
     outcome.most("HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
-    meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "tag", since=at)
+    metric = ("datagrams_total", "downlink", "tag")
+    meters.moves(outcome, flight, "world", *metric, since=0.0)
+    before, after = (
+        meters.reading("world", meters.seen_by(flight, "world", until), *metric)
+        for until in (at, at + 1.0)
+    )
+    outcome.least(f"metric {' '.join(metric)} in the second of the worst", after - before, 50)
     outcome.least("corrupted datagrams", toll.given, 100)
     outcome.same("of them taken", toll.taken, 0)
     return outcome

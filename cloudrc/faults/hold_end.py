@@ -1,9 +1,9 @@
 """The invariants of how a HOLD ends: the robot flies on with care, or lands once it was left alone.
 
-TRACK begins a second after the last one at the earliest, and out of HOLD on ten fresh commands;
-then the robot is led slowly at first. In a mission HOLD ends in LAND after the time that is set
-for it, and so does the wait on the ground, ten seconds at least; before that only a cloud that says
-what is impossible makes the robot land.
+TRACK begins a second after the last one at the earliest, a HOLD for silence as long after the last
+HOLD, and TRACK out of HOLD on ten fresh commands; then the robot is led slowly at first. In a
+mission HOLD ends in LAND after the time that is set for it, and so does the wait on the ground, ten
+seconds at least; before that only a cloud that says what is impossible makes the robot land.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 
 from cloudrc.faults.ticks import TICK_NS
 from cloudrc.faults.word import Note, Word
-from cloudrc.messages import ZERO, Command, GuardState, Vector
+from cloudrc.messages import ZERO, Cause, Command, GuardState, Vector
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 RESUME_COMMANDS = 10
 RESUME_NS = 500_000_000
 """So many fresh commands within so long end a HOLD [ns]. Source: DESIGN, section 5."""
 SETTLE_NS = 1_000_000_000
-"""From one TRACK to the next [ns]. Source: fault F5."""
+"""From one TRACK to the next, and from one HOLD to the next [ns]. Source: fault F5."""
 INVALID_COMMANDS = 5
 INVALID_NS = 1_000_000_000
 """So many impossible commands within so long make the robot land [ns]. Source: fault F23."""
@@ -102,7 +102,8 @@ class HoldEnd:
         self._ramp_ns = round(max(RAMP_MIN, patience.speed_max / RAMP) * 1e9)
         self._alone_max_ns = patience.hold_max_ns
         self.ramp_until_ns = -1
-        self._alone_ns, self._tracked_ns = 0, -SETTLE_NS
+        self._alone_ns = 0
+        self._tracked_ns = self._held_ns = -SETTLE_NS
         self._stood = self._impossible = False
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
         self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
@@ -142,7 +143,8 @@ class HoldEnd:
 
     def put_on_ground(self, when_ns: int, cause: str) -> None:
         """The operator has it stand at its spawn: what was, counts no more."""
-        self._stood, self._tracked_ns = True, -SETTLE_NS
+        self._tracked_ns = self._held_ns = -SETTLE_NS
+        self._stood, self.ramp_until_ns = True, -1
         self._put_on_ground(when_ns, cause)
 
     def look_at_change(self, was: GuardState, state: GuardState, now_ns: int) -> None:
@@ -150,8 +152,8 @@ class HoldEnd:
         self.ramp_until_ns = -1
         if state is TRACK:
             self._look_at_track(was, now_ns)
-        elif state is HOLD:
-            self._alone_ns = now_ns
+        elif state is HOLD or (was is TRACK and state is GROUND):  # a HOLD that had not left it yet
+            self._look_at_hold(state, now_ns)
         elif state is LAND and not self._impossible:
             alone_ns = now_ns - self._alone_ns
             if was is TRACK or alone_ns <= self._wait_ns(was):
@@ -172,6 +174,12 @@ class HoldEnd:
             if len(fresh_ns) < RESUME_COMMANDS or fresh_ns[-1] - fresh_ns[0] > RESUME_NS:
                 text = f"{len(fresh_ns)} fresh commands within {took_ns * 1e-9:.3f} s"
                 self._note(now_ns, "stale", f"HOLD left for TRACK on {text}")
+
+    def _look_at_hold(self, state: GuardState, now_ns: int) -> None:
+        settled_ns = now_ns - self._held_ns
+        self._held_ns = self._alone_ns = now_ns
+        if state is HOLD and self._guard.cause is Cause.SILENCE and settled_ns < SETTLE_NS:
+            self._note(now_ns, "hold", f"HOLD again after {settled_ns * 1e-9:.3f} s")
 
     def _wait_ns(self, state: GuardState) -> float:
         """How long a robot in a mission waits for its cloud [ns]."""

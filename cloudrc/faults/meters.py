@@ -167,4 +167,6 @@ def counts(outcome: Outcome, role: str, counted: str, total: int, name: str, *la
         labels: Values of its labels.
     """
     value = reading(role, [Counted(0, role, counted, total)], name, *labels)
-    outcome.least(f"metric {' '.join((name, *labels))} shows what was counted", value, 1)
+    metric = " ".join((name, *labels))
+    outcome.least(f"metric {metric} shows what was counted", value, 1)
+    outcome.same(f"metric {metric}: shown too many or too few", value - total, 0)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
 import pytest
 
-from cloudrc.faults.fuzz import fly
 from cloudrc.faults.hold_end import GROUND_NS, RAMP
-from cloudrc.faults.schedule import Event, Schedule
-from cloudrc.messages import ZERO, Command, GuardState, Vector
-from cloudrc.world import guard as guard_module
+from cloudrc.faults.watch import Watch
+from cloudrc.messages import ZERO, Cause, Command, GuardState, Vector
 from cloudrc.world.guard import Guard
-from cloudrc.world.guard_limits import Limits
 from cloudrc.world.rotors import STOPPED
 from tests.faults.watched import World
+from tests.world.guard_play import LIMITS, SECOND, command, sensed
 
 MS = 1_000_000
 TICK_MS = 2
@@ -105,6 +103,52 @@ def test_track_begins_a_second_after_the_last_one_at_the_earliest(
     step(world, HOLD, apart_ms - 100)
     fresh(world)
     assert step(world, TRACK) == kinds
+
+
+@pytest.mark.parametrize(
+    ("cause", "kinds"), [(Cause.SILENCE, {"hold"}), (Cause.SESSION, set()), (Cause.ENDED, set())]
+)
+def test_a_hold_for_silence_begins_a_second_after_the_last_hold_at_the_earliest(
+    cause: Cause, kinds: set[str]
+) -> None:
+    for apart_ms, found in ((998, kinds), (1000, set())):
+        world = World()
+        step(world, TRACK, 1000)
+        step(world, HOLD, apart_ms - 10)
+        fresh(world)
+        step(world, TRACK, 10)
+        world.guard.cause = cause
+        assert step(world, HOLD) == found
+
+
+def test_who_was_put_on_the_ground_has_no_last_hold() -> None:
+    for put, kinds in ((True, set()), (False, {"hold"})):
+        world = World()
+        step(world, TRACK, 1000)
+        step(world, HOLD, 100)
+        if put:
+            world.guard.put_on_ground(0, "from spawn")
+        step(world, GROUND, 100)
+        world.guard.start_mission(0)
+        step(world, TRACK, 100)
+        world.guard.cause = Cause.SILENCE
+        assert step(world, HOLD) == kinds
+
+
+def test_a_hold_that_had_not_left_the_ground_is_over_in_the_tick_that_it_began_in() -> None:
+    """The guard waits for ten seconds from then on, not from the last command before TRACK."""
+    world, readings = World(), sensed()
+    world.guard = world.robot.guard = Guard(replace(LIMITS, hold_max_ns=2 * SECOND))
+    watch = Watch(6.0, 12.0, 1.0, 250 * MS, 2 * SECOND)
+    watch.attach(world, 0)
+    world.guard.start_mission(0)
+    for now_ns in range(0, 22 * SECOND, TICK_MS * MS):
+        if 2 * SECOND <= now_ns < 5 * SECOND:
+            world.guard.offer(command(ZERO, now_ns), now_ns)
+        world.guard.tick(now_ns, readings, 0.002)
+        world.simulator.step(STOPPED if world.guard.state in (GROUND, LAND) else (900.0,) * 4)
+    assert [change.state for change in world.guard.take_changes()] == [TRACK, HOLD, GROUND, LAND]
+    assert set(watch.counts) == set()
 
 
 def test_a_robot_that_was_put_on_the_ground_starts_at_once() -> None:
@@ -198,66 +242,3 @@ def test_in_the_end_it_grows_as_elsewhere_and_slows_down_as_hard_as_it_must() ->
 
 def scaled(way: Vector, speed: float) -> Vector:
     return (speed * way[0], speed * way[1], speed * way[2])
-
-
-def _resumes_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    init = Guard.__init__
-
-    def hasty(guard: Guard, limits: Any) -> None:
-        init(guard, limits)
-        guard._fresh_ns = guard_module.deque(maxlen=1)
-
-    monkeypatch.setattr(guard_module, "RESUME_COMMANDS", 1)
-    monkeypatch.setattr(Guard, "__init__", hasty)
-
-
-def _speeds_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Limits, "ramp_ns", 0)
-
-
-def _chatters(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guard_module, "SETTLE_NS", 0)
-
-
-def _waits_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Limits, "alone_max_ns", lambda limits, flies: 3_600_000_000_000)
-
-
-def _lands_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Limits, "alone_max_ns", lambda limits, flies: 100_000_000)
-
-
-HELD = Schedule(
-    3,
-    "paper-p2",
-    (
-        Event("blackout", 6.0, 0.4),
-        Event("blackout", 6.8, 0.3),
-        Event("blackout", 9.5, 1.5),
-        Event("blackout", 14.0, 3.0),
-    ),
-    duration=20.0,
-    hold_max=2.0,
-)
-
-
-@pytest.mark.parametrize(
-    ("breaks", "kind"),
-    [
-        (_resumes_at_once, "stale"),
-        (_speeds_up, "cap"),
-        (_chatters, "hold"),
-        (_waits_for_ever, "hold"),
-        (_lands_at_once, "hold"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else value.__name__.strip("_"),
-)
-def test_a_guard_that_ends_a_hold_otherwise_is_found(
-    breaks: Any, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    breaks(monkeypatch)
-    assert kind in fly(HELD).kinds
-
-
-def test_the_same_flight_is_nobodys_breach_with_the_guard_as_it_is() -> None:
-    assert fly(HELD).breaches == ()

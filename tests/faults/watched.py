@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from cloudrc.faults.watch import FLOWN, Watch
-from cloudrc.messages import ZERO, Command, GuardState
+from cloudrc.messages import ZERO, Cause, Command, GuardState
 from cloudrc.world.rotors import STOPPED
 
 MS = 1_000_000
@@ -21,6 +21,7 @@ class World:
         self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
         self.simulator._steps, self.simulator._last_touch = 0, {}
         self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
+        self.guard.cause = Cause.ENDED
         self.guard.offer = lambda command, now: self.refusal
         for word in ("stop", "acknowledge", "tick", "start_mission", "end_mission"):
             setattr(self.guard, word, lambda now: None)
