@@ -1,9 +1,10 @@
 """The invariants of how a HOLD ends: the robot flies on with care, or lands once it was left alone.
 
 TRACK begins a second after the last one at the earliest, a HOLD for silence as long after the last
-HOLD, and TRACK out of HOLD on ten fresh commands; then the robot is led slowly at first. In a
-mission HOLD ends in LAND after the time that is set for it, and so does the wait on the ground, ten
-seconds at least; before that only a cloud that says what is impossible makes the robot land.
+HOLD, unless commands go back to older odometry, and TRACK out of HOLD on ten fresh commands; then
+the robot is led slowly at first. In a mission HOLD ends in LAND after the time that is set for it,
+and so does the wait on the ground, ten seconds at least; before that only a cloud that says what is
+impossible makes the robot land.
 """
 
 from __future__ import annotations
@@ -104,7 +105,8 @@ class HoldEnd:
         self.ramp_until_ns = -1
         self._alone_ns = 0
         self._tracked_ns = self._held_ns = -SETTLE_NS
-        self._stood = self._impossible = False
+        self._stood = self._impossible = self._goes_back = False
+        self._basis_ns = -1
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
         self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
         self._offer, self._forget = guard.offer, guard.forget_commands
@@ -122,6 +124,8 @@ class HoldEnd:
             if len(self._invalid_ns) == INVALID_COMMANDS and took_ns <= INVALID_NS:
                 self._impossible = True
         elif not refusal and self._word.armed:
+            self._goes_back = command.basis_stamp_ns < self._basis_ns
+            self._basis_ns = max(self._basis_ns, command.basis_stamp_ns)
             if state is HOLD:
                 self._fresh_ns.append(when_ns)
             elif state is GROUND:
@@ -152,8 +156,8 @@ class HoldEnd:
         self.ramp_until_ns = -1
         if state is TRACK:
             self._look_at_track(was, now_ns)
-        elif state is HOLD or (was is TRACK and state is GROUND):  # a HOLD that had not left it yet
-            self._look_at_hold(state, now_ns)
+        elif state is HOLD or (was is TRACK and state is GROUND and not self._stood):
+            self._look_at_hold(state, now_ns)  # one that had not left the ground yet, perhaps
         elif state is LAND and not self._impossible:
             alone_ns = now_ns - self._alone_ns
             if was is TRACK or alone_ns <= self._wait_ns(was):
@@ -178,7 +182,8 @@ class HoldEnd:
     def _look_at_hold(self, state: GuardState, now_ns: int) -> None:
         settled_ns = now_ns - self._held_ns
         self._held_ns = self._alone_ns = now_ns
-        if state is HOLD and self._guard.cause is Cause.SILENCE and settled_ns < SETTLE_NS:
+        silent = state is HOLD and self._guard.cause is Cause.SILENCE and not self._goes_back
+        if silent and settled_ns < SETTLE_NS:
             self._note(now_ns, "hold", f"HOLD again after {settled_ns * 1e-9:.3f} s")
 
     def _wait_ns(self, state: GuardState) -> float:

@@ -121,14 +121,29 @@ def test_a_hold_for_silence_begins_a_second_after_the_last_hold_at_the_earliest(
         assert step(world, HOLD) == found
 
 
+def test_a_hold_is_no_breach_where_commands_go_back_to_older_odometry() -> None:
+    for bases_ms, kinds in (((9, 8), set()), ((8, 9), {"hold"}), ((9, 9), {"hold"})):
+        world = World()
+        step(world, TRACK, 1000)
+        step(world, HOLD, 250)
+        fresh(world)
+        step(world, TRACK, 10)
+        for basis_ms in bases_ms:
+            world.guard.offer(Command(0, (1260 + basis_ms) * MS, 0, ZERO, 0.0), 1270 * MS)
+        world.guard.cause = Cause.SILENCE
+        assert step(world, HOLD) == kinds
+
+
 def test_who_was_put_on_the_ground_has_no_last_hold() -> None:
     for put, kinds in ((True, set()), (False, {"hold"})):
         world = World()
         step(world, TRACK, 1000)
         step(world, HOLD, 100)
+        fresh(world)
+        step(world, TRACK, 850)
         if put:
             world.guard.put_on_ground(0, "from spawn")
-        step(world, GROUND, 100)
+        step(world, GROUND)
         world.guard.start_mission(0)
         step(world, TRACK, 100)
         world.guard.cause = Cause.SILENCE
