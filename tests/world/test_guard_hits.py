@@ -7,6 +7,7 @@ from guard_play import DT, HERE, MS, SECOND, TICK, armed, command, holding, land
 
 from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState
 from cloudrc.world.guard_hits import JOLT, PULL, SPIN_MAX, TUMBLE_MAX, UPSET, Hits
+from cloudrc.world.guard_rules import GLIMPSE_NS
 from cloudrc.world.readings import Readings
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -129,3 +130,16 @@ def test_what_lies_still_after_a_landing_is_not_stopped_again():
 
 def test_an_upright_robot_is_upright():
     assert felt() == Readings.of((*HERE, *UPRIGHT), (*ZERO, *ZERO))
+
+
+@pytest.mark.parametrize("flown_ticks", range(50, 57))
+def test_far_from_the_fence_a_hit_is_felt_within_twelve_milliseconds(flown_ticks):
+    """The guard looks again every 10 ms, and at what lasts as a hit does."""
+    guard = armed()
+    for now_ns in range(0, (flown_ticks + 7) * TICK, TICK):
+        hit = now_ns >= flown_ticks * TICK
+        guard.offer(command((0.0, 0.0, 0.5), now_ns), now_ns)
+        guard.tick(now_ns, felt(rate=(0.0, 0.0, 9.0) if hit else ZERO), DT)
+    changes = guard.take_changes()
+    assert [change.state for change in changes] == [TRACK, ESTOP]
+    assert changes[1].stamp_ns - flown_ticks * TICK <= GLIMPSE_NS + TICK

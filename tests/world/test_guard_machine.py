@@ -2,7 +2,7 @@
 
 from math import hypot, nan
 
-from guard_play import DT, LIMITS, MS, command, sensed
+from guard_play import DT, LIMITS, MS, TICK, command, sensed
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -11,6 +11,7 @@ from cloudrc.messages import GuardState
 from cloudrc.world.guard import Guard
 from cloudrc.world.guard_hits import JOLT
 from cloudrc.world.guard_limits import Limits
+from cloudrc.world.guard_rules import GLIMPSE_NS
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 AGE_MAX_NS = LIMITS.command_age_max_ns
@@ -148,14 +149,14 @@ class GuardMachine(RuleBasedStateMachine):
         calm = sensed((1.0, 1.0, self.height), (0.0, 0.0, self.climb))
         flew = self.guard.tick(self.now_ns, calm, DT) is not None
         self.noted("time")
-        self.now_ns += 10 * MS
+        self.now_ns += GLIMPSE_NS + TICK  # until then the guard need not look
         spun = calm._replace(angular_velocity_body=(0.0, 0.0, 9.0))
         self.flown = self.guard.tick(self.now_ns, spun, DT)
         self.noted("hit")
         assert self.flown is None
         assert (self.state is ESTOP) >= flew
         self.started &= not flew
-        self.now_ns += 2 * MS
+        self.now_ns += TICK
 
     @rule(height=st.sampled_from([0.1, 0.5, 2.4]))
     def move(self, height):
