@@ -176,11 +176,20 @@ def test_a_robot_that_was_put_on_the_ground_starts_at_once() -> None:
     assert step(world, TRACK) == set()
 
 
-@pytest.mark.parametrize(
-    ("state", "wait_ms"), [(HOLD, HOLD_MAX_MS), (GROUND, max(HOLD_MAX_MS, GROUND_NS // MS))]
-)
-def test_nobody_waits_for_a_cloud_longer_than_is_set(state: GuardState, wait_ms: int) -> None:
-    world = World()
+WAITS = [
+    (HOLD, HOLD_MAX_MS, HOLD_MAX_MS),
+    (GROUND, HOLD_MAX_MS, HOLD_MAX_MS),
+    (HOLD, 2_000, 2_000),
+    (GROUND, 2_000, GROUND_NS // MS),
+]
+"""In which state, for how long as it is set, and for how long in fact [ms]."""
+
+
+@pytest.mark.parametrize(("state", "hold_max_ms", "wait_ms"), WAITS)
+def test_nobody_waits_for_a_cloud_longer_than_is_set(
+    state: GuardState, hold_max_ms: int, wait_ms: int
+) -> None:
+    world = World(hold_max_ms=hold_max_ms)
     assert step(world, state, wait_ms) == set()
     assert step(world, state, 3 * TICK_MS) == {"hold"}
 
@@ -200,10 +209,10 @@ def test_the_wait_on_the_ground_begins_anew_with_each_command() -> None:
     assert step(world, GROUND, 3 * TICK_MS) == {"hold"}
 
 
-@pytest.mark.parametrize("state", [GROUND, HOLD])
-def test_nobody_lands_before_that_time(state: GuardState) -> None:
-    for waited_ms, kinds in ((HOLD_MAX_MS, {"hold"}), (HOLD_MAX_MS + TICK_MS, set())):
-        world = World()
+@pytest.mark.parametrize(("state", "hold_max_ms", "wait_ms"), WAITS)
+def test_nobody_lands_before_that_time(state: GuardState, hold_max_ms: int, wait_ms: int) -> None:
+    for waited_ms, kinds in ((wait_ms, {"hold"}), (wait_ms + TICK_MS, set())):
+        world = World(hold_max_ms=hold_max_ms)
         step(world, state, waited_ms)
         assert step(world, LAND) == kinds
 

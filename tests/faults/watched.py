@@ -14,10 +14,10 @@ TRACK = GuardState.TRACK
 class World:
     """A robot that is wherever a test puts it."""
 
-    def __init__(self, yaw_rate=0.0, refusal=None, honest=False):
+    def __init__(self, yaw_rate=0.0, refusal=None, honest=False, hold_max_ms=60_000):
         self.readings = SimpleNamespace(position=INSIDE, velocity=ZERO)
         self.refusal, self.steps = refusal, 0
-        self.watch = Watch(6.0, 12.0, 1.0, 250 * MS)
+        self.watch = Watch(6.0, 12.0, 1.0, 250 * MS, hold_max_ms * MS)
         self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
         self.simulator._steps, self.simulator._last_touch = 0, {}
         self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
