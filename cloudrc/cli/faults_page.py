@@ -33,7 +33,7 @@ NOTES = {
         "",
         "In half of the schedules teleop is a process of its own, as in production: it looks every",
         "20 ms, its sockets take 11 datagrams, and while its journal waits for the disk it neither",
-        "hears nor speaks. In every third a HOLD of 0.8 to 3 s ends in LAND, as it does in about half",
+        "hears nor speaks. In every third a HOLD of 0.8 to 3 s ends in LAND, as it does in half",
         "of these; in the others it would take 60 s.",
         "",
         "What is no matter of what comes together has scenarios of its own, by [name](faults.md):",
