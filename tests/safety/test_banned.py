@@ -75,6 +75,9 @@ def _of_call(node: ast.Call, safe: set[str]) -> Iterator[str]:
         if keyword.arg == "allow_pickle" and not off:
             yield f"{node.lineno}: allow_pickle"
     module, _, called = name.rpartition(".")
+    if called == "import_module" and node.args and isinstance(node.args[0], ast.Constant):
+        if str(node.args[0].value).partition(".")[0] in MODULES:
+            yield f"{node.lineno}: imports {node.args[0].value}"
     if called in SHELLS.get(module, ()):
         yield f"{node.lineno}: calls {name}"
     if module == "yaml" and called in LOADERS:
@@ -167,6 +170,8 @@ def test_nor_does_a_test() -> None:
         "exec(text)",
         "builtins.eval(text)",
         "__import__('os')",
+        "importlib.import_module('pickle')",
+        "import_module('marshal')",
         "yaml.load(text)",
         "yaml.load(text, yaml.Loader)",
         "yaml.load(text, Loader=yaml.UnsafeLoader)",
@@ -201,6 +206,7 @@ def test_a_breach_is_found(code: str) -> None:
         "class Mine(yaml.SafeLoader): ...\nyaml.load(text, Loader=Mine)",
         "subprocess.run(command, shell=False)",
         "model.eval()",
+        "importlib.import_module('json')",
         "from os import path\nfrom yaml import safe_load, CSafeLoader",
         "json.load(file)",
     ],
