@@ -51,10 +51,10 @@ def _corruption(seed: int) -> Outcome:
     asks.done(outcome, flight)
     outcome.most("HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
     metric = ("datagrams_total", "downlink", "tag")
-    meters.moves(outcome, flight, "world", *metric, since=0.0)
-    before, after = (
+    meters.moves(outcome, flight, "world", *metric, since=at)
+    before, after = (  # world tells its counts once a second
         meters.reading("world", meters.seen_by(flight, "world", until), *metric)
-        for until in (at, at + 1.0)
+        for until in (at, at + 2.0)
     )
     outcome.least(f"metric {' '.join(metric)} in the second of the worst", after - before, 50)
     outcome.least("corrupted datagrams", toll.given, 100)

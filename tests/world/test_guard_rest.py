@@ -15,6 +15,8 @@ from cloudrc.world.guard_rest import (
     PULL,
     PULL_MAX,
     STILL,
+    TRIM,
+    TRIM_MAX,
     Rest,
     brake_start,
 )
@@ -127,6 +129,46 @@ def test_it_pulls_no_faster_than_it_may(speed_max, allowed):
 def test_it_pulls_no_harder_than_the_robot_brakes():
     reference = at_rest().follow(ZERO, moved((3.0, 0.0, 0.0)), 0.0, DT)
     assert reference == pytest.approx((-BRAKE * DT, 0.0, 0.0))
+
+
+def trimmed(offset, seconds, sink=0.0):
+    """What it asks for on its anchor [m/s], after so long [s] beside it, every 0.1 s."""
+    rest = at_rest(sink)
+    for _ in range(round(seconds / 0.1)):
+        rest.follow(ZERO, moved(offset), sink, 0.1)
+    return rest.follow(ZERO, moved(ZERO), sink, ENOUGH)
+
+
+def test_it_leans_against_what_keeps_it_beside_its_anchor():
+    beside = (0.03, -0.02, 0.01)
+    lean = tuple(-TRIM * each * 2.0 for each in beside)
+    assert trimmed(beside, 2.0) == pytest.approx(lean)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_it_leans_no_farther_than_it_has_to(sign):
+    """Or it would wind up against what it touches."""
+    beside = (0.05 * sign, 0.05 * sign, 0.05 * sign)
+    assert trimmed(beside, 60.0) == pytest.approx((-TRIM_MAX * sign,) * 3)
+
+
+def test_on_its_way_back_it_does_not_lean():
+    """Or it would fly past its anchor."""
+    assert trimmed((0.06, 0.0, 0.0799), 1.0) != ZERO
+    assert trimmed((0.06, 0.0, 0.0801), 1.0) == ZERO
+
+
+def test_going_down_it_leans_sideways_only():
+    assert trimmed((0.03, -0.02, 0.5), 2.0, 0.5) == pytest.approx((-0.012, 0.008, -0.5))
+
+
+def test_of_another_rest_it_knows_nothing():
+    rest = at_rest()
+    for _ in range(20):
+        rest.follow(ZERO, moved((0.03, 0.0, 0.0)), 0.0, 0.1)
+    rest.forget()
+    rest.follow(ZERO, sensed(HERE, ZERO), 0.0, ENOUGH)
+    assert rest.follow(ZERO, moved(ZERO), 0.0, ENOUGH) == ZERO
 
 
 def test_going_down_it_holds_the_position_sideways_only():

@@ -46,7 +46,7 @@ def test_towards_a_wall_a_robot_that_falls_lies_before_it(axis, sign, height):
         place = by_the_wall(axis, sign, distance, height)
         speed = hypot(*rules.fenced(tuple(velocity), place, LOW, HIGH))
         stops = 0.6 * speed + speed * speed / 6 + 0.2
-        lies = speed * (sqrt(2 * height / 9.81) + 0.4 + 0.3) + 0.3
+        lies = speed * (sqrt(2 * height / 9.81) + 0.4 + 0.2 + 0.3) + 0.3
         assert max(stops, lies) == pytest.approx(distance) or (speed <= 0.5 and lies > distance)
 
 
@@ -72,7 +72,7 @@ def test_towards_a_wall_it_is_far_up_to_where_it_would_come_to_lie(axis, sign):
     height, velocity = 1.3, [0.0, 0.0, 0.0]
     velocity[axis] = 1.5 * sign
     falls = sqrt(2 * (height + rules.GLIMPSE) / 9.81)
-    reach = 1.5 * (falls + 0.4 + 0.3) + 0.3 + rules.GLIMPSE
+    reach = 1.5 * (falls + 0.4 + 0.2 + 0.3) + 0.3 + rules.GLIMPSE
     for beyond, far in ((-1e-9, False), (1e-9, True)):
         place = by_the_wall(axis, sign, reach + beyond, height)
         assert rules.is_far(tuple(velocity), place, LOW, HIGH) == far
