@@ -23,6 +23,11 @@ def along(axis, speed):
     return tuple(velocity)
 
 
+def aside(height):
+    """What share of its speed a hit at this height [m] may turn towards a wall."""
+    return 0.44 + 0.6 * min(max(height - 0.9, 0.0), 1.0)
+
+
 WALLS = [(axis, sign) for axis in (0, 1) for sign in (-1, 1)]
 
 
@@ -33,7 +38,7 @@ def test_along_a_wall_a_robot_that_is_turned_aside_lies_before_it(axis, sign, he
     for distance in (0.4, 0.8, 1.2, 1.6):
         place = by_the_wall(axis, sign, distance, height)
         speed = hypot(*rules.fenced(along(axis, 6.0), place, LOW, HIGH))
-        lies = 0.44 * speed * (sqrt(2 * height / 9.81) + 0.4) + 0.3
+        lies = aside(height) * speed * (sqrt(2 * height / 9.81) + 0.4) + 0.3
         assert lies == pytest.approx(distance) or (speed == 0.5 and lies > distance)
 
 
@@ -61,7 +66,8 @@ def test_away_from_a_wall_it_is_slowed_for_its_side_speed_alone():
 @pytest.mark.parametrize(("axis", "sign"), WALLS)
 def test_along_a_wall_it_is_far_up_to_where_it_would_come_to_lie(axis, sign):
     height = 1.3
-    reach = 0.44 * 3.0 * (sqrt(2 * (height + rules.GLIMPSE) / 9.81) + 0.4) + 0.3 + rules.GLIMPSE
+    above = height + rules.GLIMPSE
+    reach = aside(above) * 3.0 * (sqrt(2 * above / 9.81) + 0.4) + 0.3 + rules.GLIMPSE
     for beyond, far in ((-1e-9, False), (1e-9, True)):
         place = by_the_wall(axis, sign, reach + beyond, height)
         assert rules.is_far(along(axis, 3.0), place, LOW, HIGH) == far
