@@ -34,8 +34,8 @@ ASIDE = 0.44
 """What the robot hits turns it aside: so much of its speed [1] may become speed towards a wall. Off
 the board's edge at 2.7 m/s it goes on across at 1.2."""
 TOP, OFF_TOP = 0.55, 0.6
-"""From so high above the margin of the floor [m] the robot may roll off the top of a pipe: its fall,
-too, becomes speed towards a wall. So much more of its own is counted per height [1/m], up to 1 m."""
+"""From so high above the margin of the floor [m] it may roll off the top of a pipe: its fall, too,
+becomes speed towards a wall. So much more of its own is counted per height [1/m], up to 1 m."""
 SLIDE, TUMBLE = 0.4, 0.3
 """A hit stops the rotors: the robot falls, goes on along the floor for so long [s], and then lies
 so much [m] farther. Few get beyond that: `pytest -m "" -k after_a_fall tests/world`."""
