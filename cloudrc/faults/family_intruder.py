@@ -56,7 +56,7 @@ def _corruption(seed: int) -> Outcome:
         meters.reading("world", meters.seen_by(flight, "world", until), *metric)
         for until in (at, at + 2.0)
     )
-    outcome.least(f"metric {' '.join(metric)} in the second of the worst", after - before, 50)
+    outcome.least(f"metric {' '.join(metric)} in two seconds from the worst on", after - before, 50)
     outcome.least("corrupted datagrams", toll.given, 100)
     outcome.same("of them taken", toll.taken, 0)
     return outcome

@@ -261,9 +261,13 @@ def test_the_sources_are_all_that_a_flight_depends_on(tmp_path: Path) -> None:
 
 
 FLIGHTS = """
-import sys
+import importlib, pkgutil, sys
+import cloudrc.faults
 from cloudrc.faults import adversary, compose, fuzz
 
+for module in pkgutil.iter_modules(cloudrc.faults.__path__, "cloudrc.faults."):
+    if not module.ispkg:
+        importlib.import_module(module.name)
 for seed in (1, 2):
     for schedule in (compose.compose(seed), compose.calm(seed), adversary.choose(seed)):
         fuzz.fly(schedule)
