@@ -149,7 +149,8 @@ class Guard(Section):
     hold_max_s: Patience = Field(
         60.0,
         description="HOLD for so long during a mission ends in LAND, and so does GROUND without a "
-        "fresh command, after 10 s at least [s]; flying on takes 0.75 s of it",
+        "fresh command, after 10 s at least [s]; below 0.75 any silence in flight does: it takes "
+        "so long to fly on",
     )
 
 
