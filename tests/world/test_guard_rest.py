@@ -152,10 +152,12 @@ def test_it_leans_no_farther_than_it_has_to(sign):
     assert trimmed(beside, 60.0) == pytest.approx((-TRIM_MAX * sign,) * 3)
 
 
-def test_on_its_way_back_it_does_not_lean():
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
+def test_on_its_way_back_it_does_not_lean(order):
     """Or it would fly past its anchor."""
-    assert trimmed((0.06, 0.0, 0.0799), 1.0) != ZERO
-    assert trimmed((0.06, 0.0, 0.0801), 1.0) == ZERO
+    near, far = (0.06, 0.0, 0.0799), (0.06, 0.0, 0.0801)
+    assert trimmed(tuple(near[axis] for axis in order), 1.0) != ZERO
+    assert trimmed(tuple(far[axis] for axis in order), 1.0) == ZERO
 
 
 def test_going_down_it_leans_sideways_only():
