@@ -6,7 +6,6 @@ import json
 import multiprocessing.context
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -16,7 +15,6 @@ from typing import Any
 import pytest
 
 from cloudrc.cli import faults_fuzz, faults_slices
-from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.main import main
 from cloudrc.faults.fuzz import Finding
 from cloudrc.faults.schedule import Schedule
@@ -67,7 +65,7 @@ def test_slices_are_added_up_to_what_one_search_has_shown(
     assert "Written by `cloudrc faults merge SLICE... --document search.md`" in page
     assert "- `cloudrc faults fuzz --first 4 --seeds 6 --slice b.json`\n" in page
     assert "| collisions | 0 | 12 | p < 0.25 |" in page
-    assert f"`{sources()[:16]}`" in page
+    assert f"`{faults_slices.sources()[:16]}`" in page
 
 
 def test_a_sum_of_slices_is_a_slice(fuzz: Fuzz, capsys: pytest.CaptureFixture[str]) -> None:
@@ -241,45 +239,6 @@ def test_what_was_flown_is_kept_every_while(fuzz: Fuzz, monkeypatch: pytest.Monk
     monkeypatch.setattr(faults_slices, "keep", see)
     fuzz("a.json", 1, 4)
     assert kept == [1, 2, 3, 4, 4]
-
-
-def test_the_sources_are_all_that_a_flight_depends_on(tmp_path: Path) -> None:
-    apart = ("cli/main.py", "faults/real/processes.py", "world/notes.txt")
-    names = (*apart, "world/scene.xml", "world/guard.py", "faults/realm.py")
-    for name in names:
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(name)
-    seen = [sources(tmp_path)]
-    for name in names:
-        (tmp_path / name).write_text("other")
-        seen.append(sources(tmp_path))
-    assert len({*seen[: len(apart) + 1]}) == 1
-    assert len({*seen[len(apart) :]}) == 4
-    (tmp_path / "world/guard.py").rename(tmp_path / "world/other.py")
-    assert sources(tmp_path) not in seen
-
-
-FLIGHTS = """
-import importlib, pkgutil, sys
-import cloudrc.faults
-from cloudrc.faults import adversary, compose, fuzz
-
-for module in pkgutil.iter_modules(cloudrc.faults.__path__, "cloudrc.faults."):
-    if not module.ispkg:
-        importlib.import_module(module.name)
-for seed in (1, 2):
-    for schedule in (compose.compose(seed), compose.calm(seed), adversary.choose(seed)):
-        fuzz.fly(schedule)
-print(*sys.modules)
-"""
-
-
-def test_a_flight_of_a_search_imports_nothing_that_its_hash_leaves_out() -> None:
-    done = subprocess.run([sys.executable, "-c", FLIGHTS], capture_output=True, text=True)
-    names = {f"{name.removeprefix('cloudrc.').replace('.', '/')}/" for name in done.stdout.split()}
-    assert "world/guard/" in names, done.stderr
-    assert [name for name in names if name.startswith(faults_slices.NOT_FLOWN)] == []
 
 
 def test_several_processes_stop_together_and_leave_a_slice_without_a_gap(
