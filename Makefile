@@ -112,11 +112,11 @@ nightly: $(VENV)/dev ## run every test and number, 500 hours of faults, e2e-full
 		--document docs/safety/adversary.md $(STORE)
 	$(bin)/cloudrc faults fuzz --seeds 30000 --jobs $(JOBS) \
 		--document docs/safety/search.md $(STORE)
-	$(bin)/python tools/figures.py --document docs/safety/numbers.md
 	$(MAKE) mutants
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 	@if unshare --net tc qdisc add dev lo root netem delay 1ms; then $(MAKE) test-netem-full; \
 		else echo "no sch_netem for this user here: 'make test-netem-full' is left out"; fi
+	$(bin)/python tools/figures.py --document docs/safety/numbers.md
 	$(MAKE) e2e-full
 
 lint: $(VENV)/dev ## check format and rules
