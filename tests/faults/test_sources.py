@@ -10,7 +10,7 @@ from cloudrc.cli.faults_slices import NOT_FLOWN, sources
 
 
 def test_the_sources_are_all_that_a_flight_depends_on(tmp_path: Path) -> None:
-    apart = ("cli/main.py", "faults/real/processes.py", "world/notes.txt")
+    apart = ("cli/main.py", "faults/real/wire.py", "link/verify_loss.py", "world/notes.txt")
     names = (*apart, "world/scene.xml", "world/guard.py", "faults/realm.py")
     for name in names:
         path = tmp_path / name
