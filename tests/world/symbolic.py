@@ -34,6 +34,9 @@ class Symbol:
     def __neg__(self):
         return self._new(z3.fpNeg(self.term))
 
+    def __abs__(self):
+        return self._new(z3.fpAbs(self.term))
+
     def __add__(self, other):
         return self._new(z3.fpAdd(ROUND, self.term, self._with(other)))
 

@@ -4,11 +4,14 @@ from functools import partial
 
 import pytest
 import z3
+from guard_play import LIMITS
 from symbolic import everywhere, root
 
+from cloudrc.messages import Command
 from cloudrc.world import guard_rest
 from cloudrc.world import guard_rules as rules
-from cloudrc.world.guard_limits import AGE_MAX_NS
+from cloudrc.world.guard import Guard
+from cloudrc.world.guard_limits import AGE_MAX_NS, RANGE
 
 LATEST = AGE_MAX_NS * 1e-9 + rules.REACTION
 """After which the robot brakes [s], at the largest age of a command that may be flown."""
@@ -21,6 +24,20 @@ def abstract_root(monkeypatch):
 
 def is_finite(term):
     return z3.Not(z3.Or(z3.fpIsNaN(term), z3.fpIsInf(term)))
+
+
+def test_a_command_with_a_number_out_of_range_is_refused_whole():
+    """`Guard.offer` refuses all but what is within the range: NaN, infinities and 1e308, too."""
+
+    def check(run):
+        numbers = [run.fresh(name) for name in ("vx", "vy", "vz", "yaw_rate")]
+        inside = z3.And([z3.fpAbs(number.term) <= RANGE for number in numbers])
+        refused = Guard(LIMITS).offer(Command(0, 0, 0, tuple(numbers[:3]), numbers[3]), 0)
+        assert refused in (None, "range")
+        run.prove(z3.Not(inside) if refused else inside)
+
+    # All in range, or one of the four is the first that is not.
+    assert everywhere(check) == 5
 
 
 def test_within_answers_from_its_interval_whatever_comes_in():
