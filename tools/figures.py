@@ -1,7 +1,7 @@
 """The numbers of link and safety: what tests have measured, printed beside what was asked.
 
-`make figures` prints what the tests have noted since `make clean`; the full numbers need
-`make nightly`, the slices of CI are noted by `make test` and `make process`.
+`make figures` prints what the tests have noted of the sources as they are now; the full numbers
+need `make nightly`, the slices of CI are noted by `make test` and `make process`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import json
 import sys
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from cloudrc.report.document import environment_document
 FOLDER = Path(__file__).resolve().parents[1] / "build" / "figures"
 ROUNDING = 1e-9
 """Of a number of nanoseconds that has become seconds."""
+NONE = "no numbers of these sources yet: run make test, make process or make nightly"
 PAGE = """\
 # The numbers of link and safety
 
@@ -32,6 +34,12 @@ Times are those of the machine that it ran on. What is composed at random has pa
 [search](search.md), [adversary](adversary.md), [clean](clean.md); the faults one by one:
 [faults](faults.md).
 """
+
+
+@cache
+def flown() -> str:
+    """Hash what is measured, as it was when this process first asked."""
+    return sources(apart=())
 
 
 def note(
@@ -58,6 +66,7 @@ def note(
         "asked": asked,
         "unit": unit,
         "count": count,
+        "sources": flown(),
     }
     new = FOLDER / f"{key}.new"
     new.write_text(json.dumps(document), encoding="utf-8")
@@ -65,11 +74,12 @@ def note(
 
 
 def read() -> list[dict[str, Any]]:
-    """Sum up what was noted: the worst of each number, and of how many cases."""
+    """Sum up what was noted of these sources: the worst of each number, and of how many cases."""
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for path in sorted(FOLDER.glob("*.json")):
         found = json.loads(path.read_text(encoding="utf-8"))
-        groups[found["name"]].append(found)
+        if found.get("sources") == flown():
+            groups[found["name"]].append(found)
     rows = []
     for _, group in sorted(groups.items()):
         worst = (min if group[0]["relation"] == ">=" else max)(group, key=lambda g: g["measured"])
@@ -105,7 +115,7 @@ def cells(rows: list[dict[str, Any]]) -> list[tuple[str, ...]]:
 def page(rows: list[dict[str, Any]]) -> str:
     """Lay the rows out as a page of the documentation."""
     head, *lines = cells(rows)
-    where, flown = environment_document(), sources(apart=())
+    where = environment_document()
     return "\n".join(
         [
             *PAGE.splitlines(),
@@ -115,7 +125,7 @@ def page(rows: list[dict[str, Any]]) -> str:
             "|---|---|---|---|---|",
             *(f"| {' | '.join(line)} |" for line in lines),
             "",
-            f"Measured by cloudrc {__version__}; SHA-256 of its sources: `{flown[:16]}`.",
+            f"Measured by cloudrc {__version__}; SHA-256 of its sources: `{flown()[:16]}`.",
             "",
         ]
     )
@@ -128,7 +138,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     options = parser.parse_args(arguments)
     rows = read()
     if not rows:
-        print("no numbers yet: run make test, make process or make nightly", file=sys.stderr)
+        print(NONE, file=sys.stderr)
         return 3
     print(table(cells(rows)))
     if options.document:

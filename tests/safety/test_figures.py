@@ -44,6 +44,16 @@ def test_a_test_that_is_run_again_replaces_what_it_noted() -> None:
     assert (row["measured"], row["count"]) == (1.0, 7)
 
 
+def test_what_other_sources_have_measured_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    figures.note("test_a.py::test_a", "accepted", 1.0, "==", 0.0, "", 7)
+    figures.note("test_a.py::test_b", "accepted", 0.0, "==", 0.0, "", 5)
+    monkeypatch.setattr(figures, "flown", lambda: "other sources")
+    assert figures.read() == []
+    figures.note("test_a.py::test_a", "accepted", 0.0, "==", 0.0, "", 7)
+    (row,) = figures.read()
+    assert (row["measured"], row["count"]) == (0.0, 7)
+
+
 @pytest.mark.parametrize(
     ("measured", "relation", "asked"),
     [(0.253, "<=", 0.252), (0.1, ">=", 0.12), (1, "==", 0), (float("nan"), "<=", 1.0)],
