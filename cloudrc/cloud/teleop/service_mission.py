@@ -106,6 +106,8 @@ class Mission:
         self.happened[entry["event"]] += 1
         self.state = STATES.get(entry["event"], self.state)
         self.elapsed, self.world = entry["time_s"], entry["world"]
+        if self.world and self.state in (QUEUED, STARTING):
+            self.state = FLYING  # it was started, though a damaged journal has lost what said so
         self.witness = Witness(**entry["witness"])
         self.verdict = entry.get("verdict", self.verdict)
         # A waypoint is reached once, whatever is told how often.
