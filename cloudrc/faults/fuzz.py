@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.teleop.service import MissionService
+from cloudrc.cloud.teleop.service_mission import QUEUED
 from cloudrc.cloud.teleop.sight import LATCHED
 from cloudrc.faults.adversary import temptation
 from cloudrc.faults.asks import held
@@ -176,15 +177,16 @@ class Operator:
         service = flight.desk.service
         if service is None or now_ns < self._next_ns or flight.cloud.inner is None:
             return
-        unseen = service.sight.seen is None
-        if unseen or (flight.desk.missions and not flight.mission.ended):
+        over = not flight.desk.missions or flight.mission.ended
+        waits = not over and flight.mission.state == QUEUED
+        if service.sight.seen is None or not (over or waits):
             return
         self._next_ns = now_ns + PATIENCE_NS
         # What the operator sees: a world that was restarted is in GROUND, and changes nothing.
         own_ns = flight.cloud.clock.at(now_ns)
         if service.state(own_ns)["seen"]["guard"] in [each.name for each in LATCHED]:
             flight.desk.ask(MissionService.acknowledge, own_ns)
-        else:
+        elif over:
             flight.ask_for_mission(now_ns)
 
 
