@@ -78,6 +78,7 @@ ALLOWED = {
 }
 
 
+@pytest.mark.promise("P-LINK-7")
 def test_nothing_on_the_control_path_reads_a_wall_clock() -> None:
     found = {}
     for path in PACKAGE.rglob("*.py"):
