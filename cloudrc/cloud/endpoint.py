@@ -154,7 +154,7 @@ class CloudEndpoint:
             elif kind == Kind.ACCEPT:
                 self._receive_accept(epoch, codec.decode_accept(body), now_ns)
             elif kind == Kind.CHALLENGE:
-                hello = self._knocker.challenged(body)
+                hello = self._knocker.challenged(codec.decode_challenge(body))
                 if hello is not None and self._asks(now_ns):
                     self._greet(hello)
             elif kind == Kind.BUSY:

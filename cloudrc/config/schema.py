@@ -149,8 +149,8 @@ class Guard(Section):
     hold_max_s: Patience = Field(
         60.0,
         description="HOLD for so long during a mission ends in LAND, and so does GROUND without a "
-        "fresh command, after 10 s at least [s]; below 0.75 any silence in flight does: it takes "
-        "so long to fly on",
+        "fresh command, after 10 s at least [s]; below 1 s less guard.command_age_max_ms any "
+        "silence in flight does: it takes so long to fly on",
     )
 
 

@@ -14,7 +14,7 @@ DURATION = 60.0
 PROFILES = ("ideal", "wifi", "lte", "5g", "lossy", "paper-p1", "paper-p2", "paper-p3")
 PAPER = PROFILES[-3:]
 HOLDS = 0.8, 3.0
-"""Shortest and longest HOLD that is drawn [s]: 0.75 s are needed to fly on."""
+"""Shortest and longest HOLD that is drawn [s]: 0.75 s are needed to fly on, at the default age."""
 HOLD_MAX = Schedule(0).hold_max
 ONCE = ("second_cloud", "key_rotated")
 """Kinds that happen at most once in a flight."""

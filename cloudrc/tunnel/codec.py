@@ -29,9 +29,9 @@ from cloudrc.messages import (
     Telemetry,
 )
 
-VERSION = 4
+VERSION = 5
 """Of the wire, one per build; 1 had no tags, in 2 a request did not say on what it was based, in 3
-telemetry did not say why the guard is in its state.
+telemetry did not say why the guard is in its state, in 4 a challenge was shorter than its answer.
 Another one is refused, never spoken."""
 DATAGRAM_MAX = 512
 """Longer than any datagram of ours [bytes]; a longer one is refused unread."""
@@ -122,7 +122,7 @@ _COMMAND = struct.Struct("<qqq3dd")
 _OPERATOR = struct.Struct("<IBBQHq")
 _HELLO = struct.Struct("<16s16s16sB")
 _ACCEPT = struct.Struct("<16s16s16sB")
-_COOKIE = struct.Struct("<16s")
+_CHALLENGE = struct.Struct("<16s33x")  # as long as a hello, which answers it
 _BUSY = struct.Struct("<16s?")
 
 NUMBER_MAX = 2**32 - 1
@@ -134,7 +134,7 @@ HEADER_SIZE = _HEADER.size
 BODY_SIZES = {
     Kind.HELLO: _HELLO.size,
     Kind.ACCEPT: _ACCEPT.size,
-    Kind.CHALLENGE: _COOKIE.size,
+    Kind.CHALLENGE: _CHALLENGE.size,
     Kind.BUSY: _BUSY.size,
     Kind.TELEMETRY: _TELEMETRY.size,
     Kind.COMMAND: _COMMAND.size,
@@ -278,8 +278,19 @@ def decode_accept(body: bytes) -> Accept:
     return Accept(*_ACCEPT.unpack(body))
 
 
+def encode_challenge(cookie: bytes) -> bytes:
+    """Lay out the body of a CHALLENGE datagram: a cookie of 16 bytes, and zeros."""
+    return _CHALLENGE.pack(cookie)
+
+
+def decode_challenge(body: bytes) -> bytes:
+    """Read the cookie [16 bytes] in the body of a CHALLENGE datagram."""
+    cookie: bytes = _CHALLENGE.unpack(body)[0]
+    return cookie
+
+
 def encode_busy(busy: Busy) -> bytes:
-    """Lay out the body of a BUSY datagram; that of a CHALLENGE is the cookie itself."""
+    """Lay out the body of a BUSY datagram."""
     return _BUSY.pack(*busy)
 
 

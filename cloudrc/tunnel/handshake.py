@@ -9,10 +9,10 @@
 
 All of them carry a tag by the pre-shared key: who does not have it is not answered at all. The
 cookie is a MAC over the current two seconds, so world keeps nothing for a hello without it, and a
-captured hello is worth nothing four seconds later. No answer is longer than a hello, and there are
-at most 20 of them in any second: ten challenges, ten other answers. A captured hello that somebody
-repeats can use up the challenges alone, and these, which name nobody, lead the honest cloud on all
-the same; a hello with a cookie is answered once per counter.
+captured hello is worth nothing four seconds later. No answer is longer than what it answers, and
+there are at most 20 of them in any second: ten challenges, ten other answers. A captured hello that
+somebody repeats can use up the challenges alone, and these, which name nobody, lead the honest
+cloud on all the same; a hello with a cookie is answered once per counter.
 
 The cloud that has the session keeps it while it is heard: one datagram, new and sealed with the
 session's keys, in `command_age_max`. Only after that another one gets it, under the next epoch. A
@@ -39,6 +39,7 @@ from cloudrc.tunnel.codec import (
     Kind,
     encode_accept,
     encode_busy,
+    encode_challenge,
 )
 from cloudrc.tunnel.keys import Key
 from cloudrc.tunnel.session import (
@@ -184,7 +185,7 @@ class Door:
             if now_ns - self._challenged_ns < CHALLENGE_NS:
                 return Answer("unanswered", [])
             self._challenged_ns = now_ns
-            return self._answer("hello", CHALLENGE, self._cookie(now_ns))
+            return self._answer("hello", CHALLENGE, encode_challenge(self._cookie(now_ns)))
         if counter <= self._counters.get(hello.nonce, -1):
             return Answer(REPEATED, [])
         answered = self._answered_ns

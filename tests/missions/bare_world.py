@@ -135,7 +135,7 @@ class BareCloud:
             return None
         self.heard.append(Kind(kind).name)
         if kind == Kind.CHALLENGE:
-            hello = self.knocker.challenged(body)
+            hello = self.knocker.challenged(codec.decode_challenge(body))
             return hello and self.session.greet(Kind.HELLO, hello)
         if kind == Kind.BUSY:
             self.knocker.refused(codec.decode_busy(body))

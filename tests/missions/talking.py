@@ -63,9 +63,11 @@ class Talk:
         session, knocker = self.cloud(nonce)
         self.send(session.greet(Kind.HELLO, knocker.hello()))
         answers = self.hear(Kind.CHALLENGE, Kind.ACCEPT)
-        for kind, _, cookie in answers:
+        for kind, _, body in answers:
             if kind == Kind.CHALLENGE:
-                self.send(session.greet(Kind.HELLO, knocker.challenged(cookie)))
+                self.send(
+                    session.greet(Kind.HELLO, knocker.challenged(codec.decode_challenge(body)))
+                )
                 answers = self.hear(Kind.ACCEPT)
         for _, epoch, body in answers:
             accept = codec.decode_accept(body)

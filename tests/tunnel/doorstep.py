@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from cloudrc.tunnel.codec import Direction, Hello, Kind
+from cloudrc.tunnel.codec import Direction, Hello, Kind, decode_challenge
 from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, Door
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.knocker import NO_COOKIE
@@ -48,4 +48,4 @@ class Doorstep:
         self.now_ns = max(self.now_ns, self.door._challenged_ns + CHALLENGE_NS)
         kind, _, body = self.answer(nonce)
         assert kind == Kind.CHALLENGE
-        return body
+        return decode_challenge(body)

@@ -94,7 +94,7 @@ def test_for_which_session_a_request_is_meant_is_not_told_to_the_robot(request_,
 
 def test_the_header_lies_where_the_design_puts_it():
     data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788, generation=9)
-    assert data == bytes([4, 1, 4, 3, 2, 1, 9, 6]) + bytes.fromhex("8877665544332211")
+    assert data == bytes([5, 1, 4, 3, 2, 1, 9, 6]) + bytes.fromhex("8877665544332211")
     assert codec.peek(data) == (Kind.COMMAND, 0x01020304, 0x1122334455667788)
 
 
@@ -105,9 +105,11 @@ def test_a_direction_that_does_not_exist_is_refused():
         codec.check(bytes(data))
 
 
-def test_no_answer_to_a_hello_is_longer_than_it_and_nothing_is_longer_than_the_most():
+@pytest.mark.promise("P-LINK-4")
+def test_no_greeting_is_longer_than_the_one_it_answers_and_nothing_is_longer_than_the_most():
     answers = (Kind.CHALLENGE, Kind.ACCEPT, Kind.BUSY)
     assert all(codec.SIZES[kind] <= codec.SIZES[Kind.HELLO] for kind in answers)
+    assert codec.SIZES[Kind.HELLO] <= codec.SIZES[Kind.CHALLENGE]
     assert max(codec.SIZES.values()) <= codec.DATAGRAM_MAX
 
 
@@ -121,6 +123,12 @@ def test_a_hello_comes_back_as_it_was(hello):
 @settings(max_examples=20, deadline=None)
 def test_an_accept_comes_back_as_it_was(accept):
     assert codec.decode_accept(codec.encode_accept(accept)) == accept
+
+
+def test_a_challenge_is_a_cookie_and_zeros():
+    body = codec.encode_challenge(bytes(range(16)))
+    assert body == bytes(range(16)) + bytes(33)
+    assert codec.decode_challenge(body) == bytes(range(16))
 
 
 @pytest.mark.parametrize("used", [False, True])

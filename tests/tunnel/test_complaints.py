@@ -18,12 +18,12 @@ def faults(bare):
 
 def test_another_version_is_told_once():
     bare = Bare(ring())
-    hello = bytes([5]) + bare.cloud("a").hello()[1:]
+    hello = bytes([6]) + bare.cloud("a").hello()[1:]
     for _ in range(3):
         bare.world.receive_datagram(hello, 0)
     (fault,) = faults(bare)
     assert fault.code == "version"
-    assert fault.text.startswith("peer speaks v5, we speak v4: ")
+    assert fault.text.startswith("peer speaks v6, we speak v5: ")
     assert bare.world._counts["version"] == 3
 
 
@@ -59,7 +59,7 @@ def test_a_tag_is_worth_a_word_if_it_is_a_greetings(kind):
 
 def test_of_another_version_both_are_named():
     complaints = Complaints()
-    text = "peer speaks v9, we speak v4: run the same version of cloudrc at both ends"
+    text = "peer speaks v9, we speak v5: run the same version of cloudrc at both ends"
     assert complaints.about("version", bytes([9, 1, 2]), 7) == [Fault(7, "version", text)]
     assert complaints.about("version", bytes([9, 1, 2]), 8) == []
 

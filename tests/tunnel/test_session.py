@@ -112,8 +112,8 @@ def test_without_a_session_nothing_is_opened_but_greetings(make):
     with pytest.raises(DecodeError, match=r"^old_epoch$"):
         cloud.open(world.seal(Kind.TELEMETRY, bytes(codec.BODY_SIZES[Kind.TELEMETRY])))
     assert cloud.tend(0) == []
-    cookie = b"c" * 16
-    assert cloud.open(world.greet(Kind.CHALLENGE, cookie))[4] == cookie
+    challenge = codec.encode_challenge(b"c" * 16)
+    assert cloud.open(world.greet(Kind.CHALLENGE, challenge))[4] == challenge
 
 
 FLAWS = {

@@ -70,12 +70,12 @@ def test_hkdf_is_that_of_rfc_5869(key, salt, info, length, result):
 
 
 def test_a_key_derives_by_hkdf_with_version_and_use():
-    label = b"cloudrc 4 use"
+    label = b"cloudrc 5 use"
     assert Key(SECRET).derive(b"salt", b"use") == derived(SECRET, b"salt", label)
 
 
 def test_a_keys_name_is_made_of_nothing_but_what_is_derived():
-    assert Key(SECRET).name == derived(SECRET, b"", b"cloudrc 4 name")[:4].hex()
+    assert Key(SECRET).name == derived(SECRET, b"", b"cloudrc 5 name")[:4].hex()
 
 
 # McGrew and Viega, "The Galois/Counter Mode of Operation", submitted to NIST: test case 16.
@@ -126,9 +126,9 @@ def test_chacha20_poly1305_is_that_of_rfc_8439():
 
 def by_hand(suite, direction, epoch, generation, kind, counter, body):
     """A sealed datagram as docs/safety/wire.md describes it."""
-    use = b"cloudrc 4 session %d %d %d %d" % (suite, direction, epoch, generation)
+    use = b"cloudrc 5 session %d %d %d %d" % (suite, direction, epoch, generation)
     key = derived(SECRET, b"cloud".ljust(16) + b"world".ljust(16), use)
-    header = struct.pack("<BBIBBQ", 4, direction, epoch, generation % 256, kind, counter)
+    header = struct.pack("<BBIBBQ", 5, direction, epoch, generation % 256, kind, counter)
     cipher = AESGCM(key) if suite == 1 else ChaCha20Poly1305(key)
     return header + cipher.encrypt(header[4:], body, header)
 
@@ -147,8 +147,8 @@ def test_a_datagram_can_be_made_from_the_description_alone(suite):
 def test_a_greeting_can_be_made_from_the_description_alone():
     session = Session(Direction.DOWNLINK, KeyRing(KeySet(Key(SECRET))))
     body = codec.encode_hello(Hello(b"n" * 16, b"c" * 16, b"k" * 16, 1))
-    data = struct.pack("<BBIBBQ", 4, 1, 0, 0, 1, 0) + body
-    tagging = derived(SECRET, b"", b"cloudrc 4 greeting")
+    data = struct.pack("<BBIBBQ", 5, 1, 0, 0, 1, 0) + body
+    tagging = derived(SECRET, b"", b"cloudrc 5 greeting")
     tag = hmac.digest(tagging, data, hashlib.sha256)[:16]
     assert session.greet(Kind.HELLO, body) == data + tag
 
@@ -158,9 +158,10 @@ def test_a_cookie_can_be_made_from_the_description_alone():
         nonce=b"w" * 16, clock_id=bytes(16), suite=1, last_epoch=0, next_epoch=None
     )
     door = Door(Session(Direction.UPLINK, KeyRing(KeySet(Key(SECRET)))), identity, age_max_ns=1)
-    cookies = derived(SECRET, b"w" * 16, b"cloudrc 4 cookies")
+    cookies = derived(SECRET, b"w" * 16, b"cloudrc 5 cookies")
     (answer,) = door.knock(Hello(bytes(16), bytes(16), bytes(16), 1), 0, 7_999_999_999).datagrams
-    assert answer[16:32] == hmac.digest(cookies, b"3", hashlib.sha256)[:16]
+    cookie = hmac.digest(cookies, b"3", hashlib.sha256)[:16]
+    assert answer[16:-16] == cookie + bytes(33)
 
 
 def test_the_second_name_of_a_cloud_is_made_of_the_first():
@@ -175,18 +176,18 @@ def test_the_second_name_of_a_cloud_is_made_of_the_first():
 
 FROZEN = {
     (AES_256_GCM, Kind.COMMAND): (
-        "040107000000000600000000000000001f314829f91581996482ae646a684372586e6d05b6eceb21"
-        "97fc2b0d2b476d211fdcc2945ce7284ebba9b90f21870576da966de83ab234c8bef7b7b9b74880f4"
-        "4e666cb2af794aa9"
+        "050107000000000600000000000000004849753119341adf51181dd39732a02320d0f5b4cd45d4a3"
+        "a44073943e4e1fc1c4bdc60728769976d6fefca1012f98d72245370c30d40778fd83747d7f8ced23"
+        "4cde87d757611564"
     ),
-    (AES_256_GCM, Kind.ALIVE): ("04010700000000080000000000000000a8641115625b589ee4cf6e48a9f02204"),
+    (AES_256_GCM, Kind.ALIVE): ("050107000000000800000000000000005be2b6966721a6b47c110d8a57e3cdb7"),
     (CHACHA20_POLY1305, Kind.COMMAND): (
-        "04010700000000060000000000000000cb80463dda3768886edc5fd4dac51e0c205f5887e99ae527"
-        "0ae0a7562a8d6291ed59924d8efcbc9fda5a036819c62b60d1eef35c5782aa64c92bdb13f8fc2870"
-        "1ed01f725fe39166"
+        "050107000000000600000000000000003d4af1049ea1addf07d11e3ebcb34e5f9afc50b17bacf3ce"
+        "071100c0e3f9fcc99fdaf305afc7aa18c94def68273541297c64fa70e36888cbbd416e18c4483ed7"
+        "7f1a9d40c4747fe0"
     ),
     (CHACHA20_POLY1305, Kind.ALIVE): (
-        "040107000000000800000000000000009e8c21e55b3f462ededbfa4cff713b2e"
+        "050107000000000800000000000000005adf6fc11e2258aa23ce1349f9620714"
     ),
 }
 
