@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
 from typing import TypeVar
 
 from cloudrc.cli.signals import end_with
@@ -16,6 +17,9 @@ from cloudrc.errors import InvalidRunError
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
+AHEAD = 100
+"""Pieces of work that wait in the pool, at most. With all of a long search in it at once the pool
+hangs for ever before Python 3.11.6: each wakes it through a pipe that holds 16,384 (gh-105829)."""
 KILLED = "a worker was killed, by the kernel if memory ran out"
 
 
@@ -47,9 +51,12 @@ def in_order(
     pool = ProcessPoolExecutor(workers, fork, _begin, (os.getpid(),))
     try:
         # Not `map`: where a worker has died, it cancels what the pool marks as failed just then.
-        futures = deque(pool.submit(function, each) for each in work)
+        left = iter(work)
+        futures = deque(pool.submit(function, each) for each in islice(left, AHEAD))
         while futures:
-            yield futures.popleft().result()
+            result = futures.popleft().result()
+            futures.extend(pool.submit(function, each) for each in islice(left, 1))
+            yield result
     except KeyboardInterrupt:  # who presses Ctrl-C does not want to wait
         for worker in multiprocessing.active_children():
             worker.terminate()

@@ -7,12 +7,13 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.cli.pool import WorkerDiedError, in_order
+from cloudrc.cli.pool import AHEAD, WorkerDiedError, in_order
 from cloudrc.faults.catalogue import find
 from cloudrc.faults.document import Result
 from cloudrc.faults.fuzz import Finding
@@ -45,6 +46,25 @@ def _end_one(number: int) -> int:
 
 def test_results_come_in_the_order_of_the_work() -> None:
     assert list(in_order(_slow_first, range(6), 2)) == list(range(6))
+
+
+class _Asked(list[int]):
+    """Work that knows how much of it has been taken."""
+
+    taken = 0
+
+    def __iter__(self) -> Iterator[int]:
+        for each in super().__iter__():
+            self.taken += 1
+            yield each
+
+
+def test_a_long_search_is_not_handed_in_at_once() -> None:
+    work = _Asked(range(1000))
+    done = in_order(_who, work, 2)
+    next(done)
+    assert work.taken == AHEAD + 1
+    assert sum(1 for _ in done) == 999
 
 
 def test_there_are_no_more_processes_than_cores_however_many_are_asked_for() -> None:
