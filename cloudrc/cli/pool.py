@@ -17,9 +17,9 @@ from cloudrc.errors import InvalidRunError
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
-AHEAD = 100
-"""Pieces of work that wait in the pool, at most. With all of a long search in it at once the pool
-hangs for ever before Python 3.11.6: each wakes it through a pipe that holds 16,384 (gh-105829)."""
+AHEAD = 1000
+"""Pieces of work in a pool, at most; more than any machine has cores. Given all of a long search at
+once, it hangs before Python 3.11.6: each wakes it by a pipe that holds 16,384 (cpython 105829)."""
 KILLED = "a worker was killed, by the kernel if memory ran out"
 
 
@@ -54,9 +54,8 @@ def in_order(
         left = iter(work)
         futures = deque(pool.submit(function, each) for each in islice(left, AHEAD))
         while futures:
-            result = futures.popleft().result()
+            yield futures.popleft().result()
             futures.extend(pool.submit(function, each) for each in islice(left, 1))
-            yield result
     except KeyboardInterrupt:  # who presses Ctrl-C does not want to wait
         for worker in multiprocessing.active_children():
             worker.terminate()

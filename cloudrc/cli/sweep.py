@@ -9,16 +9,17 @@ import os
 import signal
 import sys
 from collections.abc import Generator, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.closing import EXIT_CODES
 from cloudrc.cli.folder import new_folder
 from cloudrc.cli.output import say, unread_is_fine, written
-from cloudrc.cli.pool import KILLED, WorkerDiedError
+from cloudrc.cli.pool import AHEAD, KILLED, WorkerDiedError
 from cloudrc.cli.signals import end_with
 from cloudrc.cli.statistics import as_csv, as_table, summarise
 
@@ -77,12 +78,13 @@ def _reports(
         pool = ProcessPoolExecutor(workers, context, end_with, (os.getpid(),))
     with pool:
         try:
-            with _born_apart():
-                futures: list[Future[dict[str, Any]]] = [
-                    pool.submit(_fly_one, experiment, overrides, folder, seed) for seed in seeds
-                ]
-            for future in as_completed(futures):
-                yield future.result()
+            left = (pool.submit(_fly_one, experiment, overrides, folder, seed) for seed in seeds)
+            with _born_apart():  # the first ones begin all processes
+                flying = set(islice(left, AHEAD))
+            while flying:
+                finished, flying = wait(flying, return_when=FIRST_COMPLETED)
+                yield from (future.result() for future in finished)
+                flying.update(islice(left, len(finished)))
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             # Leaving `with` waits for the workers, and they for the end of their flights.

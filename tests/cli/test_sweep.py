@@ -40,6 +40,15 @@ def test_many_seeds_become_one_table(folder: Path, capsys: pytest.CaptureFixture
     assert len((folder / "sweep/sweep.csv").read_text().splitlines()) == 3
 
 
+def test_seeds_that_are_handed_in_later_are_flown_too(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep, "AHEAD", 2)
+    assert main(["run", "steps", "--seeds", "5", *SHORT, "--out", "sweep"]) == 0
+    document = json.loads((folder / "sweep/sweep.json").read_text())
+    assert [run["seed"] for run in document["runs"]] == [1, 2, 3, 4, 5]
+
+
 @pytest.mark.parametrize("finished", [0, 2])
 @pytest.mark.parametrize(
     ("error", "code", "word"),
