@@ -52,10 +52,10 @@ def in_order(
     try:
         # Not `map`: where a worker has died, it cancels what the pool marks as failed just then.
         left = iter(work)
-        futures = deque(pool.submit(function, each) for each in islice(left, AHEAD))
-        while futures:
-            yield futures.popleft().result()
-            futures.extend(pool.submit(function, each) for each in islice(left, 1))
+        # Batch by batch: a pool that is broken takes no more, and what it has done is told first.
+        while futures := deque(pool.submit(function, each) for each in islice(left, AHEAD)):
+            while futures:
+                yield futures.popleft().result()
     except KeyboardInterrupt:  # who presses Ctrl-C does not want to wait
         for worker in multiprocessing.active_children():
             worker.terminate()

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Generator, Iterator
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from itertools import islice
@@ -79,12 +79,13 @@ def _reports(
     with pool:
         try:
             left = (pool.submit(_fly_one, experiment, overrides, folder, seed) for seed in seeds)
-            with _born_apart():  # the first ones begin all processes
-                flying = set(islice(left, AHEAD))
-            while flying:
-                finished, flying = wait(flying, return_when=FIRST_COMPLETED)
-                yield from (future.result() for future in finished)
-                flying.update(islice(left, len(finished)))
+            while True:
+                with _born_apart():
+                    flying = list(islice(left, AHEAD))
+                if not flying:
+                    break
+                for future in as_completed(flying):
+                    yield future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             # Leaving `with` waits for the workers, and they for the end of their flights.

@@ -86,6 +86,21 @@ def test_a_process_that_is_killed_is_told_of() -> None:
     assert multiprocessing.active_children() == []
 
 
+def _slowly(done: Iterator[int]) -> Iterator[int]:
+    """Listen more slowly than they work."""
+    for each in done:
+        yield each
+        time.sleep(0.1)
+
+
+def test_what_was_done_before_a_process_was_killed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cloudrc.cli.pool.AHEAD", KILLED)
+    told: list[int] = []
+    with pytest.raises(WorkerDiedError):
+        told.extend(_slowly(in_order(_end_one, range(9), 2)))
+    assert told[:KILLED] == list(range(KILLED))
+
+
 def _fly(schedule: Schedule, keep: bool = False) -> Finding:
     if schedule.seed == KILLED:
         time.sleep(0.5)  # until those before are told
