@@ -149,7 +149,7 @@ def spawn(bare: Bare) -> None:
 
 def check(names: tuple[str, ...]) -> None:
     """Play one interleaving: what is applied rises, and an epoch belongs to one cloud."""
-    bare, applied, owner = Bare(), [], {}
+    bare, applied, owner = Bare(ring()), [], {}
     for name in names:
         ACTIONS[name](bare)
         applied += bare.used()

@@ -72,22 +72,34 @@ def _cloud_paused(seed: int) -> Outcome:
 
 
 def _cloud_throttled(seed: int) -> Outcome:
+    """First short stalls, which ride inside the age limit; then ones of nearly a second."""
     outcome = Outcome()
     with Processes(seed=seed) as run:
         run.reached(2)
-        pid = run.running["cloud"].pid
-        group = throttle(pid, 0.02)
-        if group is None:
-            outcome.skipped = "cgroups cannot be made here; run as root"
-            return outcome
-        try:
-            time.sleep(5.0)
-            outcome.least("periods in which it was throttled", throttled(group), 1)
-        finally:
-            release(group, pid)
+        for period in (0.1, 1.0):
+            since = time.monotonic() - run.slip()
+            periods = _throttled(run, period)
+            if periods is None:
+                outcome.skipped = "cgroups cannot be made here; run as root"
+                return outcome
+            outcome.least(f"periods of {period:g} s whose 2 ms were used up", periods, 1)
         flown = finish(outcome, run)
-        outcome.most("HOLD, if any, after", age_at_hold(flown), AGE_MAX, "s")
+        outcome.least("HOLDs amid the long stalls", holds(flown, since), 1)
+        outcome.most("HOLD after", age_at_hold(flown), AGE_MAX, "s")
     return outcome
+
+
+def _throttled(run: Processes, period: float) -> int | None:
+    """Throttle cloud for 5 s; count the periods whose share it has used up; None if forbidden."""
+    pid = run.running["cloud"].pid
+    group = throttle(pid, 0.002 / period, period)
+    if group is None:
+        return None
+    try:
+        time.sleep(5.0)
+        return throttled(group)
+    finally:
+        release(group, pid)
 
 
 def _world_killed(seed: int) -> Outcome:
@@ -198,7 +210,7 @@ SCENARIOS = (
     Scenario(
         16,
         "cloud-throttled",
-        "a cgroup gives the cloud process 2 % of a processor for 5 s",
+        "a cgroup gives the cloud process 2 ms of each 100 for 5 s, then of each 1,000 for 5 s",
         "stalls ride inside the age limit, else HOLD",
         "none",
         "-",

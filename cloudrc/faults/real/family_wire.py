@@ -1,8 +1,9 @@
-"""Faults with real sockets and files: a flood of garbage, a killed recorder."""
+"""Faults with real sockets and files: a flood of garbage, a full disk, a killed recorder."""
 
 from __future__ import annotations
 
 import os
+import resource
 import time
 from math import nan
 
@@ -11,7 +12,9 @@ from cloudrc.faults.held import holds
 from cloudrc.faults.real.family_processes import REAL, WORKING, finish
 from cloudrc.faults.real.processes import Processes, flood
 from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.scribe import PAGE
 from cloudrc.faults.toll import REFUSED
+from cloudrc.record.columns import Recording
 from cloudrc.tunnel.codec import Direction
 
 RATE = 10_000
@@ -86,6 +89,35 @@ def _recorder_killed(seed: int) -> Outcome:
     return outcome
 
 
+def _disk_full(seed: int) -> Outcome:
+    """No file of world may grow beyond its recording in the pipes and a page, in which a note fits.
+
+    To its writes that is a disk without room; what else it writes is shorter.
+    """
+    outcome = Outcome()
+    with Processes(seed=seed) as run:
+        run.reached(WORKING)
+        path = run.recording_path("world")
+        room = path.stat().st_size + PAGE
+        resource.prlimit(run.running["world"].pid, resource.RLIMIT_FSIZE, (room, room))
+        run.until("the recording stops", lambda: "recording stopped" in run.log("world"))
+        since = run.events().count("reached")
+        finish(outcome, run)
+        outcome.least("waypoints reached without a recording", 7 - since, 1)
+        shown = run.scrape()
+        stops = 'cloudrc_guard_transitions_total{state="%s"}'
+        for state in ("land", "estop"):
+            outcome.same(f"metric guard_transitions_total: {state}", shown[stops % state], 0)
+        touched = shown['cloudrc_contacts_total{body="pipe"}']
+        outcome.same("metric contacts_total: pipe", touched, 0)
+        dropped = shown["cloudrc_recorder_dropped_records_total"]
+        outcome.least("metric recorder_dropped_records_total", dropped, 1000)
+        _, recovery = run.recording("world")
+        outcome.same("torn chunks left", recovery.bytes_lost, 0)
+        outcome.true("a reader is told", "recording stopped" in Recording.read(path).note)
+    return outcome
+
+
 SCENARIOS = (
     Scenario(
         20,
@@ -96,6 +128,16 @@ SCENARIOS = (
         "none",
         "cloudrc_datagrams_total by outcome",
         _garbage,
+        REAL,
+    ),
+    Scenario(
+        29,
+        "bad-disk",
+        "the world process may write no file longer than its recording is in the pipes",
+        "the mission goes on; the chunk is closed cleanly",
+        "samples, which are counted",
+        "recording stopped; cloudrc_recorder_dropped_records_total",
+        _disk_full,
         REAL,
     ),
     Scenario(

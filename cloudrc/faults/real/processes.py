@@ -165,11 +165,19 @@ class Processes:
 
     def recording(self, name: str, which: int = -1) -> tuple[Recording, Recovery]:
         """Recover a recording of a process and read it; by default the newest."""
-        paths = sorted(self.folder.glob(f"{name}-*.mcap"), key=lambda path: path.stat().st_ctime)
-        paths = [path for path in paths if "recovered" not in path.name]
-        clean = self.folder / f"{paths[which].stem}.recovered-{time.monotonic_ns()}.mcap"
-        recovery = recover(paths[which], clean)
+        path = self.recording_path(name, which)
+        clean = self.folder / f"{path.stem}.recovered-{time.monotonic_ns()}.mcap"
+        recovery = recover(path, clean)
         return Recording.read(clean), recovery
+
+    def recording_path(self, name: str, which: int = -1) -> Path:
+        """Find a recording of a process; by default the newest."""
+        paths = sorted(self.folder.glob(f"{name}-*.mcap"), key=lambda path: path.stat().st_ctime)
+        return [path for path in paths if "recovered" not in path.name][which]
+
+    def log(self, name: str) -> str:
+        """What a process has said."""
+        return (self.folder / f"{name}.log").read_text(errors="replace")
 
     def scrape(self, name: str = "world", timeout: float = 5.0) -> dict[str, float]:
         """Read the metrics of a process [any unit].
@@ -204,7 +212,7 @@ class Processes:
     def _last_words(self) -> str:
         words = []
         for name in self.running:
-            lines = (self.folder / f"{name}.log").read_text(errors="replace").splitlines()
+            lines = self.log(name).splitlines()
             words.append(f"{name}: {lines[-1] if lines else 'nothing'}")
         return "; ".join(words)
 
@@ -245,14 +253,26 @@ def flood(port: int, way: Direction, rate: int, seconds: int) -> subprocess.Pope
     return subprocess.Popen(command, stdout=subprocess.PIPE)
 
 
-def throttle(pid: int, share: float) -> Path | None:
-    """Give a process a share in [0, 1] of a processor, by a cgroup; None if that is not allowed."""
-    for root, quota in (("/sys/fs/cgroup/cpu", "cpu.cfs_quota_us"), ("/sys/fs/cgroup", "cpu.max")):
+def throttle(pid: int, share: float, period: float = 0.1) -> Path | None:
+    """Give a process a share of a processor, by a cgroup.
+
+    Args:
+        pid: Of the process.
+        share: In [0, 1]; of a period it is at least 1 ms.
+        period: In which it has its share at once, and then waits [s], 1 at most.
+
+    Returns:
+        The cgroup, or None if that is not allowed.
+    """
+    period_us, quota_us = round(period * 1e6), round(share * period * 1e6)
+    first = {"cpu.cfs_period_us": f"{period_us}", "cpu.cfs_quota_us": f"{quota_us}"}
+    second = {"cpu.max": f"{quota_us} {period_us}"}
+    for root, settings in (("/sys/fs/cgroup/cpu", first), ("/sys/fs/cgroup", second)):
         group = Path(root) / f"cloudrc-{pid}"
         try:
             group.mkdir()
-            value = f"{round(share * 100_000)}"
-            (group / quota).write_text(value if "cfs" in quota else f"{value} 100000")
+            for name, value in settings.items():
+                (group / name).write_text(value)
             (group / "cgroup.procs").write_text(str(pid))
         except OSError:
             if group.exists():
