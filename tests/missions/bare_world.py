@@ -150,7 +150,7 @@ class BareCloud:
 class Bare:
     """One world and some clouds, joined by a link that loses and delays nothing."""
 
-    def __init__(self, keys: KeyRing | None = None) -> None:
+    def __init__(self, keys: KeyRing) -> None:
         self.keys, self.now_ns = keys, 0
         self.world = bare_world(ring=keys)
         self.clouds: dict[str, BareCloud] = {}
