@@ -39,5 +39,5 @@ def test_a_setting_reaches_the_flight() -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("part", range(20))
 def test_two_hundred_do_not_either(part: int, figure: Callable[..., Any]) -> None:
-    flown, broken = fly(range(7 + 20 * part, 27 + 20 * part), STIFFER)
+    flown, broken = fly(range(7 + 22 * part, 29 + 22 * part), STIFFER)
     figure(f"hostile clouds, {STIFFER}: breaches", len(broken), "==", 0, count=flown)
