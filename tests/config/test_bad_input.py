@@ -119,7 +119,8 @@ def test_unknown_keys_and_forgotten_units(mine: Path, typo: str, meant: str) -> 
         ("", "mine.yaml: must be a mapping"),
         ("- 1", "mine.yaml: must be a mapping"),
         ("seed: !!python/name:os.system x", "mine.yaml:1"),
-        ("[" * 100_000, "nested more than 50 deep"),
+        ("[" * 60, "nested more than 50 deep"),
+        ("[" * 100_000, "nest"),  # a newer libyaml looks ahead, and counts before we do
         ("a: &a [*a]", "a value contains itself"),
         ("a: " + "9" * 5000, "not readable"),
         ("world: 3", "mine.yaml:1: world: 3: must be a mapping"),
