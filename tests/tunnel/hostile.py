@@ -52,6 +52,8 @@ class Target:
                 self.give(datagrams, target)
         assert self.cloud._session.epoch == self.world._session.epoch == 1
         self.captured = tuple(self.frames)
+        busy = codec.encode_busy(codec.Busy(b"c" * 16, used=True))
+        self.frames.append(self.world._session.greet(Kind.BUSY, busy))
         talker = BareCloud(b"other", None)
         talker.session = self.cloud._session
         self.frames += [talker.command(), talker.start(1), talker.session.seal(Kind.ALIVE, b"")]

@@ -15,6 +15,8 @@ from pathlib import Path
 import pytest
 from hostile import LONGEST, Target, memory
 
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.codec import Kind
 from cloudrc.tunnel.openers import Openers
 
 
@@ -53,10 +55,10 @@ def test_time_passes_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
     assert target.now_ns > 1000e9
 
 
-def test_every_truncation_and_every_longer_version_is_refused(
-    target: Target, figure: Callable[..., None]
-) -> None:
-    kinds = {frame[6:8]: frame for frame in target.frames}
+def test_every_truncation_and_every_longer_version_is_refused(figure: Callable[..., None]) -> None:
+    target = Target()
+    kinds = {Kind(codec.peek(frame)[0]): frame for frame in target.frames}
+    assert kinds.keys() == set(Kind)
     for frame in kinds.values():
         for length in range(LONGEST + 1):
             if length != len(frame):
