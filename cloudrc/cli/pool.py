@@ -58,7 +58,7 @@ def in_order(
                 yield futures.popleft().result()
     except KeyboardInterrupt:  # who presses Ctrl-C does not want to wait
         for worker in multiprocessing.active_children():
-            worker.terminate()
+            worker.kill()  # one that has only begun may still take SIGTERM as Ctrl-C, and lose it
         raise
     except BrokenProcessPool as error:
         raise WorkerDiedError(f"{KILLED}: try fewer '--jobs'") from error

@@ -172,6 +172,15 @@ def test_ctrl_c_ends_the_processes_at_once() -> None:
     assert multiprocessing.active_children() == []
 
 
+def test_ctrl_c_ends_a_process_that_has_not_heard_of_sigterm(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Before it has begun, a worker has its parent's handlers, whose interrupt may be lost."""
+    deaf = lambda first: signal.signal(signal.SIGTERM, signal.SIG_IGN)  # noqa: E731
+    monkeypatch.setattr("cloudrc.cli.pool._begin", deaf)
+    test_ctrl_c_ends_the_processes_at_once()
+
+
 def test_a_slice_is_not_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
