@@ -41,21 +41,30 @@ def flights_of_others_are_not_seen(
 
 @pytest.fixture
 def figure(request: pytest.FixtureRequest) -> Callable[..., None]:
-    """Note a number: figure("HOLD after", 0.252, "<=", 0.252, "s"); `make figures` prints it."""
+    """Note a number: figure("HOLD after", 0.252, "<=", 0.252, "s"); `make figures` prints it.
+
+    A number that is not what was asked is noted, and fails its test.
+    """
 
     def note(
         name: str, measured: float, relation: str, asked: float, unit: str = "", count: int = 1
     ) -> None:
-        figures.note(request.node.nodeid, name, measured, relation, asked, unit, count)
+        row = figures.note(request.node.nodeid, name, measured, relation, asked, unit, count)
+        assert figures.holds(row), f"{name}: {measured:g} {unit}, asked {relation} {asked:g} {unit}"
 
     return note
 
 
 @pytest.fixture(autouse=True)
 def signals_stay_as_they_were() -> Iterator[None]:
-    """A command that a test calls may take over signals, as a process of its own should."""
+    """A command that a test calls may take over signals, as a process of its own should.
+
+    Under `nohup` tests ignore SIGHUP, and so would all that they start; some are tested for it.
+    """
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     handlers = {number: signal.getsignal(number) for number in numbers}
+    if handlers[signal.SIGHUP] is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda number, frame: None)  # the default again in a child
     yield
     for number, handler in handlers.items():
         if signal.getsignal(number) is not handler:

@@ -44,7 +44,7 @@ def flown() -> str:
 
 def note(
     test: str, name: str, measured: float, relation: str, asked: float, unit: str, count: int
-) -> None:
+) -> dict[str, Any]:
     """Keep one number; a test that is run again replaces what it had noted before.
 
     Args:
@@ -55,6 +55,9 @@ def note(
         asked: What was asked [any unit].
         unit: Of both.
         count: How many cases this is the worst of.
+
+    Returns:
+        What is kept.
     """
     FOLDER.mkdir(parents=True, exist_ok=True)
     key = hashlib.sha256(f"{test}\n{name}".encode()).hexdigest()[:24]
@@ -71,6 +74,7 @@ def note(
     new = FOLDER / f"{key}.new"
     new.write_text(json.dumps(document), encoding="utf-8")
     new.replace(FOLDER / f"{key}.json")
+    return document
 
 
 def read() -> list[dict[str, Any]]:

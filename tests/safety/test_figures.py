@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,13 @@ def test_a_test_that_is_run_again_replaces_what_it_noted() -> None:
         figures.note("test_a.py::test_a", "accepted", measured, "==", 0.0, "", 7)
     (row,) = figures.read()
     assert (row["measured"], row["count"]) == (1.0, 7)
+
+
+def test_a_number_that_was_missed_fails_its_test(figure: Callable[..., None]) -> None:
+    figure("accepted", 0, "==", 0)
+    with pytest.raises(AssertionError, match=r"HOLD after: 0.253 s, asked <= 0.252 s"):
+        figure("HOLD after", 0.253, "<=", 0.252, "s")
+    assert [row["name"] for row in figures.read()] == ["HOLD after", "accepted"]
 
 
 def test_what_other_sources_have_measured_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
