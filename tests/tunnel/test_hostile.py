@@ -108,7 +108,7 @@ def test_a_million_hostile_datagrams(target: Target, figure: Callable[..., None]
 @pytest.mark.process
 @pytest.mark.parametrize(
     ("runs", "least"),  # some of what the fuzzer makes are frames that both ends know
-    [(200_000, 140_000), pytest.param(11_500_000, 10_000_000, marks=pytest.mark.full)],
+    [(1_150_000, 1_000_000), pytest.param(11_500_000, 10_000_000, marks=pytest.mark.full)],
 )
 def test_coverage_guided_ones(
     runs: int, least: int, tmp_path: Path, figure: Callable[..., None]
