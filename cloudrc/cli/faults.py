@@ -102,7 +102,7 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--junit", type=written_to, metavar="FILE", help="write the results as JUnit"
     )
-    text = "write the documentation's table"
+    text = "write the documentation's table; with --all"
     parser.add_argument("--document", type=written_to, metavar="FILE", help=text)
     place_arguments(parser)
 

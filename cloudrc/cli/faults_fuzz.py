@@ -242,12 +242,21 @@ def _report(finding: Finding, store: Path, say: bool, stop: Callable[[], bool]) 
     text = dump(smallest, f"Found by seed {finding.schedule.seed}.\n{note}")
     if say and not stop():
         print(f"\n{paint('FAILED', 'red')} seed {finding.schedule.seed}\n{text}", flush=True)
-    store.mkdir(parents=True, exist_ok=True)
-    path = store / f"{'-'.join(sorted(kinds))}-{smallest.policy or 'seed'}-{smallest.seed}.yaml"
-    path.write_text(text, encoding="utf-8")
+    name = f"{'-'.join(sorted(kinds))}-{smallest.policy or 'seed'}-{smallest.seed}"
+    path = _keep(text, store, name)
     return {
         "seed": finding.schedule.seed,
         "breaches": [breach._asdict() for breach in finding.breaches],
         "schedule": asdict(smallest),
         "file": str(path),
     }
+
+
+def _keep(text: str, store: Path, name: str) -> Path:
+    """Write a schedule down; one of its name that says something else is a test, and stays."""
+    store.mkdir(parents=True, exist_ok=True)
+    path, number = store / f"{name}.yaml", 2
+    while path.exists() and path.read_text(encoding="utf-8") != text:
+        path, number = store / f"{name}-{number}.yaml", number + 1
+    path.write_text(text, encoding="utf-8")
+    return path

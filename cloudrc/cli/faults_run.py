@@ -46,6 +46,8 @@ def run(options: argparse.Namespace) -> int:
     from cloudrc.faults.catalogue import called, scenarios
 
     mode = _mode(options)
+    if options.document is not None and not options.all:
+        raise BadInputError("--document writes a page of all faults: add --all in place of a name")
     if mode == "cluster":
         _look_for_release(options)
     elif any(_place(options).values()):

@@ -227,6 +227,13 @@ def test_a_failure_is_printed_and_stored(
     assert stored
     assert [event.kind for event in load(stored[0]).events] == ["blackout"]
     assert "p <" in printed, "invariants that held have their bound"
+    kept = stored[0].read_text()
+    stored[0].write_text("found in another year")
+    for _ in range(2):
+        assert main(["faults", "fuzz", *flags]) == 1
+        assert stored[0].read_text() == "found in another year"
+        assert stored[0].with_stem(f"{stored[0].stem}-2").read_text() == kept
+        assert len(list(tmp_path.glob("collision-*.yaml"))) == len(stored) + 1
 
 
 def test_a_stored_schedule_is_flown_again(

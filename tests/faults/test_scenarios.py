@@ -272,6 +272,7 @@ def test_without_a_name_or_an_action_it_says_what_is_missing(
         ("fuzz --first -5 --seeds 1", 2, "'-5' is not a whole number"),
         ("run F37 --junit none/x.xml", 2, "no file can be written there"),
         ("run F37 --document /", 2, "no file can be written there"),
+        ("run F37 --document page.md", 2, "a page of all faults: add --all in place of a name"),
         ("fuzz --seeds 1 --document none/x.md", 2, "no file can be written there"),
         ("run F13 --real -n lab", 2, "say which robot of a cluster: add --cluster"),
         ("run --all --cluster", 3, "no cluster is configured"),
