@@ -13,6 +13,7 @@ PROMISE = re.compile(r"\[(P-[A-Z]+-\d+)\]")
 DOCUMENTS = [
     ROOT / "SECURITY.md",
     ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
     ROOT / "charts" / "cloudrc" / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
