@@ -17,7 +17,7 @@ from cloudrc.faults.fuzz import Finding, fly, judged
 from cloudrc.faults.remains import KILLED, Remains
 from cloudrc.faults.schedule import KINDS, Event, Schedule, dump, load, shaped
 from cloudrc.faults.shrink import shrink
-from cloudrc.faults.watch import Breach, Watch
+from cloudrc.faults.watch import Watch
 from cloudrc.link.profile import Change, DirectionProfile
 from cloudrc.messages import OperatorRequest, Request
 from cloudrc.record.columns import Recording
@@ -205,44 +205,6 @@ def test_the_watch_judges_by_its_own_fence(monkeypatch: pytest.MonkeyPatch) -> N
 def test_the_watch_counts_the_age_of_commands_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cloudrc.faults.flight._watch", lambda _: Watch(6.0, 12.0, 1.0, 50_000_000))
     assert fly(Schedule(1, "paper-p2", duration=5.0)).kinds == {"stale"}
-
-
-def test_a_failure_is_printed_and_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def breaking(schedule: Schedule, keep: bool = False) -> Finding:
-        bad = any(event.kind == "blackout" for event in schedule.events)
-        breaches = (Breach(1.5, "collision", "body touched pipe_1"),) if bad else ()
-        return Finding(schedule, breaches, "", 1.0, 2.0, 0, 1)
-
-    monkeypatch.setattr("cloudrc.faults.fuzz.fly", breaking)
-    document = tmp_path / "search.md"
-    flags = ["--seeds", "12", "--store", str(tmp_path), "--document", str(document)]
-    assert main(["faults", "fuzz", *flags]) == 1
-    printed = capsys.readouterr().out
-    assert "| fence breaches | 0 | 12 | p < 0.25 |" in document.read_text()
-    assert "| false alarms | - | 0 | not judged |" in document.read_text()
-    assert "collision: body touched pipe_1" in printed
-    stored = sorted(tmp_path.glob("collision-*.yaml"))
-    assert stored
-    assert [event.kind for event in load(stored[0]).events] == ["blackout"]
-    assert "p <" in printed, "invariants that held have their bound"
-    kept = stored[0].read_text()
-    stored[0].write_text("found in another year")
-    for _ in range(2):
-        assert main(["faults", "fuzz", *flags]) == 1
-        assert stored[0].read_text() == "found in another year"
-        assert stored[0].with_stem(f"{stored[0].stem}-2").read_text() == kept
-        assert len(list(tmp_path.glob("collision-*.yaml"))) == len(stored) + 1
-
-
-def test_a_stored_schedule_is_flown_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "schedule.yaml"
-    path.write_text(dump(Schedule(1, events=(Event("blackout", 2.0, 0.5),), duration=6.0)))
-    assert main(["faults", "replay", str(path)]) == 0
-    assert "passed" in capsys.readouterr().out
 
 
 def test_no_zero_is_told_of_what_was_not_looked_at(capsys: pytest.CaptureFixture[str]) -> None:
