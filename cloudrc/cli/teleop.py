@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.ends import open_exporter, process_arguments
 from cloudrc.cli.extras import require
-from cloudrc.cli.teleop_api import ServedApi, api_address, serve_api
+from cloudrc.cli.teleop_alarm import Alarm
+from cloudrc.cli.teleop_api import ServedApi, api_address, complain, serve_api
+from cloudrc.cli.teleop_reserve import shorten
 
 if TYPE_CHECKING:
     from cloudrc.cloud.teleop.api_bridge import Bridge
@@ -137,7 +139,7 @@ def _fly(
     calls: Calls = list
     stops: Calls = list
     if served is not None:
-        served.open(service, lambda: peer.send(wire.encode(wire.ALARM)))
+        served.open(service, Alarm(lambda: peer.send(wire.encode(wire.ALARM))))
         calls, stops = served.bridge.take, served.bridge.take_urgent
     feed.ready()
 
@@ -187,7 +189,6 @@ def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge | None) -
 def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> MissionService:
     """Remember what the journal has; what is too old to be known is taken out of it."""
     import os
-    from contextlib import suppress
 
     from cloudrc.cloud.teleop.service import MissionService
     from cloudrc.errors import BadInputError
@@ -203,9 +204,9 @@ def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> Mi
             "it written by another one? Move it away, or name another file"
         ) from error
     known = [entry for entry in journal.entries if service.book.knows(entry)]
-    if len(known) < len(journal.entries):
-        with suppress(OSError):  # a full disk: it is done at the next start
-            journal.rewrite(known)
+    if trouble := shorten(journal, known):
+        complain(trouble)
+        journal.trouble = "; ".join(filter(None, (journal.trouble, trouble)))
     return service
 
 

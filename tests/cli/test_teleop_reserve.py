@@ -1,0 +1,292 @@
+"""A journal that has filled its volume: a restart shortens it, in the room of its reserve."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cloudrc.assembly import build_plan
+from cloudrc.cli import teleop
+from cloudrc.cli.main import main
+from cloudrc.cloud.teleop.journal import Journal
+from cloudrc.cloud.teleop.journal_disk import Disk
+from cloudrc.cloud.teleop.journal_format import Entry, parse, to_bytes
+from cloudrc.cloud.teleop.service_book import KEPT, QUEUE_MAX, MissionBook
+from cloudrc.cloud.teleop.service_mission import Order
+from cloudrc.config.load import load_experiment
+from cloudrc.config.shipped import FOLDERS
+
+MIB = 1 << 20
+RESERVE = 2 * MIB
+LEFT = KEPT + 1
+"""Missions: what a mission makes too old is forgotten as that is ordered, not as it ends."""
+HOVER = load_experiment("hover")
+Printed = pytest.CaptureFixture[str]
+
+
+class KilledError(BaseException):
+    """The process is gone: nothing catches it."""
+
+
+class Volume(Disk):
+    """A real folder with no more room than it is given, which refuses and kills as it is told.
+
+    Attributes:
+        room: For all files of the folder [bytes].
+        error: With which it says that there is no more.
+        refused: Which operation fails, on which ending of a name, and with what.
+        steps: How many operations there have been.
+        kill_at: The operation before which the process is killed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.folder, self.room, self.error = folder, 64 * MIB, errno.ENOSPC
+        self.refused: tuple[str, str, int] = ("", "", 0)
+        self.steps, self.kill_at = 0, -1
+
+    @property
+    def used(self) -> int:
+        return sum(path.stat().st_size for path in self.folder.iterdir())
+
+    def _step(self, name: str, path: Path | None = None) -> None:
+        if self.steps == self.kill_at:
+            raise KilledError(name)
+        self.steps += 1
+        which, ending, error = self.refused
+        if name == which and (path is None or path.name.endswith(ending)):
+            raise OSError(error, "refused")
+
+    def open(self, path: Path, *, new: bool = False) -> int:
+        self._step("open", path)
+        return super().open(path, new=new)
+
+    def write(self, file: int, data: bytes) -> int:
+        self._step("write")
+        room = self.room - self.used
+        if room <= 0:
+            raise OSError(self.error, "No space left on device")
+        return super().write(
+            file, data[: min(room, (len(data) + 1) // 2)]
+        )  # as the journal's tests do
+
+    def sync(self, file: int) -> None:
+        self._step("sync")  # what survives the machine is not asked here
+
+    def replace(self, new: Path, path: Path) -> None:
+        self._step("replace", path)
+        super().replace(new, path)
+
+    def remove(self, path: Path) -> None:
+        self._step("remove", path)
+        super().remove(path)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    folder = tmp_path / "volume"
+    folder.mkdir()
+    return folder / "missions.journal"
+
+
+@pytest.fixture
+def reserve(path: Path) -> Path:
+    return path.with_name("missions.journal.reserve")
+
+
+@pytest.fixture
+def volume(path: Path, monkeypatch: pytest.MonkeyPatch) -> Volume:
+    """On which teleop finds its journal, and whatever it puts beside that."""
+    disk = Volume(path.parent)
+    for module in ("journal", "journal_disk"):
+        monkeypatch.setattr(f"cloudrc.cloud.teleop.{module}.Disk", lambda: disk)
+    return disk
+
+
+def over(count: int) -> list[Entry]:
+    """Of so many missions that were cancelled before they began."""
+    entries: list[Entry] = []
+    book, order = MissionBook(entries.append, [], bytes(16)), Order(build_plan(HOVER))
+    for _ in range(count):
+        book.cancel(book.add(order))
+    return entries
+
+
+def start(path: Path) -> str:
+    """Have teleop open its journal, and end; what it says is wrong."""
+    with Journal(path) as journal:
+        teleop._open_service(HOVER, journal)
+        return journal.trouble
+
+
+def fill(path: Path, volume: Volume, count: int = KEPT + 50) -> None:
+    """Have the journal take all the room there is."""
+    volume.room = 64 * MIB
+    with Journal(path) as journal:
+        journal.rewrite(over(count))
+    volume.room = volume.used
+
+
+def missions(path: Path) -> int:
+    return len({entry["mission"] for entry in parse(path.read_bytes()).entries})
+
+
+def names(path: Path) -> set[str]:
+    return {each.name.removeprefix(path.name) for each in path.parent.iterdir()}
+
+
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT])
+def test_a_journal_that_has_filled_its_volume_is_shortened_by_a_restart(
+    error: int, path: Path, reserve: Path, volume: Volume, capsys: Printed
+) -> None:
+    start(path)
+    for _ in range(2):  # as often as it happens
+        fill(path, volume)
+        volume.error = error
+        assert start(path) == ""
+        assert missions(path) == LEFT
+        assert reserve.stat().st_size == RESERVE
+        assert reserve.stat().st_mode & 0o777 == 0o600
+        with Journal(path) as journal:
+            journal.append(over(1)[0])  # there is room again
+    assert names(path) == {"", ".lock", ".reserve"}
+    assert capsys.readouterr().err == ""
+
+
+def test_the_reserve_takes_what_a_start_leaves_of_the_papers_missions() -> None:
+    """Its waypoints are reached, and its missions kept, by entries like these."""
+    entries: list[Entry] = []
+    plan = build_plan(load_experiment("paper"))
+    book = MissionBook(entries.append, [], bytes(16))
+    mission = book.add(Order(plan, "paper", "k" * 36))
+    for event in ("starting", "started", *["reached"] * len(plan.legs), "done"):
+        book.note(mission, event, "waypoint 7 of 7 reached", world="0" * 32)
+    assert 4 * (KEPT + QUEUE_MAX + 1) * len(to_bytes(entries)) < RESERVE
+
+
+def test_the_reserve_is_real_room_and_made_once(path: Path, reserve: Path, volume: Volume) -> None:
+    start(path)
+    before = reserve.stat()
+    assert before.st_blocks * 512 >= RESERVE
+    start(path)
+    after = reserve.stat()
+    assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+
+
+def test_one_that_a_crash_has_left_half_or_that_leads_elsewhere_is_made_anew(
+    path: Path, reserve: Path, volume: Volume
+) -> None:
+    precious = path.parent.with_name("precious")
+    precious.write_bytes(b"precious")
+    reserve.symlink_to(precious)
+    start(path)
+    assert not reserve.is_symlink()
+    assert precious.read_bytes() == b"precious"
+    reserve.write_bytes(bytes(MIB))
+    start(path)
+    assert reserve.stat().st_size == RESERVE
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_where_even_that_does_not_help_it_is_told_and_teleop_goes_on(
+    there: bool, path: Path, reserve: Path, volume: Volume, capsys: Printed
+) -> None:
+    """No reserve was made, or somebody else takes its room."""
+    if there:
+        start(path)
+    fill(path, volume)
+    entries, volume.room = path.read_bytes(), volume.room - RESERVE * there
+    trouble = start(path)
+    assert trouble == (
+        f"{path}: cannot be shortened to the missions still known: No space left on device; "
+        "once it is full no mission can start: free or mend its volume, then restart teleop"
+    )
+    assert capsys.readouterr().err == f"cloudrc teleop: {trouble}\n"
+    assert path.read_bytes() == entries
+    assert names(path) == {"", ".lock"}  # there is more need of the room for what happens now
+    volume.room = 64 * MIB  # somebody does as it says
+    assert start(path) == ""
+    assert missions(path) == LEFT
+    assert reserve.stat().st_size == RESERVE
+
+
+def test_a_journal_that_cannot_be_shortened_is_told_where_all_is_told(
+    path: Path, volume: Volume, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, handlers: None
+) -> None:
+    fill(path, volume)
+    told: list[Any] = []
+    monkeypatch.setattr(teleop, "_fly", lambda *words: told.extend(words))
+    words = ["--socket", str(tmp_path), "--journal", str(path)]
+    assert main(["teleop", "--config", str(FOLDERS["experiment"] / "hover.yaml"), *words]) == 0
+    assert "free or mend its volume" in told[-1]
+
+
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO])
+@pytest.mark.parametrize("operation", ["open", "write", "sync", "remove"])
+def test_no_reserve_stops_nobody(
+    operation: str, error: int, path: Path, reserve: Path, volume: Volume, capsys: Printed
+) -> None:
+    ending = ".reserve" if operation in ("open", "remove") else ""
+    with Journal(path) as journal:
+        journal.rewrite(over(1))
+    volume.refused = (operation, ending, error)
+    with Journal(path) as journal:
+        service = teleop._open_service(HOVER, journal)
+        assert list(service.book.missions) == ["m1"]
+        assert journal.trouble == ""
+    assert not reserve.exists()
+    assert capsys.readouterr().err == (
+        f"cloudrc teleop: {reserve}: refused: without it a restart cannot shorten a journal that "
+        "has filled its volume; free or mend that\n"
+    )
+
+
+def test_a_part_of_a_reserve_takes_no_room_from_the_journal(
+    path: Path, reserve: Path, volume: Volume
+) -> None:
+    volume.room = MIB
+    start(path)
+    assert not reserve.exists()
+
+
+def test_any_other_refusal_gives_no_reserve_up(path: Path, reserve: Path, volume: Volume) -> None:
+    start(path)
+    fill(path, volume)
+    volume.room, volume.refused = 64 * MIB, ("replace", "", errno.EIO)
+    assert "refused; once it is full no mission can start" in start(path)
+    assert reserve.stat().st_size == RESERVE
+
+
+def kills(path: Path, volume: Volume) -> Iterator[int]:
+    """Teleop starts with a full volume and dies, once before its every operation."""
+    at = 0
+    while True:
+        volume.room, volume.kill_at = 64 * MIB, -1
+        start(path)
+        fill(path, volume)
+        volume.steps, volume.kill_at = 0, at
+        try:
+            start(path)
+        except KilledError:
+            volume.kill_at = -1
+            yield at
+        else:
+            return
+        at += 1
+
+
+def test_after_a_kill_at_any_step_the_next_start_ends_with_both(
+    path: Path, reserve: Path, volume: Volume
+) -> None:
+    count = 0
+    for _ in kills(path, volume):
+        assert start(path) == ""
+        assert missions(path) == LEFT
+        assert reserve.stat().st_size == RESERVE
+        assert names(path) == {"", ".lock", ".reserve"}
+        count += 1
+    assert count > 20
