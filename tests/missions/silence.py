@@ -8,6 +8,8 @@ from typing import NamedTuple
 from flying import LIMIT_NS, join
 
 from cloudrc.config.load import load_experiment
+from cloudrc.geometry.clearance import pipe_index
+from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState, Vector
 from cloudrc.records import CommandApplied, Contact, GuardChange, Record
 from cloudrc.world.clock import STEP_NS
@@ -19,13 +21,6 @@ PATIENCE = (
 )
 """So that no limit of time ends a mission that waits for its link."""
 SLOW = ("cloud.controller.speed_max=1.5",)
-FLIGHT_S = 27.0
-"""Until shortly before the board is touched; there the robot presses on it."""
-INSTANTS = [round(1.5 + k * (FLIGHT_S - 1.5) / 199, 3) for k in range(200)]
-"""At which the cloud falls silent, or is killed [s]."""
-DAILY = INSTANTS[13::40]
-"""Those that are not left to the night."""
-REST = [start_s for start_s in INSTANTS if start_s not in DAILY]
 
 
 class Instant(NamedTuple):
@@ -41,6 +36,7 @@ class Silence(NamedTuple):
     """A flight with one silence in it; times [s] since the start of the silence or of the HOLD.
 
     Attributes:
+        pipe: Index of the one that the base was in when the silence began; -1 for none.
         outcome: Of the mission.
         held_after: From the start of the silence to HOLD; None if there was none.
         basis_age: How old what the newest applied command was computed from is at HOLD.
@@ -51,6 +47,7 @@ class Silence(NamedTuple):
         touched: What was touched, but for the board by the arm's tip.
     """
 
+    pipe: int
     outcome: str
     held_after: float | None
     basis_age: float
@@ -68,20 +65,26 @@ def fly_through(
     blackouts = [
         f"link.{way}.blackouts=[{{start_s: {start_s}, duration_s: {duration_s}}}]" for way in ways
     ]
-    ends = join(load_experiment("paper", [*PATIENCE, *blackouts, *settings]))
+    experiment = load_experiment("paper", [*PATIENCE, *blackouts, *settings])
+    ends = join(experiment)
     records: list[Record] = []
     trace: list[Instant] = []
     begin_ns, end_ns = round(start_s * 1e9), round((start_s + duration_s) * 1e9)
     _watch(ends.world.robot, trace, begin_ns)
-    ends.run.fly(lambda: ends.cloud.mission_over, LIMIT_NS, lambda w, c: records.extend(w))
+
+    def over() -> bool:
+        return ends.cloud.mission_over and ends.run.now_ns > end_ns
+
+    ends.run.fly(over, LIMIT_NS, lambda w, c: records.extend(w))
     outcome = ends.cloud.teleop.outcome
     changes = [r for r in records if isinstance(r, GuardChange) and r.stamp_ns >= begin_ns]
     held = next((c for c in changes if c.state is GuardState.HOLD), None)
     contacts = [r for r in records if isinstance(r, Contact)]
     touched = [r.body for r in contacts if r.body != "board" or not r.tip]
     code = outcome.code if outcome else "none"
+    (pipe,) = pipe_index(load_scene(experiment.world.scene), trace[0].position).tolist()
     if held is None or held.cause == "mission ended":
-        return Silence(code, None, 0.0, 0.0, 0.0, None, 0.0, touched)
+        return Silence(pipe, code, None, 0.0, 0.0, 0.0, None, 0.0, touched)
     held_ns = held.stamp_ns
     bases_ns = [
         r.basis_stamp_ns for r in records if isinstance(r, CommandApplied) and r.stamp_ns <= held_ns
@@ -92,6 +95,7 @@ def fly_through(
     still = silent[next((k for k, i in enumerate(silent) if i.position is rest), 0) :]
     back = [c.stamp_ns for c in changes if c.state is GuardState.TRACK and c.stamp_ns > held_ns]
     return Silence(
+        pipe,
         code,
         (held_ns - begin_ns) * 1e-9,
         (held_ns - max(bases_ns)) * 1e-9,

@@ -3,10 +3,13 @@
 from math import hypot
 
 import pytest
-from silence import DAILY, REST, SLOW
+from instants import DAILY, DAILY_ANYWHERE, REST, REST_ANYWHERE, mid_pipe
+from silence import SLOW
 
 from cloudrc.faults import asks
 from cloudrc.faults.flight import Flight
+from cloudrc.geometry.clearance import pipe_index
+from cloudrc.geometry.scene import load_scene
 from cloudrc.records import SessionOpened
 
 AWAY = 3.0
@@ -16,10 +19,20 @@ SAMPLE = 0.01
 
 
 def fly_and_kill(at):
-    """A SIGKILL of cloud; what comes back has nothing of what the one before knew."""
-    flight = Flight(*SLOW)
-    flight.cloud.at(at, lambda now_ns: flight.kill_cloud(now_ns, AWAY))
-    return flight.fly_mission(200.0)
+    """A SIGKILL of cloud; what comes back has nothing of what the one before knew.
+
+    With the index of the pipe that the base was in at the kill, -1 for none.
+    """
+    flight, places = Flight(*SLOW), []
+
+    def kill(now_ns):
+        places.append(flight.robot.simulator.readings.position)
+        flight.kill_cloud(now_ns, AWAY)
+
+    flight.cloud.at(at, kill)
+    flight.fly_mission(200.0)
+    (pipe,) = pipe_index(load_scene(flight.experiment.world.scene), places).tolist()
+    return flight, pipe
 
 
 def calm_after(flight, start, end):
@@ -39,8 +52,8 @@ def greeted_after(flight, back):
     return sum(r.stamp_ns >= back * 1e9 for r in opened)
 
 
-def check_kill(figure, at):
-    flight, back = fly_and_kill(at), at + AWAY
+def check_kill(figure, at, where="anywhere"):
+    (flight, pipe), back = fly_and_kill(at), at + AWAY
     (hold,) = asks.held(flight)
     held = hold.stamp_ns * 1e-9
     basis_age = asks.basis_age_at_hold(flight)
@@ -52,7 +65,7 @@ def check_kill(figure, at):
         ("in TRACK after the new one's start", resumed, 1.0, "s"),
         ("breaches", flight.watch.counts.total(), 0, ""),
     ):
-        figure(f"cloud process killed, 1.5 m/s: {name}", measured, "<=", asked, unit)
+        figure(f"cloud process killed {where}, 1.5 m/s: {name}", measured, "<=", asked, unit)
     assert flight.generations == {"world": 1, "cloud": 2}
     assert greeted_after(flight, back) == 1
     assert at < held <= at + 0.252
@@ -63,15 +76,32 @@ def check_kill(figure, at):
     waypoints = range(len(flight.mission.order.plan.legs))
     assert [event.waypoint for event in flight.events("reached")] == list(waypoints)
     assert flight.mission.state == "done"
+    return pipe
+
+
+def check_kill_mid_pipe(figure, k):
+    at, pipe = mid_pipe(*SLOW)[k]
+    assert check_kill(figure, at, "mid-pipe") == pipe
 
 
 @pytest.mark.promise("P-GUARD-1")
-@pytest.mark.parametrize("at", DAILY)
-def test_when_its_cloud_is_killed_the_robot_stops_and_a_new_one_flies_on(at, figure):
-    check_kill(figure, at)
+@pytest.mark.parametrize("k", DAILY)
+def test_when_its_cloud_is_killed_the_robot_stops_and_a_new_one_flies_on(k, figure):
+    check_kill_mid_pipe(figure, k)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("at", REST)
-def test_killed_at_any_instant_a_new_cloud_flies_on(at, figure):
+@pytest.mark.parametrize("k", REST)
+def test_killed_at_any_instant_a_new_cloud_flies_on(k, figure):
+    check_kill_mid_pipe(figure, k)
+
+
+@pytest.mark.parametrize("at", DAILY_ANYWHERE)
+def test_killed_outside_of_the_pipes_a_new_cloud_flies_on_too(at, figure):
+    assert check_kill(figure, at) == -1
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("at", REST_ANYWHERE)
+def test_killed_anywhere_a_new_cloud_flies_on(at, figure):
     check_kill(figure, at)

@@ -2,18 +2,37 @@
 
 import pytest
 from flying import fly, join, numbers
-from silence import BOTH, DAILY, INSTANTS, PATIENCE, REST, SLOW, fly_through
+from instants import (
+    ANYWHERE,
+    COUNT,
+    DAILY,
+    DAILY_ANYWHERE,
+    REST,
+    REST_ANYWHERE,
+    mid_pipe,
+    undisturbed,
+)
+from silence import BOTH, PATIENCE, SLOW, fly_through
 
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState
 from cloudrc.records import Control, GuardChange, MissionEvent
 
 LONG = ("guard.hold_max_s=100",)
-FEW = (INSTANTS[71], INSTANTS[115])
-"""Those that are not left to the night, uncapped."""
+FEW = (13, 133)
+"""Those of the instants in the pipes that are not left to the night, uncapped."""
 
 
-def check_minute(figure, start_s, calm_within, *settings):
+@pytest.mark.parametrize(
+    ("settings", "of_each"), [(SLOW, [47, 51, 102]), ((), [41, 48, 111])], ids=["1.5", "uncapped"]
+)
+def test_all_of_the_200_instants_are_in_a_pipe(settings, of_each):
+    pipes = [pipe for _, pipe in mid_pipe(*settings)]
+    assert len(pipes) == COUNT
+    assert [pipes.count(pipe) for pipe in range(3)] == pytest.approx(of_each, abs=2)
+
+
+def check_minute(figure, start_s, calm_within, *settings, where="anywhere"):
     """Both directions fall silent for a minute, as if the cloud were gone; yet it lives on.
 
     In test_cloud_kills.py it does not.
@@ -27,7 +46,8 @@ def check_minute(figure, start_s, calm_within, *settings):
         ("in TRACK after the link's return", silence.resumed_after, 1.0, "s"),
         ("touched but the board by the tip", len(silence.touched), 0, ""),
     ):
-        figure(f"cloud silent for a minute, {speed}: {name}", measured, "<=", asked, unit)
+        text = f"cloud silent for a minute {where}, {speed}: {name}"
+        figure(text, measured, "<=", asked, unit)
     assert silence.outcome == "done"
     assert silence.touched == []
     # Of the newest command that was applied: not before the limit, and within a tick after it.
@@ -36,35 +56,68 @@ def check_minute(figure, start_s, calm_within, *settings):
     assert silence.calm_after <= calm_within
     assert silence.drift <= 0.10
     assert silence.resumed_after <= 1.0
+    return silence
+
+
+def check_minute_mid_pipe(figure, k, calm_within, *settings):
+    start_s, pipe = mid_pipe(*settings)[k]
+    silence = check_minute(figure, start_s, calm_within, *settings, where="mid-pipe")
+    assert silence.pipe == pipe
 
 
 @pytest.mark.promise("P-GUARD-1")
-@pytest.mark.parametrize("start_s", DAILY)
-def test_without_its_cloud_the_robot_stops_within_a_second_and_stays(start_s, figure):
-    check_minute(figure, start_s, 1.0, *SLOW)
+@pytest.mark.parametrize("k", DAILY)
+def test_without_its_cloud_the_robot_stops_within_a_second_and_stays(k, figure):
+    check_minute_mid_pipe(figure, k, 1.0, *SLOW)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("start_s", REST)
-def test_without_its_cloud_the_robot_stops_at_any_instant(start_s, figure):
+@pytest.mark.parametrize("k", REST)
+def test_without_its_cloud_the_robot_stops_at_any_instant(k, figure):
+    check_minute_mid_pipe(figure, k, 1.0, *SLOW)
+
+
+@pytest.mark.parametrize("start_s", DAILY_ANYWHERE)
+def test_without_its_cloud_the_robot_stops_outside_of_the_pipes_too(start_s, figure):
+    assert check_minute(figure, start_s, 1.0, *SLOW).pipe == -1
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("start_s", REST_ANYWHERE)
+def test_without_its_cloud_the_robot_stops_anywhere(start_s, figure):
     check_minute(figure, start_s, 1.0, *SLOW)
 
 
 def test_a_hold_of_almost_a_minute_is_resumed_as_any_other():
-    silence = fly_through(INSTANTS[71], 59.5, *SLOW)
+    silence = fly_through(ANYWHERE[71], 59.5, *SLOW)
     assert (silence.outcome, silence.touched) == ("done", [])
     assert silence.drift <= 0.10
     assert silence.resumed_after <= 1.0
 
 
-@pytest.mark.parametrize("start_s", FEW)
-def test_uncapped_it_takes_a_little_longer(start_s, figure):
-    check_minute(figure, start_s, 1.4)
+def test_after_a_silence_too_late_to_keep_a_mission_from_its_end_the_robot_holds():
+    silence = fly_through(undisturbed(*SLOW).end_ns * 1e-9 - 0.02, 60.5, *LONG, *SLOW)
+    assert (silence.outcome, silence.touched) == ("done", [])
+    assert 0.250 < silence.basis_age <= 0.252 + 1e-9
+    assert silence.calm_after <= 1.0
+    assert silence.drift <= 0.10
+    assert silence.resumed_after is None
+
+
+@pytest.mark.parametrize("k", FEW)
+def test_uncapped_it_takes_a_little_longer(k, figure):
+    check_minute_mid_pipe(figure, k, 1.4)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("start_s", [s for s in INSTANTS if s not in FEW])
-def test_uncapped_it_takes_a_little_longer_at_any_instant(start_s, figure):
+@pytest.mark.parametrize("k", [k for k in range(COUNT) if k not in FEW])
+def test_uncapped_it_takes_a_little_longer_at_any_instant(k, figure):
+    check_minute_mid_pipe(figure, k, 1.4)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("start_s", ANYWHERE)
+def test_uncapped_it_takes_a_little_longer_anywhere(start_s, figure):
     check_minute(figure, start_s, 1.4)
 
 
