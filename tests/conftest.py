@@ -6,6 +6,7 @@ import gc
 import os
 import signal
 from collections.abc import Callable, Iterator
+from math import nan
 
 import pytest
 
@@ -47,8 +48,14 @@ def figure(request: pytest.FixtureRequest) -> Callable[..., None]:
     """
 
     def note(
-        name: str, measured: float, relation: str, asked: float, unit: str = "", count: int = 1
+        name: str,
+        measured: float | None,
+        relation: str,
+        asked: float,
+        unit: str = "",
+        count: int = 1,
     ) -> None:
+        measured = nan if measured is None else measured  # what did not happen is never as asked
         row = figures.note(request.node.nodeid, name, measured, relation, asked, unit, count)
         assert figures.holds(row), f"{name}: {measured:g} {unit}, asked {relation} {asked:g} {unit}"
 

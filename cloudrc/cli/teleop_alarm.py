@@ -36,6 +36,7 @@ class Alarm:
         """Send it, now or as soon as cloud takes it."""
         with self._lock:
             if self._send():
+                self._until = 0.0  # once is enough
                 return
             self._until = time.monotonic() + REPEAT_LIMIT
             if self._repeats:
@@ -54,5 +55,5 @@ class Alarm:
         """Wait, then try again; say whether it has to be tried once more."""
         time.sleep(period)
         with self._lock:  # whoever asks meanwhile finds a thread that goes on, or none
-            self._repeats = not self._send() and time.monotonic() < self._until
+            self._repeats = time.monotonic() < self._until and not self._send()
             return self._repeats

@@ -32,6 +32,12 @@ chart's volume has 64 MiB, of which the audit log may take 16.
 FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
+def room(folder: Path) -> int:
+    """How much a folder's volume has left for this user [bytes]."""
+    volume = os.statvfs(folder)
+    return volume.f_bavail * volume.f_frsize
+
+
 def shorten(journal: Journal, known: Sequence[Entry], disk: Disk | None = None) -> str:
     """Leave in the journal what is known alone, also on a full disk; keep room for the next time.
 
@@ -108,11 +114,13 @@ class Reserve:
         """Make it, unless it is there and whole.
 
         Raises:
-            OSError: If the disk refuses; there is none then.
+            OSError: If the disk refuses, or has no more room than entries need; there is none then.
         """
         if self._size() == RESERVE_SIZE:
             return
         self._disk.remove(self.path)  # one that a crash has left, or whatever a link leads to
+        if room(self.path.parent) < 2 * RESERVE_SIZE:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         file = self._disk.open(self.path, new=True)
         try:
             # Not zeros, nor a hole: a disk that compresses would keep no room for those.

@@ -3,87 +3,31 @@
 from __future__ import annotations
 
 import errno
+import shutil
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
+from small_volume import MIB, KilledError, Volume
 
 from cloudrc.assembly import build_plan
-from cloudrc.cli import teleop
+from cloudrc.cli import teleop, teleop_reserve
 from cloudrc.cli.main import main
 from cloudrc.cloud.teleop.journal import Journal
-from cloudrc.cloud.teleop.journal_disk import Disk
 from cloudrc.cloud.teleop.journal_format import Entry, parse, to_bytes
 from cloudrc.cloud.teleop.service_book import KEPT, QUEUE_MAX, MissionBook
 from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
 
-MIB = 1 << 20
-RESERVE = 2 * MIB
+RESERVE = MIB // 8
+"""In the place of the real one, so that a journal need not be long to take as much room."""
 LEFT = KEPT + 1
 """Missions: what a mission makes too old is forgotten as that is ordered, not as it ends."""
 HOVER = load_experiment("hover")
 Printed = pytest.CaptureFixture[str]
-
-
-class KilledError(BaseException):
-    """The process is gone: nothing catches it."""
-
-
-class Volume(Disk):
-    """A real folder with no more room than it is given, which refuses and kills as it is told.
-
-    Attributes:
-        room: For all files of the folder [bytes].
-        error: With which it says that there is no more.
-        refused: Which operation fails, on which ending of a name, and with what.
-        steps: How many operations there have been.
-        kill_at: The operation before which the process is killed.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__()
-        self.folder, self.room, self.error = folder, 64 * MIB, errno.ENOSPC
-        self.refused: tuple[str, str, int] = ("", "", 0)
-        self.steps, self.kill_at = 0, -1
-
-    @property
-    def used(self) -> int:
-        return sum(path.stat().st_size for path in self.folder.iterdir())
-
-    def _step(self, name: str, path: Path | None = None) -> None:
-        if self.steps == self.kill_at:
-            raise KilledError(name)
-        self.steps += 1
-        which, ending, error = self.refused
-        if name == which and (path is None or path.name.endswith(ending)):
-            raise OSError(error, "refused")
-
-    def open(self, path: Path, *, new: bool = False) -> int:
-        self._step("open", path)
-        return super().open(path, new=new)
-
-    def write(self, file: int, data: bytes) -> int:
-        self._step("write")
-        room = self.room - self.used
-        if room <= 0:
-            raise OSError(self.error, "No space left on device")
-        return super().write(
-            file, data[: min(room, (len(data) + 1) // 2)]
-        )  # as the journal's tests do
-
-    def sync(self, file: int) -> None:
-        self._step("sync")  # what survives the machine is not asked here
-
-    def replace(self, new: Path, path: Path) -> None:
-        self._step("replace", path)
-        super().replace(new, path)
-
-    def remove(self, path: Path) -> None:
-        self._step("remove", path)
-        super().remove(path)
 
 
 @pytest.fixture
@@ -102,11 +46,14 @@ def reserve(path: Path) -> Path:
 def volume(path: Path, monkeypatch: pytest.MonkeyPatch) -> Volume:
     """On which teleop finds its journal, and whatever it puts beside that."""
     disk = Volume(path.parent)
+    monkeypatch.setattr(teleop_reserve, "RESERVE_SIZE", RESERVE)
+    monkeypatch.setattr(teleop_reserve, "room", lambda folder: max(disk.room - disk.used, 0))
     for module in ("journal", "journal_disk"):
         monkeypatch.setattr(f"cloudrc.cloud.teleop.{module}.Disk", lambda: disk)
     return disk
 
 
+@cache
 def over(count: int) -> list[Entry]:
     """Of so many missions that were cancelled before they began."""
     entries: list[Entry] = []
@@ -123,7 +70,7 @@ def start(path: Path) -> str:
         return journal.trouble
 
 
-def fill(path: Path, volume: Volume, count: int = KEPT + 50) -> None:
+def fill(path: Path, volume: Volume, count: int = KEPT + 900) -> None:
     """Have the journal take all the room there is."""
     volume.room = 64 * MIB
     with Journal(path) as journal:
@@ -165,7 +112,7 @@ def test_the_reserve_takes_what_a_start_leaves_of_the_papers_missions() -> None:
     mission = book.add(Order(plan, "paper", "k" * 36))
     for event in ("starting", "started", *["reached"] * len(plan.legs), "done"):
         book.note(mission, event, "waypoint 7 of 7 reached", world="0" * 32)
-    assert 4 * (KEPT + QUEUE_MAX + 1) * len(to_bytes(entries)) < RESERVE
+    assert 4 * (KEPT + QUEUE_MAX + 1) * len(to_bytes(entries)) < teleop_reserve.RESERVE_SIZE
 
 
 def test_the_reserve_is_real_room_and_made_once(path: Path, reserve: Path, volume: Volume) -> None:
@@ -245,12 +192,21 @@ def test_no_reserve_stops_nobody(
     )
 
 
-def test_a_part_of_a_reserve_takes_no_room_from_the_journal(
+def test_no_reserve_takes_the_room_that_entries_need(
     path: Path, reserve: Path, volume: Volume
 ) -> None:
-    volume.room = MIB
+    for room in (RESERVE // 2, RESERVE, 2 * RESERVE - 1):  # entries need room, too
+        volume.room = room
+        start(path)
+        assert not reserve.exists()
+    volume.room = 2 * RESERVE + volume.used
     start(path)
-    assert not reserve.exists()
+    assert reserve.stat().st_size == RESERVE
+
+
+def test_how_much_room_there_is(tmp_path: Path) -> None:
+    free = shutil.disk_usage(tmp_path).free
+    assert teleop_reserve.room(tmp_path) == pytest.approx(free, abs=free / 10)
 
 
 def test_any_other_refusal_gives_no_reserve_up(path: Path, reserve: Path, volume: Volume) -> None:

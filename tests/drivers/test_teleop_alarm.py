@@ -157,6 +157,25 @@ class _Clock:
         self.monotonic, self.sleep = (lambda: now[0]), sleep
 
 
+def test_what_was_taken_meanwhile_is_not_said_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    tries: list[bool] = []
+
+    def send() -> bool:
+        tries.append(bool(tries))  # the first one is refused
+        return tries[-1]
+
+    asked = threading.Event()
+    monkeypatch.setattr(teleop_alarm, "time", _Clock([100.0], lambda seconds: asked.wait(5.0)))
+    alarm = Alarm(send)
+    alarm()
+    (repeats,) = threads()
+    alarm()
+    asked.set()
+    repeats.join(5.0)
+    assert not repeats.is_alive()
+    assert tries == [False, True]
+
+
 def test_where_there_can_be_no_thread_the_caller_goes_on(
     peers: Peers, monkeypatch: pytest.MonkeyPatch
 ) -> None:

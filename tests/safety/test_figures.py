@@ -49,7 +49,9 @@ def test_a_number_that_was_missed_fails_its_test(figure: Callable[..., None]) ->
     figure("accepted", 0, "==", 0)
     with pytest.raises(AssertionError, match=r"HOLD after: 0.253 s, asked <= 0.252 s"):
         figure("HOLD after", 0.253, "<=", 0.252, "s")
-    assert [row["name"] for row in figures.read()] == ["HOLD after", "accepted"]
+    with pytest.raises(AssertionError, match=r"resumed after: nan s"):
+        figure("resumed after", None, "<=", 1.0, "s")
+    assert [row["name"] for row in figures.read()] == ["HOLD after", "accepted", "resumed after"]
 
 
 def test_what_other_sources_have_measured_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
