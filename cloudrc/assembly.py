@@ -35,7 +35,8 @@ CRUISE_SPEED = 1.0
 SETTLE_TIME = 4.0
 """Expected for a leg's beginning and end [s]."""
 LEG_PATIENCE = 3.0
-"""A leg that takes so many times what is expected has failed [1]. Source: fault F28."""
+"""A leg fails after this multiple of its expected time [1].
+Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
 """Number on board of the mission of a cloud that flies no other."""
 FENCE_SPAN = dist(fence.LOW, fence.HIGH)

@@ -14,7 +14,8 @@ from cloudrc.records_link import LinkChanged as LinkChanged
 from cloudrc.records_link import LinkChecked as LinkChecked
 
 REAL_TIME_FACTOR_MIN = 0.95
-"""Below it a run that was to be in real time is invalid. Source: DESIGN, section 9."""
+"""Below it a run that was to be in real time is invalid [1].
+Source: docs/reference/control.md, "Real-time factor"."""
 
 
 class TelemetrySent(NamedTuple):

@@ -204,6 +204,7 @@ def _counts(kind: str, parts: Sequence[Document]) -> tuple[int, int]:
 
 def _judge(looked_at: int, broken: int) -> Document:
     """One invariant: in how many flights it was looked at, and in how many it broke."""
-    # Source: the rule of three: 0 events in N runs, p < 3/N with 95 % confidence.
+    # Rule of three: 0 events in N runs mean p < 3/N with 95 % confidence.
+    # Source: J. A. Hanley, A. Lippman-Hand, JAMA 249(13), 1983.
     bound = min(3.0 / looked_at, 1.0) if looked_at and not broken else None
     return {"judged": looked_at, "broken": broken if looked_at else None, "bound": bound}

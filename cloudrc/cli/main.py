@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Without the program's name; default: those of this process.
 
     Returns:
-        The exit code; the design's table of codes is in `cloudrc --help`.
+        The exit code; `cloudrc --help` lists the codes.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:

@@ -24,7 +24,7 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
     The k-th smallest and the k-th largest of n values enclose the median with probability
     1 - 2 * sum_{i<k} C(n, i) / 2^n; k is the largest for which that is at least 95 %.
 
-    Source: H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., section 7.1.
+    Source: H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., 2003, section 7.1.
 
     Returns:
         Lower and upper bound, or None for fewer than 6 values, which cannot tell.

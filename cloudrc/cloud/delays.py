@@ -13,7 +13,7 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.messages import NEVER_NS, Telemetry
 
 HORIZON_MAX = 1.0
-"""A prediction over more than this is a guess [s]. Source: design, section 2."""
+"""Longest horizon of a prediction [s]. Source: docs/reference/control.md, "Predictors"."""
 
 
 class DelayMeter:

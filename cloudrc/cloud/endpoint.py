@@ -27,7 +27,7 @@ from cloudrc.tunnel.session import NO_EPOCH
 from cloudrc.tunnel.unsealed import make_session
 
 PERIOD_NS = 10_000_000
-"""Source: control.md, commands at 100 Hz."""
+"""Time between two commands [ns]. Source: docs/reference/plant.md, "Commands"."""
 HELLO_PERIOD_NS = 100_000_000
 GIVE_UP_NS = 5_000_000_000
 """A robot that has not been told in so long that its mission is over will not be told."""

@@ -24,8 +24,8 @@ from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Teleme
 from cloudrc.records import Control, Fault
 
 FREEZE_NS = 400_000_000
-"""An echo that is silent for longer than horizon and this freezes the reference [ns].
-Source: DESIGN, section 5."""
+"""An echo that is silent for longer than the horizon and this freezes the reference [ns].
+Source: docs/reference/plant.md, "Frozen reference"."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 _new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
 

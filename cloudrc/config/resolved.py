@@ -15,7 +15,8 @@ from cloudrc.config.fields import CommandAge, Speed
 from cloudrc.config.schema import Cloud, Direction, Experiment, Guard, Mission, PlugIn
 
 COMMAND_AGE_MAX_MS = 250.0
-"""Where neither the experiment nor the profile says [ms]. Source: DESIGN, section 5."""
+"""Default where neither the experiment nor the profile says [ms].
+Source: docs/reference/plant.md, "Command age"."""
 
 
 def speed_cap(command_age_max_ms: float) -> float:
@@ -23,7 +24,7 @@ def speed_cap(command_age_max_ms: float) -> float:
 
     It flies on for `command_age_max_ms` [ms] and 0.2 s, then brakes at 3 m/s^2:
     v (T + 0.2) + v^2 / 6 = 8.7 m.
-    Source: DESIGN, section 5.
+    Source: docs/reference/plant.md, "Speed cap".
     """
     blind = command_age_max_ms * 1e-3 + 0.2
     return round(3.0 * (sqrt(blind * blind + 8.7 / 1.5) - blind), 6)

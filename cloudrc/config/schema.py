@@ -98,7 +98,7 @@ class Mission(Section):
 
 
 class LowLevel(Section):
-    """Onboard velocity and attitude loops (plant.md: the published gains at the true dt)."""
+    """Onboard velocity and attitude loops: the published gains at the true dt."""
 
     gain_p: tuple[NotNegative, NotNegative, NotNegative] = Field(
         (4.0, 4.0, 10.0), description="Per axis [N/(m/s)]"

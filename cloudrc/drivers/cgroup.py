@@ -27,8 +27,8 @@ class Throttling(NamedTuple):
 def read_throttling(root: Path = ROOT) -> Throttling | None:
     """Read the counts; None where the kernel keeps none, as outside of containers.
 
-    Source: Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
-    scheduler/sched-bwc.rst (throttled_time of version 1, in ns) of the Linux kernel.
+    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
+    Documentation/scheduler/sched-bwc.rst (throttled_time of version 1, in ns).
     """
     for name in STATS:
         try:

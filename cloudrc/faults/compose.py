@@ -105,7 +105,10 @@ def _event(kind: str, rng: np.random.Generator) -> Event:
 
 
 def _swizzle(rng: np.random.Generator) -> list[Event]:
-    """Freeze everything one by one, let it go in random order. Source: FoundationDB."""
+    """Freeze everything one by one, let it go in random order.
+
+    Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
+    """
     things = [("blackout", "up"), ("blackout", "down"), ("cloud_paused", "both")]
     things.append(("world_paused", "both"))
     starts = float(rng.uniform(1.0, 35.0)) + np.cumsum(rng.uniform(0.05, 0.8, 4))

@@ -93,7 +93,7 @@ def _hasty(outcome: Outcome, seed: int, shape: Shape, age_max: float, least: flo
         tempt=tempting(_to_and_fro),
     ).fly(40.0)
     asks.safe(outcome, flight)
-    # Source: DESIGN, section 5: v (command_age_max + 0.2) + v^2/6 = 8.7 m.
+    # Source: docs/reference/plant.md, "Speed cap": v (command_age_max + 0.2) + v^2/6 = 8.7 m.
     reaction = age_max + 0.2
     cap = 3.0 * (sqrt(reaction * reaction + 2.0 * 8.7 / 3.0) - reaction)
     what = f"at full speed, commands of up to {age_max:g} s:"

@@ -30,7 +30,10 @@ class Span(NamedTuple):
 
 
 def _spans(seed: int) -> dict[str, Span]:
-    """Freeze the things one by one, let them go in random order. Source: FoundationDB."""
+    """Freeze the things one by one, let them go in random order.
+
+    Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
+    """
     rng, count = generator(seed, 40), len(THINGS)
     starts = instant(seed) + np.cumsum(rng.uniform(0.1, 1.0, count))
     ends = rng.permutation(starts[-1] + np.cumsum(rng.uniform(0.1, 1.5, count)))

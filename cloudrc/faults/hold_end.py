@@ -20,22 +20,26 @@ from cloudrc.messages import ZERO, Cause, Command, GuardState, Vector
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 RESUME_COMMANDS = 10
 RESUME_NS = 500_000_000
-"""So many fresh commands within so long end a HOLD [ns]. Source: DESIGN, section 5."""
+"""RESUME_COMMANDS fresh commands within this time end a HOLD [ns].
+Source: docs/reference/plant.md, "Leaving HOLD"."""
 SETTLE_NS = 1_000_000_000
-"""From one TRACK to the next, and from one HOLD to the next [ns]. Source: fault F5."""
+"""Least time from one TRACK to the next, and from one HOLD to the next [ns].
+Source: docs/reference/faults.md, "F5"."""
 INVALID_COMMANDS = 5
 INVALID_NS = 1_000_000_000
-"""So many impossible commands within so long make the robot land [ns]. Source: fault F23."""
+"""INVALID_COMMANDS impossible commands within this time make the robot land [ns].
+Source: docs/reference/faults.md, "F23"."""
 INVALID = ("range", "future")
 """Why the guard refuses those."""
 GROUND_NS = 10_000_000_000
-"""On the ground a mission's first command is waited for so long at least [ns]. Source:
-docs/safety/guard.md."""
+"""Least time for which a robot on the ground waits for a mission's first command [ns].
+Source: docs/safety.md, "Guard"."""
 RAMP = 3.0
-"""By so much the reference grows after a HOLD at most [m/s^2]. Source: DESIGN, section 5."""
+"""Largest growth of the reference after a HOLD [m/s^2].
+Source: docs/reference/plant.md, "Leaving HOLD"."""
 RAMP_MIN = 1.0
-"""For so long at least [s], and for as long as it takes to the cap. Source:
-docs/safety/guard.md."""
+"""The reference grows slowly for at least this time, and until it may reach the cap [s].
+Source: docs/safety.md, "Guard"."""
 SLACK = 1e-9
 """For rounding [m/s]."""
 

@@ -12,7 +12,8 @@ GROUND, _, HOLD, LAND, ESTOP = GuardState
 PERIOD_NS = 10_000_000
 """Of odometry, by which a contact is told [ns]: it began within so long before its stamp."""
 BRAKES_NS = 200_000_000
-"""Within which a descent is stopped that the operator has acknowledged [ns]; DESIGN's 0.2 s."""
+"""Time within which a descent that the operator has acknowledged is stopped [ns].
+Source: docs/reference/plant.md, "Stop rule"."""
 
 
 def seen_now(world: Any) -> tuple[GuardState, str]:

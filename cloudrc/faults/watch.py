@@ -41,7 +41,7 @@ REST = 0.5
 """So much farther than its way to a stop a robot that is left alone may go [m]: it swings back. In
 200 flights of the search, half of them under a hostile cloud, it was 0.20 at most."""
 FALL_MAX = 1.5
-"""How far outside the fence people are told to stay [m]. Source: docs/safety/guard.md."""
+"""How far outside the fence people are told to stay [m]. Source: docs/safety.md, "Guard"."""
 
 
 class Breach(NamedTuple):
@@ -285,7 +285,7 @@ class Watch:
 def stops(speed: float, below: float, above: float) -> bool:
     """Say whether the robot can stop before the face that it flies towards.
 
-    Source: DESIGN, section 5: 0.2 v + v^2/6 <= distance - 0.1.
+    Source: docs/reference/plant.md, "Stop rule": 0.2 v + v^2/6 <= distance - 0.1.
 
     Args:
         speed: Component of the velocity along an axis [m/s].

@@ -1,7 +1,9 @@
 """How near the robot is to the pipes: poses go in, distances to the nearest wall come out.
 
 A pipe is taken as the ideal hollow cylinder with flat ends, not as the staves that the physics
-collides with: those deviate by up to 3.2 mm (control.md, section 6).
+collides with: those deviate by up to 3.2 mm.
+
+Source: docs/reference/plant.md, "Staves".
 """
 
 from __future__ import annotations

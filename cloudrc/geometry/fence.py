@@ -6,7 +6,8 @@ from cloudrc.messages import Vector
 
 LOW: Vector = (-3.0, -8.5, 0.0)
 HIGH: Vector = (9.2, 5.5, 2.5)
-"""Corners of the box, base position [m], world frame. Source: plant.md, "Fence of the guard"."""
+"""Corners of the box, base position [m], world frame.
+Source: docs/reference/plant.md, "Fence of the guard"."""
 FLOOR_MARGIN = 0.35
 """Lower than this above the fence's floor no position is held [m]: parts of a tilted robot would
 touch the ground, or scrape along it."""

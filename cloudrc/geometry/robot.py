@@ -1,6 +1,6 @@
 """The robot as points in its body frame, and where they are when it is somewhere.
 
-Source of all sizes: plant.md, "Robot" and "key points for clearance".
+Source: docs/reference/plant.md, "Robot", "Key points for clearance".
 """
 
 from __future__ import annotations

@@ -69,7 +69,8 @@ def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
 def uniforms(key: StreamKey, purpose: Purpose, block: int) -> NDArray[np.float64]:
     """Draw independent uniform variates for the 256 packets of a block.
 
-    Source: Philox 4x64-10, Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
+    Source: J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011:
+    Philox 4x64-10.
 
     Returns:
         Variates in the open interval (0, 1), read-only, shape (256,).

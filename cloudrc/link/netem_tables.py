@@ -4,7 +4,7 @@ netem draws an entry of a table of up to 16,384 and multiplies it by the jitter;
 and 16 bits end at 4. tc's own tables are not ours (see `fates.shape`), and it has none for the
 uniform distribution, without which a qdisc cannot go back to uniform once it had another.
 
-Source: iproute2 netem/README.distribution, linux net/sched/sch_netem.c (tabledist).
+Source: iproute2 netem/README.distribution, Linux, net/sched/sch_netem.c (tabledist).
 """
 
 from __future__ import annotations

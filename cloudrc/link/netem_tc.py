@@ -102,7 +102,7 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
 def may_shape(status: str) -> bool:
     """Say whether a process is root with NET_ADMIN, from the text of its /proc/PID/status.
 
-    Source: linux include/uapi/linux/capability.h, CAP_NET_ADMIN is bit 12.
+    Source: Linux, include/uapi/linux/capability.h: CAP_NET_ADMIN is bit 12.
     """
     uid = re.search(r"^Uid:\s+\d+\s+(\d+)", status, re.MULTILINE)
     effective = re.search(r"^CapEff:\s+([0-9a-fA-F]+)", status, re.MULTILINE)

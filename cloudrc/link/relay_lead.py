@@ -10,7 +10,7 @@ from __future__ import annotations
 LEAD_MAX_NS, FIRST_LEAD_MAX_NS = 60_000, 150_000
 """Longest look at the clock, each time [ns]: of an ordinary thread, and of one under SCHED_FIFO.
 
-Source: measured; later wakes are of another kind: other programs', or other machines'.
+Later wakes have other causes than the timer: other programs, or other virtual machines.
 """
 SHARE_MAX, FIRST_SHARE_MAX = 0.05, 0.10
 """Largest share of a core that goes into looking at the clock, in [0, 1], of either."""

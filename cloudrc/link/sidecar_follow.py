@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 PROFILE_PERIOD = 0.05
 """How often the profile's file is looked at [s]."""
 PEER_PAUSE = (0.5, 1.0)
-"""After so long the peer's name is resolved again [s]: by chance, so that the links of many
-releases do not ask their name server at once. Source: fault F19."""
+"""Shortest and longest pause until the peer's name is resolved again [s]: it is random, so that the
+links of many releases do not ask their name server at once.
+Source: docs/reference/faults.md, "F19"."""
 
 
 class Loaded(NamedTuple):

@@ -45,8 +45,8 @@ class Numbers:
         correlation: Of the delay of one packet with that of the next [1].
         loss: Share that did not arrive, in [0, 1].
         runs: Losses in a row, one entry per run.
-        overtaken: Share of those that arrived after one that was sent later, in [0, 1]. Source: RFC
-            4737 section 3.
+        overtaken: Share of those that arrived after one that was sent later, in [0, 1].
+            Source: RFC 4737, section 3.
         duplicated: Share of those of which two copies arrived, in [0, 1].
     """
 

@@ -24,7 +24,8 @@ UNREAD_SHARE = 0.003
 """If it has left more than this share of what was sent unread, it does not get its CPU."""
 THROTTLED_SHARE, CPU_PERIOD = 0.01, 0.1
 """Stopped in so few periods [1], of so long each [s], a shaper is as good as never stopped; what is
-late is so by at most the root of the one times the other. Source: Linux, cpu.cfs_period_us."""
+late is so by at most the root of the one times the other. Source: Linux,
+Documentation/scheduler/sched-bwc.rst, cpu.cfs_period_us."""
 _NOTHING = 0.15
 """Share of the delay asked for below which nothing shapes."""
 

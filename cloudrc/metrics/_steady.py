@@ -9,8 +9,8 @@ from cloudrc.metrics._flight import Flight
 WINDOW_NS = 5_000_000_000
 """The last part of the flight, over which it is averaged [ns]."""
 SETTLING_NS = 10_000_000_000
-"""How long the setpoint must have stood still before that [ns]. Source: control.md, section 3:
-the slowest of the published variants that settle at all takes 8-15 s to stay within 1 cm."""
+"""How long the setpoint must have stood still before that [ns]. Source: docs/reference/control.md,
+"Steady state": the slowest variant that settles needs 8 to 15 s to stay within 1 cm."""
 
 
 def steady_error(flight: Flight, axis: int) -> float | None:

@@ -3,7 +3,7 @@
 RMS over all commands applied. It holds the predictor and the delay estimate to account together:
 a command acts at the instant of its application, whatever instant it was computed for.
 
-Source: the design's measurements, "error against the truth at the instant the command is applied".
+Source: docs/reference/control.md, "Predictors".
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
 """Distance between the setpoint and the measurement that cloud used: RMS.
 
-Source: the paper's error figure. It is dominated by how far away the next waypoint is, and says
-nothing about how accurate the estimate is; for that read estimate_error_rms.
+It is dominated by how far away the next waypoint is, and says nothing about how accurate the
+estimate is; for that read estimate_error_rms.
+
+Source: the paper, error figure.
 """
 
 from __future__ import annotations

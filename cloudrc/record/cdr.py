@@ -86,7 +86,7 @@ def shifted(data: bytes, offset_ns: int) -> bytes:
 def _rotate(orientation_wxyz: Quaternion, vector: Vector) -> Vector:
     """Turn a vector from the body frame to the world frame: v + 2 u x (u x v + w v).
 
-    Source: Rodrigues' formula for the unit quaternion (w, u).
+    This is Rodrigues' formula for the unit quaternion (w, u).
     """
     w, x, y, z = orientation_wxyz
     a, b, c = vector

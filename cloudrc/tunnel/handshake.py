@@ -55,8 +55,8 @@ BUSY, CHALLENGE, OPERATOR = int(Kind.BUSY), int(Kind.CHALLENGE), int(Kind.OPERAT
 
 EPOCH_MAX = 2**32 - 1
 ANSWERS_MAX = 10
-"""Answers in any second to hellos with a cookie; as many challenges. Source: 20 together, as
-WireGuard's handshakes per second and address."""
+"""Answers in any second to hellos with a cookie; challenges have the same limit.
+Source: WireGuard, 20 handshakes per second and address: both limits together."""
 SECOND_NS = 1_000_000_000
 CHALLENGE_NS = SECOND_NS // 10
 """Between two challenges [ns]; spread over the second, so that none waits long for the next."""

@@ -46,9 +46,10 @@ TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {ACCEPT}
 
 AES_256_GCM, CHACHA20_POLY1305 = 1, 2
 REKEY_NS = 120_000_000_000
-"""Source: WireGuard's REKEY-AFTER-TIME."""
+"""Age at which a sender changes its key [ns]. Source: WireGuard, REKEY-AFTER-TIME."""
 REKEY_DATAGRAMS = 2**32
-"""Of all kinds. Deviation: WireGuard's 2^60; the design asks for 2^32."""
+"""Datagrams of all kinds after which a sender changes its key.
+Deviation: WireGuard allows 2^60."""
 LOOKS = 3
 """In a row at which the peer is heard with the key before, until this end goes back to it."""
 

@@ -8,7 +8,8 @@ skips a tick, and a stalled machine gives a slow world, not a jumping one.
 from __future__ import annotations
 
 STEP_NS = 2_000_000
-"""One tick of physics, low-level controller and guard [ns]. Source: plant.md, 500 Hz."""
+"""One tick of physics, low-level controller and guard [ns].
+Source: docs/reference/plant.md, "Physics step"."""
 STEP = STEP_NS * 1e-9
 """The same [s]."""
 CATCH_UP_NS = 50_000_000

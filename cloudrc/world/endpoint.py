@@ -43,7 +43,7 @@ from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 
 ODOMETRY_PERIOD_NS = 10_000_000
-"""Source: plant.md, 100 Hz."""
+"""Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""
 COUNT_PERIOD_NS = TEND_PERIOD_NS = 1_000_000_000
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # an enum's member is slow to look up
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period

@@ -22,8 +22,6 @@ is GROUND: its rotors stop, the mission goes on, for 60 s without the cloud as i
 A command is fresh while its *basis*, the odometry it was computed from, is at most
 `command_age_max` old. HOLD after a mission's end lasts as long as the operator likes: there a robot
 waits for the next one. HOLD within a mission does not: who should end it may be gone.
-Deviation: DESIGN, section 5 has one tiny module; these are five, so that rules, rest, hits and
-limits are proven and tested without the states.
 """
 
 from __future__ import annotations
@@ -43,13 +41,16 @@ GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # an enum's member is slow to loo
 
 RESUME_COMMANDS = 10
 RESUME_NS = 500_000_000
-"""So many fresh commands within so long end a HOLD [ns]. Source: DESIGN, section 5."""
+"""RESUME_COMMANDS fresh commands within this time end a HOLD [ns].
+Source: docs/reference/plant.md, "Leaving HOLD"."""
 SETTLE_NS = 1_000_000_000
-"""Least time from one HOLD to the next, and from one TRACK to the next [ns]. Source: fault F5."""
+"""Least time from one HOLD to the next, and from one TRACK to the next [ns].
+Source: docs/reference/plant.md, "Settling time"; docs/reference/faults.md, "F5"."""
 INVALID_COMMANDS = 5
 IMPOSSIBLE = f"{INVALID_COMMANDS} impossible commands within 1 s"
 INVALID_NS = 1_000_000_000
-"""So many impossible commands within so long end in LAND [ns]. Source: fault F23."""
+"""INVALID_COMMANDS impossible commands within this time end in LAND [ns].
+Source: docs/reference/faults.md, "F23"."""
 
 
 class Guard:

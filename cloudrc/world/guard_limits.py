@@ -21,8 +21,8 @@ RAMP_MIN = 1.0
 """Out of HOLD the reference is led slowly for so long at least [s]."""
 RANGE = 1000.0
 """Largest number of a command that is shortened to a cap, not refused [m/s, rad/s]: no controller
-asks a robot for more. One that does has a bug, and its direction is as wrong as its length. Source:
-threat T12, which has 1e308 refused; fault F23, which has what is over the cap shortened."""
+asks a robot for more. One that does has a bug, and its direction is as wrong as its length.
+Source: docs/reference/faults.md, "F23"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,8 @@ class Limits:
         """How long the reference grows by no more than BRAKE after a HOLD [ns]: to the cap.
 
         By time alone: the first commands after a silence rest, and a ramp that ended where the
-        reference has caught up with them would be none. Source: DESIGN, section 5.
+        reference has caught up with them would be none.
+        Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
 

@@ -23,7 +23,7 @@ LEAD, LEAST_SHARE = 1.0, 0.2
 STILL = 0.1
 """Slower than this the robot counts as come to rest [m/s]."""
 LAND_SPEED = 0.5
-"""Of the descent [m/s]. Source: DESIGN, section 5."""
+"""Speed of the descent [m/s]. Source: docs/reference/plant.md, "Landing"."""
 STILL_SHARE = 0.2
 """A descent slower than this share of its speed stands, where that is below STILL: with a low cap
 every descent is slower than STILL, and would count as touched down in the air."""

@@ -13,17 +13,19 @@ from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Vector
 
 BRAKE = 3.0
-"""Deceleration that the robot is sure to reach [m/s^2]. Source: DESIGN, section 5."""
+"""Deceleration that the robot is sure to reach [m/s^2].
+Source: docs/reference/plant.md, "Stop rule"."""
 REACTION = 0.2
-"""Time until it does [s]. Source: likewise."""
+"""Time until it does [s]. Source: docs/reference/plant.md, "Stop rule"."""
 STOPPING_DISTANCE = 8.7
-"""Within which the fastest allowed speed has to be stopped [m]. Source: likewise."""
+"""Distance within which the robot stops from the speed cap [m].
+Source: docs/reference/plant.md, "Speed cap"."""
 SIXTH = 1.0 / (2.0 * BRAKE)
 CAUTION, MARGIN = 0.6, 0.2
 """At the fence v has to keep CAUTION v + v^2/6 <= distance - MARGIN [s], [m]. At the floor with
 FLOOR_MARGIN instead, and there REACTION is enough, since the robot climbs readily.
-Deviation: DESIGN, section 5 has 0.2 s and 0.1 m. So late follows the low-level controller that a
-cloud which does its worst gets the robot 0.3 m beyond the fence with these."""
+Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With these a hostile cloud
+gets the robot 0.3 m beyond the fence, because the low-level controller follows late."""
 FAR = 1e6
 """Farther than this [m] a face limits nothing."""
 GLIMPSE, GLIMPSE_NS = 0.25, 10_000_000

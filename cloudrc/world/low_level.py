@@ -3,8 +3,7 @@
 A velocity PID gives the force that the robot needs; geometric attitude control turns the thrust
 axis towards it; the allocation splits thrust and torque over four rotors. Plain floats: it runs at
 every physics step.
-Source: plant.md, "LLC", which restates the published controller (after Lee, Leok and McClamroch,
-"Geometric tracking control of a quadrotor UAV on SE(3)", CDC 2010).
+Source: docs/reference/plant.md, "Low-level controller".
 Deviation: the published code takes dt = 10 ms while it is called every 2 ms; here dt is the true
 one and the gains are those that the published code then has in effect.
 """
@@ -19,13 +18,17 @@ from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.rotors import ARM, SPEED_MAX, THRUST_COEFFICIENT, TORQUE_RATIO
 
 MASS = 1.05
-"""What the controller believes [kg]; the robot has 1.06. Source: plant.md, "LLC"."""
+"""Mass that the controller assumes [kg]; the robot has 1.06.
+Source: docs/reference/plant.md, "Total mass"."""
 GRAVITY = 9.81
-"""What the controller believes [m/s^2]; the physics has 9.8066. Source: plant.md, "Robot"."""
+"""Gravity that the controller assumes [m/s^2]; the physics has 9.8066.
+Source: docs/reference/plant.md, "Gravity"."""
 TILT_GAIN, YAW_GAIN = 1.0, 0.035
-"""k_R: torque per attitude error about x and y, about z [N m]. Source: plant.md, "LLC"."""
+"""k_R: torque per attitude error about x and y, about z [N m].
+Source: docs/reference/plant.md, "Low-level controller"."""
 TILT_RATE_GAIN, YAW_RATE_GAIN = 0.22, 0.01
-"""k_w: torque per angular velocity, likewise [N m s]. Source: plant.md, "LLC"."""
+"""k_w: torque per angular velocity about x and y, about z [N m s].
+Source: docs/reference/plant.md, "Low-level controller"."""
 THRUST_MAX = THRUST_COEFFICIENT * SPEED_MAX**2
 """Of one rotor [N]."""
 TINY = 1e-9
@@ -107,7 +110,7 @@ class LowLevel:
         """Compute the force that the robot needs, and move the integral on by one `dt`.
 
         e = v - v_ref;  F = -(Kp e + Ki int(e dt) + Kd de/dt) + (0, 0, m g), int(e dt) clamped.
-        Source: plant.md, "LLC".
+        Source: docs/reference/plant.md, "Low-level controller".
 
         Args:
             velocity: [m/s], world frame, shape (3,).
@@ -148,7 +151,7 @@ def attitude(force: Vector, readings: Readings) -> Effort:
     z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
     e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R e_R + k_w w); thrust = F . (R z).
     Worked out in the body frame, where the vectors wanted are the rows of Q.
-    Source: plant.md, "LLC", with yaw and yaw rate reference 0.
+    Source: docs/reference/plant.md, "Low-level controller", with yaw and yaw rate reference 0.
     Deviation: where a hit has turned the robot by more than 17 degrees, the tilt is corrected about
     the axes that it has now: e_R steers it half the yaw error aside, and beyond 90 degrees the
     wrong way.
@@ -192,7 +195,7 @@ def allocate(effort: Effort) -> RotorSpeeds:
 
     f = T/4 + (-ty/2l + tz/4km, tx/2l - tz/4km, ty/2l + tz/4km, -tx/2l - tz/4km) for front, left,
     back, right; w = sqrt(f/kf), within [0, 1838 rad/s].
-    Source: plant.md, "LLC".
+    Source: docs/reference/plant.md, "Low-level controller".
 
     Args:
         effort: Thrust [N] and torque [N m], body frame, shape (4,).

@@ -3,7 +3,7 @@
 Plain floats; this runs at every physics step. Order of the rotors everywhere: front (+x), left
 (+y), back, right. Front and back give a positive reaction torque about z for their thrust, left and
 right a negative one.
-Source: plant.md, "Robot", which restates the RotorS model of the paper's world.
+Source: docs/reference/plant.md, "Robot".
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Rotors:
         axis. With body velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h) that part is
         (u + q h - r y, v + r x - p h). Summed over x = (l, 0, -l, 0), y = (0, l, 0, -l):
         torque = sum of r x F = (-h Fy, h Fx, sum of x Fy - y Fx).
-        Source: plant.md, "rotor speed", "rotor drag"; the RotorS motor model.
+        Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
 
         Args:
             commands: [rad/s], shape (4,).

@@ -18,7 +18,8 @@ ROBOT_PREFIX = "robot/"
 ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
 """Names of a robot's actuators, in the order of every tuple of four."""
 TIMESTEP = 0.002
-"""The one that the onboard part runs at [s]. Source: plant.md, "LLC"."""
+"""Step of the physics and of the onboard part [s].
+Source: docs/reference/plant.md, "Physics step"."""
 FOLDER = Path(__file__).parent
 _NO_GL = {"", "disable", "disabled", "off", "false", "0"}
 

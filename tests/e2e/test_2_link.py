@@ -50,7 +50,7 @@ LIMIT_MEMORY = 320 * 2**20
 WINDOWS = 3
 """Over which the cost is measured; the least counts, since what else runs only adds to it."""
 TOLERANCE = 0.002
-"""Of a mean one-way delay [s]. Source: issue, "Numbers it must reach"."""
+"""Of a mean one-way delay [s]."""
 MEANS = {"paper-p1": 0.020, "paper-p3": 0.070, "paper-p2": 0.045}
 """Profile -> mean delay of each direction [s]; the last one is what the release began with."""
 MEASURED = {"paper-p1": 8.0, "paper-p2": 10.0, "paper-p3": 20.0}

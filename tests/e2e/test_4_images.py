@@ -11,7 +11,7 @@ from kube import command
 from cloudrc import __version__
 
 SIZES = {"world": 420, "cloud": 320}
-"""At most, uncompressed [MB]. Source: issue, "What must be there"."""
+"""At most, uncompressed [MB]."""
 LOOK = """\
 import json, os, shutil
 from importlib.util import find_spec

@@ -13,7 +13,7 @@ from cloudrc.config.load import load_experiment
 from tests.missions.flying import fly, numbers
 
 CONTACT_TOLERANCE = 0.05
-"""Of the contact time, against the virtual run. Source: issue, "Numbers it must reach"."""
+"""Of the contact time, against the virtual run, as a share of it."""
 DELAY, DELAY_TOLERANCE = 0.045, 0.002
 """Of the paper's second profile, each way [s]."""
 

@@ -60,7 +60,7 @@ def test_distance_changes_no_faster_than_the_point(
 def test_clearance_on_the_axis_is_that_of_the_plant(
     height: float, expected: tuple[float, ...]
 ) -> None:
-    """Source: control.md, section 1, yaw 0."""
+    """Source: docs/reference/plant.md, "Clearance on the axis", yaw 0."""
     at = [(x, y, height) for x, y, _ in (pipe.centre for pipe in PIPES.pipes)]
     found = clearance(PIPES, at, [LEVEL] * 3)
     assert found == pytest.approx(expected, abs=2e-3)
@@ -70,7 +70,10 @@ def test_clearance_on_the_axis_is_that_of_the_plant(
 
 
 def test_clearance_turns_with_the_robot() -> None:
-    """Along the pipe every pipe leaves .320. Source: control.md, section 1."""
+    """Along the pipe every pipe leaves .320.
+
+    Source: docs/reference/plant.md, "Clearance on the axis".
+    """
     for pipe in PIPES.pipes:
         yaw = math.atan2(pipe.axis[1], pipe.axis[0])
         facing = (math.cos(yaw / 2), 0, 0, math.sin(yaw / 2))

@@ -20,7 +20,7 @@ def test_pipes_are_those_of_the_plant() -> None:
          (-1, 1)]
         for pipe in scene.pipes
     ]  # fmt: skip
-    # Source: plant.md, "Scene".
+    # Source: docs/reference/plant.md, "Scene".
     expected = [
         [(-1, 2.5, 0.8), (-1, -2.5, 0.8)],
         [(-0.8334, -2.8682, 0.8), (2.7534, -6.3518, 0.8)],

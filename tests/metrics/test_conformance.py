@@ -26,7 +26,8 @@ PROMISED = {
     *("tracking_rms_estimated", "hold_count", "real_time_factor", "world_lateness_p99"),
     "cloud_lateness_p99",
 }
-"""Names that others build on. Source: DESIGN, section 9."""
+"""Names that others build on.
+Source: docs/reference/control.md, "Names that others use"."""
 
 
 def flight_of(recording: Recording) -> Flight:

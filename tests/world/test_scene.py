@@ -1,4 +1,7 @@
-"""Robot and scene hold to plant.md: masses, pipes, board, contact, and bad files are refused."""
+"""Robot and scene have the masses, pipes, board and contact of docs/reference/plant.md.
+
+Bad files are refused.
+"""
 
 from math import pi, sin, tan
 from xml.etree import ElementTree

@@ -1,6 +1,6 @@
 """Controller: predicted odometry and setpoint come in, a velocity command goes out.
 
-Source: eqs. (4) and (5) of the paper; gains of the published code (plant.md, "Cloud controller").
+Source: the paper, eqs. (4) and (5); gains: docs/reference/plant.md, "Cloud controller".
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Pid(Controller):
         The three terms returned are those before the limits, so they sum to the velocity only
         while no limit holds it. The integral is that of the errors before this one.
 
-        Source: eq. (5).
+        Source: the paper, eq. (5).
 
         Args:
             estimate: Predicted position [m] and velocity [m/s], world frame.
@@ -142,7 +142,7 @@ def build(
 ) -> Pid:
     """Make the controller; the defaults are the published gains.
 
-    Source: plant.md, "Cloud controller": P .8, .8, 1.5; I 0; D 0; no saturation.
+    Source: docs/reference/plant.md, "Cloud controller": P .8, .8, 1.5; I 0; D 0; no saturation.
 
     Args:
         gain_p: Per axis [1/s], shape (3,).

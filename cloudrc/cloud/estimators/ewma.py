@@ -1,7 +1,7 @@
 """Delay estimator: loop delays come in, their exponentially weighted average goes out.
 
-Source: control.md, section 4: a gain of 0.05 follows a step of the delay three times as well as
-eq. (1) and is no worse under constant conditions.
+Source: docs/reference/control.md, "Delay estimators": a gain of 0.05 follows a step of the delay
+three times as well as the paper, eq. (1), and is no worse at a constant delay.
 """
 
 from __future__ import annotations

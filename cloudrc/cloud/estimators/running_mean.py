@@ -1,6 +1,6 @@
 """Delay estimator: the loop delays so far come in, their mean goes out.
 
-Source: eq. (1) of the paper.
+Source: the paper, eq. (1).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class RunningMean(Estimator):
     def update(self, sample: DelaySample) -> None:
         """Add one loop delay [s]: mean += (sample - mean) / (k + 1), k samples before it.
 
-        Source: eq. (1) as printed; tau_n is `loop_delay`, the hold on the robot included.
+        Source: the paper, eq. (1), as printed; tau_n is `loop_delay`, with the hold on the robot.
         """
         self._count += 1
         self._mean += (sample.loop_delay - self._mean) / self._count

@@ -1,6 +1,6 @@
 """Delay estimator: a running mean of the loop delay that stops slowing down after 500 samples.
 
-Source: the authors' published controller. It speaks of a window of 500 samples, but computes a
+Source: the authors' published code. It speaks of a window of 500 samples, but computes a
 mean whose gain 1/(k+1) stays at 1/500 from then on: an exponential average.
 """
 

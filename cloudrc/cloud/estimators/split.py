@@ -1,7 +1,7 @@
 """Delay estimator: the age of this very odometry plus the average delay of the way back.
 
-Source: control.md, section 4, "split": the best of those compared, because the jitter of the
-uplink is measured per packet and only that of the downlink has to be guessed.
+Source: docs/reference/control.md, "Delay estimators": the best of those compared, because it
+measures the jitter of the uplink per packet and has to guess only that of the downlink.
 
 No synchronised clocks are needed. With `offset` = cloud's clock minus world's,
 

@@ -1,8 +1,9 @@
 """Rotation ahead in time, shared by the predictors: orientation and body rate in, orientation out.
 
-Source: q(t + tau) = q(t) * exp(omega tau / 2), exact while the body's angular velocity is constant
-(Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, eq. 101 and 214). The paper
-says only "similarly the orientation".
+q(t + tau) = q(t) * exp(omega tau / 2), exact while the body's angular velocity is constant. The
+paper says only "similarly the orientation".
+
+Source: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, eqs. (101), (214).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Predictor: odometry and the last command come in; where that command leads goes out.
 
-Source: the authors' published controller, which multiplies the delay with the velocity that it
-commanded last, not with the measured one of the paper's eq. (3).
+Source: the authors' published code, which multiplies the delay with the velocity that it commanded
+last, not with the measured one of the paper, eq. (3).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class CommandedVelocity(Predictor):
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Move a sample ahead: p + u tau; the velocity stays as measured.
 
-        Source: the published code; the orientation by its measured rate, as in the others.
+        Source: the authors' published code; the orientation by its measured rate, as in the others.
 
         Args:
             odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.

@@ -1,7 +1,7 @@
 """Predictor: odometry comes in; where it leads at the acceleration of late goes out.
 
-Source: eq. (3) of the paper with its acceleration, which is taken here from recent velocities;
-control.md, section 4, predictor (d).
+Source: the paper, eq. (3), with its acceleration, taken here from recent velocities;
+docs/reference/control.md, "Predictors", (d).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class ConstantAcceleration(Predictor):
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Move a sample ahead: p + v tau + a tau^2 / 2, v + a tau.
 
-        Source: eq. (3b) for the velocity.
+        Source: the paper, eq. (3b), for the velocity.
         Deviation: eq. (3a) as printed has no acceleration in the position.
 
         Args:

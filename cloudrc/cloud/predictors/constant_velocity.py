@@ -1,6 +1,6 @@
 """Predictor: odometry comes in; where it leads at constant velocity goes out.
 
-Source: eqs. (2) and (3) of the paper, in its text.
+Source: the paper, eqs. (2) and (3).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class ConstantVelocity(Predictor):
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Move a sample ahead: p + v tau, v + a tau with a = 0.
 
-        Source: eq. (3a); (3b) with zero acceleration, which the robot does not measure.
+        Source: the paper, eq. (3a); eq. (3b) with zero acceleration, as the robot measures none.
 
         Args:
             odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.

@@ -1,6 +1,6 @@
 """Predictor: odometry comes in and goes out as it is, as if nothing moved on the way.
 
-Source: none; the baseline that the others have to beat.
+Source: docs/reference/control.md, "Predictors", (a): the baseline for the others.
 """
 
 from __future__ import annotations

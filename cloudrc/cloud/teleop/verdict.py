@@ -14,9 +14,10 @@ from typing import Any, Literal
 from cloudrc.cloud.teleop.messages import Outcome, Seen
 
 REAL_TIME_FACTOR_MIN = 0.95
-"""Below it the simulated robot was slower than its network. Source: DESIGN, section 9."""
+"""Below it the simulated robot was slower than its network [1].
+Source: docs/reference/control.md, "Real-time factor"."""
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
-"""Source: DESIGN, section 9."""
+"""Exit code of each outcome. Source: docs/reference/control.md, "Exit codes"."""
 AWAY = -1
 """In place of a slip [ns]: world has not been seen yet by this process."""
 

@@ -28,9 +28,10 @@ KILL = "import resource; resource.prlimit(1, resource.RLIMIT_CPU, (1, 1))"
 """SIGKILL of a container's first process from within, which no other process in it may send: the
 kernel does once the CPU time of a process [s] is over its limit, and cloud's has long been."""
 ENDS_IN = 2.0
-"""For a pod that is asked to end, and its robot to hold [s]. Source: fault F33."""
+"""Time for a pod that is asked to end, and for its robot to hold [s].
+Source: docs/reference/faults.md, "F33"."""
 COMMANDS_IN = 2.0
-"""For a new cloud to command [s]. Source: fault F13."""
+"""Time for a new cloud to command [s]. Source: docs/reference/faults.md, "F13"."""
 POD_START = 10.0
 """Kubernetes' own part of it where the image is on the node [s], for a pod that ends at the end of
 its grace, too: from the pod's deletion to the flight 6.3 to 9.5 s were measured on kind with 2 CPUs

@@ -20,7 +20,8 @@ from cloudrc.tunnel.codec import Direction
 RATE = 10_000
 """Datagrams of garbage per second."""
 FLOOD_SECONDS = "CLOUDRC_FLOOD_SECONDS"
-"""Variable of the environment that says for how long [s]; the specification's F20 asks for 600."""
+"""Environment variable with the length of the flood [s].
+Source: docs/reference/faults.md, "F20", asks for 600 in the full run."""
 COUNTED_AFTER = 3.0
 """A datagram is counted as lost behind 128 newer ones, and counts are told once a second [s]."""
 
