@@ -1,9 +1,10 @@
 """Finds plug-ins: a kind and a configuration name go in, what its `build` makes comes out.
 
 A plug-in is one file with a function `build(**parameters)`; the file's name is its configuration
-name. Three places are searched: the kind's package here, where files that start with an underscore
-are no plug-ins; installed packages that name one in the entry-point group `cloudrc.<kind>`; and,
-for a name that is a path or ends in `.py`, that file.
+name. (A metric has no `build`: see `cloudrc.metrics`.) Three places are searched: the kind's
+package here, where files that start with an underscore are no plug-ins; installed packages that
+name one in the entry-point group `cloudrc.<kind>`; and, for a name that is a path or ends in `.py`,
+that file.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
     "predictors": "cloudrc.cloud.predictors",
     "controllers": "cloudrc.cloud.controllers",
-    "metrics": "cloudrc.metrics",
+    "metrics": "",
 }
-"""Kind of plug-in -> the package whose files are plug-ins of it."""
+"""Kind of plug-in -> the package whose files are plug-ins of it; metrics ship as rows of tables."""
 
 
 def names(kind: str) -> list[str]:
@@ -131,6 +132,8 @@ def _build(kind: str, name: str) -> Callable[..., Any]:
 def _shipped(kind: str) -> list[str]:
     if kind not in PACKAGES:
         raise BadInputError(unknown("kind of plug-in", kind, list(PACKAGES)))
+    if not PACKAGES[kind]:
+        return []
     package = importlib.import_module(PACKAGES[kind])
     return [
         module.name

@@ -253,6 +253,7 @@ def _report(
     digest = messages_sha256(mission.contents.messages)
     run = replace(Run("cluster", shaper(folder), digest), interrupted=interrupted)
     try:
-        return write_report(folder, mission.recording(), experiment, run)
+        own = experiment.report.metrics  # measured here: the pods need no such file
+        return write_report(folder, mission.recording(), experiment, run, own=own)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))

@@ -164,7 +164,8 @@ def _report(
     from cloudrc.report.write import write_report
 
     try:
-        return write_report(folder, recording, experiment, run, page=page)
+        own = experiment.report.metrics
+        return write_report(folder, recording, experiment, run, own=own, page=page)
     except KeyboardInterrupt:
         raise InterruptedRunError(
             f"interrupted; the recording is kept, the report is not written: "

@@ -59,11 +59,15 @@ def describe_all(kind: str) -> dict[str, str]:
 
     if kind in PLUGINS:
         lines = {name: plugins.describe(kind, name) for name in plugins.names(kind)}
+        if kind == "metrics":
+            from cloudrc.metrics import SHIPPED
+
+            lines |= {metric.name: metric.meaning for metric in SHIPPED.values()}
     else:
         one = kind.removesuffix("s")
         describe = shipped.describe if kind in YAML else _comment
         lines = {name: describe(one, name) for name in shipped.names(one)}
-    return {name: _plain(line, kind) for name, line in lines.items()}
+    return {name: _plain(line, kind) for name, line in sorted(lines.items())}
 
 
 def _plain(line: str, kind: str) -> str:

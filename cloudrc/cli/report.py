@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from cloudrc.cli.extras import require
@@ -12,12 +13,21 @@ from cloudrc.errors import BadInputError
 EPILOG = """\
 examples:
   cloudrc report runs/latest
+  cloudrc report runs/latest --metric ./overshoot.py
   cloudrc report runs/paper-local-seed1-1 -o json"""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
+    parser.add_argument(
+        "--metric",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="measure by this Python file too; may be repeated (files that the run's own"
+        " configuration names are not run)",
+    )
     output_argument(parser)
 
 
@@ -26,10 +36,16 @@ def execute(options: argparse.Namespace) -> int:
     require("a report", ("record", "report"))
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
+    from cloudrc import metrics
     from cloudrc.cli.closing import exit_code, show
     from cloudrc.report.write import read_run, write_report
 
-    document = write_report(options.run, *read_run(options.run))
+    metrics.check(options.metric)
+    recording, experiment, run = read_run(options.run)
+    # The run may come from somebody else: nothing that it names is run.
+    missed = metrics.not_measured(experiment.report.metrics, options.metric)
+    run = replace(run, notes=(*run.notes, *missed))
+    document = write_report(options.run, recording, experiment, run, own=options.metric)
     if options.output != "table":
         print(written(document, options.output))
     else:

@@ -98,11 +98,13 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> int:
+    from cloudrc import metrics
     from cloudrc.cli.closing import exit_code, show
     from cloudrc.cli.folder import discard, new_folder, point_latest_to
     from cloudrc.config.load import load_experiment
 
     experiment = load_experiment(options.experiment, overrides)
+    metrics.check(experiment.report.metrics)
     # What is wrong with the place is said before a folder is made for the run.
     flight = _in_cluster(experiment, options) if mode == "cluster" else _here(experiment, mode)
     name = experiment.name

@@ -29,10 +29,13 @@ def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
 
     Who interrupts gets the table of the seeds that are finished; so does who loses a worker.
     """
+    from cloudrc import metrics
     from cloudrc.config.load import load_experiment
 
     # Loaded here too: a mistake is told once, not N times.
-    name = load_experiment(options.experiment, overrides).name
+    loaded = load_experiment(options.experiment, overrides)
+    metrics.check(loaded.report.metrics)
+    name = loaded.name
     folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds")
     seeds = range(1, options.seeds + 1)
     reports: list[dict[str, Any]] = []

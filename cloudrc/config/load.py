@@ -105,12 +105,13 @@ def _load_experiment(
     if any(change.path in (("link",), ("link", "profile")) for change in before):
         _forget_profile(document)
     overrides.apply(document, before)
-    for key in ("world", "guard", "link", "cloud"):
+    for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
     found = [*_inline_mission(document), *_inline_profile(document)]
     overrides.apply(document, [change for change in changes if change.inside_name])
     for key in parameters.KINDS:
         _default(document, ("cloud", key), Experiment().cloud.model_dump()[key])
+    parameters.locate_metrics(document)
     found += [*plug_ins(document), *_resolve_traces(document, ("link",))]
     found += _check_files(document)
     experiment = _validate(document, ResolvedExperiment, name, found)

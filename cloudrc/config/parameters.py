@@ -54,6 +54,19 @@ def leave(document: Document) -> list[Problem]:
     return []
 
 
+def locate_metrics(document: Document) -> None:
+    """Make the paths of the user's metrics absolute, and one name a list; nothing is imported."""
+    names = document.get("report", "metrics")
+    names = [names] if isinstance(names, str) else names
+    if not isinstance(names, list):
+        return  # missing, or left to the schema
+    document.tree["report"]["metrics"] = names
+    for index, name in enumerate(names):
+        if isinstance(name, str) and plugins.is_path(name):
+            source = document.source(("report", "metrics", str(index)))
+            names[index] = str(source.absolute(name))
+
+
 def build(kind: str, choice: PlugIn) -> Any:
     """Build the plug-in that a resolved experiment names, with the types that its `build` asks for.
 

@@ -46,6 +46,7 @@ __all__ = [
     "Mission",
     "PlugIn",
     "Profile",
+    "Report",
     "Sensors",
     "Steps",
     "Tunnel",
@@ -200,6 +201,16 @@ class Criteria(Section):
     time_limit_s: Limit = Field(60.0, description="Since the mission began [s]")
 
 
+class Report(Section):
+    """What the report of a run has beside the shipped and the installed metrics."""
+
+    metrics: tuple[str, ...] = Field(
+        (),
+        description="Your own metrics, measured by `cloudrc run`: paths of Python files, or names "
+        "that have to be installed",
+    )
+
+
 class Experiment(Section):
     """One experiment file."""
 
@@ -218,3 +229,4 @@ class Experiment(Section):
     link: Link = Link()
     cloud: Cloud = Cloud()
     criteria: Criteria = Criteria()
+    report: Report = Report()

@@ -20,7 +20,7 @@ import numpy as np
 
 from cloudrc.messages import GuardState, Vector
 from cloudrc.metrics import Flight, Number
-from cloudrc.metrics._contact import first_touch
+from cloudrc.metrics.mission import first_touch
 from cloudrc.records import REAL_TIME_FACTOR_MIN
 
 SLIP_MAX = 0.25

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -61,19 +62,26 @@ class _Before(BaseModel):
     notes: tuple[str, ...] = ()
 
 
-def assess(recording: Recording, experiment: ResolvedExperiment, run: Run) -> Assessment:
+def assess(
+    recording: Recording,
+    experiment: ResolvedExperiment,
+    run: Run,
+    own: Iterable[str] = (),
+) -> Assessment:
     """Measure and judge a run; nothing is written and no picture drawn.
 
     Args:
         recording: Of both ends, on world's clock.
-        experiment: That was flown.
+        experiment: That was flown. The metrics that it names are not run: it may come from
+            somebody else.
         run: What the recording does not say.
+        own: The user's own metrics, names or paths; they are run.
     """
     mission = experiment.mission
     waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
     scene = load_scene(experiment.world.scene)
     flight = Flight(recording, experiment.criteria, waypoints, scene)
-    numbers, troubles = measure_all(flight)
+    numbers, troubles = measure_all(flight, own)
     torn = not recording.complete
     verdict = judge(
         flight,
@@ -102,6 +110,7 @@ def write_report(
     experiment: ResolvedExperiment,
     run: Run,
     *,
+    own: Iterable[str] = (),
     page: bool = True,
 ) -> dict[str, Any]:
     """Write report.json and environment.json, and report.html with its figures.
@@ -111,6 +120,7 @@ def write_report(
         recording: Of both ends, on world's clock.
         experiment: That was flown.
         run: What the recording does not say.
+        own: The user's own metrics, as for `assess`.
         page: Whether to draw figures and page; the numbers are written in any case.
 
     Returns:
@@ -120,7 +130,7 @@ def write_report(
         MissingPrerequisiteError: If the page is wanted and matplotlib is not installed; the numbers
             are written before.
     """
-    assessment = assess(recording, experiment, run)
+    assessment = assess(recording, experiment, run, own)
     write_json(folder / "report.json", assessment.document)
     environment = environment_document()
     write_json(folder / "environment.json", environment)

@@ -39,6 +39,8 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
         ("--set cloud.predictr=last_sample", 2, "predictor"),
         ("--set cloud.predictor=kalmann", 2, "last_sample"),
         ("--set link.uplink.loss=1.2", 2, "loss"),
+        ("--set report.metrics=./no.py", 2, "no.py': there is no such file"),
+        ("--set report.metrics=duratoin", 2, "did you mean duration?"),
         ("--set nonsense", 2, "key=value"),
     ],
 )

@@ -90,8 +90,9 @@ def ending(api: FakeApi, kind: str, exit_code: int, message: str) -> Callable[[]
 def test_a_flight_leaves_what_a_run_leaves(
     pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "two.py").write_text("UNIT = '1'\ndef measure(flight):\n    return 2.0\n")
     at_look(pods, 2, ending(pods, "Complete", 0, "mission done"))
-    code = main([*LINE, "--out", "out"])
+    code = main([*LINE, "--out", "out", "--set", "report.metrics=./two.py"])
     captured = capsys.readouterr()
     assert "waypoint 1 of 1 reached" in captured.err
     report = json.loads(captured.out)
@@ -100,6 +101,7 @@ def test_a_flight_leaves_what_a_run_leaves(
     assert (report["mode"], report["shaper"]) == ("cluster", "relay")
     assert report["complete"]
     assert report["numbers"]["waypoints_reached"]["value"] == 1
+    assert report["numbers"]["two"]["value"] == 2.0, "measured here, not in a pod"
     left = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"config.yaml", "mission.mcap", "report.json", "environment.json"} <= left
     assert {"world.mcap", "cloud.mcap", "world-link.metrics", "cloud-teleop.log"} <= left

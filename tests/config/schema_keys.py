@@ -28,6 +28,7 @@ SPECIAL: dict[str, Any] = {
     "cloud.predictor.name": "last_sample",
     "cloud.controller": "pid",
     "cloud.controller.name": "pid",
+    "report.metrics": ["duration"],
 }
 
 

@@ -235,6 +235,17 @@ def test_another_profile_on_a_resolved_file_brings_its_own_limits(tmp_path: Path
     assert (again.guard.command_age_max_ms, again.guard.speed_max_mps) == (250.0, 6.0)
 
 
+def test_paths_of_metrics_are_relative_to_their_file_or_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine.yaml").write_text("report: {metrics: [a.py, duration]}")
+    monkeypatch.chdir("/")
+    mine = load_experiment(tmp_path / "mine.yaml", ["report.metrics.2=./b.py"])
+    assert mine.report.metrics == (str(tmp_path / "a.py"), "duration", "/b.py")
+    assert again(mine, tmp_path) == mine
+    assert load_experiment("paper", ["report.metrics=b.py"]).report.metrics == ("/b.py",)
+
+
 def test_a_heading_that_would_not_be_flown_is_refused() -> None:
     with pytest.raises(BadInputError, match="holds yaw at 0"):
         load_experiment("paper", ["mission.waypoints.2.yaw_deg=90"])

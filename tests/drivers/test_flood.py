@@ -19,9 +19,10 @@ import pytest
 from cloudrc.config.schema import Criteria
 from cloudrc.faults.toll import REFUSED
 from cloudrc.geometry.scene import load_scene
-from cloudrc.metrics import Flight, hold_count
-from cloudrc.metrics._link import SENT, SETTLING_NS, loss
-from cloudrc.metrics._wakes import wakes
+from cloudrc.metrics import Flight
+from cloudrc.metrics.control import wakes
+from cloudrc.metrics.link import SENT, SETTLING_NS, loss
+from cloudrc.metrics.mission import hold_count
 from cloudrc.record.columns import Recording
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
@@ -147,7 +148,7 @@ def check_flood(folder: Path, figure: Callable[..., None]) -> float:
     calm, stormy = fly(folder / "calm", flooded=False), fly(folder / "stormy", flooded=True)
     flight, sent = stormy.flight, stormy.sent
     counted = refused(flight) / sent
-    losses, count = [loss(flight, topic) for topic in SENT], honest(flight)
+    losses, count = [loss(flight, way) for way in SENT], honest(flight)
     print(f"p99 {done_p99(calm) * 1e3:.2f} ms calm, {done_p99(stormy) * 1e3:.2f} ms flooded;"
           f" lost {losses} of {count}; refused {counted:.4f} of {sent}")  # fmt: skip
     kind = f"garbage flood, {folder.name}"
@@ -158,7 +159,7 @@ def check_flood(folder: Path, figure: Callable[..., None]) -> float:
     assert counted >= 0.98, "not all of it has come to world's port"
     assert losses == [0.0, 0.0]
     assert count >= 0.95 * 2 * 100 * SECONDS
-    assert hold_count.measure(flight) == hold_count.measure(calm.flight)
+    assert hold_count(flight) == hold_count(calm.flight)
     return done_p99(stormy) - done_p99(calm)
 
 

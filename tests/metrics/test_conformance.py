@@ -1,22 +1,19 @@
-"""Every metric that is found by its file keeps the contract of metrics, on any recording."""
+"""Every row of the tables keeps the contract of metrics, on any recording."""
 
 from __future__ import annotations
 
 from math import isfinite
-from pathlib import Path
 
 import pytest
 
-from cloudrc import metrics, plugins
 from cloudrc.config.schema import Criteria
 from cloudrc.geometry.scene import load_scene
-from cloudrc.metrics import Flight, measure_all
+from cloudrc.metrics import SHIPPED, Flight, control, link, measure_all, mission, motion
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from tests.metrics.flights import DONE, ONE_PIPE, flown, paper, straight_flight
 
 UNITS = {"s", "m", "m/s", "N", "1"}
-NAMES = plugins.names("metrics")
 WAYS = ("uplink", "downlink")
 PROMISED = {
     *("duration", "contact_time", "min_clearance", "min_clearance_flight", "pipe_contacts"),
@@ -35,23 +32,26 @@ def flight_of(recording: Recording) -> Flight:
 
 
 def test_the_promised_names_are_there() -> None:
-    assert set(NAMES) >= PROMISED
+    assert set(SHIPPED) >= PROMISED
 
 
-@pytest.mark.parametrize("name", NAMES)
+def test_no_two_rows_have_one_name() -> None:
+    assert len(SHIPPED) == sum(len(table.METRICS) for table in (motion, control, link, mission))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
 def test_contract(name: str) -> None:
-    metric = plugins.find("metrics", name)
-    assert metric.UNIT in UNITS
-    first_line = plugins.describe("metrics", name)
-    assert first_line.endswith(".")
-    assert first_line[0].isupper()
+    metric = SHIPPED[name]
+    assert metric.unit in UNITS
+    assert metric.meaning.endswith(".")
+    assert metric.meaning[0].isupper()
     value = metric.measure(flight_of(paper()[1]))
     assert value is None or (isinstance(value, float) and isfinite(value))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_an_empty_recording_has_no_numbers(name: str) -> None:
-    assert plugins.find("metrics", name).measure(flight_of(Recording.from_records([]))) is None
+    assert SHIPPED[name].measure(flight_of(Recording.from_records([]))) is None
 
 
 @pytest.mark.parametrize("lost", sorted(TOPICS))
@@ -65,7 +65,8 @@ def test_a_lost_topic_costs_no_other_number_its_life(lost: str) -> None:
 def test_the_papers_flight_has_every_number_but_those_of_real_time_and_hovering() -> None:
     numbers, notes = measure_all(flight_of(paper()[1]))
     assert notes == []
-    absent = set(NAMES) - set(numbers) - {"recorder_dropped"}
+    assert list(numbers) == sorted(numbers)
+    absent = set(SHIPPED) - set(numbers) - {"recorder_dropped"}
     assert absent == {
         *("real_time_factor", "world_slip", "world_lateness_p99", "cloud_lateness_p99"),
         "missed_periods",
@@ -74,26 +75,6 @@ def test_the_papers_flight_has_every_number_but_those_of_real_time_and_hovering(
         *(f"relay_{name}_{way}" for name in ("overflow", "stalled") for way in WAYS),
         *("steady_error_x", "steady_error_y", "steady_error_z"),
     }
-
-
-def test_a_strangers_metric_that_raises_costs_only_its_own_number(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bodies = {
-        "raises": "raise RuntimeError('no such column')",
-        "infinite": "return float('inf')",
-        "good": "return 3.0",
-    }
-    for name, body in bodies.items():
-        text = f'"""A metric."""\nUNIT = "1"\ndef measure(flight):\n    {body}\n'
-        (tmp_path / f"{name}.py").write_text(text)
-    monkeypatch.setattr(metrics.plugins, "names", lambda kind: [str(p) for p in paths])
-    paths = sorted(tmp_path.glob("*.py"))
-    numbers, notes = measure_all(straight_flight())
-    assert [number.value for number in numbers.values()] == [3.0]
-    assert len(notes) == 2
-    assert "raises.py failed: RuntimeError: no such column" in notes[1]
-    assert "infinite.py gave inf: left out" in notes[0]
 
 
 def test_a_flight_without_an_ending_lasts_as_long_as_its_recording() -> None:

@@ -6,9 +6,8 @@ from math import hypot, nan
 
 import pytest
 
-from cloudrc import plugins
 from cloudrc.messages import GuardState
-from cloudrc.metrics import Flight
+from cloudrc.metrics import SHIPPED, Flight
 from cloudrc.records import (
     Arrival,
     Control,
@@ -32,7 +31,7 @@ from tests.metrics.flights import (
 
 
 def measured(name: str, flight: Flight) -> float | None:
-    return plugins.find("metrics", name).measure(flight)
+    return SHIPPED[name].measure(flight)
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from cloudrc import plugins
 from cloudrc.messages import GuardState
-from cloudrc.metrics import Flight, Number
+from cloudrc.metrics import SHIPPED, Flight, Number
 from cloudrc.records import (
     REAL_TIME_FACTOR_MIN,
     Arrival,
@@ -33,7 +32,7 @@ def judged(flight: Flight, *, real_time: bool = False, interrupted: bool = False
     numbers = {
         name: Number(value, "", "")
         for name in ("waypoints_reached", "real_time_factor", "world_slip")
-        if (value := plugins.find("metrics", name).measure(flight)) is not None
+        if (value := SHIPPED[name].measure(flight)) is not None
     }
     return judge(flight, numbers, real_time=real_time, interrupted=interrupted)
 

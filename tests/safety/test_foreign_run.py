@@ -27,6 +27,8 @@ cloud:
   estimator: {spy}
   predictor: ./spy.py
   controller: {{name: ../run/spy.py, share: 2.5}}
+report:
+  metrics: ./spy.py
 """
 
 
@@ -62,6 +64,7 @@ def test_a_report_runs_nothing_of_the_run(
     assert main(["report", str(run)]) == 1
     assert not told.exists()
     assert json.loads((run / "report.json").read_text())["experiment"] == "config"
+    assert "metric spy is not measured" in (run / "report.json").read_text()
     assert f"<dd>{run / 'spy.py'}</dd>" in (run / "report.html").read_text(), "named all the same"
 
 
@@ -83,13 +86,20 @@ def test_what_is_read_is_what_the_file_says(run: Path) -> None:
     assert read_experiment(run / "config.yaml") == flown, "a run's own names all parameters"
 
 
-@pytest.mark.parametrize(("end", "imports"), [("world", False), ("cloud", True)])
+@pytest.mark.parametrize(
+    ("end", "config", "imports"),
+    [
+        ("world", "cloud: {predictor: ./spy.py}", False),
+        ("cloud", "cloud: {predictor: ./spy.py}", True),
+        ("cloud", "report: {metrics: ./spy.py}", False),
+    ],
+)
 def test_of_the_ends_cloud_alone_imports_what_flies_it(
-    run: Path, told: Path, monkeypatch: pytest.MonkeyPatch, end: str, imports: bool
+    run: Path, told: Path, monkeypatch: pytest.MonkeyPatch, end: str, config: str, imports: bool
 ) -> None:
     for name in ("_open_keys", "_open_peer", "_open_recorder", "open_exporter"):
         monkeypatch.setattr(opened, name, lambda *words: None)
-    (run / "config.yaml").write_text("cloud: {predictor: ./spy.py}")
+    (run / "config.yaml").write_text(config)
     opened.open_end(argparse.Namespace(config=run / "config.yaml"), end)
     assert told.exists() == imports
 

@@ -13,7 +13,7 @@ from math import inf, isnan
 import numpy as np
 
 from cloudrc.config.schema import Direction
-from cloudrc.metrics._flight import Array
+from cloudrc.metrics.flight import Array
 from cloudrc.report.figures import band
 from cloudrc.report.figures.subject import Subject
 

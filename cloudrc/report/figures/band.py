@@ -10,7 +10,7 @@ import numpy as np
 from cloudrc.config.schema import Direction
 from cloudrc.errors import BadInputError
 from cloudrc.link.trace import read_trace
-from cloudrc.metrics._flight import Array
+from cloudrc.metrics.flight import Array
 
 
 @dataclass(frozen=True, slots=True)

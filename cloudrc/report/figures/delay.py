@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cloudrc.metrics._flight import Array
-from cloudrc.metrics._round_trip import round_trips
+from cloudrc.metrics.control import round_trips
+from cloudrc.metrics.flight import Array
 from cloudrc.report.figures.asked import bounds
 from cloudrc.report.figures.events import legend, mark_events
 from cloudrc.report.figures.style import (

@@ -6,8 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cloudrc.metrics._flight import Array
-from cloudrc.metrics._statistics import rms
+from cloudrc.metrics.flight import Array, rms
 from cloudrc.report.figures.events import legend, mark_events
 from cloudrc.report.figures.style import (
     ESTIMATED,

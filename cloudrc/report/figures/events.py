@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 from matplotlib.axes import Axes
 
-from cloudrc.metrics._hold import holds
+from cloudrc.metrics.mission import holds
 from cloudrc.report.figures.asked import set_in_flight, spans
 from cloudrc.report.figures.style import GREY, PURPLE, VERMILION
 from cloudrc.report.figures.subject import Subject

@@ -14,8 +14,8 @@ from matplotlib.patches import Polygon
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH, ARM_RADIUS, Points, place
 from cloudrc.geometry.scene import Pipe
-from cloudrc.metrics._contact import first_touch
-from cloudrc.metrics._flight import Array
+from cloudrc.metrics.flight import Array
+from cloudrc.metrics.mission import first_touch
 from cloudrc.report.figures.style import BLACK, GREY, PAGE, VERMILION, new_figure, panel
 from cloudrc.report.figures.subject import Subject
 

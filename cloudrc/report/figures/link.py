@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from cloudrc.config.schema import Direction
-from cloudrc.metrics._flight import Array
+from cloudrc.metrics.flight import Array
 from cloudrc.report.figures import band
 from cloudrc.report.figures.style import (
     DOWNLINK,

@@ -10,8 +10,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from cloudrc.geometry.clearance import pipe_index
-from cloudrc.metrics._contact import first_touch
-from cloudrc.metrics._flight import Array
+from cloudrc.metrics.flight import Array
+from cloudrc.metrics.mission import first_touch
 from cloudrc.report.figures.solids import Face, board_faces, is_swallowed, pipe_faces, robot_faces
 from cloudrc.report.figures.style import BLUE, LIGHT, PAGE, new_figure
 from cloudrc.report.figures.subject import Subject

@@ -11,7 +11,7 @@ import numpy as np
 
 from cloudrc.geometry import robot as body
 from cloudrc.geometry.scene import Board, Pipe
-from cloudrc.metrics._flight import Array
+from cloudrc.metrics.flight import Array
 
 PIPE_COLOUR, WALL_COLOUR = (0.86, 0.88, 0.90), (0.45, 0.48, 0.52)
 BASE_COLOUR, ROD_COLOUR, ARM_COLOUR = (0.16, 0.33, 0.55), (0.30, 0.30, 0.32), (0.84, 0.37, 0.0)

@@ -1,15 +1,13 @@
-"""The flight as the metrics see it: a recording, cut to its mission, with what they share.
+"""The flight as metrics see it: a recording cut to its mission; and metrics of the robot's motion.
 
-Records come in as columns, on world's clock; the derived columns that several metrics need (true
-position at any instant, commands joined with what they were computed from, clearance) go out,
-computed once. Time zero is the instant at which the guard first lets commands through (TRACK):
-only from there on does the robot move. The flight ends with the mission's last event, or with the
-recording where there is none.
+All stamps are on world's clock. Time zero is the instant at which the guard first lets commands
+through (TRACK): only from there on does the robot move. The flight ends with the mission's last
+event, or with the recording if there is none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any, TypeAlias
@@ -33,9 +31,9 @@ CONTROL_TOPICS = (
     "/delay_estimate",
     "/pid",
 )
-"""What one period of the control loop is recorded as."""
+"""Topics of one period of the control loop."""
 UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
-"""Events of a mission that goes on; every other event ends it."""
+"""Events of a mission that continues; every other event ends it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +43,7 @@ class AppliedCommands:
     Attributes:
         stamp_ns: Instant of application [ns], world's clock, shape (n,).
         basis_stamp_ns: Stamp of the odometry it was computed from [ns], world's clock, shape (n,).
-        horizon: By how much cloud looked ahead of that [s], shape (n,).
+        horizon: Time from that odometry to the instant that cloud predicted [s], shape (n,).
         predicted: Position that cloud expected [m], shape (n, 3).
     """
 
@@ -62,7 +60,7 @@ class Flight:
     Attributes:
         recording: All topics, cloud's shifted to world's clock.
         criteria: What makes a flight a success.
-        waypoints: How many the mission has.
+        waypoints: Number of waypoints of the mission.
         scene: Pipes and board.
     """
 
@@ -161,7 +159,7 @@ class Flight:
 
     @cached_property
     def pipes_flown(self) -> int:
-        """How many different pipes the base was inside of."""
+        """Number of different pipes that the base was inside of."""
         if not len(self.truth["stamp_ns"]):
             return 0
         indices = np.unique(pipe_index(self.scene, self.truth["position"]))
@@ -198,3 +196,97 @@ def _within(columns: Columns, start_ns: int | None, end_ns: int | None) -> dict[
     else:
         rows = (stamps >= start_ns) & (stamps <= end_ns)
     return {name: column[rows] for name, column in columns.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A metric: one row of the tables in this package.
+
+    Attributes:
+        name: Its name in report.json.
+        unit: An SI unit as text: "s", "m", "m/s", "N"; "1" for counts and shares.
+        meaning: One sentence for the report and for `cloudrc list metrics`.
+        measure: Computes the number in `unit`; returns None if it cannot be known.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    measure: Callable[[Flight], float | None]
+
+
+def mean(values: Array) -> float | None:
+    """Average the finite ones of `values`, shape (n,), any unit; None if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else None
+
+
+def percentile(values: Array, percent: float) -> float | None:
+    """Take a percentile; None if nothing is finite.
+
+    Args:
+        values: Shape (n,), any unit; those that are not finite do not count.
+        percent: Share of them that lies below [%].
+    """
+    finite = values[np.isfinite(values)]
+    return float(np.percentile(finite, percent)) if len(finite) else None
+
+
+def rms(errors: Array) -> float | None:
+    """Take the root of the mean square of the lengths of error vectors.
+
+    Args:
+        errors: Shape (n,) or (n, 3), any unit; rows that are not finite do not count.
+
+    Returns:
+        In the unit of `errors`; None if no row counts.
+    """
+    squares = np.square(errors) if errors.ndim == 1 else np.square(errors).sum(axis=1)
+    square = mean(squares)
+    return None if square is None else float(np.sqrt(square))
+
+
+def _duration(flight: Flight) -> float | None:
+    return None if flight.end_ns is None else float(flight.seconds(flight.end_ns))
+
+
+def _distance_flown(flight: Flight) -> float | None:
+    steps = np.diff(flight.truth["position"], axis=0)
+    return float(np.linalg.norm(steps, axis=1).sum()) if len(steps) else None
+
+
+def _speed_max(flight: Flight) -> float | None:
+    speeds = np.linalg.norm(flight.truth["velocity"], axis=1)
+    return float(speeds.max()) if len(speeds) else None
+
+
+def _min_clearance(flight: Flight) -> float | None:
+    """Take the minimum over the samples inside a pipe; negative if a wall was penetrated."""
+    inside = flight.clearance[flight.inside]
+    return float(inside.min()) if len(inside) else None
+
+
+def _min_clearance_flight(flight: Flight) -> float | None:
+    """Take the minimum over all samples. The board does not count: it is there to be touched."""
+    return float(flight.clearance.min()) if len(flight.clearance) else None
+
+
+METRICS = (
+    Metric("duration", "s", "Time from the start of the mission to its end.", _duration),
+    Metric(
+        "distance_flown", "m", "Length of the way that the robot's base has flown.", _distance_flown
+    ),
+    Metric("speed_max", "m/s", "Largest true speed of the robot's base.", _speed_max),
+    Metric(
+        "min_clearance",
+        "m",
+        "Smallest distance between the robot and a pipe's wall while its base is inside a pipe.",
+        _min_clearance,
+    ),
+    Metric(
+        "min_clearance_flight",
+        "m",
+        "Smallest distance between the robot and a pipe, inside or outside, from start to end.",
+        _min_clearance_flight,
+    ),
+)

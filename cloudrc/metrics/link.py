@@ -1,0 +1,99 @@
+"""Metrics of the link, each for both directions: delay, loss, lateness, and the relay's own counts.
+
+All datagrams that arrive judge the link, the late ones included: those that the loop uses are a
+selection of the quick ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from cloudrc.metrics.flight import Flight, Metric, mean
+
+WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
+"""Direction -> its words in the meaning of a metric."""
+SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
+"""Direction -> topic with one row per datagram sent that way."""
+SETTLING_NS = 2_000_000_000
+"""Time after which a datagram counts as lost [ns]."""
+PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
+RELAY_COUNTS = {
+    "relay_overflow": "that the relay had no room for.",
+    # These left later than the release errors say.
+    "relay_stalled": "that waited 50 ms or more for the relay to look at them.",
+    "released_early": "that left before they were due: none, unless the code is wrong.",
+}
+
+
+def _delay_mean(flight: Flight, way: str) -> float | None:
+    """Average; None if the two ends could not prove that they share a clock."""
+    return mean(flight.during(f"/{way}_delay")["delay"])
+
+
+def _late(flight: Flight, way: str) -> float | None:
+    used = flight.during(f"/{way}_delay")["used"]
+    return float(np.mean(~used.astype(bool))) if len(used) else None
+
+
+def loss(flight: Flight, way: str) -> float | None:
+    """Compute the share of the datagrams sent during the flight that never arrived [1].
+
+    Datagrams are joined by epoch and counter. Those of the recording's last seconds may still be
+    on their way and do not count.
+    """
+    sent, arrivals = flight.during(SENT[way]), flight.recording[f"/{way}_delay"]
+    world = flight.recording["/telemetry"]["stamp_ns"]
+    if not len(world):
+        return None
+    settled = sent["stamp_ns"] <= world[-1] - SETTLING_NS
+    keys = set(zip(sent["epoch"][settled], sent["counter"][settled], strict=True))
+    arrived = keys.intersection(zip(arrivals["epoch"], arrivals["counter"], strict=True))
+    return 1.0 - len(arrived) / len(keys) if keys else None
+
+
+def _relay_count(flight: Flight, name: str, scale: float = 1.0) -> float | None:
+    """Take the relay's last total of a count since it began; None if no relay shaped the link."""
+    count = flight.recording["/count"]
+    rows = zip(count["name"], count["total"], strict=True)
+    totals = [int(total) for one, total in rows if one == name]
+    return totals[-1] * scale if totals else None
+
+
+def _of_way(way: str, words: str) -> Iterator[Metric]:
+    """Yield the metrics of one direction."""
+    yield Metric(
+        f"{way}_delay_mean",
+        "s",
+        f"One-way delay {words}: mean over all datagrams that arrived, late ones included.",
+        partial(_delay_mean, way=way),
+    )
+    yield Metric(
+        f"late_{way}",
+        "1",
+        f"Share of the datagrams {words} that arrived but came too late to be used.",
+        partial(_late, way=way),
+    )
+    yield Metric(
+        f"loss_{way}",
+        "1",
+        f"Share of the datagrams {words} that never arrived.",
+        partial(loss, way=way),
+    )
+    for name, share in PERCENTILES.items():
+        yield Metric(
+            f"release_error_{name}_{way}",
+            "s",
+            f"How late the relay released datagrams {words}: {share}.",
+            partial(_relay_count, name=f"{way}_release_error_{name}_ns", scale=1e-9),
+        )
+    for name, what in RELAY_COUNTS.items():
+        count = f"{way}_{name.removeprefix('relay_')}"
+        yield Metric(
+            f"{name}_{way}", "1", f"Datagrams {words} {what}", partial(_relay_count, name=count)
+        )
+
+
+METRICS = tuple(metric for way, words in WAYS.items() for metric in _of_way(way, words))

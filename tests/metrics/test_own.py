@@ -1,0 +1,142 @@
+"""A user's own metrics: found by path or installed, measured by a run, refused before it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cloudrc import plugins
+from cloudrc.cli.list import describe_all
+from cloudrc.cli.main import main
+from cloudrc.metrics import SHIPPED, measure_all
+from tests.metrics.flights import straight_flight
+
+OVERSHOOT = '''"""Largest distance by which the robot flies past the setpoint along x.
+
+More text.
+"""
+import numpy as np
+UNIT = "m"
+def measure(flight):
+    control = flight.control
+    past = flight.true_position(control["stamp_ns"])[:, 0] - control["setpoint"][:, 0]
+    return max(0.0, np.nanmax(past))
+'''
+BODIES = {
+    "raises": "raise RuntimeError('no such column')",
+    "infinite": "return float('inf')",
+    "wordy": "return 'much'",
+}
+SHORT = ["steps", "--mode", "virtual", "--set", "mission.steps.count=1"]
+Captured = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "overshoot.py").write_text(OVERSHOOT)
+    for name, body in BODIES.items():
+        path = tmp_path / "mine" / f"{name}.py"
+        path.write_text(f'"""A metric."""\nUNIT = "1"\ndef measure(flight):\n    {body}\n')
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def report_of(run: Path) -> dict[str, Any]:
+    return json.loads((run / "report.json").read_text())
+
+
+def test_a_run_measures_a_file_and_a_later_report_only_if_it_is_named(folder: Path) -> None:
+    run = folder / "run"
+    asked = "report.metrics=[mine/overshoot.py, mine/raises.py]"
+    assert main(["run", *SHORT, "--set", asked, "--out", "run"]) == 0
+    first = report_of(run)
+    assert list(first["numbers"]) == sorted(first["numbers"])
+    overshoot = first["numbers"]["overshoot"]
+    assert overshoot["value"] >= 0.0
+    assert overshoot["unit"] == "m"
+    assert first["notes"] == ["metric raises failed: RuntimeError: no such column"]
+    assert "flies past the setpoint along x" in (run / "report.html").read_text()
+    assert str(folder / "mine" / "overshoot.py") in (run / "config.yaml").read_text()
+
+    assert main(["report", "run"]) == 0
+    again = report_of(run)
+    assert again["numbers"] == {k: v for k, v in first["numbers"].items() if k != "overshoot"}
+    assert again["notes"] == [
+        f"metric {name} is not measured: name its file with --metric"
+        for name in ("overshoot", "raises")
+    ]
+
+    line = ["report", "run", "--metric", "mine/overshoot.py", "--metric", "mine/raises.py"]
+    assert main(line) == 0
+    assert report_of(run) == first
+
+
+def test_a_sweep_measures_it_too(folder: Path) -> None:
+    line = ["run", *SHORT, "--seeds", "2", "--out", "sweep"]
+    assert main([*line, "--set", "report.metrics=mine/overshoot.py"]) == 0
+    numbers = json.loads((folder / "sweep" / "sweep.json").read_text())["numbers"]
+    assert numbers["overshoot"]["count"] == 2
+
+
+def test_a_metric_that_fails_costs_only_its_own_number(folder: Path) -> None:
+    numbers, notes = measure_all(straight_flight(), sorted(map(str, folder.glob("mine/*.py"))))
+    assert {"duration", "overshoot"} <= set(numbers)
+    assert notes == [
+        "metric infinite gave inf: left out",
+        "metric raises failed: RuntimeError: no such column",
+        "metric wordy failed: ValueError: could not convert string to float: 'much'",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("names", "text", "reason"),
+    [
+        (["no.py"], "", "there is no such file"),
+        (["bad.py"], "UNIT = '1'", "needs a text UNIT and a function measure(flight)"),
+        (["bad.py"], "def measure(flight): ...", "needs a text UNIT"),
+        (["bad.py"], "import nowhere", "cannot be imported: ModuleNotFoundError"),
+        (["bad.py"], "def measure(:", "cannot be imported: SyntaxError"),
+        (["duration.py"], OVERSHOOT, "duration is a metric already; rename the file"),
+        (["bad.py", "mine/../bad.py"], OVERSHOOT, "are both named bad"),
+        (["overshoot"], "", "no metric named 'overshoot'; available: age_of_"),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "run --seeds 2", "report"])
+def test_what_is_no_metric_is_refused_in_one_line(
+    folder: Path, capsys: Captured, command: str, names: list[str], text: str, reason: str
+) -> None:
+    if text:
+        (folder / names[0]).write_text(text)
+    line = ["report", "mine", *(f"--metric={name}" for name in names)]
+    if command != "report":
+        line = [*command.split(), *SHORT, "--set", f"report.metrics={json.dumps(names)}"]
+    assert main(line) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("cloudrc: error: ")
+    assert said.count("\n") == 1
+    assert reason in said
+    assert not (folder / "runs").exists()
+
+
+def test_an_installed_metric_is_in_every_report(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("past", "duration")  # what ships cannot be replaced
+    entries = tuple(EntryPoint(name, "overshoot", "cloudrc.metrics") for name in names)
+    monkeypatch.syspath_prepend(str(folder / "mine"))
+    monkeypatch.setattr(
+        plugins, "entry_points", lambda group: entries if group == "cloudrc.metrics" else ()
+    )
+    numbers, notes = measure_all(straight_flight(), ["past"])
+    assert (numbers["past"].unit, notes) == ("m", [])
+    assert numbers["duration"].meaning == SHIPPED["duration"].meaning
+    listed = describe_all("metrics")
+    assert list(listed) == sorted({*SHIPPED, "past"})
+    assert listed["past"].startswith("Largest distance by which")
+    sys.modules.pop("overshoot", None)
