@@ -30,12 +30,12 @@ INVALID = ("range", "future")
 """Why the guard refuses those."""
 GROUND_NS = 10_000_000_000
 """On the ground a mission's first command is waited for so long at least [ns]. Source:
-docs/safety/guard.md."""
+docs/safety.md."""
 RAMP = 3.0
 """By so much the reference grows after a HOLD at most [m/s^2]. Source: DESIGN, section 5."""
 RAMP_MIN = 1.0
 """For so long at least [s], and for as long as it takes to the cap. Source:
-docs/safety/guard.md."""
+docs/safety.md."""
 SLACK = 1e-9
 """For rounding [m/s]."""
 
