@@ -20,8 +20,6 @@ PUBLIC = re.compile(
     r"|\bthe paper, (?:eqs?\. \(\d|[\w ]+ figure|network conditions)"
     r"|\b[A-Z]\. [A-Z]\w+.*\b(?:19|20)\d\d\b"  # an article or a book, with its year
 )
-TO_COME = {"docs/safety.md"}
-"""Pages that may be missing for now; their headings are checked once they exist."""
 
 
 def entries(text: str, suffix: str) -> Iterator[str]:
@@ -48,7 +46,7 @@ def unresolved(entry: str) -> list[str]:
             text = (ROOT / name).read_text(encoding="utf-8")
             there = re.findall(r"^(?:#+|\|) +(.+?) *(?:\||$)", text, re.MULTILINE)
             found += [heading for heading in headings if heading not in there]
-        if not headings or not ((ROOT / name).is_file() or name in TO_COME):
+        if not headings or not (ROOT / name).is_file():
             found.append(name)
     return found if pages or PUBLIC.search(entry) else [*found, entry]
 

@@ -18,10 +18,9 @@ Every process serves `/metrics` for Prometheus, `/healthz` (200 while its own lo
 last 5 s) and `/readyz` (200 once it hears its peer) where `--metrics HOST:PORT` says; in the
 cluster that is port 9100 of `world` and `cloud`, 9101 of `teleop` and 9102 of `link`. All values
 are in base units, all labels have closed sets of values but for the two of `cloudrc_build_info`
-that name a version and a configuration, and a value that cannot be known is absent, never zero
-[P-METRIC-1]. A page is made at most four times a second, whoever asks, and tells what was
-known 0.25 s ago at most [P-METRIC-2]. Beside these there are the usual `process_*` metrics: CPU,
-memory, file descriptors.
+that name a version and a configuration, and a value that cannot be known is absent, never zero.
+A page is made at most four times a second, whoever asks, and is at most 0.25 s old. Beside these
+there are the usual `process_*` metrics: CPU, memory, file descriptors.
 """
 
 QUERIES = {

@@ -33,13 +33,13 @@ INVALID = ("range", "future")
 """Why the guard refuses those."""
 GROUND_NS = 10_000_000_000
 """Least time for which a robot on the ground waits for a mission's first command [ns].
-Source: docs/safety.md, "Guard"."""
+Source: docs/safety.md, "The guard"."""
 RAMP = 3.0
 """Largest growth of the reference after a HOLD [m/s^2].
 Source: docs/reference/plant.md, "Leaving HOLD"."""
 RAMP_MIN = 1.0
 """The reference grows slowly for at least this time, and until it may reach the cap [s].
-Source: docs/safety.md, "Guard"."""
+Source: docs/safety.md, "The guard"."""
 SLACK = 1e-9
 """For rounding [m/s]."""
 

@@ -41,7 +41,7 @@ REST = 0.5
 """So much farther than its way to a stop a robot that is left alone may go [m]: it swings back. In
 200 flights of the search, half of them under a hostile cloud, it was 0.20 at most."""
 FALL_MAX = 1.5
-"""How far outside the fence people are told to stay [m]. Source: docs/safety.md, "Guard"."""
+"""How far outside the fence people are told to stay [m]. Source: docs/safety.md, "The guard"."""
 
 
 class Breach(NamedTuple):

@@ -61,7 +61,6 @@ def test_a_secret_is_read_by_its_owner_and_the_pods_group_alone(mode: str) -> No
     }
 
 
-@pytest.mark.promise("P-CHART-4")
 @each_mode
 def test_who_owns_a_link_has_neither_key_nor_token_nor_the_sockets_of_teleop(mode: str) -> None:
     found = pods(mode)

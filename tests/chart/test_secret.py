@@ -21,7 +21,6 @@ def test_a_key_of_32_bytes_is_made() -> None:
     assert len(base64.b64decode(secret["data"]["key"])) == 32
 
 
-@pytest.mark.promise("P-CHART-1")
 def test_an_upgrade_finds_it_and_uninstalling_keeps_it() -> None:
     installed = render(lookup=a_namespace())
     upgraded = render(lookup=holding(installed, a_namespace()))

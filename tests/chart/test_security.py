@@ -47,7 +47,6 @@ def breaches(pod: Object) -> list[str]:
     return found
 
 
-@pytest.mark.promise("P-CHART-3")
 @each_file
 def test_a_release_passes_restricted_with_the_relay(path: Path) -> None:
     values = {**values_of(path)}
@@ -61,7 +60,6 @@ def test_the_default_passes_restricted_where_the_namespace_is_unknown() -> None:
     assert not any(map(breaches, pod_specs(render()).values()))
 
 
-@pytest.mark.promise("P-CHART-3")
 @pytest.mark.parametrize("mode", ["netem", "auto"])
 def test_netem_adds_one_capability_to_one_container(mode: str) -> None:
     pods = pod_specs(render({"link": {"mode": mode}}, lookup=a_namespace()))

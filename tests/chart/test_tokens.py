@@ -27,7 +27,6 @@ def test_two_that_differ_are_made() -> None:
     assert operator != reader
 
 
-@pytest.mark.promise("P-CHART-1")
 def test_an_upgrade_finds_them_and_uninstalling_keeps_them() -> None:
     installed = render(lookup=a_namespace())
     upgraded = render(lookup=holding(installed, a_namespace()))

@@ -29,8 +29,6 @@ SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: r
 Printed = pytest.CaptureFixture[str]
 Printing = Callable[[], str]
 
-pytestmark = pytest.mark.promise("P-CODE-3")
-
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

@@ -85,7 +85,6 @@ def test_runs_whose_api_is_not_up_or_that_have_none_are_not_asked_about(
         assert len(api.alarms) == 1
 
 
-@pytest.mark.promise("P-API-14")
 @pytest.mark.parametrize("folder", ["runs/latest", "foreign"])
 def test_the_operators_word_goes_to_no_server_that_a_folder_names(
     elsewhere: Path, capsys: Printed, folder: str
@@ -102,7 +101,6 @@ def test_the_operators_word_goes_to_no_server_that_a_folder_names(
             stranger.accept()
 
 
-@pytest.mark.promise("P-API-14")
 @pytest.mark.parametrize("by", ["flag", "environment"])
 def test_a_run_here_is_sent_no_token_not_even_one_that_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str

@@ -20,7 +20,6 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "key"
 
 
-@pytest.mark.promise("P-LINK-5")
 def test_a_second_rotation_within_the_overlap_is_refused_so_that_no_end_is_left_behind(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

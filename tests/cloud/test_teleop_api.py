@@ -127,7 +127,7 @@ def test_the_state_is_told_and_unknown_numbers_are_null(idle):
     assert "waits for a mission" in state["seen"]["next_step"]
 
 
-@pytest.mark.promise("P-MISSION-5")
+@pytest.mark.promise("bad-missions-are-refused")
 @pytest.mark.parametrize(
     ("body", "path", "index", "words"),
     [

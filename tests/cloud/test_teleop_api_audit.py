@@ -7,7 +7,6 @@ import stat
 import threading
 import time
 
-import pytest
 from api_harness import OPERATOR, READER, running
 
 from cloudrc.cloud.teleop import api_gate
@@ -15,7 +14,6 @@ from cloudrc.cloud.teleop import api_gate
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 
 
-@pytest.mark.promise("P-API-6")
 def test_commands_are_audited_with_who_and_what_became_of_them():
     with running() as api:
         api.post("/v1/missions", {**A_MISSION, "key": "uid"})
@@ -40,7 +38,6 @@ def test_commands_are_audited_with_who_and_what_became_of_them():
     assert READER not in text
 
 
-@pytest.mark.promise("P-API-6")
 def test_what_a_reader_is_refused_displaces_no_command(monkeypatch):
     monkeypatch.setattr(api_gate, "REFUSALS_NOTED", (0.0, 2))
     with running() as api:

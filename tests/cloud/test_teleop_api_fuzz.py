@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from cloudrc.messages import Request
 
-pytestmark = pytest.mark.promise("P-API-11")
 SETTINGS = {"deadline": None, "suppress_health_check": list(HealthCheck)}
 
 numbers = st.one_of(

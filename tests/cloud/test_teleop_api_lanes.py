@@ -28,7 +28,6 @@ def statuses(one, count, path, token, method, data=b""):
     return [one.send(one.request(path, sent, token, method))[0] for _ in range(count)]
 
 
-@pytest.mark.promise("P-API-7")
 def test_readers_whose_requests_hang_do_not_hold_up_an_operator(monkeypatch):
     """The loop waits for its disk, and 200 readers wait for the loop."""
     with running(limits=Limits()) as one:
@@ -48,7 +47,6 @@ def test_readers_whose_requests_hang_do_not_hold_up_an_operator(monkeypatch):
             connection.close()
 
 
-@pytest.mark.promise("P-API-7")
 def test_streams_of_readers_leave_an_operator_one(monkeypatch):
     monkeypatch.setattr(api_events, "LOOK_PERIOD", 0.01)
     with running(limits=Limits(1e6, 10**6, 64, streams=1)) as one:
@@ -61,7 +59,6 @@ def test_streams_of_readers_leave_an_operator_one(monkeypatch):
             stream.close()
 
 
-@pytest.mark.promise("P-API-8")
 def test_an_acknowledgement_that_was_asked_before_a_stop_does_not_release_it():
     """The stop passes it by while the loop waits for its disk."""
     with running() as one:
@@ -102,7 +99,6 @@ def test_each_role_waits_in_a_lane_of_its_own_and_operators_first():
     assert made == [("operator", 0), *(("reader", number) for number in others)]
 
 
-@pytest.mark.promise("P-API-7")
 @pytest.mark.parametrize("method", ["GET", "PUT", "DELETE", "OPTIONS"])
 @pytest.mark.parametrize(("token", "left"), [(READER, 5), (OPERATOR, 4), (STRANGER, 5)])
 def test_the_path_of_the_emergency_stop_is_no_way_round_the_limits(method, token, left):
@@ -115,7 +111,6 @@ def test_the_path_of_the_emergency_stop_is_no_way_round_the_limits(method, token
         assert one.alarms == []
 
 
-@pytest.mark.promise("P-API-7")
 def test_neither_is_its_head():
     with running(limits=TIGHT) as one:
         connection = connect(one)
@@ -126,7 +121,6 @@ def test_neither_is_its_head():
         assert one.gate.counts["busy"] == 4
 
 
-@pytest.mark.promise("P-API-7")
 @pytest.mark.parametrize("path", ["/v1/estop", "/v1/hold", "/v1/missions", "/nowhere"])
 @pytest.mark.parametrize(("token", "refused"), [(READER, 403), (STRANGER, 401)])
 def test_a_flood_of_what_is_not_allowed_is_refused_as_a_flood_and_not_written_down(
@@ -138,7 +132,7 @@ def test_a_flood_of_what_is_not_allowed_is_refused_as_a_flood_and_not_written_do
         assert len(one.audited()) == (5 if token == READER else 0)
 
 
-@pytest.mark.promise("P-API-8")
+@pytest.mark.promise("emergency-stop-gets-through")
 def test_an_operators_stop_is_served_while_others_flood_its_path():
     with running(limits=TIGHT) as one:
         for token in (READER, STRANGER):
@@ -149,7 +143,7 @@ def test_an_operators_stop_is_served_while_others_flood_its_path():
         assert one.get("/v1/state")["seen"], "stops take none of the operator's room"
 
 
-@pytest.mark.promise("P-API-8")
+@pytest.mark.promise("emergency-stop-gets-through")
 def test_a_stop_that_teleop_does_not_answer_in_time_is_made_all_the_same(monkeypatch):
     """The loop waits for its disk; other calls are dropped, for whoever asked looks again."""
     monkeypatch.setattr(api, "ANSWER_LIMIT", 0.1)

@@ -27,7 +27,6 @@ def is_cut_off(connection):
         connection.close()
 
 
-@pytest.mark.promise("P-API-7")
 def test_a_flood_of_either_role_or_of_strangers_is_refused_and_leaves_the_others_alone():
     with running(limits=TIGHT) as one:
         for token, left in (("no-token-that-is-known", 5), (READER, 5), (OPERATOR, 4)):
@@ -40,7 +39,7 @@ def test_a_flood_of_either_role_or_of_strangers_is_refused_and_leaves_the_others
         assert (status, answer) == (429, {"detail": "too many requests; try again in a second"})
 
 
-@pytest.mark.promise("P-API-8")
+@pytest.mark.promise("emergency-stop-gets-through")
 def test_the_emergency_stop_is_served_while_a_flood_is_refused():
     with running(limits=TIGHT) as one:
         while one.post("/v1/hold")[0] != 429:
@@ -51,7 +50,7 @@ def test_the_emergency_stop_is_served_while_a_flood_is_refused():
         one.until(lambda: one.flight.guard.name == "ESTOP")
 
 
-@pytest.mark.promise("P-API-8")
+@pytest.mark.promise("emergency-stop-gets-through")
 def test_the_emergency_stop_passes_by_what_waits_for_the_loop():
     bridge, calls = Bridge(), []
     bridge.open(ServiceFlight().teleop)
@@ -93,13 +92,11 @@ def test_so_many_streams_and_no_more(monkeypatch):
         one.until(lambda: one.gate._in_flight["operator", "stream"] == 0)
 
 
-@pytest.mark.promise("P-API-9")
 def test_the_limits_are_those_that_are_promised():
     limits = (api_connections.HEAD_LIMIT, api_errors.BODY_LIMIT, api_connections.SEND_LIMIT)
     assert limits == (5.0, 5.0, 10.0)
 
 
-@pytest.mark.promise("P-API-9")
 @pytest.mark.parametrize("said", [b"", b"GET / HT", head("GET", "/v1/state")[:-2]])
 def test_a_client_that_dawdles_over_its_head_is_cut_off(monkeypatch, said):
     monkeypatch.setattr(api_connections, "HEAD_LIMIT", 0.1)
@@ -110,7 +107,6 @@ def test_a_client_that_dawdles_over_its_head_is_cut_off(monkeypatch, said):
         assert one.server.counts["slow"] >= 1
 
 
-@pytest.mark.promise("P-API-9")
 def test_so_is_one_that_dawdles_over_its_second(monkeypatch):
     """Each byte comes in time for a limit between two bytes: the whole head has one."""
     monkeypatch.setattr(api_connections, "HEAD_LIMIT", 0.3)
@@ -131,7 +127,6 @@ def test_so_is_one_that_dawdles_over_its_second(monkeypatch):
         connection.close()
 
 
-@pytest.mark.promise("P-API-9")
 def test_a_body_that_does_not_come_is_not_waited_for(monkeypatch):
     monkeypatch.setattr(api, "BODY_LIMIT", 0.1)
     with running() as one:
@@ -153,7 +148,6 @@ def test_a_client_that_leaves_in_the_middle_of_its_body_is_no_fault_of_the_api()
         assert one.complaints == []
 
 
-@pytest.mark.promise("P-API-10")
 def test_a_body_that_says_it_is_too_long_is_not_read():
     with running() as one:
         connection = connect(one)
@@ -169,7 +163,6 @@ def test_a_body_that_says_it_is_too_long_is_not_read():
         connection.close()
 
 
-@pytest.mark.promise("P-API-10")
 @pytest.mark.parametrize(
     "body",
     [

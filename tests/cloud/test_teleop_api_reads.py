@@ -24,7 +24,6 @@ def until_closed(connection):
     return said
 
 
-@pytest.mark.promise("P-API-8")
 def test_little_is_taken_from_a_connection_before_it_is_another_s_turn(monkeypatch):
     taken, take = [], api_connections.PatientProtocol.data_received
 
@@ -44,7 +43,6 @@ def test_little_is_taken_from_a_connection_before_it_is_another_s_turn(monkeypat
     assert max(taken) == api_connections.READ_MAX <= 1024
 
 
-@pytest.mark.promise("P-API-8")
 def test_chunks_that_are_still_to_come_after_the_answer_are_not_taken_apart():
     with running() as one:
         connection = connect(one)
@@ -64,7 +62,6 @@ def test_a_body_in_chunks_that_has_come_leaves_its_connection_open():
             assert answer.read()
 
 
-@pytest.mark.promise("P-API-8")
 def test_a_head_has_no_more_room_than_is_said_if_it_comes_at_once_either():
     assert api_server.HEAD_MAX <= 4096, "lines of four bytes each: 64 such heads take a while"
     with running() as one:
@@ -77,7 +74,7 @@ def test_a_head_has_no_more_room_than_is_said_if_it_comes_at_once_either():
         assert until_closed(connection).startswith(b"HTTP/1.1 400 ")
 
 
-@pytest.mark.promise("P-API-8")
+@pytest.mark.promise("emergency-stop-gets-through")
 def test_a_stop_that_is_there_is_served_though_very_many_come_behind_it_at_once():
     """All of them while the server's thread is busy: it takes them when it is free again."""
     with running() as one:

@@ -52,7 +52,7 @@ def bodies(api, path):
     return json.dumps(A_MISSION).encode() if path == "/v1/missions" else b"{}"
 
 
-@pytest.mark.promise("P-API-1")
+@pytest.mark.promise("api-needs-a-token")
 @pytest.mark.parametrize("token", WRONG)
 def test_without_a_valid_token_every_route_is_401_and_nothing_happens(idle, token):
     before = idle.flight.kept.copy(), len(idle.flight.requests), len(idle.alarms)
@@ -64,7 +64,7 @@ def test_without_a_valid_token_every_route_is_401_and_nothing_happens(idle, toke
     assert (idle.flight.kept, len(idle.flight.requests), len(idle.alarms)) == before
 
 
-@pytest.mark.promise("P-API-1")
+@pytest.mark.promise("api-needs-a-token")
 @pytest.mark.parametrize(
     "header",
     [
@@ -97,7 +97,7 @@ def test_the_scheme_is_written_in_any_case_and_a_stranger_is_told_what_is_wanted
     connection.close()
 
 
-@pytest.mark.promise("P-API-2")
+@pytest.mark.promise("api-needs-a-token")
 def test_a_reader_may_look_and_nothing_else(idle):
     before = idle.flight.kept.copy(), len(idle.flight.requests), len(idle.alarms)
     for method, path in routes(idle):
@@ -119,13 +119,11 @@ def test_the_description_names_the_scheme_at_every_route(idle):
             assert {"401", "403", "429"} <= set(operation["responses"])
 
 
-@pytest.mark.promise("P-API-13")
 def test_a_network_address_is_not_served_without_tokens():
     with running(unix=True) as api, pytest.raises(BadInputError, match="needs --tokens DIR"):
         ApiServer(api.gate, api.bridge, ("127.0.0.1", 0))
 
 
-@pytest.mark.promise("P-API-13")
 @pytest.mark.parametrize("port", ["0", "18080"])
 def test_a_port_without_a_host_is_served_on_this_machine_alone(port):
     host, number = api_address(port)
@@ -141,7 +139,6 @@ def test_a_port_without_a_host_is_served_on_this_machine_alone(port):
         server.stop()
 
 
-@pytest.mark.promise("P-API-13")
 @pytest.mark.parametrize(
     ("where", "told"),
     [("0", False), ("127.0.0.1:0", False), ("localhost:0", False), ("0.0.0.0:0", True)],
@@ -155,7 +152,6 @@ def test_an_address_that_others_reach_is_warned_of_and_asks_for_tokens(
     assert ("can be reached from outside" in capsys.readouterr().err) is told
 
 
-@pytest.mark.promise("P-API-5")
 def test_a_socket_file_is_for_its_owner_alone_and_wants_no_token():
     with running(unix=True) as api:
         assert stat.S_IMODE(os.stat(api.address).st_mode) == 0o600
@@ -182,7 +178,6 @@ def test_a_file_where_the_socket_shall_be_is_left_alone(tmp_path):
     assert (BadInputError.exit_code, precious.read_text()) == (2, "mine")
 
 
-@pytest.mark.promise("P-MISSION-3")
 def test_a_thousand_posts_at_once_under_one_key_are_one_mission():
     with running() as api:
         body = json.dumps({**A_MISSION, "key": "uid"}).encode()
@@ -212,7 +207,7 @@ def test_an_alarm_goes_out_at_once_and_teleop_is_asked_before_it_can_see_its_eff
         assert steps[2:] == ["asked", "alarm"]
 
 
-@pytest.mark.promise("P-API-8")
+@pytest.mark.promise("emergency-stop-gets-through")
 def test_a_stop_while_teleop_starts_is_told_as_soon_as_it_has_started():
     """Teleop has just died, an alarm rings, and somebody hits the button: it waits for no retry."""
     with running(ready=False) as api, concurrent.futures.ThreadPoolExecutor(1) as pool:
@@ -270,7 +265,6 @@ def test_nothing_but_http_gets_an_answer(idle):
     assert idle.send(upgrade)[0] == 200
 
 
-@pytest.mark.promise("P-API-6")
 def test_the_audit_log_names_whoever_connects_and_not_whom_they_name():
     """uvicorn would believe anybody on this machine that he is a proxy."""
     named = {"X-Forwarded-For": "203.0.113.7", "X-Forwarded-Proto": "https"}

@@ -57,7 +57,6 @@ def test_what_is_no_token_file_is_refused_and_not_waited_for(tmp_path, role, how
         Tokens(folder)
 
 
-@pytest.mark.promise("P-API-4")
 @pytest.mark.parametrize("how", ["pipe", "long"])
 def test_what_becomes_no_token_file_in_flight_admits_nobody(tmp_path, monkeypatch, how):
     monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
@@ -71,7 +70,6 @@ def test_what_becomes_no_token_file_in_flight_admits_nobody(tmp_path, monkeypatc
     assert tokens.caller(header).role == "operator"
 
 
-@pytest.mark.promise("P-API-3")
 def test_no_token_is_held_or_shown(tmp_path):
     tokens = Tokens(token_folder(tmp_path / "t", operator=OPERATOR, reader=READER))
     for shown in (repr(tokens), repr(vars(tokens)), str(tokens.caller(b"Bearer x" + b"y" * 20))):
@@ -111,7 +109,6 @@ def is_call(node, name):
     return isinstance(node, ast.Call) and ast.unparse(node.func) == name
 
 
-@pytest.mark.promise("P-API-3")
 def test_tokens_are_compared_in_constant_time(monkeypatch, tmp_path):
     source = Path(api_tokens.__file__).read_text()
     assert compared_early(source) == []
@@ -134,7 +131,6 @@ def test_tokens_are_compared_in_constant_time(monkeypatch, tmp_path):
         assert [(len(a), len(b)) for a, b in seen] == [(32, 32)] * 2  # digests, both, each time
 
 
-@pytest.mark.promise("P-API-4")
 def test_tokens_are_followed_when_they_change(tmp_path, monkeypatch):
     assert api_tokens.LOOK_PERIOD <= 2.0
     monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
@@ -153,7 +149,6 @@ def test_tokens_are_followed_when_they_change(tmp_path, monkeypatch):
     assert tokens.caller(old).role == "operator"
 
 
-@pytest.mark.promise("P-API-4")
 def test_a_token_that_changes_while_it_is_first_read_is_followed(tmp_path, monkeypatch):
     monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
     folder = token_folder(tmp_path / "t", operator=OPERATOR)
@@ -171,7 +166,6 @@ def test_a_token_that_changes_while_it_is_first_read_is_followed(tmp_path, monke
     assert tokens.caller(b"Bearer another-token-altogether").role == "operator"
 
 
-@pytest.mark.promise("P-API-4")
 def test_a_token_that_is_taken_away_reads_no_open_stream(monkeypatch):
     monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
     monkeypatch.setattr(api_events, "LOOK_PERIOD", 0.01)
@@ -190,7 +184,6 @@ def test_a_token_that_is_taken_away_reads_no_open_stream(monkeypatch):
         assert one.complaints == []
 
 
-@pytest.mark.promise("P-API-4")
 @pytest.mark.parametrize(("revoked", "status"), [(False, b" 409 "), (True, b" 401 ")])
 def test_a_token_that_is_taken_away_while_a_body_arrives_commands_nothing(
     monkeypatch, revoked, status

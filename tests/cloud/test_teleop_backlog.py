@@ -27,7 +27,6 @@ def ids(flight):
     return [e["id"] for e in flight.kept if "id" in e]
 
 
-@pytest.mark.promise("P-MISSION-7")
 def test_an_end_that_was_refused_is_kept_before_the_next_mission_is():
     flight, mission_id = flying()
     flight.full = True
@@ -80,7 +79,6 @@ def test_the_trouble_is_told_once_until_it_is_over():
     assert [fault.code for fault in flight.faults] == ["journal", "journal"]
 
 
-@pytest.mark.promise("P-MISSION-7")
 def test_a_cancelled_mission_does_not_revive_although_its_end_was_never_kept():
     flight, mission_id = flying()
     flight.full = True
@@ -97,7 +95,6 @@ def test_a_cancelled_mission_does_not_revive_although_its_end_was_never_kept():
     assert (view["state"], view["verdict"]["failures"][0]["code"]) == ("failed", "end_lost")
 
 
-@pytest.mark.promise("P-MISSION-7")
 def test_what_waits_is_cancelled_once_that_is_kept_for_the_next_teleop_would_fly_it():
     flight, _ = flying()
     waits = flight.create(queue=True)
@@ -114,7 +111,6 @@ def test_what_waits_is_cancelled_once_that_is_kept_for_the_next_teleop_would_fly
     assert [m.id for m in flight.teleop.book.open()] == []
 
 
-@pytest.mark.promise("P-MISSION-7")
 @pytest.mark.parametrize("written", [1, 2])
 def test_a_mission_of_which_the_order_alone_was_kept_is_not_flown_twice(written):
     flight = ServiceFlight()
@@ -134,7 +130,6 @@ def test_a_mission_of_which_the_order_alone_was_kept_is_not_flown_twice(written)
     assert flight.view(mission_id)["verdict"]["failures"][0]["code"] == "end_lost"
 
 
-@pytest.mark.promise("P-MISSION-2")
 def test_what_waits_begins_on_no_full_disk_either_though_nothing_was_refused_before():
     """A teleop that has just begun does not know that the disk is full."""
     flight, _ = flying()
@@ -169,7 +164,6 @@ class DiskFlight(ServiceFlight):
         self.teleop = MissionService(0.25, self.journal.append, self.journal.entries, salt=b"")
 
 
-@pytest.mark.promise("P-MISSION-7")
 @pytest.mark.parametrize("refused", range(12))
 def test_whichever_entry_a_full_disk_refuses_the_journal_has_all_of_them_in_order(refused):
     flight = DiskFlight()

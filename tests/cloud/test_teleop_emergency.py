@@ -87,7 +87,7 @@ def test_it_is_repeated_until_it_is_seen():
     assert flight.guard is GuardState.ESTOP
 
 
-@pytest.mark.promise("P-API-8")
+@pytest.mark.promise("emergency-stop-gets-through")
 def test_nothing_supersedes_it():
     flight = machine_flying()
     flight.downlink = False
@@ -159,7 +159,6 @@ def test_a_robot_that_landed_flies_again_after_the_acknowledgement():
     assert flight.view(second)["state"] == "flying"
 
 
-@pytest.mark.promise("P-MISSION-4")
 def test_before_its_end_teleop_lets_the_robot_hold_and_a_successor_goes_on():
     flight, mission_id = flying()
     flight.teleop.pause(flight.now_ns)

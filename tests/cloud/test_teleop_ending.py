@@ -40,7 +40,6 @@ def resume(flight):
     flight.teleop.resume(flight.now_ns)
 
 
-@pytest.mark.promise("P-MISSION-4")
 @pytest.mark.parametrize(
     ("before", "say"),
     [
@@ -85,7 +84,6 @@ def test_where_it_is_seen_the_robot_stays_though_its_end_is_lost():
     assert flight.setpoints[-1].position == HALFWAY
 
 
-@pytest.mark.promise("P-MISSION-4")
 @pytest.mark.parametrize("state", ["flying", "held", "starting"])
 def test_asked_to_end_in_its_first_instant_it_pauses_what_it_has_found_under_way(state):
     """The robot flew on to its waypoint, and nothing was written down."""
@@ -121,7 +119,6 @@ class Neighbour:
         return True
 
 
-@pytest.mark.promise("P-MISSION-4")
 @pytest.mark.parametrize("fsync_ns", [0, 600_000_000, 1_000_000_000])
 def test_it_says_that_the_robot_is_to_hold_however_long_the_disk_takes(monkeypatch, fsync_ns):
     """The time for that was over before: the robot flew on to its waypoint."""

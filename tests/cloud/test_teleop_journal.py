@@ -31,7 +31,6 @@ def test_it_is_there_when_it_is_opened_again(tmp_path):
     assert path.stat().st_mode & 0o777 == 0o600
 
 
-@pytest.mark.promise("P-JOURNAL-1")
 def test_what_is_written_is_on_the_disk_when_it_returns(tmp_path, monkeypatch):
     path, synced = tmp_path / "journal", []
 
@@ -51,7 +50,6 @@ def test_what_is_written_is_on_the_disk_when_it_returns(tmp_path, monkeypatch):
     assert folder[0] == str(tmp_path)
 
 
-@pytest.mark.promise("P-JOURNAL-2")
 def test_a_torn_end_is_cut_and_reported(tmp_path):
     path = tmp_path / "journal"
     write(path, SOME)
@@ -164,7 +162,6 @@ def test_an_endless_one_takes_no_memory(tmp_path):
     assert path.stat().st_size == 8 << 30
 
 
-@pytest.mark.promise("P-JOURNAL-3")
 def test_a_second_one_is_kept_out_until_the_first_ends(tmp_path):
     path = tmp_path / "journal"
     with Journal(path) as first:
@@ -186,7 +183,6 @@ def test_without_a_lock_file_the_folder_is_locked(tmp_path):
     Journal(tmp_path / "journal").close()
 
 
-@pytest.mark.promise("P-JOURNAL-3")
 def test_room_for_a_lock_file_lets_no_second_teleop_in(tmp_path):
     """The disk was full when the first one started, so it has the folder."""
     path, taken = tmp_path / "journal", tmp_path / "journal.lock"

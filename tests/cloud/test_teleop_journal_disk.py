@@ -51,7 +51,6 @@ def append_all(disk, done):
             done.append(entry)
 
 
-@pytest.mark.promise("P-JOURNAL-1")
 def test_what_append_has_returned_for_survives_a_kill_at_any_step():
     count = 0
     for disk, done in kills(append_all):
@@ -194,7 +193,6 @@ def written():
     return disk
 
 
-@pytest.mark.promise("P-MISSION-2")
 @pytest.mark.parametrize("error", [errno.EROFS, errno.EACCES, errno.ENOSPC, errno.EDQUOT])
 def test_a_disk_that_can_only_be_read_is_read_and_takes_entries_once_it_can(error):
     disk = written()

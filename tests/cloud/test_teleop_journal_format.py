@@ -47,7 +47,6 @@ def test_cut_at_any_byte_all_whole_entries_are_there(some, data):
     assert count == len(some) or cut < len(whole(some[: count + 1]))
 
 
-@pytest.mark.promise("P-JOURNAL-2")
 def test_every_flipped_byte_costs_one_entry_at_most_and_is_noticed():
     full = whole(SOME)
     for at in range(len(full)):

@@ -208,7 +208,6 @@ def ended():
     return flight
 
 
-@pytest.mark.promise("P-MISSION-8")
 def test_a_robot_that_may_still_fly_is_led_nowhere_before_it_is_seen_to_start_anew(ended):
     """It would fly past the spawn, through whatever stands between."""
     ended.operate(StartMission(PLAN))

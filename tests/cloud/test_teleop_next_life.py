@@ -35,7 +35,6 @@ def test_its_first_number_is_above_that_of_one_that_was_not_seen():
     assert numbers == [PREDECESSORS + 5_000, PREDECESSORS + 5_010, PREDECESSORS]
 
 
-@pytest.mark.promise("P-API-8")
 def test_a_start_under_the_number_of_an_emergency_stop_does_not_settle_it():
     flight = Flight()
     flight.step()
@@ -112,7 +111,6 @@ def test_a_stop_is_not_asked_again_of_a_robot_that_has_flown_since(since):
     assert Request.ESTOP not in {request.request for request in flight.requests[asked:]}
 
 
-@pytest.mark.promise("P-API-8")
 @pytest.mark.parametrize("since", ["other mission", "other world"])
 def test_a_stop_before_the_robot_is_seen_is_asked_of_whatever_it_flies(since):
     """It was taken for one of the teleop before, which is not asked again of another robot."""
@@ -171,7 +169,6 @@ def test_a_stop_that_was_acknowledged_is_not_asked_again(next_mission):
     assert Request.ESTOP not in {request.request for request in flight.requests[asked:]}
 
 
-@pytest.mark.promise("P-MISSION-4")
 @pytest.mark.parametrize("state", ["flying", "starting"])
 def test_asked_to_end_it_leads_nowhere_though_a_waypoint_is_reached(state):
     flight = Flight()
@@ -186,7 +183,6 @@ def test_asked_to_end_it_leads_nowhere_though_a_waypoint_is_reached(state):
     assert flight.setpoints[-1].waypoint == -1
 
 
-@pytest.mark.promise("P-MISSION-4")
 def test_a_mission_that_is_held_never_says_that_it_is_resumed_before_it_is():
     """Killed between the two, teleop would fly on in its next life."""
     flight, mission_id = flying()
@@ -197,7 +193,6 @@ def test_a_mission_that_is_held_never_says_that_it_is_resumed_before_it_is():
     assert "resumed" not in flight.names(mission_id)
 
 
-@pytest.mark.promise("P-MISSION-2")
 def test_what_waits_is_not_begun_before_what_is_flown_is_written_down():
     flight, first = flying()
     second = flight.create(queue=True)

@@ -13,7 +13,6 @@ from cloudrc.cloud.teleop.messages import (
 from cloudrc.messages import MISSION_OVER, GuardState, Request
 
 
-@pytest.mark.promise("P-MISSION-8")
 @pytest.mark.parametrize("onboard", [(0, 3), (ID + 1, 0), (ID + 1, 3)])
 def test_who_finds_another_mission_on_board_does_not_fly_on(onboard):
     """Another cloud has had the robot, and has moved it: the way to the next waypoint is not free.

@@ -175,7 +175,7 @@ def fly_killed_at(step):
     return flight, False
 
 
-@pytest.mark.promise("P-MISSION-1")
+@pytest.mark.promise("waypoints-once-in-order")
 def test_every_waypoint_is_reached_once_and_in_order_wherever_teleop_is_killed():
     """Between write and sync, and everywhere else; power is lost, too."""
     killed, step = True, 0
@@ -191,7 +191,6 @@ def test_every_waypoint_is_reached_once_and_in_order_wherever_teleop_is_killed()
     assert step > 15
 
 
-@pytest.mark.promise("P-MISSION-2")
 def test_with_a_full_disk_the_flight_goes_on_and_the_robot_is_the_witness():
     flight = KilledFlight()
     flight.step()
@@ -212,7 +211,6 @@ def test_with_a_full_disk_the_flight_goes_on_and_the_robot_is_the_witness():
     assert "known on board to be reached" in str(view["events"])
 
 
-@pytest.mark.promise("P-MISSION-2")
 def test_a_full_disk_refuses_a_mission_before_anything_is_asked_of_the_robot():
     flight = KilledFlight()
     flight.step()
@@ -226,7 +224,6 @@ def test_a_full_disk_refuses_a_mission_before_anything_is_asked_of_the_robot():
     assert flight.create() == "m1"
 
 
-@pytest.mark.promise("P-MISSION-3")
 def test_one_key_is_one_mission_however_often():
     flight = ServiceFlight()
     flight.step()

@@ -38,7 +38,6 @@ def journal(tmp_path: Path) -> Path:
 # Its sockets are closed by the end of the process, which here goes on.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.usefixtures("handlers")
-@pytest.mark.promise("P-JOURNAL-2")
 @pytest.mark.parametrize(("cut", "repaired"), [(0, 0), (3, 1)])
 def test_a_torn_journal_shows_in_the_metrics_of_the_teleop_that_finds_it(
     cut: int, repaired: int, journal: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

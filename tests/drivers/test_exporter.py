@@ -120,7 +120,6 @@ def test_labels_keep_to_their_sets(role: str, flight: Flight) -> None:
                     assert value in (metric.labels[name] or (__version__, ""))
 
 
-@pytest.mark.promise("P-METRIC-1")
 @pytest.mark.parametrize("pod", [("world", "link"), ("cloud", "teleop", "link")])
 def test_a_pod_has_less_than_200_series(pod: tuple[str, ...], flight: Flight) -> None:
     """Of its metrics of missions there are one set: teleop's."""
@@ -134,7 +133,7 @@ def test_a_cloud_whose_missions_are_teleops_tells_of_none(flight: Flight) -> Non
     assert "cloudrc_rtt_seconds_count" in shown[False]
 
 
-@pytest.mark.promise("P-METRIC-1")
+@pytest.mark.promise("unknown-is-absent")
 def test_how_old_the_recording_on_the_disk_is_is_absent_until_it_is_known() -> None:
     ages: list[float | None] = [None, 0.25]
     world = Exporter("world")

@@ -51,7 +51,6 @@ def test_metrics_and_probes_are_on_one_port(
     assert get(port, "/readyz")[0] == 503
 
 
-@pytest.mark.promise("P-METRIC-2")
 def test_however_often_it_is_scraped_a_page_is_made_four_times_a_second(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -66,7 +65,6 @@ def test_however_often_it_is_scraped_a_page_is_made_four_times_a_second(
     assert made == [1000.0 + quarter / 4 for quarter in range(12)]
 
 
-@pytest.mark.promise("P-METRIC-2")
 def test_scrapers_that_come_at_once_have_one_page_made(
     served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:

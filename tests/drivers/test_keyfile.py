@@ -194,7 +194,7 @@ def test_a_rotation_says_until_when_the_key_before_is_valid(path: Path) -> None:
     assert before + 60.0 <= until <= time.time() + 61.0
 
 
-@pytest.mark.promise("P-LINK-9")
+@pytest.mark.promise("old-keys-expire")
 @pytest.mark.parametrize("later", [60.0, 61.0, 1e6])
 def test_a_process_that_starts_after_the_overlap_refuses_the_key_before_and_says_so(
     path: Path, later: float
@@ -224,7 +224,7 @@ def test_what_is_wrong_at_the_start_hides_no_new_key(path: Path) -> None:
     assert said.text.startswith(f"new key {Key(FIRST).name}")
 
 
-@pytest.mark.promise("P-LINK-9")
+@pytest.mark.promise("old-keys-expire")
 def test_an_end_asks_the_wall_clock_as_it_reads_its_key(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -68,7 +68,6 @@ def release(tmp_path: Path) -> Iterator[Release]:
 
 
 @pytest.mark.process
-@pytest.mark.promise("P-MISSION-4")
 def test_a_pod_that_ends_in_flight_holds_the_robot_by_its_word(release: Release) -> None:
     """Cloud is asked first: it ended before teleop had said anything."""
     release.fly()

@@ -113,7 +113,6 @@ def operate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True)
 
 
-@pytest.mark.promise("P-API-6")
 def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
     folder = tmp_path / "run"
     run = start(folder)

@@ -41,7 +41,6 @@ def run(endpoint: object) -> list[bytes]:
                 return heard
 
 
-@pytest.mark.promise("P-LINK-6")
 def test_the_driver_with_a_socket_refuses_an_end_without_keys() -> None:
     with pytest.raises(ValueError, match="world has no key, and nothing leaves a process unsealed"):
         run(bare_world())

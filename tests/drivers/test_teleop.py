@@ -87,7 +87,6 @@ def request(number, what):
     return OperatorRequest(number, what, mission_id=7)
 
 
-@pytest.mark.promise("P-GUARD-6")
 @pytest.mark.parametrize("stalled", [False, True])
 def test_after_a_stall_cloud_passes_on_what_stops_and_not_what_leads(peers, stalled):
     """What takes it back has found the socket full."""

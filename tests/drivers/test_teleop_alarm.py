@@ -51,7 +51,7 @@ def _none_is_left() -> Any:
     until(lambda: not threads())
 
 
-@pytest.mark.promise("P-API-8")
+@pytest.mark.promise("emergency-stop-gets-through")
 def test_a_full_socket_delays_an_emergency_stop_until_it_is_drained_whatever_the_loop_waits_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

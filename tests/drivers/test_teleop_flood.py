@@ -95,13 +95,13 @@ def is_undisturbed(folder: Path, seconds: float, figure, tries: int, is_last: bo
     return good
 
 
-@pytest.mark.promise("P-API-12")
+@pytest.mark.promise("api-load-spares-the-loop")
 def test_a_slice_of_such_a_flood_does_not_disturb_it(tmp_path, figure):
     turns = ((tmp_path / str(n), n == TRIES - 1) for n in range(TRIES))
     assert any(is_undisturbed(folder, 5.0, figure, TRIES, is_last) for folder, is_last in turns)
 
 
 @pytest.mark.full
-@pytest.mark.promise("P-API-12")
+@pytest.mark.promise("api-load-spares-the-loop")
 def test_a_thousand_requests_a_second_do_not_disturb_the_control_loop(tmp_path, figure):
     assert is_undisturbed(tmp_path / "long", 20.0, figure, 1, True)

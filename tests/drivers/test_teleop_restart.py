@@ -63,7 +63,6 @@ def test_a_second_teleop_waits_for_the_journal_and_takes_over(release):
     release.until(lambda: release.mission()["state"] == "done")
 
 
-@pytest.mark.promise("P-MISSION-4")
 def test_asked_to_end_in_flight_teleop_pauses_the_mission_and_a_successor_goes_on(release):
     release.fly()
     teleop = release.running["teleop"]
@@ -79,7 +78,7 @@ def test_asked_to_end_in_flight_teleop_pauses_the_mission_and_a_successor_goes_o
     assert [reached["waypoint"] for reached in release.mission()["reached"]] == [0, 1, 2]
 
 
-@pytest.mark.promise("P-API-8")
+@pytest.mark.promise("emergency-stop-gets-through")
 def test_an_emergency_stop_stops_the_rotors_and_is_audited(release):
     job = release.fly()
     release.post("/v1/estop")

@@ -70,7 +70,7 @@ def test_one_way_delays_are_those_that_arrived(flight: Flight, role: str, index:
     assert min(delays) < age.total / age.cumulative()[-1] < 2 * max(delays)
 
 
-@pytest.mark.promise("P-METRIC-1")
+@pytest.mark.promise("unknown-is-absent")
 def test_without_a_shared_clock_one_way_delays_are_absent() -> None:
     experiment = load_experiment("hover", ["link.profile=paper-p1"])
     both = records(experiment, offset_ns=7_000_000_000)

@@ -27,7 +27,6 @@ NOT_DATAGRAMS = {
 } | {f"limited_{limit}" for limit in labels.LIMITS}
 
 
-@pytest.mark.promise("P-METRIC-1")
 @pytest.mark.parametrize("metric", METRICS.values(), ids=lambda metric: metric.name)
 def test_a_metric_keeps_the_rules(metric: Metric) -> None:
     assert re.fullmatch(r"cloudrc(_[a-z]+)+", metric.name)

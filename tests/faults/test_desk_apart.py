@@ -171,7 +171,6 @@ def test_a_frozen_cloud_has_room_for_eleven_words(patch: Patch) -> None:
     assert len(story.of(Setpoint, 10.99, 11.005)) == SOCKET_MAX
 
 
-@pytest.mark.promise("P-GUARD-6")
 def test_a_frozen_cloud_passes_on_no_start_that_its_socket_has_kept() -> None:
     """There was no room for the end behind it: the rotors turned until that was said again."""
     flight = Flight("link.profile=ideal", seed=3, apart=True, start=False)

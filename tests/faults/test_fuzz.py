@@ -33,13 +33,12 @@ def test_what_was_found_once_stays_mended(path: Path) -> None:
     assert (finding.breaches, finding.thrown) == ((), 0.0)
 
 
-@pytest.mark.promise("P-FAULT-2")
 @pytest.mark.parametrize("seed", range(1, 5))
 def test_random_faults_break_no_invariant(seed: int) -> None:
     assert fly(compose(seed)).breaches == ()
 
 
-@pytest.mark.promise("P-FAULT-3")
+@pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("policy", sorted(POLICIES))
 def test_a_hostile_cloud_causes_no_breach(policy: str) -> None:
     seeds = [seed for seed in range(1, 30) if choose(seed).policy == policy]
@@ -250,7 +249,6 @@ def test_a_torn_journal_loses_one_entry_and_the_mission_goes_on(value: float) ->
     assert fly(schedule).breaches == ()
 
 
-@pytest.mark.promise("P-FAULT-4")
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_clean_flight_raises_no_alarm(seed: int) -> None:
     finding = fly(calm(seed))

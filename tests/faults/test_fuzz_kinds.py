@@ -84,7 +84,6 @@ def test_teleop_that_is_asked_to_end_pauses_and_its_successor_goes_on(kind: str)
     assert flight.mission.state == "done"
 
 
-@pytest.mark.promise("P-LINK-9")
 @pytest.mark.parametrize(("step", "keys"), [(0.0, 2), (60.0, 1), (-3600.0, 1)])
 def test_who_starts_asks_the_wall_clock_whether_the_key_before_is_valid(
     step: float, keys: int

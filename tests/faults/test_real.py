@@ -37,7 +37,6 @@ def survived(outcome: Outcome) -> bool:
 
 
 @pytest.mark.process
-@pytest.mark.promise("P-FAULT-1")
 @pytest.mark.parametrize("scenario", [r for r in REAL if r.name in QUICK], ids=named)
 def test_a_fault_with_real_processes_is_survived(scenario: Scenario) -> None:
     first = scenario.run(1)  # in real time, on a machine that does other things, too

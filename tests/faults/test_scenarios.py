@@ -35,14 +35,12 @@ PAGES: dict[Mode, Path] = {
 }
 
 
-@pytest.mark.promise("P-FAULT-1")
 def test_every_fault_of_the_table_has_a_scenario() -> None:
     assert {each.number for each in scenarios()} == set(FAULTS)
     names = [(each.name, each.mode) for each in scenarios()]
     assert len(names) == len(set(names))
 
 
-@pytest.mark.promise("P-FAULT-1")
 @pytest.mark.parametrize(("mode", "page"), PAGES.items())
 def test_a_page_is_of_its_mode_s_faults_and_no_check_on_it_has_failed(
     mode: Mode, page: Path
@@ -63,7 +61,6 @@ def test_a_page_is_of_its_mode_s_faults_and_no_check_on_it_has_failed(
     assert ": NO" not in measured
 
 
-@pytest.mark.promise("P-FAULT-1")
 def test_where_a_metric_is_named_it_was_looked_at_and_else_it_says_that_there_is_none() -> None:
     _, _, measured = PAGE.read_text(encoding="utf-8").partition("\n## Measured\n")
     sections = dict(re.findall(r"### (F\d+) [^\n]*\n(.*?)(?=\n### |\Z)", measured, re.DOTALL))
@@ -81,7 +78,6 @@ def flown(name: str) -> Outcome:
     return find(name, "virtual").run(1)
 
 
-@pytest.mark.promise("P-FAULT-1")
 @pytest.mark.parametrize("name", QUICK)
 def test_a_fault_is_survived(name: str) -> None:
     outcome = flown(name)
@@ -89,7 +85,6 @@ def test_a_fault_is_survived(name: str) -> None:
     assert outcome.checks
 
 
-@pytest.mark.promise("P-FAULT-5")
 @pytest.mark.parametrize("name", QUICK)
 def test_the_page_is_of_what_is_flown_now(name: str) -> None:
     """Its checks are; hashes are not compared: processors of one name may round otherwise."""
@@ -101,7 +96,6 @@ def test_the_page_is_of_what_is_flown_now(name: str) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.promise("P-FAULT-1")
 @pytest.mark.parametrize("scenario", SHARED, ids=lambda each: each.name)
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_every_fault_is_survived(scenario: Scenario, seed: int) -> None:
@@ -110,7 +104,7 @@ def test_every_fault_is_survived(scenario: Scenario, seed: int) -> None:
     assert outcome.checks
 
 
-@pytest.mark.promise("P-FAULT-5")
+@pytest.mark.promise("one-seed-one-run")
 @pytest.mark.parametrize("name", ["F40", "F16"], ids=["one flight", "three flights"])
 def test_one_seed_is_one_run(name: str) -> None:
     scenario = find(name, "virtual")

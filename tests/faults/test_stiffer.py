@@ -23,7 +23,7 @@ def fly(seeds: Iterable[int], *settings: str) -> tuple[int, list[str]]:
         return len(schedules), [str(b) for each in schedules for b in fuzz.fly(each).breaches]
 
 
-@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.promise("stays-inside-the-fence")
 def test_a_hostile_cloud_does_not_get_a_stiffer_robot_out_of_the_fence() -> None:
     flown, broken = fly(range(1, 7), STIFFER)
     assert flown > 1

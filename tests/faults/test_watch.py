@@ -12,14 +12,12 @@ INSIDE, OUTSIDE = (1.0, 1.0, 1.0), (9.3, 1.0, 1.0)
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
 
-@pytest.mark.promise("P-GUARD-3")
 @pytest.mark.parametrize("state", GuardState)
 def test_the_base_may_not_be_outside_in_any_state_rotors_stopped_or_not(state):
     assert World().tick(ZERO, state=state) == set()
     assert World().tick(ZERO, state=state, position=OUTSIDE) == {"fence"}
 
 
-@pytest.mark.promise("P-GUARD-3")
 def test_stopped_by_the_operators_word_it_may_fall_out_but_not_far_nor_fly_there():
     world, far = World(), (9.2 + 1.51, 1.0, 1.0)
     world.guard.stop(0)
@@ -32,7 +30,6 @@ def test_stopped_by_the_operators_word_it_may_fall_out_but_not_far_nor_fly_there
     assert world.tick(ZERO, state=ESTOP, position=far) == {"fence"}
 
 
-@pytest.mark.promise("P-GUARD-3")
 @pytest.mark.parametrize(("speed", "kinds"), [(0.11, set()), (0.13, {"fence"})])
 def test_stopped_by_the_operators_word_it_may_not_take_off_in_its_fall(speed, kinds):
     world = World()
@@ -44,7 +41,6 @@ def test_stopped_by_the_operators_word_it_may_not_take_off_in_its_fall(speed, ki
     assert world.tick(ZERO, state=TRACK) == kinds
 
 
-@pytest.mark.promise("P-GUARD-3")
 @pytest.mark.parametrize("state", [GROUND, LAND, ESTOP])
 def test_a_word_that_stops_no_rotors_excuses_no_fall(state):
     """Stopped by a hit, it falls; what is said to it later has not brought that about."""
@@ -55,7 +51,6 @@ def test_a_word_that_stops_no_rotors_excuses_no_fall(state):
     assert world.watch.fallen == 0.0
 
 
-@pytest.mark.promise("P-GUARD-3")
 def test_stopped_by_a_hit_it_may_fall_out_but_not_far_nor_fly_there():
     world, far = World(), (9.2 + 1.51, 1.0, 1.0)
     assert world.tick(ZERO, state=TRACK) == set()

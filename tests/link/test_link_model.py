@@ -85,7 +85,7 @@ def test_threads_do_not_matter() -> None:
     assert answers == [ask(link(LIVELY), counters)] * 4
 
 
-@pytest.mark.promise("P-SHAPE-1")
+@pytest.mark.promise("link-follows-the-seed")
 def test_other_kinds_and_epochs_shift_nothing() -> None:
     alone, among = link(LIVELY), link(LIVELY)
     for n in range(1000):

@@ -98,7 +98,6 @@ def test_changes_and_blackouts_are_steps() -> None:
 BURSTS = GilbertElliott(0.1, 0.5, delay_bad=0.04)
 
 
-@pytest.mark.promise("P-SHAPE-3")
 @pytest.mark.parametrize(
     ("profile", "key"),
     [

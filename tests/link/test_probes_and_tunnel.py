@@ -30,7 +30,6 @@ def probes(kind: int) -> list[bytes]:
     ]
 
 
-@pytest.mark.promise("P-SHAPE-6")
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_end_takes_a_probe_for_a_datagram_or_answers_it(kind: int) -> None:
     target = Target()

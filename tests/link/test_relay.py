@@ -84,7 +84,6 @@ def bench() -> Iterator[Callable[..., Bench]]:
     assert max(one.close() for one in benches) < 0.2 + 0.1, "slow to stop"
 
 
-@pytest.mark.promise("P-SHAPE-2")
 def test_the_delays_are_the_models_and_nothing_is_early(bench: Callable[..., Bench]) -> None:
     profile = DirectionProfile(0.020, 0.010)
     pair, model = bench(profile), LinkDirection(profile, 1, True)
@@ -122,7 +121,6 @@ def test_packets_overtake_as_the_model_says(bench: Callable[..., Bench]) -> None
     assert arrived == expected != list(range(10))
 
 
-@pytest.mark.promise("P-SHAPE-2")
 def test_what_is_lost_malformed_or_too_much_is_counted(bench: Callable[..., Bench]) -> None:
     pair = bench(DirectionProfile(0.1), DirectionProfile(loss=1.0), in_flight_max=3)
     for data in (b"", b"xyz", bytes(1400)):

@@ -53,7 +53,7 @@ def sound(folder: Path, link: dict[str, object], rate: float, seconds: float) ->
     return flows
 
 
-@pytest.mark.promise("P-SHAPE-1")
+@pytest.mark.promise("link-follows-the-seed")
 @pytest.mark.parametrize("name", [*STEADY, "lively"])
 def test_a_relay_run_draws_the_virtual_sequence(tmp_path: Path, name: str) -> None:
     """Asked of a model that never saw a clock: which numbers arrive, how often, how late."""

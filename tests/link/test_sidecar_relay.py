@@ -133,7 +133,7 @@ def test_it_draws_the_models_delays_in_the_direction_asked(pod: Callable[..., Po
     assert np.median(errors) < 0.005
 
 
-@pytest.mark.promise("P-SHAPE-5")
+@pytest.mark.promise("link-changes-in-flight")
 def test_a_change_in_flight_acts_within_a_second_and_loses_nothing(
     pod: Callable[..., Pod],
 ) -> None:

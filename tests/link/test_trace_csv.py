@@ -35,7 +35,6 @@ def test_what_has_no_delay_or_is_marked_is_lost(row: str) -> None:
     )
 
 
-@pytest.mark.promise("P-SHAPE-7")
 def test_round_trips_are_halved_if_asked_only() -> None:
     assert read("time_s,rtt_ms\n0,90\n1,80", halve=True).delays == pytest.approx((0.045, 0.040))
     with pytest.raises(BadInputError, match=r"column rtt_ms: has round trips; .*--halve-rtt"):

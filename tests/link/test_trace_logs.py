@@ -36,7 +36,6 @@ def test_ping_gives_halves_sent_when_the_request_left() -> None:
     assert packets.delays == pytest.approx((0.020, 0.015, None, 0.050))
 
 
-@pytest.mark.promise("P-SHAPE-7")
 def test_ping_is_not_halved_unasked() -> None:
     with pytest.raises(BadInputError, match=r"ping measures round trips; .*--halve-rtt"):
         read_ping(PING, "x", halve=False)

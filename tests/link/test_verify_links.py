@@ -45,7 +45,7 @@ def verify(
     return find_causes(found)
 
 
-@pytest.mark.promise("P-SHAPE-4")
+@pytest.mark.promise("verify-tells-the-link")
 @pytest.mark.parametrize("name", QUICK)
 def test_a_true_link_is_believed(name: str) -> None:
     for way in ("uplink", "downlink"):
@@ -99,7 +99,7 @@ FAULTS: dict[str, tuple[DirectionProfile, DirectionProfile, DirectionProfile, Ev
 }
 
 
-@pytest.mark.promise("P-SHAPE-4")
+@pytest.mark.promise("verify-tells-the-link")
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named(fault: str, figure: Callable[..., None]) -> None:
     causes = {cause.code for cause in verify(*FAULTS[fault])}

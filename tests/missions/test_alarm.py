@@ -45,7 +45,7 @@ def test_an_alarm_before_the_first_session_keeps_the_robot_on_the_ground() -> No
     assert states.count(GuardState.ESTOP) == 1
 
 
-@pytest.mark.promise("P-API-8")
+@pytest.mark.promise("emergency-stop-gets-through")
 @pytest.mark.parametrize("seed", range(1, 6))
 def test_a_link_that_loses_most_loses_no_alarm(seed: int) -> None:
     ends = join(load_experiment("hover", ["link.profile=ideal", f"seed={seed}"]))

@@ -72,7 +72,7 @@ def accepted(run: Captured) -> dict[str, int]:
     return counts | {"sessions": run.world._session.epoch + run.cloud._session.epoch}
 
 
-@pytest.mark.promise("P-LINK-2")
+@pytest.mark.promise("old-datagrams-do-nothing")
 @pytest.mark.parametrize("last_epoch", [0, 2, 4096], ids=["epochs lost", "kept", "kept in blocks"])
 @pytest.mark.parametrize("seconds", [0, 0.05, 1, 3])
 def test_a_run_replayed_after_both_restarts_is_not_accepted(first, last_epoch, seconds, figure):
@@ -173,7 +173,6 @@ def greetings(run: Captured, kind: Kind, *, to_world: bool) -> list[bytes]:
     return [data for data in run.heard[to_world] if peek(data)[0] == kind]
 
 
-@pytest.mark.promise("P-LINK-4")
 @pytest.mark.parametrize("rate_hz", [18, 25, 100, 500])
 @pytest.mark.parametrize("which", ["old hello", "fresh hello", "hellos", "challenges", "all"])
 def test_so_does_one_while_captured_greetings_are_repeated(first, which, rate_hz):

@@ -84,7 +84,7 @@ def check_kill_mid_pipe(figure, k):
     assert check_kill(figure, at, "mid-pipe") == pipe
 
 
-@pytest.mark.promise("P-GUARD-1")
+@pytest.mark.promise("brakes-without-commands")
 @pytest.mark.parametrize("k", DAILY)
 def test_when_its_cloud_is_killed_the_robot_stops_and_a_new_one_flies_on(k, figure):
     check_kill_mid_pipe(figure, k)

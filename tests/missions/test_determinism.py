@@ -19,10 +19,12 @@ def short(*settings):
     return load_experiment("paper", (*SHORT, *settings))
 
 
+@pytest.mark.promise("one-seed-one-run")
 def test_the_same_seed_gives_the_same_records_and_another_others():
     assert digest(short()) == digest(short()) != digest(short("seed=2"))
 
 
+@pytest.mark.promise("one-seed-one-run")
 def test_another_process_gives_the_same_records():
     command = [sys.executable, "-c", PRINT.format(settings=SHORT)]
     env = os.environ | {"PYTHONHASHSEED": "77", "PYTHONPATH": os.path.dirname(__file__)}

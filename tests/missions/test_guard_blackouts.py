@@ -65,7 +65,7 @@ def check_minute_mid_pipe(figure, k, calm_within, *settings):
     assert silence.pipe == pipe
 
 
-@pytest.mark.promise("P-GUARD-1")
+@pytest.mark.promise("brakes-without-commands")
 @pytest.mark.parametrize("k", DAILY)
 def test_without_its_cloud_the_robot_stops_within_a_second_and_stays(k, figure):
     check_minute_mid_pipe(figure, k, 1.0, *SLOW)

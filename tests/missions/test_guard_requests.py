@@ -33,7 +33,7 @@ def test_an_emergency_stop_acts_at_the_next_tick(talk):
     assert talk.take(GuardChange)[-1].cause == "emergency stop"
 
 
-@pytest.mark.promise("P-GUARD-4")
+@pytest.mark.promise("only-the-operator-arms")
 @pytest.mark.parametrize("start", Start)
 def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
     ask(talk, 2, Request.ESTOP)
@@ -50,7 +50,6 @@ def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
     assert talk.take(GuardChange)[-1].state is GuardState.TRACK
 
 
-@pytest.mark.promise("P-GUARD-6")
 @pytest.mark.parametrize("start", Start)
 @pytest.mark.parametrize(
     ("held_back", "ahead", "outcome"),

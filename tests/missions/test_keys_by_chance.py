@@ -149,7 +149,6 @@ class Two:
         return world._door._fresh_until_ns >= self.run.now_ns and heard_ns < 500 * MS
 
 
-@pytest.mark.promise("P-LINK-5")
 @pytest.mark.parametrize("first", [0, pytest.param(1_000, marks=pytest.mark.full)])
 def test_once_it_is_calm_both_ends_hear_each_other(first: int) -> None:
     seeds, judged = range(first, 4 * first or 40), 0

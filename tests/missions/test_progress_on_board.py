@@ -98,7 +98,6 @@ def test_an_alarm_gets_a_number_that_world_acts_on() -> None:
     assert changes[0] is GuardState.ESTOP
 
 
-@pytest.mark.promise("P-MISSION-6")
 def test_a_leg_that_takes_three_times_what_is_expected_fails_and_the_robot_holds() -> None:
     """Its tolerance is finer than the sensor's noise: it can be flown to, and never be reached."""
     experiment = load_experiment(

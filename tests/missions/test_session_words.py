@@ -38,7 +38,6 @@ def say(ends: Ends, *words: Setpoint | OperatorRequest) -> list[int]:
     return [peek(data)[0] for data in ends.cloud.take_datagrams()]
 
 
-@pytest.mark.promise("P-MISSION-8")
 def test_a_setpoint_for_another_session_is_not_flown(ends: Ends) -> None:
     epoch = ends.cloud._session.epoch
     before = ends.cloud._setpoint
@@ -50,7 +49,6 @@ def test_a_setpoint_for_another_session_is_not_flown(ends: Ends) -> None:
         assert ends.cloud._setpoint == mine
 
 
-@pytest.mark.promise("P-MISSION-8")
 def test_nothing_starts_in_a_session_before_the_robot_is_seen_in_it(ends: Ends) -> None:
     start, end = (OperatorRequest(99, request) for request in (Request.START, Request.END))
     assert say(ends, start) == [Kind.OPERATOR]
@@ -59,7 +57,6 @@ def test_nothing_starts_in_a_session_before_the_robot_is_seen_in_it(ends: Ends) 
     assert say(ends, end) == [Kind.OPERATOR]
 
 
-@pytest.mark.promise("P-MISSION-8")
 def test_a_start_that_was_said_in_another_session_is_not_passed_on(ends: Ends) -> None:
     """Teleop lags, as behind a slow disk; meanwhile somebody else may have moved the robot."""
     epoch = ends.cloud._session.epoch
@@ -71,7 +68,6 @@ def test_a_start_that_was_said_in_another_session_is_not_passed_on(ends: Ends) -
     assert ends.cloud._counts["words_dropped"] == 2 * len(Start)
 
 
-@pytest.mark.promise("P-API-8")
 def test_when_the_numbers_are_used_up_nothing_breaks_and_the_next_session_has_them_all_again(
     ends: Ends,
 ) -> None:
@@ -122,7 +118,6 @@ class Lagging:
         return outputs
 
 
-@pytest.mark.promise("P-MISSION-8")
 def test_a_teleop_that_lags_starts_its_mission_in_the_session_that_it_has_seen() -> None:
     """Its first order is on the way while cloud restarts; it arrives in the next session."""
     ends = join(HOVER)

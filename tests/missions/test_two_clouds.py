@@ -20,7 +20,7 @@ def test_a_hello_brings_a_session_in_two_round_trips():
     assert bare.cloud("a").session.epoch == bare.world._session.epoch == 1
 
 
-@pytest.mark.promise("P-LINK-3")
+@pytest.mark.promise("one-cloud-flies")
 def test_the_incumbent_keeps_authority_while_it_is_heard():
     bare = a_session()
     for _ in range(20):
@@ -171,7 +171,7 @@ BASIC = ["a", "b", "silence", "replay"]
 BACK = "two-cloud interleavings to depth {}: commands that go back"
 
 
-@pytest.mark.promise("P-LINK-3")
+@pytest.mark.promise("one-cloud-flies")
 def test_no_short_interleaving_takes_a_command_back(figure):
     assert explore(BASIC, 5) == 4**5
     assert explore(list(ACTIONS), 4) == 6**4

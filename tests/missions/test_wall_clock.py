@@ -42,7 +42,7 @@ def undisturbed() -> str:
         return fly(patch, None)
 
 
-@pytest.mark.promise("P-LINK-7")
+@pytest.mark.promise("wall-clock-does-not-matter")
 @pytest.mark.parametrize("step", STEPS)
 def test_the_flight_is_the_same_whatever_the_wall_clock_does(
     step: str, undisturbed: str, monkeypatch: pytest.MonkeyPatch, figure: Callable[..., None]
@@ -78,7 +78,7 @@ ALLOWED = {
 }
 
 
-@pytest.mark.promise("P-LINK-7")
+@pytest.mark.promise("wall-clock-does-not-matter")
 def test_nothing_on_the_control_path_reads_a_wall_clock() -> None:
     found = {}
     for path in PACKAGE.rglob("*.py"):

@@ -38,14 +38,14 @@ for n in range(10_000):
 """
 
 
-@pytest.mark.promise("P-RECORD-1")
+@pytest.mark.promise("a-kill-loses-half-a-second")
 @pytest.mark.process
 @pytest.mark.parametrize("after", [0.9, 1.3])
 def test_sigkill_loses_at_most_half_a_second(tmp_path: Path, after: float) -> None:
     kill_after(tmp_path, after)
 
 
-@pytest.mark.promise("P-RECORD-1")
+@pytest.mark.promise("a-kill-loses-half-a-second")
 @pytest.mark.process
 @pytest.mark.parametrize("sync", [0.4, 60.0])
 def test_so_it_does_while_the_disk_is_slow(tmp_path: Path, sync: float) -> None:

@@ -161,7 +161,6 @@ def check_flips(folder: Path, places: Iterable[int]) -> None:
         assert code or contents(new) == EXPECTED, f"byte {at}"
 
 
-@pytest.mark.promise("P-RECORD-2")
 def test_a_flipped_byte_is_detected_or_harmless(tmp_path: Path) -> None:
     heads = [start + n for _, start, _ in spans(WHOLE) for n in (0, 1, 9)]
     check_flips(tmp_path, [at for at in heads if at < len(WHOLE)])
@@ -175,7 +174,6 @@ def test_every_flipped_byte_is_detected_or_harmless(tmp_path: Path, part: int) -
     check_flips(tmp_path, range(part, len(WHOLE), 8))
 
 
-@pytest.mark.promise("P-RECORD-4")
 def test_lengths_that_lie_take_no_memory(tmp_path: Path) -> None:
     huge = WHOLE[:8] + bytes([Opcode.ATTACHMENT]) + (1 << 62).to_bytes(8, "little") + WHOLE[8:]
     code, account, _ = rescue(tmp_path, huge)

@@ -97,7 +97,6 @@ def defined(topic: str = "/telemetry") -> bytes:
     return record(Opcode.SCHEMA, schema) + record(Opcode.CHANNEL, values)
 
 
-@pytest.mark.promise("P-RECORD-4")
 @pytest.mark.parametrize("size", [0, 1 << 20])
 def test_a_file_that_unpacks_to_more_than_a_recording_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
@@ -123,7 +122,6 @@ def test_a_file_that_unpacks_to_more_than_a_recording_is_not_read(
     assert os.listdir(tmp_path) == ["w.mcap"]
 
 
-@pytest.mark.promise("P-RECORD-4")
 def test_messages_of_topics_that_nobody_asked_for_are_not_kept(tmp_path: Path) -> None:
     path = tmp_path / "w.mcap"
     path.write_bytes(file(chunk(defined(), message(1)), chunk(channel(2), message(2) * 20_000)))

@@ -120,14 +120,13 @@ def found_in(paths: list[Path]) -> dict[str, list[str]]:
     return {path.relative_to(ROOT).as_posix(): found for path, found in every.items() if found}
 
 
-@pytest.mark.promise("P-CODE-1")
+@pytest.mark.promise("foreign-files-run-nothing")
 def test_nothing_that_ships_runs_foreign_bytes() -> None:
     """But for the bench, which times what the paper's tunnel did."""
     yardstick = YARDSTICK.relative_to(ROOT).as_posix()
     assert found_in(SHIPPED) == {yardstick: ["in a program: 2: imports pickle"]}
 
 
-@pytest.mark.promise("P-CODE-1")
 def test_a_shell_gets_one_fixed_text_that_ships() -> None:
     """What comes from outside are its arguments, which it does not take apart."""
     given = {text for path in SHIPPED for text in shells(ast.parse(path.read_text()))}
@@ -136,7 +135,6 @@ def test_a_shell_gets_one_fixed_text_that_ships() -> None:
     assert not re.search(r"\$[0-9@*]", quoted), "an argument is one word, whatever it holds"
 
 
-@pytest.mark.promise("P-CODE-1")
 def test_the_bench_unpickles_only_what_it_has_just_pickled_itself() -> None:
     (program,) = programs(ast.parse(YARDSTICK.read_text()))
     calls = [ast.unparse(node) for node in ast.walk(program) if isinstance(node, ast.Call)]

@@ -63,7 +63,7 @@ def test_what_a_recording_has_is_seen(tmp_path: Path) -> None:
     assert TOKEN.encode() in found_in(what_is_in(path))
 
 
-@pytest.mark.promise("P-CODE-2")
+@pytest.mark.promise("secrets-stay-secret")
 def test_what_holds_a_secret_does_not_show_it(tmp_path: Path) -> None:
     (tmp_path / "operator").write_text(TOKEN)
     for holder in (Key(KEY), Tokens(tmp_path)):
@@ -85,7 +85,7 @@ class Watched(Release):
 
 
 @pytest.mark.process
-@pytest.mark.promise("P-CODE-2")
+@pytest.mark.promise("secrets-stay-secret")
 def test_a_flight_shows_and_leaves_none(tmp_path: Path) -> None:
     release = Watched(tmp_path)
     shown: dict[str, bytes] = {}

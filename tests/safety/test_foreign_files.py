@@ -27,8 +27,6 @@ from cloudrc.records import GroundTruth
 from cloudrc.report.write import read_run, write_report
 from tests.metrics.flights import flown
 
-pytestmark = pytest.mark.promise("P-CODE-4")
-
 
 @pytest.fixture(autouse=True)
 def patience() -> Iterator[None]:

@@ -23,7 +23,6 @@ from cloudrc.report.document import write_json
 from cloudrc.report.write import read_run, write_report
 from tests.record.samples import world_records, write
 
-pytestmark = pytest.mark.promise("P-CODE-5")
 HEX = b"\xab" * 8
 
 

@@ -20,7 +20,7 @@ from cloudrc.drivers.interpreter import interpreter
 from cloudrc.record.merge import write_mission
 from tests.metrics.flights import flown
 
-pytestmark = pytest.mark.promise("P-CODE-1")
+pytestmark = pytest.mark.promise("foreign-files-run-nothing")
 PACKAGE = Path(opened.__file__).parents[1]
 CONFIG = """\
 cloud:

@@ -28,7 +28,7 @@ def fly(talk: Talk, seconds: float, velocity: tuple[float, float, float]) -> Non
         talk.send(talk.command(velocity))
 
 
-@pytest.mark.promise("P-GUARD-1")
+@pytest.mark.promise("brakes-without-commands")
 def test_without_fresh_commands_the_robot_brakes_and_holds() -> None:
     talk = talking()
     fly(talk, 1.0, (0.0, 0.0, 0.8))
@@ -52,7 +52,7 @@ def test_without_fresh_commands_the_robot_brakes_and_holds() -> None:
                for r in path) <= 0.10  # fmt: skip
 
 
-@pytest.mark.promise("P-GUARD-2")
+@pytest.mark.promise("commands-within-caps")
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(FLOATS, FLOATS, FLOATS), min_size=20, max_size=60))
 def test_whatever_the_cloud_sends_what_is_flown_is_finite_and_within_the_caps(velocities) -> None:
@@ -65,7 +65,7 @@ def test_whatever_the_cloud_sends_what_is_flown_is_finite_and_within_the_caps(ve
         assert hypot(*record.reference) <= 6.0 + 1e-9
 
 
-@pytest.mark.promise("P-LINK-1")
+@pytest.mark.promise("forged-datagrams-do-nothing")
 def test_a_datagram_of_which_any_bit_differs_changes_nothing() -> None:
     talk = talking()
     fly(talk, 0.2, (0.0, 0.0, 0.5))
@@ -85,7 +85,7 @@ def test_a_datagram_of_which_any_bit_differs_changes_nothing() -> None:
     assert talk.take(CommandApplied)[-1].velocity == (3.0, 3.0, 3.0)
 
 
-@pytest.mark.promise("P-LINK-2")
+@pytest.mark.promise("old-datagrams-do-nothing")
 def test_what_was_captured_is_worth_nothing_after_a_restart_of_both_ends() -> None:
     captured: list[bytes] = []
     talk = talking()

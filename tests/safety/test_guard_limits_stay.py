@@ -58,7 +58,7 @@ def fly_hostile(policy: str, seed: int) -> Flight:
     return flight
 
 
-@pytest.mark.promise("P-GUARD-2")
+@pytest.mark.promise("commands-within-caps")
 def test_nothing_that_comes_through_the_tunnel_changes_the_limits() -> None:
     answers, changes = Counter[str](), []
     for policy, seed in HOSTILE.items():

@@ -105,7 +105,6 @@ def test_a_direction_that_does_not_exist_is_refused():
         codec.check(bytes(data))
 
 
-@pytest.mark.promise("P-LINK-4")
 def test_no_greeting_is_longer_than_the_one_it_answers_and_nothing_is_longer_than_the_most():
     answers = (Kind.CHALLENGE, Kind.ACCEPT, Kind.BUSY)
     assert all(codec.SIZES[kind] <= codec.SIZES[Kind.HELLO] for kind in answers)

@@ -27,7 +27,6 @@ def test_another_version_is_told_once():
     assert bare.world._counts["version"] == 3
 
 
-@pytest.mark.promise("P-LINK-4")
 def test_another_key_is_told_once():
     bare = Bare(ring())
     for _ in range(3):

@@ -43,7 +43,6 @@ def test_a_peer_that_is_not_heard_may_have_moved_on_further(rekeys, silence_ns, 
     assert refuses(world, cloud.seal(Kind.COMMAND, BODY)) == refused
 
 
-@pytest.mark.promise("P-LINK-5")
 @pytest.mark.parametrize("rekeys", [128, 255, 256, 300, 700])
 def test_however_long_an_end_slept_it_hears_its_peer_some_seconds_after(rekeys):
     """Its own clock stood still meanwhile; the peer's did not."""

@@ -97,7 +97,7 @@ def test_another_cloud_is_refused_while_the_incumbent_is_fresh(step):
     assert step.world.epoch == 2
 
 
-@pytest.mark.promise("P-LINK-2")
+@pytest.mark.promise("old-datagrams-do-nothing")
 def test_a_nonce_that_had_its_session_gets_no_other(step):
     step.knock(cookie=step.cookie())
     step.now_ns += 2 * SECOND_NS
@@ -208,7 +208,6 @@ def test_a_cloud_that_has_dropped_the_key_of_its_epoch_gets_another_epoch(heard,
     assert NONCE not in step.door._used
 
 
-@pytest.mark.promise("P-LINK-4")
 def test_answers_are_never_longer_than_the_hello(step):
     hello = codec.SIZES[Kind.HELLO]
     answers = [step.knock(), step.knock(cookie=step.cookie()), step.knock(b"m" * 16, step.cookie())]

@@ -16,7 +16,6 @@ def test_used_names_are_remembered_for_longer_than_a_cookie_lasts():
     assert USED_MAX * SECOND_NS // ANSWERS_MAX * 2 > 2 * COOKIE_NS
 
 
-@pytest.mark.promise("P-LINK-4")
 def test_no_more_than_twenty_answers_in_any_second(step):
     answered_ns = []
     for _ in range(3000):
@@ -29,7 +28,6 @@ def test_no_more_than_twenty_answers_in_any_second(step):
         assert later - first >= SECOND_NS
 
 
-@pytest.mark.promise("P-LINK-4")
 def test_hellos_without_a_cookie_cannot_use_up_the_answers_to_those_with_one(step):
     cookie = step.cookie()
     for _ in range(1000):

@@ -175,7 +175,7 @@ def test_a_rotated_key_file_says_the_whole_second_after_which_the_old_key_is_ref
     assert parse(write(keys).encode()) == keys
 
 
-@pytest.mark.promise("P-LINK-9")
+@pytest.mark.promise("old-keys-expire")
 @pytest.mark.parametrize(
     ("wall", "left"),
     [
@@ -206,7 +206,7 @@ def test_of_a_file_that_does_not_say_until_when_the_overlap_counts_from_each_sta
     assert ring.accepted(300 * SECOND_NS) == (B,)
 
 
-@pytest.mark.promise("P-LINK-9")
+@pytest.mark.promise("old-keys-expire")
 def test_a_clock_that_is_set_back_gives_no_more_than_the_overlap():
     """It is asked at the start alone: whatever it says then, the process counts by itself."""
     for wall in range(round(MADE) - 400, round(MADE) + 400, 7):
@@ -244,7 +244,7 @@ def test_otherwise_nothing_is(keys):
     assert keys.caution(MADE + 299.0) == ""
 
 
-@pytest.mark.promise("P-LINK-9")
+@pytest.mark.promise("old-keys-expire")
 def test_what_is_written_anew_beside_a_previous_key_makes_its_time_no_longer():
     ring = KeyRing(ROTATED, now_ns=0, wall=MADE + 300.0)  # it is over
     ring.replace(KeySet(B, A, 600.0), 10 * SECOND_NS)

@@ -97,7 +97,7 @@ def test_another_process_of_world_may_begin_again_from_one(knocker):
     assert accepted(knocker, 1, accept(world=b"v" * 16), 3)
 
 
-@pytest.mark.promise("P-LINK-2")
+@pytest.mark.promise("old-datagrams-do-nothing")
 def test_a_world_that_is_gone_does_not_come_back(knocker):
     accepted(knocker, 3, accept(), 0)
     accepted(knocker, 4, accept(world=b"v" * 16), 3)

@@ -59,7 +59,7 @@ def generation(data):
     return data[GENERATION]
 
 
-@pytest.mark.promise("P-LINK-5")
+@pytest.mark.promise("keys-change-in-flight")
 def test_after_two_minutes_the_keys_are_new_and_every_datagram_is_opened():
     ends = Ends()
     assert ends.pass_time(119) == 0
@@ -78,7 +78,6 @@ def test_counters_go_on_through_a_rekey():
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[3] == 1
 
 
-@pytest.mark.promise("P-LINK-8")
 def test_the_keys_of_two_generations_differ():
     _, cloud = pair()
     first = cloud.seal(Kind.ALIVE, b"")
@@ -124,7 +123,7 @@ def test_generations_long_gone_are_forgotten():
         world.open(late)
 
 
-@pytest.mark.promise("P-LINK-5")
+@pytest.mark.promise("keys-change-in-flight")
 @pytest.mark.parametrize("order", [("world", "cloud"), ("cloud", "world")])
 @pytest.mark.parametrize("apart", [0, 1, 90])
 def test_a_rotation_goes_through_without_losing_a_datagram(order, apart):
@@ -186,7 +185,7 @@ def test_a_flood_of_forged_generations_derives_each_key_once(monkeypatch):
     assert len(derived) == 1
 
 
-@pytest.mark.promise("P-LINK-9")
+@pytest.mark.promise("old-keys-expire")
 def test_after_the_overlap_the_old_key_opens_nothing():
     ends = Ends(overlap=10.0)
     ends.rotate("world")
@@ -219,7 +218,6 @@ def test_while_two_keys_are_valid_greetings_of_both_are_taken():
         assert ends.world.greeting_key == key
 
 
-@pytest.mark.promise("P-LINK-5")
 def test_an_end_that_had_a_wrong_key_goes_on_with_the_right_one():
     """Its peer has used that one all the time, and was heard while the wrong one was there."""
     ends = Ends(overlap=2.0)
@@ -249,7 +247,6 @@ def test_what_was_heard_in_the_epoch_before_tells_nothing_of_this_one():
     assert ends.world._key == ends.cloud._key == NEW
 
 
-@pytest.mark.promise("P-LINK-10")
 def test_whatever_befell_the_key_files_once_they_are_the_same_both_ends_hear_each_other():
     for chance in map(random.Random, range(1500)):
         ends = Ends(overlap=chance.choice((2.0, 5.0, 30.0)))

@@ -35,7 +35,6 @@ def look(ends, *, heard):
     return ends.world.tend(ends.now_ns)
 
 
-@pytest.mark.promise("P-LINK-10")
 @pytest.mark.parametrize("first", ["world", "cloud"])
 def test_one_end_that_is_rolled_back_is_followed(first):
     """It knows the new key for two seconds more, the other one the old key for minutes."""
@@ -81,7 +80,6 @@ def test_the_looks_are_counted_in_a_row(between):
     assert ends.world._key == NEW
 
 
-@pytest.mark.promise("P-LINK-1")
 @pytest.mark.parametrize("end", ["world", "cloud"])
 def test_what_was_captured_before_a_rotation_leads_nobody_back(end):
     ends = Ends()
@@ -98,7 +96,7 @@ def test_what_was_captured_before_a_rotation_leads_nobody_back(end):
     assert end._key == NEW
 
 
-@pytest.mark.promise("P-LINK-9")
+@pytest.mark.promise("old-keys-expire")
 def test_a_key_that_is_retired_opens_nothing_from_then_on():
     ends = rotated()
     ends.cloud._move_on(OLD)

@@ -150,7 +150,6 @@ def test_each_direction_has_its_own_key():
     assert cloud.seal(Kind.ALIVE, b"")[16:] != world.seal(Kind.ALIVE, b"")[16:]
 
 
-@pytest.mark.promise("P-LINK-8")
 def test_no_nonce_is_used_twice_in_an_epoch():
     _, cloud = pair()
     kinds = [Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE]
@@ -250,7 +249,7 @@ def flip_every_bit(made):
     return accepted, flips
 
 
-@pytest.mark.promise("P-LINK-1")
+@pytest.mark.promise("forged-datagrams-do-nothing")
 def test_no_bit_of_a_thousand_datagrams_can_be_flipped(figure):
     accepted, flips = flip_every_bit(datagrams(500))
     figure("bit flips of 1,000 datagrams: accepted", accepted, "==", 0, count=flips)

@@ -125,7 +125,7 @@ def test_chacha20_poly1305_is_that_of_rfc_8439():
 
 
 def by_hand(suite, direction, epoch, generation, kind, counter, body):
-    """A sealed datagram as docs/safety/wire.md describes it."""
+    """A sealed datagram as docs/wire.md describes it."""
     use = b"cloudrc 5 session %d %d %d %d" % (suite, direction, epoch, generation)
     key = derived(SECRET, b"cloud".ljust(16) + b"world".ljust(16), use)
     header = struct.pack("<BBIBBQ", 5, direction, epoch, generation % 256, kind, counter)

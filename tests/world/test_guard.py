@@ -39,6 +39,7 @@ def test_at_first_nothing_is_armed_and_nothing_flown():
     assert guard.changes == []
 
 
+@pytest.mark.promise("only-the-operator-arms")
 def test_fresh_commands_alone_never_arm():
     guard = Guard(LIMITS)
     assert guard.offer(command(), 0) is None
@@ -166,7 +167,7 @@ def test_one_command_is_slowed_all_the_more_the_nearer_the_fence_is():
 # From TRACK to HOLD
 
 
-@pytest.mark.promise("P-GUARD-1")
+@pytest.mark.promise("brakes-without-commands")
 def test_hold_begins_with_the_first_tick_after_the_age_limit():
     guard = tracking()
     run(guard, 0, 252 * MS)

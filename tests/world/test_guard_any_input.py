@@ -83,7 +83,7 @@ def check_flown(guard, reference, position):
             assert 0.2 * abs(v) + v * v / 6 <= room - 0.1 + 1e-9
 
 
-@pytest.mark.promise("P-GUARD-2")
+@pytest.mark.promise("commands-within-caps")
 @given(CASES)
 @settings(max_examples=10_000 // CASES_AT_ONCE, deadline=None)
 def test_whatever_is_commanded_and_sensed_what_is_flown_is_inside_the_caps(cases):

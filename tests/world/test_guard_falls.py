@@ -21,7 +21,7 @@ def simulator():
 
 
 def check_stopped(simulator, seed, figure):
-    """docs/safety/guard.md tells people how far to stay away: more than it has ever gone."""
+    """docs/safety.md tells people how far to stay away: more than it has ever gone."""
     flight = Flight(simulator)
     flight.fly(1.0, UP)
     flight.fly(Random(seed).uniform(1.0, 12.0), hostile(seed))
@@ -114,7 +114,7 @@ def scrapes(simulator, seed, room):
     return nearest
 
 
-@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("seed", [48, 86, 90, 101])
 def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence(simulator, seed):
     """Those of 400 that get farthest: lying tilted, it is pushed along before it rises."""
@@ -132,7 +132,7 @@ def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence_in_four_hundre
     assert nearest > 0.02
 
 
-@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("nearer", [0.01, -0.01])
 def test_stopped_near_a_wall_it_takes_off_only_so_far_from_it(simulator, nearer):
     flight = Flight(simulator)

@@ -85,7 +85,7 @@ def test_after_an_acknowledged_stop_it_takes_off_again_from_where_it_is(flight):
     assert flight.guard.state is GuardState.TRACK
 
 
-@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.promise("stays-inside-the-fence")
 def test_acknowledged_in_its_fall_it_does_not_take_off_before_it_lies(flight):
     flight.guard.stop(flight.now_ns)
     flight.fly(0.1)
@@ -101,7 +101,7 @@ def test_acknowledged_in_its_fall_it_does_not_take_off_before_it_lies(flight):
     assert flight.now_ns - still_ns >= 400 * MS
 
 
-@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.promise("stays-inside-the-fence")
 def test_where_it_was_stopped_outside_the_fence_it_does_not_take_off(simulator):
     flight = Flight(simulator)
     _, y, z = LIMITS.fence_low
@@ -117,7 +117,7 @@ def test_where_it_was_stopped_outside_the_fence_it_does_not_take_off(simulator):
 FACES = [(9.0, 0.0, 0.0), (-9.0, 0.0, 0.0), (0.0, 9.0, 0.0), (0.0, -9.0, 0.0), (0.0, 0.0, 9.0)]
 
 
-@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("velocity", [*FACES, (0.0, 0.0, -9.0), (5.0, -5.0, 5.0), (-5.0,) * 3])
 def test_full_speed_at_a_face_ends_before_it(flight, velocity):
     flight.fly(8.0, velocity)
@@ -134,7 +134,7 @@ def check_hostile(simulator, seed):
     assert flight.readings.position[2] > 0.2
 
 
-@pytest.mark.promise("P-GUARD-3")
+@pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("seed", range(3))
 def test_a_hostile_cloud_does_not_get_it_out_of_the_fence(simulator, seed):
     check_hostile(simulator, seed)

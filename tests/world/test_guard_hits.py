@@ -72,7 +72,6 @@ def test_there_is_nothing_to_compare_the_first_reading_with():
     assert hits.felt(TICK, felt((-5.0, 0.0, 0.0))) is None
 
 
-@pytest.mark.promise("P-GUARD-3")
 @pytest.mark.parametrize("make", [tracking, holding, landing])
 def test_after_a_hit_the_rotors_stop_and_the_mission_is_over(make):
     guard = make()

@@ -143,7 +143,6 @@ def test_land_goes_down_slowly_and_stops_the_rotors_once_it_stands():
     assert guard.take_changes()[-1] == (4398 * MS, LAND, "touched down, rotors stopped")
 
 
-@pytest.mark.promise("P-GUARD-3")
 def test_what_it_has_landed_on_it_may_slide_off():
     guard = landing()
     run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 0.6), (0.0, 0.0, -0.5))
@@ -209,7 +208,7 @@ def test_land_out_of_flight_goes_down_where_the_robot_is():
 # Latches
 
 
-@pytest.mark.promise("P-GUARD-4")
+@pytest.mark.promise("only-the-operator-arms")
 @pytest.mark.parametrize("make", [landing, lambda: stopped(tracking())])
 def test_nothing_but_the_acknowledgement_leads_out_of_a_latch(make):
     guard = make()

@@ -111,7 +111,7 @@ def test_the_file_refuses_a_speed_or_an_age_beyond_the_stop_rule():
         load_experiment("paper", ["guard.command_age_max_ms=10001"])
 
 
-@pytest.mark.promise("P-GUARD-2")
+@pytest.mark.promise("commands-within-caps")
 @pytest.mark.parametrize("name", [field.name for field in fields(Limits)])
 def test_a_limit_cannot_be_changed_once_it_is_set(name):
     with pytest.raises(FrozenInstanceError):

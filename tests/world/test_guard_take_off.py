@@ -203,7 +203,7 @@ def test_a_robot_that_is_fast_brakes_before_its_rotors_stop():
     assert states(guard) == [GROUND]
 
 
-@pytest.mark.promise("P-GUARD-5")
+@pytest.mark.promise("no-rotor-stop-in-the-air")
 def test_a_robot_that_has_left_the_ground_stays_up_and_climbs_clear_of_it():
     guard = taking_off(1.1 * HOP)
     flown = run(guard, 10 * MS, 3 * SECOND, above(1.1 * HOP))
@@ -212,7 +212,7 @@ def test_a_robot_that_has_left_the_ground_stays_up_and_climbs_clear_of_it():
     assert flown[-1][2] == pytest.approx(0.8 * (FLOOR_MARGIN - STANDS[2] - 1.1 * HOP))
 
 
-@pytest.mark.promise("P-GUARD-5")
+@pytest.mark.promise("no-rotor-stop-in-the-air")
 def test_a_robot_that_has_flown_never_stops_its_rotors_where_it_once_stood():
     """It may have taken off from a roof, and be beside it."""
     guard = taking_off(1.0)

@@ -24,7 +24,7 @@ ANY_WORLD = ""
 """Until the robot is seen to have started it does not matter which world it stands in."""
 HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
 """No robot is held lower [m]: it would scrape along the floor. One that has not taken off yet does,
-and is held there. Source: docs/safety.md, "Guard"."""
+and is held there. Source: docs/safety.md, "The guard"."""
 NO_WAYPOINT = -1
 UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
 ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
