@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import pytest
-from rendering import ROOT, Object, containers, of_kind, pod_specs, render
+from rendering import Object, containers, of_kind, pod_specs, render
 
 TUNNEL, DNS, API = {("UDP", 7400)}, {("UDP", 53), ("TCP", 53)}, {("TCP", 8080)}
 LINK_TEST = {("TCP", 9100), ("TCP", 9102)}
@@ -91,19 +90,6 @@ def test_scraping_is_admitted_by_name_and_to_all_metrics_ports() -> None:
             if port["name"].endswith("metrics")
         }
         assert ports(rule) == {("TCP", port) for port in served}
-
-
-def test_the_threat_model_names_every_metrics_port() -> None:
-    threats = (ROOT / "SECURITY.md").read_text()
-    served = {
-        port["containerPort"]
-        for pod in pod_specs(render()).values()
-        for container in containers(pod).values()
-        for port in container.get("ports", ())
-        if port["name"].endswith("metrics")
-    }
-    assert served
-    assert [port for port in sorted(served) if not re.search(rf"\b{port}\b", threats)] == []
 
 
 def test_others_may_call_the_api_when_named() -> None:
