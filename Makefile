@@ -13,8 +13,10 @@ IMAGES := world cloud
 SCRIPTS := .ci/run
 # Flights at once in the search for faults.
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
-# What the search finds is shrunk and becomes a test, until it is mended a failing one.
-STORE := --store tests/faults/regressions
+# Where the results of `make faults`, `make mutants` and `make nightly` go.
+EVIDENCE := build/evidence
+# A failing schedule is shrunk and kept there; moved to tests/faults/regressions it is a test.
+FUZZ = $(bin)/cloudrc faults fuzz --jobs $(JOBS) --store $(EVIDENCE)/regressions
 # What tests guard, tunnel and journal in seconds.
 SLOW := %_any_input.py %_falls.py %_flight.py %_machine.py %_proof.py %_hostile.py
 CORE := $(filter-out $(SLOW),$(wildcard \
@@ -29,7 +31,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio websockets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process e2e e2e-full test-netem test-netem-full faults figures coverage mutants nightly lint types bench bench-link pictures docs images kind-load lock chart-docs clean
+.PHONY: help demo test process e2e e2e-full test-netem test-netem-full faults coverage mutants nightly lint types bench bench-link pictures docs images kind-load lock chart-docs clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -57,67 +59,71 @@ test-netem: $(VENV)/dev ## run the tests of the kernel's netem; needs root and s
 test-netem-full: $(VENV)/dev ## the same, and every shipped profile for a minute
 	$(bin)/pytest -m netem -rP tests/link
 
-# What the search shows in short goes below build/: the pages in docs/ are of make nightly's seeds.
-faults: $(VENV)/dev ## bring every fault about, compose 200 at random; writes docs/safety/faults.md
-	$(bin)/cloudrc faults run --all --jobs $(JOBS) --document docs/safety/faults.md
-	mkdir -p build
-	$(bin)/cloudrc faults fuzz --seeds 200 --jobs $(JOBS) --document build/search.md $(STORE)
-	$(bin)/cloudrc faults fuzz --adversarial --seeds 200 --jobs $(JOBS) \
-		--document build/adversary.md $(STORE)
-
-figures: $(VENV)/dev ## print the numbers that tests have measured: asked, measured, of how many
-	$(bin)/python tools/figures.py
+faults: $(VENV)/dev ## bring every fault about, compose 400 schedules of them at random
+	mkdir -p $(EVIDENCE)
+	$(bin)/cloudrc faults run --all --jobs $(JOBS) --document $(EVIDENCE)/faults.md
+	$(FUZZ) --seeds 200
+	$(FUZZ) --adversarial --seeds 200
 
 coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and journal is tested
 	$(bin)/python -m coverage run -m pytest --hypothesis-seed=0 $(CORE)
 	$(bin)/python -m coverage report
 
-# mutmut writes where it runs; docs/safety/mutants.md says why each of those that survive may.
-mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways; 1 if the page lists other ones
-	rm -rf build/mutants && mkdir -p build/mutants
-	cp -r cloudrc tests tools pyproject.toml build/mutants
+# mutmut writes where it runs. `mutmut show NAME`, called in build/mutants, shows a mutant.
+mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways, list what tests notice
+	rm -rf build/mutants && mkdir -p build/mutants $(EVIDENCE)
+	cp -r cloudrc tests pyproject.toml build/mutants
 	find build/mutants/tests -name 'test_*.py' -delete && cp --parents $(CORE) build/mutants
 	cd build/mutants && $(abspath $(bin))/python -m mutmut run $(MUTANTS)
-	cd build/mutants && $(abspath $(bin))/python -m mutmut results --all true > results.txt
-	$(bin)/python tools/mutants.py < build/mutants/results.txt
+	cd build/mutants && $(abspath $(bin))/python -m mutmut results --all true \
+		> $(CURDIR)/$(EVIDENCE)/mutants.txt
 
-# The long numbers, and the tests that reach them; the seeds and the real floods are lines below.
-#   10^7 hostile datagrams, coverage-guided    test_coverage_guided_ones
-#   10^6 hostile datagrams, by chance          test_a_million_hostile_datagrams
-#   every bit of 1,000 datagrams flipped       test_no_bit_of_a_thousand_datagrams_can_be_flipped
-#   every sequence of 6 of 16 counters         test_every_sequence_of_six_agrees_with_a_set
-#   two clouds, interleaved to depth 10        test_no_interleaving_of_ten_takes_a_command_back
-#   10^6 cases of hypothesis at the guard      test_a_million_cases_of_hypothesis_stay_inside_the_caps
-#   10^6 commands and readings of the guard    test_a_million_commands_and_readings_stay_inside_the_caps
-#   silent from 200 instants on, 1.5 m/s       test_without_its_cloud_the_robot_stops_at_any_instant
-#   silent from 200 instants on, uncapped      test_uncapped_it_takes_a_little_longer_at_any_instant
-#   killed at 200 instants, a new process      test_killed_at_any_instant_a_new_cloud_flies_on
-#   blackouts at 24 instants, each way         test_a_silence_anywhere_touches_nothing
-#   1,000 requests a second for 20 s           test_a_thousand_requests_a_second_do_not_disturb_the_control_loop
-# The search takes hours: told to stop (Ctrl-C, SIGTERM) it keeps what was flown as a slice, and
-# says how to go on. Slices of one search, flown by the same sources, make the page as well:
-#   cloudrc faults fuzz --first 1 --seeds 15000 --slice build/a.json
-#   cloudrc faults fuzz --first 15001 --seeds 15000 --slice build/b.json
-#   cloudrc faults merge build/a.json build/b.json --document docs/safety/search.md
-# The cluster comes last: without Docker, kind, helm and kubectl all else is done.
-nightly: $(VENV)/dev ## run every test and number, 500 hours of faults, e2e-full (needs what e2e needs)
-	rm -rf build/figures
-	$(bin)/pytest -n auto -m 'not process and not e2e and not netem'
-	$(bin)/pytest -m process
-	$(bin)/cloudrc faults run --all --real --document docs/safety/faults-real.md
-	CLOUDRC_FLOOD_SECONDS=600 $(bin)/cloudrc faults run garbage-flood --real
-	$(bin)/cloudrc faults fuzz --clean --seeds 600 --jobs $(JOBS) \
-		--document docs/safety/clean.md $(STORE)
-	$(bin)/cloudrc faults fuzz --adversarial --seeds 5000 --jobs $(JOBS) \
-		--document docs/safety/adversary.md $(STORE)
-	$(bin)/cloudrc faults fuzz --seeds 30000 --jobs $(JOBS) \
-		--document docs/safety/search.md $(STORE)
-	$(MAKE) mutants
-	$(bin)/python -m tools.bench_link $(BENCH_LINK)
+# In this order, each part even if one before it has failed: without Docker, kind, helm and kubectl
+# all but the cluster's is done.
+NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults-virtual.json faults-real.json \
+	faults-flood.json search-clean.json search-adversarial.json search-random.json link.json) \
+	mutants night-netem e2e-full $(EVIDENCE)/index.md
+
+nightly: export CLOUDRC_EVIDENCE = $(CURDIR)/$(EVIDENCE)
+nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence (needs what e2e needs)
+	rm -rf $(EVIDENCE) && mkdir -p $(EVIDENCE)
+	$(MAKE) --jobs=1 --keep-going $(NIGHT)
+
+$(EVIDENCE)/tests.xml:
+	$(bin)/pytest -n auto -m 'not process and not e2e and not netem' --junitxml=$@
+
+$(EVIDENCE)/process.xml:
+	$(bin)/pytest -m process --junitxml=$@
+
+$(EVIDENCE)/faults-virtual.json:
+	$(bin)/cloudrc faults run --all --jobs $(JOBS) -o json > $@
+
+$(EVIDENCE)/faults-real.json:
+	$(bin)/cloudrc faults run --all --real -o json > $@
+
+$(EVIDENCE)/faults-flood.json:
+	CLOUDRC_FLOOD_SECONDS=600 $(bin)/cloudrc faults run garbage-flood --real -o json > $@
+
+# Together about a quarter of an hour on two cores.
+$(EVIDENCE)/search-clean.json:
+	$(FUZZ) --clean --seeds 60 -o json > $@
+
+$(EVIDENCE)/search-adversarial.json:
+	$(FUZZ) --adversarial --seeds 300 -o json > $@
+
+$(EVIDENCE)/search-random.json:
+	$(FUZZ) --seeds 1000 -o json > $@
+
+$(EVIDENCE)/link.json:
+	$(bin)/python -m tools.bench_link $(BENCH_LINK) -o json > $@
+
+$(EVIDENCE)/index.md:
+	$(bin)/python -m tools.evidence $(EVIDENCE)
+
+.PHONY: night-netem
+night-netem:
 	@if unshare --net tc qdisc add dev lo root netem delay 1ms; then $(MAKE) test-netem-full; \
 		else echo "no sch_netem for this user here: 'make test-netem-full' is left out"; fi
-	$(bin)/python tools/figures.py --document docs/safety/numbers.md
-	$(MAKE) e2e-full
 
 lint: $(VENV)/dev ## check format and rules
 	$(bin)/ruff format --check .

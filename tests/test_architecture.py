@@ -173,10 +173,10 @@ def test_what_is_imported_is_what_is_declared_and_nothing_else() -> None:
     assert foreign([ast.parse("def f():\n    from polaris.client import get")]) == {"polaris"}
 
 
-def test_no_file_is_longer_than_300_lines() -> None:
+def test_no_file_is_longer_than_700_lines() -> None:
     files = [*FILES, *(ROOT / "tests").rglob("*.py")]
     lengths = {path.relative_to(ROOT): len(path.read_text().splitlines()) for path in files}
-    assert {path: length for path, length in lengths.items() if length > 300} == {}
+    assert {path: length for path, length in lengths.items() if length > 700} == {}
 
 
 def test_no_function_is_longer_than_50_lines() -> None:

@@ -20,8 +20,7 @@ examples:
   cloudrc faults run --all --real            with processes, signals and sockets
   cloudrc faults fuzz --seeds 200 --jobs 2   random compositions, invariants
   cloudrc faults fuzz --seeds 200 --adversarial
-  cloudrc faults fuzz --first 201 --seeds 200 --slice b.json
-  cloudrc faults merge a.json b.json         two slices as one search
+  cloudrc faults fuzz --first 201 --seeds 200
 
 exit codes: 0 no check failed, 1 one did, 2 bad input,
   3 or 5 no cluster or no release there (--cluster),
@@ -33,7 +32,6 @@ ACTIONS = {
     "list": "all faults, what is done and what has to follow",
     "run": "bring faults about and check what follows",
     "fuzz": "compose faults at random, look at the invariants in every step",
-    "merge": "add slices of a search up: their seeds follow each other without a gap",
     "replay": "fly a stored schedule again",
 }
 
@@ -49,12 +47,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     _modes(parsers["list"])
     _run_arguments(parsers["run"])
     _fuzz_arguments(parsers["fuzz"])
-    merge = parsers["merge"]
-    merge.add_argument("slices", type=read_from, nargs="+", metavar="SLICE", help="of fuzz --slice")
-    text = "write the result as text"
-    merge.add_argument("--document", type=written_to, metavar="FILE", help=text)
-    text = "keep the sum as a slice, to which further ones can be added"
-    merge.add_argument("--slice", type=written_to, metavar="FILE", help=text)
     parsers["replay"].add_argument(
         "file", type=read_from, metavar="FILE", help="a schedule (.yaml)"
     )
@@ -102,7 +94,7 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--junit", type=written_to, metavar="FILE", help="write the results as JUnit"
     )
-    text = "write the documentation's table; with --all"
+    text = "write the result as a page of Markdown; with --all"
     parser.add_argument("--document", type=written_to, metavar="FILE", help=text)
     place_arguments(parser)
 
@@ -118,10 +110,8 @@ def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:
     kind.add_argument(
         "--clean", action="store_true", help="nothing goes wrong: any HOLD is a false alarm"
     )
-    text = "write the result as text"
+    text = "write the result as a page of Markdown"
     parser.add_argument("--document", type=written_to, metavar="FILE", help=text)
-    text = "keep the totals, for 'faults merge'; every 10 s, and when it is told to stop"
-    parser.add_argument("--slice", type=written_to, metavar="FILE", help=text)
     parser.add_argument(
         "--store",
         type=folder,
@@ -143,7 +133,6 @@ def execute(options: argparse.Namespace) -> int:
         "list": faults_run.show,
         "run": faults_run.run,
         "fuzz": faults_fuzz.fuzz,
-        "merge": faults_fuzz.merge,
         "replay": faults_fuzz.replay,
     }
     return actions[options.action](options)

@@ -1,4 +1,4 @@
-"""`cloudrc faults fuzz`, `merge` and `replay`: random schedules of faults, and stored ones."""
+"""`cloudrc faults fuzz` and `replay`: random schedules of faults, and stored ones."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli import faults_page as page
-from cloudrc.cli import faults_slices as slices
-from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import paint, say, table, unread_is_fine, written
 from cloudrc.cli.pool import WorkerDiedError, in_order
 from cloudrc.errors import BadInputError
@@ -26,17 +24,14 @@ if TYPE_CHECKING:
 
 FAILED = 1
 INTERRUPTED = 130
-SLICE = "slice-{kind}-{first}-{count}.json"
-"""What was flown until it was told to stop, if no other name was given."""
 PROGRESS_PERIOD = 10.0
 """Between two lines of progress [s]."""
 
 
 def fuzz(options: argparse.Namespace) -> int:
     """Fly many random schedules; 1 if an invariant broke, 130 if told to stop, 6 if killed."""
-    _refuse_to_replace(options.slice)
     say = options.output == "table"
-    search = Search(options, sources())
+    search = Search(options)
     cause, code = "stopped", INTERRUPTED
     with stopping() as stop:
         try:
@@ -48,37 +43,16 @@ def fuzz(options: argparse.Namespace) -> int:
     if cut and not search.findings:
         print(f"cloudrc: {cause}; not one schedule was flown", file=sys.stderr)
         return code
-    if path := options.slice or (options.store / SLICE.format(**document) if cut else None):
-        slices.keep(document, path)
     if options.document is not None and not cut:
         by = f"{page.command(document)} --document {options.document}"
         options.document.write_text(page.markdown(document, by), encoding="utf-8")
     if cut:
         then = page.command(document | _rest(document, options))
-        told = f"{cause}; {document['count']} of {options.seeds} are kept in {path}"
+        told = f"{cause}; {document['count']} of {options.seeds} were flown"
         with unread_is_fine(sys.stderr):  # else nothing of what follows was written to a file
             print(f"cloudrc: {told}; go on with '{then}'", file=sys.stderr, flush=True)
     _print(document, options)
     return code if cut else FAILED if search.failures else 0
-
-
-def _refuse_to_replace(path: Path | None) -> None:
-    """A slice may have taken hours."""
-    if path is not None and path.exists() and path.stat().st_size:
-        raise BadInputError(f"--slice {path}: is there already; name another file, or remove it")
-
-
-def merge(options: argparse.Namespace) -> int:
-    """Add slices of a search up; 1 if an invariant broke in one of them."""
-    document, parts = slices.merged(options.slices)
-    if options.slice is not None:
-        slices.keep(document, options.slice)
-    if options.document is not None:
-        by = f"cloudrc faults merge SLICE... --document {options.document}"
-        text = page.markdown(document, by, [(path.name, part) for path, part in parts])
-        options.document.write_text(text, encoding="utf-8")
-    _print(document, options)
-    return FAILED if document["failures"] else 0
 
 
 def _print(document: dict[str, Any], options: argparse.Namespace) -> None:
@@ -103,26 +77,18 @@ def _fly_all(search: Search, say: bool, stop: Callable[[], bool]) -> None:
         search.take(finding, say, stop)
         if stop():  # what is printed may have no reader: a terminal that was closed
             return
-        if time.monotonic() - told > PROGRESS_PERIOD:
+        if say and time.monotonic() - told > PROGRESS_PERIOD:
             told = time.monotonic()
-            if options.slice is not None:
-                slices.keep(search.document(), options.slice)
-            if say:
-                flown, failed = len(search.findings), len(search.failures)
-                print(f"{flown} of {options.seeds} flown, {failed} failed", flush=True)
+            flown, failed = len(search.findings), len(search.failures)
+            print(f"{flown} of {options.seeds} flown, {failed} failed", flush=True)
 
 
 class Search:
     """What was flown so far: always all seeds from the first one on, without a gap."""
 
-    def __init__(self, options: argparse.Namespace, of: str) -> None:
-        """Begin.
-
-        Args:
-            options: Of the command.
-            of: Hash of the sources that fly.
-        """
-        self.options, self._sources, self._began = options, of, time.monotonic()
+    def __init__(self, options: argparse.Namespace) -> None:
+        """Begin, with the options of the command."""
+        self.options, self._began = options, time.monotonic()
         self.findings: list[dict[str, Any]] = []
         self.failures: list[dict[str, Any]] = []
 
@@ -134,13 +100,12 @@ class Search:
 
     def document(self) -> dict[str, Any]:
         """Tell all of it."""
-        return slices.document(
+        return page.document(
             self.findings,
             self.failures,
             kind=_kind(self.options),
             first=self.options.first,
             seconds=time.monotonic() - self._began,
-            sources=self._sources,
         )
 
 

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.faults_slices import sources
 from cloudrc.cli.output import harmless, paint, table, written
 from cloudrc.cli.pool import WorkerDiedError, in_order
 from cloudrc.errors import BadInputError
@@ -67,8 +66,7 @@ def run(options: argparse.Namespace) -> int:
     if options.junit is not None:
         options.junit.write_text(document.as_junit(results, options.seed), encoding="utf-8")
     if options.document is not None and not cause:
-        of = sources() if mode == "virtual" else sources(apart=())
-        text = document.as_markdown(results, options.seed, mode, of)
+        text = document.as_markdown(results, options.seed, mode)
         options.document.write_text(text, encoding="utf-8")
     if options.output != "table":
         print(written(document.as_json(results, options.seed), options.output))

@@ -1,4 +1,4 @@
-"""The results of a run as JUnit, as JSON and as the table of the documentation."""
+"""The results of a run of faults: as JSON, as JUnit and as a page of Markdown."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 from cloudrc import __version__
 from cloudrc.faults.scenario import Mode, Outcome, Scenario
-from cloudrc.report.document import environment_document
 
 
 class Result(NamedTuple):
@@ -95,40 +94,10 @@ def as_junit(results: Sequence[Result], seed: int) -> str:
     return Xml.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
 
 
-HEADS: dict[Mode, str] = {
-    "virtual": """\
-# Faults: what is done, what has to follow, what was measured
-
-Written by `make faults` (`cloudrc faults run --all --document docs/safety/faults.md`); do not edit.
-{result} Each is one command: `cloudrc faults run F13`.
-These run in virtual time, with the ends, the driver, the keys and the journal of production. Of a
-promise that is checked several times, the worst value is shown. Of every metric that is named it is
-said below how it was looked at: that it moves within 5 s of the fault, or of its end where who
-stands still shows nothing before; or what it reads. What teleop's API and journal refuse and mend
-is no part of a flight: there the count was looked at, not when it shows. What makes sense elsewhere
-is brought about there, too: [with real processes](faults-real.md), where F31 is, which takes
-sockets, and [in a Kubernetes cluster](faults-cluster.md). All faults together, at random:
-[search](search.md), and with a cloud that wants a breach: [adversary](adversary.md). Promises:
-[P-FAULT-1] that all pass, [P-FAULT-5] that a seed is a run.
-The hashes of the records are those of
-{built}: others may round otherwise.
-""",
-    "real": """\
-# Faults with real processes, signals and sockets
-
-Written by `make nightly` (`cloudrc faults run --all --real --document docs/safety/faults-real.md`);
-do not edit. {result} Each is one command:
-`cloudrc faults run F13 --real`. Times are those of the machine that it ran on. Some are run before
-every change lands, too. The others, in virtual time: [faults](faults.md).
-""",
-    "cluster": """\
-# Faults in a Kubernetes cluster
-
-Written by `make e2e-full` (`cloudrc faults run --all --cluster --document
-docs/safety/faults-cluster.md`); do not edit. {result}
-Each is one command, beside a release that flies nothing: `cloudrc faults run F13 --cluster`. Times
-are those of the machine that it ran on. The others, in virtual time: [faults](faults.md).
-""",
+TITLES: dict[Mode, str] = {
+    "virtual": "Faults in virtual time",
+    "real": "Faults with real processes, signals and sockets",
+    "cluster": "Faults in a Kubernetes cluster",
 }
 COLUMNS = """
 | fault | what is done | what has to follow | what is lost | what the user sees | checks |
@@ -136,37 +105,24 @@ COLUMNS = """
 """
 
 
-def built() -> str:
-    """What the records of a seed depend on beside cloudrc: what computes their numbers."""
-    here = environment_document()
-    versions = " and ".join(f"{name} {here['packages'][name]}" for name in ("mujoco", "numpy"))
-    return f"{versions} on {here['processor']}, {here['architecture']}"
-
-
-def as_markdown(results: Sequence[Result], seed: int, mode: Mode, sources: str) -> str:
-    """The page of the documentation on the faults of a mode.
+def as_markdown(results: Sequence[Result], seed: int, mode: Mode) -> str:
+    """Lay out the results as a page: a table of the faults, then what was measured.
 
     Args:
         results: Of the run.
         seed: Of the run.
         mode: Of all of them.
-        sources: Hash of what was run.
     """
     passed = sum(result.passed for result in results)
     skipped = sum(bool(result.outcome.skipped) for result in results)
-    told = f"Seed {seed}: {passed} of {len(results)} scenarios passed."
-    if skipped:
-        told = (
-            f"Seed {seed}: {passed} of {len(results) - skipped} run passed, {skipped} not run yet."
-        )
-    head = HEADS[mode].format(result=told, built=built())
-    lines = [head, COLUMNS, *map(_row, results), "\n## Measured\n"]
+    told = f"Seed {seed}, cloudrc {__version__}: {passed} of {len(results) - skipped} passed"
+    lines = [f"# {TITLES[mode]}\n\n{told}{f', {skipped} not run' if skipped else ''}.\n", COLUMNS]
+    lines += [*map(_row, results), "\n## Measured\n"]
     for result in results:
         lines.append(f"\n### {result.scenario.id} {result.scenario.name}: {result.word}\n\n")
         if result.outcome.sha256:
             lines.append(f"Records, SHA-256: `{result.outcome.sha256[:16]}`\n\n")
         lines += [f"- {line}\n" for line in _measured(result)]
-    lines.append(f"\nRun by cloudrc {__version__}; SHA-256 of its sources: `{sources[:16]}`.\n")
     return "".join(lines)
 
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
 from cloudrc.cli import closing
-from cloudrc.cli.faults_page import INVARIANTS
-from cloudrc.cli.faults_slices import document, keep
 from cloudrc.cli.link_verify_text import Said, as_text
 from cloudrc.cli.live import FlightView
 from cloudrc.cli.main import main
@@ -97,30 +94,6 @@ def test_what_happens_in_a_flight() -> None:
     stream = io.StringIO()
     FlightView(stream, 1).see([Fault(0, "bad", EVIL)])
     assert_harmless(stream.getvalue())
-
-
-def found(version: str) -> dict[str, Any]:
-    what = {"kind": "random", "first": 1, "seconds": 1.0, "sources": "ab"}
-    flight = {
-        **{"judged": INVARIANTS, "kinds": (), "margin": 0.1, "speed": 1.0, "holds": 0},
-        **{"missions": 1, "fallen": 0.0, "thrown": 0.0, "landed_on": False, "duration": 60.0},
-    }
-    return document([flight], [], **what) | {"version": version}
-
-
-def test_a_page_and_an_error_of_a_search(here: Path, printed: Printing) -> None:
-    keep(found("1"), here / "a.json")
-    keep(found(EVIL) | {"first": 2}, here / "b.json")
-    assert main(["faults", "merge", "a.json", "b.json"]) == 2
-    assert printed().count("\n") == 1
-    assert main(["faults", "merge", "b.json", "--document", "page.md"]) == 0
-    assert_harmless((here / "page.md").read_text())
-
-
-def test_a_slice_without_words_where_words_belong(here: Path, capsys: Printed) -> None:
-    keep(found("1") | {"sources": 3}, here / "a.json")
-    assert main(["faults", "merge", "a.json", "--document", "page.md"]) == 2
-    assert "a.json: is no slice" in capsys.readouterr().err
 
 
 def test_what_a_link_container_tells_of_itself() -> None:

@@ -113,13 +113,13 @@ def test_a_search_that_loses_a_process_keeps_what_was_flown(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cloudrc.faults.fuzz.fly", _fly)
-    assert main("faults fuzz --seeds 9 --jobs 2 --slice a.json".split()) == 6
-    error = capsys.readouterr().err
+    assert main("faults fuzz --seeds 9 --jobs 2 -o json".split()) == 6
+    out, error = capsys.readouterr()
     assert error.count("\n") == 1
     assert error.startswith("cloudrc: a worker was killed")
-    count = json.loads(Path("a.json").read_text())["count"]
+    count = json.loads(out)["count"]
     assert 1 <= count < KILLED
-    assert f"{count} of 9 are kept in a.json" in error
+    assert f"; {count} of 9 were flown" in error
     assert f"go on with 'cloudrc faults fuzz --first {count + 1} --seeds {9 - count}'" in error
     assert main(f"faults fuzz --first {KILLED} --seeds 2 --jobs 2".split()) == 6
     assert "; not one schedule was flown" in capsys.readouterr().err
@@ -181,13 +181,10 @@ def test_ctrl_c_ends_a_process_that_has_not_heard_of_sigterm(
     test_ctrl_c_ends_the_processes_at_once()
 
 
-def test_a_slice_is_not_replaced(
+def test_a_store_that_is_no_folder_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("a.json").write_text("of hours")
-    assert main("faults fuzz --seeds 1 --slice a.json".split()) == 2
-    assert "--slice a.json: is there already" in capsys.readouterr().err
-    assert Path("a.json").read_text() == "of hours"
+    Path("a.json").touch()
     assert main("faults fuzz --seeds 1 --store a.json/found".split()) == 2
     assert "no folder can be made there" in capsys.readouterr().err

@@ -29,7 +29,7 @@ def patience() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.parametrize("words", ["recover", "faults replay", "faults merge"])
+@pytest.mark.parametrize("words", ["recover", "faults replay"])
 @pytest.mark.parametrize("what", ["pipe", "/dev/null", "."])
 def test_what_is_no_file_is_refused_and_not_waited_for(
     words: str,

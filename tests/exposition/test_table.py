@@ -108,16 +108,3 @@ def test_no_label_is_one_that_prometheus_keeps_for_itself() -> None:
     """promtool refuses them outside of histograms and summaries."""
     labels = {label for metric in METRICS.values() for label in metric.labels}
     assert not labels & {"le", "quantile", "job", "instance", "namespace", "pod"}
-
-
-def test_no_page_names_a_metric_that_there_is_not() -> None:
-    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "charts").rglob("*.md")]
-    named = {
-        name
-        for path in pages
-        for name in re.findall(r"\bcloudrc_[a-z_]+", path.read_text(encoding="utf-8"))
-    }
-    assert len(named) > len(METRICS) // 2
-    assert {re.sub("_(bucket|sum|count)$", "", name) for name in named - METRICS.keys()} <= (
-        METRICS.keys()
-    )

@@ -45,20 +45,6 @@ def test_a_hostile_cloud_causes_no_breach(policy: str) -> None:
     assert fly(replace(choose(seeds[0]), duration=12.0)).breaches == ()
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("first", range(1, 1001, 50))
-def test_a_thousand_random_schedules_break_no_invariant(first: int) -> None:
-    failed = [seed for seed in range(first, first + 50) if fly(compose(seed)).breaches]
-    assert failed == []
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("first", range(1, 201, 25))
-def test_two_hundred_hostile_clouds_cause_no_breach(first: int) -> None:
-    findings = [fly(choose(seed)) for seed in range(first, first + 25)]
-    assert [each.schedule.seed for each in findings if each.breaches or each.thrown] == []
-
-
 def test_an_adversary_flies_alone_or_amid_every_kind_of_fault() -> None:
     chosen = [choose(seed) for seed in range(400)]
     alone = [schedule for schedule in chosen if not schedule.events]
@@ -107,7 +93,6 @@ def test_what_falls_out_of_the_fence_by_the_operators_word_is_told_and_fails_not
     assert main(["faults", "fuzz", "--adversarial", "--seeds", "4", f"--document={page}"]) == 0
     told = "2 stopped by the operator's word came to lie outside of it, at most by 0.40 m"
     assert told in page.read_text()
-    assert "a [known limit](guard.md)" in page.read_text()
     command = f"cloudrc faults fuzz --adversarial --seeds 4 --document {page}"
     assert f"Written by `{command}`" in page.read_text()
     assert told in capsys.readouterr().out

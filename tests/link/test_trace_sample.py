@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import isnan, sqrt
 
 import numpy as np
@@ -34,6 +35,29 @@ def test_in_order_nothing_is_overtaken_and_the_mean_rises() -> None:
     found = measured(DirectionProfile(0.045, 0.025, keep_order=True))
     assert found.overtaken == 0.0
     assert found.mean > 0.050
+
+
+@pytest.mark.parametrize(
+    ("distribution", "lag_one"), [("normal", 0.50), ("uniform", 0.48), ("pareto", 0.38)]
+)
+def test_a_correlation_of_a_half_survives_its_distribution(
+    distribution: str, lag_one: float
+) -> None:
+    profile = DirectionProfile(1.0, 0.01, distribution, 0.5)  # type: ignore[arg-type]
+    assert measured(profile).correlation == pytest.approx(lag_one, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("jitter", "overtaken", "mean", "deviation"),
+    [(0.010, 0.12, 0.0704, 0.0054), (0.025, 0.41, 0.0753, 0.0109), (0.040, 0.54, 0.0829, 0.0150)],
+)
+def test_more_jitter_reorders_more_or_costs_more_delay_in_order(
+    jitter: float, overtaken: float, mean: float, deviation: float
+) -> None:
+    profile = DirectionProfile(0.07, jitter)
+    assert measured(profile).overtaken == pytest.approx(overtaken, abs=0.02)
+    in_order = measured(replace(profile, keep_order=True))
+    assert (in_order.mean, in_order.deviation) == pytest.approx((mean, deviation), abs=0.0005)
 
 
 def test_losses_in_a_row_are_counted() -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.faults_slices import keep
 from cloudrc.cli.main import main
 from cloudrc.drivers.epochs import replace_durably
 from cloudrc.errors import BadInputError
@@ -58,7 +57,6 @@ WRITERS: list[Callable[[Path], object]] = [
     lambda path: replace_durably(path, b"new"),
     lambda path: publish(path, "new"),
     lambda path: write_json(path, {}),
-    lambda path: keep({}, path),
     lambda path: write_mission(path, world_records(20), ()),
     recovered,
 ]

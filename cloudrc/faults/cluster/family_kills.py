@@ -34,8 +34,8 @@ COMMANDS_IN = 2.0
 """Time for a new cloud to command [s]. Source: docs/reference/faults.md, "F13"."""
 POD_START = 10.0
 """Kubernetes' own part of it where the image is on the node [s], for a pod that ends at the end of
-its grace, too: from the pod's deletion to the flight 6.3 to 9.5 s were measured on kind with 2 CPUs
-that others slow down (docs/safety/faults-cluster.md)."""
+its grace, too: from the pod's deletion to the flight 6.3 to 9.5 s were measured on kind with 2 busy
+CPUs."""
 CONTAINER_START = 5.0
 """Likewise in a pod that stays [s]: the kubelet looks for what has ended once a second. Killed a
 second time within 10 minutes a container has to wait for 10 s, but here its pod goes next."""

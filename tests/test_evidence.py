@@ -1,0 +1,87 @@
+"""A number that a test misses fails it; a night's page shows the worst of each number."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli.main import main
+from tools import evidence
+
+
+@pytest.mark.parametrize(
+    ("measured", "relation", "asked"),
+    [
+        (0.252 + 1e-10, "<=", 0.252),
+        (0.12, ">=", 0.12),
+        (0, "==", 0),
+    ],
+)
+def test_a_number_that_is_as_asked_passes(
+    figure: Callable[..., None], measured: float, relation: str, asked: float
+) -> None:
+    figure("number", measured, relation, asked)
+
+
+@pytest.mark.parametrize(
+    ("measured", "relation", "asked", "said"),
+    [
+        (0.253, "<=", 0.252, "number: 0.253 s, asked <= 0.252 s"),
+        (0.1, ">=", 0.12, "number: 0.1 s, asked >= 0.12 s"),
+        (1, "==", 0, "number: 1 s, asked == 0 s"),
+        (None, "<=", 1.0, "number: nan s, asked <= 1 s"),
+    ],
+)
+def test_a_number_that_was_missed_fails_its_test(
+    figure: Callable[..., None], measured: float | None, relation: str, asked: float, said: str
+) -> None:
+    with pytest.raises(AssertionError, match=said):
+        figure("number", measured, relation, asked, "s")
+
+
+def test_a_night_s_page_shows_the_worst_of_each_number(
+    figure: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CLOUDRC_EVIDENCE", str(tmp_path))
+    figure("clearance", 0.2, ">=", 0.12, "m", count=10)
+    figure("clearance", 0.13, ">=", 0.12, "m", count=20)
+    with pytest.raises(AssertionError):
+        figure("HOLD after", None, "<=", 0.252, "s")
+    figure("HOLD after", 0.25, "<=", 0.252, "s")
+    evidence.write(tmp_path)
+    lines = (tmp_path / "index.md").read_text().splitlines()
+    assert "| HOLD after | <= 0.252 s | - | 2 | tests/test_evidence.py |" in lines
+    assert "| clearance | >= 0.12 m | 0.13 m | 30 | tests/test_evidence.py |" in lines
+    written = json.loads((tmp_path / "numbers.json").read_text())["numbers"]
+    assert [(row["name"], row["measured"]) for row in written] == [
+        ("HOLD after", None),
+        ("clearance", 0.13),
+    ]
+
+
+def test_a_night_s_page_shows_faults_searches_tests_and_mutants(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, words in (
+        ("faults-virtual", "faults run F37"),
+        ("search-clean", "faults fuzz --clean --seeds 1"),
+    ):
+        assert main([*words.split(), "-o", "json"]) == 0
+        (tmp_path / f"{name}.json").write_text(capsys.readouterr().out)
+    (tmp_path / "faults-real.json").touch()  # its command broke
+    (tmp_path / "tests.xml").write_text(
+        '<testsuite tests="9" failures="1" errors="0" skipped="2"/>'
+    )
+    (tmp_path / "mutants.txt").write_text(
+        "  a.x_b__mutmut_1: killed\n  a.x_b__mutmut_2: survived\n"
+    )
+    evidence.write(tmp_path)
+    page = (tmp_path / "index.md").read_text()
+    assert "| virtual | F37 | bad-configuration | passed |" in page
+    assert "## Search: clean" in page
+    assert "| fence breaches | 0 | 1 | p < 1 |" in page
+    assert "| tests | 9 | 1 | 0 | 2 |" in page
+    assert "| survived | 1 |" in page
