@@ -70,7 +70,7 @@ def _judge(name: str, findings: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Count the flights in which an invariant was checked, and those in which it broke."""
     judged = sum(name in each["judged"] for each in findings)
     broken = sum(name in each["kinds"] for each in findings)
-    # Source: the rule of three: 0 events in N runs, p < 3/N with 95 % confidence.
+    # The rule of three: 0 events in N runs, p < 3/N with 95 % confidence.
     bound = min(3.0 / judged, 1.0) if judged and not broken else None
     return {"judged": judged, "broken": broken if judged else None, "bound": bound}
 
