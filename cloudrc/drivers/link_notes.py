@@ -16,14 +16,7 @@ from pathlib import Path
 from cloudrc.errors import in_one_line
 from cloudrc.files import TooLongError, read, version
 from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, LinkState, from_text
-from cloudrc.records import (
-    Counted,
-    GuardChange,
-    LinkChanged,
-    MissionEvent,
-    Record,
-    SessionOpened,
-)
+from cloudrc.records import Counted, GuardChange, LinkChanged, MissionEvent, Record, SessionOpened
 
 PERIOD_NS = 100_000_000
 """Between two looks [ns]."""

@@ -13,14 +13,7 @@ from cloudrc.faults.meters import reading
 from cloudrc.faults.scenario import Outcome
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import (
-    CommandApplied,
-    Fault,
-    GuardChange,
-    Record,
-    SessionOpened,
-    TelemetrySent,
-)
+from cloudrc.records import CommandApplied, Fault, GuardChange, Record, SessionOpened, TelemetrySent
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 
