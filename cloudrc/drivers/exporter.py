@@ -23,12 +23,9 @@ from prometheus_client.metrics_core import Metric as Family
 from cloudrc import __version__
 from cloudrc.drivers.cgroup import read_throttling
 from cloudrc.drivers.probes import Answer, ProbeServer
-from cloudrc.exposition.histogram import Histogram
-from cloudrc.exposition.labels import Labels
 from cloudrc.exposition.live import Live
-from cloudrc.exposition.metric import Kind, Metric
-from cloudrc.exposition.part import Readings, plain
-from cloudrc.exposition.table import of_role
+from cloudrc.exposition.parts import Histogram, Readings, plain
+from cloudrc.exposition.table import Kind, Labels, Metric, of_role
 from cloudrc.records import Counted, Record
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from math import nan
 
-from cloudrc.exposition.streams import Stream
+from cloudrc.exposition.parts import Stream
 from cloudrc.link.verify_block import Block
 from cloudrc.link.verify_twin import Heard
 from cloudrc.records import Arrival

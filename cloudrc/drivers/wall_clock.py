@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 
-from cloudrc.exposition.end import CLOCK_SET
+from cloudrc.exposition.ends import CLOCK_SET
 from cloudrc.records import Fault
 
 STEP = 0.1

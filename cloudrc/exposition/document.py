@@ -5,9 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 
-from cloudrc.exposition.labels import ROLES
-from cloudrc.exposition.metric import Metric
-from cloudrc.exposition.table import METRICS
+from cloudrc.exposition.table import METRICS, ROLES, Metric
 
 HEAD = """\
 # Metrics

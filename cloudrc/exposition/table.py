@@ -2,34 +2,251 @@
 
 Names follow Prometheus' rules: prefix `cloudrc_`, base units, counters end in `_total`. Every
 label has a closed set of values, so that one pod stays below 200 series.
+
+The closed sets that labels take their values from, and the buckets of the histograms.
+
+What one Prometheus metric is: its name, type, meaning, labels, and who exposes it.
+
+The part of the table of metrics that is the standing check of the link.
+
+The metrics of the emulated link: who shapes it, what was asked for, what became of datagrams.
+
+The metrics of missions, of the API that takes them, and of the journal that keeps them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from enum import Enum
 from types import MappingProxyType
+from typing import NamedTuple
 
-from cloudrc.exposition.labels import (
-    AXES,
-    BODIES,
-    CLOUD,
-    DIRECTIONS,
-    ENDS,
-    GAP_BUCKETS,
-    GUARD_STATES,
-    LATENESS_BUCKETS,
-    LIMITS,
-    OUTCOMES,
-    PERIOD_BUCKETS,
-    PLUGINS,
-    ROLES,
-    TERMS,
-    WORLD,
+WORLD, CLOUD, TELEOP, LINK = "world", "cloud", "teleop", "link"
+ROLES = (WORLD, CLOUD, TELEOP, LINK)
+ENDS = (WORLD, CLOUD)
+MISSION = (CLOUD, TELEOP)
+
+AXES = ("x", "y", "z")
+TERMS = ("proportional", "integral", "derivative")
+DIRECTIONS = ("uplink", "downlink")
+OUTCOMES = (
+    "sent",
+    "used",
+    "late",
+    "stale",
+    "repeated",
+    "old_epoch",
+    "range",
+    "future",
+    "malformed",
+    "version",
+    "direction",
+    "accept_ignored",
+    "tag",
+    "hello",
+    "busy",
+    "unanswered",
 )
-from cloudrc.exposition.metric import Kind, Metric, counter, delay, gauge, numbered
-from cloudrc.exposition.table_check import CHECK
-from cloudrc.exposition.table_link import LINKS
-from cloudrc.exposition.table_mission import MISSIONS
+"""What becomes of a datagram; all but "sent" are told by its receiver."""
+ONLY_WORLD = {"stale", "range", "future", "hello", "unanswered"}
+ONLY_CLOUD = {"accept_ignored"}
+LIMITS = ("speed", "yaw_rate", "fence")
+"""Of the guard."""
+PLUGINS = ("estimator", "predictor", "controller")
+GUARD_STATES = ("ground", "track", "hold", "land", "estop")
+"""In the order of `cloudrc.messages.GuardState`."""
+MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
+"""In the order of `cloudrc.cloud.teleop.messages.State`."""
+MISSION_OUTCOMES = (
+    "done",
+    "cancelled",
+    "timed_out",
+    "leg_timed_out",
+    "world_restarted",
+    "guard_stopped",
+    "emergency_stopped",
+    "taken_over",
+    "end_lost",
+    "other",
+)
+API_REFUSALS = ("token", "role", "busy", "slow")
+"""Why the API does not serve: no valid token, a reader's token, too many requests or connections,
+a client that dawdles."""
+ORDER_REFUSALS = ("invalid", "conflict")
+"""Why an order is not flown: a value that cannot be used, a mission in the way."""
+BODIES = ("pipe", "board", "floor", "other")
+"""Kinds of bodies: `pipe_2` is a "pipe", and what else a scene may have is "other"."""
+LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
+"""As `cloudrc.link.relay_lanes.Lanes.outcomes` explains them."""
+SHAPERS = ("relay", "netem")
+LINK_MODES = ("auto", "relay", "netem")
+
+DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
+GAP_BUCKETS = (0.05, 0.25)
+"""More than jitter makes of a period of 10 ms, and the age at which the guard holds; only two, for
+a pod has less than 200 series."""
+PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
+"""Around the 10 ms of both loops."""
+LATENESS_BUCKETS = (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1)
+RELEASE_PERCENTILES = {"50": "p50", "99": "p99", "99.9": "p999"}
+"""Label -> how `cloudrc.link.relay_errors` names it."""
+STEP_PERCENTILES = {"50": "p50", "99": "p99"}
+"""Label -> how `cloudrc.link.netem_steps` names it."""
+
+Labels = tuple[str, ...]
+
+
+class Kind(Enum):
+    """What Prometheus calls the type of a metric."""
+
+    COUNTER = "counter"
+    GAUGE = "gauge"
+    HISTOGRAM = "histogram"
+
+
+class Metric(NamedTuple):
+    """One metric.
+
+    Attributes:
+        name: As it is scraped; a histogram adds `_bucket`, `_sum` and `_count`.
+        kind: Its type.
+        meaning: One sentence or two: the HELP text.
+        roles: Which processes expose it.
+        labels: Name -> all values that it may have.
+        buckets: Upper bounds of a histogram, rising, in the metric's unit.
+    """
+
+    name: str
+    kind: Kind
+    meaning: str
+    roles: tuple[str, ...]
+    labels: Mapping[str, Labels] = MappingProxyType({})
+    buckets: tuple[float, ...] = ()
+
+
+def counter(name: str, meaning: str, roles: tuple[str, ...], **labels: Labels) -> Metric:
+    """What only rises."""
+    return Metric(name, Kind.COUNTER, meaning, roles, labels)
+
+
+def gauge(name: str, meaning: str, roles: tuple[str, ...], **labels: Labels) -> Metric:
+    """What is so now."""
+    return Metric(name, Kind.GAUGE, meaning, roles, labels)
+
+
+def delay(name: str, meaning: str, roles: tuple[str, ...]) -> Metric:
+    """How often a delay was how long."""
+    return Metric(name, Kind.HISTOGRAM, meaning, roles, buckets=DELAY_BUCKETS)
+
+
+def numbered(names: Labels) -> str:
+    """Say which number stands for which state."""
+    return ", ".join(f"{number} {name}" for number, name in enumerate(names))
+
+
+CHECK = (
+    gauge(
+        "cloudrc_link_believed",
+        "1 if the direction that this end hears is proven to be what was asked for, 0 if it is"
+        " not (/link.json of the same port says why); absent while there are too few datagrams to"
+        " say.",
+        ENDS,
+        direction=DIRECTIONS,
+    ),
+)
+"""Entries of the table."""
+
+
+LINKS = (
+    Metric(
+        "cloudrc_link_info",
+        Kind.GAUGE,
+        "1; its labels say who shapes a direction of the link, and which mode was asked for.",
+        (LINK,),
+        {"shaper": SHAPERS, "direction": DIRECTIONS, "mode": LINK_MODES},
+    ),
+    gauge(
+        "cloudrc_link_delay_seconds",
+        "Mean one-way delay that the profile in force asks for.",
+        (LINK,),
+        direction=DIRECTIONS,
+    ),
+    gauge(
+        "cloudrc_link_step_lateness_seconds",
+        "How late netem's qdisc took the last 10,000 steps of its time line; absent without steps.",
+        (LINK,),
+        percentile=tuple(STEP_PERCENTILES),
+    ),
+    counter(
+        "cloudrc_link_datagrams_total",
+        "Datagrams at the shaper by what became of them.",
+        (LINK,),
+        outcome=LINK_OUTCOMES,
+    ),
+    counter(
+        "cloudrc_link_restored_total",
+        "How often another hand had removed or changed netem's qdisc, and it was put back.",
+        (LINK,),
+    ),
+    gauge(
+        "cloudrc_link_release_error_seconds",
+        "How late datagrams left the relay in the last 10 s; absent with netem.",
+        (LINK,),
+        percentile=tuple(RELEASE_PERCENTILES),
+    ),
+    counter(
+        "cloudrc_link_released_early_total",
+        "Datagrams that left the relay before they were due: none, unless its code is wrong; absent"
+        " with netem.",
+        (LINK,),
+    ),
+    counter(
+        "cloudrc_dns_errors_total",
+        "Times that the peer's name could not be resolved; the last address known is kept.",
+        (LINK,),
+    ),
+)
+"""A part of the table."""
+
+
+MISSIONS = (
+    # Mission: in the process that flies it.
+    gauge("cloudrc_mission_state", f"State of the mission: {numbered(MISSION_STATES)}.", MISSION),
+    gauge("cloudrc_mission_waypoint", "Index of the waypoint flown to; -1 if none.", MISSION),
+    counter("cloudrc_waypoints_reached_total", "Waypoints reached.", MISSION),
+    counter("cloudrc_missions_total", "Missions ended.", MISSION, outcome=MISSION_OUTCOMES),
+    # Teleop: its API and its journal.
+    counter("cloudrc_api_requests_total", "Requests that the API has served.", (TELEOP,)),
+    counter(
+        "cloudrc_api_rejected_total",
+        "Requests refused and connections cut off by the API.",
+        (TELEOP,),
+        reason=API_REFUSALS,
+    ),
+    counter(
+        "cloudrc_missions_refused_total",
+        "Orders that the API refused: of what cannot be flown, or while a mission is in the way.",
+        (TELEOP,),
+        reason=ORDER_REFUSALS,
+    ),
+    counter(
+        "cloudrc_stream_dropped_events_total",
+        "Events that were forgotten before a reader of the stream, who was too slow, had them.",
+        (TELEOP,),
+    ),
+    counter(
+        "cloudrc_audit_dropped_total",
+        "Lines of the audit log that a slow or full disk did not take.",
+        (TELEOP,),
+    ),
+    counter(
+        "cloudrc_journal_repaired_total",
+        "Times that the journal was found damaged and mended.",
+        (TELEOP,),
+    ),
+)
+"""A part of the table."""
+
 
 _ENTRIES = (
     # Every process.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from math import nan
 
-from cloudrc.exposition.histogram import Histogram
 from cloudrc.exposition.live import Live
+from cloudrc.exposition.parts import Histogram
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome
 from cloudrc.records import Counted, Record

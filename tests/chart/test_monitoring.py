@@ -11,8 +11,7 @@ import pytest
 import yaml
 from rendering import CHART, ROOT, Object, containers, of_kind, pod_specs, render
 
-from cloudrc.exposition.metric import Kind
-from cloudrc.exposition.table import METRICS
+from cloudrc.exposition.table import METRICS, Kind
 
 OPERATOR = "monitoring.coreos.com/v1"
 BOTH: Object = {"metrics": {"podMonitor": {"enabled": True}, "prometheusRule": {"enabled": True}}}

@@ -15,7 +15,7 @@ from cloudrc.cloud.teleop.service_book import (
 )
 from cloudrc.cloud.teleop.service_mission import ENDED, STATES, Order
 from cloudrc.config.load import load_experiment
-from cloudrc.exposition.labels import MISSION_OUTCOMES
+from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.messages import GuardState, Request, Setpoint, Start
 
 QUICK = Plan((Leg(A, dwell=0.0),), Start.HERE)

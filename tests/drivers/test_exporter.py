@@ -14,15 +14,16 @@ from prometheus_client.parser import text_string_to_metric_families
 from cloudrc import __version__
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.exporter import Exporter
-from cloudrc.exposition.labels import (
+from cloudrc.exposition.table import (
     BODIES,
     DIRECTIONS,
     ENDS,
     LINK_OUTCOMES,
+    METRICS,
     ROLES,
+    Kind,
+    of_role,
 )
-from cloudrc.exposition.metric import Kind
-from cloudrc.exposition.table import METRICS, of_role
 from cloudrc.link.netem_steps import Steps
 from cloudrc.link.relay_errors import Recent, ReleaseErrors
 from cloudrc.messages import ZERO

@@ -26,7 +26,7 @@ from standing_flights import (
 from cloudrc.drivers.standing_basis import Basis
 from cloudrc.drivers.standing_check import StandingCheck
 from cloudrc.drivers.standing_tally import Tally
-from cloudrc.exposition.check import Check
+from cloudrc.exposition.ends import Check
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import STATE_MAX
 from cloudrc.link.verify_twin import WINDOW, Heard, Twin

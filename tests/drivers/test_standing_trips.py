@@ -22,7 +22,7 @@ from standing_flights import (
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.drivers.standing_check import StandingCheck
-from cloudrc.exposition.check import Check
+from cloudrc.exposition.ends import Check
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.verify_standing import WINDOW_MAX
 from cloudrc.link.verify_trips import TICK

@@ -11,9 +11,8 @@ from typing import Any
 
 import yaml
 
-from cloudrc.exposition.histogram import Histogram
 from cloudrc.exposition.live import Live
-from cloudrc.exposition.part import Readings
+from cloudrc.exposition.parts import Histogram, Readings
 from cloudrc.exposition.table import METRICS
 from cloudrc.faults import meters
 from cloudrc.faults.flight import Flight

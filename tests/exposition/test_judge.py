@@ -10,7 +10,7 @@ from control_periods import MS, period
 from flying import records
 
 from cloudrc.config.load import load_experiment
-from cloudrc.exposition.judge import DelayJudge, PredictionJudge
+from cloudrc.exposition.ends import DelayJudge, PredictionJudge
 from cloudrc.exposition.live import Live
 from cloudrc.records import CommandApplied, Control
 

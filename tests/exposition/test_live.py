@@ -9,9 +9,9 @@ from control_periods import MS, period
 from flying import records
 
 from cloudrc.config.load import load_experiment
-from cloudrc.exposition import labels
-from cloudrc.exposition.histogram import Histogram
+from cloudrc.exposition import table
 from cloudrc.exposition.live import Live
+from cloudrc.exposition.parts import Histogram
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.records import (
     Arrival,
@@ -74,7 +74,7 @@ def test_one_way_delays_are_those_that_arrived(flight: Flight, role: str, index:
 def test_without_a_shared_clock_one_way_delays_are_absent() -> None:
     experiment = load_experiment("hover", ["link.profile=paper-p1"])
     both = records(experiment, offset_ns=7_000_000_000)
-    for role, of_end in zip(labels.ENDS, both, strict=True):
+    for role, of_end in zip(table.ENDS, both, strict=True):
         live = Live(role)
         live.see(of_end)
         assert not any("age_of" in name or "link_delay" in name for name in live.read())
@@ -200,7 +200,7 @@ def heard(role: str, *seen: Record) -> bool:
     return live.end.has_peer
 
 
-@pytest.mark.parametrize("role", labels.ENDS)
+@pytest.mark.parametrize("role", table.ENDS)
 def test_an_end_has_a_peer_while_it_hears_it(role: str) -> None:
     opened = SessionOpened(0, role, 1, "")
     arrival = Arrival(1000 * MS, role == "cloud", 1, 0, math.nan, True)
@@ -213,7 +213,7 @@ def test_an_end_has_a_peer_while_it_hears_it(role: str) -> None:
     assert heard(role, opened, arrival, again, wake(5010))
 
 
-@pytest.mark.parametrize("role", labels.ENDS)
+@pytest.mark.parametrize("role", table.ENDS)
 @pytest.mark.parametrize(("behind", "hears"), [(0, False), (1, True), (500, False)])
 def test_a_datagram_that_is_sent_again_is_no_sign_of_life(
     role: str, behind: int, hears: bool
@@ -227,7 +227,7 @@ def test_a_datagram_that_is_sent_again_is_no_sign_of_life(
     assert heard(role, opened, first, newest, again, wake(2500)) == hears
 
 
-@pytest.mark.parametrize("role", labels.ENDS)
+@pytest.mark.parametrize("role", table.ENDS)
 def test_a_gap_lies_between_two_arrivals_of_a_session_and_nobody_hides_it(role: str) -> None:
     live = Live(role)
     live.see([SessionOpened(0, role, 1, "")])
@@ -268,7 +268,7 @@ def test_the_mission_is_told_by_its_events() -> None:
         ("leg_timed_out", 0),
     ):
         live.see([MissionEvent(0, event, waypoint, "")])
-        state = labels.MISSION_STATES[int(value(live, "cloudrc_mission_state"))]
+        state = table.MISSION_STATES[int(value(live, "cloudrc_mission_state"))]
         seen.append((state, value(live, "cloudrc_mission_waypoint")))
     assert seen == [
         ("flying", 0),

@@ -7,7 +7,7 @@ import random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.exposition.streams import WINDOW, Stream
+from cloudrc.exposition.parts import WINDOW, Stream
 
 
 def taken(*counters: int, epoch: int = 1) -> Stream:

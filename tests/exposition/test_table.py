@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cloud.teleop.messages import State
-from cloudrc.exposition import labels
+from cloudrc.exposition import table
 from cloudrc.exposition.document import OPEN, QUERIES, page
-from cloudrc.exposition.metric import Kind, Metric
-from cloudrc.exposition.table import METRICS, of_role
+from cloudrc.exposition.table import METRICS, Kind, Metric, of_role
 from cloudrc.messages import GuardState
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,7 +23,7 @@ NOT_DATAGRAMS = {
     "frozen",
     "start_refused",
     "held_seconds",
-} | {f"limited_{limit}" for limit in labels.LIMITS}
+} | {f"limited_{limit}" for limit in table.LIMITS}
 
 
 @pytest.mark.parametrize("metric", METRICS.values(), ids=lambda metric: metric.name)
@@ -32,7 +31,7 @@ def test_a_metric_keeps_the_rules(metric: Metric) -> None:
     assert re.fullmatch(r"cloudrc(_[a-z]+)+", metric.name)
     assert metric.name.endswith("_total") == (metric.kind is Kind.COUNTER)
     assert metric.meaning.endswith(".")
-    assert set(metric.roles) <= set(labels.ROLES)
+    assert set(metric.roles) <= set(table.ROLES)
     assert bool(metric.buckets) == (metric.kind is Kind.HISTOGRAM)
     assert list(metric.buckets) == sorted(metric.buckets)
     for name, values in metric.labels.items():
@@ -40,7 +39,7 @@ def test_a_metric_keeps_the_rules(metric: Metric) -> None:
 
 
 def test_delays_are_resolved_from_5_ms_to_1_s() -> None:
-    assert (labels.DELAY_BUCKETS[0], labels.DELAY_BUCKETS[-1]) == (0.005, 1.0)
+    assert (table.DELAY_BUCKETS[0], table.DELAY_BUCKETS[-1]) == (0.005, 1.0)
 
 
 def test_the_names_that_others_build_on_are_there() -> None:
@@ -61,8 +60,8 @@ def test_the_names_that_others_build_on_are_there() -> None:
 
 
 def test_states_are_numbered_as_their_enumerations() -> None:
-    assert tuple(state.name.lower() for state in GuardState) == labels.GUARD_STATES
-    assert tuple(state.name.lower() for state in State) == labels.MISSION_STATES
+    assert tuple(state.name.lower() for state in GuardState) == table.GUARD_STATES
+    assert tuple(state.name.lower() for state in State) == table.MISSION_STATES
 
 
 def test_the_shipped_bodies_are_known() -> None:
@@ -71,7 +70,7 @@ def test_the_shipped_bodies_are_known() -> None:
         name for scene in scenes for name in re.findall(r'<body name="(\w+)"', scene.read_text())
     }
     assert bodies
-    assert {body.rstrip("_0123456789") for body in bodies} <= set(labels.BODIES)
+    assert {body.rstrip("_0123456789") for body in bodies} <= set(table.BODIES)
 
 
 def test_whatever_the_ends_count_is_a_metric() -> None:
@@ -84,11 +83,11 @@ def test_whatever_the_ends_count_is_a_metric() -> None:
             if path.name == "guard.py":
                 found.update(re.findall(r'return "(\w+)"', text))
     assert {"sent", "malformed", "old_epoch", "stale", "missed_periods"} <= found
-    assert found - set(labels.OUTCOMES) - NOT_DATAGRAMS == set()
+    assert found - set(table.OUTCOMES) - NOT_DATAGRAMS == set()
 
 
 def test_every_role_has_the_metrics_of_a_process() -> None:
-    for role in labels.ROLES:
+    for role in table.ROLES:
         names = {metric.name for metric in of_role(role)}
         assert {"cloudrc_build_info", "cloudrc_cpu_throttled_seconds_total"} <= names
 

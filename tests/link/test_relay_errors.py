@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cloudrc.exposition.labels import LINK_OUTCOMES, RELEASE_PERCENTILES
+from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay import bind_loopback

@@ -1,0 +1,503 @@
+"""What world exposes besides what both ends do: the robot, its guard, contacts, real time.
+
+What an end tells of the standing check of the link: the verdict, and all of it as JSON.
+
+What both ends of the tunnel expose: session, datagrams, one-way delay, how the loop keeps up.
+
+Predictions and delay estimates held to what arrives later: control periods in, errors out.
+
+Everything is computed from `Control` records, on the clock that each stamp belongs to, so it works
+without a shared clock.
+
+What cloud exposes besides what both ends do: delays in the loop, prediction, control.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from heapq import heappop, heappush
+from math import isfinite, nan
+
+from cloudrc.exposition.parts import (
+    Handlers,
+    Histogram,
+    Readings,
+    Stream,
+    by,
+    chosen,
+    known,
+    per_axis,
+    plain,
+)
+from cloudrc.exposition.table import (
+    AXES,
+    BODIES,
+    DELAY_BUCKETS,
+    DIRECTIONS,
+    GAP_BUCKETS,
+    GUARD_STATES,
+    LATENESS_BUCKETS,
+    LIMITS,
+    ONLY_CLOUD,
+    ONLY_WORLD,
+    OUTCOMES,
+    PERIOD_BUCKETS,
+    PLUGINS,
+    TERMS,
+    Labels,
+)
+from cloudrc.messages import NEVER_NS, GuardState, Vector
+from cloudrc.records import (
+    Arrival,
+    CommandApplied,
+    Contact,
+    Control,
+    Counted,
+    Fault,
+    GroundTruth,
+    GuardChange,
+    Lateness,
+    LinkChecked,
+    SessionOpened,
+    TelemetrySent,
+)
+
+_KNOWN = ("stamp_ns", "uplink")
+"""Of no use to a reader, or said once for all."""
+
+
+class Check:
+    """The newest verdict on the direction that an end hears."""
+
+    def __init__(self, direction: str) -> None:
+        """Begin before the first; the direction is "uplink" or "downlink"."""
+        self._direction = direction
+        self._newest: tuple[LinkChecked, ...] = ()
+
+    def see(self, record: LinkChecked) -> None:
+        """Take note of one quantity; those of an older verdict are forgotten."""
+        newest = self._newest
+        if newest and newest[0].stamp_ns != record.stamp_ns:
+            newest = ()
+        self._newest = (*newest, record)  # replaced, not changed: others may be reading it
+
+    @property
+    def verdict(self) -> str:
+        """Of all quantities: "ok", "off", or "open" while there is too little to say."""
+        verdicts = {record.verdict for record in self._newest} - {"told"}
+        return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
+
+    def text(self) -> str:
+        """Say all that is known now, as JSON."""
+        rows = [
+            {
+                key: value
+                for key, value in record._asdict().items()
+                if key not in _KNOWN and not (isinstance(value, float) and not isfinite(value))
+            }
+            for record in self._newest
+        ]
+        found = {"direction": self._direction, "verdict": self.verdict, "rows": rows}
+        return json.dumps(found, indent=2) + "\n"
+
+    def read(self) -> Readings:
+        """See `Part`."""
+        if self.verdict == "open":
+            return {}
+        return {"cloudrc_link_believed": {(self._direction,): float(self.verdict == "ok")}}
+
+
+CLOCK_SET = "wall_clock"
+"""Code of the fault that tells that the wall clock was set; see `cloudrc.drivers.wall_clock`."""
+SILENCE_NS = 2_000_000_000
+"""An end that has heard nothing for so long has no peer [ns]."""
+
+
+class End:
+    """World or cloud; the incoming direction is the one that it hears.
+
+    Attributes:
+        check: The standing check of that direction.
+    """
+
+    def __init__(self, incoming: str, outgoing: str) -> None:
+        """Begin before the first session; the directions are "uplink" and "downlink"."""
+        self._incoming, self._outgoing = incoming, outgoing
+        others = ONLY_CLOUD if incoming == DIRECTIONS[1] else ONLY_WORLD
+        self._outcomes = tuple(name for name in OUTCOMES[1:] if name not in others)
+        self._counts: dict[str, int] = {}
+        self._stream = Stream()
+        self.check = Check(incoming)
+        self._one_way, self._age = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
+        self._gap = Histogram(GAP_BUCKETS)
+        self._period, self._lateness = Histogram(PERIOD_BUCKETS), Histogram(LATENESS_BUCKETS)
+        self._busy = 0.0
+        self._clock_steps = 0
+        self._sessions, self._epoch, self._opened_ns = 0, 0, NEVER_NS
+        self._heard_ns = self._woke_ns = self._deadline_ns = NEVER_NS
+        self._silent = True  # no telemetry or command has arrived in this session
+        # What the newest datagram used tells about the age of what this end knows.
+        self._newest_ns, self._newest_delay = NEVER_NS, nan
+
+    def handlers(self) -> Handlers:
+        """See `Part`."""
+        return {
+            Arrival: self._see_arrival,
+            Counted: self._see_count,
+            Fault: self._see_fault,
+            Lateness: self._see_wake,
+            SessionOpened: self._see_session,
+            LinkChecked: self.check.see,
+        }
+
+    @property
+    def has_peer(self) -> bool:
+        """Whether the other end has been heard within 2 s."""
+        return self._opened_ns != NEVER_NS and self._woke_ns - self._heard_ns < SILENCE_NS
+
+    def _see_arrival(self, record: Arrival) -> None:
+        stamp_ns, _, epoch, counter, delay, used = record
+        if self._stream.take(epoch, counter):  # those that are repeated anybody can send
+            if not self._silent:
+                self._gap.observe((stamp_ns - self._heard_ns) * 1e-9)
+            self._heard_ns, self._silent = stamp_ns, False
+        if delay == delay:  # not NaN: both ends share a clock
+            self._one_way.observe(delay)
+        if used:
+            self._newest_ns, self._newest_delay = stamp_ns, delay
+
+    def _see_count(self, record: Counted) -> None:
+        self._counts[record.name] = record.total
+
+    def _see_fault(self, record: Fault) -> None:
+        self._clock_steps += record.code == CLOCK_SET
+
+    def _see_session(self, record: SessionOpened) -> None:
+        self._sessions += 1
+        self._epoch = record.epoch
+        self._opened_ns = self._heard_ns = record.stamp_ns
+        self._silent = True
+        self._newest_delay = nan
+
+    def _see_wake(self, record: Lateness) -> None:
+        stamp_ns, _, lateness, busy, slip_ns = record
+        now_ns = stamp_ns + slip_ns
+        if self._deadline_ns != NEVER_NS:
+            self._period.observe((now_ns - self._deadline_ns) * 1e-9)
+        self._deadline_ns, self._woke_ns = now_ns, stamp_ns
+        self._lateness.observe(lateness)
+        self._busy += busy
+
+    def _see_age(self, now_ns: int) -> None:
+        """Once per period: how old what this end knows is now [ns, own clock]."""
+        delay = self._newest_delay
+        if delay == delay:
+            self._age.observe(delay + (now_ns - self._newest_ns) * 1e-9)
+
+    def read(self) -> Readings:
+        """See `Part`."""
+        counts, stream, incoming = self._counts, self._stream, (self._incoming,)
+        received = chosen(self._outcomes, counts)
+        datagrams: dict[Labels, float] = {(*incoming, name): n for name, n in received.items()}
+        datagrams[self._outgoing, "sent"] = counts.get("sent", 0)
+        readings: Readings = self.check.read() | {
+            "cloudrc_session_epoch": plain(self._epoch),
+            "cloudrc_sessions_opened_total": plain(self._sessions),
+            "cloudrc_datagrams_total": datagrams,
+            "cloudrc_datagrams_expected_total": {incoming: stream.expected},
+            "cloudrc_datagrams_lost_total": {incoming: stream.lost},
+            "cloudrc_datagrams_reordered_total": {incoming: stream.reordered},
+            "cloudrc_link_gap_seconds": self._gap,
+            "cloudrc_loop_period_seconds": self._period,
+            "cloudrc_loop_lateness_seconds": self._lateness,
+            "cloudrc_loop_busy_seconds_total": plain(self._busy),
+            "cloudrc_clock_steps_total": plain(self._clock_steps),
+            "cloudrc_recorder_dropped_records_total": plain(counts.get("recorder_dropped", 0)),
+        }
+        if self._one_way.cumulative()[-1]:  # a delay that nobody can know is absent, never zero
+            readings[f"cloudrc_{self._incoming}_delay_seconds"] = self._one_way
+            readings["cloudrc_age_of_information_seconds"] = self._age
+        return readings
+
+
+STEP_NS = 1_000_000_000
+STEPS = 10
+"""The real-time factor is that of the last 10 s, or of what there is."""
+ADMITTED = "cloud said hello"
+"""Why a session is opened for a cloud that had none; see `cloudrc.records.SessionOpened`."""
+
+
+class WorldEnd(End):
+    """The robot's end."""
+
+    def __init__(self) -> None:
+        """Begin on the ground."""
+        uplink, downlink = DIRECTIONS
+        super().__init__(incoming=downlink, outgoing=uplink)
+        self._truth: GroundTruth | None = None
+        self._guard = GuardState.GROUND
+        self._changes = dict.fromkeys(GUARD_STATES, 0)
+        self._contacts = dict.fromkeys(BODIES, 0)
+        self._slip_ns = self._admitted = 0
+        self._basis_ns, self._command_age = NEVER_NS, Histogram(DELAY_BUCKETS)
+        # Instants of world's clock and of the machine's [ns].
+        self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
+        self._instant_ns = NEVER_NS
+
+    def handlers(self) -> Handlers:
+        """See `Part`."""
+        return {
+            **super().handlers(),
+            GroundTruth: self._see_truth,
+            TelemetrySent: self._see_telemetry,
+            CommandApplied: self._see_command,
+            GuardChange: self._see_guard,
+            Contact: self._see_contact,
+        }
+
+    @property
+    def has_peer(self) -> bool:
+        """As of any end; a cloud that has nothing to command yet is heard once, at its hello."""
+        return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
+
+    def _see_session(self, record: SessionOpened) -> None:
+        super()._see_session(record)
+        self._admitted += record.cause == ADMITTED
+
+    def _see_truth(self, record: GroundTruth) -> None:
+        self._truth = record
+
+    def _see_command(self, record: CommandApplied) -> None:
+        self._basis_ns = record.basis_stamp_ns
+
+    def _see_telemetry(self, record: TelemetrySent) -> None:
+        self._see_age(record.stamp_ns)
+        if record.telemetry.guard is GuardState.TRACK:  # nowhere else a command is in use
+            self._command_age.observe((record.stamp_ns - self._basis_ns) * 1e-9)
+
+    def _see_guard(self, record: GuardChange) -> None:
+        if record.state != self._guard or record.state is GuardState.GROUND:
+            self._changes[GUARD_STATES[record.state]] += 1  # touch-down is told, but stays LAND
+        self._guard = record.state
+
+    def _see_contact(self, record: Contact) -> None:
+        kind = record.body.rstrip("_0123456789")
+        self._contacts[kind if kind in self._contacts else "other"] += 1
+
+    def _see_wake(self, record: Lateness) -> None:
+        super()._see_wake(record)
+        now_ns = self._deadline_ns
+        self._slip_ns = record.slip_ns
+        if now_ns >= self._instant_ns:
+            self._instant_ns = now_ns + STEP_NS
+            self._instants.append((record.stamp_ns, now_ns))
+
+    def read(self) -> Readings:
+        """See `Part`."""
+        readings = super().read()
+        readings |= {
+            "cloudrc_clouds_admitted_total": plain(self._admitted),
+            "cloudrc_sessions_refused_total": plain(self._counts.get("busy", 0)),
+            "cloudrc_command_age_seconds": self._command_age,
+            "cloudrc_guard_state": plain(self._guard),
+            "cloudrc_guard_transitions_total": by(self._changes),
+            "cloudrc_guard_limited_total": by(
+                {limit: self._counts.get(f"limited_{limit}", 0) for limit in LIMITS}
+            ),
+            "cloudrc_guard_held_seconds_total": plain(self._counts.get("held_seconds", 0)),
+            "cloudrc_guard_starts_refused_total": plain(self._counts.get("start_refused", 0)),
+            "cloudrc_contacts_total": by(self._contacts),
+            "cloudrc_world_slip_seconds_total": plain(self._slip_ns * 1e-9),
+            "cloudrc_world_stalls_total": plain(self._counts.get("stalls", 0)),
+        }
+        if self._truth is not None:
+            readings["cloudrc_position_meters"] = per_axis(self._truth.odometry.position)
+            readings["cloudrc_tip_force_newtons"] = plain(self._truth.tip_force)
+        factor = self._real_time_factor()
+        if factor is not None:
+            readings["cloudrc_real_time_factor"] = plain(factor)
+        return readings
+
+    def _real_time_factor(self) -> float | None:
+        instants = list(self._instants)
+        if len(instants) < 2:
+            return None
+        (world_ns, machine_ns), (world_end_ns, machine_end_ns) = instants[0], instants[-1]
+        return (world_end_ns - world_ns) / (machine_end_ns - machine_ns)
+
+
+GAP_MAX_NS = 50_000_000
+"""Between measurements further apart nothing is interpolated, and nothing judged [ns]."""
+WAITING_MAX = 256
+"""Predictions that wait for their measurement; a horizon of 1 s leaves 100."""
+
+
+class PredictionJudge:
+    """Compares each position predicted for an instant with the one measured at that instant.
+
+    Attributes:
+        error: The newest: predicted minus measured [m], shape (3,); NaN before the first.
+        square: Sum of the squared lengths of all errors [m^2].
+        judged: Number of predictions compared.
+    """
+
+    def __init__(self) -> None:
+        """Begin with nothing predicted."""
+        self.error: Vector = (nan, nan, nan)
+        self.square = 0.0
+        self.judged = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget predictions and measurements: a new session begins."""
+        self._waiting: list[tuple[int, Vector]] = []
+        self._measured_ns = NEVER_NS
+        self._measured: Vector = (nan, nan, nan)
+
+    def take(self, control: Control) -> None:
+        """Take a period's measurement, judge what was predicted up to it, keep its prediction."""
+        stamp_ns, waiting = control.basis_stamp_ns, self._waiting
+        if stamp_ns > self._measured_ns:
+            before_ns, before = self._measured_ns, self._measured
+            self._measured_ns, self._measured = stamp_ns, control.measured
+            while waiting and waiting[0][0] <= stamp_ns:
+                at_ns, predicted = heappop(waiting)
+                if before_ns <= at_ns and stamp_ns - before_ns <= GAP_MAX_NS:
+                    share = (at_ns - before_ns) / (stamp_ns - before_ns)
+                    self._judge(predicted, before, control.measured, share)
+        if len(waiting) < WAITING_MAX:
+            heappush(waiting, (stamp_ns + int(control.horizon * 1e9), control.position))
+
+    def _judge(self, predicted: Vector, before: Vector, after: Vector, share: float) -> None:
+        (px, py, pz), (ax, ay, az), (bx, by, bz) = predicted, before, after
+        x = px - ax - share * (bx - ax)
+        y = py - ay - share * (by - ay)
+        z = pz - az - share * (bz - az)
+        self.error = (x, y, z)
+        self.square += x * x + y * y + z * z
+        self.judged += 1
+
+
+class DelayJudge:
+    """Compares each delay estimate with the time that passed until its command was applied.
+
+    An echo tells when a command was applied on world's clock: the echoing odometry's stamp minus
+    the hold. Its age in cloud tells which command it was.
+
+    Attributes:
+        error: The newest: estimate minus what really passed [s]; NaN before the first.
+    """
+
+    def __init__(self) -> None:
+        """Begin with nothing estimated."""
+        self.error = nan
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the commands: a new session begins."""
+        self._sent: dict[int, Control] = {}
+        self._sent_before: dict[int, Control] = {}
+
+    def sent(self, control: Control) -> None:
+        """Remember a command."""
+        if len(self._sent) >= WAITING_MAX:
+            self._sent_before, self._sent = self._sent, {}
+        self._sent[control.stamp_ns] = control
+
+    def echoed(self, control: Control, arrival_ns: int) -> None:
+        """Judge the command that this period's odometry echoed.
+
+        Args:
+            control: Of the first period after the echo.
+            arrival_ns: When that odometry arrived [ns], cloud's clock.
+        """
+        stamp_ns = arrival_ns - round(control.loop_delay * 1e9)
+        sent = self._sent.get(stamp_ns) or self._sent_before.get(stamp_ns)
+        if sent is not None:
+            applied_ns = control.basis_stamp_ns - round((control.loop_delay - control.rtt) * 1e9)
+            self.error = sent.horizon - (applied_ns - sent.basis_stamp_ns) * 1e-9
+
+
+class CloudEnd(End):
+    """The remote controller's end."""
+
+    def __init__(self) -> None:
+        """Begin with nothing measured."""
+        uplink, downlink = DIRECTIONS
+        super().__init__(incoming=uplink, outgoing=downlink)
+        self._rtt, self._loop = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
+        self._prediction, self._delay = PredictionJudge(), DelayJudge()
+        self._control: Control | None = None
+        self._loop_delay = nan
+        self._used_ns, self._used_count = NEVER_NS, 0
+
+    def handlers(self) -> Handlers:
+        """See `Part`."""
+        return {**super().handlers(), Control: self._see_control}
+
+    def _see_session(self, record: SessionOpened) -> None:
+        super()._see_session(record)
+        self._prediction.reset()
+        self._delay.reset()
+
+    def _see_arrival(self, record: Arrival) -> None:
+        super()._see_arrival(record)
+        if record.used:
+            self._used_count += 1
+
+    def _see_control(self, record: Control) -> None:
+        self._control = record
+        self._see_age(record.stamp_ns)
+        self._prediction.take(record)
+        loop_delay = record.loop_delay
+        if loop_delay != self._loop_delay and loop_delay == loop_delay:  # a new echo
+            self._loop_delay = loop_delay
+            self._loop.observe(loop_delay)
+            self._rtt.observe(record.rtt)
+            if self._used_count == 1:  # of two odometries nobody can say which one echoed
+                self._delay.echoed(record, self._newest_ns)
+        self._used_count = 0
+        self._delay.sent(record)
+
+    def read(self) -> Readings:
+        """See `Part`."""
+        counts, prediction = self._counts, self._prediction
+        readings = super().read()
+        readings |= {
+            "cloudrc_rtt_seconds": self._rtt,
+            "cloudrc_loop_delay_seconds": self._loop,
+            "cloudrc_delay_estimate_error_seconds": known(self._delay.error),
+            "cloudrc_prediction_error_meters": per_axis(prediction.error),
+            "cloudrc_prediction_error_square_meters_total": plain(prediction.square),
+            "cloudrc_predictions_judged_total": plain(prediction.judged),
+            "cloudrc_horizon_clamped_total": plain(counts.get("horizon_clamped", 0)),
+            "cloudrc_commands_frozen_total": plain(counts.get("frozen", 0)),
+            "cloudrc_words_dropped_total": plain(counts.get("words_dropped", 0)),
+            "cloudrc_loop_missed_periods_total": plain(counts.get("missed_periods", 0)),
+            "cloudrc_plugin_failures_total": {
+                (plugin,): counts.get(f"{plugin}_failed", 0) for plugin in PLUGINS
+            },
+        }
+        return readings if self._control is None else readings | _of_period(self._control)
+
+
+def _of_period(control: Control) -> Readings:
+    """What the newest period of the control loop says."""
+    terms = (control.proportional, control.integral, control.derivative)
+    return {
+        "cloudrc_delay_estimate_seconds": known(control.horizon),
+        "cloudrc_tracking_error_meters": per_axis(_minus(control.setpoint, control.measured)),
+        "cloudrc_setpoint_meters": per_axis(control.setpoint),
+        "cloudrc_command_velocity_meters_per_second": per_axis(control.command),
+        "cloudrc_command_yaw_rate_radians_per_second": known(control.yaw_rate),
+        "cloudrc_pid_output": {
+            (axis, name): term[index]
+            for name, term in zip(TERMS, terms, strict=True)
+            for index, axis in enumerate(AXES)
+        },
+    }
+
+
+def _minus(one: Vector, other: Vector) -> Vector:
+    return (one[0] - other[0], one[1] - other[1], one[2] - other[2])
