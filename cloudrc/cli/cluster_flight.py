@@ -182,8 +182,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
         CloudrcError: If the recordings cannot be fetched; without the rest there is a report.
     """
     from cloudrc.cluster.fetch import fetch_logs, fetch_metrics
-    from cloudrc.record.cut import cut_to_last_mission
-    from cloudrc.record.merge import merge
+    from cloudrc.record.merge import cut_to_last_mission, merge
 
     for _ in range(FETCHES):
         time.sleep(FLUSH)

@@ -59,9 +59,8 @@ def fly(
 def _fly_virtual(
     experiment: ResolvedExperiment, folder: Path, see: See, page: bool
 ) -> dict[str, Any]:
-    from cloudrc.record.columns import Recording
+    from cloudrc.record.columns import Recording, merged
     from cloudrc.record.hash import RecordHash
-    from cloudrc.record.order import merged
     from cloudrc.record.writer import McapWriter
     from cloudrc.report.document import Run
 

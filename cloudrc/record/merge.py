@@ -2,28 +2,145 @@
 
 Of cloud's messages only the stamp moves; other stamps inside a message stay on the clock that
 their description names.
+
+How two clocks lie to each other: both ends' recordings go in, world's minus cloud's comes out.
+
+No packet arrives before it was sent. So each telemetry says that world's clock is ahead of cloud's
+by at least (sent - arrived), each command by at most (arrived - sent); the quickest packets each
+way leave the narrowest interval, as wide as the smallest round trip without any hold.
+
+World's clock lags its machine's after a stall: instants on that one in, on world's out.
+
+Out of a long recording the last mission: all that two pods recorded in, one flight out.
+
+A pod outlives its missions and records all of them into one file, which is still open when it is
+fetched: that its end is missing is no loss if the mission's own end is there.
 """
 
 from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import draft
-from cloudrc.record.cdr import shifted
-from cloudrc.record.columns import Recording
-from cloudrc.record.offset import SAME_CLOCK, ClockOffset, clock_offset
-from cloudrc.record.order import merged
+from cloudrc.record.columns import Recording, Table, merged
 from cloudrc.record.reader import Contents, read_contents
-from cloudrc.record.slip import WorldTime
+from cloudrc.record.ros import shifted
+from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import MISSING, McapWriter
 from cloudrc.records import Record
+
+
+@dataclass(frozen=True, slots=True)
+class ClockOffset:
+    """World's clock minus cloud's.
+
+    Attributes:
+        offset_ns: To add to cloud's stamps [ns].
+        uncertainty_ns: The true offset is within this of it [ns]; None if that is not known.
+        method: "same clock"; "packets" if estimated from both ways; "first records" if nothing
+            relates the clocks and both recordings are taken to begin together.
+    """
+
+    offset_ns: int
+    uncertainty_ns: int | None
+    method: Literal["same clock", "packets", "first records"]
+
+    def metadata(self) -> dict[str, str]:
+        """Write it down for a file's metadata; an unknown uncertainty is absent."""
+        noted = {"clock_offset_ns": str(self.offset_ns), "clock_offset_method": self.method}
+        if self.uncertainty_ns is not None:
+            noted["clock_offset_uncertainty_ns"] = str(self.uncertainty_ns)
+        return noted
+
+
+SAME_CLOCK = ClockOffset(0, 0, "same clock")
+
+
+def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
+    """Find out how to put cloud's stamps on world's clock.
+
+    Source: the clock filter of RFC 5905 (NTP), section 10: the sample of the smallest round trip,
+        half of which bounds the error.
+    Deviation: the two ways are minimised apart, so that the quickest packet of each counts; clock
+        drift is not modelled (50 ppm are 3 ms in a minute).
+
+    Args:
+        world: What world recorded, on its clock.
+        cloud: What cloud recorded, on its clock.
+
+    Returns:
+        The identity if both name the same clock; else the middle of what the packets allow.
+    """
+    clock_id = world.metadata.get("clock_id")
+    if clock_id and clock_id == cloud.metadata.get("clock_id"):
+        return SAME_CLOCK
+    uplink = _smallest_difference(world["/telemetry"], cloud["/uplink_delay"])
+    downlink = _smallest_difference(cloud["/delay_estimate"], world["/downlink_delay"])
+    if uplink is None or downlink is None:
+        return ClockOffset(_first_ns(world) - _first_ns(cloud), None, "first records")
+    # uplink = d1 - offset and downlink = d2 + offset, where d1, d2 >= 0 are one-way delays.
+    uncertainty_ns = (abs(downlink + uplink) + 1) // 2
+    return ClockOffset((downlink - uplink) // 2, uncertainty_ns, "packets")
+
+
+def _smallest_difference(sent: Table, arrived: Table) -> int | None:
+    """Find the smallest arrival minus departure [ns], each on its own clock."""
+    departures = dict(zip(_names(sent), sent["stamp_ns"].tolist(), strict=True))
+    differences = [
+        stamp_ns - departures[name]
+        for name, stamp_ns in zip(_names(arrived), arrived["stamp_ns"].tolist(), strict=True)
+        if name in departures
+    ]
+    return min(differences, default=None)
+
+
+def _names(table: Table) -> list[tuple[int, int]]:
+    return list(zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True))
+
+
+def _first_ns(recording: Recording) -> int:
+    stamps = [int(recording[topic]["stamp_ns"][0]) for topic in TOPICS if len(recording[topic])]
+    return min(stamps, default=0)
+
+
+class WorldTime:
+    """Knows by how much world's clock lagged at every instant of a recording."""
+
+    def __init__(self, telemetry: Table) -> None:
+        """Learn it from what telemetry says.
+
+        Args:
+            telemetry: Of world; its stamps are on world's clock.
+        """
+        self._slip_ns = telemetry["slip_ns"]
+        self._machine_ns = telemetry["stamp_ns"] + self._slip_ns
+
+    def at(self, machine_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Convert instants; between two samples world's clock is taken to run evenly.
+
+        Args:
+            machine_ns: On the machine's clock [ns], shape (n,).
+
+        Returns:
+            On world's clock [ns], shape (n,); rising if the argument rises.
+        """
+        if not self._slip_ns.any():
+            return machine_ns
+        # Differences are exact in float64; the stamps themselves need not be.
+        first: Any = self._machine_ns[0]
+        since, known = (machine_ns - first).astype(float), (self._machine_ns - first).astype(float)
+        slip_ns: NDArray[np.int64] = np.rint(np.interp(since, known, self._slip_ns)).astype(int)
+        return machine_ns - slip_ns
+
 
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}
 
@@ -147,3 +264,53 @@ def _attach(writer: McapWriter, attachments: Mapping[str, bytes]) -> None:
     for name, data in attachments.items():
         media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
         writer.attach(name, data, media_type)
+
+
+UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
+"""Events of a mission that goes on; every other event ends it."""
+BEFORE_NS = 1_000_000_000
+"""What is kept before a mission starts [ns]: the session and the guard's change that open it."""
+AFTER_NS = 2_000_000_000
+"""What is kept after a mission's end [ns]."""
+CUT_SHORT = "cut short"
+"""How the reader's note begins that a file has no end."""
+
+
+def cut_to_last_mission(mission: Mission) -> tuple[Mission, bool]:
+    """Keep the last mission of a recording.
+
+    Args:
+        mission: Both ends' recordings, merged.
+
+    Returns:
+        The last mission that was started in it, and whether its end is in it.
+    """
+    contents = mission.contents
+    began, ended = _last_mission(contents)
+    until = contents.messages[-1][1] if contents.messages else 0
+    whole = ended is not None and until > ended
+    first = began - BEFORE_NS if began is not None else 0
+    last = ended + AFTER_NS if ended is not None else until
+    kept = [message for message in contents.messages if first <= message[1] <= last]
+    cut = Contents(kept, dict(contents.metadata), contents.attachments, contents.note)
+    if whole:
+        cut.note = "; ".join(n for n in contents.note.split("; ") if CUT_SHORT not in n)
+        cut.metadata.pop(MISSING, None)
+        if cut.note:
+            cut.metadata[MISSING] = cut.note
+    return replace(mission, contents=cut), whole
+
+
+def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
+    """Stamps [ns] of the last mission's start and of its end; None for what is not there."""
+    events = [message for message in contents.messages if message[0] == "/mission"]
+    table = Recording.from_contents(Contents(events))["/mission"]
+    began = ended = None
+    for stamp_ns, event in zip(table["stamp_ns"].tolist(), table["event"].tolist(), strict=True):
+        if event == "started":
+            began, ended = stamp_ns, None
+        elif event not in UNDER_WAY and ended is None:
+            ended = stamp_ns
+        elif event in UNDER_WAY and began is None:
+            ended = None  # resumed by a new pod: the start is in the old one's recording
+    return began, ended

@@ -3,10 +3,14 @@
 MCAP has no such tool in Python. Everything whole is kept: messages with their stamps, schemas and
 channels, attachments, metadata. The result has an index, checksums, and, if anything is missing, a
 note that says so to whoever reads it.
+
+A file on a disk that is failing: what cannot be read of it costs no more than itself.
 """
 
 from __future__ import annotations
 
+import errno
+import io
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -14,10 +18,63 @@ from typing import IO, Any
 from cloudrc import __version__
 from cloudrc.errors import BadInputError
 from cloudrc.files import draft
-from cloudrc.record.packages import missing
-from cloudrc.record.scan import Scan, TooMuchError
-from cloudrc.record.sectors import SECTOR, Sectors
+from cloudrc.record import missing
+from cloudrc.record.reader import Scan, TooMuchError
 from cloudrc.record.writer import METADATA, MISSING
+
+SECTOR = 4096
+"""What the kernel reads at once [bytes]."""
+
+
+class Sectors(io.BufferedReader):
+    """A file whose bad sectors read as zeros.
+
+    Attributes:
+        bad: Numbers of those that were met.
+    """
+
+    def __init__(self, raw: io.RawIOBase) -> None:
+        """Take a file over.
+
+        Args:
+            raw: Open, without a buffer; is closed with this.
+        """
+        super().__init__(raw)
+        self.bad: set[int] = set()
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read at most so many bytes; fewer at the end alone.
+
+        Raises:
+            OSError: If something else is wrong than a sector.
+        """
+        at = self.tell()
+        try:
+            return super().read(size)
+        except OSError as error:
+            if error.errno != errno.EIO or size is None or size < 0:
+                raise
+        return self._in_parts(at, size)
+
+    def _in_parts(self, at: int, size: int) -> bytes:
+        whole = self.seek(0, io.SEEK_END)
+        end, parts = min(at + size, whole), list[bytes]()
+        while at < end:
+            length = min(SECTOR - at % SECTOR, end - at)
+            try:
+                self.seek(at)
+                part = super().read(length)
+            except OSError as error:
+                if error.errno != errno.EIO:
+                    raise
+                part = b""
+            if len(part) < length:
+                self.bad.add(at // SECTOR)
+            parts.append(part.ljust(length, b"\0"))
+            at += length
+        self.seek(at)
+        return b"".join(parts)
+
 
 try:
     from mcap.records import Attachment, Channel, Header, McapRecord, Message, Metadata, Schema

@@ -2,19 +2,120 @@
 
 A record fans out to one or more topics; a topic is a table whose columns are the fields below,
 named as in `cloudrc/records.py`, after the column `stamp_ns`. Quaternions are `wxyz` and velocities
-in the world frame here, whatever the ROS type asks for (`cloudrc/record/cdr.py` converts).
+in the world frame here, whatever the ROS type asks for (`cloudrc/record/ros.py` converts).
+
+What a topic is: a table of the recording, its columns and their units.
+
+The topics themselves are listed in `cloudrc/record/topics.py`.
+
+What both ends record of the link between them: the link's part of the table of topics.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from operator import attrgetter
-from typing import TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from cloudrc import records as rec
-from cloudrc.record.link_topics import LINK_TOPICS
-from cloudrc.record.schema import Field, Row, Topic, Values
 from cloudrc.records import Record
+
+Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion"]
+Values: TypeAlias = tuple[Any, ...]
+Row: TypeAlias = tuple[str, int, Values]
+"""Topic, stamp [ns] on the clock of the end that recorded it, values in the order of the fields."""
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A column of a topic.
+
+    Attributes:
+        name: Of the column and of the ROS field.
+        kind: What one value is; vectors have shape (3,), quaternions shape (4,).
+        unit: In words, "" if it has none.
+        text: What it means.
+        path: Where the record holds it, dotted; "" if that is its name.
+    """
+
+    name: str
+    kind: Kind
+    unit: str
+    text: str
+    path: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A table of the recording.
+
+    Attributes:
+        name: As in MCAP, with its slash.
+        ros_type: Message type; those in `cloudrc_msgs` are defined by `fields`.
+        source: Record class that it is made from.
+        end: Who records it: "world", "cloud" or "either".
+        text: What one row is.
+        fields: The columns after `stamp_ns`.
+        stamp_path: Where the record holds the row's stamp, dotted.
+    """
+
+    name: str
+    ros_type: str
+    source: type[Record]
+    end: Literal["world", "cloud", "either"]
+    text: str
+    fields: tuple[Field, ...]
+    stamp_path: str = "stamp_ns"
+
+
+LINK_TOPICS = (
+    Topic(
+        "/link",
+        "cloudrc_msgs/msg/LinkChanged",
+        rec.LinkChanged,
+        "either",
+        "What shapes what this end sends was seen first, has changed or is told again, in real time"
+        " only, clock of its end",
+        (
+            Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
+            Field("shaper", "string", "", "relay or netem"),
+            Field("cause", "string", "", "why it changed; empty if it is as it came up"),
+            Field("age", "float", "s", "it had been in force for so long"),
+            Field("time_line", "float", "s", "its time line had run for so long; NaN: as before"),
+            Field("delay", "float", "s", "asked for at the time line's beginning, one way"),
+            Field("jitter", "float", "s", "likewise"),
+            Field("loss", "float", "1", "likewise, in the long run"),
+            Field("rate", "float", "bit/s", "likewise; NaN without a bottleneck"),
+            Field("conditions", "string", "", "all that is asked for, as JSON"),
+        ),
+    ),
+    Topic(
+        "/link_check",
+        "cloudrc_msgs/msg/LinkChecked",
+        rec.LinkChecked,
+        "either",
+        "One number of the link that this end hears, judged in flight, in real time only, clock of"
+        " its end",
+        (
+            Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
+            Field("quantity", "string", "", "mean, deviation, variation, round_trip, loss..."),
+            Field("asked", "float", "s or 1", "what a true link shows: a delay, or a share"),
+            Field("measured", "float", "s or 1", "likewise"),
+            Field("low", "float", "s or 1", "least that is believed, likewise"),
+            Field("high", "float", "s or 1", "most that is believed, likewise"),
+            Field(
+                "verdict",
+                "string",
+                "",
+                "ok, off, open where there were too few to say; told judges nothing",
+            ),
+            Field("datagrams", "int", "", "that this rests on"),
+        ),
+    ),
+)
+"""Topics whose records drivers make."""
+
 
 __all__ = ["TOPICS", "rows"]
 

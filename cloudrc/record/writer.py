@@ -17,11 +17,9 @@ from pathlib import Path
 from typing import IO, Any, Self
 
 from cloudrc import __version__
-from cloudrc.record.cdr import encode
-from cloudrc.record.packages import missing
-from cloudrc.record.ros_types import definition, type_hash
-from cloudrc.record.schema import Row
-from cloudrc.record.topics import TOPICS, rows
+from cloudrc.record import missing
+from cloudrc.record.ros import definition, encode, type_hash
+from cloudrc.record.topics import TOPICS, Row, rows
 from cloudrc.records import Record
 
 try:

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.record.cut import cut_to_last_mission
-from cloudrc.record.merge import Mission, merge
+from cloudrc.record.merge import Mission, cut_to_last_mission, merge
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
 from cloudrc.report.document import Run

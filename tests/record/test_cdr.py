@@ -12,8 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from cloudrc import records as rec
 from cloudrc.messages import Odometry
-from cloudrc.record.cdr import decode, encode, shifted
-from cloudrc.record.ros_types import definition, is_known, type_hash
+from cloudrc.record.ros import decode, definition, encode, is_known, shifted, type_hash
 from cloudrc.record.topics import TOPICS, rows
 from tests.record.samples import any_record
 

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from cloudrc import records as rec
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
-from cloudrc.record.merge import merge, write_mission
-from cloudrc.record.offset import ClockOffset, clock_offset
+from cloudrc.record.merge import ClockOffset, clock_offset, merge, write_mission
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record

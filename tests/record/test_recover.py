@@ -19,7 +19,7 @@ from cloudrc.cli.main import main
 from cloudrc.config import yaml_text
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
-from cloudrc.record.frames import CHUNK_MAX, RECORD_MAX
+from cloudrc.record.reader import CHUNK_MAX, RECORD_MAX
 from cloudrc.record.recover import recover
 from cloudrc.record.writer import McapWriter
 from tests.record.samples import assert_equal, cloud_records, world_records

@@ -14,11 +14,18 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 
 from cloudrc.errors import BadInputError
-from cloudrc.record.frames import DEFINITION_MAX, MAGIC, DamagedError, unpack
-from cloudrc.record.reader import read_contents
+from cloudrc.record.reader import (
+    DEFINITION_MAX,
+    MAGIC,
+    RECORD_COST,
+    ROOM_SHARE,
+    DamagedError,
+    Scan,
+    read_contents,
+    unpack,
+)
 from cloudrc.record.recover import recover
-from cloudrc.record.ros_types import definition
-from cloudrc.record.scan import RECORD_COST, ROOM_SHARE, Scan
+from cloudrc.record.ros import definition
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import TelemetrySent
@@ -102,7 +109,7 @@ def test_a_file_that_unpacks_to_more_than_a_recording_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:
     """Its chunks are as a writer's own, its topics known; there are many, of few bytes each."""
-    monkeypatch.setattr("cloudrc.record.scan.ROOM_MIN", room := 3 << 20)
+    monkeypatch.setattr("cloudrc.record.reader.ROOM_MIN", room := 3 << 20)
     one = record(Opcode.MESSAGE, struct.pack("<H", 1) + bytes(20 + size))
     path, new = tmp_path / "w.mcap", tmp_path / "new.mcap"
     path.write_bytes(file(chunk(defined()), *[chunk(one * ((1 << 20) // len(one) + 1))] * 9))

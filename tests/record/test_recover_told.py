@@ -10,7 +10,7 @@ import pytest
 from cloudrc.cli.main import main
 from cloudrc.faults.scribe import FullDisk
 from cloudrc.record.columns import Recording
-from cloudrc.record.frames import HEAD, MAGIC
+from cloudrc.record.reader import HEAD, MAGIC
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
 from cloudrc.record.writer import MISSING, McapWriter

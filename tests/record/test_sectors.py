@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from cloudrc.record.columns import Recording
-from cloudrc.record.recover import recover
-from cloudrc.record.sectors import SECTOR, Sectors
+from cloudrc.record.recover import SECTOR, Sectors, recover
 from tests.record.samples import world_records, write
 
 

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.record.columns import Recording
-from cloudrc.record.merge import merge
-from cloudrc.record.slip import WorldTime
+from cloudrc.record.merge import WorldTime, merge
 from cloudrc.records import Record, TelemetrySent
 from tests.record.samples import MS, SECOND, cloud_records, world_records, write
 

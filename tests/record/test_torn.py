@@ -16,7 +16,7 @@ from mcap.writer import Writer
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.reader import read_contents
-from cloudrc.record.ros_types import definition
+from cloudrc.record.ros import definition
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from tests.record.samples import assert_equal, world_records
