@@ -18,8 +18,8 @@ from cloudrc.cloud.teleop.messages import StartMission
 from cloudrc.cloud.teleop.mission import Teleop
 from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.config import schema
+from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.parameters import build
-from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss

@@ -23,7 +23,7 @@ import chart_values  # noqa: E402
 from chart_kubernetes import Quantities, Resources  # noqa: E402
 from chart_values import ChartValues  # noqa: E402
 
-from cloudrc.config.describe import leaves  # noqa: E402
+from cloudrc.config.problems import leaves  # noqa: E402
 from cloudrc.config.schema import Experiment  # noqa: E402
 from cloudrc.config.shipped import FOLDERS  # noqa: E402
 

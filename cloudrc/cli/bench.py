@@ -21,7 +21,7 @@ from cloudrc.errors import CloudrcError
 
 if TYPE_CHECKING:
     from cloudrc.cloud.endpoint import CloudEndpoint
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.virtual import VirtualRun
     from cloudrc.records import Record
     from cloudrc.world.endpoint import WorldEndpoint

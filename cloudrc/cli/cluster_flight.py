@@ -18,7 +18,7 @@ from cloudrc.errors import BadInputError, CloudrcError
 if TYPE_CHECKING:
     from cloudrc.cluster.access import Release
     from cloudrc.cluster.jobs import JobStatus
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.record.merge import Mission
 
 Tell = Callable[[str], None]

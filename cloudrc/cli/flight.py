@@ -12,7 +12,7 @@ from cloudrc.cli.extras import missing
 from cloudrc.errors import CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.record.columns import Recording
     from cloudrc.records import Record
     from cloudrc.report.document import Run

@@ -20,10 +20,11 @@ from cloudrc.cli.link_cluster_hand import (
     needed,
     take_back,
 )
-from cloudrc.cli.link_edit import DIRECTIONS, Edit, edit
 from cloudrc.cluster.errors import ClusterError
 from cloudrc.cluster.link import COMPONENTS, PROFILE, LinkParts, Place, write_files
-from cloudrc.config import document, yaml_text
+from cloudrc.config import document
+from cloudrc.config import document as yaml_text
+from cloudrc.config.edit import DIRECTIONS, Edit, edit
 from cloudrc.config.load import FILES
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.link.sidecar_handed import Handed

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.link_cluster_inside import hand_over
-from cloudrc.cli.link_edit import DIRECTIONS, TIME_LINES
 from cloudrc.cluster.errors import ClusterError
 from cloudrc.cluster.link import COMPONENTS, PROFILE, LinkParts, Place
-from cloudrc.config import yaml_text
+from cloudrc.config import document
+from cloudrc.config.edit import DIRECTIONS, TIME_LINES
 from cloudrc.config.load import FILES
 from cloudrc.errors import CloudrcError
 from cloudrc.link.sidecar_handed import Handed
@@ -104,7 +104,7 @@ def take_back(place: Place, link: LinkParts, given: Given) -> str:
     Returns:
         What holds now where that is not just as before, and what to do; "" if there is nothing.
     """
-    values, _ = yaml_text.parse(link.files[PROFILE], PROFILE)
+    values, _ = document.parse(link.files[PROFILE], PROFILE)
     values = values if isinstance(values, dict) else {}
     files = needed(values, link.files)
     before = read_change(link.files.get(CHANGE_FILE, "")).number

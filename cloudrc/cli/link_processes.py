@@ -33,7 +33,7 @@ from cloudrc.link.netem_text import check
 from cloudrc.link.state import STATE_FILE, LinkState, from_text
 
 if TYPE_CHECKING:
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.config.schema import Profile
 
 LOOPBACK = "127.0.0.1"

@@ -19,8 +19,8 @@ from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 
 if TYPE_CHECKING:
     from cloudrc.cli.link_cluster import HandedOver
-    from cloudrc.cli.link_edit import Edit
     from cloudrc.cluster.link import LinkParts, Place
+    from cloudrc.config.edit import Edit
     from cloudrc.link.state import LinkState
 
     Look = Callable[[], list[LinkState]]
@@ -81,9 +81,9 @@ def execute(options: argparse.Namespace) -> int:
 
 def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[Edit, Look]:
     """Leave a new profile where the run's relay looks for it."""
-    from cloudrc.cli.link_edit import DIRECTIONS, edit
     from cloudrc.cli.relay_control import PROFILE_FILE
     from cloudrc.config.document import Document
+    from cloudrc.config.edit import DIRECTIONS, edit
     from cloudrc.link.route import publish
     from cloudrc.link.state import CHANGE_FILE, from_text
 
@@ -115,7 +115,7 @@ def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
         looking = pool.submit(_link_of, options, where)
         # Meanwhile, since it takes as long: a change is to be in force within a second.
         from cloudrc.cli.link_cluster import hand_profile
-        from cloudrc.cli.link_edit import check
+        from cloudrc.config.edit import check
 
         if looking.exception() is not None:
             check(options.profile, options.settings)  # what is wrong here comes first

@@ -14,7 +14,7 @@ from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.cli.link_verify_text import Said
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
 
 EPILOG = """\
 examples:

@@ -19,7 +19,7 @@ from cloudrc.cli.link_verify_late import LateWatch
 from cloudrc.cli.link_verify_notes import describe, notes, on_correlation, shaper_in_words
 from cloudrc.cli.link_verify_probes import PROBE, TRAIN, Probes
 from cloudrc.cli.link_verify_text import Said
-from cloudrc.config import yaml_text
+from cloudrc.config import document
 from cloudrc.config.load import dump
 from cloudrc.config.schema import Profile
 from cloudrc.drivers.realtime import free_ports
@@ -37,7 +37,7 @@ from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
 
 if TYPE_CHECKING:
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
 
 BEGIN = 1.0
 """After the link came up the first probe leaves [s]."""
@@ -94,7 +94,7 @@ def verify(
     tell("plans the probes")
     asked = plan(experiment, seconds, shaper)
     profile = applied or Profile(uplink=experiment.uplink, downlink=experiment.downlink)
-    text = yaml_text.write(profile.model_dump(mode="json", exclude_defaults=True))
+    text = document.write(profile.model_dump(mode="json", exclude_defaults=True))
     with banks(shaper) as ends:
         places = {way: bank.place for way, bank in ends.items()}
         tell("starts the link")

@@ -80,9 +80,9 @@ def _experiment(release: Release) -> Experiment | None:
 
     from cloudrc.cluster.errors import ClusterError
     from cloudrc.cluster.experiment import FILE, experiment_text
+    from cloudrc.config.document import parse as parse_yaml
     from cloudrc.config.schema import Experiment
     from cloudrc.config.shipped import check_name
-    from cloudrc.config.yaml_text import parse as parse_yaml
 
     try:
         tree, _ = parse_yaml(experiment_text(release), FILE)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from cloudrc.cli.ends import listening, open_exporter, resolved, warn_if_exposed
 
 if TYPE_CHECKING:
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.drivers.keyfile import KeyFile
     from cloudrc.drivers.realtime import Peer

@@ -26,7 +26,7 @@ def written(document: object, form: str) -> str:
     text = json.dumps(document, indent=2, ensure_ascii=False)
     if form == "json":  # the same string, but no terminal obeys what is in it
         return re.sub("[\x7f-\x9f]", lambda found: f"\\u{ord(found[0]):04x}", text)
-    from cloudrc.config import yaml_text
+    from cloudrc.config import document as yaml_text
 
     return yaml_text.write(json.loads(text)).rstrip("\n")
 

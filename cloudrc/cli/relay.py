@@ -20,7 +20,7 @@ from cloudrc.cli.ends import (
 )
 
 if TYPE_CHECKING:
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.relay import Relay
 

@@ -28,7 +28,7 @@ from cloudrc.link.sidecar_follow import PROFILE_PERIOD, Loaded, ProfileFile
 from cloudrc.link.state import RELEASED_SUFFIX, LinkState, summary, to_text
 
 if TYPE_CHECKING:
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.relay import Relay
 

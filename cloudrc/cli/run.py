@@ -17,7 +17,7 @@ from cloudrc.cli.signals import end_orderly
 from cloudrc.errors import BadInputError, CloudrcError
 
 if TYPE_CHECKING:
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.records import Record
 
 Flight = Callable[[Path, TextIO, int], dict[str, Any]]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from cloudrc.cloud.teleop.api_bridge import Bridge
     from cloudrc.cloud.teleop.journal import Journal
     from cloudrc.cloud.teleop.service import MissionService
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.drivers.teleop import Calls
 

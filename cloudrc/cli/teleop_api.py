@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cloudrc.cloud.teleop.api_bridge import Bridge
     from cloudrc.cloud.teleop.api_server import ApiServer
     from cloudrc.cloud.teleop.service import MissionService
-    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.records import Counted
 
 LOOPBACK = "127.0.0.1"

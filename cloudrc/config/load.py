@@ -4,6 +4,12 @@ In this order: the file is read; `--set` is applied; mission and profile are loo
 their places, under the values that the experiment gives itself; plug-ins are completed from their
 signatures; and the whole is checked against the schema, the scene and the disk. All that is wrong
 is said at once, each with the line it stands in.
+
+An experiment with nothing left to look up: what the ends, the link and the report are made from.
+
+Names have become what they stand for: the mission is inline, the link's directions are spelled
+out, plug-ins carry all their parameters, limits have their values. Written to a file it is still
+an experiment file, and flies the same run again.
 """
 
 from __future__ import annotations
@@ -11,21 +17,96 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable
+from math import sqrt
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
-from cloudrc.config import overrides, parameters, problems, shipped, yaml_text
+from cloudrc.config import document as yaml_text
+from cloudrc.config import overrides, parameters, problems, shipped
 from cloudrc.config.document import Document
-from cloudrc.config.fields import COMMAND_AGE_MS
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem
-from cloudrc.config.resolved import COMMAND_AGE_MAX_MS, ResolvedExperiment, speed_cap
-from cloudrc.config.schema import Experiment, Mission, Profile
+from cloudrc.config.schema import (
+    COMMAND_AGE_MS,
+    Cloud,
+    CommandAge,
+    Direction,
+    Experiment,
+    Guard,
+    Mission,
+    PlugIn,
+    Profile,
+    Speed,
+)
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
 from cloudrc.link.trace import read_table, read_trace
+
+COMMAND_AGE_MAX_MS = 250.0
+"""Default where neither the experiment nor the profile says [ms].
+Source: docs/reference/plant.md, "Command age"."""
+
+
+def speed_cap(command_age_max_ms: float) -> float:
+    """Give the speed [m/s] at which the robot still comes to rest in time.
+
+    It flies on for `command_age_max_ms` [ms] and 0.2 s, then brakes at 3 m/s^2:
+    v (T + 0.2) + v^2 / 6 = 8.7 m.
+    Source: docs/reference/plant.md, "Speed cap".
+    """
+    blind = command_age_max_ms * 1e-3 + 0.2
+    return round(3.0 * (sqrt(blind * blind + 8.7 / 1.5) - blind), 6)
+
+
+class ResolvedGuard(Guard):
+    """A guard whose limits are all known."""
+
+    command_age_max_ms: CommandAge = Field(
+        COMMAND_AGE_MAX_MS, description="A command whose basis is older is not flown [ms]"
+    )
+    speed_max_mps: Speed = Field(
+        speed_cap(COMMAND_AGE_MAX_MS), description="Cap on the commanded speed [m/s]"
+    )
+
+    @field_validator("speed_max_mps")
+    @classmethod
+    def _can_be_stopped(cls, speed_max: float, info: ValidationInfo) -> float:
+        age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
+        if speed_max > speed_cap(age_max) + 1e-6:
+            raise ValueError(
+                f"at most {speed_cap(age_max):g} m/s can be stopped from in time while commands "
+                f"may be {age_max:g} ms old; lower it, or guard.command_age_max_ms"
+            )
+        return speed_max
+
+
+class ResolvedCloud(Cloud):
+    """Plug-ins with all their parameters, those of the defaults too."""
+
+    estimator: PlugIn
+    predictor: PlugIn
+    controller: PlugIn
+
+
+class ResolvedExperiment(Experiment):
+    """An experiment with nothing left to look up."""
+
+    mission: Mission
+    guard: ResolvedGuard
+    cloud: ResolvedCloud
+
+    @property
+    def uplink(self) -> Direction:
+        """World to cloud, complete."""
+        return self.link.uplink
+
+    @property
+    def downlink(self) -> Direction:
+        """Cloud to world, complete."""
+        return self.link.downlink
+
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _DIRECTIONS = ("uplink", "downlink")
@@ -149,7 +230,7 @@ def _validate(document: Document, model: type[_Model], name: str, found: list[Pr
     return result
 
 
-def _default(document: Document, path: yaml_text.Path, value: Any) -> None:
+def _default(document: Document, path: yaml_text.KeyPath, value: Any) -> None:
     if document.get(*path) is None and isinstance(document.get(*path[:-1]), dict):
         document.graft(path, value, document.source(path))
 
@@ -202,7 +283,7 @@ def _age_max(document: Document) -> float:
     return age_max if usable else COMMAND_AGE_MAX_MS
 
 
-def _lay_under(document: Document, path: yaml_text.Path, file: Document, key: str) -> None:
+def _lay_under(document: Document, path: yaml_text.KeyPath, file: Document, key: str) -> None:
     """Fill what is not given at `path` from `key` of another file."""
     _default(document, path, {})
     given = document.get(*path)
@@ -239,7 +320,7 @@ def _forget_profile(document: Document) -> None:
                 del guard[key]
 
 
-def _resolve_traces(document: Document, above: yaml_text.Path) -> list[Problem]:
+def _resolve_traces(document: Document, above: yaml_text.KeyPath) -> list[Problem]:
     """Make the paths of traces and tables absolute, and read them to see whether they can be."""
     found = []
     for path in ((*above, key, name) for key in _DIRECTIONS for name in FILES):

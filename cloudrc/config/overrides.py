@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cloudrc.config import yaml_text
+from cloudrc.config import document as yaml_text
 from cloudrc.config.document import SETTING, Document, Source
 from cloudrc.config.schema import Direction, Experiment
 from cloudrc.errors import BadInputError
@@ -31,7 +31,7 @@ class Override:
         value: As YAML reads it.
     """
 
-    path: yaml_text.Path
+    path: yaml_text.KeyPath
     value: Any
 
     @property
@@ -80,7 +80,7 @@ def is_spelled_out(direction: Any) -> bool:
     return isinstance(direction, dict) and direction.keys() >= Direction.model_fields.keys()
 
 
-def _open(document: Document, path: yaml_text.Path) -> None:
+def _open(document: Document, path: yaml_text.KeyPath) -> None:
     """Make the containers above `path`, from the schema's defaults where there are some."""
     node: Any = document.tree
     default: Any = _DEFAULTS
@@ -100,7 +100,7 @@ def _open(document: Document, path: yaml_text.Path) -> None:
         node = _put(node, key, child)
 
 
-def _check_index(node: Any, path: yaml_text.Path, depth: int) -> None:
+def _check_index(node: Any, path: yaml_text.KeyPath, depth: int) -> None:
     key = path[depth]
     if not isinstance(node, list):
         return

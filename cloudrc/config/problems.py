@@ -1,18 +1,171 @@
-"""What is wrong with a configuration, in words: pydantic's errors in, one line for each out."""
+"""What is wrong with a configuration, in words: pydantic's errors in, one line for each out.
+
+What a key may hold: the schema goes in, words with type, range, unit and neighbours come out.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import difflib
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin
 
+from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from cloudrc.config import describe
-from cloudrc.config.document import Document
-from cloudrc.config.yaml_text import Path
+from cloudrc.config.document import Document, KeyPath
 from cloudrc.errors import BadInputError
+
+_TYPES = {
+    float: "a number",
+    int: "a whole number",
+    str: "text",
+    bool: "true or false",
+    NoneType: "null",
+}
+_SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
+
+
+def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPath, FieldInfo]]:
+    """List all keys that hold no further keys, with their fields; index 0 stands for any."""
+    for key, info in model.model_fields.items():
+        inner = list(_models(info.annotation))
+        many = ("0",) if _is_list(info.annotation) else ()
+        if not inner or str in _types(info.annotation) or float in _types(info.annotation):
+            yield (*above, key), info
+        for section in inner:
+            yield from leaves(section, (*above, key, *many))
+
+
+def field_at(model: type[BaseModel], path: KeyPath) -> FieldInfo | None:
+    """Give the field that the last key of `path` names; None if there is none."""
+    field = None
+    models = [model]
+    for key in path:
+        if key.isdecimal():
+            continue
+        found = [inner.model_fields[key] for inner in models if key in inner.model_fields]
+        if not found:
+            return None
+        field = found[0]
+        models = [inner for info in found for inner in _models(info.annotation)]
+    return field
+
+
+def expectation(model: type[BaseModel], path: KeyPath) -> str:
+    """Say what the value at `path` must be: "must be a number >= 0 [ms]"."""
+    field = field_at(model, path)
+    if field is None:
+        return "is not valid"
+    inside_list = path[-1].isdecimal()
+    if get_origin(field.annotation) is Literal:
+        return f"must be one of {', '.join(map(repr, get_args(field.annotation)))}"
+    words = [_TYPES[kind] for kind in dict.fromkeys(_types(field.annotation)) if kind in _TYPES]
+    if words and words[0].endswith("number"):
+        words[0] = " ".join([words[0], " and ".join(dict.fromkeys(_limits(field)))]).strip()
+    if any(_models(field.annotation)):
+        words.append("a mapping of keys")
+    if _is_list(field.annotation) and not inside_list:
+        words = [_list_in_words(field.annotation)]
+    return " ".join(["must be", " or ".join(words), _unit(field)]).strip()
+
+
+def nearest_key(model: type[BaseModel], path: KeyPath) -> str:
+    """Say which known key an unknown one may have been meant for."""
+    *above, key = path
+    siblings = _keys_at(model, tuple(above))
+    near = _near(key, siblings)
+    if near:
+        field = field_at(model, (*above, near))
+        unit = _unit(field) if field else ""
+        return f"did you mean {near}{' ' if unit else ''}{unit}?"
+    everywhere = {leaf[-1]: ".".join(leaf) for leaf, _ in reversed(list(leaves(model)))}
+    near = _near(key, list(everywhere))
+    if near:
+        return f"did you mean {everywhere[near]}?"
+    return f"known here: {', '.join(siblings)}" if siblings else "no key is known here"
+
+
+def nearest_choice(detail: ErrorDetails) -> str:
+    """Say which of the allowed words a wrong one may have been meant for."""
+    expected = detail["ctx"]["expected"]
+    near = _near(str(detail["input"]), re.findall(r"'([^']*)'", expected))
+    return f"must be {expected}" + (f"; did you mean {near}?" if near else "")
+
+
+def _near(key: str, known: list[str]) -> str | None:
+    # `delay` means `delay_ms`: units are forgotten more often than letters are swapped.
+    begun = [name for name in known if name.startswith(f"{key}_")]
+    close = difflib.get_close_matches(key, known, n=1)
+    return next(iter(begun or close), None)
+
+
+def _keys_at(model: type[BaseModel], path: KeyPath) -> list[str]:
+    field = field_at(model, path)
+    models = [model] if not path else list(_models(field.annotation)) if field else []
+    return [key for inner in models for key in inner.model_fields]
+
+
+def _types(annotation: Any) -> Iterator[Any]:
+    """List the plain types, models and literals in an annotation, aliases and unions opened."""
+    if get_origin(annotation) is Literal:
+        return
+    arguments = [argument for argument in get_args(annotation) if argument is not Ellipsis]
+    if hasattr(annotation, "__metadata__"):
+        arguments = arguments[:1]
+    if not arguments:
+        yield annotation
+    for argument in arguments:
+        yield from _types(argument)
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    for kind in _types(annotation):
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield kind
+
+
+def _is_list(annotation: Any) -> bool:
+    return any(
+        get_origin(kind) in (tuple, list, Sequence) for kind in (annotation, *get_args(annotation))
+    )
+
+
+def _list_in_words(annotation: Any) -> str:
+    size = len(get_args(annotation)) if get_origin(annotation) is tuple else 0
+    numbers = " numbers" if float in _types(annotation) else ""
+    fixed = size and Ellipsis not in get_args(annotation)
+    null = " or null" if NoneType in get_args(annotation) else ""
+    return (
+        f"a list of {size}{numbers}"
+        if fixed
+        else f"a list{' of' if numbers else ''}{numbers}{null}"
+    )
+
+
+def _limits(part: Any) -> Iterator[str]:
+    """List the limits in a field or an annotation, as ">= 0"."""
+    if isinstance(part, FieldInfo):
+        yield from (text for item in part.metadata for text in _limits(item))
+        yield from _limits(part.annotation)
+    elif type(part) in _SIGNS:
+        limit = next(
+            getattr(part, name) for name in ("ge", "gt", "le", "lt") if hasattr(part, name)
+        )
+        yield f"{_SIGNS[type(part)]} {limit}"
+    else:
+        for item in (*getattr(part, "__metadata__", ()), *get_args(part)):
+            yield from _limits(item)
+
+
+def _unit(field: FieldInfo) -> str:
+    found = re.search(r"\[[^\],]+\]$|\[[^\],]+\](?=[,; ])", field.description or "")
+    return found.group() if found else ""
+
 
 _LISTED = 50  # a mission of thousands of points in wrong units is wrong thousands of times
 
@@ -27,7 +180,7 @@ class Problem:
         reason: What it must be, and what to do.
     """
 
-    path: Path
+    path: KeyPath
     value: str
     reason: str
 
@@ -36,7 +189,7 @@ class Problem:
 
 
 def from_pydantic(
-    error: ValidationError, model: type[BaseModel], prefix: Path = (), limit: int | None = None
+    error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
 ) -> list[Problem]:
     """Put pydantic's errors into words.
 
@@ -84,7 +237,7 @@ def in_words(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: Path) -> Problem:
+def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> Problem:
     kind, value = detail["type"], in_words(detail["input"])
     keys = tuple(map(str, detail["loc"]))
     # Names of a union's members are tagged with <>: they are no keys. What nobody knows is one.
@@ -92,9 +245,9 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: Path) -> Prob
     known = keys[: len(keys) - len(unknown)]
     path = tuple(key for key in known if not key.startswith("<")) + unknown
     if kind == "extra_forbidden":
-        return Problem(prefix + path, "", f"unknown key; {describe.nearest_key(model, path)}")
+        return Problem(prefix + path, "", f"unknown key; {nearest_key(model, path)}")
     if kind == "missing":
-        expected = describe.expectation(model, path)
+        expected = expectation(model, path)
         return Problem(prefix + path, "", f"is missing; {expected}")
     if kind == "value_error":
         return Problem(prefix + path, "", str(detail["ctx"]["error"]))
@@ -106,9 +259,9 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: Path) -> Prob
     if kind == "unprintable":
         return Problem(prefix + path, value, detail["msg"])
     if kind == "literal_error":
-        return Problem(prefix + path, value, describe.nearest_choice(detail))
+        return Problem(prefix + path, value, nearest_choice(detail))
     if kind == "string_pattern_mismatch":
         return Problem(prefix + path, value, "must be text without slashes")
     if kind == "finite_number":
         return Problem(prefix + path, value, "must be finite")
-    return Problem(prefix + path, value, describe.expectation(model, path))
+    return Problem(prefix + path, value, expectation(model, path))

@@ -14,8 +14,7 @@ from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.identity import CloudIdentity
 from cloudrc.cloud.teleop.service_mission import Mission, Order
-from cloudrc.config.load import load_experiment
-from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults import states

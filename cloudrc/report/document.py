@@ -11,8 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from cloudrc.config.load import fingerprint
-from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.load import ResolvedExperiment, fingerprint
 from cloudrc.files import put
 from cloudrc.metrics import Number
 from cloudrc.report.verdict import Failure, Verdict

@@ -17,8 +17,7 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 from cloudrc import __version__
-from cloudrc.config.load import dump
-from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.metrics import Flight, Number
 from cloudrc.report import numbers as table
 from cloudrc.report import prose

@@ -9,8 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from cloudrc.config.load import read_experiment
-from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.load import ResolvedExperiment, read_experiment
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, in_words
 from cloudrc.files import put, read
 from cloudrc.geometry.scene import load_scene

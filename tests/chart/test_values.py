@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rendering import CHART, CI_VALUES, EXAMPLES, ROOT, Object, laid_over, render, schema, values_of
 
-from cloudrc.config.describe import leaves
+from cloudrc.config.problems import leaves
 from cloudrc.config.schema import Experiment
 
 jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-validate, extra dev")

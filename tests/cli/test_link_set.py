@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import link_set, relay_control
-from cloudrc.cli.link_edit import edit
 from cloudrc.cli.main import main
 from cloudrc.cli.relay_control import RelayControl
 from cloudrc.config.document import Document
+from cloudrc.config.edit import edit
 from cloudrc.drivers import flights
 from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection

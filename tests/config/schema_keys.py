@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any, Literal, get_args, get_origin
 
-from cloudrc.config import describe
+from cloudrc.config import problems
 from cloudrc.config.schema import Experiment
 
-LEAVES = {".".join(path): field for path, field in describe.leaves(Experiment)}
+LEAVES = {".".join(path): field for path, field in problems.leaves(Experiment)}
 
 SPECIAL: dict[str, Any] = {
     "mission": "hover",
@@ -39,7 +39,7 @@ def valid(key: str) -> Any:
     field = LEAVES[key]
     if get_origin(field.annotation) is Literal:
         return get_args(field.annotation)[-1]
-    words = describe.expectation(Experiment, tuple(key.split(".")))
+    words = problems.expectation(Experiment, tuple(key.split(".")))
     if "list of 3" in words:
         return [0.25, 0.5, 0.75]
     if "whole number" in words:

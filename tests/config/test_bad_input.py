@@ -141,7 +141,7 @@ def test_files_that_cannot_be_used(mine: Path, text: str, reason: str) -> None:
 def test_aliases_of_aliases_do_not_fill_the_memory(
     mine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cloudrc.config.yaml_text._MAX_VALUES", 10_000)
+    monkeypatch.setattr("cloudrc.config.document._MAX_VALUES", 10_000)
     levels = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 10)]
     assert "more than 10000 values" in refused(mine, "\n".join(["a0: &a0 [1]", *levels]))
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from schema_keys import LEAVES, base, beside, setting, valid
 
-from cloudrc.config import describe
+from cloudrc.config import problems
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.config.schema import Experiment
 from cloudrc.errors import BadInputError
@@ -21,7 +21,7 @@ def refusal(key: str, value: Any, *others: str) -> str:
 
 
 def words(key: str) -> str:
-    return describe.expectation(Experiment, tuple(key.split(".")))
+    return problems.expectation(Experiment, tuple(key.split(".")))
 
 
 def value_at(tree: Any, key: str) -> Any:

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.assembly import link_profile
-from cloudrc.config import shipped, yaml_text
+from cloudrc.config import document, shipped
 from cloudrc.config.load import (
+    ResolvedExperiment,
     dump,
     fingerprint,
     load_experiment,
     load_profile,
     read_experiment,
 )
-from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError
 
 EXPERIMENTS = shipped.names("experiment")
@@ -200,7 +200,7 @@ plain = st.recursive(
 @given(plain)
 def test_yaml_comes_back_as_it_was_written(value: object) -> None:
     if "<<" not in repr(value):
-        assert yaml_text.parse(yaml_text.write(value), "text")[0] == value
+        assert document.parse(document.write(value), "text")[0] == value
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_yaml_comes_back_as_it_was_written(value: object) -> None:
      ("true", True), ("2024-01-01", "2024-01-01"), ("010", 10), ("'1'", "1")],
 )  # fmt: skip
 def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
-    found = yaml_text.parse(text, "text")[0]
+    found = document.parse(text, "text")[0]
     assert (found, type(found)) == (value, type(value))
 
 

@@ -12,8 +12,7 @@ from functools import cache
 
 from cloudrc.assembly import build_cloud, build_links, build_world
 from cloudrc.cloud.endpoint import CloudIdentity
-from cloudrc.config.load import load_experiment
-from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.config.schema import Criteria
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.geometry.scene import Board, Pipe, Scene

@@ -7,8 +7,7 @@ from typing import NamedTuple
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.identity import CloudIdentity
-from cloudrc.config.load import load_experiment
-from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.record.columns import Recording
 from cloudrc.record.hash import RecordHash

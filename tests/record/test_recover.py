@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from cloudrc.cli.main import main
-from cloudrc.config import yaml_text
+from cloudrc.config import document as yaml_text
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.reader import CHUNK_MAX, RECORD_MAX

@@ -16,10 +16,9 @@ from cloudrc.cloud.teleop.api_models import GoToRequest, MissionRequest
 from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.cloud.teleop.service_book import ConflictError
 from cloudrc.cloud.teleop.service_mission import HELD, Order
-from cloudrc.config.fields import Section
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem, from_pydantic
-from cloudrc.config.schema import MAX_WAYPOINTS, Mission, Waypoint
+from cloudrc.config.schema import MAX_WAYPOINTS, Mission, Section, Waypoint
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.placement import crossed_pipe
 from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH

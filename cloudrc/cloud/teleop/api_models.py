@@ -11,8 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
 from cloudrc.cloud.teleop.service_mission import SHOWN
-from cloudrc.config.fields import Finite, Limit, Section
-from cloudrc.config.schema import MAX_WAYPOINTS, Waypoint
+from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Limit, Section, Waypoint
 
 Position = tuple[Finite, Finite, Finite]
 
