@@ -12,7 +12,7 @@ from cloudrc.cli.extras import missing
 from cloudrc.errors import CloudrcError
 
 if TYPE_CHECKING:
-    from cloudrc.cluster.access import Release
+    from cloudrc.cluster.client import Release
 
 NEEDED = {
     "helm": "https://helm.sh/docs/intro/install",
@@ -56,7 +56,7 @@ def cluster(context: str | None) -> Iterator[Check]:
     """
     if missing("kube"):
         return  # which is a line of its own, and without it there is no way to look
-    from cloudrc.cluster.access import connect
+    from cloudrc.cluster.client import connect
 
     try:
         release = connect(context)
@@ -70,7 +70,7 @@ def cluster(context: str | None) -> Iterator[Check]:
 
 
 def _answering(release: Release) -> Check:
-    from cloudrc.cluster.version import OLDEST, server_version
+    from cloudrc.cluster.client import OLDEST, server_version
 
     oldest = ".".join(map(str, OLDEST))
     try:

@@ -6,10 +6,10 @@ import argparse
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
-from cloudrc.cluster.access import DEFAULT_RELEASE
+from cloudrc.cluster.client import DEFAULT_RELEASE
 
 if TYPE_CHECKING:
-    from cloudrc.cluster.access import Release
+    from cloudrc.cluster.client import Release
 
 READY_LIMIT = 300.0
 """For the pods of a release to become ready, where the user does not say [s]."""
@@ -45,7 +45,7 @@ def place(options: argparse.Namespace) -> Release:
         MissingPrerequisiteError: If the Kubernetes client or a kubeconfig is missing.
     """
     require("a cluster", ("kube",))
-    from cloudrc.cluster.access import connect
+    from cloudrc.cluster.client import connect
 
     return connect(options.context, options.namespace, options.release or DEFAULT_RELEASE)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.errors import BadInputError, CloudrcError
 
 if TYPE_CHECKING:
-    from cloudrc.cluster.access import Release
+    from cloudrc.cluster.client import Release
     from cloudrc.cluster.jobs import JobStatus
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.record.merge import Mission
@@ -52,8 +52,8 @@ def fly_in_cluster(
     Raises:
         CloudrcError: If the mission could not be flown, or another one is under way there.
     """
-    from cloudrc.cluster.chart import chart_folder
-    from cloudrc.cluster.deploy import current_values, install
+    from cloudrc.cluster.release import current_values, install
+    from cloudrc.cluster.tools import chart_folder
     from cloudrc.config.load import dump
 
     _refuse_busy(release)
@@ -89,8 +89,8 @@ def values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[st
 
 def _refuse_busy(release: Release) -> None:
     """Refuse to end somebody's flight: installing another experiment replaces both pods."""
-    from cloudrc.cluster.cancel import under_way
-    from cloudrc.cluster.errors import ClusterError
+    from cloudrc.cluster.jobs import under_way
+    from cloudrc.cluster.tools import ClusterError
 
     found, job = under_way(release)
     if found:
@@ -144,9 +144,8 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
     """Fly by a Job; interrupted, the mission is cancelled before this function ends."""
-    from cloudrc.cluster.errors import ClusterError
-    from cloudrc.cluster.follow import follow, patience
-    from cloudrc.cluster.jobs import run_job
+    from cloudrc.cluster.jobs import follow, patience, run_job
+    from cloudrc.cluster.tools import ClusterError
 
     limit = experiment.criteria.time_limit_s
     job = run_job(release, mission_document(experiment), limit=limit)
@@ -161,7 +160,7 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
 
 
 def _cancel(release: Release, job: JobStatus, tell: Tell) -> None:
-    from cloudrc.cluster.cancel import cancel
+    from cloudrc.cluster.jobs import cancel
 
     try:
         tell(cancel(release, job.name))
@@ -181,7 +180,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
     Raises:
         CloudrcError: If the recordings cannot be fetched; without the rest there is a report.
     """
-    from cloudrc.cluster.fetch import fetch_logs, fetch_metrics
+    from cloudrc.cluster.pods import fetch_logs, fetch_metrics
     from cloudrc.record.merge import cut_to_last_mission, merge
 
     for _ in range(FETCHES):
@@ -206,7 +205,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
 
 def _fetch_recordings(release: Release, folder: Path, tell: Tell) -> None:
     """Copy both recordings; a way that breaks off is tried again."""
-    from cloudrc.cluster.fetch import fetch_recording
+    from cloudrc.cluster.pods import fetch_recording
 
     for component in COMPONENTS:
         for left in reversed(range(FETCHES)):
@@ -222,7 +221,7 @@ def _fetch_recordings(release: Release, folder: Path, tell: Tell) -> None:
 
 def _fetch_before(release: Release, folder: Path, tell: Tell) -> None:
     """Copy what led to the end of a container, if one was started again; the report needs none."""
-    from cloudrc.cluster.fetch import fetch_before
+    from cloudrc.cluster.pods import fetch_before
 
     for component in COMPONENTS:
         path = folder / f"{component}.before.mcap"

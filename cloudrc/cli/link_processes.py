@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.assembly import link_profile
-from cloudrc.cluster.forward import DIRECTLY
+from cloudrc.cluster.pods import DIRECTLY
 from cloudrc.drivers.interpreter import interpreter
 from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.route import parse

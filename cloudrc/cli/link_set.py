@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cli.cluster_flags import place, place_arguments
 from cloudrc.cli.here import find_here, link_of, nobody_here, run_argument
 from cloudrc.cli.output import output_argument, say, written
-from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.tools import ClusterError
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
 
 if TYPE_CHECKING:
-    from cloudrc.cli.link_cluster import HandedOver
-    from cloudrc.cluster.link import LinkParts, Place
+    from cloudrc.cluster.link import HandedOver, LinkParts, Place
     from cloudrc.config.edit import Edit
     from cloudrc.link.state import LinkState
 
@@ -107,14 +106,14 @@ def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
     """Hand a new profile to both link containers."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from cloudrc.cluster.access import DEFAULT_RELEASE
+    from cloudrc.cluster.client import DEFAULT_RELEASE
     from cloudrc.cluster.link import Place
 
     where = Place(options.context, options.namespace, options.release or DEFAULT_RELEASE)
     with ThreadPoolExecutor(1) as pool:
         looking = pool.submit(_link_of, options, where)
         # Meanwhile, since it takes as long: a change is to be in force within a second.
-        from cloudrc.cli.link_cluster import hand_profile
+        from cloudrc.cluster.link import hand_profile
         from cloudrc.config.edit import check
 
         if looking.exception() is not None:
@@ -131,7 +130,7 @@ def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
 
 def _whole_or_not_at_all(handed: HandedOver, number: str) -> list[LinkState]:
     """See that both directions have a change; what one cannot be the other does not stay."""
-    from cloudrc.cli.link_cluster_inside import PATIENCE
+    from cloudrc.cluster.link import PATIENCE
 
     late = f"within {PATIENCE:g} s; see the logs of the link containers"
     try:

@@ -123,8 +123,7 @@ def _ends(options: argparse.Namespace) -> Said:
     from contextlib import ExitStack
 
     release = place(options)
-    from cloudrc.cluster.forward import forwarded
-    from cloudrc.cluster.pods import find_pod
+    from cloudrc.cluster.pods import find_pod, forwarded
 
     with ExitStack() as ways:
         pods = {}

@@ -21,8 +21,7 @@ from cloudrc.cli.link_verify_notes import (
     on_patience,
 )
 from cloudrc.cli.link_verify_text import NOT_JUDGED, Said
-from cloudrc.cluster.fetch import METRICS
-from cloudrc.cluster.forward import DIRECTLY
+from cloudrc.cluster.pods import DIRECTLY, METRICS
 from cloudrc.drivers.standing_basis import TAKES
 from cloudrc.errors import TimedOutError
 from cloudrc.link.sidecar_told import Told, read_told

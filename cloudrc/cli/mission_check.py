@@ -13,7 +13,7 @@ from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.cloud.teleop.api_models import MissionRequest
-    from cloudrc.cluster.access import Release
+    from cloudrc.cluster.client import Release
     from cloudrc.config.problems import Problem
     from cloudrc.config.schema import Experiment
 
@@ -78,8 +78,8 @@ def _experiment(release: Release) -> Experiment | None:
     """Read a release's experiment; None if this user, or this version, cannot."""
     from pydantic import ValidationError
 
-    from cloudrc.cluster.errors import ClusterError
-    from cloudrc.cluster.experiment import FILE, experiment_text
+    from cloudrc.cluster.client import FILE, experiment_text
+    from cloudrc.cluster.tools import ClusterError
     from cloudrc.config.document import parse as parse_yaml
     from cloudrc.config.schema import Experiment
     from cloudrc.config.shipped import check_name

@@ -20,7 +20,7 @@ from cloudrc.cli.token import reader, token_file
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 if TYPE_CHECKING:
-    from cloudrc.cluster.access import Release
+    from cloudrc.cluster.client import Release
     from cloudrc.cluster.jobs import JobStatus
 
 
@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 def api(options: argparse.Namespace) -> Iterator[Api]:
     """Open the way to a release's API for as long as the block lasts."""
     release, path = _place(options), token_file(options)
-    from cloudrc.cluster.forward import api_url
-    from cloudrc.cluster.tokens import operator_token
+    from cloudrc.cluster.pods import api_url, operator_token
 
     token = operator_token(release) if path is None else ""
     with api_url(release.context, release.namespace, release.name) as url:
@@ -42,10 +41,9 @@ def _run(options: argparse.Namespace) -> int:
         mission["name"] = options.name
     request = parse(options.mission, mission)
     release = _place(options)
-    from cloudrc.cluster.deploy import wait_ready
-    from cloudrc.cluster.follow import follow, patience
-    from cloudrc.cluster.jobs import run_job
+    from cloudrc.cluster.jobs import follow, patience, run_job
     from cloudrc.cluster.pods import require_release
+    from cloudrc.cluster.release import wait_ready
 
     require_release(release)
     limit = check_on(release, options.mission, request)
@@ -101,7 +99,7 @@ def _cancel(options: argparse.Namespace) -> int:
         with api(options) as of_release:
             return OF_API["cancel"](options, of_release)
     release = _place(options)
-    from cloudrc.cluster.cancel import cancel
+    from cloudrc.cluster.jobs import cancel
 
     path = token_file(options)
     say(cancel(release, options.id, reader(path)() if path else None))
@@ -110,8 +108,7 @@ def _cancel(options: argparse.Namespace) -> int:
 
 def _logs(options: argparse.Namespace) -> int:
     release = _place(options)
-    from cloudrc.cluster.follow import follow, logs
-    from cloudrc.cluster.jobs import list_jobs
+    from cloudrc.cluster.jobs import follow, list_jobs, logs
 
     job = options.id
     if job is None:

@@ -142,8 +142,8 @@ def test_the_papers_mission_is_the_one_that_ships(tmp_path: Path) -> None:
 
 def test_the_chart_makes_the_same_job_as_the_program() -> None:
     """`cloudrc mission run` and the chart differ in names and times only."""
-    from cloudrc.cluster import manifest
-    from cloudrc.cluster.access import Release
+    from cloudrc.cluster import jobs as manifest
+    from cloudrc.cluster.client import Release
 
     follower = manifest.Follower(
         "cloudrc/cloud:0.1.0",

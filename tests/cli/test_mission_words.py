@@ -17,7 +17,8 @@ from cloudrc.cli.main import main
 from cloudrc.cli.output import harmless
 from cloudrc.cloud.teleop.service_mission import SHOWN as EVENTS
 from cloudrc.cloud.teleop.service_mission import Order
-from cloudrc.cluster import follow, jobs
+from cloudrc.cluster import jobs
+from cloudrc.cluster import jobs as follow
 from cloudrc.cluster.jobs import JobStatus
 from cloudrc.errors import BadInputError
 

@@ -11,8 +11,9 @@ import pytest
 from fake_api import FakeApi, deployment, kubeconfig, pod
 from link_pods import Cluster, pretended
 
-from cloudrc.cluster import deploy, errors, follow
-from cloudrc.cluster.access import Release, connect
+from cloudrc.cluster import jobs, tools
+from cloudrc.cluster import release as deploy
+from cloudrc.cluster.client import Release, connect
 
 TOKEN = "operator-token-of-the-release"
 
@@ -23,8 +24,8 @@ def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeApi]:
     path = tmp_path / "kubeconfig"
     path.write_text(kubeconfig(server.url))
     monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", str(path))
-    monkeypatch.setattr(follow, "LOOK_PERIOD", 0.01)
-    monkeypatch.setattr(errors, "OUTAGE_PERIOD", 0.01)
+    monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
+    monkeypatch.setattr(tools, "OUTAGE_PERIOD", 0.01)
     monkeypatch.setattr(deploy, "LOOK_PERIOD", 0.01)
     monkeypatch.setattr(deploy, "PATIENCE", 0.0)
     yield server

@@ -12,9 +12,9 @@ import pytest
 import yaml
 from fake_api import FakeApi, kubeconfig, pod
 
-from cloudrc.cluster.access import Release, connect
-from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.client import Release, connect
 from cloudrc.cluster.pods import find_pod, list_pods
+from cloudrc.cluster.tools import ClusterError
 from cloudrc.errors import MissingPrerequisiteError
 
 ROOT = Path(__file__).resolve().parents[2]

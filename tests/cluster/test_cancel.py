@@ -12,10 +12,9 @@ import pytest
 from fake_api import FakeApi
 from test_jobs import MISSION, end
 
-from cloudrc.cluster.access import Release
-from cloudrc.cluster.cancel import cancel
-from cloudrc.cluster.errors import ClusterError
-from cloudrc.cluster.jobs import run_job
+from cloudrc.cluster.client import Release
+from cloudrc.cluster.jobs import cancel, run_job
+from cloudrc.cluster.tools import ClusterError
 
 
 class FakeTeleop(ThreadingHTTPServer):

@@ -15,7 +15,7 @@ from fake_api import FakeApi, kubeconfig
 
 from cloudrc.cli import checks, extras, run
 from cloudrc.cli.main import main
-from cloudrc.cluster.version import OLDEST
+from cloudrc.cluster.client import OLDEST
 
 Printed = pytest.CaptureFixture[str]
 CHART = Path(__file__).resolve().parents[2] / "charts" / "cloudrc" / "Chart.yaml"

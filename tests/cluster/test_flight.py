@@ -16,10 +16,10 @@ from test_jobs import at_look, end, start_pod, terminated
 
 from cloudrc.cli import cluster_flight
 from cloudrc.cli.main import main
-from cloudrc.cluster import fetch
-from cloudrc.cluster.access import Release, connect
-from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster import pods as fetch
+from cloudrc.cluster.client import Release, connect
 from cloudrc.cluster.jobs import run_job
+from cloudrc.cluster.tools import ClusterError
 from cloudrc.config.load import load_experiment
 
 Patch = pytest.MonkeyPatch

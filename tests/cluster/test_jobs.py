@@ -11,11 +11,10 @@ from typing import Any
 import pytest
 from fake_api import FakeApi, pod
 
-from cloudrc.cluster import manifest
-from cloudrc.cluster.access import Release
-from cloudrc.cluster.errors import ClusterError, WaitedTooLongError
-from cloudrc.cluster.follow import follow, logs
-from cloudrc.cluster.jobs import delete_job, list_jobs, read_job, run_job
+from cloudrc.cluster import jobs
+from cloudrc.cluster.client import Release
+from cloudrc.cluster.jobs import delete_job, follow, list_jobs, logs, read_job, run_job
+from cloudrc.cluster.tools import ClusterError, WaitedTooLongError
 
 MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
 
@@ -28,7 +27,7 @@ def end(api: FakeApi, name: str, kind: str, **condition: str) -> None:
 def start_pod(api: FakeApi, name: str, **given: Any) -> None:
     """The Job's pod, as Kubernetes would make it."""
     uid = api.get("jobs", name)["metadata"]["uid"]
-    api.put("pods", "demo", pod(f"{name}-x", "mission", labels={manifest.UID_LABEL: uid}, **given))
+    api.put("pods", "demo", pod(f"{name}-x", "mission", labels={jobs.UID_LABEL: uid}, **given))
 
 
 def terminated(exit_code: int, message: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.link_cluster_inside import INSIDE, PATIENCE
+from cloudrc.cluster.link import INSIDE, PATIENCE
 from cloudrc.link.route import publish
 from cloudrc.link.sidecar_handed import HANDED_FILE, Handed, read_handed, write_handed
 from cloudrc.link.state import STATE_FILE, LinkState, to_text

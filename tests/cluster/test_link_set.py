@@ -10,8 +10,8 @@ import yaml
 from fake_api import FakeApi
 from link_pods import PROFILE, TRACE, Cluster
 
-from cloudrc.cli.link_cluster import with_files
 from cloudrc.cli.main import main
+from cloudrc.cluster.link import with_files
 from cloudrc.errors import BadInputError
 
 
@@ -72,7 +72,7 @@ def test_a_trace_that_is_too_long_for_a_config_map_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "t.csv").write_text(TRACE)
-    monkeypatch.setattr("cloudrc.cli.link_cluster.SIZE_MAX", 50)
+    monkeypatch.setattr("cloudrc.cluster.link.SIZE_MAX", 50)
     with pytest.raises(BadInputError, match="a ConfigMap takes 50"):
         with_files({"profile.yaml": PROFILE}, None, [f"uplink.trace={tmp_path / 't.csv'}"])
 

@@ -14,11 +14,10 @@ from test_jobs import MISSION, end, start_pod, terminated
 
 from cloudrc.cli import mission_cluster
 from cloudrc.cli.main import main
-from cloudrc.cluster import follow as following
-from cloudrc.cluster.access import Release
-from cloudrc.cluster.errors import ClusterError
-from cloudrc.cluster.follow import patience
-from cloudrc.cluster.jobs import run_job
+from cloudrc.cluster import jobs as following
+from cloudrc.cluster.client import Release
+from cloudrc.cluster.jobs import patience, run_job
+from cloudrc.cluster.tools import ClusterError
 
 Printed = pytest.CaptureFixture[str]
 WAYPOINTS = "waypoints: [{position_m: [0.0, 0.0, 1.0]}]"

@@ -9,12 +9,11 @@ import pytest
 from fake_api import FakeApi
 from test_jobs import MISSION, end, start_pod, terminated
 
-from cloudrc.cluster import errors
-from cloudrc.cluster.access import Release
-from cloudrc.cluster.deploy import wait_ready
-from cloudrc.cluster.errors import AwayError, ClusterError
-from cloudrc.cluster.follow import follow
-from cloudrc.cluster.jobs import run_job
+from cloudrc.cluster import tools
+from cloudrc.cluster.client import Release
+from cloudrc.cluster.jobs import follow, run_job
+from cloudrc.cluster.release import wait_ready
+from cloudrc.cluster.tools import AwayError, ClusterError
 
 
 def away(api: FakeApi, plural: str, code: int, times: int) -> Callable[[], int]:
@@ -68,7 +67,7 @@ def test_what_is_refused_is_not_asked_again(running: FakeApi, release: Release) 
 def test_one_that_does_not_come_back_ends_it(
     running: FakeApi, release: Release, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(errors, "OUTAGE_MAX", 0.05)
+    monkeypatch.setattr(tools, "OUTAGE_MAX", 0.05)
     run_job(release, MISSION, name="first")
     away(running, "jobs", 500, 1_000_000)
     with pytest.raises(AwayError, match="leader changed") as caught:

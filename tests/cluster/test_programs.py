@@ -11,11 +11,10 @@ from pathlib import Path
 import pytest
 from fake_api import FakeApi, pod
 
-from cloudrc.cluster import fetch, forward, tools
-from cloudrc.cluster.access import Release
-from cloudrc.cluster.chart import chart_folder
-from cloudrc.cluster.deploy import install
-from cloudrc.cluster.errors import ClusterError, WaitedTooLongError
+from cloudrc.cluster import pods, tools
+from cloudrc.cluster.client import Release
+from cloudrc.cluster.release import install
+from cloudrc.cluster.tools import ClusterError, WaitedTooLongError, chart_folder
 from cloudrc.errors import MissingPrerequisiteError
 
 Pretend = Callable[[str, str], Path]
@@ -98,7 +97,7 @@ def test_a_way_to_a_port_is_open_while_the_block_lasts(
         "echo 'Forwarding from 127.0.0.1:40001 -> 9100'\n"
         "echo 'Forwarding from 127.0.0.1:40002 -> 9102'\nexec sleep 60",
     )
-    with forward.forwarded(release, "world-1", [9100, 9102]) as ports:
+    with pods.forwarded(release, "world-1", [9100, 9102]) as ports:
         assert ports == {9100: 40001, 9102: 40002}
         pid = int((tmp_path / "pid").read_text())
         os.kill(pid, 0)
@@ -111,7 +110,7 @@ def test_a_way_that_does_not_open_is_told(release: Release, pretend: Pretend) ->
     pretend("kubectl", "echo 'error: unable to forward port: pod is gone' >&2; exit 1")
     with (
         pytest.raises(ClusterError, match=r"no way to pod 'cloud-1'.*pod is gone"),
-        forward.forwarded(release, "cloud-1", [8080]),
+        pods.forwarded(release, "cloud-1", [8080]),
     ):
         pytest.fail("there is no way")
 
@@ -119,12 +118,12 @@ def test_a_way_that_does_not_open_is_told(release: Release, pretend: Pretend) ->
 def test_a_way_that_takes_for_ever_is_given_up(
     release: Release, pretend: Pretend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(forward, "START_LIMIT", 0.1)
+    monkeypatch.setattr(pods, "START_LIMIT", 0.1)
     pretend("kubectl", "exec sleep 60")
     began = time.monotonic()
     with (
         pytest.raises(WaitedTooLongError, match="not open within"),
-        forward.forwarded(release, "cloud-1", [8080]),
+        pods.forwarded(release, "cloud-1", [8080]),
     ):
         pytest.fail("there is no way")
     assert time.monotonic() - began < 2.0
@@ -134,7 +133,7 @@ def test_an_error_inside_the_block_is_not_taken_for_one_of_the_way(
     release: Release, pretend: Pretend
 ) -> None:
     pretend("kubectl", "echo 'Forwarding from 127.0.0.1:40001 -> 8080'; exec sleep 60")
-    with pytest.raises(KeyError), forward.forwarded(release, "cloud-1", [8080]):
+    with pytest.raises(KeyError), pods.forwarded(release, "cloud-1", [8080]):
         raise KeyError
 
 
@@ -145,7 +144,7 @@ def test_a_recording_is_copied_byte_by_byte(
     source, target = tmp_path / "source", tmp_path / "world.mcap"
     source.write_bytes(bytes(range(256)) * 100)
     pretend("kubectl", f"echo $@ > {tmp_path}/line; cat {source}")
-    fetch.fetch_recording(release, "world", target)
+    pods.fetch_recording(release, "world", target)
     assert target.read_bytes() == source.read_bytes()
     line = (tmp_path / "line").read_text()
     assert "exec world-1 --container=world -- cat /var/lib/cloudrc/world.mcap" in line

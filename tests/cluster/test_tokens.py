@@ -7,10 +7,10 @@ import base64
 import pytest
 from fake_api import FakeApi
 
-from cloudrc.cluster.access import Release
-from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.client import Release
 from cloudrc.cluster.jobs import run_job
-from cloudrc.cluster.tokens import operator_token, secret_name
+from cloudrc.cluster.pods import operator_token, secret_name
+from cloudrc.cluster.tools import ClusterError
 
 
 def test_it_is_the_one_that_the_pod_mounts(running: FakeApi, release: Release) -> None:

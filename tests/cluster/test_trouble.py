@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from fake_api import FakeApi, deployment, pod
 
-from cloudrc.cluster.access import Release
-from cloudrc.cluster.deploy import wait_ready
-from cloudrc.cluster.errors import ClusterError, WaitedTooLongError
+from cloudrc.cluster.client import Release
 from cloudrc.cluster.pods import list_pods, trouble
+from cloudrc.cluster.release import wait_ready
+from cloudrc.cluster.tools import ClusterError, WaitedTooLongError
 
 
 def waiting(reason: str, message: str = "") -> dict[str, Any]:

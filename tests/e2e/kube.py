@@ -16,10 +16,8 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from cloudrc.cli.mission_http import Api
-from cloudrc.cluster.access import Release, connect
-from cloudrc.cluster.fetch import fetch_metrics
-from cloudrc.cluster.forward import api_url
-from cloudrc.cluster.tokens import operator_token
+from cloudrc.cluster.client import Release, connect
+from cloudrc.cluster.pods import api_url, fetch_metrics, operator_token
 
 ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "charts" / "cloudrc"

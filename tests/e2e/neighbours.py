@@ -10,8 +10,8 @@ from urllib.parse import urlencode
 import yaml
 from kube import NAMESPACE, CommandFailedError, apply, command, eventually, kubectl, pod
 
-from cloudrc.cluster.access import connect
-from cloudrc.cluster.forward import DIRECTLY, forwarded
+from cloudrc.cluster.client import connect
+from cloudrc.cluster.pods import DIRECTLY, forwarded
 
 MONITORING = f"{NAMESPACE}-monitoring"
 SECURITY = {

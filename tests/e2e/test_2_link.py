@@ -33,8 +33,7 @@ from kube import (
     value,
 )
 
-from cloudrc.cli.link_cluster_inside import hand_over
-from cloudrc.cluster.link import PROFILE, Place
+from cloudrc.cluster.link import PROFILE, Place, hand_over
 from cloudrc.link.sidecar_handed import Handed
 
 SET_WITHIN = 1.0

@@ -22,7 +22,7 @@ from kube import (
     value,
 )
 
-from cloudrc.cluster.deploy import wait_ready
+from cloudrc.cluster.release import wait_ready
 from cloudrc.config.load import load_mission
 from cloudrc.faults.cluster.family_kills import COMMANDS_IN, ENDS_IN, POD_START
 

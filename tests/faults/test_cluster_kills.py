@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.tools import ClusterError
 from cloudrc.faults.catalogue import find
 from cloudrc.faults.cluster import family_kills
 from cloudrc.faults.cluster.family_kills import KILL

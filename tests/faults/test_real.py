@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.tools import ClusterError
 from cloudrc.errors import BadInputError
 from cloudrc.faults.catalogue import find, scenarios
 from cloudrc.faults.cluster import family_pods

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc.cli.link_cluster_inside import INSIDE
+from cloudrc.cluster.link import INSIDE
 from cloudrc.config.load import load_experiment
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile

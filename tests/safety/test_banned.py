@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.link_cluster_inside import INSIDE
+from cloudrc.cluster.link import INSIDE
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = [*sorted((ROOT / "cloudrc").rglob("*.py")), *sorted((ROOT / "tools").rglob("*.py"))]

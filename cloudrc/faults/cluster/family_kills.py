@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 
-from cloudrc.cluster.access import Release
-from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.client import Release
 from cloudrc.cluster.pods import find_pod
+from cloudrc.cluster.tools import ClusterError
 from cloudrc.faults.cluster.family_pods import CLUSTER
 from cloudrc.faults.cluster.release import (
     delete,

@@ -11,12 +11,11 @@ import os
 import subprocess
 import time
 
-from cloudrc.cluster.access import Release
-from cloudrc.cluster.deploy import wait_ready
-from cloudrc.cluster.errors import ClusterError
+from cloudrc.cluster.client import Release
 from cloudrc.cluster.jobs import read_job
 from cloudrc.cluster.pods import find_pod, list_pods
-from cloudrc.cluster.tools import program
+from cloudrc.cluster.release import wait_ready
+from cloudrc.cluster.tools import ClusterError, program
 from cloudrc.faults.cluster.release import (
     ENDS,
     LIMIT,

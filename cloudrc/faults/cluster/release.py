@@ -9,13 +9,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from cloudrc.cluster.access import DEFAULT_RELEASE, Release, connect
-from cloudrc.cluster.errors import ClusterError
-from cloudrc.cluster.fetch import fetch_metrics, fetch_recording
-from cloudrc.cluster.follow import logs
-from cloudrc.cluster.jobs import read_job, run_job
+from cloudrc.cluster.client import DEFAULT_RELEASE, Release, connect
+from cloudrc.cluster.jobs import logs, read_job, run_job
 from cloudrc.cluster.link import PROFILE, Place, read_link
-from cloudrc.cluster.pods import find_pod
+from cloudrc.cluster.pods import fetch_metrics, fetch_recording, find_pod
+from cloudrc.cluster.tools import ClusterError
 from cloudrc.cluster.tools import run as call
 from cloudrc.config.load import load_mission
 from cloudrc.errors import CloudrcError, TimedOutError

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cloudrc.cloud.teleop.service_mission import ENDED, STATES
-from cloudrc.cluster.forward import DIRECTLY
+from cloudrc.cluster.pods import DIRECTLY
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.drivers.epochs import replace_durably
 from cloudrc.drivers.realtime import free_ports

@@ -8,10 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cluster.access import REQUEST_TIMEOUT, Release
-from cloudrc.cluster.errors import ClusterError, WaitedTooLongError, explained, insist
+from cloudrc.cluster.client import REQUEST_TIMEOUT, Release
 from cloudrc.cluster.pods import is_ready, list_pods, missing_secret, trouble
-from cloudrc.cluster.tools import run
+from cloudrc.cluster.tools import ClusterError, WaitedTooLongError, explained, insist, run
 
 COMPONENTS = ("world", "cloud")
 LOOK_PERIOD = 1.0

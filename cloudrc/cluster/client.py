@@ -1,15 +1,21 @@
-"""Which cluster, which namespace, which release: flags come in, clients of that place go out."""
+"""Which cluster, which namespace, which release: flags come in, clients of that place go out.
+
+How old a cluster is: a place comes in, the version of its API server goes out.
+
+The experiment of a release: its ConfigMap is found, the text in it goes out as it was given.
+"""
 
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from cloudrc.cluster.errors import explained
+from cloudrc.cluster.tools import ClusterError, explained
 from cloudrc.errors import MissingPrerequisiteError
 
 DEFAULT_RELEASE = "cloudrc"
@@ -165,3 +171,47 @@ def connect(
 def _unknown_context(context: str, known: Sequence[str]) -> str:
     names = ", ".join(sorted(known)) or "none"
     return f"no context '{context}' in the kubeconfig; there are: {names}; choose with --context"
+
+
+OLDEST = (1, 29)
+"""Kubernetes that the chart runs on; the same as kubeVersion in its Chart.yaml."""
+ANSWER_LIMIT = 5.0
+"""For the API server to say its version [s]."""
+
+
+def server_version(release: Release) -> tuple[int, int]:
+    """Ask the API server for its version.
+
+    Returns:
+        Major and minor.
+
+    Raises:
+        ClusterError: If it does not answer, or refuses.
+    """
+    with explained("get the version", release.where):
+        code = release.version.get_code(_request_timeout=ANSWER_LIMIT)
+    # Minor is "29+" where the cluster's vendor has added something.
+    found = [re.match(r"\d+", str(text)) for text in (code.major, code.minor)]
+    if not all(found):
+        raise ClusterError(f"the API server {release.where} calls itself {code.git_version}")
+    major, minor = (int(match.group()) for match in found if match)
+    return major, minor
+
+
+COMPONENT = "experiment"
+FILE = "experiment.yaml"
+
+
+def experiment_text(release: Release) -> str:
+    """Read what a release was told to fly, as YAML; "" if it does not say.
+
+    Raises:
+        ClusterError: If the ConfigMap cannot be read.
+    """
+    with explained("list configmaps", release.where):
+        found = release.core.list_namespaced_config_map(
+            release.namespace,
+            label_selector=release.selector(COMPONENT),
+            _request_timeout=REQUEST_TIMEOUT,
+        ).items
+    return next((str((each.data or {}).get(FILE, "")) for each in found), "")
