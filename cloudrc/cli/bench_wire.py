@@ -84,8 +84,7 @@ def measure_wire(rounds: int = ROUNDS) -> WireCost:
     from cloudrc.messages import GuardState, Odometry, Telemetry
     from cloudrc.tunnel import codec
     from cloudrc.tunnel.codec import Direction, Kind
-    from cloudrc.tunnel.session import Agreement, Session, pair
-    from cloudrc.tunnel.unsealed import UnsealedSession
+    from cloudrc.tunnel.session import Agreement, Session, UnsealedSession, pair
 
     odometry = Odometry(1, (0.1, 0.2, 0.3), (0.9, 0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
     telemetry = Telemetry(1, odometry, 0.0, 2, 3, 0, 1, GuardState.TRACK)

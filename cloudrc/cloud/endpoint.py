@@ -21,10 +21,8 @@ from cloudrc.records import Arrival, Counted, MissionEvent, Record, SessionOpene
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
-from cloudrc.tunnel.complaints import BUSY, SILENCE, Complaints
-from cloudrc.tunnel.knocker import Knocker
-from cloudrc.tunnel.session import NO_EPOCH
-from cloudrc.tunnel.unsealed import make_session
+from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE, Complaints, Knocker
+from cloudrc.tunnel.session import NO_EPOCH, make_session
 
 PERIOD_NS = 10_000_000
 """Time between two commands [ns]. Source: docs/reference/plant.md, "Commands"."""
@@ -160,7 +158,7 @@ class CloudEndpoint:
             elif kind == Kind.BUSY:
                 if self._knocker.refused(codec.decode_busy(body)) and self._asks(now_ns):
                     self._counts["busy"] += 1
-                    self._records += self._complaints.say("busy", BUSY, now_ns)
+                    self._records += self._complaints.say("busy", BUSY_TEXT, now_ns)
             elif kind != Kind.ALIVE:
                 raise DecodeError("malformed")
         except DecodeError as error:

@@ -23,7 +23,7 @@ from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.faults.walls import jumping_wall_clock, steppable_wall_clock
 from cloudrc.messages import GuardState
 from cloudrc.records import Fault
-from cloudrc.tunnel.complaints import BUSY
+from cloudrc.tunnel.handshake import BUSY_TEXT
 from cloudrc.tunnel.keys import Key, KeySet, write
 
 BAD_KEYS = (
@@ -103,7 +103,7 @@ def _two_clouds(seed: int) -> Outcome:
     meters.moves(outcome, flight, "world", "sessions_refused_total", since=at)
     outcome.least("the second is refused", flight.world.inner._counts["busy"], 1)  # type: ignore[union-attr]
     told = [r for r in crowd.others if isinstance(r, Fault) and r.code == "busy"]
-    outcome.true("the second says why it waits, once", [r.text for r in told] == [BUSY])
+    outcome.true("the second says why it waits, once", [r.text for r in told] == [BUSY_TEXT])
     said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
     outcome.most("it says so after", said - at, 1.0, "s")
     by_first = [r for r in meters.seen_by(flight, "cloud", at + 6.0) if isinstance(r, Fault)]

@@ -32,9 +32,8 @@ from cloudrc.records import (
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
-from cloudrc.tunnel.complaints import NO_EPOCH, Complaints
-from cloudrc.tunnel.handshake import Door
-from cloudrc.tunnel.unsealed import make_session
+from cloudrc.tunnel.handshake import NO_EPOCH, Complaints, Door
+from cloudrc.tunnel.session import make_session
 from cloudrc.world.clock import CATCH_UP_NS, SimulationClock
 from cloudrc.world.identity import WorldIdentity as WorldIdentity
 from cloudrc.world.orders import Orders

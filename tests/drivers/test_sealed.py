@@ -11,7 +11,7 @@ from bare_world import bare_world, ring
 
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.tunnel.codec import Direction
-from cloudrc.tunnel.unsealed import make_session
+from cloudrc.tunnel.session import make_session
 
 PACKAGE = Path(__file__).parents[2] / "cloudrc"
 

@@ -22,7 +22,7 @@ from cloudrc.link.sidecar_follow import PeerName
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Contact, Counted, Fault
-from cloudrc.tunnel.complaints import Complaints
+from cloudrc.tunnel.handshake import Complaints
 from cloudrc.world.clock import STEP_NS
 from cloudrc.world.guard import Guard
 from cloudrc.world.robot import Robot

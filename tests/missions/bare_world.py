@@ -22,10 +22,9 @@ from cloudrc.messages import (
 from cloudrc.records import Arrival, Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
+from cloudrc.tunnel.handshake import Knocker
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.knocker import Knocker
-from cloudrc.tunnel.session import AES_256_GCM, Session
-from cloudrc.tunnel.unsealed import make_session
+from cloudrc.tunnel.session import AES_256_GCM, Session, make_session
 from cloudrc.world.endpoint import WorldEndpoint
 from cloudrc.world.identity import WorldIdentity
 

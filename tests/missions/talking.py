@@ -8,8 +8,8 @@ from cloudrc.messages import Command, OperatorRequest, Request, Start
 from cloudrc.records import Counted
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
+from cloudrc.tunnel.handshake import Knocker
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.knocker import Knocker
 from cloudrc.tunnel.session import AES_256_GCM, Session
 from cloudrc.world.identity import WorldIdentity
 

@@ -5,7 +5,7 @@ from talking import MS, talking
 
 from cloudrc.messages import GuardState, Request, Start
 from cloudrc.records import Fault, TelemetrySent
-from cloudrc.tunnel.complaints import NO_EPOCH
+from cloudrc.tunnel.handshake import NO_EPOCH
 
 
 @pytest.fixture

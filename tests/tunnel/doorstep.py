@@ -3,9 +3,8 @@
 from types import SimpleNamespace
 
 from cloudrc.tunnel.codec import Direction, Hello, Kind, decode_challenge
-from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, Door
+from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, NO_COOKIE, Door
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.knocker import NO_COOKIE
 from cloudrc.tunnel.session import AES_256_GCM, Session
 
 MS = 1_000_000

@@ -6,7 +6,7 @@ from bare_world import Bare, BareCloud, ring
 from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
-from cloudrc.tunnel.complaints import KEY, Complaints
+from cloudrc.tunnel.handshake import KEY, Complaints
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
 OTHER = KeyRing(KeySet(Key(b"x" * 32)))

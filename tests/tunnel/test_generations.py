@@ -4,8 +4,16 @@ import pytest
 
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Kind
-from cloudrc.tunnel.openers import AHEAD_MAX, FAR_MAX, FAR_TRIES, KEPT, SILENCE_NS
-from cloudrc.tunnel.session import REKEY_NS, Session, pair
+from cloudrc.tunnel.session import (
+    AHEAD_MAX,
+    FAR_MAX,
+    FAR_TRIES,
+    KEPT,
+    REKEY_NS,
+    SILENCE_NS,
+    Session,
+    pair,
+)
 
 BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
 GENERATION = 6  # where it stands in the header

@@ -12,12 +12,12 @@ from cloudrc.tunnel.handshake import (
     COOKIE_NS,
     EPOCH_MAX,
     GRACE_NS,
+    NO_COOKIE,
     REPEATS_MAX,
     Door,
     epochs_after,
 )
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.knocker import NO_COOKIE
 from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, Agreement, Session
 
 

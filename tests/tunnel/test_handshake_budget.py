@@ -3,8 +3,14 @@
 import pytest
 from doorstep import MS, NONCE, SECOND_NS, Doorstep
 
-from cloudrc.tunnel.handshake import ANSWERS_MAX, CHALLENGE_NS, COOKIE_NS, REPEATS_MAX, USED_MAX
-from cloudrc.tunnel.knocker import NO_COOKIE
+from cloudrc.tunnel.handshake import (
+    ANSWERS_MAX,
+    CHALLENGE_NS,
+    COOKIE_NS,
+    NO_COOKIE,
+    REPEATS_MAX,
+    USED_MAX,
+)
 
 
 @pytest.fixture

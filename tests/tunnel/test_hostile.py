@@ -17,7 +17,7 @@ from hostile import LONGEST, Target, memory
 
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
-from cloudrc.tunnel.openers import Openers
+from cloudrc.tunnel.session import Openers
 
 
 @pytest.fixture(scope="module")

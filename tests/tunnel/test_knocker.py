@@ -4,7 +4,7 @@ import pytest
 
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Accept, Busy, Hello
-from cloudrc.tunnel.knocker import COOKIES_MAX, LEFT_MAX, NO_COOKIE, REPLIES_MAX, Knocker
+from cloudrc.tunnel.handshake import COOKIES_MAX, LEFT_MAX, NO_COOKIE, REPLIES_MAX, Knocker
 from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, Agreement
 
 NONCE, CLOCK, WORLD = b"n" * 16, b"c" * 16, b"w" * 16

@@ -7,8 +7,7 @@ import pytest
 from cloudrc.tunnel import codec, session
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.openers import KEPT
-from cloudrc.tunnel.session import REKEY_NS, Agreement, Session, pair
+from cloudrc.tunnel.session import KEPT, REKEY_NS, Agreement, Session, pair
 
 BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
 SECOND_NS = 1_000_000_000

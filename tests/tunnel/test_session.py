@@ -13,9 +13,10 @@ from cloudrc.tunnel.session import (
     NO_EPOCH,
     Agreement,
     Session,
+    UnsealedSession,
+    make_session,
     pair,
 )
-from cloudrc.tunnel.unsealed import UnsealedSession, make_session
 
 BODY = bytes(range(codec.BODY_SIZES[Kind.COMMAND]))
 AGREEMENT = Agreement(b"cloud".ljust(16), b"world".ljust(16))

@@ -17,9 +17,8 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from cloudrc.messages import Command
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Busy, Direction, Hello, Kind
-from cloudrc.tunnel.handshake import Door
+from cloudrc.tunnel.handshake import Door, Knocker
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.knocker import Knocker
 from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, REKEY_NS, Session, pair
 
 SECRET = bytes(range(32))
