@@ -56,8 +56,8 @@ def build_world(
         clock: Its monotonic clock [ns]; read last, since a scene takes a while to compile.
     """
     from cloudrc.world.endpoint import WorldEndpoint
-    from cloudrc.world.guard import Guard
-    from cloudrc.world.guard_limits import Limits
+    from cloudrc.world.guard.limits import Limits
+    from cloudrc.world.guard.state import Guard
     from cloudrc.world.low_level import LowLevel
     from cloudrc.world.robot import Robot
     from cloudrc.world.sensors import Sensors

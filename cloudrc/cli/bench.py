@@ -114,7 +114,7 @@ def _replay(experiment: ResolvedExperiment) -> Play:
     """Fly once with a tape, to be replayed."""
     import numpy as np
 
-    from cloudrc.world.replay import replay
+    from cloudrc.world.simulator import replay
 
     world, cloud, run = _assemble(experiment)
     simulator = world.robot.simulator

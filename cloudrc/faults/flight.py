@@ -30,8 +30,7 @@ from cloudrc.messages import GuardState
 from cloudrc.record.hash import RecordHash
 from cloudrc.records import Contact, Counted, GroundTruth, GuardChange, MissionEvent, Record
 from cloudrc.tunnel.keys import KeyRing, KeySet
-from cloudrc.world.endpoint import WorldEndpoint
-from cloudrc.world.identity import WorldIdentity
+from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
 
 SHARED = b"one clock for all"[:16]
 OTHER = b"another clock..."

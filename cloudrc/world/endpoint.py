@@ -3,12 +3,25 @@
 Time only moves in `_advance`: before anything that comes in has an effect, the ticks before it are
 run, so the result does not depend on when a driver wakes up. World alone hands out epochs: a cloud
 that gets authority gets a new one, and so does a mission that starts from the spawn.
+
+What the robot has touched in a mission: contacts come in, what the verdict needs goes out.
+
+What the operator asks of the robot: requests come in, the guard is told, progress is kept.
+
+Whether simulated time keeps up with the machine's: looks of world's clock in, a fault out.
+
+What is slow is the robot, not its network, so a run like that is invalid: who watches it is told
+while it flies, and the metric goes on telling.
+
+Who world's end is, what it must not forget, and what it may accept.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from math import nan
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import hypot, isnan, nan
 
 from cloudrc.messages import (
     NEVER_NS,
@@ -16,14 +29,17 @@ from cloudrc.messages import (
     GuardState,
     Odometry,
     OperatorRequest,
+    Request,
     Start,
     Telemetry,
 )
 from cloudrc.records import (
+    REAL_TIME_FACTOR_MIN,
     Arrival,
     CommandApplied,
     Contact,
     Counted,
+    Fault,
     GroundTruth,
     Record,
     SessionOpened,
@@ -33,13 +49,182 @@ from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.handshake import NO_EPOCH, Complaints, Door
-from cloudrc.tunnel.session import make_session
-from cloudrc.world.clock import CATCH_UP_NS, SimulationClock
-from cloudrc.world.identity import WorldIdentity as WorldIdentity
-from cloudrc.world.orders import Orders
-from cloudrc.world.pace import Pace
-from cloudrc.world.robot import Robot
+from cloudrc.tunnel.keys import KeyRing
+from cloudrc.tunnel.session import AES_256_GCM, make_session
+from cloudrc.world.guard.state import Guard
+from cloudrc.world.readings import Touch
+from cloudrc.world.robot import CATCH_UP_NS, Robot, SimulationClock
 from cloudrc.world.sensors import Sensors
+
+
+class Touches:
+    """Of one mission.
+
+    Attributes:
+        pipes: How often the robot has begun to touch a pipe.
+        speed: Of the tip when it first touched the board [m/s]; NaN if it has not yet.
+    """
+
+    def __init__(self) -> None:
+        self.pipes = 0
+        self.speed = nan
+
+    def note(self, touch: Touch) -> None:
+        """Take note of a contact that has begun."""
+        if touch.body.startswith("pipe"):
+            self.pipes += 1
+        elif touch.body == "board" and touch.tip and isnan(self.speed):
+            self.speed = hypot(*touch.tip_velocity)
+
+
+START_AGE_MAX_NS = 1_000_000_000
+"""What cloud saw when it passed a start on may be so old [ns], or as old as a command may be."""
+
+
+class Orders:
+    """The operator's requests, obeyed by rising number.
+
+    Attributes:
+        number: Of the newest that was acted on in this session.
+        mission_id: The mission started last, through every session.
+        reached: How many of its waypoints are known to be reached; it only ever rises.
+        touches: What the robot has touched in it.
+    """
+
+    def __init__(
+        self, guard: Guard, counts: defaultdict[str, int], command_age_max_ns: int
+    ) -> None:
+        """Begin with nothing asked.
+
+        Args:
+            guard: Is told.
+            counts: Takes up "start_refused".
+            command_age_max_ns: Of a command's basis [ns].
+        """
+        self._guard, self._counts = guard, counts
+        self._age_max_ns = max(START_AGE_MAX_NS, command_age_max_ns)
+        self.number = self.mission_id = self.reached = 0
+        self.touches = Touches()
+
+    def obey(
+        self,
+        request: OperatorRequest,
+        now_ns: int,
+        *,
+        waited: bool,
+        has_epoch: Callable[[], bool],
+    ) -> bool:
+        """Do as is asked, but for a start, which the caller begins.
+
+        Args:
+            request: In the operator's name.
+            now_ns: World's clock [ns].
+            waited: Whether it may have waited in the socket through a stall.
+            has_epoch: Whether there is an epoch for a start from the spawn.
+
+        Returns:
+            Whether a mission is to be started.
+
+        Raises:
+            DecodeError: "stale" or "future" for a start that was not said just now: somebody may
+                have held it back, and the mission may be over.
+        """
+        if request.request is Request.PROGRESS:
+            self._keep_progress(request)
+            return False
+        if request.number <= self.number:
+            return False
+        starts = request.request is Request.START
+        if starts:
+            self._refuse_unless_new(now_ns - request.basis_stamp_ns, waited)
+            # Not acted on, so not confirmed either: the operator has to acknowledge first.
+            if self._guard.latched or (request.start is Start.SPAWN and not has_epoch()):
+                self._counts["start_refused"] += 1
+                return False
+        self.number = request.number
+        if starts:
+            self._begin_mission(request)
+        self._keep_progress(request)
+        if request.request is Request.END:
+            self._guard.end_mission(now_ns)
+        elif request.request is Request.ESTOP:
+            self._guard.stop(now_ns)
+        elif request.request is Request.ACKNOWLEDGE:
+            self._guard.acknowledge(now_ns)
+        return starts
+
+    def _refuse_unless_new(self, age_ns: int, waited: bool) -> None:
+        if waited or age_ns > self._age_max_ns:
+            raise DecodeError("stale")
+        if age_ns < 0:
+            raise DecodeError("future")
+
+    def _begin_mission(self, request: OperatorRequest) -> None:
+        """From the spawn nothing is reached yet, and nothing touched."""
+        if request.mission_id != self.mission_id or request.start is Start.SPAWN:
+            self.mission_id, self.reached = request.mission_id, 0
+            self.touches = Touches()
+
+    def _keep_progress(self, request: OperatorRequest) -> None:
+        """The onboard witness of how far a mission is."""
+        if request.mission_id == self.mission_id:
+            self.reached = max(self.reached, request.reached)
+
+
+QUIET_NS = 10_000_000_000
+"""It is told again once it has kept up for so long [ns]."""
+
+
+class Pace:
+    """Compares each look with the one before; the first, after a process's start, tells nothing."""
+
+    def __init__(self) -> None:
+        self._looked_ns = self._slip_ns = NEVER_NS
+        self._slow_ns = NEVER_NS
+
+    def look(self, now_ns: int, slip_ns: int) -> list[Fault]:
+        """Say so if world has fallen behind since the look before, about a second ago.
+
+        Args:
+            now_ns: World's clock [ns].
+            slip_ns: By how much it lags the machine's [ns].
+        """
+        passed_ns, slipped_ns = now_ns - self._looked_ns, slip_ns - self._slip_ns
+        is_first = self._looked_ns == NEVER_NS
+        self._looked_ns, self._slip_ns = now_ns, slip_ns
+        factor = passed_ns / (passed_ns + slipped_ns)
+        if is_first or factor >= REAL_TIME_FACTOR_MIN:
+            return []
+        is_news = self._slow_ns == NEVER_NS or now_ns - self._slow_ns > QUIET_NS
+        self._slow_ns = now_ns
+        text = (
+            f"real-time factor {factor:.2f} over {(passed_ns + slipped_ns) * 1e-9:.1f} s: "
+            "simulated time falls behind; give world more processor time"
+        )
+        return [Fault(now_ns, "late", text)] if is_news else []
+
+
+@dataclass(frozen=True, slots=True)
+class WorldIdentity:
+    """What world's end is given at its start.
+
+    Attributes:
+        clock_id: 16 bytes that name this machine's monotonic clock.
+        nonce: 16 bytes that name this process; never the same twice.
+        last_epoch: The last epoch handed out before this process began.
+        ring: The pre-shared keys; None for an end that never leaves its process.
+        suite: Cipher that this machine is fast at.
+        next_epoch: Gives epochs that are persisted before they are used, or None as long as the
+            disk has none; None to count on from `last_epoch`.
+    """
+
+    clock_id: bytes
+    nonce: bytes
+    last_epoch: int = 0
+    ring: KeyRing | None = None
+    suite: int = AES_256_GCM
+    next_epoch: Callable[[], int | None] | None = None
+
 
 ODOMETRY_PERIOD_NS = 10_000_000
 """Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""

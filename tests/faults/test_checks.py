@@ -23,9 +23,8 @@ from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Contact, Counted, Fault
 from cloudrc.tunnel.handshake import Complaints
-from cloudrc.world.clock import STEP_NS
-from cloudrc.world.guard import Guard
-from cloudrc.world.robot import Robot
+from cloudrc.world.guard.state import Guard
+from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.rotors import STOPPED
 
 
@@ -137,7 +136,7 @@ def never_freezes(name: str) -> Callable[[pytest.MonkeyPatch], None]:
 
 
 def keeps_up_by_its_own_word(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cloudrc.world.pace.REAL_TIME_FACTOR_MIN", 0.0)
+    monkeypatch.setattr("cloudrc.world.endpoint.REAL_TIME_FACTOR_MIN", 0.0)
 
 
 def never_says_that_cloud_lives(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,8 +9,8 @@ import pytest
 from cloudrc.faults.fuzz import fly
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.messages import ZERO, Cause, GuardState
-from cloudrc.world.guard_hits import Hits
-from cloudrc.world.guard_rest import Descent, TakeOff
+from cloudrc.world.guard.hold import Descent, TakeOff
+from cloudrc.world.guard.state import Hits
 from cloudrc.world.readings import Readings
 from tests.faults.watched import World
 
@@ -99,7 +99,7 @@ def test_a_guard_that_feels_what_is_not_there_is_found(
 
 
 def test_a_landing_in_a_clean_flight_is_an_alarm(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cloudrc.world.guard.Limits.alone_max_ns", lambda *_: -1)
+    monkeypatch.setattr("cloudrc.world.guard.state.Limits.alone_max_ns", lambda *_: -1)
     finding = fly(Schedule(3, "paper-p1", duration=4.0))
     assert "LAND in a clean flight" in " ".join(breach.text for breach in finding.breaches)
 

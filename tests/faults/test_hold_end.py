@@ -9,7 +9,7 @@ import pytest
 from cloudrc.faults.hold_end import GROUND_NS, RAMP
 from cloudrc.faults.watch import Watch
 from cloudrc.messages import ZERO, Cause, Command, GuardState, Vector
-from cloudrc.world.guard import Guard
+from cloudrc.world.guard.state import Guard
 from cloudrc.world.rotors import STOPPED
 from tests.faults.watched import World
 from tests.world.guard_play import LIMITS, SECOND, command, sensed

@@ -8,9 +8,9 @@ import pytest
 
 from cloudrc.faults.fuzz import fly
 from cloudrc.faults.schedule import Event, Schedule
-from cloudrc.world import guard as guard_module
-from cloudrc.world.guard import Guard
-from cloudrc.world.guard_limits import Limits
+from cloudrc.world.guard import state as guard_module
+from cloudrc.world.guard.limits import Limits
+from cloudrc.world.guard.state import Guard
 
 
 def _resumes_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

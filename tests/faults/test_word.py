@@ -9,7 +9,7 @@ import pytest
 from cloudrc.faults.fuzz import fly
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.messages import ZERO, Cause, Command, GuardState
-from cloudrc.world.guard import Guard
+from cloudrc.world.guard.state import Guard
 from tests.faults.watched import World
 
 MS = 1_000_000

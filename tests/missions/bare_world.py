@@ -25,8 +25,7 @@ from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.handshake import Knocker
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import AES_256_GCM, Session, make_session
-from cloudrc.world.endpoint import WorldEndpoint
-from cloudrc.world.identity import WorldIdentity
+from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
 
 MS = 1_000_000
 CLOCK = bytes(16)

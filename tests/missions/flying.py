@@ -14,8 +14,7 @@ from cloudrc.record.hash import RecordHash
 from cloudrc.records import Record
 from cloudrc.report.document import Run
 from cloudrc.report.write import Assessment, assess
-from cloudrc.world.endpoint import WorldEndpoint
-from cloudrc.world.identity import WorldIdentity
+from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
 
 CLOCK = b"one clock for all"[:16]
 LIMIT_NS = 150_000_000_000

@@ -12,7 +12,7 @@ from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState, Vector
 from cloudrc.records import CommandApplied, Contact, GuardChange, Record
-from cloudrc.world.clock import STEP_NS
+from cloudrc.world.robot import STEP_NS
 
 BOTH = ("uplink", "downlink")
 PATIENCE = (

@@ -11,7 +11,7 @@ from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.handshake import Knocker
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import AES_256_GCM, Session
-from cloudrc.world.identity import WorldIdentity
+from cloudrc.world.endpoint import WorldIdentity
 
 MS = 1_000_000
 CLOCK = b"one clock for all"[:16]

@@ -13,7 +13,7 @@ from cloudrc.records import Arrival, CommandApplied, SessionOpened
 from cloudrc.tunnel.codec import Kind, peek
 from cloudrc.tunnel.handshake import COOKIE_NS
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.world.identity import WorldIdentity
+from cloudrc.world.endpoint import WorldIdentity
 
 EXPERIMENT = load_experiment("hover", ["mission.waypoints.0.dwell_s=1"])
 SECOND_NS = 1_000_000_000

@@ -24,7 +24,7 @@ from cloudrc.records import (
     TelemetrySent,
 )
 from cloudrc.tunnel import codec
-from cloudrc.world.identity import WorldIdentity
+from cloudrc.world.endpoint import WorldIdentity
 
 EXPERIMENT = load_experiment("hover", ["link.profile=ideal"])
 

@@ -14,7 +14,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, GuardChange, Record
 from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
-from cloudrc.world.identity import WorldIdentity
+from cloudrc.world.endpoint import WorldIdentity
 
 HOVER = load_experiment("hover", ["link.profile=ideal"])
 S = 1_000_000_000

@@ -14,7 +14,7 @@ from cloudrc.faults.liar import tempting
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.voice import at_bad_moments
 from cloudrc.messages import GuardState
-from cloudrc.world.guard import Guard
+from cloudrc.world.guard.state import Guard
 
 HOSTILE = {"stop-and-go": 1, "false-basis": 8, "strange-numbers": 64}
 """Policies, each with a seed: together they bring about all of ANSWERS, CAUSES and states."""

@@ -9,7 +9,7 @@ from guard_play import LIMITS, MS, SECOND
 
 from cloudrc.geometry import fence
 from cloudrc.messages import Command
-from cloudrc.world.guard import Guard
+from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.robot import Robot
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from cloudrc.geometry import fence
 from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState, Vector
-from cloudrc.world.guard import Guard
-from cloudrc.world.guard_limits import Limits
+from cloudrc.world.guard.limits import Limits
+from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Readings
 
 MS = 1_000_000

@@ -21,10 +21,9 @@ from guard_play import (
 from test_guard_rules import SPECIAL
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard import Guard
-from cloudrc.world.guard_limits import RANGE, Limits
-from cloudrc.world.guard_rest import HARDEST, PULL_MAX
-from cloudrc.world.guard_rules import CREEP
+from cloudrc.world.guard.hold import HARDEST, PULL_MAX
+from cloudrc.world.guard.limits import CREEP, RANGE, Limits
+from cloudrc.world.guard.state import Guard
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 BEYOND = [value for value in (*SPECIAL, 1e308, -1e308) if abs(value) > RANGE]

@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from test_guard_rules import ANY, PLACES, SPECIAL, SPECIAL_BAD, SPEEDS, VECTORS
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard_hits import JOLT
-from cloudrc.world.guard_limits import RANGE
-from cloudrc.world.guard_rules import growth
+from cloudrc.world.guard.limits import RANGE, growth
+from cloudrc.world.guard.state import JOLT
 
 TAKEN = st.tuples(*[st.floats(-RANGE, RANGE)] * 3)
 """What is not refused, however strange."""

@@ -8,7 +8,7 @@ import pytest
 from guard_play import HERE, MS, SECOND, armed, command, feed, holding, landing, run, tracking
 
 from cloudrc.messages import Cause, GuardState
-from cloudrc.world.guard import Guard
+from cloudrc.world.guard.state import Guard
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LOW = (1.0, 2.0, 0.1)

@@ -10,8 +10,8 @@ from guard_play import HERE, LIMITS, MS, SECOND, command, feed, landing, run
 from cloudrc.geometry import fence
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard_limits import Limits
-from cloudrc.world.guard_rest import LAND_SPEED
+from cloudrc.world.guard.hold import LAND_SPEED
+from cloudrc.world.guard.limits import Limits
 from cloudrc.world.simulator import Simulator
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState

@@ -9,9 +9,9 @@ from guard_play import LIMITS
 
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import GuardState
-from cloudrc.world.guard import Guard
-from cloudrc.world.guard_rest import TAKE_OFF_MARGIN
-from cloudrc.world.guard_rules import BOUNCE, CREEP, SLIDE, TUMBLE, fall_time
+from cloudrc.world.guard.hold import TAKE_OFF_MARGIN
+from cloudrc.world.guard.limits import BOUNCE, CREEP, SLIDE, TUMBLE, fall_time
+from cloudrc.world.guard.state import Guard
 from cloudrc.world.simulator import Simulator
 
 

@@ -8,7 +8,7 @@ from guard_flying import UP, Flight, hostile
 from guard_play import LIMITS, MS, SECOND
 
 from cloudrc.messages import GuardState
-from cloudrc.world.guard import Guard
+from cloudrc.world.guard.state import Guard
 from cloudrc.world.simulator import Simulator
 
 

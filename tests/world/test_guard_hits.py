@@ -6,8 +6,8 @@ import pytest
 from guard_play import DT, HERE, MS, SECOND, TICK, armed, command, holding, landing, run, tracking
 
 from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState
-from cloudrc.world.guard_hits import JOLT, PULL, SPIN_MAX, TUMBLE_MAX, UPSET, Hits
-from cloudrc.world.guard_rules import GLIMPSE_NS
+from cloudrc.world.guard.limits import GLIMPSE_NS
+from cloudrc.world.guard.state import JOLT, PULL, SPIN_MAX, TUMBLE_MAX, UPSET, Hits
 from cloudrc.world.readings import Readings
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState

@@ -19,8 +19,8 @@ from guard_play import (
 )
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard import Guard
-from cloudrc.world.guard_rest import LAND_SPEED, STILL
+from cloudrc.world.guard.hold import LAND_SPEED, STILL
+from cloudrc.world.guard.state import Guard
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 

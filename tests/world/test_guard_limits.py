@@ -10,8 +10,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import GuardState
-from cloudrc.world.guard_limits import Limits
-from cloudrc.world.guard_rules import MARGIN
+from cloudrc.world.guard.limits import MARGIN, Limits
 
 NUMBERS = [field.name for field in fields(Limits) if not field.name.startswith("fence")]
 

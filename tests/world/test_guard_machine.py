@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from cloudrc.messages import GuardState
-from cloudrc.world.guard import Guard
-from cloudrc.world.guard_hits import JOLT
-from cloudrc.world.guard_limits import Limits
-from cloudrc.world.guard_rules import GLIMPSE_NS
+from cloudrc.world.guard.limits import GLIMPSE_NS, Limits
+from cloudrc.world.guard.state import JOLT, Guard
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 AGE_MAX_NS = LIMITS.command_age_max_ns

@@ -8,10 +8,10 @@ from guard_play import LIMITS
 from symbolic import everywhere, root
 
 from cloudrc.messages import Command
-from cloudrc.world import guard_rest
-from cloudrc.world import guard_rules as rules
-from cloudrc.world.guard import Guard
-from cloudrc.world.guard_limits import AGE_MAX_NS, RANGE
+from cloudrc.world.guard import hold
+from cloudrc.world.guard import limits as rules
+from cloudrc.world.guard.limits import AGE_MAX_NS, RANGE
+from cloudrc.world.guard.state import Guard
 
 LATEST = AGE_MAX_NS * 1e-9 + rules.REACTION
 """After which the robot brakes [s], at the largest age of a command that may be flown."""
@@ -103,8 +103,8 @@ def test_what_grows_is_no_more_than_what_there_is():
 
 def test_the_rate_of_braking_is_inside_its_range_whatever_comes_in():
     def check(run):
-        rate = lift(run, guard_rest.brake_rate(run.fresh("speed"))).term
-        run.prove(z3.And(rate >= guard_rest.GENTLEST, rate <= guard_rest.HARDEST))
+        rate = lift(run, hold.brake_rate(run.fresh("speed"))).term
+        run.prove(z3.And(rate >= hold.GENTLEST, rate <= hold.HARDEST))
 
     everywhere(check)
 

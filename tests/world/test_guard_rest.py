@@ -6,7 +6,7 @@ import pytest
 from guard_play import DT, HERE, sensed
 
 from cloudrc.messages import ZERO
-from cloudrc.world.guard_rest import (
+from cloudrc.world.guard.hold import (
     DAMPING,
     EASE,
     GENTLEST,
@@ -20,7 +20,7 @@ from cloudrc.world.guard_rest import (
     Rest,
     brake_start,
 )
-from cloudrc.world.guard_rules import BRAKE
+from cloudrc.world.guard.limits import BRAKE
 
 LOW, HIGH = (-2.8, -8.3, 0.0), (9.0, 5.3, 2.3)
 ENOUGH = 1.0

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import ZERO
-from cloudrc.world import guard_rules as rules
-from cloudrc.world.guard_rest import brake_rate, brake_start
+from cloudrc.world.guard import limits as rules
+from cloudrc.world.guard.hold import brake_rate, brake_start
 
 BIG, TINY = 1.7976931348623157e308, 5e-324
 SPECIAL = (0.0, -0.0, 1.0, -1.0, 6.0, TINY, -TINY, 2.2e-308, 1e154, -1e200, BIG, -BIG)

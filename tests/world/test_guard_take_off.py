@@ -8,8 +8,8 @@ from guard_play import HERE, LIMITS, MS, SECOND, TICK, armed, command, feed, run
 
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Command, GuardState
-from cloudrc.world.guard import Guard
-from cloudrc.world.guard_rest import HOP, HOP_SPEED, STILL, STILL_TICKS, TakeOff
+from cloudrc.world.guard.hold import HOP, HOP_SPEED, STILL, STILL_TICKS, TakeOff
+from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.robot import Robot
 from cloudrc.world.simulator import Simulator

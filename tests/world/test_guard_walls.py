@@ -6,7 +6,7 @@ import pytest
 from guard_play import LIMITS
 from test_guard_rules import HIGH, LOW
 
-from cloudrc.world import guard_rules as rules
+from cloudrc.world.guard import limits as rules
 
 
 def by_the_wall(axis, sign, distance, height):

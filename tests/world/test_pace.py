@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from cloudrc.world.pace import QUIET_NS, Pace
+from cloudrc.world.endpoint import QUIET_NS, Pace
 
 SECOND_NS = 1_000_000_000
 

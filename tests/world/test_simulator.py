@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.world.low_level import LowLevel, allocate
 from cloudrc.world.readings import Readings
-from cloudrc.world.replay import replay
 from cloudrc.world.rotors import Rotors
-from cloudrc.world.simulator import Simulator
+from cloudrc.world.simulator import Simulator, replay
 
 HOVER = 10.394996  # 1.06 kg * 9.8066 m/s^2
 AT_REST = Readings.of((*ZERO, *UPRIGHT), (*ZERO, *ZERO))

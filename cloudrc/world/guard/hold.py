@@ -11,7 +11,7 @@ from math import hypot, nan
 from operator import le
 
 from cloudrc.messages import ZERO, Cause, Vector
-from cloudrc.world.guard_rules import BRAKE, shortened, towards, within
+from cloudrc.world.guard.limits import BRAKE, shortened, towards, within
 from cloudrc.world.readings import Readings
 
 HARDEST, GENTLEST = 5.5, 1.0
