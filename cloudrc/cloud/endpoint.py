@@ -4,25 +4,85 @@ It asks for a session with hellos, and takes the epoch that world hands out; whi
 to command it says that it is alive, for its authority lasts as long as it is heard. Teleoperation
 is joined to it by messages only: what is seen goes there, setpoints and operator requests come
 back.
+
+Who cloud's end is, and which keys it has.
+
+Cloud's periods that pass without a command: counts in, a fault out where they are many.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import dataclass
 from math import nan
 
-from cloudrc.cloud.identity import CloudIdentity as CloudIdentity
-from cloudrc.cloud.lateness import Lateness
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Alarm, is_meant_for, seen_in
 from cloudrc.cloud.operator import Operator as Operator
 from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
-from cloudrc.records import Arrival, Counted, MissionEvent, Record, SessionOpened
+from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
 from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE, Complaints, Knocker
-from cloudrc.tunnel.session import NO_EPOCH, make_session
+from cloudrc.tunnel.keys import KeyRing
+from cloudrc.tunnel.session import AES_256_GCM, NO_EPOCH, make_session
+
+
+@dataclass(frozen=True, slots=True)
+class CloudIdentity:
+    """What cloud's end is given at its start.
+
+    Attributes:
+        clock_id: 16 bytes that name this machine's monotonic clock.
+        nonce: 16 bytes that name this process; never the same twice.
+        ring: The pre-shared keys; None for an end that never leaves its process.
+        suite: Cipher that this machine is fast at.
+    """
+
+    clock_id: bytes
+    nonce: bytes
+    ring: KeyRing | None = None
+    suite: int = AES_256_GCM
+
+
+MISSED_MAX = 50
+"""So many at a time are a fault worth telling; a few happen on any machine [periods]."""
+FORGIVEN_NS = 200_000_000
+"""After so long one is forgiven: 5 % of all periods may be missed for ever [ns]."""
+
+
+class Lateness:
+    """Tells when cloud falls behind, and again once all that it has missed is forgiven."""
+
+    def __init__(self) -> None:
+        self._missed, self._told = 0, False
+        self._forgiven_ns = NEVER_NS  # when all will be
+
+    def miss(self, count: int, now_ns: int) -> list[Fault]:
+        """Count missed periods.
+
+        Args:
+            count: How many, of 10 ms.
+            now_ns: Cloud's monotonic clock [ns].
+
+        Returns:
+            What there is to tell: a fault or nothing.
+        """
+        full_ns = now_ns + MISSED_MAX * FORGIVEN_NS
+        if self._forgiven_ns <= now_ns:
+            self._missed, self._told, self._forgiven_ns = 0, False, now_ns
+        self._missed += count
+        self._forgiven_ns = min(self._forgiven_ns + count * FORGIVEN_NS, full_ns)
+        if self._told or self._forgiven_ns < full_ns:
+            return []
+        self._told = True
+        text = (
+            f"cloud has let {self._missed} periods of 10 ms pass without a command: "
+            "a plug-in is slow or the machine is busy"
+        )
+        return [Fault(now_ns, "late", text)]
+
 
 PERIOD_NS = 10_000_000
 """Time between two commands [ns]. Source: docs/reference/plant.md, "Commands"."""

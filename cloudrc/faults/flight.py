@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Unpack
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudEndpoint
-from cloudrc.cloud.identity import CloudIdentity
+from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
 from cloudrc.cloud.teleop.service_mission import Mission, Order
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.drivers.virtual import VirtualRun

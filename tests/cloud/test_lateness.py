@@ -1,6 +1,6 @@
 """Cloud's missed periods: when they are told, and when again."""
 
-from cloudrc.cloud.lateness import Lateness
+from cloudrc.cloud.endpoint import Lateness
 
 MS, S = 1_000_000, 1_000_000_000
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from cloudrc.cloud.endpoint import CloudEndpoint
-from cloudrc.cloud.identity import CloudIdentity
+from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
 from cloudrc.messages import (
     NEVER_NS,
     UPRIGHT,

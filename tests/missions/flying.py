@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudEndpoint
-from cloudrc.cloud.identity import CloudIdentity
+from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.record.columns import Recording

@@ -6,7 +6,7 @@ import pytest
 from flying import CLOCK, Ends, join
 
 from cloudrc import assembly
-from cloudrc.cloud.identity import CloudIdentity
+from cloudrc.cloud.endpoint import CloudIdentity
 from cloudrc.cloud.teleop.wire import ALARM
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request

@@ -6,7 +6,7 @@ import pytest
 from flying import CLOCK
 
 from cloudrc import assembly
-from cloudrc.cloud.identity import CloudIdentity
+from cloudrc.cloud.endpoint import CloudIdentity
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.records import Arrival, CommandApplied, SessionOpened

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from talking import MS, Talk, talking
 
 from cloudrc import assembly
-from cloudrc.cloud.identity import CloudIdentity
+from cloudrc.cloud.endpoint import CloudIdentity
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState
 from cloudrc.records import (

@@ -6,7 +6,7 @@ import pytest
 from flying import CLOCK, Ends, join
 
 from cloudrc import assembly
-from cloudrc.cloud.identity import CloudIdentity
+from cloudrc.cloud.endpoint import CloudIdentity
 from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.teleop.messages import Output, Seen
 from cloudrc.cloud.teleop.wire import ALARM

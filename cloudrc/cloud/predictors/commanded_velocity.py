@@ -6,8 +6,7 @@ last, not with the measured one of the paper, eq. (3).
 
 from __future__ import annotations
 
-from cloudrc.cloud.predictors import Predictor
-from cloudrc.cloud.predictors._rotation import rotate_ahead
+from cloudrc.cloud.predictors import Predictor, rotate_ahead
 from cloudrc.messages import ZERO, Command, Odometry
 
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections import deque
 
 from cloudrc.cloud.parameters import positive
-from cloudrc.cloud.predictors import Predictor
-from cloudrc.cloud.predictors._rotation import rotate_ahead
+from cloudrc.cloud.predictors import Predictor, rotate_ahead
 from cloudrc.messages import ZERO, Odometry, Vector
 
 

@@ -5,8 +5,7 @@ Source: the paper, eqs. (2) and (3).
 
 from __future__ import annotations
 
-from cloudrc.cloud.predictors import Predictor
-from cloudrc.cloud.predictors._rotation import rotate_ahead
+from cloudrc.cloud.predictors import Predictor, rotate_ahead
 from cloudrc.messages import Odometry
 
 
