@@ -14,9 +14,6 @@ import numpy as np
 
 from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity, Operator
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.cloud.teleop.messages import StartMission
-from cloudrc.cloud.teleop.mission import Teleop
-from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.parameters import build
@@ -25,6 +22,8 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
 from cloudrc.link.trace import SIZE_MAX, read_table, read_trace
 from cloudrc.messages import Start
+from cloudrc.teleop.mission import Teleop
+from cloudrc.teleop.wire import Leg, Plan, StartMission
 
 if TYPE_CHECKING:
     from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity

@@ -55,9 +55,9 @@ def _join(folder: Path) -> Operator:
     """Join the process of teleop, which may come and go."""
     import time
 
-    from cloudrc.cloud.teleop import wire
     from cloudrc.drivers.teleop import RemoteTeleop
     from cloudrc.drivers.unix import UnixPeer
+    from cloudrc.teleop import wire
 
     peer = UnixPeer(folder / "cloud.sock", folder / "teleop.sock")
     return RemoteTeleop(peer, wire.encode, wire.decode, time.monotonic_ns())

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.cloud.teleop.api_models import MissionRequest
     from cloudrc.cluster.client import Release
     from cloudrc.config.problems import Problem
     from cloudrc.config.schema import Experiment
+    from cloudrc.teleop.models import MissionRequest
 
 UNKNOWN_LIMIT = 600.0
 """Of a mission that does not say its own, on a release whose experiment may not be read [s]."""
@@ -35,8 +35,8 @@ def parse(name: str, mission: Mapping[str, Any]) -> MissionRequest:
     """
     from pydantic import ValidationError
 
-    from cloudrc.cloud.teleop.api_models import MissionRequest
     from cloudrc.config.problems import Problem, from_pydantic
+    from cloudrc.teleop.models import MissionRequest
 
     try:
         request = MissionRequest.model_validate_json(json.dumps(mission))

@@ -15,12 +15,12 @@ from cloudrc.cli.teleop_api import ServedApi, api_address, complain, serve_api
 from cloudrc.cli.teleop_reserve import shorten
 
 if TYPE_CHECKING:
-    from cloudrc.cloud.teleop.api_bridge import Bridge
-    from cloudrc.cloud.teleop.journal import Journal
-    from cloudrc.cloud.teleop.service import MissionService
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.drivers.teleop import Calls
+    from cloudrc.teleop.bridge import Bridge
+    from cloudrc.teleop.journal import Journal
+    from cloudrc.teleop.service import MissionService
 
 EPILOG = """\
 It talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
@@ -128,11 +128,11 @@ def _fly(
     trouble: str,
 ) -> None:
     """Run the service until `stop()`."""
-    from cloudrc.cloud.teleop import wire
     from cloudrc.drivers.feed import Feed
     from cloudrc.drivers.teleop import serve_teleop
     from cloudrc.drivers.unix import UnixPeer
     from cloudrc.records import Fault
+    from cloudrc.teleop import wire
 
     feed = Feed.on_stdout(watched=options.feed)
     peer = UnixPeer(options.socket / "teleop.sock", options.socket / "cloud.sock")
@@ -166,7 +166,7 @@ def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge | None) -
     """Wait for the journal as long as another teleop holds it; None if told to stop."""
     import time
 
-    from cloudrc.cloud.teleop.journal import Journal, JournalLockedError
+    from cloudrc.teleop.journal import Journal, JournalLockedError
 
     said = False
     while not stop():
@@ -190,8 +190,8 @@ def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> Mi
     """Remember what the journal has; what is too old to be known is taken out of it."""
     import os
 
-    from cloudrc.cloud.teleop.service import MissionService
     from cloudrc.errors import BadInputError
+    from cloudrc.teleop.service import MissionService
 
     limit, salt = experiment.criteria.contact_speed_max_mps, os.urandom(SALT_SIZE)
     if journal is None:
@@ -217,8 +217,7 @@ def _start(
     import time
 
     from cloudrc import assembly
-    from cloudrc.cloud.teleop.service_book import ConflictError
-    from cloudrc.cloud.teleop.service_mission import Order
+    from cloudrc.teleop.store import ConflictError, Order
 
     if not (options.start or options.mission):
         return False

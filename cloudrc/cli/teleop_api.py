@@ -13,12 +13,12 @@ from cloudrc.cli.output import say
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from cloudrc.cloud.teleop.api_audit import Audit
-    from cloudrc.cloud.teleop.api_bridge import Bridge
-    from cloudrc.cloud.teleop.api_server import ApiServer
-    from cloudrc.cloud.teleop.service import MissionService
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.records import Counted
+    from cloudrc.teleop.auth import Audit
+    from cloudrc.teleop.bridge import Bridge
+    from cloudrc.teleop.server import ApiServer
+    from cloudrc.teleop.service import MissionService
 
 LOOPBACK = "127.0.0.1"
 COUNT_PERIOD_NS = 1_000_000_000
@@ -74,14 +74,12 @@ def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> Se
     from functools import partial
 
     from cloudrc import assembly
-    from cloudrc.cloud.teleop.api import Surroundings, create_app
-    from cloudrc.cloud.teleop.api_audit import Audit
-    from cloudrc.cloud.teleop.api_bridge import Bridge
-    from cloudrc.cloud.teleop.api_gate import Gate
-    from cloudrc.cloud.teleop.api_server import ApiServer
-    from cloudrc.cloud.teleop.api_tokens import Tokens
     from cloudrc.geometry.scene import load_scene
     from cloudrc.link.route import publish
+    from cloudrc.teleop.api import Surroundings, create_app
+    from cloudrc.teleop.auth import Audit, Tokens
+    from cloudrc.teleop.bridge import Bridge
+    from cloudrc.teleop.server import ApiServer, Gate
 
     if not isinstance(options.api, Path):
         warn_if_exposed(options.api)

@@ -18,9 +18,7 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.teleop_api import complain
 
 if TYPE_CHECKING:
-    from cloudrc.cloud.teleop.journal import Journal
-    from cloudrc.cloud.teleop.journal_disk import Disk
-    from cloudrc.cloud.teleop.journal_format import Entry
+    from cloudrc.teleop.journal import Disk, Entry, Journal
 
 RESERVE_SIZE = 2 << 20
 """Of the file [bytes].
@@ -94,7 +92,7 @@ class Reserve:
             journal: Path of the journal.
             disk: Where it is; None for the machine's own.
         """
-        from cloudrc.cloud.teleop.journal_disk import Disk
+        from cloudrc.teleop.journal import Disk
 
         self.path, self._disk = journal.with_name(f"{journal.name}.reserve"), disk or Disk()
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from cloudrc.cloud.teleop.messages import Outcome, Output, Seen
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Telemetry
 from cloudrc.records import Fault
+from cloudrc.teleop.wire import Outcome, Output, Seen
 from cloudrc.tunnel.session import NO_EPOCH
 
 REPEAT_NS = 100_000_000

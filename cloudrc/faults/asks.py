@@ -7,7 +7,6 @@ from itertools import pairwise
 from math import dist, hypot, inf, nan
 from typing import Any
 
-from cloudrc.cloud.teleop.sight import NO_CLOUD, NOT_HEARD
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.meters import reading
 from cloudrc.faults.scenario import Outcome
@@ -16,6 +15,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.records import CommandApplied, Fault, GuardChange, Record, SessionOpened, TelemetrySent
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
+from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD
 
 OTHERS = ("rest", "latch", "hold", "order", "error")
 """Kinds of breach that no scenario asks for on its own."""

@@ -12,16 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cloud.operator import Operator
-from cloudrc.cloud.teleop.api_bridge import Call
-from cloudrc.cloud.teleop.journal import Journal
-from cloudrc.cloud.teleop.journal_format import Entry
-from cloudrc.cloud.teleop.messages import Outcome, Output, Seen
-from cloudrc.cloud.teleop.plan import Plan
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
-from cloudrc.cloud.teleop.service_mission import Mission, Order
 from cloudrc.faults.mortal import Mortal
 from cloudrc.records import Fault, MissionEvent
+from cloudrc.teleop.bridge import Call
+from cloudrc.teleop.journal import Entry, Journal
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import ConflictError, Mission, Order, UnavailableError
+from cloudrc.teleop.wire import Outcome, Output, Plan, Seen
 
 Keep = Callable[[Entry], None]
 

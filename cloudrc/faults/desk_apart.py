@@ -18,10 +18,6 @@ from functools import partial
 from pathlib import Path
 
 from cloudrc.cloud.operator import Operator
-from cloudrc.cloud.teleop import wire
-from cloudrc.cloud.teleop.api_bridge import WAITING_MAX, Call
-from cloudrc.cloud.teleop.journal_format import Entry
-from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, send, turn
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.faults.desk import Desk
@@ -29,6 +25,10 @@ from cloudrc.faults.mortal import Mortal
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Event
 from cloudrc.messages import NEVER_NS
+from cloudrc.teleop import wire
+from cloudrc.teleop.bridge import WAITING_MAX, Call
+from cloudrc.teleop.journal import Entry
+from cloudrc.teleop.service import MissionService
 
 SOCKET_MAX = 11
 """Datagrams that wait: one more than net.unix.max_dgram_qlen, which is 10 in a new namespace."""

@@ -8,17 +8,16 @@ from math import nan
 from pathlib import Path
 
 from cloudrc import assembly
-from cloudrc.cloud.teleop.api_bridge import Bridge
-from cloudrc.cloud.teleop.api_gate import Receive, Scope, Send
-from cloudrc.cloud.teleop.journal_format import Entry, parse
-from cloudrc.cloud.teleop.service_book import LOGGED, UnavailableError
-from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.drivers.teleop import LastWord
 from cloudrc.faults import asks, gate, meters
 from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.messages import GuardState
+from cloudrc.teleop.bridge import Bridge
+from cloudrc.teleop.journal import Entry, parse
+from cloudrc.teleop.server import Receive, Scope, Send
+from cloudrc.teleop.store import LOGGED, Order, UnavailableError
 
 PER_PERIOD = 10
 """Requests in every 10 ms: 1,000 in a second."""

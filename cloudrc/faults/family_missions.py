@@ -10,9 +10,6 @@ from typing import Any
 import numpy as np
 
 from cloudrc import assembly
-from cloudrc.cloud.teleop.api_check import read_mission
-from cloudrc.cloud.teleop.service_book import ConflictError
-from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Mission as MissionSchema
@@ -26,6 +23,8 @@ from cloudrc.geometry.placement import overlapped_pipe
 from cloudrc.geometry.scene import Scene, load_scene
 from cloudrc.messages import Command, GuardState, Vector
 from cloudrc.records import Control
+from cloudrc.teleop.models import read_mission
+from cloudrc.teleop.store import ConflictError, Order
 
 NEARER = 0.05
 """What the search for the nearest legal point, along some lines, may overlook [m]."""

@@ -12,7 +12,6 @@ from typing import Any, Unpack
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
-from cloudrc.cloud.teleop.service_mission import Mission, Order
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.endpoint import Endpoint
@@ -28,6 +27,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.messages import GuardState
 from cloudrc.record.hash import RecordHash
 from cloudrc.records import Contact, Counted, GroundTruth, GuardChange, MissionEvent, Record
+from cloudrc.teleop.store import Mission, Order
 from cloudrc.tunnel.keys import KeyRing, KeySet
 from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
 

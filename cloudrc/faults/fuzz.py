@@ -10,9 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from cloudrc.cloud.endpoint import CloudEndpoint
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_mission import QUEUED
-from cloudrc.cloud.teleop.sight import LATCHED
 from cloudrc.faults.adversary import temptation
 from cloudrc.faults.asks import held
 from cloudrc.faults.bug import BUGS, buggy
@@ -28,6 +25,8 @@ from cloudrc.faults.walls import steppable_wall_clock
 from cloudrc.faults.watch import Breach
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, Record
+from cloudrc.teleop.service import LATCHED, MissionService
+from cloudrc.teleop.store import QUEUED
 
 BACK = 10.0
 """In so long of calm the robot must have flown [s]."""

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from cloudrc.cloud.teleop.api_check import RefusedError
-from cloudrc.cloud.teleop.api_gate import App, Gate, Receive, Scope, Send
-from cloudrc.cloud.teleop.service_book import ConflictError
+from cloudrc.teleop.models import RefusedError
+from cloudrc.teleop.server import App, Gate, Receive, Scope, Send
+from cloudrc.teleop.store import ConflictError
 
 
 def counted(application: App, method: str, path: str, count: int = 1) -> Counter[str]:

@@ -5,17 +5,16 @@ from __future__ import annotations
 from functools import partial
 
 from cloudrc import assembly
-from cloudrc.cloud.teleop.api_bridge import Bridge, Call
-from cloudrc.cloud.teleop.journal_format import MAGIC, parse, to_bytes
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_book import UnavailableError
-from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.faults.desk_apart import Apart
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.inject_way import waylay
 from cloudrc.faults.options import SECRET
 from cloudrc.faults.schedule import STALLS, Event, Schedule
 from cloudrc.faults.walls import TAKE_OFF, Wall
+from cloudrc.teleop.bridge import Bridge, Call
+from cloudrc.teleop.journal import MAGIC, parse, to_bytes
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import Order, UnavailableError
 from cloudrc.tunnel.keys import Key, KeySet
 
 NEXT_KEY = KeySet(Key(b"the next key of a fuzzed flight!"), SECRET.current, 30.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
-from cloudrc.cloud.teleop.journal_disk import Disk
+from cloudrc.teleop.journal import Disk
 
 MIB = 1 << 20
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.cloud.teleop.sight import NO_CLOUD, NOT_HEARD
+from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD
 
 SEEN = {
     "position_m": [1.0, 2.0, 0.7],

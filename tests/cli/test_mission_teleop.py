@@ -12,10 +12,9 @@ import pytest
 
 from cloudrc.cli import extras, teleop
 from cloudrc.cli.main import main
-from cloudrc.cloud.teleop.journal import Journal
-from cloudrc.cloud.teleop.journal_format import to_bytes
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
+from cloudrc.teleop.journal import Journal, to_bytes
 
 WORDS = ["teleop", "--config", "hover", "--socket"]
 

@@ -15,12 +15,12 @@ from teleop_harness import PLAN
 from cloudrc.cli import mission_cluster, mission_follow, mission_http, mission_local
 from cloudrc.cli.main import main
 from cloudrc.cli.output import harmless
-from cloudrc.cloud.teleop.service_mission import SHOWN as EVENTS
-from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.cluster import jobs
 from cloudrc.cluster import jobs as follow
 from cloudrc.cluster.jobs import JobStatus
 from cloudrc.errors import BadInputError
+from cloudrc.teleop.store import SHOWN as EVENTS
+from cloudrc.teleop.store import Order
 
 NAME = "far\x1b[2J\nm9  forged\r\x9b31m\x7f\u202e"
 SHOWN = r"far\x1b[2J\nm9  forged\r\x9b31m\x7f\u202e"

@@ -15,12 +15,10 @@ from small_volume import MIB, KilledError, Volume
 from cloudrc.assembly import build_plan
 from cloudrc.cli import teleop, teleop_reserve
 from cloudrc.cli.main import main
-from cloudrc.cloud.teleop.journal import Journal
-from cloudrc.cloud.teleop.journal_format import Entry, parse, to_bytes
-from cloudrc.cloud.teleop.service_book import KEPT, QUEUE_MAX, MissionBook
-from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
+from cloudrc.teleop.journal import Entry, Journal, parse, to_bytes
+from cloudrc.teleop.store import KEPT, QUEUE_MAX, MissionBook, Order
 
 RESERVE = MIB // 8
 """In the place of the real one, so that a journal need not be long to take as much room."""

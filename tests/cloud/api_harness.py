@@ -14,13 +14,11 @@ from service_harness import ServiceFlight
 
 from cloudrc import assembly
 from cloudrc.cli.mission_http import Api
-from cloudrc.cloud.teleop.api import Surroundings, create_app
-from cloudrc.cloud.teleop.api_audit import Audit
-from cloudrc.cloud.teleop.api_bridge import STARTING, Bridge
-from cloudrc.cloud.teleop.api_gate import Gate, Limits
-from cloudrc.cloud.teleop.api_server import ApiServer
-from cloudrc.cloud.teleop.api_tokens import Tokens
 from cloudrc.geometry.scene import load_scene
+from cloudrc.teleop.api import Surroundings, create_app
+from cloudrc.teleop.auth import Audit, Tokens
+from cloudrc.teleop.bridge import STARTING, Bridge
+from cloudrc.teleop.server import ApiServer, Gate, Limits
 
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """Never by a proxy: `urlopen` keeps the one that was named when a process first called it."""

@@ -6,7 +6,7 @@ Names and bytes are kept twice: as the running machine sees them, and as they ar
 import errno
 from pathlib import Path
 
-from cloudrc.cloud.teleop.journal_format import MAGIC, to_record
+from cloudrc.teleop.journal import MAGIC, to_record
 
 
 class KilledError(BaseException):

@@ -4,11 +4,10 @@ import json
 
 from teleop_harness import A, B, C, Flight
 
-from cloudrc.cloud.teleop.messages import Seen
-from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.records import Fault
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import Order
+from cloudrc.teleop.wire import Leg, Plan, Seen
 
 PLAN = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)))
 

@@ -1,10 +1,9 @@
 """A robot and a lossy link for teleop to talk to: no world, no tunnel, no clock."""
 
-from cloudrc.cloud.teleop.messages import Seen, StartMission
-from cloudrc.cloud.teleop.mission import Teleop
-from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import MissionEvent
+from cloudrc.teleop.mission import Teleop
+from cloudrc.teleop.wire import Leg, Plan, Seen, StartMission
 
 PERIOD_NS = 10_000_000
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)

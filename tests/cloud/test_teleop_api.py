@@ -12,10 +12,10 @@ from api_harness import DIRECT, running
 from service_harness import A, B, C
 
 from cloudrc.cli.teleop_api import ServedApi
-from cloudrc.cloud.teleop import api_models as models
-from cloudrc.cloud.teleop.api_server import ApiServer
 from cloudrc.errors import BadInputError
 from cloudrc.exposition.live import Live
+from cloudrc.teleop import models
+from cloudrc.teleop.server import ApiServer
 
 LEG = {"dwell_s": 0.0, "tolerance_m": 0.3}
 MISSION = {"name": "round", "waypoints": [{"position_m": p, **LEG} for p in (A, B, C)]}

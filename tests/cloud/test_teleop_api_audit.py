@@ -9,7 +9,7 @@ import time
 
 from api_harness import OPERATOR, READER, running
 
-from cloudrc.cloud.teleop import api_gate
+from cloudrc.teleop import server
 
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 
@@ -39,7 +39,7 @@ def test_commands_are_audited_with_who_and_what_became_of_them():
 
 
 def test_what_a_reader_is_refused_displaces_no_command(monkeypatch):
-    monkeypatch.setattr(api_gate, "REFUSALS_NOTED", (0.0, 2))
+    monkeypatch.setattr(server, "REFUSALS_NOTED", (0.0, 2))
     with running() as api:
         api.post("/v1/estop")
         for _ in range(5):
@@ -57,7 +57,7 @@ def test_what_a_reader_is_refused_displaces_no_command(monkeypatch):
 
 
 def test_the_audit_log_is_cut_by_size_and_a_disk_that_refuses_is_told_once(tmp_path):
-    from cloudrc.cloud.teleop.api_audit import Audit
+    from cloudrc.teleop.auth import Audit
 
     path = tmp_path / "audit.jsonl"
     audit = Audit(path, size_max=100)
@@ -78,7 +78,7 @@ def test_the_audit_log_is_cut_by_size_and_a_disk_that_refuses_is_told_once(tmp_p
 
 
 def test_an_audit_log_that_cannot_be_renamed_has_no_more_room(tmp_path):
-    from cloudrc.cloud.teleop.api_audit import Audit
+    from cloudrc.teleop.auth import Audit
 
     path, said = tmp_path / "audit.jsonl", []
     path.with_name("audit.jsonl.1").mkdir()
@@ -95,11 +95,11 @@ def test_an_audit_log_that_cannot_be_renamed_has_no_more_room(tmp_path):
 
 
 def test_what_a_slow_disk_makes_too_many_is_dropped_and_counted(tmp_path, monkeypatch):
-    from cloudrc.cloud.teleop import api_audit
+    from cloudrc.teleop import auth
 
-    monkeypatch.setattr(api_audit, "WAITING_MAX", 2)
-    monkeypatch.setattr(api_audit.Audit, "_write_all", lambda self: None)
-    audit = api_audit.Audit(tmp_path / "audit")
+    monkeypatch.setattr(auth, "WAITING_MAX", 2)
+    monkeypatch.setattr(auth.Audit, "_write_all", lambda self: None)
+    audit = auth.Audit(tmp_path / "audit")
     for _ in range(5):
         audit.note(x=1)
     assert audit.dropped == 3
@@ -108,7 +108,7 @@ def test_what_a_slow_disk_makes_too_many_is_dropped_and_counted(tmp_path, monkey
 def test_a_disk_that_hangs_keeps_nothing_alive_and_what_is_given_up_is_counted(
     tmp_path, monkeypatch
 ):
-    from cloudrc.cloud.teleop import api_audit
+    from cloudrc.teleop import auth
 
     begun, released = threading.Event(), threading.Event()
 
@@ -116,10 +116,10 @@ def test_a_disk_that_hangs_keeps_nothing_alive_and_what_is_given_up_is_counted(
         begun.set()
         released.wait()
 
-    monkeypatch.setattr(api_audit, "WAITING_MAX", 2)
-    monkeypatch.setattr(api_audit, "STOP_LIMIT", 0.05)
-    monkeypatch.setattr(api_audit.Audit, "_write", hang)
-    audit = api_audit.Audit(tmp_path / "audit")
+    monkeypatch.setattr(auth, "WAITING_MAX", 2)
+    monkeypatch.setattr(auth, "STOP_LIMIT", 0.05)
+    monkeypatch.setattr(auth.Audit, "_write", hang)
+    audit = auth.Audit(tmp_path / "audit")
     audit.note(x=1)
     assert begun.wait(5.0)
     for _ in range(3):
@@ -134,7 +134,7 @@ def test_a_disk_that_hangs_keeps_nothing_alive_and_what_is_given_up_is_counted(
 
 
 def test_what_a_full_disk_tears_swallows_no_other_line(tmp_path, monkeypatch):
-    from cloudrc.cloud.teleop import api_audit
+    from cloudrc.teleop import auth
 
     real, left = io.FileIO.write, [50]
 
@@ -152,9 +152,9 @@ def test_what_a_full_disk_tears_swallows_no_other_line(tmp_path, monkeypatch):
         raw = Full(path, mode, opener=opener)
         return raw if buffering == 0 else io.BufferedWriter(raw)
 
-    monkeypatch.setattr(api_audit, "open", open_full, raising=False)
+    monkeypatch.setattr(auth, "open", open_full, raising=False)
     path = tmp_path / "audit"
-    audit = api_audit.Audit(path)
+    audit = auth.Audit(path)
     audit.close()
     audit._path = path
     for number, room in (1, 10_000), (2, 10), (3, 10_000):

@@ -11,12 +11,12 @@ import pytest
 from api_harness import LIMIT, OPERATOR, READER, connect, head, running
 from service_harness import PLAN
 
-from cloudrc.cloud.teleop import api, api_events
-from cloudrc.cloud.teleop.api_bridge import LANE, WAITING_MAX, Bridge
-from cloudrc.cloud.teleop.api_gate import Limits
-from cloudrc.cloud.teleop.service_book import UnavailableError
-from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.messages import GuardState
+from cloudrc.teleop import api
+from cloudrc.teleop import api as api_events
+from cloudrc.teleop.bridge import LANE, WAITING_MAX, Bridge
+from cloudrc.teleop.server import Limits
+from cloudrc.teleop.store import Order, UnavailableError
 
 STRANGER = "no-token-that-is-known"
 TIGHT = Limits(rate_hz=0.001, burst=5, in_flight=2, streams=1)

@@ -9,9 +9,11 @@ import pytest
 from api_harness import OPERATOR, READER, connect, head, running
 from service_harness import ServiceFlight
 
-from cloudrc.cloud.teleop import api, api_connections, api_errors, api_events
-from cloudrc.cloud.teleop.api_bridge import WAITING_MAX, Bridge
-from cloudrc.cloud.teleop.api_gate import Bucket, Limits
+from cloudrc.teleop import api, server
+from cloudrc.teleop import api as api_errors
+from cloudrc.teleop import api as api_events
+from cloudrc.teleop.bridge import WAITING_MAX, Bridge
+from cloudrc.teleop.server import Bucket, Limits
 
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 TIGHT = Limits(rate_hz=0.001, burst=5, in_flight=2, streams=1)
@@ -93,13 +95,13 @@ def test_so_many_streams_and_no_more(monkeypatch):
 
 
 def test_the_limits_are_those_that_are_promised():
-    limits = (api_connections.HEAD_LIMIT, api_errors.BODY_LIMIT, api_connections.SEND_LIMIT)
+    limits = (server.HEAD_LIMIT, api_errors.BODY_LIMIT, server.SEND_LIMIT)
     assert limits == (5.0, 5.0, 10.0)
 
 
 @pytest.mark.parametrize("said", [b"", b"GET / HT", head("GET", "/v1/state")[:-2]])
 def test_a_client_that_dawdles_over_its_head_is_cut_off(monkeypatch, said):
-    monkeypatch.setattr(api_connections, "HEAD_LIMIT", 0.1)
+    monkeypatch.setattr(server, "HEAD_LIMIT", 0.1)
     with running() as one:
         connection = connect(one)
         connection.sendall(said)
@@ -109,7 +111,7 @@ def test_a_client_that_dawdles_over_its_head_is_cut_off(monkeypatch, said):
 
 def test_so_is_one_that_dawdles_over_its_second(monkeypatch):
     """Each byte comes in time for a limit between two bytes: the whole head has one."""
-    monkeypatch.setattr(api_connections, "HEAD_LIMIT", 0.3)
+    monkeypatch.setattr(server, "HEAD_LIMIT", 0.3)
     with running() as one:
         connection = connect(one)
         connection.sendall(head("GET", "/v1/state"))
@@ -186,7 +188,7 @@ def test_deep_long_and_large_missions_are_refused(body):
 
 
 def test_in_a_crowd_those_that_have_waited_longest_go(monkeypatch):
-    monkeypatch.setattr(api_connections, "CONNECTIONS_MAX", 20)
+    monkeypatch.setattr(server, "CONNECTIONS_MAX", 20)
     with running() as one:
         crowd = [connect(one) for _ in range(60)]
         one.until(lambda: one.server.counts["busy"] >= 40)
@@ -200,7 +202,7 @@ def test_in_a_crowd_those_that_have_waited_longest_go(monkeypatch):
 
 
 def test_a_client_that_takes_nothing_is_cut_off(monkeypatch):
-    monkeypatch.setattr(api_connections, "SEND_LIMIT", 0.2)
+    monkeypatch.setattr(server, "SEND_LIMIT", 0.2)
     with running() as one:
         name = "x" * 200
         for number in range(60):
@@ -227,10 +229,10 @@ def flood(connection):
 
 
 def test_a_bucket_fills_again(monkeypatch):
-    from cloudrc.cloud.teleop import api_gate
+    from cloudrc.teleop import server
 
     now = [0.0]
-    monkeypatch.setattr(api_gate.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(server.time, "monotonic", lambda: now[0])
     bucket = Bucket(10.0, 3)
     assert [bucket.take() for _ in range(4)] == [True, True, True, False]
     now[0] = 0.1

@@ -6,7 +6,7 @@ import time
 import pytest
 from api_harness import connect, head, running
 
-from cloudrc.cloud.teleop import api_connections, api_server
+from cloudrc.teleop import server
 
 CHUNK = b"1\r\nx\r\n"
 
@@ -25,13 +25,13 @@ def until_closed(connection):
 
 
 def test_little_is_taken_from_a_connection_before_it_is_another_s_turn(monkeypatch):
-    taken, take = [], api_connections.PatientProtocol.data_received
+    taken, take = [], server.PatientProtocol.data_received
 
     def seen(protocol, data):
         taken.append(len(data))
         take(protocol, data)
 
-    monkeypatch.setattr(api_connections.PatientProtocol, "data_received", seen)
+    monkeypatch.setattr(server.PatientProtocol, "data_received", seen)
     with running() as one:
         chunks = CHUNK * 20_000
         lines = f"Content-Length: {len(chunks)}"
@@ -40,7 +40,7 @@ def test_little_is_taken_from_a_connection_before_it_is_another_s_turn(monkeypat
         assert b" 422 " in connection.recv(4096)
         connection.close()
     assert sum(taken) > len(chunks)
-    assert max(taken) == api_connections.READ_MAX <= 1024
+    assert max(taken) == server.READ_MAX <= 1024
 
 
 def test_chunks_that_are_still_to_come_after_the_answer_are_not_taken_apart():
@@ -63,14 +63,14 @@ def test_a_body_in_chunks_that_has_come_leaves_its_connection_open():
 
 
 def test_a_head_has_no_more_room_than_is_said_if_it_comes_at_once_either():
-    assert api_server.HEAD_MAX <= 4096, "lines of four bytes each: 64 such heads take a while"
+    assert server.HEAD_MAX <= 4096, "lines of four bytes each: 64 such heads take a while"
     with running() as one:
         with connect(one) as connection:
-            rest = api_server.HEAD_MAX - len(head("GET", "/v1/state", "X: "))
+            rest = server.HEAD_MAX - len(head("GET", "/v1/state", "X: "))
             connection.sendall(head("GET", "/v1/state", "X: " + "y" * rest))
             assert b" 200 " in connection.recv(65_536)
         connection = connect(one)
-        connection.sendall(head("GET", "/v1/state", "X: " + "y" * api_server.HEAD_MAX * 2))
+        connection.sendall(head("GET", "/v1/state", "X: " + "y" * server.HEAD_MAX * 2))
         assert until_closed(connection).startswith(b"HTTP/1.1 400 ")
 
 
@@ -82,7 +82,7 @@ def test_a_stop_that_is_there_is_served_though_very_many_come_behind_it_at_once(
         loop.call_soon_threadsafe(time.sleep, 1.0)
         stop = connect(one)
         stop.sendall(head("POST", "/v1/estop", "Content-Length: 0"))
-        crowd = [connect(one) for _ in range(api_connections.CONNECTIONS_MAX + 50)]
+        crowd = [connect(one) for _ in range(server.CONNECTIONS_MAX + 50)]
         assert not one.alarms  # all of them wait in the kernel
         assert b" 200 " in stop.recv(4096)
         assert one.alarms

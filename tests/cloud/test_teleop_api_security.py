@@ -15,11 +15,11 @@ from service_harness import PLAN
 
 from cloudrc.cli.mission_http import Api, UnreachableError
 from cloudrc.cli.teleop_api import ServedApi, api_address, serve_api
-from cloudrc.cloud.teleop.api_server import ApiServer
-from cloudrc.cloud.teleop.api_tokens import LOCAL
-from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
+from cloudrc.teleop.auth import LOCAL
+from cloudrc.teleop.server import ApiServer
+from cloudrc.teleop.store import Order
 
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 WRONG = [

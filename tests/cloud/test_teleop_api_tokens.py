@@ -9,10 +9,10 @@ import pytest
 from api_harness import OPERATOR, READER, connect, head, running
 from service_harness import PLAN
 
-from cloudrc.cloud.teleop import api_events, api_tokens
-from cloudrc.cloud.teleop.api_tokens import Tokens
-from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.errors import BadInputError
+from cloudrc.teleop import api, auth
+from cloudrc.teleop.auth import Tokens
+from cloudrc.teleop.store import Order
 
 
 def token_folder(folder, **tokens):
@@ -45,7 +45,7 @@ def spoilt(path, how):
     if how == "pipe":
         os.mkfifo(path)
     else:
-        path.write_text(OPERATOR + "\n" * api_tokens.SIZE_MAX)
+        path.write_text(OPERATOR + "\n" * auth.TOKEN_SIZE_MAX)
 
 
 @pytest.mark.parametrize(("how", "said"), [("pipe", "not a file"), ("long", "longer than 4096")])
@@ -59,7 +59,7 @@ def test_what_is_no_token_file_is_refused_and_not_waited_for(tmp_path, role, how
 
 @pytest.mark.parametrize("how", ["pipe", "long"])
 def test_what_becomes_no_token_file_in_flight_admits_nobody(tmp_path, monkeypatch, how):
-    monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
+    monkeypatch.setattr(auth, "LOOK_PERIOD", 0.0)
     folder = token_folder(tmp_path / "t", operator=OPERATOR)
     tokens, header = Tokens(folder), f"Bearer {OPERATOR}".encode()
     assert tokens.caller(header).role == "operator"
@@ -110,7 +110,7 @@ def is_call(node, name):
 
 
 def test_tokens_are_compared_in_constant_time(monkeypatch, tmp_path):
-    source = Path(api_tokens.__file__).read_text()
+    source = Path(auth.__file__).read_text()
     assert compared_early(source) == []
     for before, after in (
         ("found = caller\n", "found = caller\n                break\n"),
@@ -121,9 +121,7 @@ def test_tokens_are_compared_in_constant_time(monkeypatch, tmp_path):
         assert before in source
         assert compared_early(source.replace(before, after, 1))
     seen = []
-    monkeypatch.setattr(
-        api_tokens.hmac, "compare_digest", lambda a, b: seen.append((a, b)) or a == b
-    )
+    monkeypatch.setattr(auth.hmac, "compare_digest", lambda a, b: seen.append((a, b)) or a == b)
     tokens = Tokens(token_folder(tmp_path / "t", operator=OPERATOR, reader=READER))
     for token in (OPERATOR, READER, OPERATOR[:-1] + "x", "x" * 500):
         seen.clear()
@@ -132,8 +130,8 @@ def test_tokens_are_compared_in_constant_time(monkeypatch, tmp_path):
 
 
 def test_tokens_are_followed_when_they_change(tmp_path, monkeypatch):
-    assert api_tokens.LOOK_PERIOD <= 2.0
-    monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
+    assert auth.LOOK_PERIOD <= 2.0
+    monkeypatch.setattr(auth, "LOOK_PERIOD", 0.0)
     folder = token_folder(tmp_path / "t", operator=OPERATOR, reader=READER)
     tokens = Tokens(folder)
     old, new = f"Bearer {OPERATOR}".encode(), b"Bearer another-token-altogether"
@@ -150,7 +148,7 @@ def test_tokens_are_followed_when_they_change(tmp_path, monkeypatch):
 
 
 def test_a_token_that_changes_while_it_is_first_read_is_followed(tmp_path, monkeypatch):
-    monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
+    monkeypatch.setattr(auth, "LOOK_PERIOD", 0.0)
     folder = token_folder(tmp_path / "t", operator=OPERATOR)
     read = Tokens._read
 
@@ -167,8 +165,8 @@ def test_a_token_that_changes_while_it_is_first_read_is_followed(tmp_path, monke
 
 
 def test_a_token_that_is_taken_away_reads_no_open_stream(monkeypatch):
-    monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
-    monkeypatch.setattr(api_events, "LOOK_PERIOD", 0.01)
+    monkeypatch.setattr(auth, "LOOK_PERIOD", 0.0)
+    monkeypatch.setattr(api, "LOOK_PERIOD", 0.01)
     with running() as one:
         stream, said = connect(one), b""
         stream.sendall(head("GET", "/v1/events", token=READER))
@@ -189,7 +187,7 @@ def test_a_token_that_is_taken_away_while_a_body_arrives_commands_nothing(
     monkeypatch, revoked, status
 ):
     """It may take 5 s to arrive."""
-    monkeypatch.setattr(api_tokens, "LOOK_PERIOD", 0.0)
+    monkeypatch.setattr(auth, "LOOK_PERIOD", 0.0)
     body = json.dumps({"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}).encode()
     with running() as one:
         one.flight.teleop.create(Order(PLAN), 0)  # or it would be made

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import pytest
 from api_harness import DIRECT, OPERATOR, Running, running
 
-from cloudrc.cloud.teleop import api_models as models
 from cloudrc.errors import BadInputError
+from cloudrc.teleop import models
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_what_the_plan_refuses_is_the_senders_fault(
     def refuse(*args: object, **kwargs: object) -> None:
         raise BadInputError("time limit inf s: has to be finite and above 0")
 
-    monkeypatch.setattr("cloudrc.cloud.teleop.api.check_way", refuse)
+    monkeypatch.setattr("cloudrc.teleop.api.check_way", refuse)
     status, refusal = idle.post("/v1/goto", {"position_m": [0.5, 0.0, 0.7]})
     models.Refusal.model_validate(refusal)
     assert (status, refusal["detail"]) == (422, "time limit inf s: has to be finite and above 0")

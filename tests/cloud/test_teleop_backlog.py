@@ -5,13 +5,18 @@ from journal_disks import PATH, MemoryDisk, full
 from service_harness import PLAN, ServiceFlight, flying
 from teleop_harness import AWAY, A, B, C
 
-from cloudrc.cloud.teleop.journal import Journal
-from cloudrc.cloud.teleop.messages import Continue
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_backlog import AT_ONCE, PASSING_MAX, Backlog
-from cloudrc.cloud.teleop.service_book import MissionBook, UnavailableError
-from cloudrc.cloud.teleop.service_mission import first_verb
 from cloudrc.messages import GuardState, Request
+from cloudrc.teleop.journal import Journal
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import (
+    AT_ONCE,
+    PASSING_MAX,
+    Backlog,
+    MissionBook,
+    UnavailableError,
+    first_verb,
+)
+from cloudrc.teleop.wire import Continue
 
 
 def finish(flight):

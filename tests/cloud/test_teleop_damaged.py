@@ -6,9 +6,8 @@ import pytest
 from service_harness import flying
 from teleop_harness import B
 
-from cloudrc.cloud.teleop.messages import Continue, StartMission
-from cloudrc.cloud.teleop.service_book import MissionBook
-from cloudrc.cloud.teleop.service_mission import first_verb
+from cloudrc.teleop.store import MissionBook, first_verb
+from cloudrc.teleop.wire import Continue, StartMission
 
 
 @pytest.mark.parametrize("lost", [("started",), ("starting", "started")])

@@ -7,13 +7,13 @@ from service_harness import PLAN, ServiceFlight, flying
 from teleop_harness import AWAY, B, Flight
 from teleop_harness import flying as machine_flying
 
-from cloudrc.cloud.teleop import wire
-from cloudrc.cloud.teleop.api_bridge import Bridge
-from cloudrc.cloud.teleop.messages import Acknowledge, EmergencyStop, GoTo, Pause, StartMission
-from cloudrc.cloud.teleop.service_book import ConflictError
 from cloudrc.drivers.teleop import turn
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Request
+from cloudrc.teleop import wire
+from cloudrc.teleop.bridge import Bridge
+from cloudrc.teleop.store import ConflictError
+from cloudrc.teleop.wire import Acknowledge, EmergencyStop, GoTo, Pause, StartMission
 
 
 def asked(flight):

@@ -5,10 +5,10 @@ from service_harness import ServiceFlight, flying
 from teleop_harness import AWAY, B, C
 
 from cloudrc.cli.teleop import _Ending
-from cloudrc.cloud.teleop import wire
-from cloudrc.cloud.teleop.service_book import UnavailableError
 from cloudrc.drivers.teleop import serve_teleop
 from cloudrc.messages import GuardState, OperatorRequest, Request
+from cloudrc.teleop import wire
+from cloudrc.teleop.store import UnavailableError
 
 HALFWAY = (0.5, 0.0, 1.0)
 

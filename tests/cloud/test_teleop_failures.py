@@ -5,11 +5,10 @@ from itertools import pairwise
 import pytest
 from teleop_harness import AWAY, PLAN, A, B, Flight, flying
 
-from cloudrc.cloud.teleop.messages import Cancel, GoTo, Hold, Resume, Seen, StartMission
-from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.cloud.teleop.request import PREDECESSORS, Repeater
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Cause, GuardState, Request, Setpoint, Start
+from cloudrc.teleop.requests import PREDECESSORS, Repeater
+from cloudrc.teleop.wire import Cancel, GoTo, Hold, Leg, Plan, Resume, Seen, StartMission
 
 NAN, INF = float("nan"), float("inf")
 

@@ -8,11 +8,9 @@ from pathlib import Path
 import pytest
 from journal_disks import SOME, records, whole
 
-from cloudrc.cloud.teleop import journal_disk
-from cloudrc.cloud.teleop.journal import Journal, JournalLockedError
-from cloudrc.cloud.teleop.journal_disk import Disk
-from cloudrc.cloud.teleop.journal_format import HEAD, MAGIC
 from cloudrc.errors import BadInputError
+from cloudrc.teleop import journal as journal_disk
+from cloudrc.teleop.journal import HEAD, MAGIC, Disk, Journal, JournalLockedError
 
 
 def write(path, some):

@@ -5,8 +5,7 @@ import errno
 import pytest
 from journal_disks import PATH, KilledError, MemoryDisk, full, refusing
 
-from cloudrc.cloud.teleop.journal import Journal
-from cloudrc.cloud.teleop.journal_format import MAGIC, parse
+from cloudrc.teleop.journal import MAGIC, Journal, parse
 
 NEW = PATH.with_name("missions.journal.new")
 SOME = [{"kind": "event", "n": n, "text": "x" * 40} for n in range(4)]

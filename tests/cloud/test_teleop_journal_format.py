@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from journal_disks import SOME, records, whole
 
-from cloudrc.cloud.teleop.journal_format import HEAD, LENGTH_MAX, MAGIC, MARK, parse, to_record
+from cloudrc.teleop.journal import HEAD, LENGTH_MAX, MAGIC, MARK, parse, to_record
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),

@@ -3,19 +3,10 @@
 import pytest
 from teleop_harness import AWAY, FROM_SPAWN, ID, THREE, A, B, C, Flight
 
-from cloudrc.cloud.teleop.messages import (
-    Acknowledge,
-    Cancel,
-    EmergencyStop,
-    GoTo,
-    Hold,
-    Pause,
-    StartMission,
-)
-from cloudrc.cloud.teleop.mission import Teleop
-from cloudrc.cloud.teleop.mission_rules import HELD_LOWEST
-from cloudrc.cloud.teleop.request import REPEAT_NS
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.teleop.mission import HELD_LOWEST, Teleop
+from cloudrc.teleop.requests import REPEAT_NS
+from cloudrc.teleop.wire import Acknowledge, Cancel, EmergencyStop, GoTo, Hold, Pause, StartMission
 
 
 @pytest.mark.parametrize("first_sight", [True, False])

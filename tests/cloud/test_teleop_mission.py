@@ -5,10 +5,9 @@ from itertools import pairwise
 import pytest
 from teleop_harness import AWAY, PLAN, A, B, C, Flight, flying
 
-from cloudrc.cloud.teleop.messages import Cancel, GoTo, Hold, Resume, StartMission
-from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Request, Setpoint, Start
+from cloudrc.teleop.wire import Cancel, GoTo, Hold, Leg, Plan, Resume, StartMission
 
 
 def last_event(flight):

@@ -7,13 +7,12 @@ from service_harness import ServiceFlight, flying
 from teleop_harness import AWAY, FROM_SPAWN, ID, THREE, A, B, C, Flight
 
 from cloudrc.cli.teleop import _start
-from cloudrc.cloud.teleop.messages import EmergencyStop, Pause, Seen, StartMission
-from cloudrc.cloud.teleop.mission import Teleop
-from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.cloud.teleop.request import PREDECESSORS, REPEAT_NS, Repeater
-from cloudrc.cloud.teleop.service_book import ConflictError
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
+from cloudrc.teleop.mission import Teleop
+from cloudrc.teleop.requests import PREDECESSORS, REPEAT_NS, Repeater
+from cloudrc.teleop.store import ConflictError
+from cloudrc.teleop.wire import EmergencyStop, Leg, Pause, Plan, Seen, StartMission
 from cloudrc.tunnel.codec import NUMBER_MAX
 
 

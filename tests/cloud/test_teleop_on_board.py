@@ -3,14 +3,8 @@
 import pytest
 from teleop_harness import AWAY, FROM_SPAWN, ID, THREE, A, B, Flight
 
-from cloudrc.cloud.teleop.messages import (
-    Cancel,
-    Continue,
-    EmergencyStop,
-    GoTo,
-    StartMission,
-)
 from cloudrc.messages import MISSION_OVER, GuardState, Request
+from cloudrc.teleop.wire import Cancel, Continue, EmergencyStop, GoTo, StartMission
 
 
 @pytest.mark.parametrize("onboard", [(0, 3), (ID + 1, 0), (ID + 1, 3)])

@@ -5,12 +5,12 @@ from journal_disks import PATH, KilledError, MemoryDisk, full
 from service_harness import PLAN, ServiceFlight, flying
 from teleop_harness import AWAY, ID, THREE, A, B, C, Flight
 
-from cloudrc.cloud.teleop.journal import Journal
-from cloudrc.cloud.teleop.messages import Continue, Hold, Seen, StartMission
-from cloudrc.cloud.teleop.request import PREDECESSORS, Repeater
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_mission import Order, number_of
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
+from cloudrc.teleop.journal import Journal
+from cloudrc.teleop.requests import PREDECESSORS, Repeater
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import Order, number_of
+from cloudrc.teleop.wire import Continue, Hold, Seen, StartMission
 
 
 def test_the_robot_is_told_of_every_waypoint_reached():

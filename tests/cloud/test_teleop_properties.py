@@ -6,10 +6,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 from teleop_harness import Flight
 
-from cloudrc.cloud.teleop.messages import Cancel, GoTo, Hold, Resume, StartMission
-from cloudrc.cloud.teleop.plan import Leg, Plan
 from cloudrc.errors import BadInputError
 from cloudrc.messages import OperatorRequest, Request, Setpoint, Start
+from cloudrc.teleop.wire import Cancel, GoTo, Hold, Leg, Plan, Resume, StartMission
 
 UNDER_WAY = {"STARTING", "FLYING", "HELD"}
 ENDS = {"DONE", "FAILED", "CANCELLED"}

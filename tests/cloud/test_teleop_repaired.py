@@ -13,13 +13,13 @@ from cloudrc.assembly import build_plan
 from cloudrc.cli import teleop
 from cloudrc.cli.ends import open_exporter
 from cloudrc.cli.main import main
-from cloudrc.cloud.teleop.journal import Journal
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_mission import Order
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.drivers.realtime import free_ports
+from cloudrc.teleop.journal import Journal
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import Order
 
 HOVER = FOLDERS["experiment"] / "hover.yaml"
 

@@ -5,18 +5,20 @@ from service_harness import PLAN, ServiceFlight, flying
 from teleop_harness import AWAY, A, B, C
 
 from cloudrc.cli.teleop import _open_service
-from cloudrc.cloud.teleop.plan import Leg, Plan
-from cloudrc.cloud.teleop.service_book import (
-    KEPT,
-    QUEUE_MAX,
-    ConflictError,
-    UnavailableError,
-    UnknownMissionError,
-)
-from cloudrc.cloud.teleop.service_mission import ENDED, STATES, Order
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.messages import GuardState, Request, Setpoint, Start
+from cloudrc.teleop.store import (
+    ENDED,
+    KEPT,
+    QUEUE_MAX,
+    STATES,
+    ConflictError,
+    Order,
+    UnavailableError,
+    UnknownMissionError,
+)
+from cloudrc.teleop.wire import Leg, Plan
 
 QUICK = Plan((Leg(A, dwell=0.0),), Start.HERE)
 

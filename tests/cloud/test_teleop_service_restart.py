@@ -8,11 +8,10 @@ from hypothesis import strategies as st
 from service_harness import ServiceFlight, flying
 from teleop_harness import AWAY, A, B, C
 
-from cloudrc.cloud.teleop import api_models as models
-from cloudrc.cloud.teleop.journal_format import parse, to_record
-from cloudrc.cloud.teleop.service_book import ConflictError, MissionBook
-from cloudrc.cloud.teleop.service_mission import SHOWN
 from cloudrc.messages import MISSION_OVER, GuardState, Request, Start
+from cloudrc.teleop import models
+from cloudrc.teleop.journal import parse, to_record
+from cloudrc.teleop.store import SHOWN, ConflictError, MissionBook
 
 
 def test_teleop_alone_restarts_and_the_mission_goes_on_at_the_same_waypoint():

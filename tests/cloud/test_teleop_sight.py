@@ -4,8 +4,8 @@ import pytest
 from service_harness import ServiceFlight, flying
 from teleop_harness import AWAY
 
-from cloudrc.cloud.teleop.sight import NO_CLOUD, NOT_HEARD, SILENCE, next_step
 from cloudrc.messages import Cause, GuardState
+from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, SILENCE, next_step
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 

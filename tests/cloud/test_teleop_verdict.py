@@ -2,9 +2,9 @@
 
 import pytest
 
-from cloudrc.cloud.teleop.messages import Outcome, Seen
-from cloudrc.cloud.teleop.verdict import Criteria, Witness, judge
 from cloudrc.messages import GuardState
+from cloudrc.teleop.verdict import Criteria, Witness, judge
+from cloudrc.teleop.wire import Outcome, Seen
 
 NAN = float("nan")
 DONE = Outcome("done", "mission done", 2, 3)

@@ -6,10 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.cloud.teleop.messages import Seen
-from cloudrc.cloud.teleop.wire import decode, encode
 from cloudrc.messages import MISSION_OVER, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
+from cloudrc.teleop.wire import Seen, decode, encode
 from cloudrc.tunnel.codec import NUMBER_MAX, encode_operator
 
 numbers = st.floats(allow_nan=False)

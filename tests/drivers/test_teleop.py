@@ -5,12 +5,12 @@ import time
 
 import pytest
 
-from cloudrc.cloud.teleop.wire import decode, encode
 from cloudrc.drivers.teleop import BLIND_WAKES, EVENTS_KEPT, STALL_NS, RemoteTeleop, serve_teleop
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.errors import BadInputError
 from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
+from cloudrc.teleop.wire import decode, encode
 
 SECOND = 1_000_000_000
 POINT, PAST = Setpoint((1.0, 2.0, 3.0)), Setpoint((0.0, 0.0, 3.0))

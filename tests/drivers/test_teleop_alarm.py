@@ -14,10 +14,10 @@ import pytest
 from cloudrc.cli import teleop, teleop_alarm
 from cloudrc.cli.teleop_alarm import Alarm
 from cloudrc.cli.teleop_api import ServedApi
-from cloudrc.cloud.teleop.api_bridge import Bridge
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.wire import ALARM, encode
 from cloudrc.drivers.unix import UnixPeer
+from cloudrc.teleop.bridge import Bridge
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.wire import ALARM, encode
 
 Peers = tuple[UnixPeer, UnixPeer]
 WORD = encode(ALARM)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from cloudrc.cloud.teleop.wire import decode, encode
 from cloudrc.drivers.teleop import ALIVE_NS, BLIND_WAKES, STALL_NS, RemoteTeleop, turn
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.messages import Setpoint
+from cloudrc.teleop.wire import decode, encode
 
 PERIOD_NS = 10_000_000
 SECOND = 1_000_000_000

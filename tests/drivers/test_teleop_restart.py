@@ -8,9 +8,9 @@ import pytest
 from release import LIMIT, TOKEN, Release
 
 from cloudrc.cli.mission_http import Api, UnreachableError
-from cloudrc.cloud.teleop.journal_format import parse
-from cloudrc.cloud.teleop.wire import ALARM, encode
 from cloudrc.drivers.unix import UnixPeer
+from cloudrc.teleop.journal import parse
+from cloudrc.teleop.wire import ALARM, encode
 
 pytestmark = pytest.mark.process
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cloud.teleop.messages import State
 from cloudrc.exposition import table
 from cloudrc.exposition.document import OPEN, QUERIES, page
 from cloudrc.exposition.table import METRICS, Kind, Metric, of_role
 from cloudrc.messages import GuardState
+from cloudrc.teleop.wire import State
 
 ROOT = Path(__file__).resolve().parents[2]
 UNITS = ("seconds", "meters", "newtons", "meters_per_second", "radians_per_second")

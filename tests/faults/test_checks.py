@@ -7,9 +7,6 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_book import MissionBook
-from cloudrc.cloud.teleop.service_mission import Mission, Order
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.teleop import LastWord
 from cloudrc.drivers.wall_clock import WallClock
@@ -22,6 +19,8 @@ from cloudrc.link.sidecar_follow import PeerName
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Contact, Counted, Fault
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import Mission, MissionBook, Order
 from cloudrc.tunnel.handshake import Complaints
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import STEP_NS, Robot
@@ -144,7 +143,7 @@ def never_says_that_cloud_lives(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def shows_the_past_as_present(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cloudrc.cloud.teleop.sight.SILENCE", 1e9)
+    monkeypatch.setattr("cloudrc.teleop.service.SILENCE", 1e9)
 
 
 def says_nothing_of_the_wall_clock(monkeypatch: pytest.MonkeyPatch) -> None:

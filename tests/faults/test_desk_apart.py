@@ -10,8 +10,6 @@ from typing import NamedTuple
 
 import pytest
 
-from cloudrc.cloud.teleop.messages import Output, Seen
-from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop
 from cloudrc.drivers.unix import UnixPeer
 from cloudrc.faults.desk_apart import SOCKET_MAX, Apart
@@ -22,6 +20,8 @@ from cloudrc.faults.schedule import STALLS, Event, Schedule
 from cloudrc.faults.walls import Wall
 from cloudrc.messages import OperatorRequest, Setpoint
 from cloudrc.records import Fault, MissionEvent
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.wire import Output, Seen
 
 Patch = pytest.MonkeyPatch
 

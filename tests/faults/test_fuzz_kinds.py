@@ -10,9 +10,6 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cloud.operator import Alarm
-from cloudrc.cloud.teleop.api_bridge import WAITING_MAX
-from cloudrc.cloud.teleop.messages import Seen
-from cloudrc.cloud.teleop.service import MissionService
 from cloudrc.faults import fuzz
 from cloudrc.faults.adversary import choose
 from cloudrc.faults.compose import RANGES, calm, compose
@@ -26,6 +23,9 @@ from cloudrc.faults.walls import Wall
 from cloudrc.link.sidecar_follow import PeerName
 from cloudrc.messages import GuardState
 from cloudrc.record.recover import Recovery, recover
+from cloudrc.teleop.bridge import WAITING_MAX
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.wire import Seen
 from cloudrc.tunnel.keys import KeyRing, KeySet
 
 Patch = pytest.MonkeyPatch

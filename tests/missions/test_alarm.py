@@ -7,10 +7,10 @@ from flying import CLOCK, Ends, join
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudIdentity
-from cloudrc.cloud.teleop.wire import ALARM
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request
 from cloudrc.records import GuardChange
+from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel.codec import Kind, peek
 
 HOVER = load_experiment("hover", ["link.profile=ideal"])

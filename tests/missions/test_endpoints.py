@@ -152,9 +152,8 @@ def test_a_start_from_the_spawn_resets_the_world_under_a_new_epoch():
 
 
 def test_one_mission_can_follow_another_from_here():
-    from cloudrc.cloud.teleop.messages import StartMission
-    from cloudrc.cloud.teleop.plan import Leg, Plan
     from cloudrc.messages import Start
+    from cloudrc.teleop.wire import Leg, Plan, StartMission
 
     ends = join(load_experiment("hover", ["mission.waypoints.0.dwell_s=0.5"]))
     done = lambda: ends.cloud.mission_over  # noqa: E731

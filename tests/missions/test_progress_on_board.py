@@ -7,11 +7,11 @@ from flying import join, records
 from talking import Talk
 
 from cloudrc import assembly
-from cloudrc.cloud.teleop.wire import ALARM
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Mission, Waypoint
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start, Telemetry
 from cloudrc.records import GuardChange, MissionEvent, TelemetrySent
+from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
 

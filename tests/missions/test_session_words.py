@@ -8,11 +8,10 @@ from flying import CLOCK, Ends, join
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudIdentity
 from cloudrc.cloud.operator import Operator
-from cloudrc.cloud.teleop.messages import Output, Seen
-from cloudrc.cloud.teleop.wire import ALARM
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, GuardChange, Record
+from cloudrc.teleop.wire import ALARM, Output, Seen
 from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
 from cloudrc.world.endpoint import WorldIdentity
 

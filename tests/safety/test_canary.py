@@ -14,10 +14,10 @@ from mcap.exceptions import McapError
 from mcap.stream_reader import StreamReader
 from release import KEY, TOKEN, Release
 
-from cloudrc.cloud.teleop.api_tokens import Tokens
 from cloudrc.drivers.local import _free_addresses
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Fault
+from cloudrc.teleop.auth import Tokens
 from cloudrc.tunnel.keys import Key
 
 OURS = ("operator", "key")

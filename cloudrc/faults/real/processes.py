@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from cloudrc.cloud.teleop.service_mission import ENDED, STATES
 from cloudrc.cluster.pods import DIRECTLY
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.drivers.epochs import replace_durably
@@ -20,6 +19,7 @@ from cloudrc.errors import TimedOutError
 from cloudrc.faults.options import SECRET
 from cloudrc.record.columns import Recording
 from cloudrc.record.recover import Recovery, recover
+from cloudrc.teleop.store import ENDED, STATES
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Direction, Kind
 from cloudrc.tunnel.keys import write
@@ -130,7 +130,7 @@ class Processes:
 
     def events(self) -> list[str]:
         """What has happened to the mission, as the journal has it."""
-        from cloudrc.cloud.teleop.journal_format import parse
+        from cloudrc.teleop.journal import parse
 
         path = self.folder / "journal"
         if not path.exists():

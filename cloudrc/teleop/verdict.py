@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from math import isfinite
 from typing import Any, Literal
 
-from cloudrc.cloud.teleop.messages import Outcome, Seen
+from cloudrc.teleop.wire import Outcome, Seen
 
 REAL_TIME_FACTOR_MIN = 0.95
 """Below it the simulated robot was slower than its network [1].

@@ -15,9 +15,9 @@ from concurrent.futures import Future
 from contextvars import ContextVar
 from typing import Any
 
-from cloudrc.cloud.teleop.api_tokens import OPERATOR, ROLES, Role
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_book import ConflictError, UnavailableError
+from cloudrc.teleop.auth import OPERATOR, ROLES, Role
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import ConflictError, UnavailableError
 
 STARTING = "teleop is starting"
 WAITING_MAX = 64

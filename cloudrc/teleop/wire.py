@@ -2,18 +2,104 @@
 
 What it tells the others is defined elsewhere: `Setpoint` to the controller and `OperatorRequest`
 to the robot in `cloudrc.messages`, `MissionEvent` to the recorder in `cloudrc.records`.
+
+The plan of a mission: a person's or an experiment's waypoints come in, checked legs go out.
+
+Teleop's datagrams: messages between cloud's and teleop's process become JSON and come back.
+
+One message each: the name of its type, then its fields in order. Both processes are of one image
+and one pod; what arrives is checked all the same, since a file that both can write to is no proof
+of who wrote.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from enum import IntEnum
-from math import nan
-from typing import NamedTuple, TypeAlias
+from math import isfinite, isnan, nan
+from typing import Any, NamedTuple, TypeAlias
 
-from cloudrc.cloud.teleop.plan import Plan
-from cloudrc.messages import Cause, GuardState, OperatorRequest, Setpoint, Vector
+from pydantic import TypeAdapter, ValidationError
+
+from cloudrc.errors import BadInputError
+from cloudrc.messages import (
+    MISSION_OVER,
+    ZERO,
+    Cause,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Setpoint,
+    Start,
+    Vector,
+)
 from cloudrc.records import MissionEvent
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """The way to one waypoint, which is reached by staying near it.
+
+    Attributes:
+        position: Waypoint [m], world frame, shape (3,).
+        yaw: Heading to hold [rad].
+        tolerance: Distance that counts as there [m]. Infinite: anywhere counts, and the leg lasts
+            `dwell`; that is how steps at fixed instants are flown.
+        dwell: How long to be seen within the tolerance without a break [s].
+        time_limit: Longest duration of the leg, held time not counted [s].
+    """
+
+    position: Vector
+    yaw: float = 0.0
+    tolerance: float = 0.10
+    dwell: float = 0.5
+    time_limit: float = 60.0
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            BadInputError: If one is not a number or out of range.
+        """
+        if not all(map(isfinite, (*self.position, self.yaw))):
+            raise BadInputError(f"waypoint {self.position}, yaw {self.yaw}: has to be finite")
+        if isnan(self.tolerance) or self.tolerance <= 0:
+            raise BadInputError(f"waypoint tolerance {self.tolerance} m: has to be above 0")
+        if not (isfinite(self.dwell) and self.dwell >= 0):
+            raise BadInputError(f"waypoint dwell {self.dwell} s: has to be finite and >= 0")
+        if not (isfinite(self.time_limit) and self.time_limit > 0):
+            raise BadInputError(f"time limit {self.time_limit} s: has to be finite and above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A mission.
+
+    Attributes:
+        legs: What to fly, in order; at least one.
+        start: From the spawn, in a fresh world, or from here.
+        time_limit: Longest duration of the mission, held time counted [s].
+    """
+
+    legs: tuple[Leg, ...]
+    start: Start = Start.SPAWN
+    time_limit: float = 60.0
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            BadInputError: If there is no leg or the limit is out of range.
+        """
+        if not self.legs:
+            raise BadInputError("a mission needs at least one waypoint")
+        if not (isfinite(self.time_limit) and self.time_limit > 0):
+            raise BadInputError(f"time limit {self.time_limit} s: has to be finite and above 0")
+
+
+NO_PLAN = Plan((Leg(ZERO),))
+"""Stands in until the first mission starts; never flown."""
 
 
 class Seen(NamedTuple):
@@ -183,3 +269,51 @@ class Outcome:
     def success(self) -> bool:
         """True if every waypoint was reached."""
         return self.code == "done"
+
+
+Message: TypeAlias = Seen | Output
+"""What goes through the sockets: `Seen` to teleop, the others to cloud."""
+
+ALARM = OperatorRequest(0, Request.ESTOP)
+"""An emergency stop that passes teleop's own machine by; cloud gives it its number."""
+
+_LEAST, _MOST = -(2**63), 2**63 - 1
+_KINDS: dict[str, TypeAdapter[Any]] = {
+    kind.__name__: TypeAdapter(kind) for kind in (Seen, Setpoint, OperatorRequest, MissionEvent)
+}
+
+
+def encode(message: Message) -> bytes:
+    """Write a message as one datagram."""
+    return json.dumps([type(message).__name__, message]).encode()
+
+
+def decode(data: bytes) -> Message:
+    """Read a message from its datagram.
+
+    Raises:
+        ValueError: If it is not one, or says what cannot be recorded, or told to the robot.
+    """
+    try:
+        name, fields = json.loads(data)
+        message: Message = _KINDS[name].validate_python(fields)
+        _check_ranges(message)
+    except (ValidationError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError(f"not a message of teleop: {data[:60]!r}") from error
+    return message
+
+
+def _check_ranges(message: Message) -> None:
+    """Let pass what a recording, and of a request what the tunnel, has room for.
+
+    Its number may be higher than the tunnel's: of these cloud keeps count as it drops them.
+
+    Raises:
+        ValueError: If a value does not fit.
+    """
+    fits = all(_LEAST <= value <= _MOST for value in message if isinstance(value, int))
+    if isinstance(message, OperatorRequest):
+        least = min(message.number, message.mission_id, message.reached)
+        fits = fits and least >= 0 and message.reached <= MISSION_OVER
+    if not fits:
+        raise ValueError("out of range")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cloudrc.cloud.teleop.messages import Seen
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
+from cloudrc.teleop.wire import Seen
 
 REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""

@@ -2,46 +2,176 @@
 
 Handlers wait for the service on the bridge and touch nothing else of it. Errors are one line of
 `detail`; a mission that is in the way is named, and so is every value that cannot be used.
+
+Server-sent events: the book's events go out as they come, numbered, so that one can resume.
+
+What the API answers when it does not do what was asked: an exception comes in, JSON goes out.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import json
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from math import radians
 from typing import Any
 
 from fastapi import APIRouter, Depends, FastAPI, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, StreamingResponse
 from fastapi.security import HTTPBearer
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
 
 from cloudrc import __version__
-from cloudrc.cloud.teleop import api_models as models
-from cloudrc.cloud.teleop.api_bridge import Bridge, Call
-from cloudrc.cloud.teleop.api_check import (
+from cloudrc.config.problems import Problem, in_words
+from cloudrc.config.schema import Mission as MissionSection
+from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.geometry.scene import Scene
+from cloudrc.teleop import models
+from cloudrc.teleop.auth import RevokedError
+from cloudrc.teleop.bridge import Bridge, Call
+from cloudrc.teleop.models import (
+    Refusal,
+    RefusedError,
+    as_json,
     check_first_way,
     check_way,
     leads_to_board,
     read_goto,
     read_mission,
 )
-from cloudrc.cloud.teleop.api_errors import (
-    BODY_LIMIT,
-    BODY_MAX,
-    REFUSALS,
-    TooLargeError,
-    TooSlowError,
-    handle_errors,
-)
-from cloudrc.cloud.teleop.api_events import last_event_id, stream
-from cloudrc.cloud.teleop.plan import Plan
-from cloudrc.cloud.teleop.service import MissionService
-from cloudrc.cloud.teleop.service_mission import Order
-from cloudrc.config.schema import Mission as MissionSection
-from cloudrc.geometry.scene import Scene
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import ConflictError, Order, UnavailableError, UnknownMissionError
+from cloudrc.teleop.wire import Plan
+
+LOOK_PERIOD = 0.1
+"""Between two looks at the book [s]."""
+ALIVE_PERIOD = 10.0
+"""After so long without an event a comment is sent, so that no proxy closes the stream [s]."""
+
+
+def last_event_id(request: Request) -> int:
+    """Where a client that was cut off left; 0 if it does not say."""
+    text = request.headers.get("last-event-id", "")
+    return int(text) if text.isdecimal() and len(text) < 16 else 0
+
+
+async def stream(
+    request: Request,
+    ask: Callable[[Call], Awaitable[Any]],
+    closed: Callable[[], bool],
+    after: int,
+) -> AsyncIterator[str]:
+    """Give the text of the stream, until the client leaves or teleop ends.
+
+    Args:
+        request: Of the client.
+        ask: Has a call made on the service.
+        closed: Whether teleop ends.
+        after: Number of the last event that the client has.
+    """
+    looks = 0
+    yield ": cloudrc\n\n"
+    while not closed() and not await request.is_disconnected():
+        try:
+            events = await ask(_after(after))
+        except (CloudrcError, TimeoutError):
+            return
+        for event in events:
+            after = event["id"]
+            yield f"id: {after}\nevent: mission\ndata: {json.dumps(event)}\n\n"
+        looks = 0 if events else looks + 1
+        if looks * LOOK_PERIOD >= ALIVE_PERIOD:
+            looks = 0
+            yield ": alive\n\n"
+        await asyncio.sleep(LOOK_PERIOD)
+
+
+def _after(number: int) -> Call:
+    return lambda service, now_ns: service.book.events_after(number)
+
+
+BODY_MAX = 256 * 1024
+"""Length of a request's body [bytes]."""
+BODY_LIMIT = 5.0
+"""For a request's body to arrive [s]."""
+
+REFUSALS: dict[int | str, dict[str, Any]] = {
+    code: {"model": Refusal, "description": text}
+    for code, text in {
+        401: "There is no valid token in the request",
+        403: "The token is a reader's",
+        404: "There is no such mission",
+        408: f"The body did not arrive within {BODY_LIMIT:g} s",
+        409: "The state does not allow it; `id` names the mission in the way",
+        413: f"The body is longer than {BODY_MAX // 1024} KiB",
+        422: "A value cannot be used; `problems` has every one",
+        429: "Too many requests; try again in a second",
+        503: "Not now: teleop starts or ends, another has the journal, it cannot be written, or "
+        "too much waits: try again. Or teleop did not answer within 2 s, and may do it yet: look. "
+        "An emergency stop is told all the same, unless another teleop flies the robot",
+    }.items()
+}
+
+
+class TooLargeError(CloudrcError):
+    """The body of a request is too long."""
+
+
+class TooSlowError(CloudrcError):
+    """The body of a request does not arrive."""
+
+
+def handle_errors(app: FastAPI) -> None:
+    """Let an application answer with `Refusal` for everything that cannot be done."""
+
+    @app.exception_handler(CloudrcError)
+    async def refuse(request: Request, error: CloudrcError) -> JSONResponse:
+        match error:
+            case RefusedError():
+                problems = [as_json(problem) for problem in error.problems]
+                return JSONResponse({"detail": str(error), "problems": problems}, 422)
+            case BadInputError():
+                return JSONResponse({"detail": str(error)}, 422)
+            case ConflictError():
+                return JSONResponse({"detail": str(error), "id": error.mission or None}, 409)
+            case UnknownMissionError():
+                return JSONResponse({"detail": str(error)}, 404)
+            case RevokedError():
+                text = REFUSALS[401]["description"]
+                return JSONResponse({"detail": text}, 401, {"WWW-Authenticate": "Bearer"})
+            case TooLargeError():
+                return JSONResponse({"detail": REFUSALS[413]["description"]}, 413)
+            case TooSlowError():
+                return JSONResponse({"detail": REFUSALS[408]["description"]}, 408)
+            case UnavailableError():
+                return JSONResponse({"detail": str(error)}, 503, {"Retry-After": "1"})
+        return JSONResponse({"detail": str(error)}, 500)
+
+    @app.exception_handler(RequestValidationError)
+    async def refuse_query(request: Request, error: RequestValidationError) -> JSONResponse:
+        found = [
+            Problem(tuple(map(str, each["loc"][1:])), in_words(each["input"]), each["msg"])
+            for each in error.errors()
+        ]
+        return await refuse(request, RefusedError(found))
+
+    @app.exception_handler(Exception)
+    async def fail(request: Request, error: Exception) -> JSONResponse:
+        return JSONResponse({"detail": "the API failed; see teleop's log"}, 500)
+
+    @app.exception_handler(ClientDisconnect)
+    async def gone(request: Request, error: ClientDisconnect) -> JSONResponse:
+        return JSONResponse({"detail": "the client has left"}, 400)  # for the audit log alone
+
+    @app.exception_handler(TimeoutError)
+    async def too_late(request: Request, error: TimeoutError) -> JSONResponse:
+        text = "teleop did not answer in time, but may do it yet: look before you try again"
+        return JSONResponse({"detail": text}, 503)
+
 
 ABOUT = """\
 Fly missions, or steer by hand. One mission is flown at a time; a second one is refused with the

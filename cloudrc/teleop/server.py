@@ -1,23 +1,39 @@
-"""The gate before the API: every request comes in; those of known callers, and few enough, go on.
+"""The API's server: an ASGI application on a thread of its own, beside teleop's loop.
+
+The gate before the API: every request comes in; those of known callers, and few enough, go on.
 
 Denied by default: whatever the path, without a valid token it is 401, and with a reader's token
 everything but looking is 403. A flood of either is answered with 429 and reaches nothing. Behind
 the gate are the routes. An operator's emergency stop has a lane of its own: it alone, by path and
 method, is never counted against anybody's room.
+
+Connections of the API: clients that dawdle are cut off, and too many make the slowest leave.
+
+A request's head has 5 s from the connection, or from the answer before it; an answer has 10 s to be
+taken once its buffer is full. When there are too many connections the one that has waited longest
+without a request goes, so that whoever asks at once is always served.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
+import os
+import socket
+import threading
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeAlias
 
-from cloudrc.cloud.teleop.api_audit import Audit
-from cloudrc.cloud.teleop.api_bridge import LANE
-from cloudrc.cloud.teleop.api_tokens import LOCAL, OPERATOR, Caller, RevokedError, Tokens
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from cloudrc.errors import BadInputError
+from cloudrc.teleop.auth import LOCAL, OPERATOR, Audit, Caller, RevokedError, Tokens
+from cloudrc.teleop.bridge import LANE, Bridge
 
 Scope: TypeAlias = MutableMapping[str, Any]
 Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -270,3 +286,223 @@ class Answer:
         except ValueError:
             return {}
         return found if isinstance(found, dict) else {}
+
+
+HEAD_LIMIT = 5.0
+"""For the head of a request to arrive [s]."""
+SEND_LIMIT = 10.0
+"""For a client to take what it is sent [s]."""
+CONNECTIONS_MAX = 256
+READ_MAX = 1_024
+"""Taken from a connection before it is another's turn [bytes]: in chunks of one byte each that is
+some 1 ms of work; asyncio's own 256 KiB would be a quarter of a second."""
+
+
+class Crowd:
+    """All connections of a server.
+
+    Attributes:
+        idle: Those that are not being answered, the longest idle first.
+        counts: How many were cut off, by reason.
+    """
+
+    def __init__(self) -> None:
+        self.idle: dict[PatientProtocol, None] = {}
+        self.counts: Counter[str] = Counter()
+
+    def protocol(self) -> type[PatientProtocol]:
+        """Give the class of this server's connections, as uvicorn wants it."""
+        return type("CrowdProtocol", (PatientProtocol,), {"crowd": self})
+
+
+class PatientProtocol(H11Protocol):
+    """One connection, whose patience ends."""
+
+    crowd: Crowd
+    _head_timer: asyncio.TimerHandle | None = None
+    _send_timer: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        """Somebody has come."""
+        super().connection_made(transport)
+        transport.max_size = READ_MAX
+        self._watch()
+        if len(self.connections) > CONNECTIONS_MAX:
+            next(iter(self.crowd.idle))._cut_off("busy")
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Somebody has left."""
+        super().connection_lost(exc)
+        self._forget()
+        self.resume_writing()
+
+    def data_received(self, data: bytes) -> None:
+        """Something has arrived: perhaps the end of a request's head."""
+        super().data_received(data)
+        self._watch()
+
+    def on_response_complete(self) -> None:
+        """An answer is given: the next request may come."""
+        if self._has_chunks_left():  # nobody wants them, and to take them apart is work
+            self.transport.close()
+        super().on_response_complete()
+        self._watch()
+
+    def pause_writing(self) -> None:
+        """The client does not take what it is sent as fast as it is sent."""
+        super().pause_writing()
+        if self._send_timer is None:
+            self._send_timer = self.loop.call_later(SEND_LIMIT, self._cut_off, "slow")
+
+    def resume_writing(self) -> None:
+        """The client goes on taking it."""
+        super().resume_writing()
+        if self._send_timer is not None:
+            self._send_timer.cancel()
+            self._send_timer = None
+
+    def _has_chunks_left(self) -> bool:
+        chunked = any(name == b"transfer-encoding" for name, _ in self.headers)
+        return chunked and self.cycle.more_body
+
+    def _watch(self) -> None:
+        """While no request is being answered, time runs."""
+        answering = self.cycle is not None and not self.cycle.response_complete
+        if answering or self.transport.is_closing():
+            self._forget()
+        elif self._head_timer is None:
+            self._head_timer = self.loop.call_later(HEAD_LIMIT, self._cut_off, "slow")
+            self.crowd.idle[self] = None
+
+    def _forget(self) -> None:
+        self.crowd.idle.pop(self, None)
+        if self._head_timer is not None:
+            self._head_timer.cancel()
+            self._head_timer = None
+
+    def _cut_off(self, reason: str) -> None:
+        self.crowd.counts[reason] += 1
+        self.transport.abort()
+        self._forget()
+
+
+Address: TypeAlias = tuple[str, int] | Path
+"""Host and port, or the path of a Unix socket."""
+STOP_LIMIT = 1.0
+"""For requests to end once the server shall stop [s]."""
+BACKLOG = 1_024
+"""Connections that the kernel keeps until they are taken."""
+ACCEPT_MAX = 16
+"""Connections taken before those that are there are read: of more, the emergency stop's could be
+the longest without a request, and be cut off, though it is there."""
+HEAD_MAX = 4_096
+"""Length of a request's head [bytes]; one of shortest lines is 4 ms of work."""
+
+
+class ApiServer:
+    """Serves from `start` to `stop`.
+
+    Attributes:
+        url: Where; "unix:PATH" for a Unix socket.
+    """
+
+    def __init__(self, gate: Gate, bridge: Bridge, address: Address) -> None:
+        """Bind; port 0 lets the kernel choose.
+
+        Args:
+            gate: Before the application.
+            bridge: To teleop's loop.
+            address: A Unix socket's file is for its owner alone.
+
+        Raises:
+            BadInputError: If the address cannot be had, or anybody there could command.
+        """
+        if gate.open and not isinstance(address, Path):
+            raise BadInputError(
+                "--api HOST:PORT needs --tokens DIR, with a file 'operator' in it; "
+                "without tokens only a socket file is served: --api unix:PATH"
+            )
+        self._crowd, self._gate, self._bridge = Crowd(), gate, bridge
+        self._socket, self.url = _bound(address)
+        self._server = _Server(
+            uvicorn.Config(
+                gate,
+                loop="asyncio",
+                http=self._crowd.protocol(),
+                ws="none",
+                lifespan="off",
+                log_level="critical",  # a flood is refused without a line for each
+                access_log=False,
+                server_header=False,
+                proxy_headers=False,  # the audit log names whoever connects, not whom they name
+                backlog=ACCEPT_MAX,
+                h11_max_incomplete_event_size=HEAD_MAX,
+                timeout_keep_alive=round(HEAD_LIMIT),
+                timeout_graceful_shutdown=1,
+            )
+        )
+        # A daemon, so that a client that hangs cannot keep the process from ending.
+        self._thread = threading.Thread(target=self._run, name="api", daemon=True)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What was done with requests and connections, by reason."""
+        return self._gate.counts + self._crowd.counts
+
+    def start(self) -> None:
+        """Begin to serve; who asks from now on is answered, if a little later."""
+        self._socket.listen(BACKLOG)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Answer what is asked, end the streams, and end."""
+        self._bridge.closed = "teleop ends"
+        self._server.should_exit = True
+        self._thread.join(STOP_LIMIT)
+        self._socket.close()
+
+    def _run(self) -> None:
+        self._server.run(sockets=[self._socket])
+
+
+class _Server(uvicorn.Server):
+    """Takes few connections at a time, and lets many wait; for asyncio both is one number."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to serve."""
+        await super().startup(sockets)
+        for each in sockets or []:
+            each.listen(BACKLOG)
+
+
+def _bound(address: Address) -> tuple[socket.socket, str]:
+    """A socket bound at an address, and its URL."""
+    if isinstance(address, Path):
+        return _bound_file(address), f"unix:{address}"
+    host, port = address
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    tcp = socket.socket(family, socket.SOCK_STREAM)
+    tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        tcp.bind((host.strip("[]"), port))
+    except OSError as error:
+        tcp.close()
+        text = f"--api {host}:{port}: {error.strerror or error}; choose another address"
+        raise BadInputError(text) from error
+    return tcp, f"http://{host}:{tcp.getsockname()[1]}"
+
+
+def _bound_file(path: Path) -> socket.socket:
+    """A Unix socket that its owner alone can connect to, from its first instant."""
+    unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
+    try:
+        if path.is_socket():  # of a server before this one
+            path.unlink()
+        unix.bind(str(path))
+    except OSError as error:
+        unix.close()
+        raise BadInputError(
+            f"--api unix:{path}: {error.strerror or error}; choose another path"
+        ) from error
+    return unix
