@@ -20,7 +20,7 @@ from cloudrc.config.parameters import build
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
-from cloudrc.link.trace import SIZE_MAX, read_table, read_trace
+from cloudrc.link.traces import SIZE_MAX, read_table, read_trace
 from cloudrc.messages import Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan, StartMission

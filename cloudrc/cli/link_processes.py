@@ -29,8 +29,8 @@ from cloudrc.errors import (
     MissingPrerequisiteError,
     TimedOutError,
 )
-from cloudrc.link.netem_text import check
 from cloudrc.link.state import STATE_FILE, LinkState, from_text
+from cloudrc.link.tc import check
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment

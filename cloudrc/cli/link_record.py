@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.link.trace_logs import Direction
-    from cloudrc.link.trace_packets import Packets
+    from cloudrc.link.traces import Direction, Packets
 
 EPILOG = """\
 sources:
@@ -76,7 +75,7 @@ def _write(packets: Packets, path: Path, direction: str, *, halve: bool) -> None
     """Write one trace; say what is in it and how a profile asks for it, as a replay or a table."""
     from statistics import fmean, pstdev
 
-    from cloudrc.link.trace_packets import trace_of, write_trace
+    from cloudrc.link.traces import trace_of, write_trace
 
     path.write_text(write_trace(trace_of(packets)), encoding="utf-8")
     arrived = [delay * 1e3 for delay in packets.arrived]

@@ -21,9 +21,8 @@ from cloudrc.records import Counted
 if TYPE_CHECKING:
     from cloudrc.cli.tc_session import Programs
     from cloudrc.drivers.exporter import Exporter
+    from cloudrc.link.follow import Load, Profiles
     from cloudrc.link.sidecar import Machine, Sidecar
-    from cloudrc.link.sidecar_follow import Load
-    from cloudrc.link.sidecar_handed import Profiles
 
 
 def run(options: argparse.Namespace) -> int:
@@ -31,10 +30,9 @@ def run(options: argparse.Namespace) -> int:
     stop = StopSignal()  # first: the first process of a container ignores SIGTERM until then
     from cloudrc.cli.link_told import Teller
     from cloudrc.cli.tc_session import runner
-    from cloudrc.link.netem_tables import write_tables
+    from cloudrc.link.follow import HANDED_FILE, HandedProfile, ProfileFile, Profiles
     from cloudrc.link.sidecar import Settings, Sidecar
-    from cloudrc.link.sidecar_follow import ProfileFile
-    from cloudrc.link.sidecar_handed import HANDED_FILE, HandedProfile, Profiles
+    from cloudrc.link.tc import write_tables
 
     warn_if_exposed(options.listen)
     exporter = open_exporter(options, "link")
@@ -66,7 +64,7 @@ def loader(direction: str) -> Load:
     """Make what reads a profile's file and takes one direction of it."""
     from cloudrc.assembly import link_profile
     from cloudrc.config.load import load_profile
-    from cloudrc.link.sidecar_follow import Loaded
+    from cloudrc.link.follow import Loaded
 
     def load(path: Path) -> Loaded:
         profile = load_profile(path.absolute())  # with a slash: no shipped profile's name
@@ -80,11 +78,10 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
     from cloudrc.config.load import read_experiment
     from cloudrc.link.model import LinkDirection
     from cloudrc.link.netem import Netem
-    from cloudrc.link.netem_tc import may_shape, try_netem
     from cloudrc.link.profile import DirectionProfile
-    from cloudrc.link.relay_priority import ask_for_fifo, settle
-    from cloudrc.link.relay_shaper import RelayShaper
+    from cloudrc.link.relay import RelayShaper, ask_for_fifo, settle
     from cloudrc.link.sidecar import Machine
+    from cloudrc.link.tc import may_shape, try_netem
     from cloudrc.tunnel.codec import peek
 
     seed = read_experiment(str(options.config)).seed
@@ -124,7 +121,7 @@ def _follow(
     sidecar: Sidecar, file: Profiles, options: argparse.Namespace, watcher: Metrics | None
 ) -> None:
     """Let threads of their own look after the profile's file and the peer's name."""
-    from cloudrc.link.sidecar_follow import PEER_PAUSE, PROFILE_PERIOD, PeerName
+    from cloudrc.link.follow import PEER_PAUSE, PROFILE_PERIOD, PeerName
 
     name = PeerName(options.peer, resolve, log)
 

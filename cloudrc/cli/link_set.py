@@ -83,8 +83,7 @@ def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[E
     from cloudrc.cli.relay_control import PROFILE_FILE
     from cloudrc.config.document import Document
     from cloudrc.config.edit import DIRECTIONS, edit
-    from cloudrc.link.route import publish
-    from cloudrc.link.state import CHANGE_FILE, from_text
+    from cloudrc.link.state import CHANGE_FILE, from_text, publish
 
     def look() -> list[LinkState]:
         try:

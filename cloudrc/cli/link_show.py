@@ -13,8 +13,8 @@ from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.config.schema import Direction, Profile
+    from cloudrc.link.model import Numbers, Stream
     from cloudrc.link.profile import DirectionProfile
-    from cloudrc.link.trace_sample import Numbers, Stream
     from cloudrc.report.figures.link import Way
 
 EPILOG = """\
@@ -101,7 +101,7 @@ def _is_trace(name: str) -> bool:
 def _profile(name: str) -> Profile:
     from cloudrc.config.load import load_profile
     from cloudrc.config.schema import Direction, Profile
-    from cloudrc.link.trace import read_trace
+    from cloudrc.link.traces import read_trace
 
     if _is_trace(name):
         path = Path(name).absolute()
@@ -113,8 +113,8 @@ def _profile(name: str) -> Profile:
 def _way(asked: Direction, name: str, options: argparse.Namespace) -> tuple[Way, Numbers]:
     """Send a stream one way, and for the numbers of a steady link a longer one."""
     from cloudrc.assembly import link_profile
-    from cloudrc.link.timeline import Timeline
-    from cloudrc.link.trace_sample import numbers
+    from cloudrc.link.model import numbers
+    from cloudrc.link.profile import Timeline
     from cloudrc.report.figures.link import Way
 
     profile = link_profile(asked)
@@ -141,8 +141,7 @@ def stream(
         count: Packets.
         rate: At which they are sent [1/s].
     """
-    from cloudrc.link.model import LinkDirection
-    from cloudrc.link.trace_sample import sample
+    from cloudrc.link.model import LinkDirection, sample
     from cloudrc.tunnel.codec import SIZES, Kind
 
     uplink = name == "uplink"

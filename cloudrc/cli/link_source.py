@@ -10,8 +10,7 @@ from cloudrc.cli.extras import require
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.link.trace_logs import Direction
-    from cloudrc.link.trace_packets import Packets
+    from cloudrc.link.traces import Direction, Packets
     from cloudrc.record.columns import Recording, Table
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -57,9 +56,7 @@ def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_unit
     Raises:
         BadInputError: If it is none of them, or cannot be used.
     """
-    from cloudrc.link.trace import read_lines
-    from cloudrc.link.trace_csv import read_csv
-    from cloudrc.link.trace_logs import is_ping, read_irtt, read_ping
+    from cloudrc.link.traces import is_ping, read_csv, read_irtt, read_lines, read_ping
 
     name = str(path)
     remedy = "give a run, a log of ping or irtt, or a CSV file"
@@ -115,7 +112,7 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     """
     from math import isnan
 
-    from cloudrc.link.trace_packets import in_order
+    from cloudrc.link.traces import in_order
 
     sent_topic, topic = TOPICS[direction]
     sent, arrivals = recording[sent_topic], recording[topic]
@@ -155,7 +152,7 @@ def _halves(recording: Recording, path: Path) -> Packets:
     """
     from math import isnan
 
-    from cloudrc.link.trace_packets import in_order
+    from cloudrc.link.traces import in_order
 
     estimates = recording["/delay_estimate"]
     rows: list[tuple[float, float]] = []

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.tc_session import runner
-from cloudrc.link.sidecar_told import Near, look_near, write_told
+from cloudrc.link.sidecar import Near, look_near, write_told
 
 if TYPE_CHECKING:
     from cloudrc.link.sidecar import Sidecar

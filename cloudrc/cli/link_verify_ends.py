@@ -22,15 +22,21 @@ from cloudrc.cli.link_verify_notes import (
 )
 from cloudrc.cli.link_verify_text import NOT_JUDGED, Said
 from cloudrc.cluster.pods import DIRECTLY, METRICS
-from cloudrc.drivers.standing_basis import TAKES
 from cloudrc.errors import TimedOutError
-from cloudrc.link.sidecar_told import Told, read_told
-from cloudrc.link.verify_applied import rate_in_force, shown
-from cloudrc.link.verify_causes import Evidence, Findings, find_causes
-from cloudrc.link.verify_ends import PERIOD
-from cloudrc.link.verify_evidence import Samples, of_metrics, of_told, samples, shaper_of
-from cloudrc.link.verify_judge import Row
-from cloudrc.link.verify_words import kbit
+from cloudrc.link.sidecar import Told, read_told
+from cloudrc.link.verify.causes import (
+    Evidence,
+    Findings,
+    Samples,
+    find_causes,
+    of_metrics,
+    of_told,
+    samples,
+    shaper_of,
+)
+from cloudrc.link.verify.judge import Row, kbit
+from cloudrc.link.verify.monitor import TAKES
+from cloudrc.link.verify.standing import PERIOD, rate_in_force, shown
 from cloudrc.tunnel.codec import SIZES, Kind
 
 END_PORT, LINK_PORT = METRICS["world"]["world"], METRICS["world"]["link"]

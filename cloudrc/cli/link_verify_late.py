@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Protocol, Self
 
-from cloudrc.link.verify_causes import Evidence
-from cloudrc.link.verify_evidence import of_metrics, samples
+from cloudrc.link.verify.causes import Evidence, of_metrics, samples
 
 PERIOD = 4.0
 """Between two questions [s]; each answer is of the ten seconds before."""

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping
 from math import isfinite
 
 from cloudrc.cli.link_verify_text import NAMES, NOT_JUDGED
-from cloudrc.link.verify_causes import Findings
-from cloudrc.link.verify_ends import PERIOD
-from cloudrc.link.verify_expect import DEVIATION_FLOOR, JITTER_SHARES, has_jitter
-from cloudrc.link.verify_plan import LONGEST, Plan
-from cloudrc.link.verify_rate import SIZE, Trains
+from cloudrc.link.verify.causes import Findings
+from cloudrc.link.verify.expect import DEVIATION_FLOOR, JITTER_SHARES, has_jitter
+from cloudrc.link.verify.judge import SIZE, Trains
+from cloudrc.link.verify.plan import LONGEST, Plan
+from cloudrc.link.verify.standing import PERIOD
 
 
 def shaper_in_words(findings: Mapping[str, Findings]) -> str:

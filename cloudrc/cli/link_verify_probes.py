@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from cloudrc.link.verify_rate import SIZE
+from cloudrc.link.verify.judge import SIZE
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import HEADER_SIZE, Direction
 

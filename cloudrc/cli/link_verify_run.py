@@ -23,16 +23,20 @@ from cloudrc.config import document
 from cloudrc.config.load import dump
 from cloudrc.config.schema import Profile
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.drivers.sounder import Shore, Volley, sound
-from cloudrc.link.verify_causes import Evidence, Findings, find_causes
-from cloudrc.link.verify_estimate import frame_of
-from cloudrc.link.verify_evidence import of_metrics, samples, with_near
-from cloudrc.link.verify_expect import as_sent, has_jitter
-from cloudrc.link.verify_judge import judge
-from cloudrc.link.verify_measure import measure
-from cloudrc.link.verify_netem import netem_makes
-from cloudrc.link.verify_plan import Plan, make_plan
-from cloudrc.link.verify_rate import SIZE, Trains, plan_trains, spans
+from cloudrc.link.verify.causes import (
+    Evidence,
+    Findings,
+    find_causes,
+    of_metrics,
+    samples,
+    with_near,
+)
+from cloudrc.link.verify.expect import as_sent, has_jitter, netem_makes
+from cloudrc.link.verify.judge import SIZE, Trains, judge, plan_trains, spans
+from cloudrc.link.verify.measure import measure
+from cloudrc.link.verify.plan import Plan, make_plan
+from cloudrc.link.verify.probe import Shore, Volley, sound
+from cloudrc.link.verify.reference import frame_of
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
 

@@ -8,8 +8,8 @@ from math import inf, isfinite, isnan
 from typing import Any
 
 from cloudrc.cli.output import harmless, paint, table
-from cloudrc.link.verify_causes import Cause, Findings
-from cloudrc.link.verify_judge import Row
+from cloudrc.link.verify.causes import Cause, Findings
+from cloudrc.link.verify.judge import Row
 
 COLOURS = {"ok": "green", "off": "red", "open": "yellow"}
 NAMES = {

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.drivers.keyfile import KeyFile
     from cloudrc.drivers.realtime import Peer
-    from cloudrc.drivers.standing_check import StandingCheck
     from cloudrc.endpoint import Endpoint
     from cloudrc.link.profile import DirectionProfile
+    from cloudrc.link.verify.monitor import StandingCheck
     from cloudrc.record.recorder import Recorder
     from cloudrc.records import Record
 
@@ -184,9 +184,9 @@ def _standing_check(
 
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
-    from cloudrc.drivers.standing_check import StandingCheck
-    from cloudrc.link.trace import SIZE_MAX
-    from cloudrc.link.verify_twin import Stream
+    from cloudrc.link.traces import SIZE_MAX
+    from cloudrc.link.verify.monitor import StandingCheck
+    from cloudrc.link.verify.twin import Stream
     from cloudrc.tunnel.codec import SIZES, Kind
 
     def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:

@@ -59,8 +59,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.feed import Feed
     from cloudrc.drivers.process import StopSignal
-    from cloudrc.link.relay import Relay
-    from cloudrc.link.relay_priority import settle
+    from cloudrc.link.relay import Relay, settle
     from cloudrc.tunnel.codec import peek
 
     stop, exporter = StopSignal(), open_exporter(options, "link")
@@ -121,7 +120,7 @@ def _side(flag: str, listen: tuple[str, int]) -> socket.socket:
 
 def _run_first() -> None:
     """Ask for SCHED_FIFO, and say what came of it."""
-    from cloudrc.link.relay_priority import ask_for_fifo
+    from cloudrc.link.relay import ask_for_fifo
 
     refused = ask_for_fifo()
     said = f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO"

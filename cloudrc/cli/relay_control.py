@@ -22,10 +22,9 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.link_run import loader
 from cloudrc.cli.output import say
+from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.route import publish
-from cloudrc.link.sidecar_follow import PROFILE_PERIOD, Loaded, ProfileFile
-from cloudrc.link.state import RELEASED_SUFFIX, LinkState, summary, to_text
+from cloudrc.link.state import RELEASED_SUFFIX, LinkState, publish, summary, to_text
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment

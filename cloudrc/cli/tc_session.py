@@ -13,7 +13,7 @@ import subprocess
 import time
 from collections.abc import Mapping, Sequence
 
-from cloudrc.link.netem_tc import Answer
+from cloudrc.link.tc import Answer
 
 PATIENCE = 5.0
 """How long tc and ip may take [s]."""

@@ -75,7 +75,7 @@ def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> Se
 
     from cloudrc import assembly
     from cloudrc.geometry.scene import load_scene
-    from cloudrc.link.route import publish
+    from cloudrc.link.state import publish
     from cloudrc.teleop.api import Surroundings, create_app
     from cloudrc.teleop.auth import Audit, Tokens
     from cloudrc.teleop.bridge import Bridge

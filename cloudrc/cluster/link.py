@@ -38,7 +38,7 @@ from cloudrc.config import document as yaml_text
 from cloudrc.config.edit import DIRECTIONS, TIME_LINES, Edit, edit
 from cloudrc.config.load import FILES
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.link.sidecar_handed import HANDED_FILE, Handed, write_handed
+from cloudrc.link.follow import HANDED_FILE, Handed, write_handed
 from cloudrc.link.state import CHANGE_FILE, STATE_FILE, Change, LinkState, from_text, read_change
 
 PROFILE = "profile.yaml"

@@ -42,7 +42,7 @@ from cloudrc.config.schema import (
 )
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
-from cloudrc.link.trace import read_table, read_trace
+from cloudrc.link.traces import read_table, read_trace
 
 COMMAND_AGE_MAX_MS = 250.0
 """Default where neither the experiment nor the profile says [ms].

@@ -24,7 +24,7 @@ from cloudrc.records import Counted, Fault, Record
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.drivers.standing_check import StandingCheck
+    from cloudrc.link.verify.monitor import StandingCheck
 
 
 PARENT = "CLOUDRC_PARENT"

@@ -10,7 +10,7 @@ from cloudrc.faults import asks, meters
 from cloudrc.faults.family_link import instant
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario, generator
-from cloudrc.link.sidecar_follow import PEER_PAUSE, PeerName
+from cloudrc.link.follow import PEER_PAUSE, PeerName
 from cloudrc.records import Counted, Record
 
 

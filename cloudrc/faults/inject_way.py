@@ -15,7 +15,7 @@ from cloudrc.faults.flight import Flight
 from cloudrc.faults.mortal import Mortal, Tamper
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Event, Schedule
-from cloudrc.link.sidecar_follow import PEER_PAUSE, PeerName
+from cloudrc.link.follow import PEER_PAUSE, PeerName
 
 CAPTURED = 2_000
 """Datagrams that an intruder keeps."""

@@ -9,25 +9,265 @@ which keeps what is queued, and removed by `close`. A root qdisc of somebody els
 What others do to ours is seen within a second (its filter within ten), put back, logged, counted.
 
 Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8).
+
+What is in force, as the kernel tells it: tc's words and its listing go in, differences come out.
+
+tc and the kernel clamp numbers without a word: a rate below 1 byte/s becomes none, a chance below
+2**-32 becomes 0, a number of 32 bits wraps. What they made of ours is read back and compared.
+
+Source: iproute2 tc/q_netem.c, netem_print_opt.
+
+Whether netem is still as it was set up: listings of tc go in, what is wrong comes out.
+
+Other hands reach a pod's interface, too: a person, a network plug-in, another tool. A link that is
+not what was asked for and does not say so is worse than none.
+
+How well a time line is followed: instants go in, counts and a line for people come out.
 """
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from math import ceil
 from pathlib import Path
 from typing import Any
 
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
-from cloudrc.link.netem_check import differences
-from cloudrc.link.netem_keep import BAND, LEAF, ROOT, Kept, counters, damage, is_ours
-from cloudrc.link.netem_steps import Steps, pause_ns
-from cloudrc.link.netem_tables import write_measured
-from cloudrc.link.netem_tc import Iproute2, Run
-from cloudrc.link.netem_text import check, limit, options
-from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay_lane import Address
-from cloudrc.link.timeline import Timeline
+from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.relay import Address
+from cloudrc.link.tc import STEP_NS, Iproute2, Run, check, limit, options, write_measured
+
+_TIME = re.compile(r"(?P<value>[\d.]+)us")
+_RELATIVE = 1e-3
+"""Rounding that nobody notices, as a share of the number."""
+_TICK = 64e-9
+"""Of tc's clock [s]."""
+_CHANCE = 2.0**-30
+"""A few steps of a chance of 32 bits, which is cut into percents with 9 digits."""
+
+# Option of tc -> the object and the keys in its listing; what is not listed is 0.
+_LISTED = {
+    "limit": ("", ("limit",)),
+    "delay": ("delay", ("delay", "jitter", "correlation")),
+    "random": ("loss-random", ("loss",)),
+    "gemodel": ("loss-gemodel", ("p", "r", "1-h", "1-k")),
+    "duplicate": ("duplicate", ("duplicate",)),
+    "corrupt": ("corrupt", ("corrupt",)),
+    "reorder": ("reorder", ("reorder",)),
+    "rate": ("rate", ("rate",)),
+}
+
+
+def differences(words: Sequence[str], listed: Mapping[str, Any]) -> list[str]:
+    """Compare what tc was asked for with what it says is in force.
+
+    Args:
+        words: As `netem_text.options` gives them.
+        listed: "options" of the qdisc, as `tc -j qdisc show` prints them.
+
+    Returns:
+        One text per number that is not what was asked: "rate: asked 0.5, in force 0".
+    """
+    found = []
+    for option, keys, asked in _asked(words):
+        inside = listed if not keys[0] else listed.get(keys[0], {})
+        for key, value in zip(keys[1], asked, strict=False):
+            shown = float(inside.get(key, 0.0))
+            near = abs(shown - value) <= max(_slack(option), _RELATIVE * abs(value))
+            if not near or (value and not shown):
+                name = key if len(keys[1]) == 1 else f"{option} {key}"
+                found.append(f"{name}: asked {value:g}, in force {shown:g}")
+    return found
+
+
+def _asked(words: Sequence[str]) -> Iterator[tuple[str, tuple[str, tuple[str, ...]], list[float]]]:
+    """Take tc's words apart: each option with where it is listed and its numbers in SI."""
+    option, numbers = "", list[float]()
+    for word in [*words, "end"]:
+        if word in _LISTED or word in ("loss", "distribution", "end"):
+            if option:
+                yield option, _LISTED[option], numbers
+            option, numbers = word if word in _LISTED else "", []
+        elif option:
+            numbers.append(_number(word))
+
+
+def _number(word: str) -> float:
+    """Read a number of tc's: times in [s], chances in [0, 1], rates in [byte/s], others as is."""
+    if match := _TIME.fullmatch(word):
+        return float(match["value"]) * 1e-6
+    if word.endswith("%"):
+        return float(word[:-1]) * 1e-2
+    for unit, scale in (("gbit", 1.25e8), ("bit", 0.125)):
+        if word.endswith(unit):
+            return float(word.removesuffix(unit)) * scale
+    return float(word)
+
+
+def _slack(option: str) -> float:
+    if option in ("limit", "rate"):
+        return 0.0
+    return 2 * _TICK if option == "delay" else _CHANCE
+
+
+ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
+"""Handles of the classful root, of its band for the tunnel's flow, and of the netem there."""
+PERIOD_NS = 1_000_000_000
+"""Between two looks at the qdiscs [ns]."""
+FILTER_LOOKS = 10
+"""Every so many looks the filter is looked at, too, which takes a process of its own."""
+
+
+def is_ours(qdiscs: Sequence[dict[str, Any]]) -> bool:
+    """Say whether the root of an interface is what `Netem` puts there."""
+    return any(
+        one.get("root") and one.get("handle") == ROOT and one.get("kind") == "prio"
+        for one in qdiscs
+    )
+
+
+def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
+    """Read what netem has counted from the objects of `tc -s -j qdisc show`.
+
+    Returns:
+        `forwarded`: sent on, copies included; `lost`: dropped, whether by chance or because the
+        queue was full; `held`: queued now. Empty if there is no such qdisc.
+    """
+    for one in qdiscs:
+        if one.get("handle") == LEAF and one.get("kind") == "netem":
+            return {"forwarded": one["packets"], "lost": one["drops"], "held": one["qlen"]}
+    return {}
+
+
+def damage(qdiscs: Sequence[dict[str, Any]], applied: Sequence[str]) -> str:
+    """Say in words what somebody has done to the qdiscs.
+
+    Args:
+        qdiscs: Of the interface.
+        applied: Words that netem was given last.
+
+    Returns:
+        "" if nothing.
+    """
+    leaf = next((one for one in qdiscs if one.get("handle") == LEAF), None)
+    if not is_ours(qdiscs) or leaf is None or leaf.get("kind") != "netem":
+        return "was removed"
+    found = differences(applied, leaf.get("options", {}))
+    return f"was changed ({'; '.join(found)})" if found else ""
+
+
+class Kept:
+    """What has been put back, and what the qdiscs before had counted.
+
+    Attributes:
+        restored: How often something was put back.
+    """
+
+    def __init__(self, log: Callable[[str], None]) -> None:
+        self.restored = 0
+        self._log, self._said = log, ""
+        self._looked_ns, self._looks = -PERIOD_NS, 0
+        self._now: dict[str, int] = {}
+        self._before: dict[str, int] = {}
+
+    def due(self, now_ns: int) -> bool:
+        """Say whether it is time for a look [ns]."""
+        return now_ns - self._looked_ns >= PERIOD_NS
+
+    def looks(self, now_ns: int) -> bool:
+        """Note that it is looked now [ns]; True if the filter's turn has come, too."""
+        self._looked_ns = now_ns
+        self._looks += 1
+        return self._looks % FILTER_LOOKS == 0
+
+    def counted(self, counts: dict[str, int]) -> dict[str, int]:
+        """Add what qdiscs before have counted; a new one begins at 0."""
+        if not counts or counts["forwarded"] < self._now.get("forwarded", 0):
+            for name in ("forwarded", "lost"):
+                self._before[name] = self._before.get(name, 0) + self._now.get(name, 0)
+        self._now = counts
+        totals = counts or dict.fromkeys(self._before, 0)
+        return {name: n + self._before.get(name, 0) for name, n in totals.items()}
+
+    def put_back(self, what: str) -> None:
+        """Note that it was put back after somebody has done `what`; log it."""
+        self.restored += 1
+        self._said = ""
+        self._log(f"{what} by another hand, and put back ({self.restored} times so far)")
+
+    def cannot(self, what: str, why: str) -> None:
+        """Note that it cannot be put back; log it unless that was the last thing that was said."""
+        line = f"{what} by another hand, and cannot be put back: {why}"
+        if line != self._said:
+            self._said = line
+            self._log(line)
+
+
+LATE_NS = 20_000_000
+"""A step that is later than this is counted as late [ns]: two periods of the loop."""
+_KEPT = 10_000
+
+
+class Steps:
+    """Counts the steps of a qdisc.
+
+    Attributes:
+        applied: Steps that were put into force.
+        late: Those of them that were later than `LATE_NS`.
+        passed_over: Steps of the time line that were over before their turn came.
+    """
+
+    def __init__(self) -> None:
+        self.applied = self.late = self.passed_over = 0
+        self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
+
+    def note(self, lateness_ns: int, passed_over: int) -> None:
+        """Note a step.
+
+        Args:
+            lateness_ns: From when it was due until tc said that it is in force [ns].
+            passed_over: Steps between the one before and this one.
+        """
+        self.applied += 1
+        self.late += lateness_ns > LATE_NS
+        self.passed_over += passed_over
+        self._lateness_ns.append(lateness_ns)
+
+    def lateness_ns(self) -> tuple[int, int]:
+        """Give median and 99th percentile of the last 10,000 latenesses [ns]; 0 without any."""
+        ordered = sorted(self._lateness_ns) or [0]
+        return ordered[(len(ordered) - 1) // 2], ordered[ceil(0.99 * (len(ordered) - 1))]
+
+    def counts(self) -> dict[str, int]:
+        """Say how many steps there were and how late they were; empty before the first."""
+        if not self.applied:
+            return {}
+        median_ns, worst_ns = self.lateness_ns()
+        return {
+            "steps": self.applied,
+            "steps_late": self.late,
+            "steps_passed_over": self.passed_over,
+            "step_lateness_p50_ns": median_ns,
+            "step_lateness_p99_ns": worst_ns,
+        }
+
+    def in_words(self) -> str:
+        """Say how it went."""
+        median, worst = (late_ns * 1e-6 for late_ns in self.lateness_ns())
+        over = f", {self.passed_over} passed over" if self.passed_over else ""
+        return (
+            f"{self.applied} steps of the time line, late by {median:.2f} ms in the median and "
+            f"{worst:.2f} ms at the 99th percentile, {self.late} above {LATE_NS * 1e-6:g} ms{over}"
+        )
+
+
+def pause_ns(due_ns: int, stepped_ns: int) -> int:
+    """Say when the step due at `due_ns` may be taken after one at `stepped_ns` [ns]."""
+    return max(due_ns, stepped_ns + STEP_NS)
+
 
 # The kernel's own default for three bands: nothing falls into the fourth by its type of service.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()

@@ -2,6 +2,12 @@
 
 Peer and profile come from other threads, which leave them here; the shaper is touched by the one
 thread that is in `run` and by no other.
+
+What a pod's sidecar asks of whatever shapes the pod's egress: relay or netem.
+
+What a link's process tells whoever judges it: who shapes, what is in force, whose netem is near.
+
+It is found out when somebody asks (/link.json of the metrics' port): tc and ip are started for it.
 """
 
 from __future__ import annotations
@@ -11,17 +17,132 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol, TypeAlias
+from typing import Any, Literal, Protocol, TypeAlias
+
+from pydantic import TypeAdapter
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
-from cloudrc.link.netem_text import check, notes
-from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay_lane import Address
-from cloudrc.link.route import publish, publish_route, withdraw
-from cloudrc.link.shaper import Shaper
-from cloudrc.link.sidecar_follow import Loaded
-from cloudrc.link.sidecar_told import Told, in_force_now
-from cloudrc.link.state import RELEASED_SUFFIX, Change, LinkState, summary, to_text
+from cloudrc.link.follow import Loaded
+from cloudrc.link.profile import DirectionProfile, Timeline, settled
+from cloudrc.link.relay import Address
+from cloudrc.link.state import (
+    RELEASED_SUFFIX,
+    Change,
+    LinkState,
+    publish,
+    publish_route,
+    summary,
+    to_text,
+    withdraw,
+)
+from cloudrc.link.tc import Iproute2, Run, check, notes
+
+
+class Shaper(Protocol):
+    """Shapes what one pod's tunnel end sends to the other's."""
+
+    @property
+    def name(self) -> str:
+        """As in `link.mode`: "relay" or "netem"."""
+        ...
+
+    def follow_peer(self, peer: Address) -> Address:
+        """Shape what goes to this peer from now on.
+
+        Returns:
+            The route: where this pod's tunnel end has to send.
+
+        Raises:
+            CloudrcError: If it cannot.
+        """
+        ...
+
+    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+        """Shape by this profile from now on; what is in flight is not lost.
+
+        Args:
+            profile: Conditions.
+            restart: Whether their time line counts from now; else from when the old one did.
+
+        Raises:
+            CloudrcError: If it cannot; then the old profile stays in force.
+        """
+        ...
+
+    def step(self, timeout: float) -> None:
+        """Work or wait, at most about `timeout` [s]."""
+        ...
+
+    def counts(self) -> dict[str, int]:
+        """Say how many datagrams met which outcome so far."""
+        ...
+
+    def released(self) -> dict[str, int]:
+        """Say how late datagrams left since the beginning; empty if that is not known here."""
+        ...
+
+    def close(self) -> None:
+        """Stop shaping and leave nothing behind."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """The netem qdiscs of a network namespace, whoever put them there.
+
+    Attributes:
+        interface: Over which the tunnel's flow leaves.
+        netems: By interface: objects of `tc -s -j qdisc show`; only where there are any.
+    """
+
+    interface: str
+    netems: dict[str, list[dict[str, Any]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What a link's process says of the direction that it shapes.
+
+    Attributes:
+        shaper: "relay" or "netem".
+        why: Why this one, in words.
+        applied: What it was told to put in force and has; None while a time line runs.
+        near: What the kernel says; None where that cannot be asked.
+    """
+
+    shaper: str
+    why: str
+    applied: DirectionProfile | None
+    near: Near | None = None
+
+
+def look_near(run: Run, host: str) -> Near | None:
+    """Ask the kernel for its netems, and for the way to a host; None if it cannot be asked."""
+    iproute2, netems = Iproute2(run), dict[str, list[dict[str, Any]]]()
+    try:
+        interface = iproute2.device(host)
+        for one in iproute2.show("qdisc", "show"):
+            if one.get("kind") == "netem":
+                netems.setdefault(str(one["dev"]), []).append(one)
+    except (CloudrcError, ValueError, LookupError):
+        return None
+    return Near(interface, netems)
+
+
+def in_force_now(profile: DirectionProfile, elapsed_ns: int) -> DirectionProfile | None:
+    """Say what holds so long [ns] after the link came up, if it holds for ever; else None."""
+    return settled(profile) if elapsed_ns >= Timeline(profile).starts_ns[-1] else None
+
+
+def write_told(told: Told) -> str:
+    """Write it as JSON."""
+    return TypeAdapter(Told).dump_json(told, indent=2).decode() + "\n"
+
+
+def read_told(text: str) -> Told:
+    """Read it; raises a ValueError if it is something else."""
+    return TypeAdapter(Told).validate_json(text)
+
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]

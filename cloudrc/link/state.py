@@ -2,16 +2,19 @@
 
 The tunnel's end of the same machine follows it and records changes; `cloudrc link set` reads from
 it that a change has taken force; reports show it.
+
+Files of the shared folder that others read while they are written: whole, or not there.
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
-from cloudrc.link.profile import DirectionProfile, mean_loss
-from cloudrc.link.timeline import Timeline
+from cloudrc.files import put
+from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
 STATE_FILE = "link.json"
 """Name of the file, beside the route."""
@@ -117,3 +120,23 @@ def summary(profile: DirectionProfile) -> dict[str, float | None]:
     loss = 1.0 if first.blackout else mean_loss(first.loss)
     delay = round(first.delay_ns * 1e-9, 9)
     return {"delay": delay, "jitter": first.jitter, "loss": loss, "rate": first.rate}
+
+
+def publish(path: Path, text: str) -> None:
+    """Write a file in one step, as far as its readers can see.
+
+    Args:
+        path: The file; its folder exists.
+        text: What stands in it from now on.
+    """
+    put(path, text.encode("utf-8"))
+
+
+def publish_route(path: Path, route: tuple[str, int]) -> None:
+    """Tell this pod's tunnel end where it has to send: one line HOST:PORT."""
+    publish(path, f"{route[0]}:{route[1]}\n")
+
+
+def withdraw(path: Path) -> None:
+    """Remove a file, if it is there."""
+    path.unlink(missing_ok=True)

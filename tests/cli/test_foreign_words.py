@@ -14,8 +14,8 @@ from cloudrc.cli.link_verify_text import Said, as_text
 from cloudrc.cli.live import FlightView
 from cloudrc.cli.main import main
 from cloudrc.cli.output import say, table
-from cloudrc.link.verify_causes import Cause, Evidence, Findings
-from cloudrc.link.verify_judge import Row
+from cloudrc.link.verify.causes import Cause, Evidence, Findings
+from cloudrc.link.verify.judge import Row
 from cloudrc.record.writer import MISSING, McapWriter
 from cloudrc.records import Fault
 from tests.record.samples import world_records

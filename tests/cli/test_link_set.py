@@ -16,9 +16,9 @@ from cloudrc.config.document import Document
 from cloudrc.config.edit import edit
 from cloudrc.drivers import flights
 from cloudrc.errors import BadInputError
+from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.sidecar_follow import Loaded
 from cloudrc.link.state import LinkState
 
 TIMED = {

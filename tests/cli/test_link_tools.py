@@ -15,7 +15,7 @@ from cloudrc.cli.link_verify import find
 from cloudrc.cli.main import main
 from cloudrc.cli.relay import show_asked
 from cloudrc.config.load import load_experiment
-from cloudrc.link.trace import read_table, read_trace
+from cloudrc.link.traces import read_table, read_trace
 from tests.record.samples import world_records, write
 
 PING = "\n".join(

@@ -19,7 +19,7 @@ from cloudrc.cli.link_verify_text import as_text
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.errors import TimedOutError
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.sidecar_told import Near, Told, write_told
+from cloudrc.link.sidecar import Near, Told, write_told
 from cloudrc.records import Counted, LinkChecked
 
 SENT_PER_LOOK = 2000

@@ -9,8 +9,8 @@ import pytest
 
 from cloudrc.cli import opened
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers.standing_check import Asked, Load, StandingCheck
 from cloudrc.errors import BadInputError
+from cloudrc.link.verify.monitor import Asked, Load, StandingCheck
 
 
 @pytest.fixture

@@ -11,8 +11,7 @@ from link_pods import PROFILE, TRACE, Cluster
 
 from cloudrc.cli.link_run import loader
 from cloudrc.cli.main import main
-from cloudrc.link.sidecar_follow import ProfileFile
-from cloudrc.link.sidecar_handed import HANDED_FILE, HandedProfile, Profiles
+from cloudrc.link.follow import HANDED_FILE, HandedProfile, ProfileFile, Profiles
 
 
 def set_link(*words: str) -> int:

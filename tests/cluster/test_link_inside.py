@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cluster.link import INSIDE, PATIENCE
-from cloudrc.link.route import publish
-from cloudrc.link.sidecar_handed import HANDED_FILE, Handed, read_handed, write_handed
-from cloudrc.link.state import STATE_FILE, LinkState, to_text
+from cloudrc.link.follow import HANDED_FILE, Handed, read_handed, write_handed
+from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
 
 NOTE = json.dumps({"number": "b2", "cause": "zwölf", "restart": False})
 TRACE = "time_s,delay_ms\n" + "0,40\n" * 20_000

@@ -8,10 +8,10 @@ from virtual_netem import VirtualNetem
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
-from cloudrc.drivers.standing_check import StandingCheck
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.verify_twin import Stream
+from cloudrc.link.verify.monitor import StandingCheck
+from cloudrc.link.verify.twin import Stream
 from cloudrc.records import Arrival, Fault, Lateness, LinkChecked, Record
 
 PERIOD_NS = 10_000_000

@@ -24,8 +24,8 @@ from cloudrc.exposition.table import (
     Kind,
     of_role,
 )
-from cloudrc.link.netem_steps import Steps
-from cloudrc.link.relay_errors import Recent, ReleaseErrors
+from cloudrc.link.lateness import Recent, ReleaseErrors
+from cloudrc.link.netem import Steps
 from cloudrc.messages import ZERO
 from cloudrc.records import (
     Contact,

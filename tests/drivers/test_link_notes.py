@@ -13,9 +13,8 @@ import pytest
 
 from cloudrc.drivers.feed import Feed, in_words
 from cloudrc.drivers.link_notes import LinkNotes
-from cloudrc.link.relay_errors import ReleaseErrors, in_ns
-from cloudrc.link.route import publish
-from cloudrc.link.state import STATE_MAX, LinkState, to_text
+from cloudrc.link.lateness import ReleaseErrors, in_ns
+from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
 from cloudrc.messages import GuardState
 from cloudrc.records import Counted, GuardChange, LinkChanged, Record, SessionOpened
 

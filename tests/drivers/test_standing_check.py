@@ -23,13 +23,11 @@ from standing_flights import (
     newest,
 )
 
-from cloudrc.drivers.standing_basis import Basis
-from cloudrc.drivers.standing_check import StandingCheck
-from cloudrc.drivers.standing_tally import Tally
 from cloudrc.exposition.ends import Check
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import STATE_MAX
-from cloudrc.link.verify_twin import WINDOW, Heard, Twin
+from cloudrc.link.verify.monitor import Basis, StandingCheck, Tally
+from cloudrc.link.verify.twin import WINDOW, Heard, Twin
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
 FAULTS = {

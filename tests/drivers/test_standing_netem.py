@@ -11,10 +11,10 @@ from virtual_netem import can
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
-from cloudrc.drivers.standing_basis import Basis
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.verify_block import Block
-from cloudrc.link.verify_twin import Stream
+from cloudrc.link.verify.measure import Block
+from cloudrc.link.verify.monitor import Basis
+from cloudrc.link.verify.twin import Stream
 
 WAYS = ("uplink", "downlink")
 SECONDS = {

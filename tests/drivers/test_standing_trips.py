@@ -21,12 +21,11 @@ from standing_flights import (
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
-from cloudrc.drivers.standing_check import StandingCheck
 from cloudrc.exposition.ends import Check
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.verify_standing import WINDOW_MAX
-from cloudrc.link.verify_trips import TICK
-from cloudrc.link.verify_twin import Stream
+from cloudrc.link.verify.monitor import StandingCheck
+from cloudrc.link.verify.standing import TICK, WINDOW_MAX
+from cloudrc.link.verify.twin import Stream
 from cloudrc.records import Arrival, Control, Lateness, LinkChecked, Record
 from cloudrc.world.scene import TIMESTEP
 

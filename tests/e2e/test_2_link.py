@@ -34,7 +34,7 @@ from kube import (
 )
 
 from cloudrc.cluster.link import PROFILE, Place, hand_over
-from cloudrc.link.sidecar_handed import Handed
+from cloudrc.link.follow import Handed
 
 SET_WITHIN = 1.0
 """For `link set` to be in force, from its start [s]: the quickest of three, on a machine that has a

@@ -15,7 +15,7 @@ from cloudrc.faults import meters
 from cloudrc.faults.catalogue import find
 from cloudrc.faults.mortal import Mortal
 from cloudrc.faults.watch import Watch
-from cloudrc.link.sidecar_follow import PeerName
+from cloudrc.link.follow import PeerName
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Contact, Counted, Fault

@@ -20,7 +20,7 @@ from cloudrc.faults.remains import KILLED
 from cloudrc.faults.schedule import KINDS, STALLS, Event, Schedule, dump, load
 from cloudrc.faults.shrink import shrink
 from cloudrc.faults.walls import Wall
-from cloudrc.link.sidecar_follow import PeerName
+from cloudrc.link.follow import PeerName
 from cloudrc.messages import GuardState
 from cloudrc.record.recover import Recovery, recover
 from cloudrc.teleop.bridge import WAITING_MAX

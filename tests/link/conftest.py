@@ -10,8 +10,8 @@ import pytest
 
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.netem import Netem
-from cloudrc.link.netem_tables import write_tables
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.tc import write_tables
 
 
 @pytest.fixture(scope="module")

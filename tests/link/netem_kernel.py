@@ -6,8 +6,8 @@ import json
 from collections.abc import Sequence
 
 from cloudrc.link.netem import Netem
-from cloudrc.link.netem_tc import Answer
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.tc import Answer
 
 PEER = ("10.244.0.7", 7400)
 UNKNOWN = Answer(2, "", "Error: Specified qdisc kind is unknown.\n")

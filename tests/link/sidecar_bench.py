@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
+from cloudrc.link.follow import Loaded
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Machine, Mode, Settings, Sidecar
-from cloudrc.link.sidecar_follow import Loaded
 from cloudrc.link.state import Change
 
 PEER = ("10.244.0.7", 7400)

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from cloudrc.link.draws import stream_key
-from cloudrc.link.fates import bit_flips
+from cloudrc.link.draws import bit_flips, stream_key
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.trace import parse_trace, read_table, read_trace
+from cloudrc.link.traces import parse_trace, read_table, read_trace
 
 
 def test_a_trace_is_read_into_si(tmp_path: Path) -> None:

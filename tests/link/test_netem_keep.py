@@ -8,10 +8,9 @@ import pytest
 from netem_kernel import PEER, Clock, Kernel
 
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.link.netem import Netem
-from cloudrc.link.netem_keep import FILTER_LOOKS
-from cloudrc.link.netem_tc import Answer
+from cloudrc.link.netem import FILTER_LOOKS, Netem
 from cloudrc.link.profile import Change, DirectionProfile
+from cloudrc.link.tc import Answer
 
 PROFILE = DirectionProfile(0.04, loss=0.1)
 

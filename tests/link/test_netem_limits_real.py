@@ -11,8 +11,8 @@ from netem_laboratory import WITHIN, Flow, measure, told
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.netem import Netem
-from cloudrc.link.netem_tc import try_netem
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.tc import try_netem
 
 pytestmark = pytest.mark.netem
 

@@ -22,12 +22,10 @@ from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.link.model import LinkDirection
+from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers
 from cloudrc.link.netem import Netem
-from cloudrc.link.netem_tables import STRETCH, table
-from cloudrc.link.netem_text import check
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
-from cloudrc.link.trace_sample import Numbers, Stream, numbers
+from cloudrc.link.tc import STRETCH, check, table
 from cloudrc.tunnel.codec import Kind
 
 SHAPED = [name for name in names("profile") if name != "lossy"]

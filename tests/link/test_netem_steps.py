@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from netem_kernel import PEER, Clock, Kernel, netem
 
-from cloudrc.link.netem_steps import Steps
+from cloudrc.link.netem import Steps
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, Trace
 
 

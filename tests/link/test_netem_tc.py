@@ -8,10 +8,9 @@ import pytest
 from netem_kernel import PEER, Clock, Kernel, netem
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.link.netem_keep import counters
-from cloudrc.link.netem_tc import Answer, explain, may_shape, try_netem
-from cloudrc.link.netem_text import limit
+from cloudrc.link.netem import counters
 from cloudrc.link.profile import Change, DirectionProfile, Trace
+from cloudrc.link.tc import Answer, explain, limit, may_shape, try_netem
 
 
 def test_only_the_tunnels_flow_to_the_peer_is_sent_to_netem() -> None:

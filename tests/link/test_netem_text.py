@@ -12,20 +12,21 @@ from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError
-from cloudrc.link.draws import Purpose, stream_key
-from cloudrc.link.fates import shape
-from cloudrc.link.netem_tables import (
+from cloudrc.link.draws import Purpose, shape, stream_key
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Timeline, Trace
+from cloudrc.link.tc import (
     ENTRIES,
     STRETCH,
+    check,
     distribution_name,
+    limit,
+    notes,
+    options,
     stretch,
     table,
     write_measured,
     write_tables,
 )
-from cloudrc.link.netem_text import check, limit, notes, options
-from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
-from cloudrc.link.timeline import Timeline
 
 
 def text(profile: DirectionProfile, at: float = 0.0) -> str:

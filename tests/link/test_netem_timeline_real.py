@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from netem_laboratory import WITHIN, Flow, least, told
 
-from cloudrc.link.netem_steps import LATE_NS, Steps
+from cloudrc.link.netem import LATE_NS, Steps
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, Trace
 
 LATE = 0.1

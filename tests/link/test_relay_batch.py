@@ -10,9 +10,15 @@ from collections.abc import Iterator
 import pytest
 
 from cloudrc.link.relay import bind_loopback
-from cloudrc.link.relay_batch import Receiver, Sender, available
-from cloudrc.link.relay_stamps import ask_for_stamps
-from cloudrc.link.relay_wait import SelectWait, TimerWait, best_wait
+from cloudrc.link.relay_io import (
+    Receiver,
+    SelectWait,
+    Sender,
+    TimerWait,
+    ask_for_stamps,
+    available,
+    best_wait,
+)
 
 pytestmark = pytest.mark.skipif(not available(), reason="Linux on 64-bit machines only")
 Pair = tuple[socket.socket, socket.socket]

@@ -6,19 +6,21 @@ import numpy as np
 import pytest
 
 from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
-from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay import bind_loopback
-from cloudrc.link.relay_errors import QUANTILES, Recent, ReleaseErrors, in_ns
-from cloudrc.link.relay_lane import Lane, Side
-from cloudrc.link.relay_lead import (
+from cloudrc.link.lateness import (
     FIRST_LEAD_MAX_NS,
     FIRST_SHARE_MAX,
     LEAD_MAX_NS,
+    QUANTILES,
     SHARE_MAX,
     Lead,
+    Recent,
+    ReleaseErrors,
+    in_ns,
 )
-from cloudrc.link.relay_stamps import AGE_MAX_NS, Stamps, instant_ns
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.relay import Lane, Side, bind_loopback
+from cloudrc.link.relay_io import AGE_MAX_NS, Stamps, instant_ns
 
 MS, SECOND = 1_000_000, 1_000_000_000
 MOST_NS = {False: LEAD_MAX_NS, True: FIRST_LEAD_MAX_NS}

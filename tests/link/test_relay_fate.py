@@ -15,7 +15,7 @@ from link_flows import SIZE
 
 from cloudrc.config.shipped import names
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.trace_packets import write_trace
+from cloudrc.link.traces import write_trace
 from cloudrc.tunnel.codec import Kind
 from tools.bench_link.anchors import fifo_allowed
 from tools.bench_link.flow import EPOCH, Flow, run_flow

@@ -9,8 +9,7 @@ import pytest
 
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay import Relay, bind_loopback
-from cloudrc.link.relay_lane import Lane, Side
+from cloudrc.link.relay import Lane, Relay, Side, bind_loopback
 from cloudrc.tunnel.codec import Kind, encode_header, peek
 from tools.bench_link.overload import measure_overload
 

@@ -9,8 +9,8 @@ import threading
 
 import pytest
 
-from cloudrc.link.relay_priority import ask_for_fifo, runs_first
-from cloudrc.link.relay_wait import tighten_slack
+from cloudrc.link.relay import ask_for_fifo, runs_first
+from cloudrc.link.relay_io import tighten_slack
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="Linux alone has it")
 GET_TIMERSLACK = 30

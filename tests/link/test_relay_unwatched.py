@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cloudrc.link import relay_lanes
-from cloudrc.link.fates import reach
+from cloudrc.link import relay
+from cloudrc.link.draws import reach
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, Trace
-from cloudrc.link.relay_lanes import Lanes
+from cloudrc.link.relay import Lanes
 
 MS, SECOND = 1_000_000, 1_000_000_000
 
@@ -79,8 +79,8 @@ class Wait:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr(relay_lanes, "monotonic_ns", made.monotonic_ns)
-    monkeypatch.setattr(relay_lanes, "sleep", made.sleep)
+    monkeypatch.setattr(relay, "monotonic_ns", made.monotonic_ns)
+    monkeypatch.setattr(relay, "sleep", made.sleep)
     return made
 
 
@@ -93,7 +93,7 @@ def forward(
     delays = rng.integers(least, most + 1, count).tolist()
     lane = Lane(clock, arrivals, delays, least)
     wait = Wait(clock, lane)
-    monkeypatch.setattr(relay_lanes, "best_wait", lambda sockets: wait)
+    monkeypatch.setattr(relay, "best_wait", lambda sockets: wait)
     lanes = Lanes((lane,), origin_ns=0)  # type: ignore[arg-type]
     while len(lane.errors) < count:
         lanes.step(0.1)

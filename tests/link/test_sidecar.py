@@ -11,12 +11,11 @@ from sidecar_bench import PEER, REFUSED, Bench, told
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link import sidecar
-from cloudrc.link.netem_text import notes
+from cloudrc.link.follow import Loaded
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.route import publish
 from cloudrc.link.sidecar import Mode
-from cloudrc.link.sidecar_follow import Loaded
-from cloudrc.link.state import Change
+from cloudrc.link.state import Change, publish
+from cloudrc.link.tc import notes
 
 NEXT = ("10.244.0.9", 7400)
 NO_NETEM = MissingPrerequisiteError("this kernel has no sch_netem; set link.mode=relay")

@@ -9,11 +9,11 @@ import pytest
 
 from cloudrc.cli.link_run import loader
 from cloudrc.errors import BadInputError
+from cloudrc.link.follow import Loaded, PeerName, ProfileFile
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Change, DirectionProfile
-from cloudrc.link.route import publish_route, withdraw
-from cloudrc.link.sidecar_follow import Loaded, PeerName, ProfileFile
 from cloudrc.link.state import Change as Note
+from cloudrc.link.state import publish_route, withdraw
 
 
 class ConfigMap:

@@ -9,17 +9,17 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli.link_run import loader
-from cloudrc.link.route import publish
-from cloudrc.link.sidecar_follow import ProfileFile
-from cloudrc.link.sidecar_handed import (
+from cloudrc.link.follow import (
     HANDED_FILE,
     SIZE_MAX,
     Handed,
     HandedProfile,
+    ProfileFile,
     Profiles,
     read_handed,
     write_handed,
 )
+from cloudrc.link.state import publish
 
 
 def note(number: str) -> str:

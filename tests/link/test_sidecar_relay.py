@@ -18,11 +18,10 @@ import pytest
 
 from cloudrc.cluster.link import INSIDE
 from cloudrc.config.load import load_experiment
+from cloudrc.link.follow import Handed, write_handed
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay import bind_loopback
-from cloudrc.link.relay_shaper import RelayShaper
-from cloudrc.link.sidecar_handed import Handed, write_handed
+from cloudrc.link.relay import RelayShaper, bind_loopback
 from cloudrc.tunnel.codec import Kind, encode_header
 
 pytestmark = pytest.mark.process

@@ -12,13 +12,12 @@ from netem_kernel import PEER, listing
 from sidecar_bench import Bench
 
 from cloudrc.cli.link_told import NOTHING, Teller
-from cloudrc.link.netem_tc import Answer
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
-from cloudrc.link.sidecar_told import Near, Told, look_near, read_told, write_told
-from cloudrc.link.verify_applied import shown
-from cloudrc.link.verify_causes import Evidence, Findings, find_causes
-from cloudrc.link.verify_evidence import of_told
-from cloudrc.link.verify_judge import Row
+from cloudrc.link.sidecar import Near, Told, look_near, read_told, write_told
+from cloudrc.link.tc import Answer
+from cloudrc.link.verify.causes import Evidence, Findings, find_causes, of_told
+from cloudrc.link.verify.judge import Row
+from cloudrc.link.verify.standing import shown
 
 RICH = DirectionProfile(
     0.04, 0.01, "table", loss=GilbertElliott(0.01, 0.2), duplicate=0.02, rate=2e6, table=(-1.0, 1.0)

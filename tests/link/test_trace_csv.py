@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.trace_csv import read_csv
-from cloudrc.link.trace_packets import Packets
+from cloudrc.link.traces import Packets, read_csv
 
 
 def read(text: str, *, halve: bool = False, trust_units: bool = False) -> Packets:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.trace_logs import Direction, is_ping, read_irtt, read_ping
+from cloudrc.link.traces import Direction, is_ping, read_irtt, read_ping
 
 PING = """\
 PING 192.0.2.1 (192.0.2.1) 56(84) bytes of data.

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.trace import parse_trace
-from cloudrc.link.trace_packets import Packets, check_unit, in_order, trace_of, write_trace
+from cloudrc.link.traces import Packets, check_unit, in_order, parse_trace, trace_of, write_trace
 
 STREAM = Packets((5.0, 5.01, 5.02, 5.03), (0.040, None, 0.060, 0.045))
 

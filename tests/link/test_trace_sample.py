@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from link_flows import MS, TELEMETRY, link
 
+from cloudrc.link.model import Numbers, Stream, loss_runs, numbers, sample
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
-from cloudrc.link.trace_sample import Numbers, Stream, loss_runs, numbers, sample
 
 
 def measured(profile: DirectionProfile, count: int = 20_000) -> Numbers:

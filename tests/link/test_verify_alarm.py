@@ -15,22 +15,15 @@ import pytest
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
-from cloudrc.link import verify_quantity
-from cloudrc.link.netem_tables import STRETCH, table
-from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.timeline import settled
-from cloudrc.link.verify_block import Block
-from cloudrc.link.verify_ends import added, allowing
-from cloudrc.link.verify_estimate import frame_of
-from cloudrc.link.verify_expect import expect, is_steady, share_margin
-from cloudrc.link.verify_judge import judge_quantity
-from cloudrc.link.verify_loss import Stretch, believed, bounds, mean_of, total
-from cloudrc.link.verify_netem import netem_makes
-from cloudrc.link.verify_plan import make_plan
-from cloudrc.link.verify_quantity import ALARM, MISS, Quantity
-from cloudrc.link.verify_rate import plan_trains
-from cloudrc.link.verify_reference import Floats, draw, instants
-from cloudrc.link.verify_standing import make_standing
+from cloudrc.link.profile import DirectionProfile, settled
+from cloudrc.link.tc import STRETCH, table
+from cloudrc.link.verify import reference
+from cloudrc.link.verify.expect import expect, is_steady, netem_makes, share_margin
+from cloudrc.link.verify.judge import judge_quantity, plan_trains
+from cloudrc.link.verify.measure import Block
+from cloudrc.link.verify.plan import Stretch, believed, bounds, make_plan, mean_of, total
+from cloudrc.link.verify.reference import ALARM, MISS, Floats, Quantity, draw, frame_of, instants
+from cloudrc.link.verify.standing import added, allowing, make_standing
 
 SIZE = 203
 OFTEN = 1e-2
@@ -125,7 +118,7 @@ def test_fresh_draws_scatter_as_was_planned(name: str, monkeypatch: pytest.Monke
     schedule = make_plan(profile, SIZE).schedule
     expects = expect(profile, schedule)
     values = measured(profile, schedule.period, count, runs)
-    monkeypatch.setattr(verify_quantity, "_Z_ALARM", NormalDist().inv_cdf(1.0 - OFTEN))
+    monkeypatch.setattr(reference, "_Z_ALARM", NormalDist().inv_cdf(1.0 - OFTEN))
     for what in JUDGED:
         asked: Quantity | None = getattr(expects, what)
         if asked is None or not asked.spread:

@@ -10,10 +10,9 @@ from virtual_probes import Asked, probe
 from cloudrc.cli.link_verify_notes import notes
 from cloudrc.cli.link_verify_probes import PROBE, TRAIN, Probes
 from cloudrc.link.profile import Change, DirectionProfile, GilbertElliott, Trace, mean_loss
-from cloudrc.link.verify_causes import find_causes
-from cloudrc.link.verify_corrupt import refusing
-from cloudrc.link.verify_expect import JITTER_SHARES
-from cloudrc.link.verify_plan import make_plan
+from cloudrc.link.verify.causes import find_causes
+from cloudrc.link.verify.expect import JITTER_SHARES, refusing
+from cloudrc.link.verify.plan import make_plan
 
 DAMAGING = DirectionProfile(0.02, 0.01, corrupt=0.1)
 

@@ -8,8 +8,14 @@ import pytest
 
 from cloudrc.cli.link_verify_late import LateWatch
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
-from cloudrc.link.verify_causes import Evidence
-from cloudrc.link.verify_evidence import in_force, netem_profile, of_metrics, of_qdiscs, samples
+from cloudrc.link.verify.causes import (
+    Evidence,
+    in_force,
+    netem_profile,
+    of_metrics,
+    of_qdiscs,
+    samples,
+)
 
 NETEM: dict[str, Any] = {
     "kind": "netem", "handle": "7401:", "packets": 990, "drops": 10,

@@ -14,7 +14,7 @@ from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.verify_causes import Cause, Evidence, Findings, find_causes
+from cloudrc.link.verify.causes import Cause, Evidence, Findings, find_causes
 
 PAPER = link_profile(load_profile("paper-p2").uplink)
 LOSING = DirectionProfile(0.045, 0.025, loss=0.05)

@@ -19,7 +19,7 @@ from cloudrc.cli.link_verify_run import Asked, Bank, banks
 from cloudrc.cli.link_verify_text import Said, as_text
 from cloudrc.config.load import dump
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
-from cloudrc.link.verify_causes import find_causes
+from cloudrc.link.verify.causes import find_causes
 
 pytestmark = pytest.mark.netem
 SETTINGS = [

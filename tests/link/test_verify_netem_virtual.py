@@ -16,10 +16,10 @@ from cloudrc.cli.link_verify_run import _notes, plan
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, mean_loss
-from cloudrc.link.verify_causes import Evidence, Findings
-from cloudrc.link.verify_loss import spread
-from cloudrc.link.verify_netem import netem_makes
-from cloudrc.link.verify_reference import draw, instants
+from cloudrc.link.verify.causes import Evidence, Findings
+from cloudrc.link.verify.expect import netem_makes
+from cloudrc.link.verify.plan import spread
+from cloudrc.link.verify.reference import draw, instants
 
 COUNT = 120_000
 WAYS = ("uplink", "downlink")

@@ -20,8 +20,8 @@ from cloudrc.link.profile import (
     Trace,
     mean_loss,
 )
-from cloudrc.link.verify_loss import believed, bounds, chances, spread
-from cloudrc.link.verify_reference import Fates, draw, instants, overtaken
+from cloudrc.link.verify.plan import believed, bounds, chances, spread
+from cloudrc.link.verify.reference import Fates, draw, instants, overtaken
 
 COUNT = 30_000
 BURSTS = GilbertElliott(0.02, 0.2, 0.7, 0.01, 0.030)

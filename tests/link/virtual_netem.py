@@ -8,10 +8,8 @@ from __future__ import annotations
 import random
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.netem_tables import stretch, table
-from cloudrc.link.netem_text import check
-from cloudrc.link.profile import DirectionProfile, GilbertElliott
-from cloudrc.link.timeline import Conditions, Timeline
+from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Timeline
+from cloudrc.link.tc import check, stretch, table
 
 _WORDS, _ONE = 1 << 32, 8192
 _HEADERS = 28

@@ -9,12 +9,11 @@ from virtual_netem import VirtualNetem
 
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
-from cloudrc.link.verify_causes import Evidence, Findings
-from cloudrc.link.verify_estimate import frame_of
-from cloudrc.link.verify_judge import Row, judge
-from cloudrc.link.verify_measure import Log, measure
-from cloudrc.link.verify_plan import Plan, make_plan
-from cloudrc.link.verify_rate import SIZE, Trains, plan_trains, spans
+from cloudrc.link.verify.causes import Evidence, Findings
+from cloudrc.link.verify.judge import SIZE, Row, Trains, judge, plan_trains, spans
+from cloudrc.link.verify.measure import Log, measure
+from cloudrc.link.verify.plan import Plan, make_plan
+from cloudrc.link.verify.reference import frame_of
 
 PROBE, TRAIN = 9, 10
 PROBE_SIZE = 200

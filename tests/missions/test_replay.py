@@ -10,9 +10,7 @@ from flying import records
 
 from cloudrc.cli.link_source import TOPICS, one_way
 from cloudrc.config.load import load_experiment
-from cloudrc.link.trace import read_trace
-from cloudrc.link.trace_logs import Direction
-from cloudrc.link.trace_packets import Packets, trace_of, write_trace
+from cloudrc.link.traces import Direction, Packets, read_trace, trace_of, write_trace
 from cloudrc.record.columns import Recording
 
 MINUTE = ["mission.steps.count=15", "guard.command_age_max_ms=1000"]

@@ -18,8 +18,8 @@ from cloudrc.config import document
 from cloudrc.config.load import load_profile, read_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.files import open_file
-from cloudrc.link import trace
-from cloudrc.link.trace import read_trace
+from cloudrc.link import traces
+from cloudrc.link.traces import read_trace
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.record.merge import write_mission
 from cloudrc.record.reader import read_contents
@@ -76,7 +76,7 @@ def test_a_path_has_no_nul(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "read"), [(document, read_experiment), (trace, read_trace)], ids=["yaml", "csv"]
+    ("module", "read"), [(document, read_experiment), (traces, read_trace)], ids=["yaml", "csv"]
 )
 def test_no_file_is_read_beyond_its_bound(tmp_path: Path, module: Any, read: Any) -> None:
     path = tmp_path / "long.yaml"

@@ -14,7 +14,7 @@ from cloudrc.cli.main import main
 from cloudrc.drivers.epochs import replace_durably
 from cloudrc.errors import BadInputError
 from cloudrc.files import draft, put
-from cloudrc.link.route import publish
+from cloudrc.link.state import publish
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import write_mission
 from cloudrc.record.recover import recover

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from cloudrc.cli.output import table
 from cloudrc.config.shipped import names
 from cloudrc.errors import CloudrcError
-from cloudrc.link.trace_packets import write_trace
+from cloudrc.link.traces import write_trace
 from tools.bench_link import report
 from tools.bench_link.anchors import compile_anchors, fifo_allowed, wake_lateness
 from tools.bench_link.draws import measure_bursts

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay_batch import Sender
+from cloudrc.link.relay_io import Sender
 from cloudrc.tunnel.codec import Kind, encode_header
 from tools.bench_link.anchors import wake_lateness
 from tools.bench_link.flow import SIZE, Way, run_flow

@@ -9,7 +9,7 @@ import numpy as np
 
 from cloudrc.config.schema import Direction
 from cloudrc.errors import BadInputError
-from cloudrc.link.trace import read_trace
+from cloudrc.link.traces import read_trace
 from cloudrc.metrics.flight import Array
 
 

@@ -2,19 +2,97 @@
 
 What can be read (qdiscs, counters, release errors, the profile in force) goes before what can only
 be concluded from the numbers.
+
+What a shaper that does not get its CPU does to the numbers of a link, and what it cannot do.
+
+What a shaper tells of itself, read back: its state, its metrics, the kernel's qdiscs.
+
+Nothing is assumed: what cannot be read is not known.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isnan, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.verify_judge import Row
-from cloudrc.link.verify_starved import SCATTER, SHARE_KEPT, are_off, beyond, may_be_lateness
-from cloudrc.link.verify_words import kbit, ms, said, times
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
+from cloudrc.link.sidecar import Near, Told
+from cloudrc.link.tc import stretch
+from cloudrc.link.verify.judge import Row, kbit, ms, said, times
+
+SCATTER = {
+    "deviation": "standard deviation",
+    "variation": "variation",
+    "middle": "deviation in the middle",
+}
+"""Rows that tell of the jitter, in words."""
+SHARE_KEPT = 0.2
+"""If less than this share of what should be overtaken is, order is kept."""
+_RATE_TIMES = 4.0
+"""Trains whose ends were left unread seem quicker than their bottleneck, though not so many times:
+three packets of four would have to be missing [1]."""
+
+
+def are_off(rows: Sequence[Row]) -> dict[str, Row]:
+    """Choose what is not as asked, by name."""
+    return {row.name: row for row in rows if row.verdict == "off"}
+
+
+def may_be_lateness(rows: Sequence[Row], late: float) -> bool:
+    """Say whether releases so late [s] may explain what is off: delays, and not by more."""
+    off, found = are_off(rows), {row.name: row for row in rows}
+    if not {"mean", "deviation"} <= found.keys():
+        return False
+    mean, deviation = found["mean"], found["deviation"]
+    by = mean.measured - mean.asked
+    if by > late or ("mean" in off and by < 0.0):
+        return False
+    if "rate" in off and off["rate"].measured > off["rate"].asked:
+        return False
+    spread = deviation.measured**2 - deviation.asked**2
+    if spread > late**2 or ("deviation" in off and spread < 0.0):
+        return False
+    return any(name in off for name in ("mean", "rate", *SCATTER))
+
+
+def beyond(rows: Sequence[Row], unread: float) -> Mapping[str, Row]:
+    """Choose what is off although nothing is known of a shaper but that it lacks its CPU.
+
+    It adds delay and scatter, and losses as many as it left unread; it takes none away. It puts
+    nothing in order either: fewer packets overtake only as fewer are there.
+
+    Args:
+        rows: Of one direction.
+        unread: Share of what was sent that the shaper had no time to read, in [0, 1].
+
+    Returns:
+        Rows by name, losses but for those.
+    """
+    return {row.name: row for row in _starved_beyond(are_off(rows), unread)}
+
+
+def _starved_beyond(off: Mapping[str, Row], unread: float) -> Iterator[Row]:
+    for name, row in off.items():
+        if name == "loss":
+            if row.measured < row.low:
+                yield row
+            elif row.measured - unread > row.high:
+                yield row._replace(measured=row.measured - unread)
+        elif name == "reordered":
+            if row.measured < SHARE_KEPT * (1.0 - unread) * row.asked:
+                yield row
+        elif name == "rate":
+            if row.measured > _RATE_TIMES * row.asked:
+                yield row
+        elif name in ("mean", "deviation"):
+            if row.measured < row.asked:
+                yield row
+        elif name in ("duplicated", "corrupted"):
+            yield row
+
 
 LATE = 1.5e-3
 """A shaper whose 99th percentile of the release error is above this [s] does not get its CPU."""
@@ -276,3 +354,162 @@ _MARKS = {
     "corrupted": ("wrong_corruption", "arrive damaged"),
     "reordered": ("wrong_order", "come overtaken"),
 }
+
+
+_IN_ORDER = 50e9
+"""A rate above this [bit/s] is there to keep the order, and limits nothing."""
+_SAMPLE = re.compile(r"^(?P<name>\w+)(?:\{(?P<labels>[^}]*)\})? (?P<value>\S+)$", re.MULTILINE)
+
+Samples = Mapping[tuple[str, str], float]
+"""Values of metrics by name and by their labels as they are written: 'outcome="lost"'."""
+
+
+def samples(text: str) -> Samples:
+    """Read Prometheus' text; values of any unit."""
+    return {
+        (found["name"], found["labels"] or ""): float(found["value"])
+        for found in _SAMPLE.finditer(text)
+    }
+
+
+def shaper_of(found: Samples, way: str) -> str:
+    """Say who shapes a direction by the link's metrics; "" if they do not tell."""
+    for (name, labels), value in found.items():
+        if name == "cloudrc_link_info" and f'direction="{way}"' in labels and value:
+            match = re.search(r'shaper="(\w+)"', labels)
+            return match[1] if match else ""
+    return ""
+
+
+def of_metrics(
+    found: Samples, sent: int, evidence: Evidence, before: Samples | None = None
+) -> Evidence:
+    """Add to what is known what the link's metrics say.
+
+    Args:
+        found: After the last probe.
+        sent: Datagrams that this end has sent.
+        evidence: What is known so far.
+        before: Before the first probe, of a link that was there already: of stops and of
+            qdiscs put back only those since then tell of these probes.
+    """
+
+    def since(name: str) -> float:
+        now, then = found.get((name, ""), 0.0), (before or {}).get((name, ""), 0.0)
+        return now - then if now >= then else now  # a link that was restarted counts from 0
+
+    # The relay counts what came in; netem what it sent on and what it dropped.
+    received = found.get(("cloudrc_link_datagrams_total", 'outcome="received"'))
+    if evidence.shaper == "netem":
+        kinds = ("forwarded", "lost", "held")
+        counts = [
+            found.get(("cloudrc_link_datagrams_total", f'outcome="{kind}"')) for kind in kinds
+        ]
+        received = sum(count or 0.0 for count in counts)
+    unread = found.get(("cloudrc_link_datagrams_total", 'outcome="unread"'))
+    late = found.get(("cloudrc_link_release_error_seconds", 'percentile="99"'))
+    periods = since("cloudrc_cpu_periods_total")
+    share = since("cloudrc_cpu_throttled_periods_total") / periods if periods > 0 else None
+    passed = None if received is None else int(received)
+    missed = None if unread is None else int(unread)
+    known = replace(evidence, sent=sent, passed=passed, unread=missed)
+    restored = int(since("cloudrc_link_restored_total"))
+    return replace(known, late=late, throttled=share, restored=restored)
+
+
+Qdiscs = Mapping[str, Sequence[Mapping[str, Any]]]
+"""Objects of `tc -s -j qdisc show`, by interface."""
+
+
+def of_qdiscs(listed: Qdiscs, interface: str) -> Evidence:
+    """Say what shapes a flow by the qdiscs of a network namespace.
+
+    Args:
+        listed: All of them.
+        interface: Over which the flow leaves.
+    """
+    netems = {name: _netems(qdiscs) for name, qdiscs in listed.items()}
+    here = netems.get(interface, [])
+    elsewhere = tuple(name for name, found in netems.items() if found and name != interface)
+    counts = [int(one.get("packets", 0)) + int(one.get("drops", 0)) for one in here]
+    return Evidence(
+        shaper="netem" if here else "none",
+        interface=interface,
+        elsewhere=elsewhere,
+        layers=len(here) or None,
+        passed=max(counts, default=None),
+    )
+
+
+def in_force(found: Evidence, listed: Qdiscs, told: Evidence) -> Evidence:
+    """Join what the kernel says with what the shaper's process says of itself.
+
+    Args:
+        found: From `of_qdiscs`.
+        listed: What that was made from.
+        told: By the process: what it was asked to put in force.
+    """
+    qdiscs = _netems(listed.get(found.interface, []))
+    applied = told.applied
+    if applied is not None and qdiscs:
+        applied = netem_profile(qdiscs[-1].get("options", {}), applied)
+    return replace(
+        found,
+        why=told.why,
+        applied=applied if qdiscs else None,
+        sent=told.sent,
+        throttled=told.throttled,
+        restored=told.restored,
+    )
+
+
+def of_told(told: Told) -> Evidence:
+    """Say what a link's process tells, of itself and of the kernel."""
+    known = Evidence(told.shaper, told.why, layers=1, applied=told.applied)
+    return with_near(known, told.near)
+
+
+def with_near(told: Evidence, near: Near | None) -> Evidence:
+    """Add to what a shaper tells of itself which netems are on the flow's way, if that is known."""
+    if near is None:
+        return told
+    if told.shaper == "netem":
+        return in_force(of_qdiscs(near.netems, near.interface), near.netems, told)
+    way = {_TO_RELAY, near.interface}
+    others = sum(len(near.netems.get(name, ())) for name in way)
+    return replace(told, interface=near.interface, layers=1 + others)
+
+
+_TO_RELAY = "lo"
+"""Over which an end reaches the relay of its pod."""
+
+
+def netem_profile(options: Mapping[str, Any], told: DirectionProfile) -> DirectionProfile:
+    """Put the options of a netem, as tc prints them, in place of the numbers of a profile.
+
+    Args:
+        options: Times in [s], chances in [0, 1], rate in [byte/s]; what is not there is 0.
+        told: Says what the options leave open: distribution, order, what changes later.
+    """
+    delay = options.get("delay", {})
+    loss: Loss = float(options.get("loss-random", {}).get("loss", 0.0))
+    chain = options.get("loss-gemodel")
+    if chain:
+        p, r, good, bad = (float(chain.get(key, 0.0)) for key in ("p", "r", "1-k", "1-h"))
+        loss = GilbertElliott(p, r, bad, good)
+    rate = 8.0 * float(options.get("rate", {}).get("rate", 0.0))
+    return replace(
+        told,
+        delay=float(delay.get("delay", 0.0)),
+        jitter=float(delay.get("jitter", 0.0)) / stretch(told),
+        loss=loss,
+        duplicate=float(options.get("duplicate", {}).get("duplicate", 0.0)),
+        reorder=float(options.get("reorder", {}).get("reorder", 0.0)),
+        corrupt=float(options.get("corrupt", {}).get("corrupt", 0.0)),
+        rate=rate if 0.0 < rate < _IN_ORDER else None,
+        keep_order=rate > 0.0,
+    )
+
+
+def _netems(qdiscs: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    return [one for one in qdiscs if one.get("kind") == "netem"]

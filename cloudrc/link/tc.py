@@ -1,0 +1,348 @@
+"""How iproute2 is asked and understood: argument lists go to a runner, answers come out as data.
+
+Nothing here starts a process: whoever has the right to, passes the runner in.
+
+The model's distributions of jitter in the form that tc-netem takes: one file of integers each.
+
+netem draws an entry of a table of up to 16,384 and multiplies it by the jitter; 8192 stands for 1,
+and 16 bits end at 4. tc's own tables are not ours (see `fates.shape`), and it has none for the
+uniform distribution, without which a qdisc cannot go back to uniform once it had another.
+
+Source: iproute2 netem/README.distribution, Linux, net/sched/sch_netem.c (tabledist).
+
+A direction's conditions in tc's words: a profile goes in, the words after `netem` come out.
+
+What netem cannot do is refused by its name.
+
+Every option is spelled out every time: `tc qdisc change` leaves the rate and the correlation that
+are not named as they were.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from hashlib import blake2b
+from itertools import pairwise
+from math import ceil, sqrt
+from pathlib import Path
+from statistics import NormalDist, fmean
+from typing import Any, NamedTuple, TypeAlias
+
+from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
+from cloudrc.link.draws import PARETO_CUT
+from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
+
+_TRIAL = "7402:"
+_INSTEAD = "set link.mode=relay, which needs nothing of the kernel"
+
+
+class Answer(NamedTuple):
+    """What a program said: its exit code, standard output and standard error."""
+
+    code: int
+    output: str
+    error: str
+
+
+Run: TypeAlias = Callable[[Sequence[str]], Answer]
+"""Runs a program to its end; 127 is the code of one that is not there."""
+
+
+class Iproute2:
+    """`tc` and `ip`, each call checked."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
+    def tc(self, *words: str) -> str:
+        """Run tc and return its output; raises as `explain` says."""
+        return self._checked("tc", words)
+
+    def show(self, *words: str) -> list[dict[str, Any]]:
+        """Run `tc -s -j` with these words and return the objects that it prints."""
+        return list(json.loads(self._checked("tc", ("-s", "-j", *words)) or "[]"))
+
+    def device(self, host: str) -> str:
+        """Name the interface over which an address is reached."""
+        routes = json.loads(self._checked("ip", ("-j", "route", "get", host)))
+        return str(routes[0]["dev"])
+
+    def _checked(self, program: str, words: Sequence[str]) -> str:
+        answer = self._run((program, *words))
+        if answer.code:
+            raise explain(program, words, answer)
+        return answer.output
+
+
+def try_netem(run: Run) -> None:
+    """Find out whether this kernel has netem, by a qdisc on the loopback that delays nothing.
+
+    A qdisc of somebody else is left alone: then nothing is found out.
+
+    Raises:
+        MissingPrerequisiteError: If there is none, or this container may not use it.
+    """
+    iproute2 = Iproute2(run)
+    root = next((q for q in iproute2.show("qdisc", "show", "dev", "lo") if q.get("root")), {})
+    if root.get("handle", "0:") not in ("0:", _TRIAL):
+        return
+    if root.get("handle") != _TRIAL:
+        iproute2.tc("qdisc", "add", "dev", "lo", "root", "handle", _TRIAL, "netem")
+    iproute2.tc("qdisc", "del", "dev", "lo", "root")
+
+
+def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
+    """Put an answer that is not the wanted one into words: the cause, and what to do."""
+    text = answer.error or answer.output
+    kind = _kind(words)
+    if answer.code == 127:
+        return MissingPrerequisiteError(
+            f"no program {program} (package iproute2); install it, or {_INSTEAD}"
+        )
+    missing = kind and "change" not in words and "No such file or directory" in text
+    if missing or "qdisc kind is unknown" in text:
+        return MissingPrerequisiteError(
+            f"this kernel has no sch_{kind or 'netem'}; {_INSTEAD}, or use nodes whose kernel has "
+            f"it ('modprobe sch_{kind or 'netem'}' there) and a namespace for privileged pods"
+        )
+    if "classifier not found" in text:
+        return MissingPrerequisiteError(
+            f"this kernel has neither cls_u32 nor cls_flower; {_INSTEAD}, or use a node whose "
+            "kernel has one of them"
+        )
+    if "Operation not permitted" in text:
+        return MissingPrerequisiteError(
+            f"tc may not change the network of this container; give it NET_ADMIN and uid 0, or "
+            f"{_INSTEAD}"
+        )
+    line = " ".join(text.split()) or f"exit code {answer.code}"
+    return MissingPrerequisiteError(f"'{program} {' '.join(words)}' failed: {line}; {_INSTEAD}")
+
+
+def may_shape(status: str) -> bool:
+    """Say whether a process is root with NET_ADMIN, from the text of its /proc/PID/status.
+
+    Source: Linux, include/uapi/linux/capability.h: CAP_NET_ADMIN is bit 12.
+    """
+    uid = re.search(r"^Uid:\s+\d+\s+(\d+)", status, re.MULTILINE)
+    effective = re.search(r"^CapEff:\s+([0-9a-fA-F]+)", status, re.MULTILINE)
+    if uid is None or effective is None:
+        return False
+    return uid[1] == "0" and bool(int(effective[1], 16) >> 12 & 1)
+
+
+def _kind(words: Sequence[str]) -> str:
+    """Name the kind of qdisc that a command is about, if it is about one."""
+    return next((word for word in words if word in ("netem", "prio")), "")
+
+
+ENTRIES = 4096
+STRETCH = {"uniform": 1, "normal": 1, "pareto": 4}
+"""How many times smaller than the jitter a table's entries are, so that its tail fits in 16 bits;
+the jitter that tc is given has to be as many times larger."""
+
+_ONE = 8192
+_END = 32_767 / _ONE
+"""Largest entry in units of the jitter: 16 bits."""
+
+
+def _pareto(share: float) -> float:
+    survival: float = PARETO_CUT + (1.0 - PARETO_CUT) * (1.0 - share)
+    return float(survival ** (-1 / 3))
+
+
+_QUANTILES: dict[str, Callable[[float], float]] = {
+    "uniform": lambda share: 2.0 * share - 1.0,
+    "normal": NormalDist().inv_cdf,
+    "pareto": _pareto,
+}
+
+
+def table(distribution: str) -> list[int]:
+    """Make the table of a distribution: its quantiles in the middle of 4096 equal shares.
+
+    Args:
+        distribution: "uniform", in (-1, 1); "normal" or "pareto", mean 0 and standard deviation 1.
+
+    Returns:
+        Entries in units of jitter / (8192 STRETCH), rising, shape (4096,).
+    """
+    quantile = _QUANTILES[distribution]
+    values = [quantile((index + 0.5) / ENTRIES) for index in range(ENTRIES)]
+    if distribution != "uniform":
+        mean = fmean(values)
+        deviation = sqrt(fmean([(value - mean) ** 2 for value in values]))
+        values = [(value - mean) / deviation for value in values]
+    return [round(value * _ONE / STRETCH[distribution]) for value in values]
+
+
+def stretch(profile: DirectionProfile) -> int:
+    """Say by what the jitter that tc is given is larger than a profile's, as in `STRETCH`."""
+    if profile.distribution != "table":
+        return STRETCH[profile.distribution]
+    return ceil(max(map(abs, profile.table)) / _END) or 1
+
+
+def distribution_name(profile: DirectionProfile) -> str:
+    """Name a profile's distribution for tc: one of `STRETCH`, or that of a measured table."""
+    if profile.distribution != "table":
+        return profile.distribution
+    # Letters and digits: tc makes a file's name of it. Another table is another file.
+    return "table" + blake2b(repr(profile.table).encode(), digest_size=8).hexdigest()
+
+
+def write_tables(folder: Path) -> None:
+    """Write all tables as tc finds them when the environment's TC_LIB_DIR names this folder."""
+    for distribution in STRETCH:
+        _write(folder, distribution, table(distribution))
+
+
+def write_measured(folder: Path, profile: DirectionProfile) -> None:
+    """Write the table of a profile whose distribution was measured; else do nothing."""
+    if profile.distribution == "table":
+        unit, values = _ONE / stretch(profile), sorted(profile.table)
+        picked = [values[(2 * i + 1) * len(values) // (2 * ENTRIES)] for i in range(ENTRIES)]
+        _write(folder, distribution_name(profile), [round(value * unit) for value in picked])
+
+
+def _write(folder: Path, name: str, entries: Iterable[int]) -> None:
+    listed = list(entries)
+    rows = [listed[start : start + 8] for start in range(0, ENTRIES, 8)]
+    text = "\n".join(" ".join(map(str, row)) for row in rows)
+    (folder / f"{name}.dist").write_text(f"# {name}\n{text}\n")
+
+
+STEP_NS = 5_000_000
+"""Shortest time between two steps of the qdisc [ns]; what changes faster is passed over."""
+LIMIT = 10_000
+"""Packets that the qdisc holds at once, as many as the relay."""
+DELAY_MAX_NS = 274_000_000_000
+"""tc keeps times in 64 ns ticks of 32 bits and refuses what is longer [ns]."""
+
+_IN_ORDER = "100gbit"
+"""netem lets no packet leave before the one before it as soon as it has a rate, whichever."""
+_ETHERNET_BYTES = 14
+"""netem counts the Ethernet header, the model does not."""
+_PACKET_BITS = 8 * 116
+"""A command, the smaller of our datagrams, with its headers: more of them fit into a delay."""
+_PACKETS = 1_000
+"""More than a tunnel sends in a second, or a probe, where no rate says how many pass [1/s]."""
+_TABLE_END = 4.0
+"""Longest draw of a table, in units of the jitter that tc is given."""
+
+
+def check(profile: DirectionProfile) -> None:
+    """Raise a BadInputError that names what netem cannot do of a profile."""
+    pieces = list(_pieces(profile))
+    if any(isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad for piece in pieces):
+        _refuse("loss.delay_bad_ms", "more delay while a burst of losses lasts")
+    if any(piece.rate and piece.jitter for piece in pieces) and not profile.keep_order:
+        _refuse("rate_kbit with jitter_ms but without keep_order", "overtaking behind a bottleneck")
+    if (slowest := max(piece.delay_ns for piece in pieces)) > DELAY_MAX_NS:
+        _refuse("delay_ms above 274000", f"its clock ends there, here {slowest * 1e-6:g} ms")
+    for blackout in profile.blackouts:
+        if blackout.duration * 1e9 < STEP_NS:
+            _refuse(
+                f"blackouts shorter than {STEP_NS * 1e-6:g} ms",
+                f"here {blackout.duration * 1e3:g} ms at {blackout.start:g} s",
+            )
+
+
+def notes(profile: DirectionProfile) -> list[str]:
+    """Say in words what netem realises otherwise than asked."""
+    said = []
+    if profile.jitter and profile.correlation:
+        said.append(f"netem realises next to nothing of correlation {profile.correlation:g}")
+    if profile.corrupt:
+        said.append(
+            "netem corrupts frames, not datagrams: the receiving kernel drops most of them by "
+            f"their checksums, so that corrupt {profile.corrupt:g} is seen as loss"
+        )
+    starts = Timeline(profile).starts_ns
+    passed_over = sum(after - before < STEP_NS for before, after in pairwise(starts))
+    if passed_over:
+        said.append(
+            f"netem is stepped every {STEP_NS * 1e-6:g} ms at most: {passed_over} of "
+            f"{len(starts)} steps of the time line come sooner, and some are passed over"
+        )
+    return said
+
+
+def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
+    """Put what holds at one instant into tc's words.
+
+    Args:
+        profile: Passed `check`.
+        conditions: That hold now.
+        room: Its `limit`, which takes long to work out for a trace [packets].
+
+    Returns:
+        Arguments for `tc qdisc add|change ... netem`.
+    """
+    words = ["limit", str(room), "delay", _microseconds(conditions.delay_ns)]
+    if conditions.jitter:
+        words += [_microseconds(conditions.jitter * 1e9 * stretch(profile))]
+        words += [_percent(profile.correlation), "distribution", distribution_name(profile)]
+    words += ["loss", *_loss(1.0 if conditions.blackout else conditions.loss)]
+    # Of a packet that is doubled and lost one copy arrives: in a blackout none may.
+    copied = 0.0 if conditions.blackout else profile.duplicate
+    words += ["duplicate", _percent(copied), "corrupt", _percent(profile.corrupt)]
+    # tc refuses it without a delay, where nothing is there to be overtaken.
+    if profile.reorder and conditions.delay_ns and not profile.keep_order:
+        words += ["reorder", _percent(profile.reorder)]
+    if conditions.rate is not None:
+        return [*words, "rate", f"{conditions.rate:.0f}bit", str(-_ETHERNET_BYTES)]
+    # A rate is the one way to keep the order; 0 takes back one that was given before.
+    return [*words, "rate", _IN_ORDER if profile.keep_order else "0bit"]
+
+
+def limit(profile: DirectionProfile) -> int:
+    """Give room for what is under way at most and, behind a bottleneck, for its queue [packets].
+
+    One number for the whole time line: a step to a shorter delay must not turn packets away
+    because those of the longer one are still under way.
+    """
+    pieces = list(_pieces(profile))
+    if all(piece.rate is None for piece in pieces):
+        return LIMIT
+    reach = stretch(profile) * _TABLE_END  # once: a trace has many pieces, a table many entries
+    return ceil(profile.queue_packets + max(_under_way(piece, reach) for piece in pieces))
+
+
+def _under_way(piece: Conditions, reach: float) -> float:
+    """Say how many packets behind the bottleneck are under way at once, at most.
+
+    Args:
+        piece: Of the time line.
+        reach: Longest draw, in units of the jitter [1].
+    """
+    longest = piece.delay_ns * 1e-9 + piece.jitter * reach
+    return longest * (_PACKETS if piece.rate is None else piece.rate / _PACKET_BITS)
+
+
+def _pieces(profile: DirectionProfile) -> Iterator[Conditions]:
+    timeline = Timeline(profile)
+    return (timeline.at(start_ns) for start_ns in timeline.starts_ns)
+
+
+def _loss(loss: Loss) -> list[str]:
+    if isinstance(loss, GilbertElliott):
+        chances = (loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good)
+        return ["gemodel", *map(_percent, chances)]
+    return ["random", _percent(loss)]
+
+
+def _microseconds(duration_ns: float) -> str:
+    return f"{duration_ns * 1e-3:.3f}us"  # iproute2 before 6.2 knows no "ns"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.9g}%"
+
+
+def _refuse(key: str, meaning: str) -> None:
+    raise BadInputError(
+        f"netem cannot do {key} ({meaning}); set link.mode=relay, which can, or leave it out"
+    )
