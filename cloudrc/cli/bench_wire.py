@@ -11,7 +11,7 @@ import subprocess
 import timeit
 from typing import NamedTuple
 
-from cloudrc.drivers.interpreter import interpreter
+from cloudrc.drivers.machine import interpreter
 
 CALLS = 400
 REFERENCE_CALLS = 40

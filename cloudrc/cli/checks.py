@@ -17,7 +17,7 @@ from typing import Literal
 from cloudrc.cli import checks_cluster
 from cloudrc.cli.check import CLUSTER, FLYING, Check
 from cloudrc.cli.extras import EXTRAS, missing
-from cloudrc.drivers.interpreter import interpreter
+from cloudrc.drivers.machine import interpreter
 
 # What a control loop of 10 ms can bear; a quiet desktop stays far below [s].
 LATE_SLEEP = 2e-3

@@ -55,8 +55,7 @@ def _join(folder: Path) -> Operator:
     """Join the process of teleop, which may come and go."""
     import time
 
-    from cloudrc.drivers.teleop import RemoteTeleop
-    from cloudrc.drivers.unix import UnixPeer
+    from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer
     from cloudrc.teleop import wire
 
     peer = UnixPeer(folder / "cloud.sock", folder / "teleop.sock")

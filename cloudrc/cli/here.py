@@ -54,7 +54,7 @@ def find_here(
     if in_cluster or Path(sys.argv[0]).name.startswith(KUBECTL_PLUGIN):
         return None
     from cloudrc.cli.folder import RUNS
-    from cloudrc.drivers.flights import under_way
+    from cloudrc.drivers.local import under_way
 
     if (found := there(RUNS / "latest")) is not None:
         return found
@@ -91,8 +91,7 @@ def link_of(run: Path) -> Path | None:
 
     A run that was killed leaves that behind, too.
     """
-    from cloudrc.drivers.flights import under_way
-    from cloudrc.drivers.local import LINK_FOLDER
+    from cloudrc.drivers.local import LINK_FOLDER, under_way
 
     folder = run / LINK_FOLDER
     try:
@@ -108,7 +107,7 @@ def url_of(run: Path) -> str | None:
     What the folder says of that is not believed: the operator's word goes to no server that
     somebody else has named.
     """
-    from cloudrc.drivers.flights import under_way
+    from cloudrc.drivers.local import under_way
 
     url = under_way().get(Path(os.path.realpath(run)), "")
     return url if url and not _is_gone(url) else None

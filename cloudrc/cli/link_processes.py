@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING
 
 from cloudrc.assembly import link_profile
 from cloudrc.cluster.pods import DIRECTLY
-from cloudrc.drivers.interpreter import interpreter
+from cloudrc.drivers.machine import interpreter
 from cloudrc.drivers.process import PARENT
-from cloudrc.drivers.route import parse
+from cloudrc.drivers.realtime import parse
 from cloudrc.errors import (
     BadInputError,
     CloudrcError,

@@ -118,8 +118,7 @@ def _open_keys(options: argparse.Namespace) -> KeyFile:
 
 def _open_peer(options: argparse.Namespace) -> Peer:
     """Bind the socket of an end, which sends to its peer or where its route leads."""
-    from cloudrc.drivers.realtime import Peer
-    from cloudrc.drivers.route import Route
+    from cloudrc.drivers.realtime import Peer, Route
 
     warn_if_exposed(options.listen)
     where = resolved("--peer", options.peer) if options.route is None else Route(options.route)

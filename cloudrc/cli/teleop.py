@@ -129,8 +129,7 @@ def _fly(
 ) -> None:
     """Run the service until `stop()`."""
     from cloudrc.drivers.feed import Feed
-    from cloudrc.drivers.teleop import serve_teleop
-    from cloudrc.drivers.unix import UnixPeer
+    from cloudrc.drivers.teleop import UnixPeer, serve_teleop
     from cloudrc.records import Fault
     from cloudrc.teleop import wire
 

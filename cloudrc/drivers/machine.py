@@ -1,9 +1,13 @@
-"""What a process knows of its machine: whose monotonic clock it reads, which cipher is fast."""
+"""What a process knows of its machine: whose monotonic clock it reads, which cipher is fast.
+
+Python again: what a process of its own is to run goes in, the words of its command come out.
+"""
 
 from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 LINUX_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -44,3 +48,13 @@ def _boot_id() -> str:
         return subprocess.run(MACOS_BOOT_ID, capture_output=True, text=True, timeout=5).stdout
     except (OSError, subprocess.SubprocessError):
         return ""
+
+
+def interpreter(*words: str) -> list[str]:
+    """Put this interpreter before its words, as `-m cloudrc relay`.
+
+    Python looks into the working folder first, which may be a run got from somebody else: the new
+    process does so only if this one does, as below `python -m`.
+    """
+    here = os.getcwd() in sys.path or "" in sys.path
+    return [sys.executable, *(() if here else ("-P",)), *words]

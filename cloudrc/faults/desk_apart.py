@@ -18,8 +18,7 @@ from functools import partial
 from pathlib import Path
 
 from cloudrc.cloud.operator import Operator
-from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, send, turn
-from cloudrc.drivers.unix import UnixPeer
+from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, UnixPeer, send, turn
 from cloudrc.faults.desk import Desk
 from cloudrc.faults.mortal import Mortal
 from cloudrc.faults.scenario import generator

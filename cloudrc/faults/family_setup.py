@@ -10,7 +10,7 @@ from math import nan
 from pathlib import Path
 
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile
-from cloudrc.drivers.wall_clock import WallClock, told
+from cloudrc.drivers.recording import WallClock, told
 from cloudrc.errors import BadInputError
 from cloudrc.faults import asks, meters
 from cloudrc.faults.crowd import Crowd

@@ -15,7 +15,7 @@ from api_harness import Running, running
 
 from cloudrc.cli.here import QUIET_LIMIT
 from cloudrc.cli.main import main
-from cloudrc.drivers import flights
+from cloudrc.drivers import local
 
 Printed = pytest.CaptureFixture[str]
 SET = ["link", "set", "uplink.loss=0.1"]
@@ -37,7 +37,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def flying(folder: Path) -> Iterator[Running]:
     """A run that flies in this folder."""
     folder.mkdir(parents=True)
-    with running(unix=True) as api, flights.announced(folder, api.url):
+    with running(unix=True) as api, local.announced(folder, api.url):
         yield api
 
 
@@ -78,8 +78,8 @@ def test_runs_whose_api_is_not_up_or_that_have_none_are_not_asked_about(
     with flying(tmp_path / "out") as api:
         not_yet = f"unix:{tmp_path / 'api.sock'}"
         with (
-            flights.announced(elsewhere / "runs" / "latest", not_yet),
-            flights.announced(tmp_path / "without an API"),
+            local.announced(elsewhere / "runs" / "latest", not_yet),
+            local.announced(tmp_path / "without an API"),
         ):
             assert main(["mission", "estop"]) == 0
         assert len(api.alarms) == 1
@@ -151,12 +151,12 @@ def with_link(folder: Path, *, killed: bool = False) -> Path:
 
 def test_a_link_is_set_on_the_only_run_that_flies(tmp_path: Path, capsys: Printed) -> None:
     run = with_link(tmp_path / "a", killed=True)
-    with flights.announced(run), flights.announced(tmp_path / "without a link"):
+    with local.announced(run), local.announced(tmp_path / "without a link"):
         assert main(SET) == 2
         said = capsys.readouterr().err
         assert said.startswith(f"cloudrc: the run that flies in {run}\n")
         assert f"{run}: no link is up there (yet); wait for the start" in said
-        with flights.announced(with_link(tmp_path / "b")):
+        with local.announced(with_link(tmp_path / "b")):
             assert main(SET) == 2
         (line,) = capsys.readouterr().err.splitlines()
         for name in "ab":
@@ -180,7 +180,7 @@ def test_the_link_of_a_run_that_was_killed_is_not_set(
     )
     assert main([*SET, "--run", str(dead)]) == 2
     assert f"--run {dead}: no run flies there" in capsys.readouterr().err
-    with flights.announced(with_link(tmp_path / "out")):
+    with local.announced(with_link(tmp_path / "out")):
         assert main(SET) == 2
     assert f"{tmp_path / 'out'}: no link is up there" in capsys.readouterr().err
 
@@ -197,6 +197,6 @@ def test_kubectl_never_means_a_run_here(
     elsewhere: Path, monkeypatch: pytest.MonkeyPatch, capsys: Printed
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc", *SET])
-    with flights.announced(with_link(elsewhere / "runs" / "latest")):
+    with local.announced(with_link(elsewhere / "runs" / "latest")):
         assert main() == 3
     assert "KUBECONFIG" in capsys.readouterr().err

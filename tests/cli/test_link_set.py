@@ -14,7 +14,7 @@ from cloudrc.cli.main import main
 from cloudrc.cli.relay_control import RelayControl
 from cloudrc.config.document import Document
 from cloudrc.config.edit import edit
-from cloudrc.drivers import flights
+from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
@@ -140,7 +140,7 @@ def flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Flight]:
     monkeypatch.chdir(tmp_path)
     found = Flight(tmp_path / "runs" / "latest")
     monkeypatch.setattr(link_set, "sleep", found.wait)
-    with flights.announced(tmp_path / "runs" / "latest"):
+    with local.announced(tmp_path / "runs" / "latest"):
         yield found
 
 

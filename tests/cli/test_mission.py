@@ -16,7 +16,7 @@ from cloudrc.cli import mission_follow, mission_local
 from cloudrc.cli.main import main
 from cloudrc.cli.mission_http import Api
 from cloudrc.cli.token import reader
-from cloudrc.drivers import flights
+from cloudrc.drivers import local
 
 FILE = """
 description: Two points
@@ -206,7 +206,7 @@ def test_the_run_that_flies_here_is_found_by_itself_and_wants_no_token(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with running(unix=True) as api:
-        with flights.announced(folder / "runs" / "latest", api.url):
+        with local.announced(folder / "runs" / "latest", api.url):
             assert main(["mission", "status"]) == 0
             assert "no mission is under way" in capsys.readouterr().out
             api.post_local("/v1/missions", {"waypoints": [{"position_m": [0.5, -2.0, 1.0]}]})

@@ -11,7 +11,7 @@ import pytest
 from fake_api import FakeApi
 
 from cloudrc.cli.main import main
-from cloudrc.drivers import flights
+from cloudrc.drivers import local
 
 Printed = pytest.CaptureFixture[str]
 IN_CLUSTER = "no missions in namespace 'demo'"
@@ -29,15 +29,15 @@ def flies_here(tmp_path: Path) -> Iterator[None]:
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(f"{tmp_path}/silent.sock")
         server.listen()
-        with flights.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
+        with local.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
             yield
 
 
 @pytest.fixture
 def was_killed(tmp_path: Path) -> None:
     """A run that could not clean up after itself."""
-    with flights.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
-        (file,) = flights.places()[0].iterdir()
+    with local.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
+        (file,) = local.places()[0].iterdir()
         left = file.read_text()
     file.write_text(left)
     file.chmod(0o600)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.drivers.unix import UnixPeer
+from cloudrc.drivers.teleop import UnixPeer
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.drivers.cgroup import Throttling, read_throttling
+from cloudrc.drivers.exporter import Throttling, read_throttling
 
 VERSION_2 = """\
 usage_usec 4402130

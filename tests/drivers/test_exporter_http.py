@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.drivers import probes
+from cloudrc.drivers import exporter as probes
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.errors import MissingPrerequisiteError
 

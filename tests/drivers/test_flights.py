@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.drivers import flights
+from cloudrc.drivers import local
 from cloudrc.drivers.local import LocalRun
 from cloudrc.records import Record
 
@@ -31,32 +31,32 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     for name, folder in (("XDG_RUNTIME_DIR", "runtime"), ("XDG_STATE_HOME", "state")):
         (tmp_path / folder).mkdir()
         monkeypatch.setenv(name, str(tmp_path / folder))
-    return flights.places()
+    return local.places()
 
 
 def test_a_flight_is_found_while_it_lasts_and_leaves_nothing(
     tmp_path: Path, places: list[Path]
 ) -> None:
-    with flights.announced(tmp_path / "a"):
-        assert flights.under_way() == {tmp_path / "a": ""}
-        with flights.announced(tmp_path / "b", "unix:/b.sock"):
-            assert flights.under_way() == {tmp_path / "b": "unix:/b.sock", tmp_path / "a": ""}
-        assert list(flights.under_way()) == [tmp_path / "a"]
-    assert flights.under_way() == {}
+    with local.announced(tmp_path / "a"):
+        assert local.under_way() == {tmp_path / "a": ""}
+        with local.announced(tmp_path / "b", "unix:/b.sock"):
+            assert local.under_way() == {tmp_path / "b": "unix:/b.sock", tmp_path / "a": ""}
+        assert list(local.under_way()) == [tmp_path / "a"]
+    assert local.under_way() == {}
     assert list(places[0].iterdir()) == []
 
 
 def test_it_is_told_by_its_whole_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with flights.announced(Path("runs/hover-1")):
+    with local.announced(Path("runs/hover-1")):
         monkeypatch.chdir("/")
-        assert list(flights.under_way()) == [tmp_path / "runs" / "hover-1"]
+        assert list(local.under_way()) == [tmp_path / "runs" / "hover-1"]
 
 
 def test_a_flight_that_fails_is_over(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), flights.announced(tmp_path):
+    with pytest.raises(KeyboardInterrupt), local.announced(tmp_path):
         raise KeyboardInterrupt
-    assert flights.under_way() == {}
+    assert local.under_way() == {}
 
 
 @pytest.mark.process
@@ -67,12 +67,12 @@ def test_a_flight_that_is_killed_is_over_and_is_cleared_away(
     assert ended.returncode == -signal.SIGKILL
     (left,) = places[0].glob("*.json")
     assert json.loads(left.read_text())["run"] == str(tmp_path)
-    assert flights.under_way() == {}
+    assert local.under_way() == {}
     assert not left.exists()
 
 
 def test_folder_and_files_are_this_users_alone(tmp_path: Path, places: list[Path]) -> None:
-    with flights.announced(tmp_path):
+    with local.announced(tmp_path):
         (file,) = places[0].iterdir()
         assert stat.S_IMODE(places[0].stat().st_mode) == 0o700
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -87,44 +87,44 @@ def test_where_others_may_write_or_nobody_may_the_second_place_is_taken(
     else:
         places[0].mkdir(parents=True)
         places[0].chmod(mode)
-    with flights.announced(tmp_path):
+    with local.announced(tmp_path):
         assert len(list(places[1].iterdir())) == 1
-        assert list(flights.under_way()) == [tmp_path]
+        assert list(local.under_way()) == [tmp_path]
 
 
 def test_what_somebody_else_could_have_written_is_not_read(
     tmp_path: Path, places: list[Path]
 ) -> None:
-    with flights.announced(tmp_path):
+    with local.announced(tmp_path):
         places[0].chmod(0o777)
-        assert flights.under_way() == {}
+        assert local.under_way() == {}
         places[0].chmod(0o700)
         (file,) = places[0].iterdir()
         file.chmod(0o640)
-        assert flights.under_way() == {}
+        assert local.under_way() == {}
         file.chmod(0o600)
-        assert list(flights.under_way()) == [tmp_path]
+        assert list(local.under_way()) == [tmp_path]
 
 
 def test_what_belongs_to_somebody_else_is_neither_read_nor_written_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with flights.announced(tmp_path / "a"):
-        assert list(flights.under_way()) == [tmp_path / "a"]
+    with local.announced(tmp_path / "a"):
+        assert list(local.under_way()) == [tmp_path / "a"]
         monkeypatch.setattr(os, "getuid", lambda: os.stat(tmp_path).st_uid + 1)
-        assert flights.under_way() == {}
+        assert local.under_way() == {}
         (tmp_path / "state" / "cloudrc" / "flights").mkdir(parents=True, mode=0o700)
-        with flights.announced(tmp_path / "b") as told:
+        with local.announced(tmp_path / "b") as told:
             assert not told
 
 
 def test_where_nothing_can_be_written_it_flies_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(flights, "places", lambda: [Path("/proc/nowhere")])
-    with flights.announced(tmp_path) as told:
+    monkeypatch.setattr(local, "places", lambda: [Path("/proc/nowhere")])
+    with local.announced(tmp_path) as told:
         assert not told
-        assert flights.under_way() == {}
+        assert local.under_way() == {}
 
 
 @pytest.mark.parametrize("api", [True, False])
@@ -135,14 +135,14 @@ def test_a_flight_that_no_command_finds_says_by_which_flag_it_is_commanded(
     said: list[Record] = []
     LocalRun(tmp_path, said.extend, api=api).fly(1.0)
     assert said == []
-    monkeypatch.setattr(flights, "places", list)
+    monkeypatch.setattr(local, "places", list)
     LocalRun(tmp_path, said.extend, api=api).fly(1.0)
     assert ["--api unix:/" in str(record) for record in said] == [True] * api
 
 
 def test_a_file_that_says_nothing_is_no_flight(places: list[Path]) -> None:
     places[0].mkdir(parents=True, mode=0o700)
-    with flights.announced(Path("a")):
+    with local.announced(Path("a")):
         (file,) = places[0].iterdir()
         file.write_text("[]")
-        assert flights.under_way() == {}
+        assert local.under_way() == {}

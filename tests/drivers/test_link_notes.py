@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.drivers.feed import Feed, in_words
-from cloudrc.drivers.link_notes import LinkNotes
+from cloudrc.drivers.process import LinkNotes
 from cloudrc.link.lateness import ReleaseErrors, in_ns
 from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
 from cloudrc.messages import GuardState

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.drivers import flights
+from cloudrc.drivers import local as flights
 
 pytestmark = pytest.mark.process
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.drivers.realtime import ROUTE_PERIOD_NS, Peer
-from cloudrc.drivers.route import Route, parse
+from cloudrc.drivers.realtime import ROUTE_PERIOD_NS, Peer, Route, parse
 
 HERE, THERE = ("127.0.0.1", 7401), ("10.1.2.3", 7400)
 

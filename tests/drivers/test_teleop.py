@@ -5,8 +5,14 @@ import time
 
 import pytest
 
-from cloudrc.drivers.teleop import BLIND_WAKES, EVENTS_KEPT, STALL_NS, RemoteTeleop, serve_teleop
-from cloudrc.drivers.unix import UnixPeer
+from cloudrc.drivers.teleop import (
+    BLIND_WAKES,
+    EVENTS_KEPT,
+    STALL_NS,
+    RemoteTeleop,
+    UnixPeer,
+    serve_teleop,
+)
 from cloudrc.errors import BadInputError
 from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent

@@ -14,7 +14,7 @@ import pytest
 from cloudrc.cli import teleop, teleop_alarm
 from cloudrc.cli.teleop_alarm import Alarm
 from cloudrc.cli.teleop_api import ServedApi
-from cloudrc.drivers.unix import UnixPeer
+from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.teleop.bridge import Bridge
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.wire import ALARM, encode

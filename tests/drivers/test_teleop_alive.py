@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from cloudrc.drivers.teleop import ALIVE_NS, BLIND_WAKES, STALL_NS, RemoteTeleop, turn
-from cloudrc.drivers.unix import UnixPeer
+from cloudrc.drivers.teleop import ALIVE_NS, BLIND_WAKES, STALL_NS, RemoteTeleop, UnixPeer, turn
 from cloudrc.messages import Setpoint
 from cloudrc.teleop.wire import decode, encode
 

@@ -8,7 +8,7 @@ import pytest
 from release import LIMIT, TOKEN, Release
 
 from cloudrc.cli.mission_http import Api, UnreachableError
-from cloudrc.drivers.unix import UnixPeer
+from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.teleop.journal import parse
 from cloudrc.teleop.wire import ALARM, encode
 

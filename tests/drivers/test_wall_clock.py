@@ -11,8 +11,7 @@ import pytest
 
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.drivers.process import _Watch
-from cloudrc.drivers.recording import RecordingThread
-from cloudrc.drivers.wall_clock import WallClock, told
+from cloudrc.drivers.recording import RecordingThread, WallClock, told
 from cloudrc.faults.walls import Wall, steppable_wall_clock
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Fault

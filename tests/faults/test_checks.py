@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from cloudrc.drivers.keyfile import KeyFile
+from cloudrc.drivers.recording import WallClock
 from cloudrc.drivers.teleop import LastWord
-from cloudrc.drivers.wall_clock import WallClock
 from cloudrc.exposition.live import Live
 from cloudrc.faults import meters
 from cloudrc.faults.catalogue import find

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import pytest
 
-from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop
-from cloudrc.drivers.unix import UnixPeer
+from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, UnixPeer
 from cloudrc.faults.desk_apart import SOCKET_MAX, Apart
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.fuzz import fly

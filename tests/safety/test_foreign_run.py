@@ -16,7 +16,7 @@ from cloudrc.cli.link_verify import find
 from cloudrc.cli.main import main
 from cloudrc.config.load import dump, load_experiment, read_experiment
 from cloudrc.config.schema import PlugIn
-from cloudrc.drivers.interpreter import interpreter
+from cloudrc.drivers.machine import interpreter
 from cloudrc.record.merge import write_mission
 from tests.metrics.flights import flown
 
