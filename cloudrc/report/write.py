@@ -17,12 +17,13 @@ from cloudrc.metrics import METRIC_NOTE, Flight, Number, measure_all
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import (
     Run,
+    Verdict,
     clock_offset_document,
     environment_document,
+    judge,
     report_document,
     write_json,
 )
-from cloudrc.report.verdict import Verdict, judge
 
 BEFORE_MAX = 16 << 20
 """Longest report.json that is read [bytes]; notes may be many."""

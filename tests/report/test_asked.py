@@ -14,10 +14,8 @@ import pytest
 from cloudrc.config.schema import Blackout, Change, Direction
 from cloudrc.records import LinkChanged
 from cloudrc.report.figures import delay
-from cloudrc.report.figures.asked import bounds, set_in_flight, spans
-from cloudrc.report.figures.events import legend, mark_events
-from cloudrc.report.figures.style import RC, new_figure
-from cloudrc.report.figures.subject import Subject
+from cloudrc.report.figures.marks import bounds, legend, mark_events, set_in_flight, spans
+from cloudrc.report.figures.style import RC, Subject, new_figure
 from tests.metrics.flights import ONE_PIPE, Log, at, flown
 
 CALM = Direction(delay_ms=50.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cloudrc.config.schema import Change, Direction
-from cloudrc.report.figures.band import at, band
+from cloudrc.report.figures.marks import at, band
 
 
 def bounds(direction: Direction, time: float) -> tuple[float, float]:

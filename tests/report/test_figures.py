@@ -13,10 +13,9 @@ from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.records import Control, GuardChange
 from cloudrc.report.figures import NAMES, draw_all, flight
-from cloudrc.report.figures.events import LEGEND, legend, mark_events
-from cloudrc.report.figures.solids import WALL_COLOUR, is_swallowed, pipe_faces
-from cloudrc.report.figures.style import RC, new_figure
-from cloudrc.report.figures.subject import Subject
+from cloudrc.report.figures.marks import LEGEND, legend, mark_events
+from cloudrc.report.figures.snapshots import WALL_COLOUR, is_swallowed, pipe_faces
+from cloudrc.report.figures.style import RC, Subject, new_figure
 from tests.metrics.flights import ONE_PIPE, START, Log, at, flown
 
 CALM = Direction(delay_ms=50.0)

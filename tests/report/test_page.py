@@ -12,11 +12,10 @@ import pytest
 
 from cloudrc.metrics import Number
 from cloudrc.report import numbers as table
-from cloudrc.report import prose
-from cloudrc.report.document import Run, environment_document
+from cloudrc.report import page as prose
+from cloudrc.report.document import Failure, Run, Verdict, environment_document
 from cloudrc.report.figures import NAMES, Picture
 from cloudrc.report.page import render
-from cloudrc.report.verdict import Failure, Verdict
 from cloudrc.report.write import assess, write_report
 from tests.metrics.flights import ONE_PIPE, flown, paper, touch
 

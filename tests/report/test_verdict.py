@@ -18,7 +18,7 @@ from cloudrc.records import (
     MissionEvent,
     SessionOpened,
 )
-from cloudrc.report.verdict import SLIP_MAX, Verdict, judge
+from cloudrc.report.document import SLIP_MAX, Verdict, judge
 from tests.metrics.flights import ONE_PIPE, SECOND, Log, at, flown, touch
 
 

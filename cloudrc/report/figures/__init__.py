@@ -13,8 +13,7 @@ from io import BytesIO
 import matplotlib
 from matplotlib.figure import Figure
 
-from cloudrc.report.figures.style import RC
-from cloudrc.report.figures.subject import Subject
+from cloudrc.report.figures.style import RC, Subject
 
 __all__ = ["NAMES", "Picture", "Subject", "draw_all"]
 

@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 
 from cloudrc.metrics.control import round_trips
 from cloudrc.metrics.flight import Array
-from cloudrc.report.figures.asked import bounds
-from cloudrc.report.figures.events import legend, mark_events
+from cloudrc.report.figures.marks import bounds, legend, mark_events
 from cloudrc.report.figures.style import (
     BLACK,
     DOWNLINK,
@@ -18,12 +17,12 @@ from cloudrc.report.figures.style import (
     PAGE,
     SKY,
     UPLINK,
+    Subject,
     legend_above,
     new_figure,
     panel,
     time_axis,
 )
-from cloudrc.report.figures.subject import Subject
 
 ALT = "Two scatter plots over time: one-way delays, and the loop delay with its estimate."
 CAPTION = (

@@ -7,18 +7,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.metrics.flight import Array, rms
-from cloudrc.report.figures.events import legend, mark_events
+from cloudrc.report.figures.marks import legend, mark_events
 from cloudrc.report.figures.style import (
     ESTIMATED,
     MEASURED,
     PAGE,
     SKY,
+    Subject,
     legend_above,
     new_figure,
     panel,
     time_axis,
 )
-from cloudrc.report.figures.subject import Subject
 
 ALT = "Two line plots over time: distance to the setpoint, and the error of the estimate."
 CAPTION = (

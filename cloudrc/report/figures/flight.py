@@ -16,8 +16,7 @@ from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH, ARM_RADIUS, Points, p
 from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import first_touch
-from cloudrc.report.figures.style import BLACK, GREY, PAGE, VERMILION, new_figure, panel
-from cloudrc.report.figures.subject import Subject
+from cloudrc.report.figures.style import BLACK, GREY, PAGE, VERMILION, Subject, new_figure, panel
 
 ALT = "The flown path from above and from the side through the pipes, coloured by clearance."
 CAPTION_PIPES = (

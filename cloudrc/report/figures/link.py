@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from cloudrc.config.schema import Direction
 from cloudrc.metrics.flight import Array
-from cloudrc.report.figures import band
+from cloudrc.report.figures import marks
 from cloudrc.report.figures.style import (
     DOWNLINK,
     GREY,
@@ -108,10 +108,10 @@ def _top(way: Way) -> float:
 def _draw_delay(axes: Axes, way: Way, colour: str, top: float) -> None:
     """Draw each packet as a dot over what was asked for, the lost along the lower edge."""
     duration = float(way.sent[-1]) if len(way.sent) else 1.0
-    steps = band.band(way.asked)
+    steps = marks.band(way.asked)
     if steps is not None and (way.asked.trace is None or way.asked.jitter_ms):
         time = np.linspace(0.0, duration, 2000)
-        low, high = band.at(steps, time)
+        low, high = marks.at(steps, time)
         axes.fill_between(time, low * 1e3, high * 1e3, color=LIGHT, lw=0, zorder=1, label="profile")
     _hatch_blackouts(axes, way.asked, duration)
     thin = slice(None, None, max(1, len(way.sent) // DOTS))

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from cloudrc.report.figures.events import legend, mark_events
+from cloudrc.report.figures.marks import legend, mark_events
 from cloudrc.report.figures.style import (
     ESTIMATED,
     MEASURED,
     PAGE,
     REFERENCE,
+    Subject,
     legend_above,
     new_figure,
     panel,
     time_axis,
 )
-from cloudrc.report.figures.subject import Subject
 
 ALT = "Three line plots of the x, y and z position over time: reference, measured, estimated."
 CAPTION = (
