@@ -6,9 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import end_arguments
-from cloudrc.cli.opened import open_end, suite
+from cloudrc.cli.runtime import end_arguments, open_end, suite
 
 if TYPE_CHECKING:
     from cloudrc.cloud.endpoint import Operator

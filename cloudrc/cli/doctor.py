@@ -1,14 +1,287 @@
-"""`cloudrc doctor`: checks this machine, line by line, and names the mend of what is missing."""
+"""`cloudrc doctor`: checks this machine, line by line, and names the mend of what is missing.
+
+One line of the doctor: what was looked at, what is there, and what to do about it.
+
+The doctor's checks of mode cluster: programs, a kubeconfig, and whether a cluster answers.
+
+The checks of `cloudrc doctor`: what this machine has, and the mend for what it has not.
+"""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+import ctypes.util
+import importlib.metadata
+import os
+import platform
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from cloudrc.cli.check import Check
-from cloudrc.cli.checks import all_checks
+from cloudrc.cli.extras import EXTRAS, missing
 from cloudrc.cli.output import output_argument, paint, table, written
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.drivers.machine import interpreter
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+
+if TYPE_CHECKING:
+    from cloudrc.cluster.client import Release
+
+
+FLYING = ("virtual", "local")
+CLUSTER = ("cluster",)
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One line of the doctor.
+
+    Attributes:
+        name: What was looked at.
+        state: "ok"; "warn": it will fly, but see `fix`; "missing".
+        found: What is there, in words.
+        fix: What to do about it; empty if nothing.
+        modes: Modes that cannot run without it.
+    """
+
+    name: str
+    state: Literal["ok", "warn", "missing"]
+    found: str
+    fix: str = ""
+    modes: tuple[str, ...] = ()
+
+
+NEEDED = {
+    "helm": "https://helm.sh/docs/intro/install",
+    "kubectl": "https://kubernetes.io/docs/tasks/tools",
+}
+"""Programs that mode cluster calls -> where to get them."""
+HELPFUL = {
+    "docker": "https://docs.docker.com/engine/install",
+    "kind": "https://kind.sigs.k8s.io",
+}
+"""Programs that make a cluster on this machine; one that is elsewhere needs neither."""
+MAKE_ONE = "kind create cluster --config kind-config.yaml"
+DOCKER_LIMIT = 5.0
+"""For Docker's daemon to answer [s]."""
+
+
+def programs() -> Iterator[Check]:
+    """Look for the programs that mode cluster uses."""
+    for name, where in NEEDED.items():
+        path = shutil.which(name)
+        if path is None:
+            yield Check(name, "missing", "not in PATH", where, CLUSTER)
+        else:
+            yield Check(name, "ok", path, "", CLUSTER)
+    for name, where in HELPFUL.items():
+        path = shutil.which(name)
+        if path is None:
+            yield Check(name, "warn", "not in PATH", f"to make a cluster here: {where}")
+        elif name == "docker" and not _docker_answers(path):
+            fix = "to make a cluster here, start it: docker info says what is wrong"
+            yield Check(name, "warn", f"{path}, but its daemon does not answer", fix)
+        else:
+            yield Check(name, "ok", path)
+
+
+def cluster(context: str | None) -> Iterator[Check]:
+    """Look for a kubeconfig, and ask the cluster that it leads to.
+
+    Args:
+        context: Of the kubeconfig; None for the current one.
+    """
+    if missing("kube"):
+        return  # which is a line of its own, and without it there is no way to look
+    from cloudrc.cluster.client import connect
+
+    try:
+        release = connect(context)
+    except CloudrcError as error:
+        found, _, fix = str(error).partition("; ")
+        yield Check("kubeconfig", "missing", _short(found), fix, CLUSTER)
+        return
+    where = f"context {context}" if context else "its current context"
+    yield Check("kubeconfig", "ok", f"{where}, namespace {release.namespace}", "", CLUSTER)
+    yield _answering(release)
+
+
+def _answering(release: Release) -> Check:
+    from cloudrc.cluster.client import OLDEST, server_version
+
+    oldest = ".".join(map(str, OLDEST))
+    try:
+        version = server_version(release)
+    except CloudrcError as error:
+        found, _, fix = str(error).partition("; ")
+        return Check("cluster", "missing", _short(found), fix or MAKE_ONE, CLUSTER)
+    found = f"Kubernetes {version[0]}.{version[1]}"
+    if version < OLDEST:
+        fix = f"the chart needs {oldest}: upgrade it, or {MAKE_ONE}"
+        return Check("cluster", "missing", f"{found}, too old", fix, CLUSTER)
+    return Check("cluster", "ok", f"{found} answers", "", CLUSTER)
+
+
+def _docker_answers(path: str) -> bool:
+    command = [path, "version", "--format={{.Server.Version}}"]
+    try:
+        return subprocess.run(command, capture_output=True, timeout=DOCKER_LIMIT).returncode == 0
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 120 else f"{text[:117]}..."
+
+
+# What a control loop of 10 ms can bear; a quiet desktop stays far below [s].
+LATE_SLEEP = 2e-3
+
+STEP = (
+    "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
+    "mujoco.mj_step(m, mujoco.MjData(m)); print(mujoco.__version__)"
+)
+
+
+def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Check]:
+    """Run every check, in the order in which they are shown.
+
+    Args:
+        mode: That is wanted; a cluster is asked only if it is "cluster".
+        context: Of the kubeconfig; None for the current one.
+    """
+    yield python()
+    for extra in EXTRAS:
+        yield packages(extra)
+    yield mujoco_steps()
+    yield udp_loopback()
+    yield timer()
+    yield cores()
+    yield graphics()
+    yield from programs()
+    if mode in CLUSTER:
+        yield from cluster(context)
+    yield netem()
+    yield cgroup()
+
+
+def python() -> Check:
+    """Check the interpreter's version."""
+    enough = sys.version_info >= (3, 11)
+    state: Literal["ok", "missing"] = "ok" if enough else "missing"
+    fix = "" if enough else "install Python 3.11 or newer"
+    return Check("python", state, platform.python_version(), fix, (*FLYING, *CLUSTER))
+
+
+def packages(extra: str) -> Check:
+    """Check the packages of one extra."""
+    everywhere = (*FLYING, *CLUSTER)
+    wanted = {"world": FLYING, "record": everywhere, "report": everywhere, "kube": CLUSTER}
+    modes = wanted.get(extra, ())
+    absent = missing(extra)
+    if absent:
+        fix = f"pip install 'cloudrc[{extra}]'"
+        return Check(f"extra {extra}", "missing", f"no {', '.join(absent)}", fix, modes)
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in EXTRAS[extra]]
+    return Check(f"extra {extra}", "ok", ", ".join(versions), "", modes)
+
+
+def mujoco_steps() -> Check:
+    """Load MuJoCo and make one step, in a process of its own: a bad library can abort."""
+    answer = subprocess.run(interpreter("-c", STEP), capture_output=True, text=True)
+    if answer.returncode == 0:
+        return Check("physics", "ok", "MuJoCo loads and steps", "", FLYING)
+    lines = answer.stderr.strip().splitlines() or [f"exit code {answer.returncode}"]
+    gl = os.environ.get("MUJOCO_GL")
+    fix = f"unset MUJOCO_GL (it is '{gl}')" if gl else "pip install --force-reinstall mujoco"
+    return Check("physics", "missing", lines[-1][:120], fix, FLYING)
+
+
+def udp_loopback(rounds: int = 200) -> Check:
+    """Send datagrams over 127.0.0.1 and back, through three free ports."""
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here:
+            here.bind(("127.0.0.1", 0))
+            here.settimeout(1.0)
+            trips = []
+            for _ in range(rounds):
+                start = time.perf_counter()
+                here.sendto(b"cloudrc", here.getsockname())
+                here.recv(16)
+                trips.append(time.perf_counter() - start)
+    except OSError as error:
+        fix = "allow UDP on 127.0.0.1 (a sandbox or a firewall refuses it)"
+        return Check("udp loopback", "missing", str(error), fix, ("local",))
+    median = sorted(trips)[rounds // 2] * 1e6
+    return Check("udp loopback", "ok", f"port free, median {median:.0f} us", "", ("local",))
+
+
+def timer(rounds: int = 100) -> Check:
+    """Measure how late a sleep of 1 ms ends."""
+    late = []
+    for _ in range(rounds):
+        start = time.monotonic()
+        time.sleep(1e-3)
+        late.append(time.monotonic() - start - 1e-3)
+    worst = sorted(late)[int(0.99 * rounds) - 1]
+    found = f"sleeps end {worst * 1e3:.2f} ms late (99 %)"
+    if worst > LATE_SLEEP:
+        return Check("timer", "warn", found, "close busy programs, or use --mode virtual")
+    return Check("timer", "ok", found)
+
+
+def cores() -> Check:
+    """Compare the cores that this process may use with what already runs."""
+    count = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    load = os.getloadavg()[0]
+    found = f"{count}, load {load:.1f}"
+    if count < 2:
+        return Check("cores", "warn", found, "real time wants two; --mode virtual flies on one")
+    if load > count:
+        return Check("cores", "warn", found, "others use them: close programs or wait")
+    return Check("cores", "ok", found)
+
+
+def graphics() -> Check:
+    """Look for GL; flying and reporting need none."""
+    found = [name for name in ("EGL", "OSMesa", "GL") if ctypes.util.find_library(name)]
+    return Check("graphics", "ok", ", ".join(found) if found else "no GL, and none is needed")
+
+
+def netem() -> Check:
+    """Look for the kernel's network emulator; the userspace relay stands in for it."""
+    release = platform.release()
+    modules = Path("/lib/modules") / release
+    builtin = "sch_netem" in _output_of(modules / "modules.builtin")
+    if builtin or Path("/sys/module/sch_netem").exists():
+        return Check("sch_netem", "ok", f"in kernel {release}")
+    if "sch_netem" in _output_of(modules / "modules.dep"):
+        return Check("sch_netem", "ok", "a module, not loaded yet")
+    return Check("sch_netem", "warn", "not found", "the relay shapes the link without it")
+
+
+def cgroup() -> Check:
+    """Look for control groups: what a CPU limit holds back is read from v1 and v2 alike."""
+    if Path("/sys/fs/cgroup/cgroup.controllers").exists():
+        return Check("cgroup", "ok", "v2")
+    if Path("/sys/fs/cgroup").is_dir():
+        return Check("cgroup", "ok", "v1")
+    return Check("cgroup", "warn", "none", "the metrics of CPU limits stay empty on this machine")
+
+
+def _output_of(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace")
+    except OSError:
+        return ""
+
 
 COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 

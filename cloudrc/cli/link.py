@@ -6,7 +6,7 @@ import argparse
 import importlib
 from pathlib import Path
 
-from cloudrc.cli.ends import address, process_arguments
+from cloudrc.cli.runtime import address, process_arguments
 from cloudrc.errors import BadInputError
 
 EPILOG = """\

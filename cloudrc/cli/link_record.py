@@ -1,15 +1,22 @@
-"""`cloudrc link record SOURCE`: measured delays come in, a trace for a profile goes out."""
+"""`cloudrc link record SOURCE`: measured delays come in, a trace for a profile goes out.
+
+Where a trace comes from: a run, an MCAP file or a log is recognised, its packets come out.
+"""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cloudrc.cli.extras import require
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.link.traces import Direction, Packets
+    from cloudrc.record.columns import Recording, Table
+
 
 EPILOG = """\
 sources:
@@ -50,7 +57,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Read the source, write the trace or traces, and say what is in them."""
-    from cloudrc.cli.link_source import from_log, from_run, is_run
 
     source: Path = options.source
     if not (source.is_dir() or source.is_file()):
@@ -90,3 +96,162 @@ def _write(packets: Packets, path: Path, direction: str, *, halve: bool) -> None
     if deviation:
         print(f"  or draw:  {{delay_ms: {mean:.4g}, jitter_ms: {deviation:.3g}, ", end="")
         print(f"distribution: table, table: {path.name}}}")
+
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+UNPACKED_MAX = 64 << 20
+"""Longest log that is unpacked [bytes], 10 min of irtt at 100 Hz; a small file may hold any."""
+SETTLING_NS = 2_000_000_000
+"""What was sent this long before its session's last datagram [ns] and did not arrive is lost."""
+TOPICS = {
+    "uplink": ("/telemetry", "/uplink_delay"),
+    "downlink": ("/delay_estimate", "/downlink_delay"),
+}
+"""By direction: one row per datagram sent, and one per datagram that arrived."""
+
+
+def is_run(path: Path) -> bool:
+    """Say whether a path is a run's folder or a recording: those have both directions."""
+    if path.is_dir():
+        return True
+    with path.open("rb") as file:
+        return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+
+
+def from_run(path: Path, direction: Direction, *, halve: bool) -> Packets:
+    """Read one direction of a run's folder or of its mission.mcap.
+
+    Args:
+        path: Folder or file.
+        direction: Which of the two.
+        halve: Whether to take half of each round trip that cloud measured in place of the one-way
+            delays, which are known only where both ends share a clock.
+
+    Raises:
+        BadInputError: If it holds no such delays.
+    """
+    require("a trace of a run", ("record",))
+    recording = _recording(path)
+    return _halves(recording, path) if halve else one_way(recording, path, direction)
+
+
+def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_units: bool) -> Packets:
+    """Read a log of ping or irtt, or a CSV file; which of them it is says its content.
+
+    Raises:
+        BadInputError: If it is none of them, or cannot be used.
+    """
+    from cloudrc.link.traces import is_ping, read_csv, read_irtt, read_lines, read_ping
+
+    name = str(path)
+    remedy = "give a run, a log of ping or irtt, or a CSV file"
+    lines = _lines(path) or read_lines(path, name, remedy)
+    if lines and lines[0].lstrip().startswith("{"):
+        if direction is None and not halve:
+            raise BadInputError(
+                f"{name}: irtt measures both ways; choose --direction uplink (what its client "
+                "sent) or downlink"
+            )
+        return read_irtt("\n".join(lines), name, direction or "uplink", halve=halve)
+    if is_ping(lines):
+        return read_ping(lines, name, halve=halve)
+    return read_csv(lines, name, halve=halve, trust_units=trust_units)
+
+
+def _lines(path: Path) -> list[str]:
+    """Unpack what irtt packs on its own; nothing if it is not packed."""
+    import gzip
+    import zlib
+
+    if path.suffix != ".gz":
+        return []
+    try:
+        with gzip.open(path) as file:
+            data = file.read(UNPACKED_MAX + 1)
+        if len(data) > UNPACKED_MAX:
+            raise OSError(f"it holds more than {UNPACKED_MAX >> 20} MiB")
+        return data.decode().splitlines()
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        raise BadInputError(f"{path}: cannot be unpacked: {error}; give the file itself") from None
+
+
+def _recording(path: Path) -> Recording:
+    from cloudrc.record.columns import Recording
+
+    file = path / "mission.mcap" if path.is_dir() else path
+    if not file.is_file():
+        raise BadInputError(f"{path}: has no mission.mcap; name the folder of a run, or a file")
+    return Recording.read(file)
+
+
+def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
+    """Join what was sent with what arrived, by epoch and counter; of copies the first counts.
+
+    Args:
+        recording: Of both ends.
+        path: Where it is from, for messages.
+        direction: Which of the two.
+
+    Raises:
+        BadInputError: If it holds no such delays.
+    """
+    from math import isnan
+
+    from cloudrc.link.traces import in_order
+
+    sent_topic, topic = TOPICS[direction]
+    sent, arrivals = recording[sent_topic], recording[topic]
+    if not len(sent) or not len(arrivals):
+        missing = sent_topic if not len(sent) else topic
+        raise BadInputError(
+            f"{path}: nothing on {missing}, so no {direction}; "
+            "give the run's folder or its mission.mcap"
+        )
+    delays: dict[tuple[float, float], float] = {}
+    for epoch, counter, delay in _columns(arrivals, "epoch", "counter", "delay"):
+        if isnan(delay):
+            raise BadInputError(
+                f"{path}: its ends did not share a clock, so one-way delays are not known; take "
+                "half of each round trip with --halve-rtt"
+            )
+        delays[epoch, counter] = min(delay, delays.get((epoch, counter), delay))
+    rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
+    # Of a session, what was sent before it was open at the far end, or near its close, may have
+    # been refused there: it is left out, for the link did not lose it.
+    first = reversed(list(_columns(arrivals, "epoch", "stamp_ns")))
+    opened_ns = {epoch: stamp_ns for epoch, stamp_ns in first}
+    last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
+    entries = [
+        ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter)))
+        for stamp_ns, epoch, counter in rows
+        if (epoch, counter) in delays
+        or opened_ns.get(epoch, stamp_ns) < stamp_ns <= last_ns[epoch] - SETTLING_NS
+    ]
+    return in_order(entries, str(path))
+
+
+def _halves(recording: Recording, path: Path) -> Packets:
+    """Take half of each round trip, at the instant at which its command left; losses are not known.
+
+    The echo of an applied command is repeated until the next: each counts once.
+    """
+    from math import isnan
+
+    from cloudrc.link.traces import in_order
+
+    estimates = recording["/delay_estimate"]
+    rows: list[tuple[float, float]] = []
+    before = None
+    for stamp_ns, rtt, loop in _columns(estimates, "stamp_ns", "rtt", "loop_delay"):
+        if not isnan(rtt) and (rtt, loop) != before:
+            before = (rtt, loop)
+            rows.append((stamp_ns - round(loop * 1e9), rtt))
+    if not rows:
+        raise BadInputError(f"{path}: holds no round trip; give the folder of a run that flew")
+    start_ns = min(stamp_ns for stamp_ns, _ in rows)
+    return in_order((((stamp_ns - start_ns) * 1e-9, rtt / 2) for stamp_ns, rtt in rows), str(path))
+
+
+def _columns(table: Table, *names: str) -> Iterator[tuple[float, ...]]:
+    """Walk over some columns row by row; integers stay integers."""
+    return zip(*(table[name].tolist() for name in names), strict=True)

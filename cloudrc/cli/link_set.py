@@ -12,7 +12,7 @@ from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.cluster_flags import place, place_arguments
-from cloudrc.cli.here import find_here, link_of, nobody_here, run_argument
+from cloudrc.cli.find_run import find_here, link_of, nobody_here, run_argument
 from cloudrc.cli.output import output_argument, say, written
 from cloudrc.cluster.tools import ClusterError
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
@@ -80,7 +80,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[Edit, Look]:
     """Leave a new profile where the run's relay looks for it."""
-    from cloudrc.cli.relay_control import PROFILE_FILE
+    from cloudrc.cli.relay import PROFILE_FILE
     from cloudrc.config.document import Document
     from cloudrc.config.edit import DIRECTIONS, edit
     from cloudrc.link.state import CHANGE_FILE, from_text, publish

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import place, place_arguments
 from cloudrc.cli.output import harmless, output_argument, written
-from cloudrc.cli.signals import end_orderly
+from cloudrc.cli.pool import end_orderly
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:

@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 from math import inf, nan
 from typing import Any, NamedTuple
 
-from cloudrc.cli.link_verify_notes import (
+from cloudrc.cli.link_verify_text import (
+    NOT_JUDGED,
+    Said,
     on_correlation,
     on_deviation,
     on_jitter,
     on_patience,
 )
-from cloudrc.cli.link_verify_text import NOT_JUDGED, Said
 from cloudrc.cluster.pods import DIRECTLY, METRICS
 from cloudrc.errors import TimedOutError
 from cloudrc.link.sidecar import Told, read_told

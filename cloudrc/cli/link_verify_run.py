@@ -1,28 +1,47 @@
-"""What `cloudrc link verify` does: plan, start the link, probe it both ways, read back, judge."""
+"""What `cloudrc link verify` does: plan, start the link, probe it both ways, read back, judge.
+
+How late the link's relays were while probes flew: asked all along, the worst is kept.
+
+A relay tells of its last ten seconds only, and one that starves early may be well again at the end.
+
+What a probe of the link looks like: its header over and over, so that damage to it is seen.
+
+A link may be asked to flip bits. Whichever bit it is, most copies of the header are whole: they say
+which probe it was, and that it is not as it was sent.
+
+Two network namespaces joined by a cable, in which netem is verified as between two pods.
+
+    [world's namespace] tunnel ======= tunnel [cloud's namespace]
+
+They live as long as the test. Needs root; nothing outside them is touched.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import os
 import socket
+import subprocess
+import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
 from cloudrc.assembly import link_profile
 from cloudrc.cli.link_processes import LOOPBACK, WAYS, Place, Shaping, refuse_impossible, shaping
-from cloudrc.cli.link_told import look
-from cloudrc.cli.link_verify_late import LateWatch
-from cloudrc.cli.link_verify_notes import describe, notes, on_correlation, shaper_in_words
-from cloudrc.cli.link_verify_probes import PROBE, TRAIN, Probes
-from cloudrc.cli.link_verify_text import Said
+from cloudrc.cli.link_run import look
+from cloudrc.cli.link_verify_text import Said, describe, notes, on_correlation, shaper_in_words
 from cloudrc.config import document
 from cloudrc.config.load import dump
 from cloudrc.config.schema import Profile
 from cloudrc.drivers.realtime import free_ports
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.verify.causes import (
     Evidence,
     Findings,
@@ -38,10 +57,105 @@ from cloudrc.link.verify.plan import Plan, make_plan
 from cloudrc.link.verify.probe import Shore, Volley, sound
 from cloudrc.link.verify.reference import frame_of
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.codec import Kind
+from cloudrc.tunnel.codec import HEADER_SIZE, Direction, Kind
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
+
+
+PERIOD = 4.0
+"""Between two questions [s]; each answer is of the ten seconds before."""
+_UNKNOWN = Evidence()
+
+
+class Told(Protocol):
+    """Who tells how late it is: see `Shaping`."""
+
+    def metrics(self) -> str:
+        """What it counts, in Prometheus' text; "" if it does not answer."""
+        ...
+
+
+class LateWatch:
+    """Asks both directions' relays on a thread of its own while it is entered."""
+
+    def __init__(self, running: Mapping[str, Told], period: float = PERIOD) -> None:
+        """Set up for the shapers of both directions; one question per `period` [s]."""
+        self._running, self._period = running, period
+        self._late: dict[str, float] = {}
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._ask_on, name="late", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._over.set()
+        self._thread.join(self._period)
+
+    def look(self) -> None:
+        """Ask once."""
+        for way, one in self._running.items():
+            late = of_metrics(samples(one.metrics()), 0, _UNKNOWN).late
+            if late is not None:
+                self._late[way] = max(late, self._late.get(way, 0.0))
+
+    def worst(self, way: str, told: Evidence) -> Evidence:
+        """Put the worst of a direction in place of what it tells at the end."""
+        known = [late for late in (told.late, self._late.get(way)) if late is not None]
+        return replace(told, late=max(known, default=None))
+
+    def _ask_on(self) -> None:
+        while not self._over.wait(self._period):
+            self.look()
+
+
+PROBE, TRAIN = 254, 255
+"""Kinds that no end of a tunnel knows: these datagrams never leave this process's own link."""
+EPOCH = 1
+
+
+class Probes:
+    """Writes and reads the probes of both directions.
+
+    Attributes:
+        damaged: Numbers of those that arrived, but not as they were sent, by direction.
+    """
+
+    def __init__(self, sizes: Mapping[str, int]) -> None:
+        """Set up for probes of these sizes, UDP payload [bytes], by direction."""
+        self._sizes = {way: {PROBE: size, TRAIN: SIZE} for way, size in sizes.items()}
+        self.damaged: dict[str, set[int]] = {way: set() for way in sizes}
+
+    def write(self, way: str, kind: int, number: int) -> bytes:
+        """Make a probe."""
+        header = codec.encode_header(kind, Direction[way.upper()], EPOCH, number)
+        return _filled(header, self._sizes[way][kind])
+
+    def read(self, data: bytes) -> tuple[int, int, int]:
+        """Read kind, epoch and number, whichever bit was flipped; note whether any was.
+
+        Raises:
+            ValueError: If it is none of ours.
+        """
+        header = data[:HEADER_SIZE]
+        whole = data == _filled(header, len(data))
+        if not whole:
+            places = range(0, len(data) - HEADER_SIZE + 1, HEADER_SIZE)
+            copies = Counter(data[place : place + HEADER_SIZE] for place in places)
+            if not copies:
+                raise ValueError("too short")
+            header = copies.most_common(1)[0][0]
+        found = codec.peek(header)
+        if not whole and found[0] == PROBE:
+            self.damaged[Direction(header[1]).name.lower()].add(found[2])
+        return found
+
+
+def _filled(header: bytes, size: int) -> bytes:
+    return (header * (size // HEADER_SIZE + 1))[:size]
+
 
 BEGIN = 1.0
 """After the link came up the first probe leaves [s]."""
@@ -160,8 +274,6 @@ def _has_rate(one: Plan) -> bool:
 def banks(shaper: str) -> Iterator[dict[str, Bank]]:
     """Open both ends of a link: on the loopback for the relay, in two namespaces for netem."""
     if shaper == "netem":
-        from cloudrc.cli.link_verify_netem import banks_of_namespaces
-
         with banks_of_namespaces() as ends:
             yield ends
         return
@@ -293,3 +405,95 @@ def _quiet(asked: Mapping[str, Asked]) -> float:
 
 def _told(tell: Tell, what: str = "sends probes") -> Callable[[float], None]:
     return lambda share: tell(f"{what}: {share:.0%}")
+
+
+DEVICE = "tunnel"
+PORT, METRICS_PORT = 7400, 9102
+HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}
+"""Addresses of the ends, by the direction that they send."""
+_CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
+
+
+@contextlib.contextmanager
+def banks_of_namespaces() -> Iterator[dict[str, Bank]]:
+    """Make the namespaces, and open a socket in each.
+
+    Raises:
+        MissingPrerequisiteError: If this user may not, or ip is missing.
+    """
+    if os.geteuid() != 0:
+        raise MissingPrerequisiteError(
+            "netem is verified between two network namespaces, which takes root; run this as root,"
+            " or verify the relay (--shaper relay)"
+        )
+    names = {way: f"cloudrc-{way}-{os.getpid()}" for way in WAYS}
+    owns: list[socket.socket] = []
+    try:
+        _join(names)
+        for way in WAYS:
+            with _inside(names[way]):
+                owns.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            owns[-1].bind((HOSTS[way], PORT))
+        yield {way: Bank(own, _place(way, names[way])) for way, own in zip(WAYS, owns, strict=True)}
+    finally:
+        for own in owns:
+            own.close()
+        for name in names.values():
+            with contextlib.suppress(MissingPrerequisiteError):
+                _ip("netns", "del", name)
+
+
+def _place(way: str, name: str) -> Place:
+    other = next(one for one in WAYS if one != way)
+    return Place(
+        peer=(HOSTS[other], PORT),
+        listen=(LOOPBACK, PORT + 1),
+        metrics=(LOOPBACK, METRICS_PORT),
+        inside=("ip", "netns", "exec", name),
+    )
+
+
+def _join(names: dict[str, str]) -> None:
+    """Make both namespaces and the cable."""
+    near, far = (names[way] for way in WAYS)
+    for name in (near, far):
+        _ip("netns", "add", name)
+    _ip("-n", near, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", far)
+    for way, name in names.items():
+        _ip("-n", name, "addr", "add", f"{HOSTS[way]}/24", "dev", DEVICE)
+        for device in ("lo", DEVICE):
+            _ip("-n", name, "link", "set", device, "up")
+
+
+def _ip(*words: str) -> str:
+    return _run("ip", *words)
+
+
+def _run(*words: str) -> str:
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=10.0, check=False)
+    except FileNotFoundError:
+        raise MissingPrerequisiteError(
+            f"no program {words[0]} (package iproute2); install it, or use --shaper relay"
+        ) from None
+    if done.returncode:
+        raise MissingPrerequisiteError(
+            f"'{' '.join(words)}' failed: {' '.join(done.stderr.split())}; use --shaper relay"
+        )
+    return done.stdout
+
+
+@contextlib.contextmanager
+def _inside(name: str) -> Iterator[None]:
+    """Be in a namespace with this thread; sockets that are opened there stay there."""
+    library = ctypes.CDLL(None, use_errno=True)  # os.setns is Python 3.12's
+    with open("/proc/thread-self/ns/net") as home, open(f"/run/netns/{name}") as there:
+        if library.setns(there.fileno(), _CLONE_NEWNET):
+            raise MissingPrerequisiteError(
+                f"cannot enter the namespace {name}: {os.strerror(ctypes.get_errno())}; use "
+                "--shaper relay"
+            )
+        try:
+            yield
+        finally:
+            library.setns(home.fileno(), _CLONE_NEWNET)

@@ -6,13 +6,13 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from cloudrc.cli.client import reader, token_argument, token_file
 from cloudrc.cli.cluster_flags import place_arguments, timeout_argument
-from cloudrc.cli.here import find_here, run_argument, url_of
+from cloudrc.cli.find_run import find_here, run_argument, url_of
 from cloudrc.cli.output import output_argument
-from cloudrc.cli.token import reader, token_argument, token_file
 
 if TYPE_CHECKING:
-    from cloudrc.cli.mission_http import Api
+    from cloudrc.cli.client import Api
 
 EPILOG = """\
 where:
@@ -93,7 +93,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Do what the verb says."""
     from cloudrc.cli import mission_cluster, mission_local
-    from cloudrc.cli.mission_http import Api
+    from cloudrc.cli.client import Api
 
     verb: str = options.verb
     if verb == "fly":

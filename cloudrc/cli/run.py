@@ -13,7 +13,7 @@ from cloudrc.cli.cluster_flags import place, place_arguments, timeout_argument
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import is_live, output_argument, say, unread_is_fine, written
 from cloudrc.cli.parser import count
-from cloudrc.cli.signals import end_orderly
+from cloudrc.cli.pool import end_orderly
 from cloudrc.errors import BadInputError, CloudrcError
 
 if TYPE_CHECKING:
@@ -99,8 +99,8 @@ def execute(options: argparse.Namespace) -> int:
 
 def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> int:
     from cloudrc import metrics
-    from cloudrc.cli.closing import exit_code, show
-    from cloudrc.cli.folder import discard, new_folder, point_latest_to
+    from cloudrc.cli.find_run import discard, new_folder, point_latest_to
+    from cloudrc.cli.summary import exit_code, show
     from cloudrc.config.load import load_experiment
 
     experiment = load_experiment(options.experiment, overrides)
@@ -145,7 +145,7 @@ def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
 
     def flight(folder: Path, stream: TextIO, waypoints: int) -> dict[str, Any]:
         from cloudrc.cli.flight import fly
-        from cloudrc.cli.live import FlightView
+        from cloudrc.cli.progress import FlightView
 
         quiet = stream is sys.stderr and not is_live(stream)
         view = None if quiet else FlightView(stream, waypoints)
@@ -160,7 +160,7 @@ def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
 
 def _in_cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> Flight:
     """Prepare a flight in the cluster that the flags name."""
-    from cloudrc.cli.cluster_flight import fly_in_cluster, refuse_local_files
+    from cloudrc.cli.run_cluster import fly_in_cluster, refuse_local_files
     from cloudrc.cluster.tools import program
 
     refuse_local_files(experiment)

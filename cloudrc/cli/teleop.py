@@ -1,26 +1,310 @@
-"""`cloudrc teleop`: the process that flies missions; its API is where they come from."""
+"""`cloudrc teleop`: the process that flies missions; its API is where they come from.
+
+The emergency stop past teleop's loop: one datagram to cloud, repeated where it is not taken.
+
+The API of `cloudrc teleop`: its flags come in, a server goes out, with tokens and audit log.
+
+Room for the journal to be shortened where it has filled its volume: a file that is given up.
+
+What a start takes out of the journal is taken out by writing the rest anew beside it, for which a
+full disk has no room; and to wait for the next start would be to wait for ever. So some room is
+kept by a file, which is deleted then and made again once the old journal is gone. Names beside the
+journal are its own, as that of its lock is; all this happens while the lock is held.
+"""
 
 from __future__ import annotations
 
 import argparse
+import errno
+import os
 import sys
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.ends import open_exporter, process_arguments
 from cloudrc.cli.extras import require
-from cloudrc.cli.teleop_alarm import Alarm
-from cloudrc.cli.teleop_api import ServedApi, api_address, complain, serve_api
-from cloudrc.cli.teleop_reserve import shorten
+from cloudrc.cli.output import say
+from cloudrc.cli.runtime import Address, address, open_exporter, process_arguments, warn_if_exposed
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.drivers.teleop import Calls
+    from cloudrc.records import Counted
+    from cloudrc.teleop.auth import Audit
     from cloudrc.teleop.bridge import Bridge
-    from cloudrc.teleop.journal import Journal
+    from cloudrc.teleop.journal import Disk, Entry, Journal
+    from cloudrc.teleop.server import ApiServer
     from cloudrc.teleop.service import MissionService
+
+
+REPEAT_PERIOD = 0.02
+"""Between two tries [s]."""
+REPEAT_LIMIT = 2.0
+"""After the operator's word [s]: who has not had an answer by then asks again, and a cloud that
+stands still for so long has a robot that holds."""
+
+
+class Alarm:
+    """Tells cloud to stop the rotors; may be called from any thread, and waits for nobody.
+
+    A cloud that stands still lets eleven datagrams wait, and refuses what comes then. Teleop's loop
+    would say it again, but may itself be waiting for its disk: so a thread says it until cloud has
+    taken it, and goes.
+    """
+
+    def __init__(self, send: Callable[[], bool]) -> None:
+        """Begin.
+
+        Args:
+            send: Sends it, if cloud takes it now; says whether it did. Must not block.
+        """
+        self._send = send
+        self._lock = threading.Lock()
+        self._until = 0.0
+        self._repeats = False  # there is such a thread
+
+    def __call__(self) -> None:
+        """Send it, now or as soon as cloud takes it."""
+        with self._lock:
+            if self._send():
+                self._until = 0.0  # once is enough
+                return
+            self._until = time.monotonic() + REPEAT_LIMIT
+            if self._repeats:
+                return
+            try:
+                threading.Thread(target=self._repeat, name="alarm", daemon=True).start()
+            except RuntimeError:  # there can be no more threads: it is left to teleop's loop
+                return
+            self._repeats = True
+
+    def _repeat(self) -> None:
+        while self._repeats_after(REPEAT_PERIOD):
+            pass
+
+    def _repeats_after(self, period: float) -> bool:
+        """Wait, then try again; say whether it has to be tried once more."""
+        time.sleep(period)
+        with self._lock:  # whoever asks meanwhile finds a thread that goes on, or none
+            self._repeats = time.monotonic() < self._until and not self._send()
+            return self._repeats
+
+
+LOOPBACK = "127.0.0.1"
+COUNT_PERIOD_NS = 1_000_000_000
+"""Between two times that the API's counts become metrics [ns]."""
+
+
+class ServedApi:
+    """An API that answers; until it is opened only that teleop is not ready yet.
+
+    Attributes:
+        bridge: From its threads to teleop's loop.
+    """
+
+    def __init__(self, bridge: Bridge, server: ApiServer, audit: Audit) -> None:
+        self.bridge, self._server, self._audit = bridge, server, audit
+        self._service: MissionService | None = None
+        self._counted_ns = 0
+
+    def open(self, service: MissionService, alarm: Callable[[], object]) -> None:
+        """Serve missions from now on.
+
+        Args:
+            service: Of them.
+            alarm: Sends an emergency stop past the service; called from any thread.
+        """
+        self.bridge.alarm, self._service = alarm, service
+        self.bridge.open(service)
+
+    def counted(self) -> list[Counted]:
+        """What was done with requests so far, once a second."""
+        import time
+
+        from cloudrc.records import Counted
+
+        now_ns = time.monotonic_ns()
+        if now_ns - self._counted_ns < COUNT_PERIOD_NS:
+            return []
+        self._counted_ns = now_ns
+        counts = {**self._server.counts, "audit_dropped": self._audit.dropped}
+        if self._service is not None:
+            counts["events_dropped"] = self._service.book.dropped
+        return [Counted(now_ns, "teleop", f"api_{name}", n) for name, n in sorted(counts.items())]
+
+    def stop(self) -> None:
+        """Answer what is asked, and end."""
+        self._server.stop()
+        self._audit.close()
+
+
+def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> ServedApi:
+    """Answer from now on, if only that teleop is not ready yet."""
+    import json
+    from functools import partial
+
+    from cloudrc import assembly
+    from cloudrc.geometry.scene import load_scene
+    from cloudrc.link.state import publish
+    from cloudrc.teleop.api import Surroundings, create_app
+    from cloudrc.teleop.auth import Audit, Tokens
+    from cloudrc.teleop.bridge import Bridge
+    from cloudrc.teleop.server import ApiServer, Gate
+
+    if not isinstance(options.api, Path):
+        warn_if_exposed(options.api)
+    criteria, bridge = experiment.criteria, Bridge()
+    scene = load_scene(experiment.world.scene)
+    plan = partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps)
+    surroundings = Surroundings(scene, criteria.time_limit_s, criteria.contact, plan)
+    tokens = Tokens(options.tokens) if options.tokens else None
+    audit = Audit(options.audit, complain)
+    gate = Gate(create_app(bridge, surroundings), tokens, audit, complain=complain)
+    server = ApiServer(gate, bridge, options.api)
+    server.start()
+    if options.api_file is not None:
+        publish(options.api_file, json.dumps({"schemaVersion": 1, "url": server.url}) + "\n")
+    return ServedApi(bridge, server, audit)
+
+
+def complain(text: str) -> None:
+    """Write a line into the process's log; from any thread."""
+    say(f"cloudrc teleop: {text}", sys.stderr)
+
+
+def api_address(text: str) -> Address | Path:
+    """Read [HOST:]PORT, whose port may be 0, or unix:PATH."""
+    if text.startswith("unix:") and len(text) > len("unix:"):
+        return Path(text.removeprefix("unix:"))
+    host, colon, port = text.rpartition(":")
+    host = host if colon else LOOPBACK
+    return (host, 0) if host and port == "0" else address(f"{host}:{port}")
+
+
+RESERVE_SIZE = 2 << 20
+"""Of the file [bytes].
+
+What a start leaves are the 100 missions that have ended last, and 17 that have not. The paper's, of
+seven waypoints, takes 3.8 kB, all of them 0.45 MB; here is room for 45 waypoints in each. The
+chart's volume has 64 MiB, of which the audit log may take 16.
+"""
+FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+def room(folder: Path) -> int:
+    """How much a folder's volume has left for this user [bytes]."""
+    volume = os.statvfs(folder)
+    return volume.f_bavail * volume.f_frsize
+
+
+def shorten(journal: Journal, known: Sequence[Entry], disk: Disk | None = None) -> str:
+    """Leave in the journal what is known alone, also on a full disk; keep room for the next time.
+
+    What the disk refuses stops nobody: the journal is then as before.
+
+    Args:
+        journal: Open.
+        known: Those of its entries that are to stay.
+        disk: Where it is; None for the machine's own.
+
+    Returns:
+        What is wrong and what to do about it; "" if nothing.
+    """
+    reserve = Reserve(journal.path, disk)
+    try:
+        if len(known) < len(journal.entries):
+            _rewrite(journal, known, reserve)
+    except OSError as error:  # the reserve stays away: there is more need of its room now
+        return (
+            f"{journal.path}: cannot be shortened to the missions still known: {error.strerror}; "
+            "once it is full no mission can start: free or mend its volume, then restart teleop"
+        )
+    try:
+        reserve.make()
+    except OSError as error:
+        complain(
+            f"{reserve.path}: {error.strerror}: without it a restart cannot shorten a journal that "
+            "has filled its volume; free or mend that"
+        )
+    return ""
+
+
+def _rewrite(journal: Journal, known: Sequence[Entry], reserve: Reserve) -> None:
+    """Write the journal anew, if need be in the room of the reserve."""
+    try:
+        journal.rewrite(known)
+    except OSError as error:
+        if error.errno not in FULL or not reserve.give_up():
+            raise
+        journal.rewrite(known)
+
+
+class Reserve:
+    """A file beside the journal that holds nothing but room.
+
+    Attributes:
+        path: Of it.
+    """
+
+    def __init__(self, journal: Path, disk: Disk | None = None) -> None:
+        """Touch nothing yet.
+
+        Args:
+            journal: Path of the journal.
+            disk: Where it is; None for the machine's own.
+        """
+        from cloudrc.teleop.journal import Disk
+
+        self.path, self._disk = journal.with_name(f"{journal.name}.reserve"), disk or Disk()
+
+    def give_up(self) -> bool:
+        """Delete it; say whether there was one.
+
+        Raises:
+            OSError: If the disk refuses.
+        """
+        if self._size() is None:
+            return False
+        self._disk.remove(self.path)
+        self._disk.sync_folder(self.path.parent)  # some disks give room back with that alone
+        return True
+
+    def make(self) -> None:
+        """Make it, unless it is there and whole.
+
+        Raises:
+            OSError: If the disk refuses, or has no more room than entries need; there is none then.
+        """
+        if self._size() == RESERVE_SIZE:
+            return
+        self._disk.remove(self.path)  # one that a crash has left, or whatever a link leads to
+        if room(self.path.parent) < 2 * RESERVE_SIZE:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        file = self._disk.open(self.path, new=True)
+        try:
+            # Not zeros, nor a hole: a disk that compresses would keep no room for those.
+            left = memoryview(os.urandom(RESERVE_SIZE))
+            while left:
+                left = left[self._disk.write(file, bytes(left)) :]
+            self._disk.sync(file)
+        except OSError:
+            with suppress(OSError):
+                self._disk.remove(self.path)
+            raise
+        finally:
+            self._disk.close(file)
+
+    def _size(self) -> int | None:
+        """Its length [bytes]; None if there is none."""
+        try:
+            return self.path.lstat().st_size
+        except OSError:
+            return None
+
 
 EPILOG = """\
 It talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With

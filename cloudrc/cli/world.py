@@ -7,11 +7,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from cloudrc.cli.ends import EPILOG as EPILOG
-from cloudrc.cli.ends import end_arguments
-from cloudrc.cli.opened import open_end, suite
 from cloudrc.cli.output import unread_is_fine
 from cloudrc.cli.parser import read_from
+from cloudrc.cli.runtime import end_arguments, open_end, suite
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from cloudrc.cli.bench_wire import measure_wire
+from cloudrc.cli.bench import measure_wire
 
 
 @pytest.mark.process

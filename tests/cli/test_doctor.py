@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import checks, doctor, extras
-from cloudrc.cli.check import Check
+from cloudrc.cli import doctor, extras
+from cloudrc.cli import doctor as checks
+from cloudrc.cli.doctor import Check
 from cloudrc.cli.main import main
 from cloudrc.errors import MissingPrerequisiteError
 

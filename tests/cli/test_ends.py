@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 
 from cloudrc import assembly
-from cloudrc.cli.ends import open_exporter, resolved, size
 from cloudrc.cli.main import main
-from cloudrc.cli.opened import _open_peer
+from cloudrc.cli.runtime import _open_peer, open_exporter, resolved, size
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent

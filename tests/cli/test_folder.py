@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.folder import new_folder
+from cloudrc.cli.find_run import new_folder
 from cloudrc.errors import BadInputError
 
 

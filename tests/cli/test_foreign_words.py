@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cloudrc.cli import closing
+from cloudrc.cli import summary
 from cloudrc.cli.link_verify_text import Said, as_text
-from cloudrc.cli.live import FlightView
 from cloudrc.cli.main import main
 from cloudrc.cli.output import say, table
+from cloudrc.cli.progress import FlightView
 from cloudrc.link.verify.causes import Cause, Evidence, Findings
 from cloudrc.link.verify.judge import Row
 from cloudrc.record.writer import MISSING, McapWriter
@@ -86,7 +86,7 @@ def test_the_description_of_a_profile(here: Path, printed: Printing) -> None:
 def test_why_a_run_has_failed(printed: Printing) -> None:
     failures = [{"code": "x", "text": EVIL}] * 2
     report = {"verdict": "failure", "failures": failures, "numbers": {}}
-    closing.show(report, Path(EVIL))
+    summary.show(report, Path(EVIL))
     assert printed().count(SHOWN) == 3
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from api_harness import Running, running
 
-from cloudrc.cli.here import QUIET_LIMIT
+from cloudrc.cli.find_run import QUIET_LIMIT
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import link_set, relay_control
+from cloudrc.cli import link_set, relay
 from cloudrc.cli.main import main
-from cloudrc.cli.relay_control import RelayControl
+from cloudrc.cli.relay import RelayControl
 from cloudrc.config.document import Document
 from cloudrc.config.edit import edit
 from cloudrc.drivers import local
@@ -125,7 +125,7 @@ def test_what_a_full_disk_does_not_take_is_told_once_it_has_room(
 
     (folder / "profile.json").write_text('{"uplink": {"delay_ms": 80}}')
     with monkeypatch.context() as disk:
-        disk.setattr(relay_control, "publish", full)
+        disk.setattr(relay, "publish", full)
         for _ in range(3):
             flight.wait(0.05)
     assert flight.delay("uplink") == pytest.approx(0.08), "in force all the same"

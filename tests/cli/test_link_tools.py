@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.cli import link_source
+from cloudrc.cli import link_record
 from cloudrc.cli.link import ACTIONS
 from cloudrc.cli.link_verify import find
 from cloudrc.cli.main import main
@@ -125,7 +125,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(
 def test_a_small_file_that_unpacks_to_any_size_is_not_unpacked_whole(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link_source, "UNPACKED_MAX", 1 << 20)
+    monkeypatch.setattr(link_record, "UNPACKED_MAX", 1 << 20)
     most = 0
 
     class Counted(gzip.GzipFile):

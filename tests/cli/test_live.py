@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from cloudrc.cli.live import FILE_COLUMNS, FlightView
+from cloudrc.cli.progress import FILE_COLUMNS, FlightView
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Control, Fault, GuardChange, MissionEvent, Record, TelemetrySent
 

@@ -12,10 +12,10 @@ import pytest
 from api_harness import Running, running
 from teleop_harness import A, B
 
-from cloudrc.cli import mission_follow, mission_local
+from cloudrc.cli import mission_local
+from cloudrc.cli import mission_local as mission_follow
+from cloudrc.cli.client import Api, reader
 from cloudrc.cli.main import main
-from cloudrc.cli.mission_http import Api
-from cloudrc.cli.token import reader
 from cloudrc.drivers import local
 
 FILE = """

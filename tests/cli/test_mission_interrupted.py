@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from api_harness import running
 
-from cloudrc.cli import mission_follow
+from cloudrc.cli import mission_local
+from cloudrc.cli.client import Api
 from cloudrc.cli.main import main
-from cloudrc.cli.mission_http import Api
 
 FILE = "name: one\nstart: here\nwaypoints: [{position_m: [0.5, 0.0, 1.0]}]\n"
 
@@ -28,7 +28,7 @@ def test_the_advice_ends_the_mission_that_was_ordered(
 ) -> None:
     path = tmp_path / "one.yaml"
     path.write_text(FILE)
-    monkeypatch.setattr(mission_follow.Follower, "follow", _interrupted)
+    monkeypatch.setattr(mission_local.Follower, "follow", _interrupted)
     with running(unix=True) as api:
         others = ["m1"] if flags else []
         for _ in others:

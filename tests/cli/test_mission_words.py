@@ -12,7 +12,8 @@ import yaml
 from api_harness import Running, running
 from teleop_harness import PLAN
 
-from cloudrc.cli import mission_cluster, mission_follow, mission_http, mission_local
+from cloudrc.cli import client, mission_cluster, mission_local
+from cloudrc.cli import mission_local as mission_follow
 from cloudrc.cli.main import main
 from cloudrc.cli.output import harmless
 from cloudrc.cluster import jobs
@@ -82,7 +83,7 @@ def test_events_and_verdicts_are_shown_and_do_nothing(
     log = tmp_path / "termination-log"
     log.touch()
     monkeypatch.setattr(mission_follow.leave_message, "__defaults__", (log,))
-    for module in (mission_local, mission_http):
+    for module in (mission_local, client):
         monkeypatch.setattr(module, "Api", lambda *_: Hostile())
     assert main(["mission", "fly", "--mission", "pipes", "--api", "unix:there"]) == 1
     assert main(["mission", "run", "pipes", "--api", "unix:there"]) == 1

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import opened
+from cloudrc.cli import runtime
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.link.verify.monitor import Asked, Load, StandingCheck
@@ -23,7 +23,7 @@ def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
 
     monkeypatch.setattr(StandingCheck, "begin", begin)
     options = argparse.Namespace(link=None, route=tmp_path / "route")
-    opened._standing_check(options, load_experiment("paper"), uplink=False)
+    runtime._standing_check(options, load_experiment("paper"), uplink=False)
     return kept[0]
 
 
@@ -35,7 +35,7 @@ def test_what_the_link_names_as_a_trace_is_read_within_bounds(
     profile = {"uplink": {key: str(path), "distribution": "table" if key == "table" else "normal"}}
     path.write_text(text)
     assert load(profile)[0].trace or load(profile)[0].table
-    path.write_text(text + "\n" * opened.TRACE_MAX)
+    path.write_text(text + "\n" * runtime.TRACE_MAX)
     with pytest.raises(BadInputError, match="longer than 2097152 bytes; give a CSV file"):
         load(profile)
     profile["uplink"][key] = "/dev/null"  # any device or pipe: one without an end takes all memory

@@ -151,7 +151,7 @@ def test_faults_that_are_cut_off_keep_what_was_run(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cloudrc.cli.faults_run._run", how)
+    monkeypatch.setattr("cloudrc.cli.faults._run", how)
     line = f"faults run --all --jobs {jobs} --junit f.xml --document f.md -o json"
     assert main(line.split()) == code
     captured = capsys.readouterr()

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.cli.signals import _hung_up, end_orderly
+from cloudrc.cli.pool import _hung_up, end_orderly
 
 
 @pytest.fixture(autouse=True)

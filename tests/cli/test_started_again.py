@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cloudrc.cli.opened import _open_recorder
+from cloudrc.cli.runtime import _open_recorder
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
 from tests.record.samples import MS, counted, world_records

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.cli.statistics import as_csv, as_table, interval, summarise
+from cloudrc.cli.sweep import as_csv, as_table, interval, summarise
 
 
 def report(seed: int, verdict: str = "success", **numbers: float) -> dict[str, Any]:

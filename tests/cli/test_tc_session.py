@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.tc_session import Programs
+from cloudrc.cli.link_run import Programs
 
 TC = f"""#!{sys.executable}
 import sys

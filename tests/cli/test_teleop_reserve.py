@@ -13,7 +13,8 @@ import pytest
 from small_volume import MIB, KilledError, Volume
 
 from cloudrc.assembly import build_plan
-from cloudrc.cli import teleop, teleop_reserve
+from cloudrc.cli import teleop
+from cloudrc.cli import teleop as teleop_reserve
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS

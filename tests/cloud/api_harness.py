@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from service_harness import ServiceFlight
 
 from cloudrc import assembly
-from cloudrc.cli.mission_http import Api
+from cloudrc.cli.client import Api
 from cloudrc.geometry.scene import load_scene
 from cloudrc.teleop.api import Surroundings, create_app
 from cloudrc.teleop.auth import Audit, Tokens

@@ -11,7 +11,7 @@ import pytest
 from api_harness import DIRECT, running
 from service_harness import A, B, C
 
-from cloudrc.cli.teleop_api import ServedApi
+from cloudrc.cli.teleop import ServedApi
 from cloudrc.errors import BadInputError
 from cloudrc.exposition.live import Live
 from cloudrc.teleop import models

@@ -13,8 +13,8 @@ import pytest
 from api_harness import OPERATOR, READER, connect, running
 from service_harness import PLAN
 
-from cloudrc.cli.mission_http import Api, UnreachableError
-from cloudrc.cli.teleop_api import ServedApi, api_address, serve_api
+from cloudrc.cli.client import Api, UnreachableError
+from cloudrc.cli.teleop import ServedApi, api_address, serve_api
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.teleop.auth import LOCAL

@@ -11,8 +11,8 @@ import pytest
 
 from cloudrc.assembly import build_plan
 from cloudrc.cli import teleop
-from cloudrc.cli.ends import open_exporter
 from cloudrc.cli.main import main
+from cloudrc.cli.runtime import open_exporter
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.drivers.exporter import Exporter

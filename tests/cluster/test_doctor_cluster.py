@@ -13,7 +13,8 @@ import pytest
 import yaml
 from fake_api import FakeApi, kubeconfig
 
-from cloudrc.cli import checks, extras, run
+from cloudrc.cli import doctor as checks
+from cloudrc.cli import extras, run
 from cloudrc.cli.main import main
 from cloudrc.cluster.client import OLDEST
 

@@ -14,7 +14,7 @@ from fake_api import FakeApi
 from test_cut import HOVER, SECOND, flown, later, merged
 from test_jobs import at_look, end, start_pod, terminated
 
-from cloudrc.cli import cluster_flight
+from cloudrc.cli import run_cluster
 from cloudrc.cli.main import main
 from cloudrc.cluster import pods as fetch
 from cloudrc.cluster.client import Release, connect
@@ -31,7 +31,7 @@ LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(cluster_flight, "FLUSH", 0.0)
+    monkeypatch.setattr(run_cluster, "FLUSH", 0.0)
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
     monkeypatch.chdir(tmp_path)
 
@@ -214,7 +214,7 @@ def test_what_the_pods_cannot_have_is_refused_before_anything_is_done(
 
 def test_what_a_release_was_installed_with_is_kept() -> None:
     before = {"metrics": {"allowFrom": ["x"]}, "link": {"mode": "relay", "profile": "paper-p1"}}
-    given = cluster_flight.values(load_experiment("hover"), before)
+    given = run_cluster.values(load_experiment("hover"), before)
     assert given["metrics"] == before["metrics"]
     assert given["link"] == {"mode": "relay", "profile": ""}
     assert given["experiment"]["name"] == "hover"
@@ -222,5 +222,5 @@ def test_what_a_release_was_installed_with_is_kept() -> None:
 
 def test_the_charts_own_mission_does_not_fly_in_the_way() -> None:
     before = {"mission": {"enabled": True, "queue": True}}
-    given = cluster_flight.values(load_experiment("hover"), before)
+    given = run_cluster.values(load_experiment("hover"), before)
     assert given["mission"] == {"enabled": False, "queue": True}

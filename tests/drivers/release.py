@@ -10,7 +10,7 @@ from pathlib import Path
 
 import yaml
 
-from cloudrc.cli.mission_http import Api
+from cloudrc.cli.client import Api
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.drivers.local import _free_addresses
 from cloudrc.errors import CloudrcError

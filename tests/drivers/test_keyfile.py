@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.cli.opened import _open_keys
+from cloudrc.cli.runtime import _open_keys
 from cloudrc.drivers import keyfile
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile, is_exposed, read_keys
 from cloudrc.errors import BadInputError

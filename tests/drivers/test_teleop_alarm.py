@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cli import teleop, teleop_alarm
-from cloudrc.cli.teleop_alarm import Alarm
-from cloudrc.cli.teleop_api import ServedApi
+from cloudrc.cli import teleop
+from cloudrc.cli import teleop as teleop_alarm
+from cloudrc.cli.teleop import Alarm, ServedApi
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.teleop.bridge import Bridge
 from cloudrc.teleop.service import MissionService

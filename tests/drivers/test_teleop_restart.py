@@ -7,7 +7,7 @@ import time
 import pytest
 from release import LIMIT, TOKEN, Release
 
-from cloudrc.cli.mission_http import Api, UnreachableError
+from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.teleop.journal import parse
 from cloudrc.teleop.wire import ALARM, encode

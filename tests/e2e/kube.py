@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from cloudrc.cli.mission_http import Api
+from cloudrc.cli.client import Api
 from cloudrc.cluster.client import Release, connect
 from cloudrc.cluster.pods import api_url, fetch_metrics, operator_token
 

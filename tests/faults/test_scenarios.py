@@ -154,10 +154,10 @@ def test_results_as_a_table_show_the_worst_of_each_check() -> None:
 def test_each_mode_writes_a_page_of_its_own(
     flag: str, title: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from cloudrc.cli import faults_run
+    from cloudrc.cli import faults
 
-    monkeypatch.setattr(faults_run, "_look_for_release", lambda options: None)
-    monkeypatch.setattr(faults_run, "_run", lambda which: Result(find(*which[:2]), good(), 1.0))
+    monkeypatch.setattr(faults, "_look_for_release", lambda options: None)
+    monkeypatch.setattr(faults, "_run", lambda which: Result(find(*which[:2]), good(), 1.0))
     page = tmp_path / "page.md"
     assert main(["faults", "run", "--all", flag, f"--document={page}"]) == 0
     text, names = page.read_text(), [f"{s.id} {s.name}" for s in scenarios(flag[2:])]  # type: ignore[arg-type]
@@ -183,9 +183,9 @@ def test_the_command_prints_json_and_exits_by_the_checks(
 def test_a_failed_check_ends_in_exit_code_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from cloudrc.cli import faults_run
+    from cloudrc.cli import faults
 
-    monkeypatch.setattr(faults_run, "_run", lambda which: results()[1])
+    monkeypatch.setattr(faults, "_run", lambda which: results()[1])
     assert main(["faults", "run", "F13"]) == 1
     assert "collisions: 2 (0)" in capsys.readouterr().out
 

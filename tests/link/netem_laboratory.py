@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.cli.tc_session import Programs, runner
+from cloudrc.cli.link_run import Programs, runner
 from cloudrc.link.netem import Netem
 from cloudrc.link.profile import DirectionProfile
 

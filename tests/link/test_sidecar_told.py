@@ -11,7 +11,7 @@ import pytest
 from netem_kernel import PEER, listing
 from sidecar_bench import Bench
 
-from cloudrc.cli.link_told import NOTHING, Teller
+from cloudrc.cli.link_run import NOTHING, Teller
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 from cloudrc.link.sidecar import Near, Told, look_near, read_told, write_told
 from cloudrc.link.tc import Answer

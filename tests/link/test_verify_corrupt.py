@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 from virtual_probes import Asked, probe
 
-from cloudrc.cli.link_verify_notes import notes
-from cloudrc.cli.link_verify_probes import PROBE, TRAIN, Probes
+from cloudrc.cli.link_verify_run import PROBE, TRAIN, Probes
+from cloudrc.cli.link_verify_text import notes
 from cloudrc.link.profile import Change, DirectionProfile, GilbertElliott, Trace, mean_loss
 from cloudrc.link.verify.causes import find_causes
 from cloudrc.link.verify.expect import JITTER_SHARES, refusing

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cli.link_verify_late import LateWatch
+from cloudrc.cli.link_verify_run import LateWatch
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.verify.causes import (
     Evidence,

@@ -14,8 +14,7 @@ from cloudrc.cli import link_processes
 from cloudrc.cli import link_verify_run as run
 from cloudrc.cli.link_processes import WAYS, Shaping, shaping
 from cloudrc.cli.link_verify import find
-from cloudrc.cli.link_verify_netem import DEVICE
-from cloudrc.cli.link_verify_run import Asked, Bank, banks
+from cloudrc.cli.link_verify_run import DEVICE, Asked, Bank, banks
 from cloudrc.cli.link_verify_text import Said, as_text
 from cloudrc.config.load import dump
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError

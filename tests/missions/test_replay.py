@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flying import records
 
-from cloudrc.cli.link_source import TOPICS, one_way
+from cloudrc.cli.link_record import TOPICS, one_way
 from cloudrc.config.load import load_experiment
 from cloudrc.link.traces import Direction, Packets, read_trace, trace_of, write_trace
 from cloudrc.record.columns import Recording

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import opened
+from cloudrc.cli import runtime
 from cloudrc.cli.link_verify import find
 from cloudrc.cli.main import main
 from cloudrc.config.load import dump, load_experiment, read_experiment
@@ -21,7 +21,7 @@ from cloudrc.record.merge import write_mission
 from tests.metrics.flights import flown
 
 pytestmark = pytest.mark.promise("foreign-files-run-nothing")
-PACKAGE = Path(opened.__file__).parents[1]
+PACKAGE = Path(runtime.__file__).parents[1]
 CONFIG = """\
 cloud:
   estimator: {spy}
@@ -98,9 +98,9 @@ def test_of_the_ends_cloud_alone_imports_what_flies_it(
     run: Path, told: Path, monkeypatch: pytest.MonkeyPatch, end: str, config: str, imports: bool
 ) -> None:
     for name in ("_open_keys", "_open_peer", "_open_recorder", "open_exporter"):
-        monkeypatch.setattr(opened, name, lambda *words: None)
+        monkeypatch.setattr(runtime, name, lambda *words: None)
     (run / "config.yaml").write_text(config)
-    opened.open_end(argparse.Namespace(config=run / "config.yaml"), end)
+    runtime.open_end(argparse.Namespace(config=run / "config.yaml"), end)
     assert told.exists() == imports
 
 

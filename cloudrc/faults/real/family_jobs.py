@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from cloudrc.cli.mission_http import Api, UnreachableError
+from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.faults.real.family_processes import REAL, finish
 from cloudrc.faults.real.processes import LIMIT, Processes
 from cloudrc.faults.scenario import Outcome, Scenario
