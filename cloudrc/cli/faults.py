@@ -159,7 +159,7 @@ PLACE = ("context", "namespace", "release")
 
 def show(options: argparse.Namespace) -> int:
     """List the faults."""
-    from cloudrc.faults.catalogue import scenarios
+    from cloudrc.faults.scenario import scenarios
 
     found = scenarios(_mode(options) if options.real or options.cluster else None)
     if options.output != "table":
@@ -176,7 +176,7 @@ def show(options: argparse.Namespace) -> int:
 def run(options: argparse.Namespace) -> int:
     """Run one fault or all of them; 1 if a check did not pass, 130 if interrupted."""
     from cloudrc.faults import document
-    from cloudrc.faults.catalogue import called, scenarios
+    from cloudrc.faults.scenario import called, scenarios
 
     mode = _mode(options)
     if options.document is not None and not options.all:
@@ -239,9 +239,8 @@ def _results(chosen: Sequence[Scenario], options: argparse.Namespace) -> Iterato
 
 def _run(which: tuple[str, Mode, int]) -> Result:
     """Run one, in this process or in one of a pool; what breaks it is part of the result."""
-    from cloudrc.faults.catalogue import find
     from cloudrc.faults.document import Result
-    from cloudrc.faults.scenario import Outcome
+    from cloudrc.faults.scenario import Outcome, find
 
     name, mode, seed = which
     scenario, began = find(name, mode), time.monotonic()

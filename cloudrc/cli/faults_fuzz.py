@@ -166,8 +166,8 @@ def _kind(options: argparse.Namespace) -> str:
 
 def _fly(which: tuple[int, str]) -> Finding:
     from cloudrc.faults.adversary import choose
-    from cloudrc.faults.compose import calm, compose
     from cloudrc.faults.fuzz import fly
+    from cloudrc.faults.schedule import calm, compose
 
     seed, kind = which
     return fly({"adversarial": choose, "clean": calm, "random": compose}[kind](seed))
@@ -193,8 +193,7 @@ def _brief(finding: Finding) -> dict[str, Any]:
 def _report(finding: Finding, store: Path, say: bool, stop: Callable[[], bool]) -> dict[str, Any]:
     """Shrink a failing schedule, print it, and keep it; as it is when there is a wish to stop."""
     from cloudrc.faults.fuzz import fly
-    from cloudrc.faults.schedule import dump
-    from cloudrc.faults.shrink import shrink
+    from cloudrc.faults.schedule import dump, shrink
 
     kinds = finding.kinds
 

@@ -4,6 +4,15 @@ Every policy sees what an honest cloud sees (the newest odometry and its own est
 and sends any command it likes, sealed as it should be. Some also lie about what a command was
 computed from, fall silent to time the guard's transitions, or speak in the operator's name. Every
 second one has an honest link; to the others befalls all that befalls an honest cloud.
+
+A cloud with valid keys that does not mean well: an honest loop, and what comes out instead.
+
+The operator's words in the mouth of a hostile cloud, said when they do the most harm.
+
+World cannot tell who speaks: cloud carries the operator's requests, sealed with its own keys. So a
+hostile one starts, ends, stops and acknowledges as it likes: at speed, at a face of the fence, in
+the middle of a fall. (Hold and resume are no words to world: an end of the mission is as good, and
+a start from where the robot is.)
 """
 
 from __future__ import annotations
@@ -11,22 +20,137 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from math import cos, inf, nan, pi, sin
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from cloudrc.cloud.endpoint import CloudEndpoint
+from cloudrc.cloud.loop import ControlLoop
 from cloudrc.errors import BadInputError
-from cloudrc.faults.compose import DURATION, PAPER, compose
-from cloudrc.faults.liar import Lie, tempting
 from cloudrc.faults.scenario import generator
-from cloudrc.faults.schedule import Schedule
-from cloudrc.faults.voice import at_bad_moments
+from cloudrc.faults.schedule import DURATION, PAPER, Schedule, compose
 from cloudrc.geometry.fence import HIGH, LOW
-from cloudrc.messages import ZERO, Command, Vector
+from cloudrc.messages import (
+    MISSION_OVER,
+    ZERO,
+    Command,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Setpoint,
+    Start,
+    Vector,
+)
 from cloudrc.records import Control
 
-Generator: TypeAlias = np.random.Generator
+Lie: TypeAlias = Callable[[Command, Control], Command]
+"""What is sent in place of a command; what cloud knew when it made it stands in the record."""
+
+Words: TypeAlias = Callable[[Control, GuardState], OperatorRequest | None]
+"""What is said with it in the operator's name, if anything, to a robot whose guard was last seen
+in that state; cloud gives it its number."""
+
+
+def drop(request: OperatorRequest) -> None:
+    """What the operator says is not passed on."""
+
+
+def tempting(lie: Lie, words: Words | None = None) -> Callable[[CloudEndpoint], None]:
+    """Make what turns an honest cloud into one that lies, and speaks in its operator's place."""
+
+    def tempt(cloud: CloudEndpoint) -> None:
+        relay = cloud._relay
+
+        def speak(control: Control) -> None:
+            if words is None:
+                return
+            cloud._relay = drop  # type: ignore[method-assign]
+            if (said := words(control, cloud.guard)) is not None:
+                relay(said._replace(number=cloud._asked + 1))
+
+        cloud._loop = Liar(cloud._loop, lie, speak)  # type: ignore[assignment]
+
+    return tempt
+
+
+class Liar:
+    """Stands in the place of a control loop, and asks it for everything else."""
+
+    def __init__(self, loop: ControlLoop, lie: Lie, speak: Callable[[Control], None]) -> None:
+        self._honest, self._lie, self._speak = loop, lie, speak
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._honest, name)
+
+    def command(
+        self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
+    ) -> tuple[Command, Control]:
+        """Compute the honest command, and send another.
+
+        Args:
+            setpoint: Where to be.
+            now_ns: Cloud's clock [ns].
+            dt: Time since the last command [s].
+            epoch: Of the session.
+            counter: That the command will carry.
+        """
+        command, control = self._honest.command(setpoint, now_ns, dt, epoch, counter)
+        self._speak(control)
+        return self._lie(command, control), control
+
+
+Generator = np.random.Generator
+
+BEGIN = OperatorRequest(0, Request.START, Start.HERE)
+AGAIN = OperatorRequest(0, Request.START, Start.SPAWN)
+END, STOP, RELEASE, PROGRESS = (
+    OperatorRequest(0, request)
+    for request in (Request.END, Request.ESTOP, Request.ACKNOWLEDGE, Request.PROGRESS)
+)
+FLYING = {BEGIN: 0.35, END: 0.3, STOP: 0.15, RELEASE: 0.1, PROGRESS: 0.07, AGAIN: 0.03}
+LATCHED = {RELEASE: 0.7, BEGIN: 0.2, STOP: 0.1}
+CHOICES = {
+    GuardState.GROUND: {BEGIN: 0.6, AGAIN: 0.25, END: 0.05, STOP: 0.05, RELEASE: 0.05},
+    GuardState.TRACK: FLYING,
+    GuardState.HOLD: FLYING,
+    GuardState.LAND: LATCHED,
+    GuardState.ESTOP: LATCHED,
+}
+"""How likely each is, by the state that cloud knows of."""
+PATIENCE_NS = 5_000_000_000
+"""For the robot to come near a face [ns]."""
+REACHED = (0, 1, 7, MISSION_OVER)
+
+
+def at_bad_moments(rng: Generator) -> Words:
+    """Speak after random whiles; every second time wait for the robot to fly near a face."""
+    pause, near = float(rng.choice([0.05, 0.3, 1.0])), float(rng.uniform(0.2, 1.5))
+    due_ns, waits = 0, False
+
+    def words(control: Control, guard: GuardState) -> OperatorRequest | None:
+        nonlocal due_ns, waits
+        far = guard is GuardState.TRACK and distance(control.measured) > near
+        until_ns = due_ns + PATIENCE_NS if far and waits else due_ns
+        if control.stamp_ns < until_ns:
+            return None
+        due_ns = control.stamp_ns + int(rng.exponential(pause) * 1e9)
+        waits = bool(rng.random() < 0.5)
+        said, likely = zip(*CHOICES[guard].items(), strict=True)
+        chosen: OperatorRequest = said[int(rng.choice(len(said), p=likely))]
+        mission, reached = int(rng.integers(0, 3)), REACHED[int(rng.integers(len(REACHED)))]
+        return chosen._replace(mission_id=mission, reached=reached)
+
+    return words
+
+
+def distance(position: Vector) -> float:
+    """How far a base at `position` [m], shape (3,), is from the nearest wall or the ceiling [m]."""
+    return min(
+        HIGH[2] - position[2],
+        *(min(position[n] - LOW[n], HIGH[n] - position[n]) for n in (0, 1)),
+    )
+
+
 Policy: TypeAlias = Callable[[Generator], Lie]
 
 HUGE = 1e308

@@ -3,33 +3,190 @@
 Both ends are those of production, driven by the driver of production; around them lies what a
 scenario needs: ends that die and return, an operator's desk with a journal, a watch over the
 invariants, and questions about what happened.
+
+How a flight of the fault suite may differ from the plain one.
+
+Several clouds at one place: what arrives is heard by all of them, each sends what it wants.
+
+Which state the guard was in: now, at an instant, and when something was touched.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any, Unpack
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeAlias, TypedDict, Unpack
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.endpoint import Endpoint
-from cloudrc.faults import states
-from cloudrc.faults.crowd import Crowd
-from cloudrc.faults.desk import Desk
-from cloudrc.faults.desk_apart import apart
-from cloudrc.faults.mortal import Clock, Mortal
-from cloudrc.faults.options import SECRET, Options, Shape
+from cloudrc.faults.invariants import Watch
+from cloudrc.faults.models import Clock, Desk, Mortal, apart
 from cloudrc.faults.walls import Wall
-from cloudrc.faults.watch import Watch
 from cloudrc.link.model import LinkDirection
-from cloudrc.messages import GuardState
+from cloudrc.link.profile import Blackout, DirectionProfile
+from cloudrc.messages import Cause, GuardState
 from cloudrc.record.hash import RecordHash
 from cloudrc.records import Contact, Counted, GroundTruth, GuardChange, MissionEvent, Record
 from cloudrc.teleop.store import Mission, Order
-from cloudrc.tunnel.keys import KeyRing, KeySet
+from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
+
+Shape: TypeAlias = Callable[[DirectionProfile], DirectionProfile]
+"""Changes the conditions of one direction of the link."""
+SECRET = KeySet(Key(b"a key of the fault suite, 32 b.."))
+
+
+class Options(TypedDict, total=False):
+    """How a flight differs from the plain one.
+
+    Attributes:
+        seed: Of everything random; 1 by default.
+        cloud_clock: Cloud's; by default the two ends share a clock.
+        uplink: Changes the link's conditions from world to cloud.
+        downlink: Likewise from cloud to world.
+        honest: Whether a contact is the cloud's failure; it is by default.
+        keep: Whether all records are kept and hashed; they are by default.
+        start: Whether the experiment's mission is ordered; it is by default.
+        life: Tells the processes of one flight from those of another, as nonces do.
+        tempt: Makes a new cloud, which has valid keys, another one than it was.
+        secrets: Key files by end; the same one for both by default.
+        second: When another cloud wants the robot, too [s]; never by default.
+        journal: Of teleop; in memory by default.
+        apart: Whether teleop is a process of its own; it is in cloud's by default.
+    """
+
+    seed: int
+    cloud_clock: Clock | None
+    uplink: Shape | None
+    downlink: Shape | None
+    honest: bool
+    keep: bool
+    start: bool
+    life: int
+    tempt: Callable[[CloudEndpoint], None] | None
+    secrets: dict[str, KeySet]
+    second: float | None
+    journal: Path
+    apart: bool
+
+
+def blackouts(*spans: tuple[float, float]) -> Shape:
+    """Let nothing pass: each span is its start and its duration [s]."""
+    return lambda profile: replace(
+        profile, blackouts=(*profile.blackouts, *(Blackout(*span) for span in spans))
+    )
+
+
+class Crowd:
+    """Endpoints that share a socket, each awake from its own instant on; an `Endpoint` itself.
+
+    Attributes:
+        members: Those that are there; the first one's story is what the recording tells.
+        others: What the others have noted down, oldest first.
+    """
+
+    def __init__(self, members: Sequence[Endpoint]) -> None:
+        self.members = members
+        self.others: list[Record] = []
+
+    @property
+    def sealed(self) -> bool:
+        """See `Endpoint`."""
+        return all(member.sealed for member in self.members)
+
+    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+        """See `Endpoint`."""
+        for member in self.members:
+            member.receive_datagram(data, now_ns)
+
+    def next_deadline_ns(self) -> int:
+        """See `Endpoint`."""
+        return min(member.next_deadline_ns() for member in self.members)
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """See `Endpoint`."""
+        for member in self.members:
+            if now_ns >= member.next_deadline_ns():
+                member.handle_deadline(now_ns)
+
+    def take_datagrams(self) -> list[bytes]:
+        """See `Endpoint`."""
+        return [data for member in self.members for data in member.take_datagrams()]
+
+    def take_records(self) -> list[Record]:
+        """See `Endpoint`; only those of the first."""
+        first, *others = (member.take_records() for member in self.members)
+        for records in others:
+            self.others += records
+        return first
+
+
+GROUND, _, HOLD, LAND, ESTOP = GuardState
+PERIOD_NS = 10_000_000
+"""Of odometry, by which a contact is told [ns]: it began within so long before its stamp."""
+BRAKES_NS = 200_000_000
+"""Time within which a descent that the operator has acknowledged is stopped [ns].
+Source: docs/reference/plant.md, "Stop rule"."""
+
+
+def seen_now(world: Any) -> tuple[GuardState, str]:
+    """Tell the state of the guard that lives, and why; a world that is down has none: GROUND.
+
+    A new world notes no change before its first: what changed last may have been another's.
+
+    Args:
+        world: That end, or None.
+    """
+    if world is None:
+        return GROUND, "the world is down"
+    guard = world.robot.guard
+    return guard.state, guard.cause.words
+
+
+def state_at(changes: Sequence[GuardChange], stamp_ns: int, born_ns: int) -> GuardState:
+    """Tell the guard's state at an instant.
+
+    Args:
+        changes: Of the guards of all worlds so far, in order.
+        stamp_ns: When [ns, world's clock].
+        born_ns: When the newest world began [ns].
+    """
+    change = _last(changes, stamp_ns, born_ns)
+    return GROUND if change is None else change.state
+
+
+def state_before(changes: Sequence[GuardChange], stamp_ns: int, born_ns: int) -> GuardState:
+    """Tell the guard's state when a contact began, which may have stopped the rotors since.
+
+    Args:
+        changes: Of the guards of all worlds so far, in order.
+        stamp_ns: Of the contact [ns, world's clock].
+        born_ns: When the newest world began [ns].
+    """
+    change = _last(changes, stamp_ns, born_ns)
+    if change is None:
+        return GROUND
+    state = change.state
+    if state is ESTOP and change.cause != Cause.STOPPED.words:
+        began_ns = stamp_ns - PERIOD_NS
+        if change.stamp_ns > began_ns:  # it is what the contact did
+            state = state_at(changes, change.stamp_ns - 1, born_ns)
+    if state is HOLD and state_at(changes, stamp_ns - BRAKES_NS, born_ns) is LAND:
+        state = LAND  # acknowledged right above a pipe that it was about to land on
+    return state
+
+
+def _last(changes: Sequence[GuardChange], stamp_ns: int, born_ns: int) -> GuardChange | None:
+    """Find the last change up to an instant, in the world that lived then."""
+    for change in reversed(changes):
+        if change.stamp_ns <= stamp_ns:
+            return None if change.stamp_ns < born_ns <= stamp_ns else change
+    return None
+
 
 SHARED = b"one clock for all"[:16]
 OTHER = b"another clock..."
@@ -264,12 +421,12 @@ class Flight:
             if kind is GuardChange:
                 self.changes.append(record)  # type: ignore[arg-type]
             elif kind is Contact:
-                state = states.state_before(self.changes, record.stamp_ns, self._born_ns)
+                state = state_before(self.changes, record.stamp_ns, self._born_ns)
                 self.watch.see(record, state, self.honest)  # type: ignore[arg-type]
 
     def state_at(self, stamp_ns: int) -> GuardState:
         """The guard's state at an instant [ns, world's clock]."""
-        return states.state_at(self.changes, stamp_ns, self._born_ns)
+        return state_at(self.changes, stamp_ns, self._born_ns)
 
     def events(self, *names: str) -> list[MissionEvent]:
         """What has happened to missions, by name."""

@@ -2,31 +2,110 @@
 
 An operator flies mission after mission: what has ended is followed by the next one, what is latched
 is acknowledged. In the calm at the end the robot must be flying again, or it is stuck.
+
+What may happen once only, and in its order: a command is flown, a waypoint is reached.
+
+An honest cloud whose controller has a bug: now and then a command holds impossible numbers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf, nan
 
 from cloudrc.cloud.endpoint import CloudEndpoint
-from cloudrc.faults.adversary import temptation
+from cloudrc.faults.adversary import Lie, temptation, tempting
 from cloudrc.faults.asks import held
-from cloudrc.faults.bug import BUGS, buggy
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import Flight, seen_now
 from cloudrc.faults.inject import inject
-from cloudrc.faults.liar import tempting
-from cloudrc.faults.mortal import Clock
-from cloudrc.faults.once import Once
+from cloudrc.faults.invariants import Breach
+from cloudrc.faults.models import Clock
 from cloudrc.faults.remains import Remains
-from cloudrc.faults.schedule import Schedule, shaped
-from cloudrc.faults.states import seen_now
+from cloudrc.faults.scenario import generator
+from cloudrc.faults.schedule import Event, Schedule, shaped
+from cloudrc.faults.toll import Generator
 from cloudrc.faults.walls import steppable_wall_clock
-from cloudrc.faults.watch import Breach
-from cloudrc.messages import GuardState
-from cloudrc.records import GuardChange, Record
+from cloudrc.messages import Command, GuardState
+from cloudrc.records import CommandApplied, Control, GuardChange, Record, SessionOpened
 from cloudrc.teleop.service import LATCHED, MissionService
 from cloudrc.teleop.store import QUEUED
+
+
+class Once:
+    """Listens to a flight through every life of its ends, and reads its journal."""
+
+    def __init__(self, flight: Flight) -> None:
+        """Listen from now on."""
+        self._flight = flight
+        self._newest = (0, -1)  # epoch and counter
+        flight.listeners.append(self.hear)
+
+    def hear(self, records: list[Record], now_ns: int) -> None:
+        """Note a command [ns] that is older than one flown before, or of an epoch that is over."""
+        for record in records:
+            kind = type(record)
+            if kind is CommandApplied:
+                self._take(record.epoch, record.counter, record.stamp_ns)  # type: ignore[union-attr]
+            elif kind is SessionOpened:
+                self._take(record.epoch, -1, record.stamp_ns)  # type: ignore[union-attr]
+
+    def judge(self) -> None:
+        """Note a mission whose waypoints the journal has as reached twice, or out of order."""
+        reached: dict[str, list[int]] = {}
+        for entry in self._flight.desk.entries:
+            if entry.get("event") == "reached":
+                reached.setdefault(entry["mission"], []).append(entry["waypoint"])
+        for mission, waypoints in reached.items():
+            if waypoints != list(range(len(waypoints))):
+                text = f"{mission} reached its waypoints as {waypoints}"
+                self._flight.watch.note(self._flight.run.now_ns, "waypoint", text)
+
+    def _take(self, epoch: int, counter: int, stamp_ns: int) -> None:
+        if (epoch, counter) <= self._newest:
+            text = f"command {counter} of epoch {epoch} after {self._newest}"
+            self._flight.watch.note(stamp_ns, "order", text)
+        self._newest = max(self._newest, (epoch, counter))
+
+
+BUGS = ("values_invalid", "values_huge")
+"""Kinds of faults that are one."""
+IMPOSSIBLE = (nan, inf, -inf)
+HUGE = (1e308, -1e308)
+
+
+def buggy(schedule: Schedule, clock: Clock) -> Lie:
+    """Make what a schedule's bugs turn commands into: one in each 1/value [s] of their whiles.
+
+    Args:
+        schedule: With the bugs.
+        clock: Of cloud, which the stamps of commands are read on.
+    """
+    rng = generator(schedule.seed, 43)
+    events = schedule.of(*BUGS)
+    due = [event.at for event in events]
+
+    def lie(command: Command, control: Control) -> Command:
+        now = clock.when(control.stamp_ns) * 1e-9
+        for n, event in enumerate(events):
+            if due[n] <= now < event.end:
+                due[n] = now + 1.0 / max(event.value, 1e-3)
+                command = _ruined(command, event, rng)
+        return command
+
+    return lie
+
+
+def _ruined(command: Command, event: Event, rng: Generator) -> Command:
+    """One of the four numbers is not finite, or the velocity is huge."""
+    if event.kind == "values_huge":
+        x, y, z = (HUGE[n] for n in rng.integers(0, len(HUGE), 3).tolist())
+        return command._replace(velocity=(x, y, z))
+    numbers = [*command.velocity, command.yaw_rate]
+    numbers[int(rng.integers(4))] = IMPOSSIBLE[int(rng.integers(len(IMPOSSIBLE)))]
+    x, y, z, yaw_rate = numbers
+    return command._replace(velocity=(x, y, z), yaw_rate=yaw_rate)
+
 
 BACK = 10.0
 """In so long of calm the robot must have flown [s]."""

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import ClassVar
 
 from cloudrc.errors import CloudrcError
-from cloudrc.faults.family_disk import LOSS_MAX, SYNC
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import generator
+from cloudrc.faults.scenarios.disk import LOSS_MAX, SYNC
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.faults.scribe import ForgetfulWriter, FullDisk, Scribe, SlowWriter
 from cloudrc.faults.toll import Generator

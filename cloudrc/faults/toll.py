@@ -7,9 +7,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from cloudrc.faults import asks, meters
+from cloudrc.faults import asks
+from cloudrc.faults import asks as meters
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.mortal import Mortal, Tamper
+from cloudrc.faults.models import Mortal, Tamper
 from cloudrc.faults.scenario import Outcome, generator
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import USED

@@ -14,10 +14,9 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cli.pool import AHEAD, WorkerDiedError, in_order
-from cloudrc.faults.catalogue import find
 from cloudrc.faults.document import Result
 from cloudrc.faults.fuzz import Finding
-from cloudrc.faults.scenario import Outcome
+from cloudrc.faults.scenario import Outcome, find
 from cloudrc.faults.schedule import Schedule
 
 KILLED = 5

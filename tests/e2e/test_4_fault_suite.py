@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from kube import NAME, NAMESPACE, cloudrc
 
-from cloudrc.faults.catalogue import scenarios
+from cloudrc.faults.scenario import scenarios
 
 WHERE = ("--cluster", "-n", NAMESPACE, "--release", NAME, "-o", "json")
 

@@ -14,7 +14,7 @@ import yaml
 from cloudrc.exposition.live import Live
 from cloudrc.exposition.parts import Histogram, Readings
 from cloudrc.exposition.table import METRICS
-from cloudrc.faults import meters
+from cloudrc.faults import asks
 from cloudrc.faults.flight import Flight
 from cloudrc.records import Counted
 
@@ -41,7 +41,7 @@ def scrapes(flight: Flight, role: str, times: range) -> Iterator[Readings]:
     """What a process shows at each of these instants [s]."""
     live, seen, sent = Live(role, missions=role != "cloud"), 0, 0
     for time in times:
-        records = meters.seen_by(flight, role, time)
+        records = asks.seen_by(flight, role, time)
         for record in records[seen:]:
             if isinstance(record, Counted) and record.name == "sent":
                 if record.total < sent:  # another process, which counts from 0

@@ -9,9 +9,8 @@ import pytest
 import yaml
 from flown_metrics import RULES, fired
 
-from cloudrc.faults.catalogue import find, scenarios
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import Scenario
+from cloudrc.faults.scenario import Scenario, find, scenarios
 
 ROOT = Path(__file__).resolve().parents[2]
 MADE_UP = (ROOT / "tests" / "e2e" / "alerts.yaml").read_text(encoding="utf-8")

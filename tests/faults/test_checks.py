@@ -11,10 +11,10 @@ from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.recording import WallClock
 from cloudrc.drivers.teleop import LastWord
 from cloudrc.exposition.live import Live
-from cloudrc.faults import meters
-from cloudrc.faults.catalogue import find
-from cloudrc.faults.mortal import Mortal
-from cloudrc.faults.watch import Watch
+from cloudrc.faults import asks
+from cloudrc.faults.invariants import Watch
+from cloudrc.faults.models import Mortal
+from cloudrc.faults.scenario import find
 from cloudrc.link.follow import PeerName
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.record.recorder import Recorder
@@ -151,9 +151,9 @@ def says_nothing_of_the_wall_clock(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def shows_it_10_s_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = meters.seen_by
+    seen = asks.seen_by
     late: Any = lambda flight, role, until: seen(flight, role, until - 10.0)  # noqa: E731
-    monkeypatch.setattr(meters, "seen_by", late)
+    monkeypatch.setattr(asks, "seen_by", late)
 
 
 def counts_the_tenth_failure_first(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import pytest
 
 from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, UnixPeer
-from cloudrc.faults.desk_apart import SOCKET_MAX, Apart
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.fuzz import fly
 from cloudrc.faults.inject import inject
+from cloudrc.faults.models import UNIX_SOCKET_MAX, Apart
 from cloudrc.faults.schedule import STALLS, Event, Schedule
 from cloudrc.faults.walls import Wall
 from cloudrc.messages import OperatorRequest, Setpoint
@@ -167,7 +167,7 @@ def test_a_frozen_cloud_has_room_for_eleven_words(patch: Patch) -> None:
     story = Story(patch, held, Event("cloud_paused", 8.0, 3.0), until=10.99)
     assert story.of(Setpoint, 8.0, 10.99) == []
     story.flight.fly(11.005)
-    assert len(story.of(Setpoint, 10.99, 11.005)) == SOCKET_MAX
+    assert len(story.of(Setpoint, 10.99, 11.005)) == UNIX_SOCKET_MAX
 
 
 def test_a_frozen_cloud_passes_on_no_start_that_its_socket_has_kept() -> None:
@@ -231,7 +231,7 @@ def test_a_socket_of_this_machine_takes_as_many_as_that_of_the_model(tmp_path: P
     ours, other = tmp_path / "ours", tmp_path / "other"
     writer, reader = UnixPeer(ours, other), UnixPeer(other, ours)
     taken = sum(writer.send(b"%d" % n) for n in range(waiting + 5))
-    assert taken - waiting == SOCKET_MAX - 10
+    assert taken - waiting == UNIX_SOCKET_MAX - 10
     assert reader.receive() == [b"%d" % n for n in range(taken)], "the oldest stay"
     for peer in (writer, reader):
         peer.close()

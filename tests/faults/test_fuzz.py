@@ -11,13 +11,22 @@ import pytest
 from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import POLICIES, choose, temptation
-from cloudrc.faults.compose import CALM, calm, compose
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.fuzz import Finding, fly, judged
+from cloudrc.faults.invariants import Watch
 from cloudrc.faults.remains import KILLED, Remains
-from cloudrc.faults.schedule import KINDS, Event, Schedule, dump, load, shaped
-from cloudrc.faults.shrink import shrink
-from cloudrc.faults.watch import Watch
+from cloudrc.faults.schedule import (
+    CALM,
+    KINDS,
+    Event,
+    Schedule,
+    calm,
+    compose,
+    dump,
+    load,
+    shaped,
+    shrink,
+)
 from cloudrc.link.profile import Change, DirectionProfile
 from cloudrc.messages import OperatorRequest, Request
 from cloudrc.record.columns import Recording
@@ -181,7 +190,7 @@ def test_a_failing_schedule_is_shrunk_to_what_it_takes() -> None:
 
 def test_the_watch_judges_by_its_own_fence(monkeypatch: pytest.MonkeyPatch) -> None:
     """The invariants can fail: where the fence is nearer than the guard believes, they do."""
-    monkeypatch.setattr("cloudrc.faults.watch.HIGH", (1.5, 1.5, 1.5))
+    monkeypatch.setattr("cloudrc.faults.invariants.HIGH", (1.5, 1.5, 1.5))
     hostile = Schedule(8, "ideal", policy="towards-a-face", duration=10.0)
     assert {"fence", "stop"} <= fly(hostile).kinds
 

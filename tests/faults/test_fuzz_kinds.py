@@ -12,13 +12,22 @@ import pytest
 from cloudrc.cloud.operator import Alarm
 from cloudrc.faults import fuzz
 from cloudrc.faults.adversary import choose
-from cloudrc.faults.compose import RANGES, calm, compose
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.fuzz import fly, judged
 from cloudrc.faults.inject import inject
 from cloudrc.faults.remains import KILLED
-from cloudrc.faults.schedule import KINDS, STALLS, Event, Schedule, dump, load
-from cloudrc.faults.shrink import shrink
+from cloudrc.faults.schedule import (
+    KINDS,
+    RANGES,
+    STALLS,
+    Event,
+    Schedule,
+    calm,
+    compose,
+    dump,
+    load,
+    shrink,
+)
 from cloudrc.faults.walls import Wall
 from cloudrc.link.follow import PeerName
 from cloudrc.messages import GuardState

@@ -17,8 +17,8 @@ import pytest
 from cloudrc.cli import faults_fuzz
 from cloudrc.cli.main import main
 from cloudrc.faults.fuzz import Finding
+from cloudrc.faults.invariants import Breach
 from cloudrc.faults.schedule import Schedule
-from cloudrc.faults.watch import Breach
 
 Fuzz = Callable[..., tuple[dict[str, Any], str]]
 BAD = 7

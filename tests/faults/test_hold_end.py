@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from cloudrc.faults.hold_end import GROUND_NS, RAMP
-from cloudrc.faults.watch import Watch
+from cloudrc.faults.invariants import Watch
 from cloudrc.messages import ZERO, Cause, Command, GuardState, Vector
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.rotors import STOPPED

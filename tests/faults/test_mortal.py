@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cloudrc.faults.mortal import FAR_NS, SOCKET_MAX, Clock, Mortal
+from cloudrc.faults.models import FAR_NS, SOCKET_MAX, Clock, Mortal
 from cloudrc.records import Record
 
 MS = 1_000_000

@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from cloudrc.faults.fuzz import fly, judged
-from cloudrc.faults.once import Once
+from cloudrc.faults.fuzz import Once, fly, judged
+from cloudrc.faults.invariants import Watch
 from cloudrc.faults.schedule import Event, Schedule
-from cloudrc.faults.watch import Watch
 from cloudrc.messages import ZERO
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.tunnel.channel import LATE, USED, Channel

@@ -15,10 +15,9 @@ import pytest
 
 from cloudrc.cluster.tools import ClusterError
 from cloudrc.errors import BadInputError
-from cloudrc.faults.catalogue import find, scenarios
-from cloudrc.faults.cluster import family_pods
-from cloudrc.faults.real.family_wire import FLOOD_SECONDS, flood_seconds
-from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.cluster import pods
+from cloudrc.faults.real.wire import FLOOD_SECONDS, flood_seconds
+from cloudrc.faults.scenario import Outcome, Scenario, find, scenarios
 from cloudrc.messages import GuardState
 from cloudrc.tunnel.keys import Key, KeySet, write
 
@@ -111,7 +110,7 @@ def test_the_last_word_of_a_job_is_heard_while_its_pod_goes(
         "list_pods": lambda release, component: ["world"],
     }
     for name, stand_in in there.items():
-        monkeypatch.setattr(family_pods, name, stand_in)
+        monkeypatch.setattr(pods, name, stand_in)
     outcome = find("F33", "cluster").run(1)
     assert [check.show() for check in outcome.checks if not check.passed] == (
         [] if heard else ["the Job ends with INTERRUPTED: NO"]
@@ -129,9 +128,9 @@ def test_a_key_that_is_promised_for_a_time_is_not_rotated_away(
         asked.append(words[0])
         return json.dumps({"data": {"key": encoded}})
 
-    monkeypatch.setattr(family_pods, "kubectl", kubectl)
-    monkeypatch.setattr(family_pods, "release_there", SimpleNamespace)
-    monkeypatch.setattr(family_pods, "_key_secret", lambda release: "key")
+    monkeypatch.setattr(pods, "kubectl", kubectl)
+    monkeypatch.setattr(pods, "release_there", SimpleNamespace)
+    monkeypatch.setattr(pods, "_key_secret", lambda release: "key")
     with pytest.raises(ClusterError, match=r"the one before, is valid for [23]\d\d s more"):
         find("F38", "cluster").run(1)
     assert asked == ["get"]

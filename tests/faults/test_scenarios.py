@@ -17,10 +17,9 @@ from cloudrc.cli.parser import COUNT_MAX
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.faults import asks, document
-from cloudrc.faults.catalogue import called, find, scenarios
 from cloudrc.faults.document import Result
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import Check, Outcome, Scenario
+from cloudrc.faults.scenario import Check, Outcome, Scenario, called, find, scenarios
 
 FAULTS = range(1, 41)
 QUICK = ("short-blackout", "cloud-killed", "forged-command", "bad-configuration")

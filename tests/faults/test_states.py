@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from cloudrc.faults import fuzz
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import Flight, seen_now, state_at, state_before
 from cloudrc.faults.fuzz import fly
 from cloudrc.faults.schedule import Event, Schedule
-from cloudrc.faults.states import seen_now, state_at, state_before
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.records import Contact, GuardChange
 

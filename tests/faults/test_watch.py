@@ -2,7 +2,7 @@
 
 import pytest
 
-from cloudrc.faults.watch import Watch, stops
+from cloudrc.faults.invariants import Watch, stops
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.records import Contact
 from tests.faults.watched import World

@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from cloudrc.faults.watch import FLOWN, Watch
+from cloudrc.faults.invariants import FLOWN, Watch
 from cloudrc.messages import ZERO, Cause, Command, GuardState
 from cloudrc.world.rotors import STOPPED
 

@@ -15,7 +15,7 @@ from bare_world import MS, bare_cloud, bare_world
 
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.drivers.virtual import VirtualRun
-from cloudrc.faults.mortal import Clock, Mortal
+from cloudrc.faults.models import Clock, Mortal
 from cloudrc.faults.schedule import Event, Schedule, shaped
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile

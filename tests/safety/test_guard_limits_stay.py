@@ -8,11 +8,9 @@ from typing import Any
 
 import pytest
 
-from cloudrc.faults.adversary import POLICIES
+from cloudrc.faults.adversary import POLICIES, at_bad_moments, tempting
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.liar import tempting
 from cloudrc.faults.scenario import generator
-from cloudrc.faults.voice import at_bad_moments
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.state import Guard
 

@@ -16,7 +16,7 @@ from cloudrc.config.load import dump, load_experiment
 from cloudrc.drivers.epochs import replace_durably
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import TimedOutError
-from cloudrc.faults.options import SECRET
+from cloudrc.faults.flight import SECRET
 from cloudrc.record.columns import Recording
 from cloudrc.record.recover import Recovery, recover
 from cloudrc.teleop.store import ENDED, STATES

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from cloudrc.cli.client import Api, UnreachableError
-from cloudrc.faults.real.family_processes import REAL, finish
+from cloudrc.faults.real.kills import REAL, finish
 from cloudrc.faults.real.processes import LIMIT, Processes
 from cloudrc.faults.scenario import Outcome, Scenario
 

@@ -9,7 +9,7 @@ from math import nan
 
 from cloudrc.errors import BadInputError
 from cloudrc.faults.held import holds
-from cloudrc.faults.real.family_processes import REAL, WORKING, finish
+from cloudrc.faults.real.kills import REAL, WORKING, finish
 from cloudrc.faults.real.processes import Processes, flood
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.faults.scribe import PAGE

@@ -13,11 +13,12 @@ from cloudrc import assembly
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Mission as MissionSchema
-from cloudrc.faults import asks, gate, meters
-from cloudrc.faults.family_link import instant
+from cloudrc.faults import asks, gate
+from cloudrc.faults import asks as meters
+from cloudrc.faults.adversary import tempting
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.liar import tempting
 from cloudrc.faults.scenario import Outcome, Scenario, generator
+from cloudrc.faults.scenarios.link import instant
 from cloudrc.geometry import fence
 from cloudrc.geometry.placement import overlapped_pipe
 from cloudrc.geometry.scene import Scene, load_scene

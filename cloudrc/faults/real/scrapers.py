@@ -12,7 +12,7 @@ from math import nan
 import numpy as np
 
 from cloudrc.faults.held import holds
-from cloudrc.faults.real.family_processes import REAL, finish
+from cloudrc.faults.real.kills import REAL, finish
 from cloudrc.faults.real.processes import LOOPBACK, Processes
 from cloudrc.faults.scenario import Outcome, Scenario
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from math import hypot, nan
 
-from cloudrc.faults import asks, meters
-from cloudrc.faults.flight import Flight
+from cloudrc.faults import asks
+from cloudrc.faults import asks as meters
+from cloudrc.faults.flight import Flight, Shape, blackouts
 from cloudrc.faults.held import AGE_MAX
-from cloudrc.faults.options import Shape, blackouts
 from cloudrc.faults.scenario import Outcome, Scenario, generator
 from cloudrc.link.profile import GilbertElliott
 from cloudrc.messages import Cause, GuardState

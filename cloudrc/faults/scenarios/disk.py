@@ -8,10 +8,11 @@ from collections.abc import Callable
 from math import nan
 from pathlib import Path
 
-from cloudrc.faults import asks, meters
-from cloudrc.faults.family_link import instant
+from cloudrc.faults import asks
+from cloudrc.faults import asks as meters
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario, generator
+from cloudrc.faults.scenarios.link import instant
 from cloudrc.faults.scribe import ForgetfulWriter, FullDisk, Scribe, SlowWriter
 from cloudrc.faults.toll import Generator
 from cloudrc.record.columns import Recording

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from math import inf, nan
 
-from cloudrc.faults import asks, meters
-from cloudrc.faults.family_link import instant
+from cloudrc.faults import asks
+from cloudrc.faults import asks as meters
+from cloudrc.faults.adversary import Lie, tempting
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.held import AGE_MAX
-from cloudrc.faults.liar import Lie, tempting
-from cloudrc.faults.mortal import Mortal, Tamper
+from cloudrc.faults.models import Mortal, Tamper
 from cloudrc.faults.scenario import Outcome, Scenario, generator
+from cloudrc.faults.scenarios.link import instant
 from cloudrc.faults.toll import Generator, Toll, unharmed
 from cloudrc.messages import Command, GuardState
 from cloudrc.records import Control, Fault

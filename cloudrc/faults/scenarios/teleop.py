@@ -9,10 +9,11 @@ from pathlib import Path
 
 from cloudrc import assembly
 from cloudrc.drivers.teleop import LastWord
-from cloudrc.faults import asks, gate, meters
-from cloudrc.faults.family_link import instant
+from cloudrc.faults import asks, gate
+from cloudrc.faults import asks as meters
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.scenarios.link import instant
 from cloudrc.messages import GuardState
 from cloudrc.teleop.bridge import Bridge
 from cloudrc.teleop.journal import Entry, parse

@@ -6,11 +6,12 @@ import re
 from itertools import pairwise
 from math import hypot, nan
 
-from cloudrc.faults import asks, meters
-from cloudrc.faults.family_link import instant
+from cloudrc.faults import asks
+from cloudrc.faults import asks as meters
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.held import AGE_MAX
 from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.scenarios.link import instant
 from cloudrc.messages import GuardState
 from cloudrc.records import CommandApplied, Fault, GroundTruth, Lateness
 

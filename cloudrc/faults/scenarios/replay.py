@@ -9,7 +9,7 @@ from math import nan
 
 from cloudrc.faults import asks
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.mortal import Mortal
+from cloudrc.faults.models import Mortal
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.faults.toll import Generator, kind_of, unharmed
 from cloudrc.records import SessionOpened

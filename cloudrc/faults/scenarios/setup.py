@@ -12,14 +12,13 @@ from pathlib import Path
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile
 from cloudrc.drivers.recording import WallClock, told
 from cloudrc.errors import BadInputError
-from cloudrc.faults import asks, meters
-from cloudrc.faults.crowd import Crowd
-from cloudrc.faults.family_link import HOUR_NS, instant
-from cloudrc.faults.flight import Flight
+from cloudrc.faults import asks
+from cloudrc.faults import asks as meters
+from cloudrc.faults.flight import SECRET, Crowd, Flight
 from cloudrc.faults.held import AGE_MAX
-from cloudrc.faults.mortal import Clock
-from cloudrc.faults.options import SECRET
+from cloudrc.faults.models import Clock
 from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.scenarios.link import HOUR_NS, instant
 from cloudrc.faults.walls import jumping_wall_clock, steppable_wall_clock
 from cloudrc.messages import GuardState
 from cloudrc.records import Fault

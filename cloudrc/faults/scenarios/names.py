@@ -6,10 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cloudrc.faults import asks, meters
-from cloudrc.faults.family_link import instant
+from cloudrc.faults import asks
+from cloudrc.faults import asks as meters
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario, generator
+from cloudrc.faults.scenarios.link import instant
 from cloudrc.link.follow import PEER_PAUSE, PeerName
 from cloudrc.records import Counted, Record
 

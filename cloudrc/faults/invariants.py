@@ -13,21 +13,101 @@ A robot that lands, since its cloud is gone for good or says what no honest one 
 is, and one that the operator stops falls: the guard knows the fence, and not what lies below. What
 it comes down on is told, and no collision, also where the operator has acknowledged a landing too
 late for it to stop above that.
+
+The invariant of how rotors stop: by a word, by a hit, or where the robot stands.
+
+A guard that lets its rotors stop in the air drops the robot. Told by what the simulator is given,
+not by speeds of 0, which hard braking commands, too.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from math import hypot, inf, sqrt
 from typing import Any, NamedTuple
 
-from cloudrc.faults import halts, hold_end, ticks, word
-from cloudrc.faults.halts import REELS_NS
-from cloudrc.faults.hold_end import Patience, growth
-from cloudrc.faults.ticks import TICK_NS
+from cloudrc.faults import hold_end
+from cloudrc.faults import hold_end as ticks
+from cloudrc.faults import hold_end as word
+from cloudrc.faults.hold_end import TICK_NS, Patience, growth
 from cloudrc.geometry.fence import HIGH, LOW, inside
 from cloudrc.messages import ZERO, Command, GuardState, Vector
 from cloudrc.records import Contact
+from cloudrc.world.rotors import STOPPED
+
+ESTOP = GuardState.ESTOP
+STANDS = 0.2
+"""What stands has no component of its velocity above this [m/s]."""
+FALL = 1.0
+"""Faster down than what drops from no higher than the guard's 0.02 m [m/s]: that gets to 0.7."""
+REELS_NS = 1_000_000_000
+"""For so long a hit explains what has become of the robot [ns]."""
+
+
+def attach_halts(
+    robot: Any, start_ns: int, note: Callable[[int, str, str], None], *, honest: bool
+) -> None:
+    """Look at every step of a robot that begins now.
+
+    Args:
+        robot: Its guard and its simulator are looked at.
+        start_ns: Instant of the first step [ns].
+        note: Is told of a breach: instant [ns], kind, what happened.
+        honest: Whether a hit that was none is a breach.
+    """
+    simulator, guard = robot.simulator, robot.guard
+    step, stop, put_on_ground = simulator.step, guard.stop, guard.put_on_ground
+    now_ns, was, turned, asked = start_ns, guard.state, False, False
+    halted, stopped, standing, falling = False, ESTOP, STOPPED, -FALL
+
+    def watched_stop(when_ns: int) -> None:
+        nonlocal asked
+        asked = True
+        stop(when_ns)
+
+    def watched_put_on_ground(when_ns: int, cause: str) -> None:
+        nonlocal asked
+        asked = True
+        put_on_ground(when_ns, cause)
+
+    def watched_step(rotor_speeds: Any) -> None:
+        nonlocal now_ns, was, turned, asked, halted
+        state, turns = guard.state, rotor_speeds is not standing
+        if state is not was:
+            if state is stopped and honest and not asked and not has_touched(simulator):
+                note(now_ns, "collision", "stopped by a hit although nothing was touched")
+            was = state
+        if turned and not turns:
+            halted = not asked and state is not stopped
+            if halted:
+                _look_at_halt(simulator.readings.velocity, state, now_ns, note)
+        elif halted:
+            halted = not turns and not asked
+            if halted and simulator.readings.velocity[2] < falling and not has_touched(simulator):
+                note(now_ns, "rest", f"falls in {state.name}, its rotors stopped in the air")
+                halted = False
+        turned, asked = turns, False
+        step(rotor_speeds)
+        now_ns += TICK_NS
+
+    simulator.step, guard.stop = watched_step, watched_stop
+    guard.put_on_ground = watched_put_on_ground
+
+
+def has_touched(simulator: Any) -> bool:
+    """Say whether the robot touches something, or has just touched it."""
+    last = max(simulator._last_touch.values(), default=-inf)
+    return bool((simulator._steps - last) * TICK_NS <= REELS_NS)
+
+
+def _look_at_halt(
+    velocity: Vector, state: GuardState, now_ns: int, note: Callable[[int, str, str], None]
+) -> None:
+    fastest = max(map(abs, velocity))
+    if not fastest <= STANDS:
+        note(now_ns, "rest", f"rotors stopped in {state.name} at {fastest:.2f} m/s")
+
 
 SLACK = 1e-9
 """For rounding [m/s]."""
@@ -116,10 +196,10 @@ class Watch:
         robot = world.robot
         self._attach_to_flight(robot.simulator, robot.guard, start_ns)
         self._attach_to_states(robot.simulator, robot.guard, start_ns)
-        ticks.attach(robot, start_ns, self.note)
-        operator = word.attach(robot, start_ns, self.note)
-        hold_end.attach(robot, start_ns, self.note, operator, self._patience)
-        halts.attach(robot, start_ns, self.note, honest=honest)
+        ticks.attach_ticks(robot, start_ns, self.note)
+        operator = word.attach_word(robot, start_ns, self.note)
+        hold_end.attach_hold_end(robot, start_ns, self.note, operator, self._patience)
+        attach_halts(robot, start_ns, self.note, honest=honest)
 
     def _attach_to_flight(self, simulator: Any, guard: Any, start_ns: int) -> None:
         """Look at where it is, and at what it flies by."""

@@ -8,7 +8,7 @@ from contextlib import suppress
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.pods import find_pod
 from cloudrc.cluster.tools import ClusterError
-from cloudrc.faults.cluster.family_pods import CLUSTER
+from cloudrc.faults.cluster.pods import CLUSTER
 from cloudrc.faults.cluster.release import (
     delete,
     finish,

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cloudrc.faults import asks, meters
-from cloudrc.faults.family_link import instant
-from cloudrc.faults.flight import Flight
+from cloudrc.faults import asks
+from cloudrc.faults import asks as meters
+from cloudrc.faults.flight import Flight, blackouts
 from cloudrc.faults.held import AGE_MAX
-from cloudrc.faults.options import blackouts
 from cloudrc.faults.scenario import Outcome, Scenario, generator
+from cloudrc.faults.scenarios.link import instant
 
 THINGS = ("uplink", "downlink", "cloud", "world", "teleop")
 """In the order in which they freeze: a direction before its sender, so that something is lost."""

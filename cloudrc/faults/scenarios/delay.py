@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from math import isnan, sqrt
 
-from cloudrc.faults import asks, meters
-from cloudrc.faults.family_link import HOUR_NS, instant
-from cloudrc.faults.flight import Flight
-from cloudrc.faults.liar import tempting
-from cloudrc.faults.mortal import Clock
-from cloudrc.faults.options import Shape
+from cloudrc.faults import asks
+from cloudrc.faults import asks as meters
+from cloudrc.faults.adversary import tempting
+from cloudrc.faults.flight import Flight, Shape
+from cloudrc.faults.models import Clock
 from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.scenarios.link import HOUR_NS, instant
 from cloudrc.link.profile import Change
 from cloudrc.messages import Command
 from cloudrc.records import Arrival, Control
