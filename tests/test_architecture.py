@@ -22,29 +22,33 @@ MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "messages": set(),
     "records": set(),
-    "records_link": set(),
     "endpoint": set(),
     "files": set(),
     "geometry": set(),
     "plugins": set(),
     "tunnel": {"endpoint"},
-    "link": {"config", "files"},
+    "link": {"config", "files", "exposition", "tunnel"},
     "config": {"plugins", "geometry", "link", "files"},
     "world": {"endpoint", "tunnel", "config", "plugins", "geometry"},
-    "cloud": {"endpoint", "tunnel", "config", "plugins", "geometry", "files"},
+    "cloud": {"endpoint", "tunnel", "config", "plugins", "teleop"},
+    "teleop": {"config", "files", "geometry"},
     "exposition": set(),
     "drivers": {"endpoint", "tunnel", "link", "metrics", "config", "exposition", "files"},
     "record": {"endpoint", "files"},
     "metrics": {"record", "config", "geometry", "plugins"},
     "report": {"record", "metrics", "config", "geometry", "link", "files"},
-    "cluster": {"config"},
+    "cluster": {"config", "link"},
     "assembly": EVERYTHING,
     "faults": EVERYTHING,
     "cli": EVERYTHING,
     "__main__": {"cli"},
     "__init__": set(),
 }
-ALWAYS = {"errors", "messages", "records", "records_link", "__version__"}
+ALWAYS = {"errors", "messages", "records", "__version__"}
+
+# What runs in real time beside the drivers: the shapers of the link and the API of teleop.
+SHAPERS = ("link/relay", "link/lateness", "link/verify/probe", "link/verify/monitor")
+API = ("teleop/api", "teleop/auth", "teleop/bridge", "teleop/server")
 
 # Faults with real processes and sockets, and a wall clock that is made to jump.
 REAL = ("faults/real/", "faults/cluster/", "faults/walls")
@@ -54,14 +58,14 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/",),
     # The simulator packs forces straight into MuJoCo's buffers: nothing else is as fast.
     # The relay reads the kernel's stamp of every datagram, and reads and sends them in batches.
-    "struct": ("tunnel/codec", "record/", "world/simulator", "link/relay_"),
+    "struct": ("tunnel/codec", "record/", "world/simulator", "link/relay_io"),
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "faults/schedule"),
     "pydantic": (
-        *("config/", "link/", "cli/", "cloud/teleop/wire", "cloud/teleop/api", "report/write"),
+        *("config/", "link/", "cli/", "teleop/", "report/write"),
         "faults/schedule",
     ),
-    **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("cloud/teleop/api",)),
-    "fcntl": ("cloud/teleop/journal", "drivers/flights"),
+    **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/server")),
+    "fcntl": ("teleop/journal", "drivers/local"),
     "matplotlib": ("report/",),
     "mcap": ("record/",),
     "rosbags": ("record/",),
@@ -69,13 +73,13 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "prometheus_client": ("drivers/",),
     "argparse": ("cli/",),
     "importlib.metadata": ("plugins", "cli/", "report/"),
-    "pkgutil": ("plugins", "faults/catalogue"),
+    "pkgutil": ("plugins", "faults/scenario"),
     "subprocess": ("drivers/", "cli/", "cluster/", *REAL),
     "multiprocessing": ("drivers/", "cli/"),
-    "concurrent": ("cli/", "cloud/teleop/api"),
+    "concurrent": ("cli/", "cluster/", "teleop/"),
     **dict.fromkeys(
         ("time", "socket", "selectors", "select", "threading", "asyncio", "signal"),
-        ("drivers/", "link/relay", "cloud/teleop/api", "cluster/", "cli/", *REAL),
+        ("drivers/", *SHAPERS, *API, "cluster/", "cli/", *REAL),
     ),
     **dict.fromkeys(("random", "secrets", "uuid"), ("drivers/", "cluster/", "cli/")),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
@@ -140,8 +144,8 @@ def test_a_file_imports_only_what_its_part_may() -> None:
 @pytest.mark.parametrize(
     ("place", "code"),
     [
-        ("world/guard.py", "from cloudrc.cloud import endpoint"),
-        ("cloud/endpoint.py", "import cloudrc.world.guard"),
+        ("world/guard/state.py", "from cloudrc.cloud import endpoint"),
+        ("cloud/endpoint.py", "import cloudrc.world.guard.state"),
         ("drivers/virtual.py", "from cloudrc.world.endpoint import WorldEndpoint"),
         ("cloud/estimators/ewma.py", "import time"),
         ("link/model.py", "def f():\n    import random"),

@@ -57,7 +57,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Read the source, write the trace or traces, and say what is in them."""
-
     source: Path = options.source
     if not (source.is_dir() or source.is_file()):
         raise BadInputError(f"{source}: no such file or folder; name a run, a log or a CSV file")

@@ -26,6 +26,8 @@ from typing import Any, NamedTuple
 
 from cloudrc.messages import ZERO, Cause, Command, GuardState, Vector
 
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
+
 TICK_NS = 2_000_000
 """Of the physics [ns]."""
 
@@ -146,7 +148,6 @@ class Word:
         self.armed = self.armed and state not in LATCHED
 
 
-GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 RESUME_COMMANDS = 10
 RESUME_NS = 500_000_000
 """RESUME_COMMANDS fresh commands within this time end a HOLD [ns].

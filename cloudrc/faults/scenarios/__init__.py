@@ -1,1 +1,1 @@
-"""TODO."""
+"""Fault scenarios in virtual time, by the part that they break."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Verify a link: probe it, predict what was asked, and judge what was measured."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""The guard on board: states and rules that hold whatever the cloud sends."""
