@@ -16,7 +16,7 @@ from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity, Operator
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.config.parameters import build
+from cloudrc.config.overrides import build
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss

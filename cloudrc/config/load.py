@@ -24,7 +24,8 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
 from cloudrc.config import document as yaml_text
-from cloudrc.config import overrides, parameters, problems, shipped
+from cloudrc.config import overrides, problems, shipped
+from cloudrc.config import overrides as parameters
 from cloudrc.config.document import Document
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem

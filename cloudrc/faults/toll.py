@@ -1,8 +1,13 @@
-"""Hostile datagrams beside honest ones: each is counted, and nothing else may come of it."""
+"""Hostile datagrams beside honest ones: each is counted, and nothing else may come of it.
+
+The gate of teleop's API without a server: requests go in, what it has counted comes out.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -12,6 +17,9 @@ from cloudrc.faults import asks as meters
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.models import Mortal, Tamper
 from cloudrc.faults.scenario import Outcome, generator
+from cloudrc.teleop.models import RefusedError
+from cloudrc.teleop.server import App, Gate, Receive, Scope, Send
+from cloudrc.teleop.store import ConflictError
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import USED
 
@@ -98,3 +106,40 @@ def unharmed(
     outcome.same("of them taken", toll.taken, 0)
     outcome.true("they opened no session", asks.epochs(clean) == asks.epochs(flight))
     return outcome
+
+
+def counted(application: App, method: str, path: str, count: int = 1) -> Counter[str]:
+    """Ask so many times at once, as the robot's owner.
+
+    Args:
+        application: Behind the gate; it must wait for nobody.
+        method: Of HTTP.
+        path: What for.
+        count: How often.
+    """
+
+    async def nothing(message: Any = None) -> Any:
+        return {}
+
+    gate = Gate(application, tokens=None)
+    for _ in range(count):
+        asking = gate({"method": method, "path": path, "headers": []}, nothing, nothing)
+        with suppress(StopIteration):
+            asking.send(None)
+    return gate.counts
+
+
+def ordered(order: Callable[[], object]) -> Counter[str]:
+    """Post one mission; what `order` raises becomes the status that the API gives it."""
+
+    async def application(scope: Scope, receive: Receive, send: Send) -> None:
+        status = 201
+        try:
+            order()
+        except RefusedError:
+            status = 422
+        except ConflictError:
+            status = 409
+        await send({"type": "http.response.start", "status": status, "headers": []})
+
+    return counted(application, "POST", "/v1/missions")

@@ -10,7 +10,7 @@ import pytest
 
 from cloudrc import plugins
 from cloudrc.config.load import load_experiment
-from cloudrc.config.parameters import build
+from cloudrc.config.overrides import build
 from cloudrc.config.schema import PlugIn
 from cloudrc.errors import BadInputError
 

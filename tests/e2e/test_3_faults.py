@@ -24,7 +24,7 @@ from kube import (
 
 from cloudrc.cluster.release import wait_ready
 from cloudrc.config.load import load_mission
-from cloudrc.faults.cluster.kills import COMMANDS_IN, ENDS_IN, POD_START
+from cloudrc.faults.cluster.pods import COMMANDS_IN, ENDS_IN, POD_START
 
 PIPES = [waypoint.model_dump(mode="json") for waypoint in load_mission("pipes").waypoints]
 LINGER = 12

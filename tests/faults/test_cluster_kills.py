@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from cloudrc.cluster.tools import ClusterError
-from cloudrc.faults.cluster import kills
-from cloudrc.faults.cluster.kills import KILL
+from cloudrc.faults.cluster import pods
+from cloudrc.faults.cluster.pods import KILL
 from cloudrc.faults.scenario import find
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
@@ -51,9 +51,9 @@ def test_that_the_kill_takes_its_messenger_with_it_is_no_error(
         raise ClusterError("'kubectl exec' failed: command terminated with exit code 137")
 
     pod = SimpleNamespace(metadata=SimpleNamespace(name="cloud-1"))
-    monkeypatch.setattr(kills, "find_pod", lambda release, component: pod)
-    monkeypatch.setattr(kills, "kubectl", kubectl)
-    kills._kill_container(SimpleNamespace())  # type: ignore[arg-type]
+    monkeypatch.setattr(pods, "find_pod", lambda release, component: pod)
+    monkeypatch.setattr(pods, "kubectl", kubectl)
+    pods._kill_container(SimpleNamespace())  # type: ignore[arg-type]
     assert said == ["exec", "cloud-1", "--container=cloud", "--", "python", "-c", KILL]
 
 
@@ -94,7 +94,7 @@ def test_who_is_late_or_holds_for_another_cause_has_failed(
         "finish": lambda outcome, release, name: flown(*after),
     }
     for name, stand_in in there.items():
-        monkeypatch.setattr(kills, name, stand_in)
+        monkeypatch.setattr(pods, name, stand_in)
     failed = [each.text for each in find(fault, "cluster").run(1).checks if not each.passed]
     assert len(failed) == len(missed)
     assert all(text.startswith(word) for text, word in zip(failed, missed, strict=True))

@@ -13,7 +13,7 @@ from cloudrc import assembly
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Mission as MissionSchema
-from cloudrc.faults import asks, gate
+from cloudrc.faults import asks, toll
 from cloudrc.faults import asks as meters
 from cloudrc.faults.adversary import tempting
 from cloudrc.faults.flight import Flight
@@ -62,7 +62,7 @@ def _impossible(seed: int) -> Outcome:
     many = {"waypoints": ({"position_m": (0.0, 0.0, 1.0)},) * 10_001}
     outcome.true("10,001 waypoints: refused", _refuses(many))
     body = b'{"waypoints": [{"position_m": [100, 0, 1]}]}'
-    refused = gate.ordered(lambda: read_mission(body, scene))["order_invalid"]
+    refused = toll.ordered(lambda: read_mission(body, scene))["order_invalid"]
     meters.counts(
         outcome, "teleop", "api_order_invalid", refused, "missions_refused_total", "invalid"
     )
@@ -168,7 +168,7 @@ def _rival_mission(seed: int) -> Outcome:
             named[0] = error.mission
             raise
 
-    flight.cloud.at(at, lambda now_ns: refused.update(gate.ordered(lambda: order(now_ns))))
+    flight.cloud.at(at, lambda now_ns: refused.update(toll.ordered(lambda: order(now_ns))))
     flight.fly_mission()
     asks.safe(outcome, flight)
     asks.done(outcome, flight)

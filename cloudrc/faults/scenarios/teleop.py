@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cloudrc import assembly
 from cloudrc.drivers.teleop import LastWord
-from cloudrc.faults import asks, gate
+from cloudrc.faults import asks, toll
 from cloudrc.faults import asks as meters
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario
@@ -64,7 +64,7 @@ def _at_the_gate(count: int) -> int:
     async def application(scope: Scope, receive: Receive, send: Send) -> None:
         return
 
-    return gate.counted(application, "GET", "/v1/state", count)["busy"]
+    return toll.counted(application, "GET", "/v1/state", count)["busy"]
 
 
 def _slow_reader(seed: int) -> Outcome:
