@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from rendering import Object, containers, of_kind, pod_specs, render
+
+from tests.chart.conftest import Object, containers, of_kind, pod_specs, render
 
 
 def argument(objects: list[Object], end: str, flag: str) -> str:

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 import yaml
-from rendering import Object, containers, of_kind, pod_specs, render
 
 from cloudrc.config.load import FILES, dump, load_experiment, load_profile
 from cloudrc.config.shipped import names
+from tests.chart.conftest import Object, containers, of_kind, pod_specs, render
 
 MEASURED = {"drive.csv": "time_s,delay_ms\n0,30\n1,40\n2,35\n"}
 NAMING: dict[str, Object] = {

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from rendering import (
+
+from tests.chart.conftest import (
     Lookup,
     Object,
     a_namespace,

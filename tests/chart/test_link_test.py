@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from rendering import Object, containers, pod_specs, render
-
 from cloudrc.cli.link_verify import ENDS_LIMIT
 from cloudrc.cli.parser import build
+from tests.chart.conftest import Object, containers, pod_specs, render
 
 HELM_WAITS = 300.0
 """For one hook, unless --timeout says otherwise [s]."""

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from rendering import CHART, Object, containers, of_kind, pod_specs, render
 
 import cloudrc
 from cloudrc.config.load import load_mission
 from cloudrc.config.mission_check import check_mission
 from cloudrc.geometry.scene import load_scene
+from tests.chart.conftest import CHART, Object, containers, of_kind, pod_specs, render
 
 EXAMPLES = {
     name: list(yaml.safe_load_all((CHART / "examples" / f"{name}.yaml").read_text()))

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 import yaml
-from rendering import CHART, ROOT, Object, containers, of_kind, pod_specs, render
 
 from cloudrc.exposition.table import METRICS, Kind
+from tests.chart.conftest import CHART, ROOT, Object, containers, of_kind, pod_specs, render
 
 OPERATOR = "monitoring.coreos.com/v1"
 BOTH: Object = {"metrics": {"podMonitor": {"enabled": True}, "prometheusRule": {"enabled": True}}}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from rendering import Object, a_namespace, containers, pod_specs, render
+
+from tests.chart.conftest import Object, a_namespace, containers, pod_specs, render
 
 END = {"experiment ro", "secret ro", "run", "data"}
 LINK = {"experiment ro", "link ro", "run"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rendering import Object, containers, of_kind, pod_specs, render
+from tests.chart.conftest import Object, containers, of_kind, pod_specs, render
 
 TUNNEL, DNS, API = {("UDP", 7400)}, {("UDP", 53), ("TCP", 53)}, {("TCP", 8080)}
 LINK_TEST = {("TCP", 9100), ("TCP", 9102)}

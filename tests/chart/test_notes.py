@@ -5,7 +5,8 @@ from __future__ import annotations
 import shlex
 
 import pytest
-from rendering import Object, component, notes, of_kind, render
+
+from tests.chart.conftest import Object, component, notes, of_kind, render
 
 
 def commands(text: str) -> list[list[str]]:

@@ -6,9 +6,18 @@ import re
 from pathlib import Path
 
 import pytest
-from rendering import CHART, CI_VALUES, METADATA, containers, of_kind, pod_specs, render, values_of
 
 import cloudrc
+from tests.chart.conftest import (
+    CHART,
+    CI_VALUES,
+    METADATA,
+    containers,
+    of_kind,
+    pod_specs,
+    render,
+    values_of,
+)
 
 LABELS = {f"app.kubernetes.io/{key}" for key in (
     "name", "instance", "version", "component", "part-of", "managed-by",

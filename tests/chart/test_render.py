@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 import yaml
-from rendering import (
+
+from tests.chart.conftest import (
     CHART,
     CI_VALUES,
     EXAMPLES,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 
 import pytest
-from rendering import a_namespace, holding, notes, of_kind, pod_specs, render
+
+from tests.chart.conftest import a_namespace, holding, notes, of_kind, pod_specs, render
 
 OURS = {"secret": {"existingSecret": "lab-key"}}
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from rendering import (
+
+from tests.chart.conftest import (
     CI_VALUES,
     EXAMPLES,
     Object,

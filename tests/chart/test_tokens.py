@@ -5,7 +5,17 @@ from __future__ import annotations
 import base64
 
 import pytest
-from rendering import Object, a_namespace, containers, holding, notes, of_kind, pod_specs, render
+
+from tests.chart.conftest import (
+    Object,
+    a_namespace,
+    containers,
+    holding,
+    notes,
+    of_kind,
+    pod_specs,
+    render,
+)
 
 OURS: Object = {"teleop": {"tokens": {"existingSecret": "lab-tokens"}}}
 MISSION: Object = {"mission": {"enabled": True}}

@@ -7,10 +7,20 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from rendering import CHART, CI_VALUES, EXAMPLES, ROOT, Object, laid_over, render, schema, values_of
 
 from cloudrc.config.problems import leaves
 from cloudrc.config.schema import Experiment
+from tests.chart.conftest import (
+    CHART,
+    CI_VALUES,
+    EXAMPLES,
+    ROOT,
+    Object,
+    laid_over,
+    render,
+    schema,
+    values_of,
+)
 
 jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-validate, extra dev")
 

@@ -18,7 +18,7 @@ from cloudrc.link.verify.causes import Cause, Evidence, Findings
 from cloudrc.link.verify.judge import Row
 from cloudrc.record.writer import MISSING, McapWriter
 from cloudrc.records import Fault
-from tests.record.samples import world_records
+from tests.record.conftest import world_records
 
 EVIL = "x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
 SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"

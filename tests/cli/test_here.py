@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from api_harness import Running, running
 
 from cloudrc.cli.find_run import QUIET_LIMIT
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
+from tests.teleop.conftest import Running, running
 
 Printed = pytest.CaptureFixture[str]
 SET = ["link", "set", "uplink.loss=0.1"]

@@ -16,7 +16,7 @@ from cloudrc.cli.main import main
 from cloudrc.cli.relay import show_asked
 from cloudrc.config.load import load_experiment
 from cloudrc.link.traces import read_table, read_trace
-from tests.record.samples import world_records, write
+from tests.record.conftest import world_records, write
 
 PING = "\n".join(
     f"[{100 + n / 5 + 0.04:.6f}] 64 bytes from 192.0.2.1: icmp_seq={n} ttl=57 time={40 + n % 3} ms"

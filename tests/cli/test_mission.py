@@ -9,14 +9,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from api_harness import Running, running
-from teleop_harness import A, B
 
 from cloudrc.cli import mission_local
 from cloudrc.cli import mission_local as mission_follow
 from cloudrc.cli.client import Api, reader
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
+from tests.teleop.conftest import A, B, Running, running
 
 FILE = """
 description: Two points

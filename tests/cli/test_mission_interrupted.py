@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from api_harness import running
 
 from cloudrc.cli import mission_local
 from cloudrc.cli.client import Api
 from cloudrc.cli.main import main
+from tests.teleop.conftest import running
 
 FILE = "name: one\nstart: here\nwaypoints: [{position_m: [0.5, 0.0, 1.0]}]\n"
 

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from api_harness import Running, running
-from teleop_harness import PLAN
 
 from cloudrc.cli import client, mission_cluster, mission_local
 from cloudrc.cli import mission_local as mission_follow
@@ -22,6 +20,7 @@ from cloudrc.cluster.jobs import JobStatus
 from cloudrc.errors import BadInputError
 from cloudrc.teleop.store import SHOWN as EVENTS
 from cloudrc.teleop.store import Order
+from tests.teleop.conftest import PLAN, Running, running
 
 NAME = "far\x1b[2J\nm9  forged\r\x9b31m\x7f\u202e"
 SHOWN = r"far\x1b[2J\nm9  forged\r\x9b31m\x7f\u202e"

@@ -12,7 +12,7 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.faults.schedule import Schedule, dump
-from tests.record.samples import world_records, write
+from tests.record.conftest import world_records, write
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 from cloudrc.cli.runtime import _open_recorder
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
-from tests.record.samples import MS, counted, world_records
+from tests.record.conftest import MS, counted, world_records
 
 
 def started(path: Path | None, size_max: float | None = None) -> Recorder:

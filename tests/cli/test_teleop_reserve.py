@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_volume import MIB, KilledError, Volume
 
 from cloudrc.assembly import build_plan
 from cloudrc.cli import teleop
@@ -20,6 +19,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.teleop.journal import Entry, Journal, parse, to_bytes
 from cloudrc.teleop.store import KEPT, QUEUE_MAX, MissionBook, Order
+from tests.cli.conftest import MIB, KilledError, Volume
 
 RESERVE = MIB // 8
 """In the place of the real one, so that a journal need not be long to take as much room."""

@@ -1,12 +1,12 @@
 """The control loop: what telemetry says about delays, and when the reference is frozen."""
 
 import pytest
-from loop_harness import MS, Integrating, command, loop, telemetry
 
 from cloudrc.cloud.estimators import Estimator
 from cloudrc.cloud.estimators.split import build as split
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.messages import ZERO
+from tests.cloud.conftest import MS, Integrating, command, loop, telemetry
 
 
 def test_round_trip_and_loop_delay_differ_by_the_hold():

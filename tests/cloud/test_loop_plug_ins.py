@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from loop_harness import HERE, MS, Integrating, command, loop, telemetry
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import Estimator
@@ -15,6 +14,7 @@ from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.predictors.last_sample import LastSample
 from cloudrc.drivers.feed import from_line, to_line
 from cloudrc.messages import ZERO
+from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
 
 
 class Raising(Estimator, Predictor, Controller):

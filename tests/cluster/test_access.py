@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from fake_api import FakeApi, kubeconfig, pod
 
 from cloudrc.cluster.client import Release, connect
 from cloudrc.cluster.pods import find_pod, list_pods
 from cloudrc.cluster.tools import ClusterError
 from cloudrc.errors import MissingPrerequisiteError
+from tests.cluster.conftest import FakeApi, kubeconfig, pod
 
 ROOT = Path(__file__).resolve().parents[2]
 

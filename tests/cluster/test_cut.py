@@ -13,7 +13,7 @@ from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
-from tests.missions.flying import records
+from tests.flights.conftest import records
 
 SECOND = 1_000_000_000
 HOVER = ("hover", ("mission.waypoints.0.dwell_s=1.0",))

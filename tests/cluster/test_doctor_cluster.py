@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 import yaml
-from fake_api import FakeApi, kubeconfig
 
 from cloudrc.cli import doctor as checks
 from cloudrc.cli import extras, run
 from cloudrc.cli.main import main
 from cloudrc.cluster.client import OLDEST
+from tests.cluster.conftest import FakeApi, kubeconfig
 
 Printed = pytest.CaptureFixture[str]
 CHART = Path(__file__).resolve().parents[2] / "charts" / "cloudrc" / "Chart.yaml"

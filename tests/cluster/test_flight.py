@@ -10,7 +10,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from fake_api import FakeApi
 from test_cut import HOVER, SECOND, flown, later, merged
 from test_jobs import at_look, end, start_pod, terminated
 
@@ -21,6 +20,7 @@ from cloudrc.cluster.client import Release, connect
 from cloudrc.cluster.jobs import run_job
 from cloudrc.cluster.tools import ClusterError
 from cloudrc.config.load import load_experiment
+from tests.cluster.conftest import FakeApi
 
 Patch = pytest.MonkeyPatch
 NAME, (SETTING,) = HOVER

@@ -9,12 +9,12 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from fake_api import FakeApi, pod
 
 from cloudrc.cluster import jobs
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.jobs import delete_job, follow, list_jobs, logs, read_job, run_job
 from cloudrc.cluster.tools import ClusterError, WaitedTooLongError
+from tests.cluster.conftest import FakeApi, pod
 
 MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 import yaml
-from link_pods import PROFILE, TRACE, Cluster
 
 from cloudrc.cli.link_run import loader
 from cloudrc.cli.main import main
 from cloudrc.link.follow import HANDED_FILE, HandedProfile, ProfileFile, Profiles
+from tests.cluster.conftest import PROFILE, TRACE, Cluster
 
 
 def set_link(*words: str) -> int:

@@ -10,10 +10,9 @@ from typing import Any
 
 import pytest
 import yaml
-from fake_api import FakeApi, kubeconfig, pod
-from link_pods import PROFILE, Cluster
 
 from cloudrc.cli.main import main
+from tests.cluster.conftest import PROFILE, Cluster, FakeApi, kubeconfig, pod
 
 ROLE = Path(__file__).parents[2] / "charts" / "cloudrc" / "examples" / "link-set-role.yaml"
 LINE = ["link", "set", "downlink.delay_ms=120", "-n", "demo"]

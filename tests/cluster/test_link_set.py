@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 import yaml
-from fake_api import FakeApi
-from link_pods import PROFILE, TRACE, Cluster
 
 from cloudrc.cli.main import main
 from cloudrc.cluster.link import with_files
 from cloudrc.errors import BadInputError
+from tests.cluster.conftest import PROFILE, TRACE, Cluster, FakeApi
 
 
 def test_the_profile_changes_for_good_and_both_pods_get_it_at_once(

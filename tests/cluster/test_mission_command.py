@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from fake_api import FakeApi
 from test_jobs import at_look, end, start_pod, terminated
 
 from cloudrc.cli.main import main
+from tests.cluster.conftest import FakeApi
 
 MISSION = """
 start: here

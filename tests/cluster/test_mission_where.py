@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fake_api import FakeApi
 
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
+from tests.cluster.conftest import FakeApi
 
 Printed = pytest.CaptureFixture[str]
 IN_CLUSTER = "no missions in namespace 'demo'"

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from fake_api import FakeApi, pod
 
 from cloudrc.cluster import pods, tools
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.release import install
 from cloudrc.cluster.tools import ClusterError, WaitedTooLongError, chart_folder
 from cloudrc.errors import MissingPrerequisiteError
+from tests.cluster.conftest import FakeApi, pod
 
 Pretend = Callable[[str, str], Path]
 

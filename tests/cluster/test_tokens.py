@@ -5,12 +5,12 @@ from __future__ import annotations
 import base64
 
 import pytest
-from fake_api import FakeApi
 
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.jobs import run_job
 from cloudrc.cluster.pods import operator_token, secret_name
 from cloudrc.cluster.tools import ClusterError
+from tests.cluster.conftest import FakeApi
 
 
 def test_it_is_the_one_that_the_pod_mounts(running: FakeApi, release: Release) -> None:

@@ -6,12 +6,12 @@ import re
 from typing import Any
 
 import pytest
-from fake_api import FakeApi, deployment, pod
 
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.pods import list_pods, trouble
 from cloudrc.cluster.release import wait_ready
 from cloudrc.cluster.tools import ClusterError, WaitedTooLongError
+from tests.cluster.conftest import FakeApi, deployment, pod
 
 
 def waiting(reason: str, message: str = "") -> dict[str, Any]:

@@ -6,12 +6,12 @@ import re
 from typing import Any
 
 import pytest
-from schema_keys import LEAVES, base, beside, setting, valid
 
 from cloudrc.config import problems
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.config.schema import Experiment
 from cloudrc.errors import BadInputError
+from tests.config.conftest import LEAVES, base, beside, setting, valid
 
 
 def refusal(key: str, value: Any, *others: str) -> str:

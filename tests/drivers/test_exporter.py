@@ -7,8 +7,6 @@ import subprocess
 import time
 
 import pytest
-from flying import records
-from pace import here
 from prometheus_client.parser import text_string_to_metric_families
 
 from cloudrc import __version__
@@ -37,6 +35,8 @@ from cloudrc.records import (
     Record,
     TelemetrySent,
 )
+from tests.drivers.conftest import here
+from tests.flights.conftest import records
 
 Flight = dict[str, list[Record]]
 PERIODS = (TelemetrySent, Control)

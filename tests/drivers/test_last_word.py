@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from release import Release
 
 from cloudrc.drivers.teleop import LAST_WORD_NS, LastWord
+from tests.drivers.conftest import Release
 
 SECOND = 1_000_000_000
 

@@ -7,11 +7,11 @@ import socket
 from pathlib import Path
 
 import pytest
-from bare_world import bare_world, ring
 
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.tunnel.codec import Direction
 from cloudrc.tunnel.session import make_session
+from tests.flights.conftest import bare_world, ring
 
 PACKAGE = Path(__file__).parents[2] / "cloudrc"
 

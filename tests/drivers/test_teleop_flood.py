@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from release import TOKEN, Release
 
 from cloudrc.record.reader import read_contents
+from tests.drivers.conftest import TOKEN, Release
 
 pytestmark = pytest.mark.process
 

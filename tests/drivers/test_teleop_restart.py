@@ -5,12 +5,12 @@ import signal
 import time
 
 import pytest
-from release import LIMIT, TOKEN, Release
 
 from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.teleop.journal import parse
 from cloudrc.teleop.wire import ALARM, encode
+from tests.drivers.conftest import LIMIT, TOKEN, Release
 
 pytestmark = pytest.mark.process
 

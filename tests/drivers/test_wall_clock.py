@@ -15,7 +15,7 @@ from cloudrc.drivers.recording import RecordingThread, WallClock, told
 from cloudrc.faults.walls import Wall, steppable_wall_clock
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Fault
-from tests.record.samples import Shelf
+from tests.record.conftest import Shelf
 
 
 @pytest.fixture

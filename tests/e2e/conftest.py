@@ -1,33 +1,256 @@
-"""A cluster for the end-to-end tests: made or found, given the images, and taken down again."""
+"""A cluster for the end-to-end tests: made or found, given the images, and taken down again.
+
+The cluster as the tests see it: kubectl and helm, one release, what to save on failure.
+
+What a release costs: the kubelet's own counters, read twice; and how fast the machine is.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
 import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
-from kube import (
-    CHART,
-    NAME,
-    NAMESPACE,
-    NAMESPACES,
-    RESTRICTED,
-    ROOT,
-    SUMMARY,
-    TIMES,
-    apply,
-    command,
-    helm,
-    kubectl,
-    place,
-    save,
-)
+from prometheus_client.parser import text_string_to_metric_families
+
+from cloudrc.cli.client import Api
+from cloudrc.cluster.client import Release, connect
+from cloudrc.cluster.pods import api_url, fetch_metrics, operator_token
+from tests.drivers.conftest import WORK, slower
+
+ROOT = Path(__file__).resolve().parents[2]
+CHART = ROOT / "charts" / "cloudrc"
+EXAMPLES = CHART / "examples"
+NAMESPACE = "cloudrc-e2e"
+NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring", f"{NAMESPACE}-bad")
+"""All that these tests make."""
+NAME = "cloudrc"
+RESTRICTED = {"pod-security.kubernetes.io/enforce": "restricted"}
+SUMMARY: list[str] = []
+"""Lines that are printed at the end."""
+TIMES: dict[str, float] = {}
+"""Instants of the session [s]."""
+
+
+class CommandFailedError(AssertionError):
+    """A command ended with another code than 0."""
+
+
+def command(
+    *words: str | Path, given: str = "", timeout: float = 120.0, environ: Mapping[str, str] = {}
+) -> str:
+    """Run a command; what it wrote."""
+    done = subprocess.run(
+        [str(word) for word in words],
+        input=given,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        cwd=ROOT,
+        env={**os.environ, **environ},
+    )
+    if done.returncode != 0:
+        line = " ".join(map(str, words))
+        raise CommandFailedError(f"{line}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def kubectl(*words: str, given: str = "", timeout: float = 120.0) -> str:
+    """In the namespace of the tests, unless the words name another."""
+    return command("kubectl", f"--namespace={NAMESPACE}", *words, given=given, timeout=timeout)
+
+
+def read(*words: str) -> Any:
+    """What `kubectl get` says, as values."""
+    return json.loads(kubectl("get", *words, "--output=json"))
+
+
+def apply(*documents: Mapping[str, Any]) -> None:
+    kubectl("apply", "--filename=-", given=yaml.safe_dump_all(documents))
+
+
+def helm(*words: str, timeout: float = 180.0) -> str:
+    return command("helm", f"--namespace={NAMESPACE}", *words, timeout=timeout)
+
+
+def cloudrc(*words: str, timeout: float = 240.0) -> subprocess.CompletedProcess[str]:
+    """Run our own command line, whatever it ends with."""
+    return subprocess.run(
+        [sys.executable, "-m", "cloudrc", *words],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        cwd=ROOT,
+    )
+
+
+def eventually(
+    look: Callable[[], Any], what: str, timeout: float = 30.0, every: float = 0.5
+) -> Any:
+    """Look until something is true; what was seen."""
+    until = time.monotonic() + timeout
+    while True:
+        seen = look()
+        if seen:
+            return seen
+        assert time.monotonic() < until, f"not within {timeout:g} s: {what}"
+        time.sleep(every)
+
+
+def place() -> Release:
+    return connect(None, NAMESPACE, NAME)
+
+
+def pods(component: str) -> list[dict[str, Any]]:
+    selector = f"app.kubernetes.io/instance={NAME},app.kubernetes.io/component={component}"
+    return read("pods", f"--selector={selector}")["items"]
+
+
+def pod(component: str) -> dict[str, Any]:
+    """The component's pod that is not about to end."""
+    (found,) = [p for p in pods(component) if "deletionTimestamp" not in p["metadata"]]
+    return found
+
+
+def identity() -> dict[str, tuple[str, list[int]]]:
+    """What changes when a pod is replaced or a container starts again."""
+    found = {}
+    for component in ("world", "cloud"):
+        one = pod(component)
+        status = one["status"]
+        containers = [*status.get("initContainerStatuses", []), *status["containerStatuses"]]
+        found[component] = one["metadata"]["uid"], [c["restartCount"] for c in containers]
+    return found
+
+
+Sample = tuple[str, tuple[tuple[str, str], ...]]
+
+
+def scrapes(component: str) -> dict[str, str]:
+    """What each container of a pod answers to a scrape."""
+    return fetch_metrics(place(), component)
+
+
+def metrics(component: str, container: str = "") -> dict[Sample, float]:
+    """Every sample of a container: by name and sorted labels."""
+    text = scrapes(component)[container or component]
+    return {
+        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
+    """Sum of the samples of a name whose labels include these."""
+    found = [
+        number
+        for (each, given), number in samples.items()
+        if each == name and labels.items() <= dict(given).items()
+    ]
+    assert found, f"no sample {name} {labels}"
+    return sum(found)
+
+
+def missions() -> list[dict[str, Any]]:
+    """All missions that the API knows, oldest first."""
+    token = operator_token(connect(None, NAMESPACE, NAME))
+    with api_url(None, NAMESPACE, NAME) as url:
+        return list(Api(url, lambda: token).get("/v1/missions")["missions"])
+
+
+@dataclass
+class JobEnd:
+    """How a Job ended."""
+
+    name: str
+    condition: str
+    exit_code: int
+    message: str
+    log: str = field(repr=False, default="")
+
+
+def job_end(name: str, timeout: float = 150.0) -> JobEnd:
+    """Wait for a Job and read its verdict as `kubectl describe` would show it."""
+
+    def ended() -> str:
+        conditions = read("job", name)["status"].get("conditions", [])
+        true = [c["type"] for c in conditions if c["status"] == "True"]
+        return next((c for c in true if c in ("Complete", "Failed")), "")
+
+    condition = eventually(ended, f"Job {name} has ended", timeout)
+    (one,) = read("pods", f"--selector=batch.kubernetes.io/job-name={name}")["items"]
+    terminated = one["status"]["containerStatuses"][0]["state"]["terminated"]
+    log = kubectl("logs", one["metadata"]["name"])
+    return JobEnd(name, condition, terminated["exitCode"], terminated.get("message", ""), log)
+
+
+def job_log(name: str) -> str:
+    """What a Job has said so far; "" while its pod does not run."""
+    try:
+        return kubectl("logs", f"job/{name}")
+    except CommandFailedError:
+        return ""
+
+
+def fly(name: str, waypoints: Sequence[Mapping[str, Any]], limit: float = 60.0) -> None:
+    """Fly waypoints by a Job of this name, as `cloudrc mission run` does."""
+    from cloudrc.cluster.jobs import run_job
+
+    mission = {"name": name, "time_limit_s": limit, "waypoints": list(waypoints)}
+    run_job(place(), mission, name=name, limit=limit)
+
+
+def save(folder: Path) -> None:
+    """Keep what helps to understand a failure: of each namespace in a folder of its own."""
+    for namespace in NAMESPACES:
+        _save_texts(folder / namespace, f"--namespace={namespace}")
+    for component in ("world", "cloud"):
+        for one in pods(component):
+            name = one["metadata"]["name"]
+            path = f"/var/lib/cloudrc/{component}.mcap"
+            words = [
+                "kubectl",
+                f"--namespace={NAMESPACE}",
+                "exec",
+                name,
+                f"--container={component}",
+            ]
+            with (folder / f"{name}.mcap").open("wb") as file:
+                subprocess.run([*words, "--", "cat", path], stdout=file, stderr=-3, timeout=60)
+
+
+def _save_texts(folder: Path, where: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def keep(name: str, *words: str) -> None:
+        try:
+            text = kubectl(where, *words, timeout=30.0)
+        except (CommandFailedError, subprocess.TimeoutExpired) as error:
+            text = str(error)
+        (folder / name).write_text(text)
+
+    keep("objects.txt", "get", "all,configmap,networkpolicy,pvc,secret", "--output=wide")
+    keep("events.txt", "get", "events", "--sort-by=.lastTimestamp")
+    keep("describe.txt", "describe", "pods,jobs")
+    for one in read("pods", where)["items"]:
+        name = one["metadata"]["name"]
+        keep(f"{name}.log", "logs", name, "--all-containers", "--prefix", "--timestamps")
+        if any(c["restartCount"] for c in one["status"].get("containerStatuses", [])):
+            keep(f"{name}.previous.log", "logs", name, "--all-containers", "--prefix", "--previous")
+
 
 CLUSTER = "cloudrc-e2e"
 IMAGES = "world cloud prometheus"  # a real Prometheus is for these tests alone
@@ -168,3 +391,76 @@ def prometheus_image(cluster: None) -> str:
     """A real Prometheus, and promtool with it."""
     found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
     return found.split()[0]
+
+
+@dataclass
+class Cost:
+    """Processor [cores] and memory [bytes]: in all, and of each container."""
+
+    cpu: float
+    memory: float
+    containers: dict[str, tuple[float, float]]
+
+
+Usage = dict[str, tuple[float, float, float]]
+"""Container -> instant [s], processor time used so far [s], memory [bytes]."""
+
+
+def usage() -> Usage:
+    """Read the counters of all containers of the release."""
+    found: Usage = {}
+    for component in ("world", "cloud"):
+        one = pod(component)
+        summary = json.loads(command("kubectl", "get", "--raw", _address(one["spec"]["nodeName"])))
+        (mine,) = [
+            each
+            for each in summary["pods"]
+            if each["podRef"]["uid"] == one["metadata"]["uid"]
+            and each["podRef"]["namespace"] == NAMESPACE
+        ]
+        for container in mine["containers"]:
+            cpu = container["cpu"]
+            found[f"{component}/{container['name']}"] = (
+                datetime.fromisoformat(cpu["time"].replace("Z", "+00:00")).timestamp(),
+                cpu["usageCoreNanoSeconds"] * 1e-9,
+                container["memory"]["workingSetBytes"],
+            )
+    return found
+
+
+def cost_between(before: Usage, after: Usage) -> Cost:
+    """What was used per second from one reading to a later one."""
+    newest = after if _is_later(after, before) else later(before)
+    containers = {
+        name: ((used - before[name][1]) / (at - before[name][0]), memory)
+        for name, (at, used, memory) in newest.items()
+        if name in before
+    }
+    cpu, memory = (sum(each[i] for each in containers.values()) for i in (0, 1))
+    return Cost(cpu, memory, containers)
+
+
+def later(before: Usage) -> Usage:
+    """Read the counters once the kubelet has measured all containers again."""
+
+    def look() -> Usage | None:
+        now = usage()
+        return now if _is_later(now, before) else None
+
+    found: Usage = eventually(look, "the kubelet has measured again", 30.0)
+    return found
+
+
+@cache  # measured where the release flies; later its pods may just be replaced
+def pace() -> float:
+    """How much slower than nominal the release's own interpreter is at its own work; at least 1."""
+    words = ("exec", pod("world")["metadata"]["name"], "--container=world", "--")
+    return slower(kubectl(*words, "python", "-c", WORK))
+
+
+def _is_later(one: Usage, other: Usage) -> bool:
+    return all(one[name][0] > other[name][0] for name in other)
+
+
+def _address(node: str) -> str:
+    return f"/api/v1/nodes/{node}/proxy/stats/summary"

@@ -8,10 +8,18 @@ from typing import Any
 from urllib.parse import urlencode
 
 import yaml
-from kube import NAMESPACE, CommandFailedError, apply, command, eventually, kubectl, pod
 
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.pods import DIRECTLY, forwarded
+from tests.e2e.conftest import (
+    NAMESPACE,
+    CommandFailedError,
+    apply,
+    command,
+    eventually,
+    kubectl,
+    pod,
+)
 
 MONITORING = f"{NAMESPACE}-monitoring"
 SECURITY = {

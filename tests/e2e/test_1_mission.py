@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from kube import (
+
+from tests.e2e.conftest import (
     CHART,
     EXAMPLES,
     TIMES,
@@ -28,7 +29,14 @@ from kube import (
     scrapes,
     value,
 )
-from neighbours import MONITORING, Prometheus, install_prometheus, promtool, rules_tried, stranger
+from tests.e2e.neighbours import (
+    MONITORING,
+    Prometheus,
+    install_prometheus,
+    promtool,
+    rules_tried,
+    stranger,
+)
 
 MISSION = "paper-mission"
 LIMIT_TIME = 360.0

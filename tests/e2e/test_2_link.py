@@ -13,13 +13,17 @@ from typing import Any
 
 import pytest
 import yaml
-from cost import Usage, cost_between, later, pace, usage
-from kube import (
+
+from cloudrc.cluster.link import PROFILE, Place, hand_over
+from cloudrc.link.follow import Handed
+from tests.e2e.conftest import (
     CHART,
     NAME,
     NAMESPACE,
     CommandFailedError,
+    Usage,
     cloudrc,
+    cost_between,
     eventually,
     fly,
     helm,
@@ -27,14 +31,14 @@ from kube import (
     job_end,
     job_log,
     kubectl,
+    later,
     metrics,
+    pace,
     pod,
     read,
+    usage,
     value,
 )
-
-from cloudrc.cluster.link import PROFILE, Place, hand_over
-from cloudrc.link.follow import Handed
 
 SET_WITHIN = 1.0
 """For `link set` to be in force, from its start [s]: the quickest of three, on a machine that has a

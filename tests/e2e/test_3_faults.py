@@ -7,7 +7,11 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from kube import (
+
+from cloudrc.cluster.release import wait_ready
+from cloudrc.config.load import load_mission
+from cloudrc.faults.cluster.pods import COMMANDS_IN, ENDS_IN, POD_START
+from tests.e2e.conftest import (
     NAME,
     JobEnd,
     eventually,
@@ -21,10 +25,6 @@ from kube import (
     pods,
     value,
 )
-
-from cloudrc.cluster.release import wait_ready
-from cloudrc.config.load import load_mission
-from cloudrc.faults.cluster.pods import COMMANDS_IN, ENDS_IN, POD_START
 
 PIPES = [waypoint.model_dump(mode="json") for waypoint in load_mission("pipes").waypoints]
 LINGER = 12

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from kube import NAME, NAMESPACE, cloudrc
 
 from cloudrc.faults.scenario import scenarios
+from tests.e2e.conftest import NAME, NAMESPACE, cloudrc
 
 WHERE = ("--cluster", "-n", NAMESPACE, "--release", NAME, "-o", "json")
 

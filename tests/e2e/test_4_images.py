@@ -6,9 +6,9 @@ import json
 from collections.abc import Callable
 
 import pytest
-from kube import command
 
 from cloudrc import __version__
+from tests.e2e.conftest import command
 
 SIZES = {"world": 420, "cloud": 320}
 """At most, uncompressed [MB]."""

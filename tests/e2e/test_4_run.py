@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from kube import NAME, NAMESPACE, cloudrc
 
 from cloudrc.config.load import load_experiment
-from tests.missions.flying import fly, numbers
+from tests.e2e.conftest import NAME, NAMESPACE, cloudrc
+from tests.flights.conftest import fly, numbers
 
 CONTACT_TOLERANCE = 0.05
 """Of the contact time, against the virtual run, as a share of it."""

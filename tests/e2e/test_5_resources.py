@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from cost import pace
-from kube import CHART, EXAMPLES, NAME, NAMESPACE, cloudrc, helm, metrics, value
+
+from tests.e2e.conftest import CHART, EXAMPLES, NAME, NAMESPACE, cloudrc, helm, metrics, pace, value
 
 PLACE = ["-n", NAMESPACE, "--release", NAME]
 SHORT = ["--set", "mission.waypoints.0.dwell_s=6"]

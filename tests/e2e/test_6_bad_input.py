@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 import yaml
-from kube import CHART, NAMESPACE, ROOT, cloudrc, command
-from neighbours import apply_anywhere
+
+from tests.e2e.conftest import CHART, NAMESPACE, ROOT, cloudrc, command
+from tests.e2e.neighbours import apply_anywhere
 
 ELSEWHERE = f"{NAMESPACE}-bad"
 Refusal = Callable[..., tuple[int, str]]

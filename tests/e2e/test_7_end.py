@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 
-from kube import EXAMPLES, NAME, cloudrc, command, eventually, helm, kubectl, read
+from tests.e2e.conftest import EXAMPLES, NAME, cloudrc, command, eventually, helm, kubectl, read
 
 KINDS = "deployment,service,configmap,networkpolicy,secret,serviceaccount,pvc,job,pod"
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import yaml
-from flown_metrics import RULES, fired
 
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Scenario, find, scenarios
+from tests.exposition.conftest import RULES, fired
 
 ROOT = Path(__file__).resolve().parents[2]
 MADE_UP = (ROOT / "tests" / "e2e" / "alerts.yaml").read_text(encoding="utf-8")

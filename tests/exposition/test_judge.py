@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterator
 
 import pytest
-from control_periods import MS, period
-from flying import records
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition.ends import DelayJudge, PredictionJudge
 from cloudrc.exposition.live import Live
 from cloudrc.records import CommandApplied, Control
+from tests.exposition.conftest import MS, period
+from tests.flights.conftest import records
 
 
 def flying_along_x(predicted_lead: float, *, every_ms: int = 10) -> Iterator[Control]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 
 import pytest
-from control_periods import MS, period
-from flying import records
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
@@ -25,6 +23,8 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
+from tests.exposition.conftest import MS, period
+from tests.flights.conftest import records
 
 Flight = tuple[list[Record], list[Record]]
 

@@ -10,7 +10,7 @@ from cloudrc.faults.remains import Tape
 from cloudrc.faults.schedule import Event
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.writer import McapWriter
-from tests.record.samples import MS, world_records
+from tests.record.conftest import MS, world_records
 
 
 def judged(kind: str, value: float) -> str:

@@ -12,7 +12,7 @@ from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.hold import Descent, TakeOff
 from cloudrc.world.guard.state import Hits
 from cloudrc.world.readings import Readings
-from tests.faults.watched import World
+from tests.faults.conftest import World
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 ZEROS = tuple(0.0 for _ in range(4))

@@ -11,8 +11,8 @@ from cloudrc.faults.invariants import Watch
 from cloudrc.messages import ZERO, Cause, Command, GuardState, Vector
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.rotors import STOPPED
-from tests.faults.watched import World
-from tests.world.guard_play import LIMITS, SECOND, command, sensed
+from tests.faults.conftest import World
+from tests.world.guard.conftest import LIMITS, SECOND, command, sensed
 
 MS = 1_000_000
 TICK_MS = 2

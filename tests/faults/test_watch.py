@@ -5,7 +5,7 @@ import pytest
 from cloudrc.faults.invariants import Watch, stops
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.records import Contact
-from tests.faults.watched import World
+from tests.faults.conftest import World
 
 MS = 1_000_000
 INSIDE, OUTSIDE = (1.0, 1.0, 1.0), (9.3, 1.0, 1.0)

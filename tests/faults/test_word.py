@@ -10,7 +10,7 @@ from cloudrc.faults.fuzz import fly
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.messages import ZERO, Cause, Command, GuardState
 from cloudrc.world.guard.state import Guard
-from tests.faults.watched import World
+from tests.faults.conftest import World
 
 MS = 1_000_000
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState

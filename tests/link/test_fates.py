@@ -6,9 +6,9 @@ from math import asin, pi, sqrt
 
 import numpy as np
 import pytest
-from link_flows import MS, bursts, delays, flow, losses
 
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
+from tests.link.conftest import MS, bursts, delays, flow, losses
 
 COUNT = 20_000
 

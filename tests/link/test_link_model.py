@@ -9,10 +9,10 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from link_flows import MS, PERIOD_NS, SIZE, TELEMETRY, flow, link
 
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
+from tests.link.conftest import MS, PERIOD_NS, SIZE, TELEMETRY, flow, link
 
 SECOND = 1_000_000_000
 LIVELY = DirectionProfile(

@@ -6,9 +6,9 @@ from time import process_time
 from timeit import repeat
 
 import pytest
-from link_flows import SIZE, TELEMETRY, link
 
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
+from tests.link.conftest import SIZE, TELEMETRY, link
 
 PACKETS = 40_000
 

@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from link_flows import SIZE, TELEMETRY, link
 from numpy.typing import NDArray
 
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
+from tests.link.conftest import SIZE, TELEMETRY, link
 
 COUNT = 1_000_000
 DELAY, JITTER, LOSS = 0.060, 0.005, 0.02

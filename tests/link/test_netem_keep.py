@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import pytest
-from netem_kernel import PEER, Clock, Kernel
 
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.netem import FILTER_LOOKS, Netem
 from cloudrc.link.profile import Change, DirectionProfile
 from cloudrc.link.tc import Answer
+from tests.link.conftest import PEER, Clock, Kernel
 
 PROFILE = DirectionProfile(0.04, loss=0.1)
 

@@ -7,12 +7,13 @@ from pathlib import Path
 import netem_laboratory as lab
 import numpy as np
 import pytest
-from netem_laboratory import WITHIN, Flow, measure, told
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.netem import Netem
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.tc import try_netem
+from tests.link.conftest import WITHIN, Flow, measure
+from tests.link.conftest import show as told
 
 pytestmark = pytest.mark.netem
 

@@ -15,8 +15,6 @@ from typing import Literal
 import netem_laboratory as lab
 import numpy as np
 import pytest
-from link_flows import SIZE
-from netem_laboratory import WITHIN, Flow, least, measure, told
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
@@ -27,6 +25,7 @@ from cloudrc.link.netem import Netem
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.tc import STRETCH, check, table
 from cloudrc.tunnel.codec import Kind
+from tests.link.conftest import SIZE, WITHIN, Flow, least, measure, show
 
 SHAPED = [name for name in names("profile") if name != "lossy"]
 """netem refuses that one."""
@@ -48,7 +47,7 @@ def test_the_delay_is_applied_to_the_tunnels_flow_alone(shaped: Netem) -> None:
         tunnel, stranger = Flow(), Flow(port=7402)
         tunnel.send(200, meanwhile=lambda: stranger.send(1, 0.0))
         delay, other = np.median(tunnel.settle().delays()), np.median(stranger.settle().delays())
-        told("60 ms asked", tunnel=delay, other_port=other)
+        show("60 ms asked", tunnel=delay, other_port=other)
         assert other < 0.020
         return float(abs(delay - other - 0.060))
 
@@ -82,7 +81,7 @@ def test_jitter_is_distributed_as_asked(shaped: Netem, distribution: Distributio
     def off() -> float:
         delays = measure(800, 0.004).delays()
         error = np.abs(np.quantile(delays, shares) - asked).max()
-        told(distribution, mean=delays.mean(), deviation=delays.std(), quantile_off=error)
+        show(distribution, mean=delays.mean(), deviation=delays.std(), quantile_off=error)
         return float(error)
 
     assert least(off, 0.006) < 0.006
@@ -92,7 +91,7 @@ def test_losses_are_as_many_as_asked_and_counted(shaped: Netem) -> None:
     shaped.follow_profile(DirectionProfile(loss=0.2))
     flow = measure(1500, 0.002)
     counts = shaped.counts()
-    told("loss 0.2 asked", measured=1 - len(flow.arrived) / 1500)
+    show("loss 0.2 asked", measured=1 - len(flow.arrived) / 1500)
     assert counts["forwarded"] == len(flow.arrived)
     assert counts["forwarded"] + counts["lost"] == 1500
     assert counts["lost"] / 1500 == pytest.approx(0.2, abs=5 * (0.2 * 0.8 / 1500) ** 0.5)
@@ -103,7 +102,7 @@ def test_losses_come_in_bursts(shaped: Netem) -> None:
     flow = measure(2000, 0.002)
     lost = sorted(set(range(2000)) - set(flow.numbers()))
     bursts = 1 + sum(after - before > 1 for before, after in pairwise(lost))
-    told("gemodel", loss=len(lost) / 2000, burst=len(lost) / bursts)
+    show("gemodel", loss=len(lost) / 2000, burst=len(lost) / bursts)
     assert len(lost) / 2000 == pytest.approx(1 / 6, abs=0.07)
     assert 2.5 < len(lost) / bursts < 6.5
 
@@ -130,7 +129,7 @@ def test_a_shipped_profile_for_a_minute(
         drawn[:] = [drawn_for(tunnel, profile, seed) for seed in range(20)]
         beside, mean = stranger.settle().delays().mean(), tunnel.delays().mean()
         asked = float(np.mean([each.mean for each in drawn]))
-        told(f"{name}, {way}, for a minute", asked=asked, measured=mean, other_port=beside)
+        show(f"{name}, {way}, for a minute", asked=asked, measured=mean, other_port=beside)
         return float(abs(mean - beside - asked))
 
     error = least(off, WITHIN)
@@ -141,7 +140,7 @@ def test_a_shipped_profile_for_a_minute(
     overtaken = float(np.mean(np.maximum.accumulate(order)[:-1] > order[1:]))
     for what, measured in (("loss", loss), ("overtaken", overtaken)):
         values = np.array([getattr(each, what) for each in drawn])
-        told(f"{name}, {way}: {what}", asked=values.mean(), measured=measured)
+        show(f"{name}, {way}: {what}", asked=values.mean(), measured=measured)
         assert abs(measured - values.mean()) <= 5 * values.std() + 0.003, what
 
 
@@ -191,7 +190,7 @@ def test_a_bottleneck_has_its_rate(shaped: Netem) -> None:
         flow.settle()
         took = (flow.arrived[-1][1] - flow.arrived[0][1]) * 1e-9
         measured = 99 * 200 * 8 / took  # 172 bytes and 28 of headers
-        told("400 kbit/s asked", measured=measured)
+        show("400 kbit/s asked", measured=measured)
         return abs(measured / 400e3 - 1.0)
 
     assert least(off, 0.03) < 0.03

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from netem_kernel import PEER, Clock, Kernel, netem
 
 from cloudrc.link.netem import Steps
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, Trace
+from tests.link.conftest import PEER, Clock, Kernel, netem
 
 
 class Watched(Kernel):

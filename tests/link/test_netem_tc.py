@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 
 import pytest
-from netem_kernel import PEER, Clock, Kernel, netem
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.netem import counters
 from cloudrc.link.profile import Change, DirectionProfile, Trace
 from cloudrc.link.tc import Answer, explain, limit, may_shape, try_netem
+from tests.link.conftest import PEER, Clock, Kernel, netem
 
 
 def test_only_the_tunnels_flow_to_the_peer_is_sent_to_netem() -> None:

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import netem_laboratory as lab
 import numpy as np
 import pytest
-from netem_laboratory import WITHIN, Flow, least, told
 
 from cloudrc.link.netem import LATE_NS, Steps
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, Trace
+from tests.link.conftest import WITHIN, Flow, least, show
 
 LATE = 0.1
 """How late a step may be where the machine now and then stands still [s]."""
@@ -44,7 +44,7 @@ def test_a_time_line_is_stepped(tables: Path) -> None:
     before = [delays[n] for n in delays if since[n] < 2.45]
     after = [delays[n] for n in delays if since[n] > 2.5 + LATE]
     lost = [since[n] for n in since if n not in delays and since[n] < 4.2]
-    told("step", before=np.median(before), after=np.median(after), dark=max(lost) - min(lost))
+    show("step", before=np.median(before), after=np.median(after), dark=max(lost) - min(lost))
     assert np.median(before) == pytest.approx(0.02, abs=0.005)
     assert np.median(after) == pytest.approx(0.1, abs=0.005)
     assert min(lost) == pytest.approx(3.5, abs=LATE)
@@ -84,7 +84,7 @@ def follow(tables: Path, trace: Trace) -> Followed:
     measured = flow.delays()[rows]
     correlation = float(np.corrcoef(asked, measured)[0, 1])
     error = float(np.median(measured - asked))
-    told(netem.steps.in_words(), correlation=correlation, median_error=error)
+    show(netem.steps.in_words(), correlation=correlation, median_error=error)
     assert netem.steps.applied + netem.steps.passed_over == len(times) - 1
     assert len(flow.arrived) == 600, "steps lose nothing"
     return Followed(correlation, error, netem.steps)

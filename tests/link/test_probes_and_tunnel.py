@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 
 sys.path.append(str(Path(__file__).parents[1] / "tunnel"))
-from hostile import Target
-
 from cloudrc.cli.link_verify_run import PROBE, TRAIN, plan
 from cloudrc.config.load import load_experiment
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
+from tests.tunnel.hostile import Target
 
 KINDS = (PROBE, TRAIN)
 

@@ -11,12 +11,12 @@ from typing import TypeAlias
 
 import numpy as np
 import pytest
-from link_flows import SIZE
 
 from cloudrc.config.shipped import names
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import write_trace
 from cloudrc.tunnel.codec import Kind
+from tests.link.conftest import SIZE
 from tools.bench_link.anchors import fifo_allowed
 from tools.bench_link.flow import EPOCH, Flow, run_flow
 from tools.bench_link.profiles import (

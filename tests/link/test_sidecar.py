@@ -7,7 +7,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from sidecar_bench import PEER, REFUSED, Bench, told
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link import sidecar
@@ -16,6 +15,7 @@ from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Mode
 from cloudrc.link.state import Change, publish
 from cloudrc.link.tc import notes
+from tests.link.conftest import PEER, REFUSED, Bench, told
 
 NEXT = ("10.244.0.9", 7400)
 NO_NETEM = MissingPrerequisiteError("this kernel has no sch_netem; set link.mode=relay")

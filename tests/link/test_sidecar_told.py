@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from netem_kernel import PEER, listing
-from sidecar_bench import Bench
 
 from cloudrc.cli.link_run import NOTHING, Teller
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
@@ -18,6 +16,7 @@ from cloudrc.link.tc import Answer
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes, of_told
 from cloudrc.link.verify.judge import Row
 from cloudrc.link.verify.standing import shown
+from tests.link.conftest import PEER, Bench, listing
 
 RICH = DirectionProfile(
     0.04, 0.01, "table", loss=GilbertElliott(0.01, 0.2), duplicate=0.02, rate=2e6, table=(-1.0, 1.0)

@@ -7,10 +7,10 @@ from math import isnan, sqrt
 
 import numpy as np
 import pytest
-from link_flows import MS, TELEMETRY, link
 
 from cloudrc.link.model import Numbers, Stream, loss_runs, numbers, sample
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
+from tests.link.conftest import MS, TELEMETRY, link
 
 
 def measured(profile: DirectionProfile, count: int = 20_000) -> Numbers:

@@ -11,7 +11,7 @@ from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import SHIPPED, Flight, control, link, measure_all, mission, motion
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
-from tests.metrics.flights import DONE, ONE_PIPE, flown, paper, straight_flight
+from tests.metrics.conftest import DONE, ONE_PIPE, flown, paper, straight_flight
 
 UNITS = {"s", "m", "m/s", "N", "1"}
 WAYS = ("uplink", "downlink")

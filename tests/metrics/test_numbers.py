@@ -9,7 +9,7 @@ import pytest
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Flight
 from cloudrc.records import Arrival, Control, Counted, Fault, GuardChange, Lateness, MissionEvent
-from tests.metrics.flights import (
+from tests.metrics.conftest import (
     ONE_PIPE,
     PERIOD,
     SECOND,

@@ -14,7 +14,7 @@ from cloudrc import plugins
 from cloudrc.cli.list import describe_all
 from cloudrc.cli.main import main
 from cloudrc.metrics import SHIPPED, measure_all
-from tests.metrics.flights import straight_flight
+from tests.metrics.conftest import straight_flight
 
 OVERSHOOT = '''"""Largest distance by which the robot flies past the setpoint along x.
 

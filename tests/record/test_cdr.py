@@ -14,7 +14,7 @@ from cloudrc import records as rec
 from cloudrc.messages import Odometry
 from cloudrc.record.ros import decode, definition, encode, is_known, shifted, type_hash
 from cloudrc.record.topics import TOPICS, rows
-from tests.record.samples import any_record
+from tests.record.conftest import any_record
 
 TYPES = sorted({topic.ros_type for topic in TOPICS.values()})
 

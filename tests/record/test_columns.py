@@ -14,7 +14,7 @@ from cloudrc import records as rec
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
-from tests.record.samples import any_record, assert_equal, cloud_records, world_records, write
+from tests.record.conftest import any_record, assert_equal, cloud_records, world_records, write
 
 SHAPES = {"vector": (0, 3), "quaternion": (0, 4)}
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from cloudrc import records as rec
 from cloudrc.messages import GuardState
 from cloudrc.record.hash import RecordHash
-from tests.record.samples import CLASSES, any_record, cloud_records, world_records
+from tests.record.conftest import CLASSES, any_record, cloud_records, world_records
 
 LINK = rec.LinkChanged(1, True, "relay", "by hand", 0.1, 2.0, 0.04, 0.01, 0.1, 1e6, "{}")
 CHECK = rec.LinkChecked(1, True, "mean", 0.04, 0.05, 0.03, 0.06, "ok", 3000)

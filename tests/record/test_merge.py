@@ -15,7 +15,7 @@ from cloudrc.record.merge import ClockOffset, clock_offset, merge, write_mission
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
-from tests.record.samples import MS, SECOND, assert_equal, cloud_records, world_records, write
+from tests.record.conftest import MS, SECOND, assert_equal, cloud_records, world_records, write
 
 
 def files(

@@ -17,7 +17,7 @@ from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted
-from tests.record.samples import MS, Shelf, assert_equal, counted, open_mcap, world_records, write
+from tests.record.conftest import MS, Shelf, assert_equal, counted, open_mcap, world_records, write
 
 NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
 

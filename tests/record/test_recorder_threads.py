@@ -14,7 +14,7 @@ from cloudrc.drivers.recording import RecordingThread
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Record
-from tests.record.samples import Shelf, assert_equal, counted, open_mcap, world_records
+from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records
 
 
 def test_the_thread_writes_everything_before_it_ends(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.reader import CHUNK_MAX, RECORD_MAX
 from cloudrc.record.recover import recover
 from cloudrc.record.writer import McapWriter
-from tests.record.samples import assert_equal, cloud_records, world_records
+from tests.record.conftest import assert_equal, cloud_records, world_records
 
 RECORDS = world_records(160)
 NOISE = random.Random(1).randbytes(80_000)

@@ -29,7 +29,7 @@ from cloudrc.record.ros import definition
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import TelemetrySent
-from tests.record.samples import world_records
+from tests.record.conftest import world_records
 from tests.record.test_recover_told import record, text
 
 

@@ -14,7 +14,7 @@ from cloudrc.record.reader import HEAD, MAGIC
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
 from cloudrc.record.writer import MISSING, McapWriter
-from tests.record.samples import MS, open_mcap, world_records, write
+from tests.record.conftest import MS, open_mcap, world_records, write
 
 
 def drained(recorder: Recorder) -> Recorder:

@@ -11,7 +11,7 @@ import pytest
 
 from cloudrc.record.columns import Recording
 from cloudrc.record.recover import SECTOR, Sectors, recover
-from tests.record.samples import world_records, write
+from tests.record.conftest import world_records, write
 
 
 class Failing(io.FileIO):

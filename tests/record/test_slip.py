@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import WorldTime, merge
 from cloudrc.records import Record, TelemetrySent
-from tests.record.samples import MS, SECOND, cloud_records, world_records, write
+from tests.record.conftest import MS, SECOND, cloud_records, world_records, write
 
 
 def slipping(records: list[Record], slips_ns: list[int]) -> list[Record]:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from cloudrc import records as rec
 from cloudrc.messages import GuardState
 from cloudrc.record.topics import TOPICS, Field, Topic, rows
-from tests.record.samples import CLASSES, any_record
+from tests.record.conftest import CLASSES, any_record
 
 COLUMNS = [(topic, field) for topic in TOPICS.values() for field in topic.fields]
 

@@ -19,7 +19,7 @@ from cloudrc.record.reader import read_contents
 from cloudrc.record.ros import definition
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
-from tests.record.samples import assert_equal, world_records
+from tests.record.conftest import assert_equal, world_records
 
 RECORDS = world_records(160)
 

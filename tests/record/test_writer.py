@@ -20,7 +20,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS, rows
 from cloudrc.record.writer import CHUNK_NS, McapWriter
 from cloudrc.records import GuardChange
-from tests.record.samples import MS, SECOND, assert_equal, cloud_records, world_records, write
+from tests.record.conftest import MS, SECOND, assert_equal, cloud_records, world_records, write
 
 RECORDS = [*world_records(150), *cloud_records(150, 1500 * MS)]
 

@@ -16,7 +16,7 @@ from cloudrc.records import LinkChanged
 from cloudrc.report.figures import delay
 from cloudrc.report.figures.marks import bounds, legend, mark_events, set_in_flight, spans
 from cloudrc.report.figures.style import RC, Subject, new_figure
-from tests.metrics.flights import ONE_PIPE, Log, at, flown
+from tests.metrics.conftest import ONE_PIPE, Log, at, flown
 
 CALM = Direction(delay_ms=50.0)
 TIMED = Direction(

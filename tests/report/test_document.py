@@ -11,7 +11,7 @@ import pytest
 
 from cloudrc.report.document import Run, clock_offset_document, environment_document, write_json
 from cloudrc.report.write import assess
-from tests.metrics.flights import paper
+from tests.metrics.conftest import paper
 
 RUN = Run("virtual", "virtual", "0" * 64)
 

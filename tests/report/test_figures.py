@@ -16,7 +16,7 @@ from cloudrc.report.figures import NAMES, draw_all, flight
 from cloudrc.report.figures.marks import LEGEND, legend, mark_events
 from cloudrc.report.figures.snapshots import WALL_COLOUR, is_swallowed, pipe_faces
 from cloudrc.report.figures.style import RC, Subject, new_figure
-from tests.metrics.flights import ONE_PIPE, START, Log, at, flown
+from tests.metrics.conftest import ONE_PIPE, START, Log, at, flown
 
 CALM = Direction(delay_ms=50.0)
 

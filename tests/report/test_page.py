@@ -17,7 +17,7 @@ from cloudrc.report.document import Failure, Run, Verdict, environment_document
 from cloudrc.report.figures import NAMES, Picture
 from cloudrc.report.page import render
 from cloudrc.report.write import assess, write_report
-from tests.metrics.flights import ONE_PIPE, flown, paper, touch
+from tests.metrics.conftest import ONE_PIPE, flown, paper, touch
 
 
 class Reader(HTMLParser):

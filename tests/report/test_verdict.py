@@ -19,7 +19,7 @@ from cloudrc.records import (
     SessionOpened,
 )
 from cloudrc.report.document import SLIP_MAX, Verdict, judge
-from tests.metrics.flights import ONE_PIPE, SECOND, Log, at, flown, touch
+from tests.metrics.conftest import ONE_PIPE, SECOND, Log, at, flown, touch
 
 
 def good() -> Log:

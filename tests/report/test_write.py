@@ -18,7 +18,7 @@ from cloudrc.record.merge import write_mission
 from cloudrc.records import Record
 from cloudrc.report.document import Run
 from cloudrc.report.write import read_run, write_report
-from tests.metrics.flights import at, flown, paper, touch
+from tests.metrics.conftest import at, flown, paper, touch
 
 RUN = Run("virtual", "virtual", "f" * 64)
 

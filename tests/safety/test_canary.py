@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 from mcap.exceptions import McapError
 from mcap.stream_reader import StreamReader
-from release import KEY, TOKEN, Release
 
 from cloudrc.drivers.local import _free_addresses
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Fault
 from cloudrc.teleop.auth import Tokens
 from cloudrc.tunnel.keys import Key
+from tests.drivers.conftest import KEY, TOKEN, Release
 
 OURS = ("operator", "key")
 """The files that may hold them."""

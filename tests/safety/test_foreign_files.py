@@ -25,7 +25,7 @@ from cloudrc.record.merge import write_mission
 from cloudrc.record.reader import read_contents
 from cloudrc.records import GroundTruth
 from cloudrc.report.write import read_run, write_report
-from tests.metrics.flights import flown
+from tests.metrics.conftest import flown
 
 
 @pytest.fixture(autouse=True)

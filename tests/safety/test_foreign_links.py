@@ -20,7 +20,7 @@ from cloudrc.record.merge import write_mission
 from cloudrc.record.recover import recover
 from cloudrc.report.document import write_json
 from cloudrc.report.write import read_run, write_report
-from tests.record.samples import world_records, write
+from tests.record.conftest import world_records, write
 
 HEX = b"\xab" * 8
 

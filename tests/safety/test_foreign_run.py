@@ -18,7 +18,7 @@ from cloudrc.config.load import dump, load_experiment, read_experiment
 from cloudrc.config.schema import PlugIn
 from cloudrc.drivers.machine import interpreter
 from cloudrc.record.merge import write_mission
-from tests.metrics.flights import flown
+from tests.metrics.conftest import flown
 
 pytestmark = pytest.mark.promise("foreign-files-run-nothing")
 PACKAGE = Path(runtime.__file__).parents[1]

@@ -7,10 +7,10 @@ from math import hypot, isfinite, nan
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from talking import MS, Talk, talking
 
 from cloudrc.messages import GuardState, Request, Start
 from cloudrc.records import CommandApplied, GroundTruth, GuardChange
+from tests.flights.conftest import MS, Talk, talking
 
 PERIOD = 10 * MS
 AGE_MAX = 250 * MS

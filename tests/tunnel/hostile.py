@@ -19,12 +19,11 @@ from pathlib import Path
 
 sys.path += [str(Path(__file__).parents[1] / "missions"), str(Path(__file__).parents[2])]
 
-from bare_world import MS, Bare, BareCloud, bare_cloud, ring
-
 from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
 from cloudrc.tunnel.session import pair
+from tests.flights.conftest import MS, Bare, BareCloud, bare_cloud, ring
 
 LONGEST = 2048
 STEPS_NS = tuple(round(ms * MS) for ms in (1, 30, 400, 1_500, 6_000, 150_000))
@@ -179,7 +178,7 @@ def main() -> None:
         for name in [name for name in sys.modules if name.startswith("cloudrc.")]:
             del sys.modules[name]
         del sys.modules["bare_world"]
-        import hostile
+        from tests.tunnel import hostile
 
     target = hostile.Target()
     begin: list[float] = []

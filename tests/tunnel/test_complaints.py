@@ -1,13 +1,13 @@
 """What keeps two ends from talking is said once, in words, and only while they do not talk."""
 
 import pytest
-from bare_world import Bare, BareCloud, ring
 
 from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
 from cloudrc.tunnel.handshake import KEY, Complaints
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from tests.flights.conftest import Bare, BareCloud, ring
 
 OTHER = KeyRing(KeySet(Key(b"x" * 32)))
 

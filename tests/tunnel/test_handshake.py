@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 import pytest
-from doorstep import CLOCK, KEY, MS, NONCE, SECOND_NS, WORLD, Doorstep
 
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Accept, Busy, DecodeError, Direction, Kind
@@ -19,6 +18,7 @@ from cloudrc.tunnel.handshake import (
 )
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, Agreement, Session
+from tests.tunnel.conftest import CLOCK, KEY, MS, NONCE, SECOND_NS, WORLD, Doorstep
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """How many hellos world answers, and that nobody can use up another one's answers."""
 
 import pytest
-from doorstep import MS, NONCE, SECOND_NS, Doorstep
 
 from cloudrc.tunnel.handshake import (
     ANSWERS_MAX,
@@ -11,6 +10,7 @@ from cloudrc.tunnel.handshake import (
     REPEATS_MAX,
     USED_MAX,
 )
+from tests.tunnel.conftest import MS, NONCE, SECOND_NS, Doorstep
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ from mmap import PAGESIZE, mmap
 from pathlib import Path
 
 import pytest
-from hostile import LONGEST, Target, memory
 
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
 from cloudrc.tunnel.session import Openers
+from tests.tunnel.hostile import LONGEST, Target, memory
 
 
 @pytest.fixture(scope="module")

@@ -273,7 +273,7 @@ SCRAPERS = (
     Scenario(
         31,
         "fast-scrapers",
-        f"{SCRAPE_RATE} scrapes of world per second, of which each by itself would have a page made",
+        f"{SCRAPE_RATE} scrapes of world per second, each of which alone would have a page made",
         "at most four pages are made a second, a scrape is answered in < 1 s; no HOLD",
         "none",
         "nothing: every scrape is answered, by what was known 0.25 s ago at most",

@@ -5,7 +5,7 @@ A limit that is switched off is the fault that nobody sees, so there is no value
 The guard's arithmetic: pure functions on floats, of which each answers to any numbers at all.
 
 Whatever comes in, NaN and infinities included, a finite answer inside its bound goes out. So every
-comparison is written so that NaN fails it. `tests/world/test_guard_proof.py` proves the scalar
+comparison is written so that NaN fails it. `tests/world/guard/test_proof.py` proves the scalar
 ones for all 64-bit floats.
 """
 

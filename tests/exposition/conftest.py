@@ -1,0 +1,120 @@
+"""Control periods to feed: everything that a test does not name is still.
+
+What Prometheus would have of a flight of the fault suite, and what the rules make of it.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from math import nan
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from cloudrc.exposition.live import Live
+from cloudrc.exposition.parts import Histogram, Readings
+from cloudrc.exposition.table import METRICS
+from cloudrc.faults import asks
+from cloudrc.faults.flight import Flight
+from cloudrc.messages import UPRIGHT, ZERO
+from cloudrc.records import Control, Counted
+
+MS = 1_000_000
+
+
+def period(stamp_ms: float, basis_ms: float, **fields: Any) -> Control:
+    """One period at `stamp_ms` of cloud's clock, from odometry of `basis_ms` of world's."""
+    still = Control(
+        round(stamp_ms * MS),
+        1,
+        0,
+        round(basis_ms * MS),
+        0.0,
+        nan,
+        nan,
+        ZERO,
+        ZERO,
+        UPRIGHT,
+        ZERO,
+        ZERO,
+        0,
+        ZERO,
+        0.0,
+        ZERO,
+        ZERO,
+        ZERO,
+    )
+    return still._replace(**fields)
+
+
+RULES = Path(__file__).resolve().parents[2] / "charts" / "cloudrc" / "files" / "rules.yaml"
+PERIOD = 5
+"""Of the scrapes [s]."""
+AFTER = 11
+"""For so long a flight that is over is scraped still [s]."""
+ROLES = ("world", "cloud", "teleop")
+
+
+def series(flight: Flight) -> list[dict[str, str]]:
+    """Every series of a flight, one value for each scrape."""
+    times = range(0, int(flight.now) + AFTER, PERIOD)
+    values: dict[str, list[str]] = {}
+    for role in ROLES:
+        for n, readings in enumerate(scrapes(flight, role, times)):
+            for name, value in samples(role, readings):
+                values.setdefault(name, ["_"] * len(times))[n] = f"{value:.9g}"
+    return [{"series": name, "values": " ".join(each)} for name, each in values.items()]
+
+
+def scrapes(flight: Flight, role: str, times: range) -> Iterator[Readings]:
+    """What a process shows at each of these instants [s]."""
+    live, seen, sent = Live(role, missions=role != "cloud"), 0, 0
+    for time in times:
+        records = asks.seen_by(flight, role, time)
+        for record in records[seen:]:
+            if isinstance(record, Counted) and record.name == "sent":
+                if record.total < sent:  # another process, which counts from 0
+                    live = Live(role, missions=role != "cloud")
+                sent = record.total
+            live.see([record])
+        seen = len(records)
+        ready = live.end is None or live.end.has_peer
+        yield live.read() | {
+            "cloudrc_build_info": {("1", role, "c"): 1.0},
+            "cloudrc_ready": {(): float(ready)},
+        }
+
+
+def samples(role: str, readings: Readings) -> Iterator[tuple[str, float]]:
+    for name, reading in readings.items():
+        if isinstance(reading, Histogram):
+            yield f'{name}_sum{{instance="{role}"}}', reading.total
+            yield f'{name}_count{{instance="{role}"}}', reading.cumulative()[-1]
+            continue
+        for labels, value in reading.items():
+            named = zip(("instance", *METRICS[name].labels), (role, *labels), strict=True)
+            inside = ",".join(f'{label}="{text}"' for label, text in named)
+            yield f"{name}{{{inside}}}", value
+
+
+def fired(flight: Flight, folder: Path) -> set[str]:
+    """Which of the chart's alerts a flight has fired; promtool knows."""
+    expression = 'group by (alertname) (last_over_time(ALERTS{alertstate="firing"}[1d]))'
+    test: dict[str, Any] = {
+        "interval": f"{PERIOD}s",
+        "input_series": series(flight),
+        "promql_expr_test": [{"expr": expression, "eval_time": f"{int(flight.now) + AFTER}s"}],
+    }
+    document = {"rule_files": ["rules.yaml"], "evaluation_interval": "5s", "tests": [test]}
+    shutil.copy(RULES, folder / "rules.yaml")
+    (folder / "tests.yaml").write_text(yaml.safe_dump(document))
+    # No sample is expected, so that every one that there is is named as one too many.
+    command = ["promtool", "test", "rules", "tests.yaml"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    found = set(re.findall(r'{alertname="(\w+)"}', done.stderr))
+    assert (done.returncode, bool(found)) in ((0, False), (1, True)), done.stderr
+    return found

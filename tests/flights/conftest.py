@@ -1,0 +1,532 @@
+"""Both ends around nothing, no robot and no loop: for a million short lives of the session.
+
+Fly an experiment in virtual time, without files, and judge it.
+
+Flights whose link falls silent: what the robot does by itself, tick by tick.
+
+When the cloud falls silent, or is killed: 200 instants in the pipes, 200 anywhere.
+
+A world, and a cloud of which a test writes every datagram itself.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from math import dist, hypot
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cloudrc import assembly
+from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
+from cloudrc.config.load import ResolvedExperiment, load_experiment
+from cloudrc.drivers.virtual import VirtualRun
+from cloudrc.geometry.clearance import pipe_index
+from cloudrc.geometry.scene import load_scene
+from cloudrc.messages import (
+    NEVER_NS,
+    UPRIGHT,
+    ZERO,
+    Cause,
+    Command,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Start,
+    Telemetry,
+    Vector,
+)
+from cloudrc.metrics import Flight
+from cloudrc.record.columns import Recording
+from cloudrc.record.hash import RecordHash
+from cloudrc.records import Arrival, CommandApplied, Contact, Counted, Fault, GuardChange, Record
+from cloudrc.report.document import Run
+from cloudrc.report.write import Assessment, assess
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.codec import DecodeError, Direction, Kind
+from cloudrc.tunnel.handshake import Knocker
+from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from cloudrc.tunnel.session import AES_256_GCM, Session, make_session
+from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
+from cloudrc.world.robot import STEP_NS
+
+MS = 1_000_000
+CLOCK = bytes(16)
+KEY = Key(b"k" * 32)
+
+
+def bare_robot() -> SimpleNamespace:
+    """A robot that flies whatever the session lets through."""
+    guard = SimpleNamespace(
+        state=GuardState.TRACK,
+        cause=Cause.COMMAND,
+        latched=False,
+        armed=True,
+        counts={},
+        changes=[],
+        reference=ZERO,
+        offer=lambda command, now_ns: None,
+    )
+    for name in ("forget_commands", "start_mission", "end_mission", "stop", "acknowledge"):
+        setattr(guard, name, lambda *given: None)
+    simulator = SimpleNamespace(
+        tip_force=lambda: 0.0, readings=(ZERO, UPRIGHT, ZERO, ZERO, ZERO * 3), touches=[]
+    )
+    return SimpleNamespace(
+        guard=guard,
+        simulator=simulator,
+        run=lambda tick_ns, stop_ns: stop_ns,
+        put_on_ground=lambda now_ns, cause: None,
+    )
+
+
+def bare_world(
+    nonce: bytes = b"w", last_epoch: int = 0, ring: KeyRing | None = None, start_ns: int = 0
+) -> WorldEndpoint:
+    """World's end, sealed if it gets keys."""
+    identity = WorldIdentity(CLOCK, nonce.ljust(16), last_epoch, ring)
+    return WorldEndpoint(
+        bare_robot(),
+        SimpleNamespace(measure=lambda truth: truth),
+        identity,
+        newest_wins=True,
+        command_age_max_ns=250 * MS,
+        start_ns=start_ns,
+    )
+
+
+class NoLoop:
+    """Stands for cloud's loop: it knows when the robot was seen, and computes nothing."""
+
+    def __init__(self) -> None:
+        self.faults: list[Fault] = []
+        self.counts: dict[str, int] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        self.ready, self.basis_stamp_ns = False, NEVER_NS
+
+    def observe(self, telemetry: Telemetry, now_ns: int) -> None:
+        self.ready, self.basis_stamp_ns = True, telemetry.stamp_ns
+
+
+def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
+    """Cloud's end; what is put into its `teleop.outputs` it sends."""
+    teleop = SimpleNamespace(
+        outputs=[], outcome=None, settled=True,
+        see=lambda seen, now_ns: None, handle_deadline=lambda now_ns: None,
+    )  # fmt: skip
+    teleop.take_outputs = lambda: [teleop.outputs.pop(0) for _ in teleop.outputs[:]]
+    identity = CloudIdentity(CLOCK, nonce.ljust(16), keys)
+    loop: Any = NoLoop()
+    return CloudEndpoint(loop, teleop, identity, newest_wins=True, start_ns=start_ns)
+
+
+def ring() -> KeyRing:
+    return KeyRing(KeySet(KEY))
+
+
+class BareCloud:
+    """A cloud process that greets and commands when it is told to."""
+
+    def __init__(self, nonce: bytes, keys: KeyRing | None) -> None:
+        self.session: Session = make_session(Direction.DOWNLINK, keys)
+        self.knocker = Knocker(nonce.ljust(16), CLOCK, AES_256_GCM)
+        self.heard: list[str] = []
+
+    def hello(self) -> bytes:
+        return self.session.greet(Kind.HELLO, self.knocker.hello())
+
+    def command(self, now_ns: int = 0) -> bytes:
+        body = codec.encode_command(Command(now_ns, now_ns, 0, ZERO, 0.0))
+        return self.session.seal(Kind.COMMAND, body)
+
+    def start(self, number: int, basis_ns: int = 0) -> bytes:
+        """Ask for a mission from the spawn: world opens an epoch."""
+        asked = OperatorRequest(number, Request.START, Start.SPAWN, basis_stamp_ns=basis_ns)
+        body = codec.encode_operator(asked)
+        return self.session.seal(Kind.OPERATOR, body)
+
+    def receive(self, data: bytes) -> bytes | None:
+        """Take an answer of world; what is to be sent because of it, if anything."""
+        try:
+            kind, _, epoch, _, body = self.session.open(data)
+        except DecodeError as error:
+            self.heard.append(str(error))
+            return None
+        self.heard.append(Kind(kind).name)
+        if kind == Kind.CHALLENGE:
+            hello = self.knocker.challenged(codec.decode_challenge(body))
+            return hello and self.session.greet(Kind.HELLO, hello)
+        if kind == Kind.BUSY:
+            self.knocker.refused(codec.decode_busy(body))
+        if kind == Kind.ACCEPT:
+            accept = codec.decode_accept(body)
+            agreement = self.knocker.accepted(epoch, accept, self.session.epoch, asks=True)
+            if agreement is not None:
+                self.session.begin(epoch, agreement)
+        return None
+
+
+class Bare:
+    """One world and some clouds, joined by a link that loses and delays nothing."""
+
+    def __init__(self, keys: KeyRing) -> None:
+        self.keys, self.now_ns = keys, 0
+        self.world = bare_world(ring=keys)
+        self.clouds: dict[str, BareCloud] = {}
+        self.sent: list[bytes] = []  # everything that any cloud has ever sent
+        self.born = 0
+
+    def cloud(self, name: str) -> BareCloud:
+        if name not in self.clouds:
+            self.born += 1
+            self.clouds[name] = BareCloud(b"%d" % self.born, self.keys)
+        return self.clouds[name]
+
+    def send(self, data: bytes | None) -> None:
+        """Deliver to world, and every answer to every cloud, until all is quiet."""
+        waiting = [data] if data else []
+        while waiting:
+            one = waiting.pop()
+            self.sent.append(one)
+            self.world.receive_datagram(one, self.now_ns)
+            for answer in self.world.take_datagrams():
+                for cloud in self.clouds.values():
+                    reply = cloud.receive(answer)
+                    if reply:
+                        waiting.append(reply)
+
+    def wait(self, ms: float) -> None:
+        """Let time pass in world, in steps that are no stall."""
+        end_ns = self.now_ns + round(ms * MS)
+        while self.now_ns < end_ns:
+            self.now_ns = min(self.now_ns + 100 * MS, end_ns)
+            self.world.handle_deadline(self.now_ns)
+        self.world.take_datagrams()
+
+    def used(self) -> list[tuple[int, int]]:
+        """Epoch and counter of the commands that were let through, in that order."""
+        records = self.world.take_records()
+        return [(r.epoch, r.counter) for r in records if isinstance(r, Arrival) and r.used]
+
+    def outcome(self, data: bytes) -> dict[str, int]:
+        """What this datagram is counted under."""
+        before = dict(self.world._counts)
+        self.world.receive_datagram(data, self.now_ns)
+        after = self.world._counts
+        return {n: after[n] - before.get(n, 0) for n in after if after[n] != before.get(n, 0)}
+
+
+SHARED_CLOCK = b"one clock for all"[:16]
+LIMIT_NS = 150_000_000_000
+
+
+class Ends(NamedTuple):
+    """Both ends and what joins them."""
+
+    world: WorldEndpoint
+    cloud: CloudEndpoint
+    run: VirtualRun
+
+
+def join(experiment: ResolvedExperiment, *, offset_ns: int = 0) -> Ends:
+    """Put an experiment together; with an offset the two clocks are not shared."""
+    world_clock = b"another clock..." if offset_ns else SHARED_CLOCK
+    world = assembly.build_world(experiment, WorldIdentity(world_clock, b"world".ljust(16)))
+    cloud = assembly.build_cloud(
+        experiment, CloudIdentity(SHARED_CLOCK, b"cloud".ljust(16)), lambda: offset_ns
+    )
+    links = assembly.build_links(experiment)
+    return Ends(world, cloud, VirtualRun(world, cloud, *links, cloud_clock_offset_ns=offset_ns))
+
+
+def records(experiment: ResolvedExperiment, **options: int) -> tuple[list[Record], list[Record]]:
+    """Fly; the records of world and of cloud."""
+    _, cloud, run = join(experiment, **options)
+    of_world: list[Record] = []
+    of_cloud: list[Record] = []
+
+    def sink(new_of_world: list[Record], new_of_cloud: list[Record]) -> None:
+        of_world.extend(new_of_world)
+        of_cloud.extend(new_of_cloud)
+
+    run.fly(lambda: cloud.mission_over, LIMIT_NS, sink)
+    return of_world, of_cloud
+
+
+def fly(name: str, *settings: str) -> Assessment:
+    """Fly; numbers and verdict."""
+    experiment = load_experiment(name, settings)
+    return assess(
+        Recording.from_records(*records(experiment)), experiment, Run("virtual", "virtual")
+    )
+
+
+def numbers(assessment: Assessment) -> dict[str, float]:
+    """The numbers alone, in their units."""
+    return {name: number.value for name, number in assessment.numbers.items()}
+
+
+def digest(experiment: ResolvedExperiment) -> str:
+    """SHA-256 of all records of a flight."""
+    digest = RecordHash()
+    for each in records(experiment):
+        digest.update(each)
+    return digest.hexdigest()
+
+
+BOTH = ("uplink", "downlink")
+PATIENCE = (
+    "criteria.time_limit_s=200",
+    *(f"mission.waypoints.{k}.time_limit_s=200" for k in range(7)),
+)
+"""So that no limit of time ends a mission that waits for its link."""
+SLOW = ("cloud.controller.speed_max=1.5",)
+
+
+class Instant(NamedTuple):
+    """The robot after one tick."""
+
+    stamp_ns: int
+    state: GuardState
+    position: Vector
+    speed: float
+
+
+class Silence(NamedTuple):
+    """A flight with one silence in it; times [s] since the start of the silence or of the HOLD.
+
+    Attributes:
+        pipe: Index of the one that the base was in when the silence began; -1 for none.
+        outcome: Of the mission.
+        held_after: From the start of the silence to HOLD; None if there was none.
+        basis_age: How old what the newest applied command was computed from is at HOLD.
+        calm_after: From HOLD on until the speed stays below 0.05 m/s, up to the link's return.
+        drift: Farthest from where the robot first came to rest [m], up to the link's return.
+        resumed_after: From the link's return to TRACK.
+        speed: When HOLD began [m/s].
+        touched: What was touched, but for the board by the arm's tip.
+    """
+
+    pipe: int
+    outcome: str
+    held_after: float | None
+    basis_age: float
+    calm_after: float
+    drift: float
+    resumed_after: float | None
+    speed: float
+    touched: list[str]
+
+
+def fly_through(
+    start_s: float, duration_s: float, *settings: str, ways: tuple[str, ...] = BOTH
+) -> Silence:
+    """Fly `paper` with a silence of one or both directions."""
+    blackouts = [
+        f"link.{way}.blackouts=[{{start_s: {start_s}, duration_s: {duration_s}}}]" for way in ways
+    ]
+    experiment = load_experiment("paper", [*PATIENCE, *blackouts, *settings])
+    ends = join(experiment)
+    records: list[Record] = []
+    trace: list[Instant] = []
+    begin_ns, end_ns = round(start_s * 1e9), round((start_s + duration_s) * 1e9)
+    _watch(ends.world.robot, trace, begin_ns)
+
+    def over() -> bool:
+        return ends.cloud.mission_over and ends.run.now_ns > end_ns
+
+    ends.run.fly(over, LIMIT_NS, lambda w, c: records.extend(w))
+    outcome = ends.cloud.teleop.outcome
+    changes = [r for r in records if isinstance(r, GuardChange) and r.stamp_ns >= begin_ns]
+    held = next((c for c in changes if c.state is GuardState.HOLD), None)
+    contacts = [r for r in records if isinstance(r, Contact)]
+    touched = [r.body for r in contacts if r.body != "board" or not r.tip]
+    code = outcome.code if outcome else "none"
+    (pipe,) = pipe_index(load_scene(experiment.world.scene), trace[0].position).tolist()
+    if held is None or held.cause == "mission ended":
+        return Silence(pipe, code, None, 0.0, 0.0, 0.0, None, 0.0, touched)
+    held_ns = held.stamp_ns
+    bases_ns = [
+        r.basis_stamp_ns for r in records if isinstance(r, CommandApplied) and r.stamp_ns <= held_ns
+    ]
+    silent = [i for i in trace if held_ns <= i.stamp_ns <= max(end_ns, held_ns + STEP_NS)]
+    fast = [i.stamp_ns for i in silent if i.speed >= 0.05]
+    rest = next((i.position for i in silent if i.speed < 0.05), None)
+    still = silent[next((k for k, i in enumerate(silent) if i.position is rest), 0) :]
+    back = [c.stamp_ns for c in changes if c.state is GuardState.TRACK and c.stamp_ns > held_ns]
+    return Silence(
+        pipe,
+        code,
+        (held_ns - begin_ns) * 1e-9,
+        (held_ns - max(bases_ns)) * 1e-9,
+        (fast[-1] + STEP_NS - held_ns) * 1e-9 if fast else 0.0,
+        max(dist(i.position, rest) for i in still) if rest else 0.0,
+        (back[0] - end_ns) * 1e-9 if back else None,
+        silent[0].speed,
+        touched,
+    )
+
+
+def _watch(robot, trace: list[Instant], begin_ns: int) -> None:
+    """Note the robot after every tick from `begin_ns` on."""
+    guard, simulator, tick = robot.guard, robot.simulator, robot.guard.tick
+
+    def noting(now_ns, readings, dt):
+        reference = tick(now_ns, readings, dt)
+        if now_ns >= begin_ns:
+            speed = hypot(*readings.velocity)
+            trace.append(Instant(now_ns, guard.state, simulator.readings.position, speed))
+        return reference
+
+    guard.tick = noting
+
+
+COUNT = 200
+DAILY = range(COUNT)[13::40]
+"""Indices of those in the pipes that are not left to the night."""
+REST = [k for k in range(COUNT) if k not in DAILY]
+LAST_S = 27.0
+"""Uncapped the board is touched 1 s later; at 1.5 m/s 4.9 s later, 2.2 s after pipe 3's mouth."""
+ANYWHERE = [round(1.5 + k * (LAST_S - 1.5) / (COUNT - 1), 3) for k in range(COUNT)]
+"""Evenly from the first waypoint on [s], before, in and between the pipes: half are in one."""
+DAILY_ANYWHERE = ANYWHERE[13::160]
+"""Before pipe 1, and at 1.5 m/s between pipes 2 and 3."""
+REST_ANYWHERE = [start_s for start_s in ANYWHERE if start_s not in DAILY_ANYWHERE]
+ENDING_NS = 100_000_000
+"""Before a mission's end [ns]: what was sent before a silence this late still ends the mission, and
+there is nothing left to resume."""
+
+
+class MidPipe(NamedTuple):
+    """An instant [s] at which the undisturbed robot's base is in the pipe of this index."""
+
+    start_s: float
+    pipe: int
+
+
+@cache
+def undisturbed(*settings: str) -> Flight:
+    """The flight without any silence or kill."""
+    return fly("paper", *PATIENCE, *settings).flight
+
+
+@cache
+def mid_pipe(*settings: str) -> tuple[MidPipe, ...]:
+    """200 instants, evenly over the time in which the undisturbed robot's base is in a pipe.
+
+    In pipes 1, 2 and 3 are 47, 51 and 102 of them at 1.5 m/s, 41, 48 and 111 uncapped: the robot
+    touches the board from within pipe 3.
+    """
+    flight = undisturbed(*settings)
+    stamps_ns, inside = flight.truth["stamp_ns"], flight.inside
+    early = stamps_ns[1:] <= flight.end_ns - ENDING_NS
+    steps = np.flatnonzero(inside[:-1] & inside[1:] & early)
+    spent_ns = np.cumsum((stamps_ns[1:] - stamps_ns[:-1])[steps])
+    wanted_ns = (np.arange(COUNT) + 0.5) * spent_ns[-1] / COUNT
+    found = np.searchsorted(spent_ns, wanted_ns)
+    at_ns = stamps_ns[steps[found] + 1] - (spent_ns[found] - wanted_ns)
+    at_ms = (at_ns // 1_000_000).astype(np.int64)
+    pipes = pipe_index(flight.scene, flight.true_position(at_ms * 1_000_000))
+    assert len(set(at_ms.tolist())) == COUNT
+    assert (pipes >= 0).all()
+    return tuple(map(MidPipe, (at_ms / 1000).tolist(), pipes.tolist()))
+
+
+HOVER = load_experiment("hover", ["link.profile=ideal"])
+
+
+class Talk:
+    """A sealed world; the cloud is what the test says."""
+
+    def __init__(self, last_epoch: int = 0, nonce: bytes = b"world", key: Key = KEY) -> None:
+        ring = KeyRing(KeySet(KEY))
+        identity = WorldIdentity(SHARED_CLOCK, nonce.ljust(16), last_epoch, ring)
+        self.world = assembly.build_world(HOVER, identity)
+        self.key, self.now_ns, self.records = key, 0, []
+        self.clouds: dict[bytes, tuple[Session, Knocker]] = {}
+        self.session = self.cloud(b"cloud")[0]
+
+    def cloud(self, nonce: bytes) -> tuple[Session, Knocker]:
+        """The cloud process of this name; from here on the one that speaks."""
+        if nonce not in self.clouds:
+            session = Session(Direction.DOWNLINK, KeyRing(KeySet(self.key)))
+            self.clouds[nonce] = session, Knocker(nonce.ljust(16), SHARED_CLOCK, AES_256_GCM)
+        self.session = self.clouds[nonce][0]
+        return self.clouds[nonce]
+
+    def wait(self, until_ns: int) -> None:
+        while self.world.next_deadline_ns() <= until_ns:
+            self.world.handle_deadline(self.world.next_deadline_ns())
+        self.now_ns = until_ns
+
+    def send(self, data: bytes) -> None:
+        self.world.receive_datagram(data, self.now_ns)
+
+    def hear(self, *kinds: Kind) -> list[tuple[int, int, bytes]]:
+        """Kind, epoch and body of what world has answered; all else is dropped."""
+        heard = []
+        for data in self.world.take_datagrams():
+            try:
+                kind, _, epoch, _, body = self.session.open(data)
+            except DecodeError:
+                continue
+            if kind in kinds:
+                heard.append((kind, epoch, body))
+        return heard
+
+    def hello(self, nonce: bytes) -> int:
+        """Greet as this cloud, up to world's answer; the epoch that it got, 0 if none."""
+        session, knocker = self.cloud(nonce)
+        self.send(session.greet(Kind.HELLO, knocker.hello()))
+        answers = self.hear(Kind.CHALLENGE, Kind.ACCEPT)
+        for kind, _, body in answers:
+            if kind == Kind.CHALLENGE:
+                self.send(
+                    session.greet(Kind.HELLO, knocker.challenged(codec.decode_challenge(body)))
+                )
+                answers = self.hear(Kind.ACCEPT)
+        for _, epoch, body in answers:
+            accept = codec.decode_accept(body)
+            agreement = knocker.accepted(epoch, accept, session.epoch, asks=True)
+            if agreement is not None:
+                session.begin(epoch, agreement)
+            return epoch
+        return 0
+
+    def request(self, number: int, request: Request, start: Start, mission_id: int = 0) -> None:
+        self.send(self.asked(number, request, start, mission_id))
+
+    def asked(self, number: int, request: Request, start: Start, mission_id: int = 0) -> bytes:
+        """A request that is passed on now."""
+        told = OperatorRequest(number, request, start, mission_id, basis_stamp_ns=self.world_ns)
+        return self.session.seal(Kind.OPERATOR, codec.encode_operator(told))
+
+    @property
+    def world_ns(self) -> int:
+        """World's clock."""
+        return self.now_ns - self.world.slip_ns
+
+    def command(self, velocity=(0.0, 0.0, 1.0), basis_ns=None) -> bytes:
+        basis_ns = self.now_ns if basis_ns is None else basis_ns
+        command = Command(self.now_ns, basis_ns, 0, velocity, 0.0)
+        return self.session.seal(Kind.COMMAND, codec.encode_command(command))
+
+    def take(self, kind: type) -> list:
+        self.records += self.world.take_records()
+        return [record for record in self.records if isinstance(record, kind)]
+
+    def counts(self) -> dict[str, int]:
+        self.wait(self.now_ns + 1000 * MS)
+        return {record.name: record.total for record in self.take(Counted)}
+
+
+def talking() -> Talk:
+    """A cloud that has a session, and a mission that has been started where the robot stands."""
+    talk = Talk()
+    talk.hello(b"cloud")
+    talk.wait(20 * MS)
+    talk.request(1, Request.START, Start.HERE)
+    return talk

@@ -1,0 +1,174 @@
+"""What the operator says reaches the guard on board, and only what it acts on is confirmed."""
+
+import pytest
+
+from cloudrc.messages import GuardState, Request, Start
+from cloudrc.records import CommandApplied, GuardChange, SessionOpened, TelemetrySent
+from tests.flights.conftest import MS, talking
+
+
+@pytest.fixture
+def talk():
+    """Flying; the request to start was number 1."""
+    talk = talking()
+    fly(talk, 10)
+    return talk
+
+
+def fly(talk, count):
+    for _ in range(count):
+        talk.send(talk.command())
+        talk.wait(talk.now_ns + 10 * MS)
+
+
+def ask(talk, number, request, start=Start.HERE):
+    talk.request(number, request, start)
+    talk.wait(talk.now_ns + 20 * MS)
+    telemetry = talk.take(TelemetrySent)[-1].telemetry
+    return telemetry.guard, telemetry.mission
+
+
+def test_an_emergency_stop_acts_at_the_next_tick(talk):
+    assert ask(talk, 2, Request.ESTOP) == (GuardState.ESTOP, 2)
+    assert talk.take(GuardChange)[-1].cause == "emergency stop"
+
+
+@pytest.mark.promise("only-the-operator-arms")
+@pytest.mark.parametrize("start", Start)
+def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
+    ask(talk, 2, Request.ESTOP)
+    sessions = len(talk.take(SessionOpened))
+    assert ask(talk, 3, Request.START, start) == (GuardState.ESTOP, 2)
+    assert len(talk.take(SessionOpened)) == sessions
+    assert talk.counts()["start_refused"] == 1
+    assert ask(talk, 4, Request.ACKNOWLEDGE) == (GuardState.GROUND, 4)
+    assert ask(talk, 3, Request.START, start) == (GuardState.GROUND, 4)  # a late copy
+    fly(talk, 5)
+    assert talk.take(GuardChange)[-1].state is GuardState.GROUND
+    assert ask(talk, 5, Request.START)[1] == 5
+    fly(talk, 5)
+    assert talk.take(GuardChange)[-1].state is GuardState.TRACK
+
+
+@pytest.mark.parametrize("start", Start)
+@pytest.mark.parametrize(
+    ("held_back", "ahead", "outcome"),
+    [
+        (998 * MS, 0, ""),
+        (1_003 * MS, 0, "stale"),
+        (200_000 * MS, 0, "stale"),
+        (0, 3 * MS, "future"),
+    ],
+)
+def test_a_start_that_was_held_back_on_the_way_starts_nothing(
+    talk, start, held_back, ahead, outcome
+):
+    """Its mission may be over by then, and given up; nobody expects the robot to take off."""
+    talk.request(2, Request.END, Start.HERE)
+    talk.now_ns += ahead
+    captured = talk.asked(3, Request.START, start)
+    talk.wait(talk.now_ns - ahead + held_back)
+    talk.send(captured)
+    assert talk.world._counts[outcome] == (outcome != "")
+    assert talk.world.robot.guard.armed == (outcome == "")
+    if outcome:  # said anew, it is obeyed
+        talk.send(talk.asked(4, Request.START, start))
+        assert talk.world.robot.guard.armed
+
+
+@pytest.mark.parametrize("request_", [Request.END, Request.ESTOP])
+def test_what_stops_the_robot_does_so_however_late_it_comes(talk, request_):
+    captured = talk.asked(2, request_, Start.HERE)
+    talk.wait(talk.now_ns + 200_000 * MS)
+    talk.send(captured)
+    assert not talk.world.robot.guard.armed
+    assert talk.world._orders.number == 2
+
+
+def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
+    """World's clock stood still meanwhile: the age of what it was based on says nothing."""
+    captured = talk.asked(2, Request.START, Start.SPAWN)
+    talk.now_ns += 60_000 * MS
+    talk.send(captured)
+    assert talk.world._counts["stale"] == 1
+    assert talk.world._orders.number == 1
+
+
+def test_a_command_that_waits_as_the_robot_is_stopped_is_not_told_to_be_flown(talk):
+    applied = len(talk.take(CommandApplied))
+    talk.send(talk.command())
+    talk.request(2, Request.ESTOP, Start.HERE)
+    talk.wait(talk.now_ns + 20 * MS)
+    assert len(talk.take(CommandApplied)) == applied
+
+
+def test_its_keys_are_looked_after_by_the_machines_clock(talk):
+    """World's own lags behind it by what it could not make up for."""
+    talk.wait(talk.now_ns + 100 * MS)
+    before_ns = talk.now_ns
+    talk.world.handle_deadline(before_ns + 60_000 * MS)
+    assert talk.world.slip_ns > 50_000 * MS
+    assert talk.world._session._tended_ns == before_ns + 60_000 * MS
+
+
+def test_the_end_of_a_mission_is_confirmed_even_while_latched(talk):
+    ask(talk, 2, Request.ESTOP)
+    assert ask(talk, 3, Request.END) == (GuardState.ESTOP, 3)
+
+
+def test_in_hold_commands_are_heard_but_neither_flown_nor_echoed(talk):
+    talk.wait(talk.now_ns + 2_000 * MS)
+    applied = len(talk.take(CommandApplied))
+    echo_ns = talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns
+    fly(talk, 9)
+    assert talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns == echo_ns
+    fly(talk, 1)
+    assert len(talk.take(CommandApplied)) == applied + 1
+    assert talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns > echo_ns
+
+
+def test_what_was_limited_is_counted(talk):
+    for _ in range(10):
+        talk.send(talk.command((0.0, 0.0, 9.0)))
+        talk.wait(talk.now_ns + 10 * MS)
+    assert talk.counts()["limited_speed"] == 10
+
+
+def test_only_a_hold_within_a_mission_is_counted_as_held(talk):
+    talk.wait(talk.now_ns + 4_000 * MS)
+    held = talk.counts()["held_seconds"]
+    assert 4 <= held <= 5
+    ask(talk, 2, Request.END)
+    talk.wait(talk.now_ns + 4_000 * MS)
+    assert talk.counts()["held_seconds"] == held
+
+
+def test_what_the_robot_has_touched_is_told_until_another_mission_starts(talk):
+    """Cloud may die right after the touch: its successor has to learn of it."""
+    ask(talk, 2, Request.END)
+    talk.world._orders.touches.pipes = 1
+    talk.wait(talk.now_ns + 300 * MS)
+    talk.hello(b"another")
+    talk.request(3, Request.START, Start.HERE)
+    talk.wait(talk.now_ns + 20 * MS)
+    assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == 1
+    talk.request(4, Request.START, Start.HERE, mission_id=7)
+    talk.wait(talk.now_ns + 20 * MS)
+    assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == 0
+
+
+def test_what_the_cloud_before_has_said_does_not_count_for_the_next_one(talk):
+    """Nine fresh commands of one and a single one of another are no proof of a link."""
+    fly(talk, 100)
+    ask(talk, 2, Request.END)
+    talk.request(3, Request.START, Start.HERE)
+    talk.wait(talk.now_ns + 1_000 * MS)
+    fly(talk, 9)
+    assert talk.take(GuardChange)[-1].state is GuardState.HOLD
+    talk.wait(talk.now_ns + 260 * MS)
+    assert talk.hello(b"another") > 0
+    fly(talk, 2)
+    assert talk.take(GuardChange)[-1].state is GuardState.HOLD
+    fly(talk, 8)
+    talk.wait(talk.now_ns + 10 * MS)
+    assert talk.take(GuardChange)[-1].state is GuardState.TRACK

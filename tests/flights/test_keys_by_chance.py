@@ -1,0 +1,160 @@
+"""Key files, ends and the link go wrong by chance: once it is calm both ends hear each other again.
+
+Both ends and their driver are the real ones, the robot does nothing: a minute takes 50 ms.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from itertools import count
+from typing import Any
+
+import pytest
+
+from cloudrc.cloud.endpoint import CloudEndpoint
+from cloudrc.drivers.virtual import VirtualRun
+from cloudrc.faults.models import Clock, Mortal
+from cloudrc.faults.schedule import Event, Schedule, shaped
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.messages import OperatorRequest, Request, Start
+from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from tests.flights.conftest import MS, bare_cloud, bare_world
+
+ENDS = ("world", "cloud")
+KEYS = [Key(letter * 32) for letter in (b"a", b"b", b"c", b"d")]
+CALM, END = 30.0, 45.0
+"""From when on nothing befalls them but the last key file, and when they are judged [s]."""
+
+
+class Two:
+    """World and cloud; whatever can happen to their session is scheduled by chance."""
+
+    def __init__(self, seed: int) -> None:
+        self.chance = chance = random.Random(seed)
+        self.said: list[tuple[Any, ...]] = []
+        self.files = dict.fromkeys(ENDS, KeySet(KEYS[0]))
+        self.rings: dict[str, KeyRing] = {}
+        self.numbers, self.lives, self.epoch = count(1), count(1), 0
+        delay, jitter = chance.choice((0.001, 0.02, 0.15)), chance.choice((0.0, 0.01, 0.1))
+        profile = DirectionProfile(delay=delay, jitter=min(jitter, delay))
+        schedule = Schedule(seed, events=self.link_events())
+        up, down = (shaped(schedule, profile, way) for way in ("up", "down"))
+        self.world = Mortal(self.build_world, Clock())
+        self.cloud = Mortal(self.build_cloud, Clock(), "cloud")
+        links = LinkDirection(up, seed, uplink=True), LinkDirection(down, seed, uplink=False)
+        self.run = VirtualRun(self.world, self.cloud, *links)
+        whatever = (self.rotate, self.rotate, self.kill, self.pause, self.start, self.start)
+        for befalls in chance.choices(whatever, k=chance.randint(2, 12)):
+            befalls()
+        self.end_with_key_files()
+
+    def build_world(self, start_ns: int) -> Any:
+        ring = self.rings["world"] = KeyRing(self.files["world"], start_ns)
+        return bare_world(b"world %d" % next(self.lives), self.epoch, ring, start_ns)
+
+    def build_cloud(self, start_ns: int) -> CloudEndpoint:
+        ring = self.rings["cloud"] = KeyRing(self.files["cloud"], start_ns)
+        return bare_cloud(b"cloud %d" % next(self.lives), ring, start_ns)
+
+    def link_events(self) -> tuple[Event, ...]:
+        chance, events = self.chance, []
+        for kind in chance.choices(("blackout", "blackout", "loss"), k=chance.randint(0, 4)):
+            at, lasts = self.when()
+            way = chance.choice(("up", "down", "both"))
+            events.append(Event(kind, at, lasts, chance.random(), way))
+        return tuple(events)
+
+    def when(self) -> tuple[float, float]:
+        """When something begins, and how long it lasts [s]."""
+        return self.chance.uniform(0.2, CALM - 6.0), self.chance.uniform(0.02, 5.0)
+
+    def at(self, end: str, time: float, what: Callable[[int], None], *words: Any) -> None:
+        getattr(self, end).at(time, what)
+        self.said.append((round(time, 3), end, *words))
+
+    def rotate(self) -> None:
+        """One end reads another key file, or both do, one after the other."""
+        chance, (time, later) = self.chance, self.when()
+        current, previous = chance.choice(KEYS[:3]), chance.choice((None, None, *KEYS[:2]))
+        overlap = chance.choice((0.5, 1.5, 4.0, 300.0))
+        keys = KeySet(current, previous if previous != current else None, overlap)
+        first, second = chance.sample(ENDS, 2)
+        self.read(first, time, keys)
+        if chance.random() < 0.5:
+            self.read(second, time + later, keys)
+
+    def read(self, end: str, time: float, keys: KeySet) -> None:
+        def read(now_ns: int) -> None:
+            self.files[end] = keys
+            self.rings[end].replace(keys, now_ns)
+
+        self.at(end, time, read, "reads", keys)
+
+    def kill(self) -> None:
+        end, (time, lasts) = self.chance.choice(ENDS), self.when()
+        mortal: Any = getattr(self, end)
+        keeps = self.chance.random() < 0.8
+
+        def kill(now_ns: int) -> None:
+            if end == "world" and mortal.inner is not None:
+                self.epoch = mortal.inner._session.epoch if keeps else 0  # as its disk does, or not
+            mortal.kill(now_ns)
+
+        self.at(end, time, kill, "is killed")
+        self.at(end, time + lasts, mortal.start, "starts")
+
+    def pause(self) -> None:
+        end, (time, lasts) = self.chance.choice(ENDS), self.when()
+        mortal: Mortal = getattr(self, end)
+        self.at(end, time, lambda now_ns: mortal.freeze(now_ns, lasts), "stands still", lasts)
+
+    def start(self) -> None:
+        """A mission starts from the spawn: world moves on to the next epoch."""
+
+        def ask(now_ns: int) -> None:
+            if isinstance(cloud := self.cloud.inner, CloudEndpoint):
+                request = OperatorRequest(next(self.numbers), Request.START, Start.SPAWN)
+                cloud.teleop.outputs.append(request)
+
+        self.at("cloud", self.when()[0], ask, "asks for a start")
+
+    def end_with_key_files(self) -> None:
+        """The same for both, or different ones with a key in common, as after a roll-back."""
+        chance, common = self.chance, self.chance.choice(KEYS)
+        one = KeySet(common, None, chance.choice((0.5, 4.0, 300.0)))
+        alike = chance.random() < 0.5
+        for end in chance.sample(ENDS, 2):
+            keys = one if alike else self.with_key(common)
+            self.read(end, CALM + chance.uniform(0.0, 3.0), keys)
+
+    def with_key(self, common: Key) -> KeySet:
+        other = self.chance.choice([key for key in KEYS if key != common])
+        files = KeySet(common), KeySet(common, other, 4.0), KeySet(common, other, 300.0)
+        return self.chance.choice((*files, KeySet(other, common, 300.0)))
+
+    def have_a_key_in_common(self) -> bool:
+        """A key before that was known as such only becomes shorter valid: it may be over."""
+        accepted = [set(self.rings[end].accepted(self.run.now_ns)) for end in ENDS]
+        return bool(accepted[0] & accepted[1])
+
+    def hear_each_other(self) -> bool:
+        self.run.fly(lambda: False, round(END * 1e9), lambda of_world, of_cloud: None)
+        world: Any = self.world.inner
+        cloud: Any = self.cloud.inner
+        if world._session.epoch != cloud._session.epoch:
+            return False
+        heard_ns = self.run.now_ns - cloud._heard_ns
+        return world._door._fresh_until_ns >= self.run.now_ns and heard_ns < 500 * MS
+
+
+@pytest.mark.parametrize("first", [0, pytest.param(1_000, marks=pytest.mark.full)])
+def test_once_it_is_calm_both_ends_hear_each_other(first: int) -> None:
+    seeds, judged = range(first, 4 * first or 40), 0
+    for seed in seeds:
+        two = Two(seed)
+        hear, said = two.hear_each_other(), sorted(two.said, key=lambda each: each[:2])
+        judged += two.have_a_key_in_common()
+        assert hear or not two.have_a_key_in_common(), f"seed {seed}: {said}"
+    assert judged > 0.9 * len(seeds)

@@ -1,0 +1,66 @@
+"""A disk that hangs has no epochs: what needs a new one is refused, and all else goes on."""
+
+import pytest
+
+from cloudrc.messages import GuardState, Request, Start
+from cloudrc.records import Fault, TelemetrySent
+from cloudrc.tunnel.handshake import NO_EPOCH
+from tests.flights.conftest import MS, talking
+
+
+@pytest.fixture
+def disk() -> list[int]:
+    """The epochs that it has."""
+    return []
+
+
+@pytest.fixture
+def talk(disk):
+    talk = talking()
+    talk.world._door._next_epoch = lambda: disk.pop() if disk else None
+    fly(talk)
+    return talk
+
+
+def fly(talk):
+    for _ in range(10):
+        talk.send(talk.command())
+        talk.wait(talk.now_ns + 10 * MS)
+    return talk.take(TelemetrySent)[-1].telemetry
+
+
+def told(talk):
+    return [fault.text for fault in talk.take(Fault)]
+
+
+def test_another_cloud_gets_a_session_as_soon_as_there_is_an_epoch(talk, disk):
+    for _ in range(3):
+        talk.wait(talk.now_ns + 1_100 * MS)  # the one before has fallen silent
+        assert talk.hello(b"two") == 0
+    assert told(talk) == [NO_EPOCH]
+    assert talk.world._session.epoch == 1
+    disk.append(2)
+    talk.wait(talk.now_ns + 1_100 * MS)
+    assert talk.hello(b"two") == 2
+
+
+def test_the_one_that_flies_goes_on_and_a_start_from_the_spawn_waits_for_an_epoch(talk, disk):
+    for number in (2, 3):
+        talk.request(number, Request.START, Start.SPAWN, mission_id=7)
+        telemetry = fly(talk)
+        assert (telemetry.mission, telemetry.mission_id) == (1, 0)
+        assert telemetry.guard is GuardState.TRACK
+    assert told(talk) == [NO_EPOCH]
+    assert talk.counts()["start_refused"] == 2
+    disk.append(2)
+    talk.request(3, Request.START, Start.SPAWN, mission_id=7)
+    assert talk.world._session.epoch == 2
+    assert talk.world._orders.mission_id == 7
+
+
+def test_what_needs_no_epoch_is_obeyed(talk):
+    talk.request(2, Request.END, Start.SPAWN)
+    talk.request(3, Request.START, Start.HERE)
+    talk.request(4, Request.ESTOP, Start.SPAWN)
+    assert fly(talk).guard is GuardState.ESTOP
+    assert told(talk) == []

@@ -1,0 +1,98 @@
+"""No wall clock reaches the control path: whatever it does, the flight is the same, bit by bit."""
+
+from __future__ import annotations
+
+import ast
+import time
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from cloudrc.config.load import load_experiment
+from tests.flights.conftest import digest
+
+PACKAGE = Path(__file__).parents[2] / "cloudrc"
+HOUR = 3600.0
+STEPS: dict[str, Callable[[int, float], float]] = {
+    "an hour ahead": lambda call, now: now + HOUR,
+    "an hour back": lambda call, now: now - HOUR,
+    "stepping at every look": lambda call, now: now + HOUR * (-1) ** call,
+    "drifting by 500 ppm": lambda call, now: now * 1.0005,
+    "in 1970": lambda call, now: 0.0,
+    "in 2106": lambda call, now: 4_294_967_296.0,
+    "running backwards": lambda call, now: 2e9 - now,
+}
+WALL = ("time", "time_ns", "localtime", "gmtime", "ctime", "strftime")
+
+
+def fly(monkeypatch: pytest.MonkeyPatch, clock: Callable[[int, float], float] | None) -> str:
+    if clock is not None:
+        calls, true = count(), time.time
+        monkeypatch.setattr(time, "time", lambda: clock(next(calls), true()))
+        monkeypatch.setattr(time, "time_ns", lambda: int(clock(next(calls), true()) * 1e9))
+    experiment = load_experiment("hover", ["mission.waypoints.0.dwell_s=0.5", "link.profile=wifi"])
+    return digest(experiment)
+
+
+@pytest.fixture(scope="module")
+def undisturbed() -> str:
+    with pytest.MonkeyPatch.context() as patch:
+        return fly(patch, None)
+
+
+@pytest.mark.promise("wall-clock-does-not-matter")
+@pytest.mark.parametrize("step", STEPS)
+def test_the_flight_is_the_same_whatever_the_wall_clock_does(
+    step: str, undisturbed: str, monkeypatch: pytest.MonkeyPatch, figure: Callable[..., None]
+) -> None:
+    differs = int(fly(monkeypatch, STEPS[step]) != undisturbed)
+    figure("steps and drifts of the wall clock: flights that differ", differs, "==", 0)
+    assert not differs
+
+
+def wall_clocks(tree: ast.AST) -> list[str]:
+    """Calls that read a wall clock."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            text = ast.unparse(node)
+            if text in {f"time.{name}" for name in WALL} | {"time.CLOCK_REALTIME"}:
+                found.append(text)
+            if node.attr in ("now", "utcnow", "today") and "date" in text:
+                found.append(text)
+        elif isinstance(node, ast.ImportFrom) and node.module == "time":
+            found += [alias.name for alias in node.names if alias.name in WALL]
+    return found
+
+
+CONTROL_PATH = ("world/", "cloud/", "tunnel/", "link/", "endpoint", "drivers/realtime",
+                "drivers/process", "drivers/keyfile", "drivers/epochs", "drivers/route",
+                "drivers/virtual", "drivers/teleop", "drivers/unix")  # fmt: skip
+ALLOWED = {
+    # The kernel stamps datagrams by the wall clock: turned into an age at once, within 0 to 50 ms.
+    "link/relay_stamps.py": ["time.time_ns"],
+    # A line of the audit log says when: people read it, and nothing that flies.
+    "cloud/teleop/api_audit.py": ["time.time"],
+}
+
+
+@pytest.mark.promise("wall-clock-does-not-matter")
+def test_nothing_on_the_control_path_reads_a_wall_clock() -> None:
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        place = path.relative_to(PACKAGE).as_posix()
+        if place.startswith(CONTROL_PATH):
+            found[place] = wall_clocks(ast.parse(path.read_text()))
+    assert len(found) > 90
+    without = [start for start in CONTROL_PATH if not any(at.startswith(start) for at in found)]
+    assert not without, "nothing has this name any more"
+    assert {place: clocks for place, clocks in found.items() if clocks} == ALLOWED
+
+
+@pytest.mark.parametrize(
+    "code", ["time.time()", "from time import time_ns", "datetime.now()", "datetime.date.today()"]
+)
+def test_a_wall_clock_is_found(code: str) -> None:
+    assert wall_clocks(ast.parse(code))

@@ -1,0 +1,497 @@
+"""The real API on a free port, over a service whose robot is flown by a thread of the test.
+
+A robot and a lossy link for teleop to talk to: no world, no tunnel, no clock.
+
+A robot, a lossy link and a journal in memory for the mission service to fly with.
+
+A disk in memory that can be full, refuse, break off at any step, and forget what was not synced.
+
+Names and bytes are kept twice: as the running machine sees them, and as they are on the platter.
+"""
+
+import errno
+import json
+import socket
+import threading
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from cloudrc import assembly
+from cloudrc.cli.client import Api
+from cloudrc.geometry.scene import load_scene
+from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.records import Fault, MissionEvent
+from cloudrc.teleop.api import Surroundings, create_app
+from cloudrc.teleop.auth import Audit, Tokens
+from cloudrc.teleop.bridge import STARTING, Bridge
+from cloudrc.teleop.journal import MAGIC, to_record
+from cloudrc.teleop.mission import Teleop
+from cloudrc.teleop.server import ApiServer, Gate, Limits
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import Order
+from cloudrc.teleop.wire import Leg, Plan, Seen, StartMission
+
+PERIOD_NS = 10_000_000
+A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
+AWAY = (0.0, -5.0, 1.0)
+ID = 7
+THREE = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)), Start.HERE)
+FROM_SPAWN = Plan(THREE.legs)
+PLAN = Plan((Leg(A, yaw=0.3), Leg(B, tolerance=0.2, dwell=0.0), Leg(C)))
+
+
+class Flight:
+    """Teleop, the robot that it steers, and everything that it has said."""
+
+    def __init__(self):
+        self.teleop = Teleop()
+        self.now_ns = 0
+        self.position = (0.0, 0.0, 0.1)
+        self.epoch = 1
+        self.world = "world 1"
+        self.mission = 0
+        self.onboard = (0, 0)  # mission's number and waypoints reached, as world keeps them
+        self.guard, self.cause = GuardState.GROUND, Cause.SPAWN
+        self.uplink = self.downlink = True
+        self.first_shown_ns = {}  # number of a request -> when telemetry first showed it
+        self.said = []
+        self.said_at = []
+
+    def step(self, position=None, seconds=0.01):
+        """Let time pass in periods of 10 ms, telemetry and deadline in each."""
+        self.position = self.position if position is None else position
+        for _ in range(round(seconds * 100)):
+            self.now_ns += PERIOD_NS
+            if self.uplink:
+                self.see()
+            self.teleop.handle_deadline(self.now_ns)
+            self._collect()
+
+    def see(self):
+        seen = Seen(
+            self.epoch, self.position, self.guard, self.mission, self.world, **self.progress()
+        )
+        self.first_shown_ns.setdefault(self.mission, self.now_ns)
+        self.teleop.see(seen, self.now_ns)
+
+    def progress(self):
+        told = (*self.onboard, self.cause)
+        return dict(zip(("mission_id", "reached", "cause"), told, strict=True))
+
+    def operate(self, verb):
+        try:
+            self.teleop.operate(verb, self.now_ns)
+        finally:
+            self._collect()
+
+    def restart(self):
+        """World loses everything it knew."""
+        self.world = f"world {self.epoch + 1}"
+        self.epoch += 1
+        self.mission = 0
+        self.onboard = (0, 0)
+        self.guard = GuardState.GROUND
+        self.position = (0.0, 0.0, 0.1)
+
+    def restart_cloud(self):
+        """A new cloud opens a new epoch in the same world, and counts requests from 1 again."""
+        self.epoch += 1
+        self.mission = 0
+        self.guard = GuardState.HOLD
+
+    @property
+    def state(self):
+        return self.teleop.state.name
+
+    @property
+    def requests(self):
+        return [said for said in self.said if isinstance(said, OperatorRequest)]
+
+    @property
+    def events(self):
+        return [said for said in self.said if isinstance(said, MissionEvent)]
+
+    @property
+    def setpoints(self):
+        return [said for said in self.said if isinstance(said, Setpoint)]
+
+    def _collect(self):
+        for output in self.teleop.take_outputs():
+            for_session = isinstance(output, Setpoint | OperatorRequest)
+            said = output._replace(epoch=0) if for_session else output
+            self.said.append(said)
+            self.said_at.append(self.now_ns)
+            if isinstance(said, OperatorRequest) and self.downlink:
+                self._obey(said)
+
+    def _obey(self, request):
+        """Act on it as world does: rising numbers only; a start from the spawn restarts."""
+        if request.request is Request.PROGRESS:
+            self._keep(request)
+        if request.number <= self.mission:
+            return
+        self.mission = request.number
+        if request.request is not Request.START:
+            stopped = self.guard in (GuardState.LAND, GuardState.ESTOP)
+            if request.request is Request.ESTOP:
+                self.guard, self.cause = GuardState.ESTOP, Cause.STOPPED
+            elif request.request is Request.ACKNOWLEDGE:
+                self.guard = GuardState.GROUND if stopped else self.guard
+            elif not stopped:
+                self.guard = GuardState.HOLD
+            return
+        if request.mission_id != self.onboard[0] or request.start is Start.SPAWN:
+            self.onboard = (request.mission_id, 0)
+        self._keep(request)
+        if request.start is Start.SPAWN:
+            self.epoch += 1
+            self.position = (0.0, 0.0, 0.1)
+        if self.guard not in (GuardState.LAND, GuardState.ESTOP):
+            self.guard, self.cause = GuardState.TRACK, Cause.COMMAND
+
+    def _keep(self, request):
+        number, reached = self.onboard
+        if request.mission_id == number:
+            self.onboard = (number, max(reached, request.reached))
+
+
+def flying(plan=PLAN):
+    """A flight whose mission has just started."""
+    flight = Flight()
+    flight.step()
+    flight.operate(StartMission(plan))
+    flight.step(seconds=0.03)
+    assert flight.state == "FLYING"
+    return flight
+
+
+SERVICE_PLAN = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)))
+
+
+class ServiceFlight(Flight):
+    """The harness of the machine, with a service in its place that may be restarted."""
+
+    def __init__(self):
+        super().__init__()
+        self.kept = []
+        self.full, self.tries = False, 0
+        self.pipe_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
+        self.restart_teleop()
+
+    def restart_teleop(self):
+        """A new process, that has nothing but the journal."""
+        self.teleop = MissionService(0.25, self.write, json.loads(json.dumps(self.kept)), salt=b"")
+
+    def write(self, entry):
+        self.tries += 1
+        if self.full:
+            raise OSError(28, "No space left on device")
+        self.kept.append(json.loads(json.dumps(entry)))
+
+    def see(self):
+        self.teleop.see(self.seen, self.now_ns)
+
+    @property
+    def seen(self):
+        return Seen(
+            self.epoch,
+            self.position,
+            self.guard,
+            self.mission,
+            self.world,
+            self.pipe_contacts,
+            self.touch_speed,
+            self.slip_ns,
+            **self.progress(),
+        )
+
+    def create(self, plan=SERVICE_PLAN, **order):
+        mission, _ = self.teleop.create(Order(plan, **order), self.now_ns)
+        self._collect()
+        return mission.id
+
+    def view(self, mission_id):
+        return self.teleop.book.find(mission_id).as_json()
+
+    def names(self, mission_id):
+        return [event["event"] for event in self.view(mission_id)["events"]]
+
+    @property
+    def faults(self):
+        return [said for said in self.said if isinstance(said, Fault)]
+
+
+def service_flying(**order):
+    """A flight on its way to the second waypoint."""
+    flight = ServiceFlight()
+    flight.step()
+    mission_id = flight.create(**order)
+    flight.step(seconds=0.05)
+    flight.step(position=A)
+    assert flight.view(mission_id)["state"] == "flying"
+    assert flight.view(mission_id)["waypoint"] == 1
+    return flight, mission_id
+
+
+DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+"""Never by a proxy: `urlopen` keeps the one that was named when a process first called it."""
+LIMIT = 5.0
+OPERATOR, READER = "operator-token-of-the-tests", "reader-token-of-the-tests"
+NO_LIMITS = Limits(1e6, 10**6, 10**6, 10**6)
+
+
+class Running:
+    """API, service and robot; `flight.position` is where the robot is."""
+
+    def __init__(self, *, ready=True, limits=NO_LIMITS, unix=False):
+        self.folder = TemporaryDirectory(prefix="cloudrc-")
+        folder = Path(self.folder.name)
+        (folder / "operator").write_text(OPERATOR + "\n")
+        (folder / "reader").write_text(READER + "\n")
+        self.flight, self.bridge = ServiceFlight(), Bridge()
+        self.alarms, self.complaints = [], []
+        self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
+        surroundings = Surroundings(load_scene("pipes"), 60.0, True, assembly.mission_plan)
+        app, tokens = create_app(self.bridge, surroundings), Tokens(folder)
+        self.audit = Audit(folder / "audit.jsonl", self.complaints.append)
+        self.gate = Gate(app, None if unix else tokens, self.audit, limits, self.complaints.append)
+        self.address = folder / "api.sock" if unix else ("127.0.0.1", 0)
+        self.server = ApiServer(self.gate, self.bridge, self.address)
+        self.token_file = folder / "operator"
+        self.audit_file = folder / "audit.jsonl"
+        self.url = self.server.url
+        self.server.start()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._fly)
+        if ready:
+            self.bridge.open(self.flight.teleop)
+        self._thread.start()
+        if not unix:
+            self.until(self.answers)
+
+    def _fly(self):
+        while not self._stopping.wait(0.002):
+            for call in self.bridge.take() if self.bridge.closed != STARTING else ():
+                call(self.flight.now_ns)
+            self.flight.step()
+
+    def answers(self):
+        try:
+            self.get("/v1/state")
+        except urllib.error.HTTPError:
+            return True
+        except OSError:
+            return False
+        return True
+
+    def stop(self):
+        self.server.stop()
+        self.audit.close()
+        self._stopping.set()
+        self._thread.join(LIMIT)
+        self.folder.cleanup()
+
+    def get(self, path):
+        with DIRECT.open(self.request(path), timeout=LIMIT) as answer:
+            return json.loads(answer.read())
+
+    def request(self, path, data=None, token=OPERATOR, method=None, headers=None):
+        headers = dict(headers or {})
+        if token is not None:
+            headers["Authorization"] = f"Bearer {token}"
+        return urllib.request.Request(self.url + path, data, headers, method=method)
+
+    def post(self, path, body=None, token=OPERATOR):
+        """Status and answer, whatever it is; `body` may be bytes."""
+        data = (
+            body if isinstance(body, bytes) else b"" if body is None else json.dumps(body).encode()
+        )
+        return self.send(self.request(path, data, token, "POST"))
+
+    def post_local(self, path, body=None):
+        """Over the socket file."""
+        return Api(self.url).post(path, body)
+
+    def send(self, request):
+        try:
+            with DIRECT.open(request, timeout=LIMIT) as answer:
+                return answer.status, json.loads(answer.read())
+        except urllib.error.HTTPError as error:
+            return error.code, json.loads(error.read())
+
+    def audited(self):
+        """What the audit log has, once every request is done with; nothing is served after."""
+        self.server.stop()
+        self.audit.close()
+        lines = self.audit_file.read_text().splitlines() if self.audit_file.exists() else []
+        return [json.loads(line) for line in lines]
+
+    def until(self, condition):
+        limit = time.monotonic() + LIMIT
+        while not condition():
+            assert time.monotonic() < limit, "not in time"
+            time.sleep(0.01)
+
+    def state_of(self, mission_id):
+        return self.get(f"/v1/missions/{mission_id}")["state"]
+
+
+def connect(one):
+    """A connection on which a test writes every byte itself."""
+    host, _, port = one.url.removeprefix("http://").partition(":")
+    return socket.create_connection((host, int(port)), timeout=10.0)
+
+
+def head(method, path, *lines, token=OPERATOR):
+    """The head of a request."""
+    lines = (f"{method} {path} HTTP/1.1", "Host: x", f"Authorization: Bearer {token}", *lines)
+    return ("\r\n".join(lines) + "\r\n\r\n").encode()
+
+
+@contextmanager
+def running(**options):
+    one = Running(**options)
+    try:
+        yield one
+    finally:
+        one.stop()
+
+
+class KilledError(BaseException):
+    """The process is gone: nothing catches it."""
+
+
+class MemoryDisk:
+    """Stands for `journal_disk.Disk`.
+
+    Attributes:
+        steps: How many operations there have been.
+        kill_at: The operation before which the process is killed; None for never.
+        fault: Called with the name of every operation; may raise OSError.
+    """
+
+    def __init__(self):
+        self.steps, self.kill_at = 0, None
+        self.fault = lambda name: None
+        self.names, self.safe_names = {}, {}  # path -> file
+        self.bytes, self.safe_bytes = [], []  # by file
+        self.handles, self.locked, self.done = {}, set(), []
+
+    def crash(self, *, power=False, kept=0.0):
+        """Begin again after a kill; without power, what was not synced is lost.
+
+        `kept` in [0, 1]: share of the bytes not synced that reached the platter all the same.
+        """
+        self.handles, self.locked, self.kill_at = {}, set(), None
+        self.fault = lambda name: None
+        if power:
+            self.names = dict(self.safe_names)
+            for file, safe in enumerate(self.safe_bytes):
+                now = self.bytes[file]
+                more = round(kept * (len(now) - len(safe))) if now.startswith(safe) else 0
+                self.bytes[file] = safe + now[len(safe) : len(safe) + max(more, 0)]
+        self.safe_names = dict(self.names)
+        self.safe_bytes = list(self.bytes)
+
+    def _step(self, name):
+        if self.kill_at == self.steps:
+            raise KilledError(name)
+        self.steps += 1
+        self.done.append(name)
+        self.fault(name)
+
+    def lock(self, path):
+        if path in self.locked:
+            raise BlockingIOError
+        self.locked.add(path)
+        self.handles[handle := object()] = path
+        return handle
+
+    def open(self, path, *, new=False):
+        self._step("open")
+        if path not in self.names:
+            self.names[path] = len(self.bytes)
+            self.bytes.append(b"")
+            self.safe_bytes.append(b"")
+        file = self.names[path]
+        if new:
+            self.bytes[file] = b""
+        self.handles[handle := object()] = file
+        return handle
+
+    def read(self, path):
+        return self.bytes[self.names[path]] if path in self.names else b""
+
+    def write(self, handle, data):
+        """Half at a time, so that a kill can come between the halves."""
+        self._step("write")
+        taken = data[: (len(data) + 1) // 2]
+        self.bytes[self.handles[handle]] += taken
+        return len(taken)
+
+    def size(self, handle):
+        return len(self.bytes[self.handles[handle]])
+
+    def truncate(self, handle, size):
+        self._step("truncate")
+        file = self.handles[handle]
+        self.bytes[file] = self.bytes[file][:size]
+
+    def sync(self, handle):
+        self._step("sync")
+        file = self.handles[handle]
+        self.safe_bytes[file] = self.bytes[file]
+
+    def replace(self, new, path):
+        self._step("replace")
+        self.names[path] = self.names.pop(new)
+
+    def sync_folder(self, folder):
+        self._step("sync_folder")
+        self.safe_names = dict(self.names)
+
+    def remove(self, path):
+        self._step("remove")
+        self.names.pop(path, None)
+
+    def close(self, handle):
+        self.locked.discard(self.handles.pop(handle))
+
+
+def full(after=0, error=errno.ENOSPC):
+    """A fault: no write succeeds any more, after so many that do."""
+    left = [after]
+
+    def fault(name):
+        if name == "write":
+            left[0] -= 1
+            if left[0] < 0:
+                raise OSError(error, "No space left on device")
+
+    return fault
+
+
+def refusing(*names, error=errno.EROFS):
+    """A fault: these operations are refused."""
+
+    def fault(name):
+        if name in names:
+            raise OSError(error, "Read-only file system")
+
+    return fault
+
+
+PATH = Path("/nowhere/missions.journal")
+SOME = [{"kind": "event", "n": n, "text": f"é\n{n}", "limit": float("inf")} for n in range(4)]
+
+
+def records(some):
+    return [to_record(number, entry) for number, entry in enumerate(some, 1)]
+
+
+def whole(some):
+    return MAGIC + b"".join(records(some))

@@ -1,0 +1,207 @@
+"""The mission machine under any order of verbs, flights, silences and restarts."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from cloudrc.errors import BadInputError
+from cloudrc.messages import OperatorRequest, Request, Setpoint, Start
+from cloudrc.teleop.wire import Cancel, GoTo, Hold, Leg, Plan, Resume, StartMission
+from tests.teleop.conftest import Flight
+
+UNDER_WAY = {"STARTING", "FLYING", "HELD"}
+ENDS = {"DONE", "FAILED", "CANCELLED"}
+ALLOWED = {
+    StartMission: {"IDLE"} | ENDS,
+    GoTo: {"IDLE", "HELD"} | ENDS,
+    Hold: {"FLYING"},
+    Resume: {"HELD"},
+    Cancel: UNDER_WAY,
+}
+CODES = {"DONE": "done", "CANCELLED": "cancelled"}
+FAILURES = {"timed_out", "leg_timed_out", "world_restarted", "guard_stopped"}
+
+coordinates = st.integers(-3, 3).map(float)
+positions = st.tuples(coordinates, coordinates, coordinates)
+legs = st.builds(
+    Leg,
+    position=positions,
+    tolerance=st.sampled_from([0.1, 1.5]),
+    dwell=st.sampled_from([0.0, 0.1]),
+    time_limit=st.sampled_from([1.0, 60.0]),
+)
+plans = st.builds(
+    Plan,
+    legs=st.lists(legs, min_size=1, max_size=6).map(tuple),
+    start=st.sampled_from(Start),
+    time_limit=st.sampled_from([2.0, 600.0]),
+)
+verbs = st.one_of(
+    st.builds(StartMission, plans),
+    st.builds(GoTo, positions),
+    st.sampled_from([Hold(), Resume(), Cancel()]),
+)
+
+
+class MissionMachine(RuleBasedStateMachine):
+    """Checks all that teleop has said after everything that can happen to it."""
+
+    def __init__(self):
+        super().__init__()
+        self.flight = Flight()
+        self.checked = 0
+        self.plan = None
+        self.reached = 0
+        self.newest = None  # request
+        self.operated_ns = self.sent_ns = 0
+
+    @rule(verb=verbs)
+    def operate(self, verb):
+        flight = self.flight
+        before = (flight.state, len(flight.said), flight.teleop.outcome)
+        if flight.state not in ALLOWED[type(verb)]:
+            with pytest.raises(BadInputError):
+                flight.operate(verb)
+            assert before == (flight.state, len(flight.said), flight.teleop.outcome)
+            return
+        flight.operate(verb)
+        self.operated_ns = flight.now_ns
+        if flight.state == "STARTING":
+            here = isinstance(verb, GoTo)
+            self.plan = Plan((Leg(verb.position),), Start.HERE) if here else verb.plan
+            self.reached = 0
+
+    @precondition(lambda self: self.flight.setpoints)
+    @rule(times=st.integers(1, 8), seconds=st.sampled_from([0.01, 0.12, 0.3]))
+    def fly_to_the_setpoint(self, times, seconds):
+        for _ in range(times):
+            self.flight.step(self.flight.setpoints[-1].position, seconds)
+
+    @rule(position=positions, seconds=st.sampled_from([0.01, 0.3, 1.5]))
+    def fly_elsewhere(self, position, seconds):
+        self.flight.step(position, seconds)
+
+    @rule(silent=st.sampled_from(["neither", "neither", "uplink", "downlink"]))
+    def change_link(self, silent):
+        self.flight.uplink, self.flight.downlink = silent != "uplink", silent != "downlink"
+
+    @rule()
+    def restart_world(self):
+        self.flight.restart()
+
+    @invariant()
+    def all_is_well(self):
+        self.check_what_was_said()
+        self.check_that_a_request_stops_only_when_it_is_acknowledged()
+        self.check_that_the_newest_request_is_what_the_state_asks_for()
+        self.check_the_outcome()
+        self.check_the_last_setpoint()
+
+    def check_what_was_said(self):
+        flight = self.flight
+        new = zip(flight.said[self.checked :], flight.said_at[self.checked :], strict=True)
+        for said, now_ns in new:
+            if isinstance(said, Setpoint):
+                # Waypoints are flown to one after the other, each only when those before are done.
+                assert said.waypoint in (-1, self.reached)
+            elif isinstance(said, OperatorRequest):
+                self.check_request(said, now_ns)
+            elif said.event == "reached":
+                assert said.waypoint == self.reached
+                self.reached += 1
+        self.checked = len(flight.said)
+
+    def check_request(self, request, now_ns):
+        """Numbers rise by one; copies follow each other at 10 Hz, none once it was acted on."""
+        if request != self.newest:
+            assert self.newest is None or request.number == self.newest.number + 1
+            self.newest = request
+        else:
+            assert now_ns - self.sent_ns == 100_000_000
+        self.sent_ns = now_ns
+        assert not self.is_acknowledged(now_ns)
+
+    def is_acknowledged(self, now_ns):
+        """Whether telemetry has shown the newest request's number by then."""
+        return self.flight.first_shown_ns.get(self.newest.number, now_ns + 1) <= now_ns
+
+    def check_that_a_request_stops_only_when_it_is_acknowledged(self):
+        now_ns = self.flight.now_ns
+        if self.newest is not None and now_ns - self.sent_ns > 100_000_000:
+            assert self.is_acknowledged(now_ns)
+
+    def check_that_the_newest_request_is_what_the_state_asks_for(self):
+        """To fly while under way, else to hold; it leaves with the first deadline in sight.
+
+        A start waits until the robot is seen to have acted on the end before it.
+        """
+        flight = self.flight
+        if self.newest is not None and flight.now_ns > self.operated_ns:
+            asked = {Request.START if flight.state in UNDER_WAY else Request.END}
+            if flight.state == "STARTING" and not self.is_acknowledged(flight.now_ns):
+                asked.add(Request.END)
+            assert self.newest.request in asked
+
+    def check_the_outcome(self):
+        flight, outcome = self.flight, self.flight.teleop.outcome
+        if flight.state in UNDER_WAY | {"IDLE"}:
+            assert outcome is None
+            return
+        assert outcome.success == (self.reached == len(self.plan.legs))
+        assert outcome.code == CODES.get(flight.state, outcome.code)
+        assert flight.state != "FAILED" or outcome.code in FAILURES
+        assert flight.events[-1].event == outcome.code
+
+    def check_the_last_setpoint(self):
+        if self.flight.setpoints:
+            aims = {"FLYING": {self.reached}, "STARTING": {-1, self.reached}}
+            assert self.flight.setpoints[-1].waypoint in aims.get(self.flight.state, {-1})
+
+
+MissionMachine.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+TestMissionMachine = MissionMachine.TestCase
+
+
+def disturb(flight, disturbance):
+    if disturbance == "hold" and flight.state == "FLYING":
+        flight.operate(Hold())
+        flight.step(seconds=0.2)
+        flight.operate(Resume())
+    elif disturbance == "goto" and flight.state == "FLYING":
+        flight.operate(Hold())
+        flight.operate(GoTo((9.0, 9.0, 9.0)))
+        flight.step((9.0, 9.0, 9.0), 0.2)
+        flight.operate(Resume())
+    elif disturbance == "silence":
+        flight.uplink = flight.downlink = False
+        flight.step(seconds=0.3)
+        flight.uplink = flight.downlink = True
+    elif disturbance == "detour":
+        flight.step((5.0, 5.0, 5.0), 0.3)
+
+
+@given(
+    places=st.lists(positions, min_size=1, max_size=8),
+    start=st.sampled_from(Start),
+    disturbances=st.lists(st.sampled_from(["hold", "goto", "silence", "detour", "none"])),
+)
+@settings(max_examples=30, deadline=None)
+def test_whatever_disturbs_it_a_mission_reaches_each_waypoint_once_and_in_order(
+    places, start, disturbances
+):
+    flight = Flight()
+    flight.operate(StartMission(Plan(tuple(Leg(place, dwell=0.1) for place in places), start)))
+    flight.step()
+    for disturbance in disturbances:
+        disturb(flight, disturbance)
+        flight.step(flight.setpoints[-1].position, 0.08)
+    for _ in range(2 * len(places) + 2):
+        flight.step(flight.setpoints[-1].position, 0.15)
+    assert flight.state == "DONE"
+    reached = [event.waypoint for event in flight.events if event.event == "reached"]
+    assert reached == list(range(len(places)))
+    assert [event.event for event in flight.events].count("started") == 1
+    assert [event.event for event in flight.events][-1] == "done"
+    waypoints = [setpoint.waypoint for setpoint in flight.setpoints if setpoint.waypoint >= 0]
+    assert waypoints == sorted(waypoints)

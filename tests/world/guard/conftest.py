@@ -1,0 +1,286 @@
+"""A robot in free air under the guard, and clouds that command it.
+
+A guard without a robot: commands, readings and time as a test writes them.
+
+Runs plain Python on all 64-bit floats at once: branches are explored, z3 answers.
+
+A `Symbol` stands for any float. Where the code under test compares, the run forks: each run takes
+one way, and what was found true on it is its path. Comparisons, sums, products and negation are
+those of IEEE 754, bit for bit, and so is division by a power of two. Other divisions and square
+roots take z3 minutes; they are replaced by what correct rounding promises of them, which is enough
+for bounds.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from math import frexp, hypot, sqrt
+from random import Random
+
+import z3
+
+from cloudrc.geometry import fence
+from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState, Vector
+from cloudrc.world.guard.limits import Limits
+from cloudrc.world.guard.state import Guard
+from cloudrc.world.low_level import LowLevel
+from cloudrc.world.readings import Readings
+from cloudrc.world.robot import Robot
+
+MS = 1_000_000
+TICK = 2 * MS
+DT = 0.002
+SECOND = 1000 * MS
+HERE = (1.0, 2.0, 1.3)
+LIMITS = Limits(fence.LOW, fence.HIGH)
+
+
+def command(velocity: Vector = (1.0, 0.0, 0.0), basis_ns: int = 0, yaw_rate: float = 0.0):
+    """A command that was computed from odometry of `basis_ns`."""
+    return Command(0, basis_ns, 0, velocity, yaw_rate)
+
+
+def sensed(position: Vector = HERE, velocity: Vector = ZERO) -> Readings:
+    """What the sensors of an upright robot say."""
+    return Readings.of((*position, *UPRIGHT), (*velocity, *ZERO))
+
+
+def armed(limits: Limits = LIMITS, now_ns: int = 0) -> Guard:
+    """On the ground, its mission started."""
+    guard = Guard(limits)
+    guard.start_mission(now_ns)
+    return guard
+
+
+def tracking(velocity: Vector = (1.0, 0.0, 0.0), limits: Limits = LIMITS) -> Guard:
+    """Flying since 0 ns by a command with a basis of 0 ns."""
+    guard = armed(limits)
+    assert guard.offer(command(velocity), 0) is None
+    return guard
+
+
+def run(guard, start_ns, end_ns, position=HERE, velocity=ZERO):
+    """Tick through a time with the sensors standing still; returns the references."""
+    return [
+        guard.tick(now_ns, sensed(position, velocity), DT)
+        for now_ns in range(start_ns, end_ns, TICK)
+    ]
+
+
+def feed(guard, start_ns, count, velocity=(1.0, 0.0, 0.0), every_ns=10 * MS, position=HERE):
+    """Offer fresh commands and tick; returns the instant after the last one."""
+    now_ns = start_ns
+    for _ in range(count):
+        guard.offer(command(velocity, basis_ns=now_ns), now_ns)
+        run(guard, now_ns, now_ns + every_ns, position)
+        now_ns += every_ns
+    return now_ns
+
+
+def holding(limits: Limits = LIMITS):
+    """In HOLD since 252 ms, at rest since; a mission is on."""
+    guard = tracking(limits=limits)
+    run(guard, 0, 2000 * MS)
+    assert guard.state is GuardState.HOLD
+    return guard
+
+
+def landing(limits: Limits = LIMITS):
+    """In LAND because of impossible commands; at 2 s."""
+    guard = holding(limits)
+    for _ in range(5):
+        guard.offer(command((float("nan"), 0.0, 0.0)), 2000 * MS)
+    assert guard.state is GuardState.LAND
+    return guard
+
+
+def states(guard):
+    """The states entered since the last call."""
+    return [change.state for change in guard.take_changes()]
+
+
+PERIOD_NS = 10 * MS
+UP = (0.0, 0.0, 1.0)
+
+
+class Flight:
+    """A robot in free air, commanded at 100 Hz."""
+
+    def __init__(self, simulator, limits=LIMITS):
+        self.guard = Guard(limits)
+        self.robot = Robot(simulator, LowLevel(), self.guard)
+        self.robot.put_on_ground(0, "test")
+        self.guard.start_mission(0)
+        self.now_ns = 0
+        self.room = 9.0  # smallest distance to a wall or the ceiling [m]
+
+    @property
+    def readings(self):
+        return self.robot.simulator.readings
+
+    @property
+    def speed(self):
+        return hypot(*self.readings.velocity)
+
+    def fly(self, seconds, policy=None):
+        """Go on; a policy gives the command, None is silence."""
+        for _ in range(round(seconds * SECOND / PERIOD_NS)):
+            if policy is not None:
+                velocity = policy(self) if callable(policy) else policy
+                self.guard.offer(Command(0, self.now_ns, 0, velocity, 0.0), self.now_ns)
+            self.robot.run(self.now_ns, self.now_ns + PERIOD_NS)
+            self.now_ns += PERIOD_NS
+            x, y, z = self.readings.position
+            (ax, ay, _), (bx, by, bz) = fence.LOW, fence.HIGH
+            self.room = min(self.room, x - ax, bx - x, y - ay, by - y, bz - z)
+        return self
+
+
+def hostile(seed):
+    """Jumps between extremes, at random instants."""
+    rng, until_ns, velocity = Random(seed), 0, UP
+
+    def policy(flight):
+        nonlocal until_ns, velocity
+        if flight.now_ns >= until_ns:
+            until_ns = flight.now_ns + rng.choice((20, 50, 200, 500, 1000, 3000)) * MS
+            velocity = tuple(rng.choice((-9.0, -3.0, 0.0, 3.0, 9.0)) for _ in range(3))
+        return velocity
+
+    return policy
+
+
+DOUBLE, ROUND = z3.Float64(), z3.RNE()
+LARGEST = sys.float_info.max
+
+
+class Symbol:
+    """Any float that fulfils the path so far."""
+
+    def __init__(self, run: Run, term: z3.FPRef) -> None:
+        self.run, self.term = run, term
+
+    def _with(self, other: Symbol | float) -> z3.FPRef:
+        return other.term if isinstance(other, Symbol) else z3.FPVal(other, DOUBLE)
+
+    def _new(self, term: z3.FPRef) -> Symbol:
+        return Symbol(self.run, term)
+
+    def __neg__(self):
+        return self._new(z3.fpNeg(self.term))
+
+    def __abs__(self):
+        return self._new(z3.fpAbs(self.term))
+
+    def __add__(self, other):
+        return self._new(z3.fpAdd(ROUND, self.term, self._with(other)))
+
+    __radd__ = __add__
+
+    def __sub__(self, other):
+        return self._new(z3.fpSub(ROUND, self.term, self._with(other)))
+
+    def __rsub__(self, other):
+        return self._new(z3.fpSub(ROUND, self._with(other), self.term))
+
+    def __mul__(self, other):
+        return self._new(z3.fpMul(ROUND, self.term, self._with(other)))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other):
+        """Of n >= 0 by d > 0: a float >= 0, not NaN; finite if n is finite and d at least 0.1.
+
+        By a power of two it is the multiplication by its inverse, of any n.
+        """
+        if isinstance(other, float) and frexp(other)[0] == 0.5:
+            return self * (1.0 / other)
+        n, d, q = self.term, self._with(other), self.run.fresh("quotient").term
+        self.run.prove(z3.And(n >= 0.0, d >= 0.1, z3.Not(z3.fpIsInf(n)), z3.Not(z3.fpIsInf(d))))
+        bound = z3.FPVal(1e300, DOUBLE)
+        self.run.prove(n <= 1e299)
+        self.run.learn(z3.And(q >= 0.0, q <= bound))
+        return self._new(q)
+
+    def __lt__(self, other):
+        return self.run.take(z3.fpLT(self.term, self._with(other)))
+
+    def __le__(self, other):
+        return self.run.take(z3.fpLEQ(self.term, self._with(other)))
+
+    def __gt__(self, other):
+        return self.run.take(z3.fpGT(self.term, self._with(other)))
+
+    def __ge__(self, other):
+        return self.run.take(z3.fpGEQ(self.term, self._with(other)))
+
+
+class Run:
+    """One way through the code."""
+
+    def __init__(self, decisions: list[bool]) -> None:
+        self.decisions, self.taken = decisions, 0
+        self.path: list[z3.BoolRef] = []
+        self.names = 0
+
+    def fresh(self, name: str) -> Symbol:
+        """A float of which nothing is known."""
+        self.names += 1
+        return Symbol(self, z3.FP(f"{name}_{self.names}", DOUBLE))
+
+    def learn(self, fact: z3.BoolRef) -> None:
+        """From here on it is so."""
+        self.path.append(fact)
+
+    def take(self, condition: z3.BoolRef) -> bool:
+        """Which way this run goes; the other one is for another run."""
+        if self.taken == len(self.decisions):
+            self.decisions.append(True)
+        decision = self.decisions[self.taken]
+        self.taken += 1
+        self.learn(condition if decision else z3.Not(condition))
+        return decision
+
+    def prove(self, claim: z3.BoolRef) -> None:
+        """Fail with a counterexample, if there is one on this path."""
+        solver = z3.Solver()
+        solver.add(*self.path, z3.Not(claim))
+        answer = solver.check()
+        assert answer == z3.unsat, f"{answer}: {solver.model() if answer == z3.sat else claim}"
+
+    def is_possible(self) -> bool:
+        """Whether any float goes this way."""
+        solver = z3.Solver()
+        solver.add(*self.path)
+        return solver.check() != z3.unsat
+
+
+def root(x: Symbol | float, top: float = LARGEST) -> Symbol | float:
+    """Of x >= 0, finite: a float >= 0, finite; up to `top` no more than the root of `top`.
+
+    Rounding keeps what is in order in order: correctly rounded, a root never falls as x grows.
+    """
+    if isinstance(x, float):
+        return sqrt(x)
+    x.run.prove(z3.And(x.term >= 0.0, z3.Not(z3.fpIsInf(x.term))))
+    r = x.run.fresh("root")
+    x.run.learn(z3.And(r.term >= 0.0, r.term <= 1.5e154))
+    x.run.learn(z3.Implies(x.term <= top, r.term <= sqrt(top)))
+    return r
+
+
+def everywhere(check: Callable[[Run], None]) -> int:
+    """Run `check` on every path; returns how many are possible."""
+    decisions: list[bool] = []
+    paths = 0
+    while True:
+        run = Run(decisions)
+        check(run)
+        paths += run.is_possible()
+        del decisions[run.taken :]
+        while decisions and not decisions[-1]:
+            decisions.pop()
+        if not decisions:
+            return paths
+        decisions[-1] = False

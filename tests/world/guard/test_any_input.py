@@ -1,0 +1,151 @@
+"""The whole guard, with any commands and any readings: what it lets through is inside its bounds.
+
+Each case is a flight of its own: what the sensors say at first may be anything, but from there on
+it changes no faster than without a hit, which would stop the rotors.
+"""
+
+import random
+import struct
+from collections import Counter
+from math import hypot, isfinite
+
+import pytest
+from hypothesis import given, seed, settings
+from hypothesis import strategies as st
+from test_guard_rules import ANY, PLACES, SPECIAL, SPECIAL_BAD, SPEEDS, VECTORS
+
+from cloudrc.messages import ZERO, GuardState
+from cloudrc.world.guard.limits import RANGE, growth
+from cloudrc.world.guard.state import JOLT
+from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, sensed
+
+TAKEN = st.tuples(*[st.floats(-RANGE, RANGE)] * 3)
+"""What is not refused, however strange."""
+CASES_AT_ONCE = 4
+CASE = st.tuples(
+    st.one_of(SPEEDS, TAKEN),
+    st.one_of(VECTORS, TAKEN, SPEEDS, SPEEDS),
+    st.one_of(ANY, st.floats(-RANGE, RANGE)),
+    st.one_of(st.just(None), PLACES, PLACES, VECTORS),
+    st.one_of(SPEEDS, VECTORS),
+    st.tuples(*[st.floats(-JOLT, JOLT)] * 3),
+    st.integers(-2, 300),
+    st.sampled_from([TICK, TICK, 300 * MS]),
+)
+CASES = st.lists(CASE, min_size=CASES_AT_ONCE, max_size=CASES_AT_ONCE)
+ASIDE = 0.04
+"""The robot moves by less than this [m] in a tick."""
+
+
+def check_cases(cases):
+    """Whatever is commanded and sensed, what is flown is finite, in the caps, and can stop."""
+    seen = Counter(check_case(*case) for case in cases)
+    assert seen.total() == len(cases)
+    return seen
+
+
+def check_case(first, then, yaw_rate, place, velocity, change, age_ms, after_ns):
+    """One command is flown, then comes another, or silence; gives the state that this ends in."""
+    guard = armed()
+    position = (1.0, 1.0, 1.0) if place is None else place
+    guard.offer(command(first), 0)
+    check_flown(guard, guard.tick(0, sensed(position, velocity), 1.0), position)
+    before, limited = guard.reference, guard.counts["limited_fence"]
+    for _ in range(5 if age_ms < 0 else 1):  # five from the future: LAND
+        guard.offer(command(then, after_ns - age_ms * MS, yaw_rate), after_ns)
+    if place is not None:
+        position = tuple(at + ASIDE * d for at, d in zip(position, change, strict=True))
+    velocity = tuple(v + d if abs(v) < 1e3 else v for v, d in zip(velocity, change, strict=True))
+    after = guard.tick(after_ns, sensed(position, velocity), DT)
+    check_flown(guard, after, position)
+    if place is None and guard.state is GuardState.TRACK:
+        # No nearer to the fence: nothing grows beyond the cap; only where the fence wants the robot
+        # slower that way does it change by more.
+        step_max = 12.0 * DT * (1 + 1e-9)
+        grown = hypot(*(growth(a, b) for a, b in zip(before, after, strict=True)))
+        step = hypot(*(b - a for a, b in zip(before, after, strict=True)))
+        assert grown <= step_max
+        assert step <= step_max or guard.counts["limited_fence"] > limited
+    return guard.state
+
+
+def check_flown(guard, reference, position):
+    """Inside the caps, and slow enough to stop before the fence."""
+    assert abs(guard.yaw_rate) <= LIMITS.yaw_rate_max
+    assert reference is not None
+    assert hypot(*reference) <= LIMITS.speed_max  # so no component is infinite or not a number
+    for v, at, low, high in zip(
+        reference, position, LIMITS.fence_low, LIMITS.fence_high, strict=True
+    ):
+        room = high - at if v > 0 else at - low
+        if guard.state is not GuardState.LAND and v != 0.0 and isfinite(at):
+            assert 0.2 * abs(v) + v * v / 6 <= room - 0.1 + 1e-9
+
+
+@pytest.mark.promise("commands-within-caps")
+@given(CASES)
+@settings(max_examples=10_000 // CASES_AT_ONCE, deadline=None)
+def test_whatever_is_commanded_and_sensed_what_is_flown_is_inside_the_caps(cases):
+    check_cases(cases)
+
+
+def any_float(rng):
+    """Of any bits, or of any size up to the range, or one of those that trouble arithmetic."""
+    (value,) = struct.unpack("d", rng.randbytes(8))
+    small = rng.choice((-1.0, 1.0)) * RANGE * 10.0 ** rng.uniform(-320.0, 0.0)
+    return rng.choice((value, small, rng.choice(SPECIAL_BAD)))
+
+
+def vector(rng, low=-8.0, high=8.0):
+    """Mostly a speed [m/s] or place [m] between two bounds, else three numbers of any kind."""
+    if rng.random() < 0.7:
+        return tuple(rng.uniform(low, high) for _ in range(3))
+    return tuple(any_float(rng) for _ in range(3))
+
+
+def case_by_chance(rng):
+    """As CASE has them, a hundred times faster, but smaller cases are not looked for."""
+    first = tuple(v if abs(v) <= RANGE else 0.0 for v in vector(rng))
+    place = rng.choice((None, vector(rng, -4.0, 10.0), vector(rng, 0.0, 2.5)))
+    change = tuple(rng.uniform(-JOLT, JOLT) for _ in range(3))
+    after_ns = rng.choice((TICK, TICK, 300 * MS))
+    age_ms = rng.randint(-2, 300)
+    return first, vector(rng), any_float(rng), place, vector(rng), change, age_ms, after_ns
+
+
+@pytest.mark.full
+def test_a_million_cases_of_hypothesis_stay_inside_the_caps(figure):
+    parts, seen = 25, Counter()  # it remembers all that it has tried in a part
+    for part in range(parts):
+
+        @seed(part)
+        @settings(max_examples=1_000_000 // parts // CASES_AT_ONCE, deadline=None, database=None)
+        @given(CASES)
+        def search(cases):
+            seen.update(check_cases(cases))
+
+        search()
+    figure("cases of hypothesis: outside the caps", 0, "==", 0, count=seen.total())
+    assert seen.total() >= 1_000_000
+
+
+@pytest.mark.full
+def test_a_million_commands_and_readings_stay_inside_the_caps(figure):
+    rng, seen = random.Random(1), Counter()
+    for _ in range(1_000_000):
+        seen.update(check_cases([case_by_chance(rng)]))
+    figure("commands and readings by chance: outside the caps", 0, "==", 0, count=seen.total())
+    assert seen.total() >= 1_000_000
+    for state in (GuardState.TRACK, GuardState.HOLD, GuardState.LAND):
+        assert seen[state] >= 5_000
+
+
+@pytest.mark.parametrize("axis", range(4))
+@pytest.mark.parametrize("value", [v for v in (*SPECIAL, RANGE, -RANGE) if abs(v) <= RANGE])
+def test_every_special_float_that_is_taken_is_flown_inside_the_caps(axis, value):
+    values = [0.5, 0.5, 0.5, 0.5]
+    values[axis] = value
+    velocity, yaw_rate = tuple(values[:3]), values[3]
+    for first, then in ((velocity, ZERO), (ZERO, velocity), (velocity, velocity)):
+        state = check_case(first, then, yaw_rate, None, ZERO, ZERO, 0, TICK)
+        assert state is GuardState.TRACK

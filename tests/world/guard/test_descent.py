@@ -1,0 +1,108 @@
+"""The guard: a landing that the operator acknowledges before the robot stands."""
+
+from dataclasses import replace
+from math import nan
+
+import pytest
+
+from cloudrc.geometry import fence
+from cloudrc.geometry.fence import FLOOR_MARGIN
+from cloudrc.messages import ZERO, GuardState
+from cloudrc.world.guard.hold import LAND_SPEED
+from cloudrc.world.guard.limits import Limits
+from cloudrc.world.simulator import Simulator
+from tests.world.guard.conftest import HERE, LIMITS, MS, SECOND, Flight, command, feed, landing, run
+
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
+
+NEAR = (1.0, 2.0, FLOOR_MARGIN)
+SINKS = (0.0, 0.0, -LAND_SPEED)
+
+
+@pytest.mark.parametrize(
+    ("position", "velocity"), [(NEAR, SINKS), (HERE, (0.0, 0.0, -LAND_SPEED / 2)), (HERE, ZERO)]
+)
+def test_a_landing_that_is_acknowledged_low_or_on_something_goes_on_to_touch_down(
+    position, velocity
+):
+    """Held there it would scrape along, or climb back into what stands beside it."""
+    guard = landing()
+    run(guard, 2 * SECOND, 3 * SECOND, position, SINKS)
+    guard.acknowledge(3 * SECOND)
+    assert None not in run(guard, 3 * SECOND, 3 * SECOND + 300 * MS, position, velocity)
+    assert guard.state is LAND
+    stood = run(guard, 3 * SECOND + 300 * MS, 5 * SECOND, position)
+    assert set(stood[stood.index(None) :]) == {None}
+    change = guard.take_changes()[-1]
+    assert (change.state, change.cause) == (GROUND, "touched down, rotors stopped")
+    assert not guard.armed
+    guard.start_mission(5 * SECOND)
+    feed(guard, 5 * SECOND, 1, position=position)
+    assert guard.state is TRACK
+
+
+def test_a_landing_that_is_acknowledged_while_it_still_climbs_holds_once_it_sinks():
+    guard, now_ns = landing(), 2 * SECOND
+    guard.acknowledge(now_ns)
+    for climb in (0.5, 0.0, -0.25):
+        now_ns += 10 * MS
+        run(guard, now_ns, now_ns + 10 * MS, velocity=(0.0, 0.0, climb))
+        assert guard.state is LAND
+    run(guard, now_ns + 10 * MS, now_ns + 12 * MS, velocity=(0.0, 0.0, -0.26))
+    assert guard.state is HOLD
+
+
+def test_an_acknowledgement_does_not_count_for_the_next_landing():
+    guard = landing()
+    guard.acknowledge(2 * SECOND)
+    run(guard, 2 * SECOND, 2 * SECOND + 10 * MS, velocity=SINKS)
+    guard.start_mission(3 * SECOND)
+    now_ns = feed(guard, 3 * SECOND, 20)
+    for _ in range(5):
+        guard.offer(command((nan, 0.0, 0.0)), now_ns)
+    run(guard, now_ns, now_ns + SECOND, velocity=SINKS)
+    assert guard.state is LAND
+
+
+def test_a_slow_robot_lands_slowly_and_its_landing_can_be_called_off():
+    """At most 0.3 m/s: it sinks at 0.15 m/s."""
+    guard = landing(Limits(fence.LOW, fence.HIGH, speed_max=0.3))
+    assert run(guard, 2 * SECOND, 3 * SECOND, velocity=(0.0, 0.0, -0.15))[-1] == (0.0, 0.0, -0.15)
+    guard.acknowledge(3 * SECOND)
+    run(guard, 3 * SECOND, 3 * SECOND + 10 * MS, velocity=(0.0, 0.0, -0.15))
+    assert guard.state is HOLD
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
+def test_a_robot_that_lands_near_the_fence_touches_down_though_it_is_pulled_inwards(share):
+    """The pull takes some of the descent's speed: both together are no faster than the creep."""
+    x, y, _ = fence.HIGH
+    guard, place = landing(), (x - share, y - share, 0.1)
+    stood = run(guard, 2 * SECOND, 4 * SECOND, place)
+    assert None in stood
+    assert guard.take_changes()[-1].cause == "touched down, rotors stopped"
+
+
+@pytest.mark.parametrize("speed_max", [0.01, 0.05, 0.19, 0.2, 0.25, 6.0])
+def test_a_robot_that_sinks_slowly_by_its_cap_has_not_touched_down(speed_max):
+    guard = landing(replace(LIMITS, speed_max=speed_max))
+    sinks = (0.0, 0.0, -0.5 * min(LAND_SPEED, 0.5 * speed_max))
+    assert None not in run(guard, 2 * SECOND, 5 * SECOND, velocity=sinks)
+    assert None in run(guard, 5 * SECOND, 6 * SECOND)
+
+
+def test_with_the_lowest_cap_it_lands_on_the_floor_and_falls_onto_nothing():
+    flight = Flight(Simulator("pelican", "empty"), replace(LIMITS, speed_max=0.1))
+    flight.fly(6.0, (0.0, 0.0, 0.1))
+    height = flight.readings.position[2]
+    for _ in range(5):
+        flight.guard.offer(command((nan, 0.0, 0.0), flight.now_ns), flight.now_ns)
+    assert flight.guard.state is LAND
+    fastest = 0.0
+    for _ in range(400):
+        flight.fly(0.1)
+        fastest = min(fastest, flight.readings.velocity[2])
+    assert flight.guard.take_changes()[-1].cause == "touched down, rotors stopped"
+    assert height > 0.4
+    assert flight.readings.position[2] < 0.15
+    assert fastest > -0.1

@@ -1,0 +1,146 @@
+"""What becomes of a robot whose rotors have stopped: where it comes to lie, and takes off again."""
+
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from cloudrc.geometry.fence import FLOOR_MARGIN
+from cloudrc.messages import GuardState
+from cloudrc.world.guard.hold import TAKE_OFF_MARGIN
+from cloudrc.world.guard.limits import BOUNCE, CREEP, SLIDE, TUMBLE, fall_time
+from cloudrc.world.guard.state import Guard
+from cloudrc.world.simulator import Simulator
+from tests.world.guard.conftest import LIMITS, UP, Flight, hostile
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    return Simulator("pelican", "empty")
+
+
+def check_stopped(simulator, seed, figure):
+    """docs/safety.md tells people how far to stay away: more than it has ever gone."""
+    flight = Flight(simulator)
+    flight.fly(1.0, UP)
+    flight.fly(Random(seed).uniform(1.0, 12.0), hostile(seed))
+    flight.guard.stop(flight.now_ns)
+    flight.fly(4.0, UP)
+    figure("stopped by a hostile cloud: outside the fence by", -flight.room, "<=", 1.5, "m")
+    assert flight.room > -1.5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_stopped_at_any_instant_it_comes_to_lie_within_what_is_told(simulator, seed, figure):
+    check_stopped(simulator, seed, figure)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(5, 400))
+def test_stopped_at_four_hundred_instants_likewise(simulator, seed, figure):
+    check_stopped(simulator, seed, figure)
+
+
+# What the fence counts on where a hit stops the rotors: `hit_speed` in guard_rules.py.
+
+
+def beyond(simulator, seed):
+    """How far a robot that is stopped lies beyond what the fence counts on, towards each side [m].
+
+    Only sides that it flies towards faster than it may creep anywhere.
+    """
+    flight = Flight(simulator)
+    flight.fly(1.0, UP)
+    flight.fly(Random(seed).uniform(0.3, 5.0), hostile(seed))
+    (x, y, z), (vx, vy, _) = flight.readings.position, flight.readings.velocity
+    flight.guard.stop(flight.now_ns)
+    falls = fall_time(z - FLOOR_MARGIN) + SLIDE + BOUNCE
+    speeds = (vx, -vx, vy, -vy)
+    ways = [0.0] * 4
+    for _ in range(30):
+        flight.fly(0.1)
+        xn, yn, _ = flight.readings.position
+        ways = list(map(max, ways, (xn - x, x - xn, yn - y, y - yn)))
+    return [
+        way - speed * falls - TUMBLE
+        for way, speed in zip(ways, speeds, strict=True)
+        if speed > CREEP
+    ]
+
+
+def check_falls(simulator, seeds, figure, share_max, farthest_max):
+    excess = [side for seed in seeds for side in beyond(simulator, seed)]
+    share = sum(side > 0.0 for side in excess) / len(excess)
+    kind, count = f"after one of {len(seeds):,} falls", len(excess)
+    figure(f"{kind}: share beyond what the fence counts on", share, "<=", share_max, count=count)
+    figure(f"{kind}: farther than that by", max(excess), "<=", farthest_max, "m", count=count)
+    assert share <= share_max
+    assert max(excess) <= farthest_max
+
+
+def test_after_a_fall_it_seldom_lies_farther_than_the_fence_counts_on(simulator, figure):
+    check_falls(simulator, range(40), figure, 0.10, 1.5)
+
+
+@pytest.mark.full
+def test_after_a_fall_it_seldom_lies_farther_in_two_thousand_falls(simulator, figure):
+    check_falls(simulator, range(2000), figure, 0.05, 1.5)
+
+
+# Where it lies tilted near a wall it scrapes along the floor before it rises.
+
+
+def scrapes(simulator, seed, room):
+    """How near it comes to a wall so far away when it takes off from where it came to lie [m]."""
+    rng, flight = Random(seed), Flight(simulator)
+    flight.fly(1.0, UP)
+    flight.fly(rng.uniform(0.3, 5.0), hostile(seed))
+    flight.guard.stop(flight.now_ns)
+    flight.fly(4.0)
+    lies, axis, sign = flight.readings.position, rng.randrange(2), rng.choice((-1, 1))
+    faces = {1: list(LIMITS.fence_high), -1: list(LIMITS.fence_low)}
+    faces[sign][axis] = lies[axis] + sign * room
+    faces[-sign][axis] = lies[axis] - sign * 5.0
+    low, high = tuple(faces[-1]), tuple(faces[1])
+    flight.guard = flight.robot.guard = Guard(replace(LIMITS, fence_low=low, fence_high=high))
+    flight.guard.start_mission(flight.now_ns)
+    outwards = [0.0, 0.0, rng.choice((-6.0, -0.3, 0.0, 0.2))]
+    outwards[axis], outwards[1 - axis] = sign * rng.choice((0.1, 0.5, 6.0)), rng.choice((0, -3, 3))
+    nearest = room
+    for _ in range(60):
+        flight.fly(0.05, tuple(outwards))
+        nearest = min(nearest, sign * (faces[sign][axis] - flight.readings.position[axis]))
+    return nearest
+
+
+@pytest.mark.promise("stays-inside-the-fence")
+@pytest.mark.parametrize("seed", [48, 86, 90, 101])
+def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence(simulator, seed):
+    """Those of 400 that get farthest: lying tilted, it is pushed along before it rises."""
+    assert scrapes(simulator, seed, TAKE_OFF_MARGIN) > 0.02
+
+
+@pytest.mark.full
+def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence_in_four_hundred(
+    simulator, figure
+):
+    seeds = range(400)
+    nearest = min(scrapes(simulator, seed, TAKE_OFF_MARGIN) for seed in seeds)
+    name = "taken off 0.5 m from the fence: nearest to it"
+    figure(name, nearest, ">=", 0.02, "m", count=len(seeds))
+    assert nearest > 0.02
+
+
+@pytest.mark.promise("stays-inside-the-fence")
+@pytest.mark.parametrize("nearer", [0.01, -0.01])
+def test_stopped_near_a_wall_it_takes_off_only_so_far_from_it(simulator, nearer):
+    flight = Flight(simulator)
+    _, y, z = LIMITS.fence_low
+    far = replace(LIMITS, fence_low=(-TAKE_OFF_MARGIN + nearer, y, z))
+    flight.guard = flight.robot.guard = Guard(far)
+    flight.guard.stop(flight.now_ns)
+    flight.fly(1.0)
+    flight.guard.acknowledge(flight.now_ns)
+    flight.guard.start_mission(flight.now_ns)
+    flight.fly(0.1, UP)
+    assert flight.guard.state is (GuardState.GROUND if nearer > 0 else GuardState.TRACK)

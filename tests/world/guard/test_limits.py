@@ -1,0 +1,117 @@
+"""The limits of the guard: none can be switched off, in the file or in code."""
+
+from dataclasses import FrozenInstanceError, fields
+from math import inf, nan
+
+import pytest
+
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.fence import FLOOR_MARGIN
+from cloudrc.messages import GuardState
+from cloudrc.world.guard.limits import MARGIN, Limits
+from tests.world.guard.conftest import LIMITS, MS, SECOND, TICK, armed, run, tracking
+
+NUMBERS = [field.name for field in fields(Limits) if not field.name.startswith("fence")]
+
+
+def limits(**values):
+    return Limits(LIMITS.fence_low, LIMITS.fence_high, **values)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("value", [0, 0.0, -1, inf, -inf, nan])
+def test_a_limit_that_limits_nothing_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"guard: {name} is"):
+        limits(**{name: value})
+
+
+def test_a_command_may_not_be_older_than_ten_seconds():
+    with pytest.raises(ValueError, match="above 10 s"):
+        limits(command_age_max_ns=10_000_000_001, speed_max=0.5)
+    limits(command_age_max_ns=10_000_000_000, speed_max=0.5)
+
+
+@pytest.mark.parametrize(("age_ms", "fastest"), [(250, 6.0), (400, 5.645805), (800, 4.823043)])
+def test_a_speed_that_cannot_be_stopped_from_in_time_is_refused(age_ms, fastest):
+    # v (T + 0.2) + v^2 / 6 = 8.7 m, solved by hand.
+    limits(command_age_max_ns=age_ms * 1_000_000, speed_max=fastest)
+    with pytest.raises(ValueError, match="speed_max"):
+        limits(command_age_max_ns=age_ms * 1_000_000, speed_max=fastest + 1e-3)
+
+
+@pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (10, 10), (11, 11)])
+def test_on_the_ground_a_mission_is_waited_for_ten_seconds_at_least(hold_s, waited_s):
+    """A hold may be too short for a first command to come."""
+    guard = armed(limits(hold_max_ns=round(hold_s * SECOND)))
+    run(guard, 0, waited_s * SECOND + TICK)
+    assert guard.state is GuardState.GROUND
+    run(guard, waited_s * SECOND + TICK, waited_s * SECOND + 2 * TICK)
+    assert guard.state is GuardState.LAND
+    assert guard.take_changes()[-1].cause == f"held for {waited_s} s without the cloud"
+
+
+@pytest.mark.parametrize("hold_s", [2, 10, 11])
+def test_in_flight_a_hold_lasts_no_longer_than_it_may(hold_s):
+    guard = tracking(limits=limits(hold_max_ns=hold_s * SECOND))
+    run(guard, 0, 12 * SECOND)
+    land = (hold_s * SECOND + 254 * MS, GuardState.LAND, f"held for {hold_s} s without the cloud")
+    assert land in guard.take_changes()
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("high", [-inf, inf, nan, -9.0, -8.5])
+def test_a_fence_without_room_is_refused(axis, high):
+    low, corner = [-9.0] * 3, [9.0] * 3
+    corner[axis] = high
+    with pytest.raises(ValueError, match="leaves no room"):
+        Limits(tuple(low), tuple(corner))
+
+
+def test_a_fence_as_thick_as_its_margins_has_no_room():
+    thin = FLOOR_MARGIN + MARGIN
+    with pytest.raises(ValueError, match="leaves no room"):
+        Limits((0.0, 0.0, 0.0), (5.0, 5.0, thin))
+    Limits((0.0, 0.0, 0.0), (5.0, 5.0, thin + 0.01))
+
+
+@pytest.mark.parametrize("low", [(0.0, 0.0), (0.0, 0.0, 0.0, 0.0)])
+def test_a_fence_has_three_axes(low):
+    with pytest.raises(ValueError, match="zip"):
+        Limits(low, (5.0, 5.0, 5.0))
+
+
+def test_inside_the_fence_are_its_margins():
+    low, high = Limits((0.0, 10.0, 20.0), (5.0, 15.0, 25.0)).inside()
+    assert low == pytest.approx((0.2, 10.2, 20.35))
+    assert high == pytest.approx((4.8, 14.8, 24.8))
+
+
+KEYS = (
+    "command_age_max_ms",
+    "speed_max_mps",
+    "acceleration_max_mps2",
+    "yaw_rate_max_radps",
+    "hold_max_s",
+)
+
+
+@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("value", ["0", "-1", ".inf", ".nan"])
+def test_the_file_refuses_it_too_and_names_the_key(key, value):
+    with pytest.raises(BadInputError, match=rf"guard\.{key}"):
+        load_experiment("paper", [f"guard.{key}={value}"])
+
+
+def test_the_file_refuses_a_speed_or_an_age_beyond_the_stop_rule():
+    with pytest.raises(BadInputError, match=r"guard\.speed_max_mps: at most 6 m/s can be stopped"):
+        load_experiment("paper", ["guard.speed_max_mps=6.5"])
+    with pytest.raises(BadInputError, match="command_age_max_ms"):
+        load_experiment("paper", ["guard.command_age_max_ms=10001"])
+
+
+@pytest.mark.promise("commands-within-caps")
+@pytest.mark.parametrize("name", [field.name for field in fields(Limits)])
+def test_a_limit_cannot_be_changed_once_it_is_set(name):
+    with pytest.raises(FrozenInstanceError):
+        setattr(LIMITS, name, getattr(LIMITS, name))

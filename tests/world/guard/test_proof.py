@@ -1,0 +1,158 @@
+"""The guard's comparisons and clamps, proven for all 64-bit floats, NaN and infinities included."""
+
+from functools import partial
+
+import pytest
+import z3
+
+from cloudrc.messages import Command
+from cloudrc.world.guard import hold
+from cloudrc.world.guard import limits as rules
+from cloudrc.world.guard.limits import AGE_MAX_NS, RANGE
+from cloudrc.world.guard.state import Guard
+from tests.world.guard.conftest import LIMITS, everywhere, root
+
+LATEST = AGE_MAX_NS * 1e-9 + rules.REACTION
+"""After which the robot brakes [s], at the largest age of a command that may be flown."""
+
+
+@pytest.fixture(autouse=True)
+def abstract_root(monkeypatch):
+    monkeypatch.setattr(rules, "sqrt", root)
+
+
+def is_finite(term):
+    return z3.Not(z3.Or(z3.fpIsNaN(term), z3.fpIsInf(term)))
+
+
+def test_a_command_with_a_number_out_of_range_is_refused_whole():
+    """`Guard.offer` refuses all but what is within the range: NaN, infinities and 1e308, too."""
+
+    def check(run):
+        numbers = [run.fresh(name) for name in ("vx", "vy", "vz", "yaw_rate")]
+        inside = z3.And([z3.fpAbs(number.term) <= RANGE for number in numbers])
+        refused = Guard(LIMITS).offer(Command(0, 0, 0, tuple(numbers[:3]), numbers[3]), 0)
+        assert refused in (None, "range")
+        run.prove(z3.Not(inside) if refused else inside)
+
+    # All in range, or one of the four is the first that is not.
+    assert everywhere(check) == 5
+
+
+def test_within_answers_from_its_interval_whatever_comes_in():
+    def check(run):
+        value, low, high = (run.fresh(name) for name in ("value", "low", "high"))
+        run.learn(z3.And(is_finite(low.term), is_finite(high.term), low.term <= high.term))
+        answer = rules.within(value, low, high)
+        run.prove(z3.And(answer.term >= low.term, answer.term <= high.term))
+
+    assert everywhere(check) == 3
+
+
+def test_within_changes_nothing_inside_its_interval():
+    def check(run):
+        value = run.fresh("value")
+        run.learn(z3.And(value.term > -1.0, value.term < 1.0))
+        run.prove(z3.fpEQ(lift(run, rules.within(value, -1.0, 1.0)).term, value.term))
+
+    everywhere(check)
+
+
+@pytest.mark.parametrize("caution", [rules.CAUTION, rules.REACTION])
+def test_an_approach_is_never_below_the_way_back_and_never_not_a_number(caution):
+    def check(run):
+        reach = run.fresh("reach")
+        answer = rules.approach(reach, caution)
+        term = answer.term if hasattr(answer, "term") else z3.FPVal(answer, z3.Float64())
+        run.prove(term >= -rules.COME_BACK_MAX)
+        # Outside or at the face never outwards; inside never back.
+        run.prove(z3.Implies(reach.term <= 0.0, term <= 0.0))
+        run.prove(z3.Implies(reach.term > 0.0, term >= 0.0))
+
+    assert everywhere(check) >= 4
+
+
+@pytest.mark.parametrize("at_the_floor", [False, True])
+def test_an_axis_at_the_fence_is_finite_and_no_faster_than_commanded(at_the_floor):
+    """One axis of `fenced`, any finite command; of `approach` only what is proven above is used."""
+
+    def check(run):
+        v, up, down = (run.fresh(name) for name in ("v", "up", "down"))
+        run.learn(is_finite(v.term))
+        run.learn(z3.And(up.term >= -rules.COME_BACK_MAX, down.term >= -rules.COME_BACK_MAX))
+        low = min(0.0, -down) if at_the_floor else -down
+        term = lift(run, rules.within(v, low, up)).term
+        bound = z3.fpMax(z3.fpAbs(v.term), z3.FPVal(rules.COME_BACK_MAX, z3.Float64()))
+        run.prove(z3.And(is_finite(term), z3.fpAbs(term) <= bound))
+
+    assert everywhere(check) == (6 if at_the_floor else 3)
+
+
+def test_what_grows_is_no_more_than_what_there_is():
+    """So what is held back keeps its sign, and is never faster than what was asked for."""
+
+    def check(run):
+        before, after = run.fresh("before"), run.fresh("after")
+        run.learn(z3.And(is_finite(before.term), is_finite(after.term)))
+        grown = lift(run, rules.growth(before, after)).term
+        run.prove(z3.And(grown >= 0.0, grown <= z3.fpAbs(after.term)))
+
+    assert everywhere(check) >= 6
+
+
+def test_the_rate_of_braking_is_inside_its_range_whatever_comes_in():
+    def check(run):
+        rate = lift(run, hold.brake_rate(run.fresh("speed"))).term
+        run.prove(z3.And(rate >= hold.GENTLEST, rate <= hold.HARDEST))
+
+    everywhere(check)
+
+
+def test_a_fall_lasts_no_longer_than_one_from_the_largest_height_whatever_comes_in(monkeypatch):
+    top = 2.0 / rules.GRAVITY * rules.HEIGHT_MAX
+    monkeypatch.setattr(rules, "sqrt", partial(root, top=top))
+    longest = rules.fall_time(rules.HEIGHT_MAX)
+    assert 1.0 < longest < 1.01
+
+    def check(run):
+        time = lift(run, rules.fall_time(run.fresh("height"))).term
+        run.prove(z3.And(time >= 0.0, time <= longest))
+
+    # From the largest height; from none; from between.
+    assert everywhere(check) == 3
+
+
+def any_speed_and_reaction(run):
+    """What `Limits` asks of: a speed >= 0, and what it may take to react, both finite."""
+    speed, reaction = run.fresh("speed"), run.fresh("reaction")
+    run.learn(z3.And(speed.term >= 0.0, is_finite(speed.term)))
+    run.learn(z3.And(reaction.term >= rules.REACTION, reaction.term <= LATEST))
+    return speed, reaction
+
+
+def test_a_way_to_rest_is_never_negative_and_always_a_number():
+    def check(run):
+        way = rules.stopping_distance(*any_speed_and_reaction(run)).term
+        run.prove(way >= 0.0)
+
+    assert everywhere(check) == 1
+
+
+def test_from_above_seven_metres_a_second_no_way_to_rest_is_allowed():
+    """Up to the largest float: a way that overflows is infinite, and that is too long as well."""
+
+    def check(run):
+        speed, reaction = any_speed_and_reaction(run)
+        run.learn(speed.term >= 7.0)
+        run.prove(rules.stopping_distance(speed, reaction).term > rules.STOPPING_DISTANCE + 1e-4)
+
+    assert everywhere(check) == 1
+
+
+def lift(run, value):
+    """A number as a symbol."""
+    if isinstance(value, float | int):
+        symbol = run.fresh("constant")
+        run.learn(z3.fpEQ(symbol.term, z3.FPVal(value, z3.Float64())))
+        return symbol
+    return value
