@@ -9,12 +9,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from test_jobs import MISSION, end
 
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.jobs import cancel, run_job
 from cloudrc.cluster.tools import ClusterError
 from tests.cluster.conftest import FakeApi
+from tests.cluster.test_jobs import MISSION, end
 
 
 class FakeTeleop(ThreadingHTTPServer):

@@ -10,8 +10,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from test_cut import HOVER, SECOND, flown, later, merged
-from test_jobs import at_look, end, start_pod, terminated
 
 from cloudrc.cli import run_cluster
 from cloudrc.cli.main import main
@@ -21,6 +19,8 @@ from cloudrc.cluster.jobs import run_job
 from cloudrc.cluster.tools import ClusterError
 from cloudrc.config.load import load_experiment
 from tests.cluster.conftest import FakeApi
+from tests.cluster.test_cut import HOVER, SECOND, flown, later, merged
+from tests.cluster.test_jobs import at_look, end, start_pod, terminated
 
 Patch = pytest.MonkeyPatch
 NAME, (SETTING,) = HOVER

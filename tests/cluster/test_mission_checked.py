@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import yaml
-from test_jobs import MISSION, end, start_pod, terminated
 
 from cloudrc.cli import mission_cluster
 from cloudrc.cli.main import main
@@ -18,6 +17,7 @@ from cloudrc.cluster.client import Release
 from cloudrc.cluster.jobs import patience, run_job
 from cloudrc.cluster.tools import ClusterError
 from tests.cluster.conftest import FakeApi, labels, pod
+from tests.cluster.test_jobs import MISSION, end, start_pod, terminated
 
 Printed = pytest.CaptureFixture[str]
 WAYPOINTS = "waypoints: [{position_m: [0.0, 0.0, 1.0]}]"

@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from test_jobs import at_look, end, start_pod, terminated
 
 from cloudrc.cli.main import main
 from tests.cluster.conftest import FakeApi
+from tests.cluster.test_jobs import at_look, end, start_pod, terminated
 
 MISSION = """
 start: here

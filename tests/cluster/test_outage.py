@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from test_jobs import MISSION, end, start_pod, terminated
 
 from cloudrc.cluster import tools
 from cloudrc.cluster.client import Release
@@ -14,6 +13,7 @@ from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.release import wait_ready
 from cloudrc.cluster.tools import AwayError, ClusterError
 from tests.cluster.conftest import FakeApi
+from tests.cluster.test_jobs import MISSION, end, start_pod, terminated
 
 
 def away(api: FakeApi, plural: str, code: int, times: int) -> Callable[[], int]:

@@ -35,7 +35,7 @@ PAIRS = 3
 FLOODER = """
 import sys
 sys.path[:0] = {path!r}
-from test_flood import flood
+from tests.drivers.test_flood import flood
 flood(("127.0.0.1", {port}), {rate}, {seconds})
 """
 
@@ -94,7 +94,7 @@ def fly(folder: Path, *, flooded: bool) -> Hover:
             break
     sent, began_ns = 0, time.monotonic_ns()
     if flooded:
-        here = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
+        here = [str(Path(__file__).parents[2])]
         program = FLOODER.format(path=here, port=port_of_world(run.pid), rate=RATE, seconds=SECONDS)
         done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
         sent = int(done.stdout)

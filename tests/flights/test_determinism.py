@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,12 @@ from cloudrc.record.columns import Recording
 from tests.flights.conftest import digest, records
 
 SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "criteria.contact=false")
-PRINT = "from flying import *; print(digest(load_experiment('paper', {settings!r})))"
+ROOT = Path(__file__).resolve().parents[2]
+PRINT = """
+from cloudrc.config.load import load_experiment
+from tests.flights.conftest import digest
+print(digest(load_experiment('paper', {settings!r})))
+"""
 
 
 def short(*settings):
@@ -27,7 +33,7 @@ def test_the_same_seed_gives_the_same_records_and_another_others():
 @pytest.mark.promise("one-seed-one-run")
 def test_another_process_gives_the_same_records():
     command = [sys.executable, "-c", PRINT.format(settings=SHORT)]
-    env = os.environ | {"PYTHONHASHSEED": "77", "PYTHONPATH": os.path.dirname(__file__)}
+    env = os.environ | {"PYTHONHASHSEED": "77", "PYTHONPATH": str(ROOT)}
     printed = subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
     assert printed.strip() == digest(short())
 

@@ -23,7 +23,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import netem_laboratory as lab
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -45,17 +44,17 @@ def tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("tc")
     write_tables(folder)
     try:
-        with lab.laboratory():
+        with laboratory():
             yield folder
-    except lab.UnableError as error:
+    except UnableError as error:
         pytest.exit(f"netem cannot be tested here: {error}", MissingPrerequisiteError.exit_code)
 
 
 @pytest.fixture
 def shaped(tables: Path) -> Iterator[Netem]:
     """netem without conditions, in force."""
-    netem = lab.netem(tables, DirectionProfile())
-    assert netem.follow_peer(lab.PEER) == lab.PEER
+    netem = real_netem(tables, DirectionProfile())
+    assert netem.follow_peer(FAR_PEER) == FAR_PEER
     yield netem
     netem.close()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import netem_laboratory as lab
 import numpy as np
 import pytest
 
@@ -12,6 +11,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.link.netem import Netem
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.tc import try_netem
+from tests.link import conftest as lab
 from tests.link.conftest import WITHIN, Flow, measure
 from tests.link.conftest import show as told
 

@@ -12,7 +12,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-import netem_laboratory as lab
 import numpy as np
 import pytest
 
@@ -25,6 +24,7 @@ from cloudrc.link.netem import Netem
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.tc import STRETCH, check, table
 from cloudrc.tunnel.codec import Kind
+from tests.link import conftest as lab
 from tests.link.conftest import SIZE, WITHIN, Flow, least, measure, show
 
 SHAPED = [name for name in names("profile") if name != "lossy"]
@@ -59,13 +59,13 @@ def test_the_delay_is_applied_to_the_tunnels_flow_alone(shaped: Netem) -> None:
 def connect() -> float:
     """Time to connect by TCP to the tunnel's own port [s]."""
     with lab.inside(lab.FAR):
-        server = socket.create_server(lab.PEER)
+        server = socket.create_server(lab.FAR_PEER)
     with lab.inside(lab.NEAR):
         client = socket.socket()
     with server, client:
         client.settimeout(5.0)
         began = time.monotonic()
-        client.connect(lab.PEER)
+        client.connect(lab.FAR_PEER)
         return time.monotonic() - began
 
 
@@ -207,11 +207,11 @@ def test_duplicates_and_packets_that_overtake(shaped: Netem) -> None:
 
 def test_it_is_set_up_once_and_removed_without_a_trace(tables: Path) -> None:
     before = lab.qdiscs()
-    first = lab.netem(tables, DirectionProfile(0.02))
+    first = lab.real_netem(tables, DirectionProfile(0.02))
     first.follow_peer(("10.79.0.9", 7400))  # killed here: its qdiscs stay
     left = lab.qdiscs()
-    second = lab.netem(tables, DirectionProfile(0.05))
-    for peer in (lab.PEER, lab.PEER, ("10.79.0.7", 7400), lab.PEER):
+    second = lab.real_netem(tables, DirectionProfile(0.05))
+    for peer in (lab.FAR_PEER, lab.FAR_PEER, ("10.79.0.7", 7400), lab.FAR_PEER):
         second.follow_peer(peer)
     assert lab.qdiscs().count("netem") == left.count("netem") == 1
     filters = lab.sh("tc", "-n", lab.NEAR, "filter", "show", "dev", lab.DEVICE, "parent", "7400:")
@@ -253,7 +253,7 @@ def test_a_qdisc_of_somebody_else_is_left_alone(tables: Path) -> None:
     lab.sh(*place, "add", "dev", lab.DEVICE, "root", "handle", "1:", "prio")
     before = lab.qdiscs()
     with pytest.raises(MissingPrerequisiteError, match=r"wire has a qdisc already \(prio 1:\)"):
-        lab.netem(tables, DirectionProfile(0.02)).follow_peer(lab.PEER)
+        lab.real_netem(tables, DirectionProfile(0.02)).follow_peer(lab.FAR_PEER)
     assert lab.qdiscs() == before
     lab.sh(*place, "del", "dev", lab.DEVICE, "root")
 

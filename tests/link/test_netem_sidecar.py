@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-import netem_laboratory as lab
 import numpy as np
 import pytest
 
 from cloudrc.errors import MissingPrerequisiteError
+from tests.link import conftest as lab
 
 pytestmark = pytest.mark.netem
 ROOT = Path(__file__).resolve().parents[2]

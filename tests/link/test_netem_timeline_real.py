@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-import netem_laboratory as lab
 import numpy as np
 import pytest
 
 from cloudrc.link.netem import LATE_NS, Steps
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, Trace
+from tests.link import conftest as lab
 from tests.link.conftest import WITHIN, Flow, least, show
 
 LATE = 0.1
@@ -31,8 +31,8 @@ def test_a_time_line_is_stepped(tables: Path) -> None:
     )
     origin_ns = time.monotonic_ns() + 5_000_000_000  # by then it is set up
     begun_ns = origin_ns + time.time_ns() - time.monotonic_ns()
-    netem, flow = lab.netem(tables, profile, origin_ns), Flow()
-    netem.follow_peer(lab.PEER)
+    netem, flow = lab.real_netem(tables, profile, origin_ns), Flow()
+    netem.follow_peer(lab.FAR_PEER)
     while time.monotonic_ns() < origin_ns + 4_500_000_000:
         flow.send(1, 0.01, meanwhile=lambda: netem.step(0.0))
     netem.close()
@@ -69,8 +69,8 @@ def follow(tables: Path, trace: Trace) -> Followed:
     profile = DirectionProfile(trace=trace)
     origin_ns = time.monotonic_ns() + 3_000_000_000  # by then it is set up
     begun_ns = origin_ns + time.time_ns() - time.monotonic_ns()
-    netem, flow = lab.netem(tables, profile, origin_ns), Flow()
-    netem.follow_peer(lab.PEER)
+    netem, flow = lab.real_netem(tables, profile, origin_ns), Flow()
+    netem.follow_peer(lab.FAR_PEER)
     sender = threading.Thread(target=flow.send, args=(600, 0.02))
     sender.start()
     while sender.is_alive():

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 
-sys.path.append(str(Path(__file__).parents[1] / "tunnel"))
 from cloudrc.cli.link_verify_run import PROBE, TRAIN, plan
 from cloudrc.config.load import load_experiment
 from cloudrc.tunnel import codec

@@ -1,12 +1,12 @@
 """Key files that differ and have one key in common: the ends come together on that one."""
 
 import pytest
-from test_rekey import NEW, OLD, SECOND_NS, Ends
 
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Kind
 from cloudrc.tunnel.keys import Key, KeySet
 from cloudrc.tunnel.session import LOOKS
+from tests.tunnel.test_rekey import NEW, OLD, SECOND_NS, Ends
 
 HELLO = bytes(codec.BODY_SIZES[Kind.HELLO])
 

@@ -12,12 +12,12 @@ from math import hypot, isfinite
 import pytest
 from hypothesis import given, seed, settings
 from hypothesis import strategies as st
-from test_guard_rules import ANY, PLACES, SPECIAL, SPECIAL_BAD, SPEEDS, VECTORS
 
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard.limits import RANGE, growth
 from cloudrc.world.guard.state import JOLT
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, sensed
+from tests.world.guard.test_rules import ANY, PLACES, SPECIAL, SPECIAL_BAD, SPEEDS, VECTORS
 
 TAKEN = st.tuples(*[st.floats(-RANGE, RANGE)] * 3)
 """What is not refused, however strange."""

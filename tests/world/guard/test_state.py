@@ -4,7 +4,6 @@ from itertools import pairwise
 from math import hypot, inf, nan, nextafter
 
 import pytest
-from test_guard_rules import SPECIAL
 
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard.hold import HARDEST, PULL_MAX
@@ -24,6 +23,7 @@ from tests.world.guard.conftest import (
     states,
     tracking,
 )
+from tests.world.guard.test_rules import SPECIAL
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 BEYOND = [value for value in (*SPECIAL, 1e308, -1e308) if abs(value) > RANGE]

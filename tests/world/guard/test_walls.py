@@ -3,10 +3,10 @@
 from math import hypot, inf, nan, sqrt
 
 import pytest
-from test_guard_rules import HIGH, LOW
 
 from cloudrc.world.guard import limits as rules
 from tests.world.guard.conftest import LIMITS
+from tests.world.guard.test_rules import HIGH, LOW
 
 
 def by_the_wall(axis, sign, distance, height):
