@@ -77,7 +77,7 @@ ORDER_REFUSALS = ("invalid", "conflict")
 BODIES = ("pipe", "board", "floor", "other")
 """Kinds of bodies: `pipe_2` is a "pipe", and what else a scene may have is "other"."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
-"""As `cloudrc.link.relay_lanes.Lanes.outcomes` explains them."""
+"""As `cloudrc.link.relay.Lanes.outcomes` explains them."""
 SHAPERS = ("relay", "netem")
 LINK_MODES = ("auto", "relay", "netem")
 
@@ -89,7 +89,7 @@ PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
 """Around the 10 ms of both loops."""
 LATENESS_BUCKETS = (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1)
 RELEASE_PERCENTILES = {"50": "p50", "99": "p99", "99.9": "p999"}
-"""Label -> how `cloudrc.link.relay_errors` names it."""
+"""Label -> how `cloudrc.link.lateness` names it."""
 STEP_PERCENTILES = {"50": "p50", "99": "p99"}
 """Label -> how `cloudrc.link.netem_steps` names it."""
 

@@ -143,7 +143,8 @@ class Scenario:
         return f"F{self.number}"
 
 
-FAMILY = ".family_"
+FOLDERS = ("scenarios", "real", "cluster")
+"""Folders of `cloudrc.faults` whose modules list scenarios, by mode: virtual, real, cluster."""
 MODES = get_args(Mode)
 
 
@@ -155,8 +156,8 @@ def scenarios(mode: Mode | None = None) -> list[Scenario]:
     """
     found: list[Scenario] = []
     for module in pkgutil.walk_packages(cloudrc.faults.__path__, "cloudrc.faults."):
-        if FAMILY in module.name:
-            found += importlib.import_module(module.name).SCENARIOS
+        if module.name.split(".")[2] in FOLDERS:
+            found += getattr(importlib.import_module(module.name), "SCENARIOS", ())
     chosen = [each for each in found if mode is None or each.mode == mode]
     return sorted(chosen, key=lambda each: (each.number, MODES.index(each.mode)))
 

@@ -65,7 +65,7 @@ def differences(words: Sequence[str], listed: Mapping[str, Any]) -> list[str]:
     """Compare what tc was asked for with what it says is in force.
 
     Args:
-        words: As `netem_text.options` gives them.
+        words: As `tc.options` gives them.
         listed: "options" of the qdisc, as `tc -j qdisc show` prints them.
 
     Returns:

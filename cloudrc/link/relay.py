@@ -183,7 +183,7 @@ class Lane:
     def released(self) -> dict[str, int]:
         """Say how late datagrams left since the beginning, and what the errors do not tell.
 
-        As `relay_errors.in_ns`; `overflow`: how many had no room here; `stalled`: how many waited
+        As `lateness.in_ns`; `overflow`: how many had no room here; `stalled`: how many waited
         for this process for 50 ms or more, and may have waited for longer than is known: they left
         later than their errors say. Empty before the first. Any thread may ask.
         """
@@ -325,7 +325,7 @@ _SLACK_NS = 2_000_000
 _UNWATCHED_MIN_NS = 2_000_000
 _UNWATCHED_MAX_NS = 20_000_000
 """Shortest and longest time for which it is not woken by what comes [ns]. The longest is well below
-`relay_stamps.AGE_MAX_NS`, and a socket of usual size takes 10,000 datagrams a second meanwhile."""
+`relay_io.AGE_MAX_NS`, and a socket of usual size takes 10,000 datagrams a second meanwhile."""
 _TAKING_NS = 300_000
 """What taking in a few may take [ns]: if a datagram is due before, that leaves first."""
 _AT_ONCE_MAX = 6

@@ -47,8 +47,7 @@ def volume(path: Path, monkeypatch: pytest.MonkeyPatch) -> Volume:
     disk = Volume(path.parent)
     monkeypatch.setattr(teleop_reserve, "RESERVE_SIZE", RESERVE)
     monkeypatch.setattr(teleop_reserve, "room", lambda folder: max(disk.room - disk.used, 0))
-    for module in ("journal", "journal_disk"):
-        monkeypatch.setattr(f"cloudrc.cloud.teleop.{module}.Disk", lambda: disk)
+    monkeypatch.setattr("cloudrc.teleop.journal.Disk", lambda: disk)
     return disk
 
 

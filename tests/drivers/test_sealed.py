@@ -79,7 +79,7 @@ def test_only_the_drivers_that_ask_send_what_an_end_says() -> None:
 
 
 def test_nobody_but_the_tunnel_makes_an_unsealed_session() -> None:
-    assert calls("UnsealedSession") == {"tunnel/unsealed.py", "cli/bench_wire.py"}
+    assert calls("UnsealedSession") == {"tunnel/session.py", "cli/bench.py"}
     assert calls("make_session") == {"world/endpoint.py", "cloud/endpoint.py"}
 
 
@@ -88,4 +88,4 @@ def test_the_commands_of_the_ends_always_give_keys(end: str) -> None:
     tree = ast.parse((PACKAGE / "cli" / f"{end}.py").read_text())
     text = ast.unparse(tree)
     assert "keys.ring" in text
-    assert "required=True" in (PACKAGE / "cli" / "ends.py").read_text().split('"--key"')[1][:80]
+    assert "required=True" in (PACKAGE / "cli" / "runtime.py").read_text().split('"--key"')[1][:80]

@@ -106,7 +106,7 @@ def test_of_the_ends_cloud_alone_imports_what_flies_it(
 
 def test_only_what_flies_imports_plug_ins() -> None:
     """Whoever else needs an experiment reads it."""
-    flies = {"cli/run.py", "cli/sweep.py", "cli/opened.py", "cli/bench.py"}
+    flies = {"cli/run.py", "cli/sweep.py", "cli/runtime.py", "cli/bench.py"}
     flies |= {"faults/flight.py", "faults/real/processes.py"}
     imports = {
         path.relative_to(PACKAGE).as_posix()
@@ -149,4 +149,4 @@ def test_every_process_is_started_so() -> None:
         for path in PACKAGE.rglob("*.py")
         if "sys.executable" in path.read_text()
     }
-    assert {name for name in starts if not name.startswith("faults/")} == {"drivers/interpreter.py"}
+    assert {name for name in starts if not name.startswith("faults/")} == {"drivers/machine.py"}
