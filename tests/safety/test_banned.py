@@ -16,7 +16,7 @@ from cloudrc.cluster.link import INSIDE
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = [*sorted((ROOT / "cloudrc").rglob("*.py")), *sorted((ROOT / "tools").rglob("*.py"))]
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
-YARDSTICK = ROOT / "cloudrc" / "cli" / "bench_wire.py"
+YARDSTICK = ROOT / "cloudrc" / "cli" / "bench.py"
 
 MODULES = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "jsonpickle"}
 CALLS = {"eval", "exec", "compile", "__import__"}
