@@ -17,10 +17,15 @@ JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 EVIDENCE := build/evidence
 # A failing schedule is shrunk and kept there; moved to tests/faults/regressions it is a test.
 FUZZ = $(bin)/cloudrc faults fuzz --jobs $(JOBS) --store $(EVIDENCE)/regressions
+# The seeds of each search of `make faults`.
+SEEDS ?= 200
+# The tests of one part: make test T=tunnel, make test T=tests/cli/test_run.py.
+T ?=
+PART = $(if $(T),$(if $(wildcard tests/$(T)),tests/$(T),$(T)))
 # What tests guard, tunnel and journal in seconds.
 SLOW := %_any_input.py %_falls.py %_flight.py %_machine.py %_proof.py %_hostile.py
 CORE := $(filter-out $(SLOW),$(wildcard \
-	tests/world/test_guard*.py tests/tunnel/test_*.py tests/cloud/test_teleop_journal*.py))
+	tests/world/guard/test_*.py tests/tunnel/test_*.py tests/teleop/test_journal*.py))
 BUILD_ARGS := $(BASE:%=--build-arg BASE=%) --build-arg VERSION=$(VERSION) \
 	--build-arg SOURCE=$(or $(filter https://%,$(shell git config remote.origin.url)),unpublished) \
 	--build-arg REVISION=$(or $(shell git rev-parse HEAD 2>/dev/null),unknown)
@@ -31,7 +36,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio websockets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process e2e e2e-full test-netem test-netem-full faults coverage mutants nightly lint types bench bench-link pictures docs images kind-load lock chart-docs clean
+.PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults coverage mutants nightly lint types bench bench-link pictures docs images kind-load lock chart-docs clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -39,8 +44,8 @@ help: ## print this list
 demo: $(VENV)/all ## fly the paper's mission in real time and write its report
 	$(bin)/cloudrc run $(EXPERIMENT) --mode local
 
-test: $(VENV)/dev ## run the default tests on all cores
-	$(bin)/pytest -n auto
+test: $(VENV)/dev ## run the default tests on all cores; of one part: make test T=tunnel
+	$(bin)/pytest -n auto $(PART)
 
 process: $(VENV)/dev ## run the tests that start processes and take real time
 	$(bin)/pytest -m 'process and not full'
@@ -56,18 +61,20 @@ e2e-full: $(VENV)/dev ## the same with every fault of the cluster's suite, its S
 test-netem: $(VENV)/dev ## run the tests of the kernel's netem; needs root and sch_netem
 	$(bin)/pytest -m 'netem and not full' -rP tests/link
 
+smoke-netem: $(VENV)/dev ## of these the few that every push runs: shape, measure, verify a profile
+	$(bin)/pytest -m smoke tests/link
+
 test-netem-full: $(VENV)/dev ## the same, and every shipped profile for a minute
 	$(bin)/pytest -m netem -rP tests/link
 
-faults: $(VENV)/dev ## bring every fault about, compose 400 schedules of them at random
+faults: $(VENV)/dev ## bring every fault about, compose 2 x SEEDS (200) at random
 	mkdir -p $(EVIDENCE)
 	$(bin)/cloudrc faults run --all --jobs $(JOBS) --document $(EVIDENCE)/faults.md
-	$(FUZZ) --seeds 200
-	$(FUZZ) --adversarial --seeds 200
+	$(FUZZ) --seeds $(SEEDS)
+	$(FUZZ) --adversarial --seeds $(SEEDS)
 
-coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and journal is tested
-	$(bin)/python -m coverage run -m pytest --hypothesis-seed=0 $(CORE)
-	$(bin)/python -m coverage report
+coverage: $(VENV)/dev ## make test, and fail unless every branch of guard, tunnel and journal is tested
+	$(bin)/pytest -n auto --hypothesis-seed=0 --cov --cov-report=term
 
 # mutmut writes where it runs. `mutmut show NAME`, called in build/mutants, shows a mutant.
 mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways, list what tests notice

@@ -40,6 +40,7 @@ Distribution = Literal["uniform", "normal", "pareto"]
 pytestmark = pytest.mark.netem
 
 
+@pytest.mark.smoke
 def test_the_delay_is_applied_to_the_tunnels_flow_alone(shaped: Netem) -> None:
     shaped.follow_profile(DirectionProfile(delay=0.060))
 

@@ -95,6 +95,7 @@ def off(asked: float) -> float:
     return lab.least(error, NEAR)
 
 
+@pytest.mark.smoke
 def test_it_takes_netem_follows_the_profile_and_leaves_nothing(pod: Callable[..., Pod]) -> None:
     before = lab.qdiscs()
     link = pod("uplink: {delay_ms: 60}\n", "auto")

@@ -94,6 +94,7 @@ def patiently(link: Link) -> Said:
     return link.verify()
 
 
+@pytest.mark.smoke
 def test_a_true_link_is_believed_and_one_whose_qdisc_was_gone_is_not(
     plan: dict[str, Asked],
 ) -> None:
