@@ -1,4 +1,4 @@
-"""The README keeps its word: its commands and files, taken from its text, work."""
+"""The commands and the files in README.md, docs/experiment.md and docs/plugins.md work."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ import pytest
 from cloudrc.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text()
+PAGES = ("README.md", "docs/experiment.md", "docs/plugins.md")
+TEXT = "\n".join((ROOT / page).read_text() for page in PAGES)
 
 BLOCK = re.compile(r"(?:<!-- test: (\S+) -->\n)?```(\w+)\n(.*?)```", re.DOTALL)
-FILES = {name: body for name, _, body in BLOCK.findall(README) if name}
+FILES = {name: body for name, _, body in BLOCK.findall(TEXT) if name}
 LINES = [
     line.partition(" #")[0].strip()
-    for _, language, body in BLOCK.findall(README)
+    for _, language, body in BLOCK.findall(TEXT)
     if language == "bash"
     for line in body.splitlines()
 ]
@@ -51,7 +52,7 @@ def execute(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A working folder with the files that the README tells one to write."""
+    """A working folder with the files that the pages tell one to write."""
     path = tmp_path_factory.mktemp("readme")
     for name, body in FILES.items():
         (path / name).write_text(body)
