@@ -116,3 +116,18 @@ def test_the_predictor_does_what_it_says(capsys: pytest.CaptureFixture[str]) -> 
         assert numbers["fault_count"]["value"] == 0
         errors.append(numbers["prediction_error_rms"]["value"])
     assert errors[0] > 1.5 * errors[1]
+
+
+@pytest.mark.usefixtures("numbers_only")
+def test_the_metric_is_measured_by_a_run_and_by_a_report(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    line = "run steps --mode virtual -o json --set mission.steps.count=3"
+    values = []
+    for command in (
+        f"{line} --set report.metrics=./overshoot.py",
+        "report runs/latest --metric ./overshoot.py -o json",
+    ):
+        assert main(command.split()) == 0
+        values.append(json.loads(capsys.readouterr().out)["numbers"]["overshoot"]["value"])
+    assert values[0] == values[1]
