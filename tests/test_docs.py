@@ -52,3 +52,9 @@ def test_every_file_in_the_architecture_exists() -> None:
     assert named
     for name in named:
         assert any(ROOT.glob(name)) or any(ROOT.glob(f"cloudrc/{name}")), name
+
+
+def test_the_list_of_pages_names_every_page() -> None:
+    listed = {path for path, _ in LINK.findall((ROOT / "docs" / "README.md").read_text())}
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in ROOT.glob("docs/**/*.md")}
+    assert pages - {"README.md"} <= listed
