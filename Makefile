@@ -36,7 +36,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio websockets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults coverage mutants nightly lint types bench bench-link pictures docs images kind-load lock chart-docs clean
+.PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults coverage mutants nightly lint types bench bench-link pictures docs images kind-load lock clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -155,8 +155,8 @@ pictures: $(VENV)/all ## draw the README's picture from a flight
 	$(bin)/cloudrc run paper --mode virtual --out build/pictures
 	cp build/pictures/figures/flight.png docs/flight.png
 
-docs: $(VENV)/all ## write docs/metrics.md from the table of metrics
-	$(bin)/python -m cloudrc.exposition.document > docs/metrics.md
+docs: $(VENV)/dev ## write the generated pages of docs/, and the chart's values, schema and table
+	$(bin)/python -m tools.docs
 
 images: ## build the containers' images; needs Docker
 	@command -v docker >/dev/null || { \
@@ -182,9 +182,6 @@ lock: $(VENV)/bin/python ## write the requirements of images and tests again
 	echo hatchling | $(COMPILE) - --output-file images/build-requirements.txt
 	$(COMPILE) pyproject.toml --extra dev --no-emit-package cloudrc \
 		--output-file tests/requirements.txt
-
-chart-docs: $(VENV)/dev ## write the chart's values, schema and tables from the models
-	$(bin)/python tools/chart_docs.py
 
 clean: ## remove the environment and what tools left
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

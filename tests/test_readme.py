@@ -1,4 +1,4 @@
-"""The README keeps its word: its commands and files, taken from its text, work."""
+"""The commands and the files in README.md, docs/experiment.md and docs/plugins.md work."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ import pytest
 from cloudrc.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text()
+PAGES = ("README.md", "docs/experiment.md", "docs/plugins.md")
+TEXT = "\n".join((ROOT / page).read_text() for page in PAGES)
 
 BLOCK = re.compile(r"(?:<!-- test: (\S+) -->\n)?```(\w+)\n(.*?)```", re.DOTALL)
-FILES = {name: body for name, _, body in BLOCK.findall(README) if name}
+FILES = {name: body for name, _, body in BLOCK.findall(TEXT) if name}
 LINES = [
     line.partition(" #")[0].strip()
-    for _, language, body in BLOCK.findall(README)
+    for _, language, body in BLOCK.findall(TEXT)
     if language == "bash"
     for line in body.splitlines()
 ]
@@ -51,7 +52,7 @@ def execute(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A working folder with the files that the README tells one to write."""
+    """A working folder with the files that the pages tell one to write."""
     path = tmp_path_factory.mktemp("readme")
     for name, body in FILES.items():
         (path / name).write_text(body)
@@ -115,3 +116,18 @@ def test_the_predictor_does_what_it_says(capsys: pytest.CaptureFixture[str]) -> 
         assert numbers["fault_count"]["value"] == 0
         errors.append(numbers["prediction_error_rms"]["value"])
     assert errors[0] > 1.5 * errors[1]
+
+
+@pytest.mark.usefixtures("numbers_only")
+def test_the_metric_is_measured_by_a_run_and_by_a_report(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    line = "run steps --mode virtual -o json --set mission.steps.count=3"
+    values = []
+    for command in (
+        f"{line} --set report.metrics=./overshoot.py",
+        "report runs/latest --metric ./overshoot.py -o json",
+    ):
+        assert main(command.split()) == 0
+        values.append(json.loads(capsys.readouterr().out)["numbers"]["overshoot"]["value"])
+    assert values[0] == values[1]

@@ -1,4 +1,4 @@
-"""Writes what the chart says about its values, from `chart_values.py`; `make chart-docs` runs it.
+"""Writes what the chart says about its values, from `chart_values.py`; `make docs` runs it.
 
 values.yaml, values.schema.json and the tables of README.md come from the models; profiles and
 missions that ship with the package are copied, since a chart can only read its own files.
@@ -8,27 +8,22 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
+from cloudrc.config.schema import Experiment
+from cloudrc.config.shipped import FOLDERS
+from tools import chart_values
+from tools.chart_kubernetes import Quantities, Resources
+from tools.chart_values import ChartValues
+
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
-
-import chart_values  # noqa: E402
-from chart_kubernetes import Quantities, Resources  # noqa: E402
-from chart_values import ChartValues  # noqa: E402
-
-from cloudrc.config.problems import leaves  # noqa: E402
-from cloudrc.config.schema import Experiment  # noqa: E402
-from cloudrc.config.shipped import FOLDERS  # noqa: E402
-
 CHART = ROOT / "charts" / "cloudrc"
-HEAD = "# Written by `make chart-docs` from tools/chart_values.py: change that, not this.\n"
+HEAD = "# Written by `make docs` from tools/chart_values.py: change that, not this.\n"
 COPIED = {"profiles": FOLDERS["profile"], "missions": FOLDERS["mission"]}
 WIDTH = 96
 COMPACT = (Resources, Quantities)
@@ -47,13 +42,6 @@ def outputs() -> dict[Path, str]:
     return found
 
 
-def stale() -> list[Path]:
-    """List the files that are not what they should be, and those that should not be."""
-    wanted = outputs()
-    old = [path for path, text in wanted.items() if not path.exists() or path.read_text() != text]
-    return old + [path for path in (CHART / "files").glob("*/*.yaml") if path not in wanted]
-
-
 def values_text(part: BaseModel, depth: int = 0) -> str:
     """Write a part of the values as YAML, each key under its description."""
     lines = []
@@ -67,9 +55,9 @@ def values_text(part: BaseModel, depth: int = 0) -> str:
         elif isinstance(value, BaseModel) and not isinstance(value, COMPACT):
             lines += [f"{key}:", values_text(value, depth + 1).rstrip("\n")]
         elif isinstance(value, Resources):
-            lines += [f"{key}:", *(f"  {k}: {_flow(v)}" for k, v in _plain(value).items())]
+            lines += [f"{key}:", *(f"  {k}: {flow(v)}" for k, v in plain(value).items())]
         else:
-            lines.append(f"{key}: {_flow(_plain(value))}")
+            lines.append(f"{key}: {flow(plain(value))}")
         if depth == 0:
             lines.append("")
     return textwrap.indent("\n".join(lines).rstrip("\n"), "  " if depth else "") + "\n"
@@ -120,16 +108,14 @@ def _adapt(part: Any) -> Any:
     return kept
 
 
-def readme(text: str) -> str:
-    """Put the tables between their marks."""
-    tables = {"values": _table(_rows(ChartValues())), "experiment": _table(_experiment_rows())}
-    for name, table in tables.items():
-        head, mark, rest = text.partition(f"<!-- {name}: make chart-docs -->\n")
-        _, end, tail = rest.partition("<!-- end -->")
-        if not end:
-            raise ValueError(f"README.md: no place for the table '{name}'")
-        text = f"{head}{mark}{table}{end}{tail}"
-    return text
+def readme(page: str) -> str:
+    """Put the table of values between its marks."""
+    head, mark, rest = page.partition("<!-- values: make docs -->\n")
+    _, end, tail = rest.partition("<!-- end -->")
+    if not end:
+        raise ValueError("README.md: no place for the table of values")
+    rows = ((f"`{key}`", f"`{default}`", text) for key, default, text in _rows(ChartValues()))
+    return f"{head}{mark}{table('key | default | meaning', rows)}{end}{tail}"
 
 
 def _rows(part: BaseModel, above: str = "") -> Iterator[tuple[str, str, str]]:
@@ -138,49 +124,34 @@ def _rows(part: BaseModel, above: str = "") -> Iterator[tuple[str, str, str]]:
         if isinstance(value, BaseModel) and not isinstance(value, (*COMPACT, Experiment)):
             yield from _rows(value, f"{key}.")
         else:
-            shown = {} if isinstance(value, Experiment) else _plain(value)
+            shown = {} if isinstance(value, Experiment) else plain(value)
             yield key, json.dumps(shown), info.description or ""
 
 
-def _experiment_rows() -> Iterator[tuple[str, str, str]]:
-    for path, info in leaves(Experiment):
-        key = ".".join(path).replace(".0", "[]")
-        default = None if info.is_required() else info.default
-        yield key, "" if info.is_required() else json.dumps(_plain(default)), info.description or ""
-
-
-def _table(rows: Iterator[tuple[str, str, str]]) -> str:
-    lines = ["| key | default | meaning |", "|---|---|---|"]
-    for key, default, meaning in rows:
-        cells = (f"`{key}`", f"`{default}`" if default else "required", meaning)
-        lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+def table(columns: str, rows: Iterable[tuple[str, ...]]) -> str:
+    """Write a table in Markdown; `columns` are their heads, with bars between them."""
+    lines = [f"| {columns} |", f"|{'---|' * len(columns.split('|'))}"]
+    for row in rows:
+        lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |")
     return "\n".join(lines) + "\n"
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """What a default looks like in YAML."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", by_alias=True, exclude_none=True)
     if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return value
 
 
-def _flow(value: Any) -> str:
+def flow(value: Any) -> str:
     """Write a value on one line, as people write YAML."""
     if isinstance(value, dict):
-        inner = ", ".join(f"{key}: {_flow(item)}" for key, item in value.items())
+        inner = ", ".join(f"{key}: {flow(item)}" for key, item in value.items())
         return f"{{{inner}}}"
     if isinstance(value, list):
-        return f"[{', '.join(map(_flow, value))}]"
+        return f"[{', '.join(map(flow, value))}]"
     if isinstance(value, str) and re.fullmatch(r"[A-Za-z][\w./-]*|[0-9]+[A-Za-z]+", value):
         return value
     return json.dumps(value)
-
-
-if __name__ == "__main__":
-    for target, content in outputs().items():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(content)
-    for leftover in stale():
-        leftover.unlink()

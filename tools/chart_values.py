@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from chart_kubernetes import Peer, Quantity, Resources, Selector, Texts, Values, resources
 from pydantic import Field
 
 from cloudrc.config.schema import Experiment, Mission, Profile
+from tools.chart_kubernetes import Peer, Quantity, Resources, Selector, Texts, Values, resources
 
 Seconds = Annotated[int, Field(ge=0)]
 ObjectName = Annotated[str, Field(pattern=r"^$|^[a-z]([-a-z0-9]*[a-z0-9])?$")]

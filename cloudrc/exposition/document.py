@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 
 from cloudrc.exposition.table import METRICS, ROLES, Metric
@@ -91,7 +90,3 @@ def _buckets(metrics: Iterable[Metric]) -> str:
         if metric.buckets
     ]
     return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    sys.stdout.write(page())

@@ -19,6 +19,7 @@ from operator import attrgetter
 from typing import Any, Literal, TypeAlias
 
 from cloudrc import records as rec
+from cloudrc.messages import MISSION_OVER, Cause
 from cloudrc.records import Record
 
 Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion"]
@@ -117,7 +118,7 @@ LINK_TOPICS = (
 """Topics whose records drivers make."""
 
 
-__all__ = ["TOPICS", "rows"]
+__all__ = ["MEANINGS", "SAMPLING", "TOPICS", "rows"]
 
 
 def _pose_and_twist(path: str) -> tuple[Field, ...]:
@@ -366,6 +367,68 @@ _TABLE = (
 
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Every topic of a recording by its name."""
+
+_WHEN_SENT = "departure of the telemetry, which is the instant of the measurement"
+_WHEN_TRUE = "instant of the physics step"
+_WHEN_COMMANDED = "departure of the command"
+_TICK, _PERIOD = "100 Hz", "100 Hz, while there is telemetry and a setpoint"
+_ON_EVENT = "once per event"
+SAMPLING: dict[str, tuple[str, str]] = {
+    "/odometry": (_WHEN_SENT, "100 Hz, in a session"),
+    "/telemetry": (_WHEN_SENT, "100 Hz, in a session"),
+    "/ground_truth": (_WHEN_TRUE, _TICK),
+    "/contact_force": (_WHEN_TRUE, _TICK),
+    "/reference": (_WHEN_TRUE, _TICK),
+    "/uplink_delay": ("arrival at cloud", "once per telemetry that arrives"),
+    "/downlink_delay": ("arrival at world", "once per command that arrives"),
+    "/command_applied": ("first physics step that follows the command", "once per command applied"),
+    "/guard": ("physics step in which the state changes", _ON_EVENT),
+    "/contact": ("the first odometry after the contact, at most 10 ms later", _ON_EVENT),
+    "/session": ("begin of the session at this end", _ON_EVENT),
+    "/estimated_odometry": (_WHEN_COMMANDED, _PERIOD),
+    "/setpoint_position": (_WHEN_COMMANDED, _PERIOD),
+    "/cmd_vel": (_WHEN_COMMANDED, _PERIOD),
+    "/delay_estimate": (_WHEN_COMMANDED, _PERIOD),
+    "/pid": (_WHEN_COMMANDED, _PERIOD),
+    "/mission": ("instant of the event", _ON_EVENT),
+    "/fault": ("when this end notices the fault", "once per fault; repetitions are only counted"),
+    "/count": ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"),
+    "/link": (
+        "when this end notices it",
+        "once per change; again when a session, a mission or a state of the guard begins",
+    ),
+    "/link_check": ("end of the interval that is judged", "every 5 s per quantity"),
+    "/lateness": ("when the deadline was handled", "100 Hz per end"),
+}
+"""Topic -> what the stamp of a row marks, and how often a row is written; for docs/topics.md."""
+MEANINGS: dict[tuple[str, str], str] = {
+    ("/telemetry", "echo_hold_ns"): "time since world applied that command; 0 if none",
+    ("/telemetry", "mission"): "number of the last request of the operator that world acted on",
+    ("/telemetry", "pipe_contacts"): "contacts with a pipe that began in this mission",
+    ("/telemetry", "touch_speed"): "of the tip when it first touched the board in this mission;"
+    " NaN before",
+    ("/telemetry", "mission_id"): "identity of the mission started last; 0 if none",
+    ("/telemetry", "reached"): "number of waypoints of that mission that world knows as reached;"
+    f" {MISSION_OVER} if the mission is over",
+    ("/telemetry", "cause"): "cause of the guard's state: "
+    + "; ".join(f"{cause:d} {cause.words}" for cause in Cause),
+    ("/command_applied", "velocity"): "as commanded, before the guard's caps, world frame",
+    ("/estimated_odometry", "position"): "predicted for the base, world frame",
+    ("/setpoint_position", "setpoint"): "position to fly to, world frame",
+    ("/reference", "reference"): "velocity after the guard's caps, world frame",
+    ("/mission", "event"): "started, reached, held, resumed, goto; at the end the outcome: done,"
+    " cancelled, timed_out, leg_timed_out, world_restarted, guard_stopped, emergency_stopped,"
+    " taken_over, end_lost",
+    ("/fault", "code"): "one word, for example estimator_failed, predictor_failed,"
+    " controller_failed, recorder, link_check, wall_clock, late",
+    ("/count", "name"): "what is counted, for example received, sent, malformed, late, stale,"
+    " repeated, old_epoch, range, recorder_dropped",
+    ("/link", "jitter"): "asked for at the time line's beginning, as in the profile",
+    ("/link", "loss"): "asked for at the time line's beginning, mean in the long run",
+    ("/link", "rate"): "asked for at the time line's beginning; NaN without a bottleneck",
+    ("/link_check", "datagrams"): "number of datagrams that the judgement rests on",
+}
+"""Topic and field -> a fuller meaning than the recorded definition has; for docs/topics.md."""
 
 _Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Values]]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import runpy
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,7 +13,6 @@ from tests.chart.conftest import (
     CHART,
     CI_VALUES,
     EXAMPLES,
-    ROOT,
     Object,
     laid_over,
     render,
@@ -38,12 +36,6 @@ def parts(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ..
     elif isinstance(node, list):
         for inner in node:
             yield from parts(inner, path)
-
-
-def test_nothing_is_stale() -> None:
-    """`make chart-docs` mends it."""
-    tool = runpy.run_path(str(ROOT / "tools" / "chart_docs.py"))
-    assert [path.name for path in tool["stale"]()] == []
 
 
 def test_the_schema_is_closed_at_every_level() -> None:

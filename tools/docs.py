@@ -1,0 +1,291 @@
+"""Write every generated file: `make docs` runs it, a test compares each file with it.
+
+docs/experiment.md comes from the models of `cloudrc/config/schema.py` and the signatures of the
+shipped plug-ins, docs/topics.md from `cloudrc/record/topics.py`, docs/metrics.md from
+`cloudrc/exposition/table.py`, the chart's values, schema and table from `tools/chart_values.py`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from annotated_types import MaxLen
+from pydantic import BaseModel
+
+from cloudrc import plugins
+from cloudrc.config import problems, shipped
+from cloudrc.config.overrides import KINDS
+from cloudrc.config.schema import Direction, Experiment, Mission, Profile
+from cloudrc.exposition import document as metrics
+from cloudrc.record.topics import MEANINGS, SAMPLING, TOPICS, Topic
+from tools import chart_docs
+from tools.chart_docs import ROOT, flow, plain, table
+
+PARTS = {
+    "mission": "#a-mission",
+    **dict.fromkeys(("uplink", "downlink"), "#one-direction-of-a-link"),
+    **dict.fromkeys(KINDS, "#plug-ins-of-the-cloud"),
+}
+"""Keys whose own keys have a section, and its link."""
+
+EXPERIMENT = """\
+# The experiment file
+
+<!-- Written by `make docs` from cloudrc/config/schema.py: edit that, or tools/docs.py. -->
+
+An experiment file is YAML and says what to fly: the mission, the robot and its guard, the link, the
+controller in the cloud, and what counts as a success. Every key has a default, so a file names only
+what differs from it. This is a complete file:
+
+<!-- test: my_experiment.yaml -->
+```yaml
+description: Two points over LTE, the uplink slower than usual
+seed: 7
+mission:                           # inline; or a name: pipes, steps, hover; or ./my_mission.yaml
+  waypoints:
+    - {position_m: [1.0, 0.0, 1.2]}
+    - {position_m: [1.0, 1.0, 1.2], dwell_s: 2.0}
+world: {scene: empty}
+link:
+  profile: lte                     # a shipped profile; or ./my_profile.yaml
+  uplink: {delay_ms: 60}           # this value replaces the profile's
+cloud:
+  estimator: split                 # a shipped plug-in; or ./my_estimator.py
+  controller: {name: pid, gain_p: [1.0, 1.0, 1.5]}   # a plug-in with parameters
+criteria: {contact: false}
+```
+
+```bash
+cloudrc run ./my_experiment.yaml --mode virtual
+cloudrc run ./my_experiment.yaml --mode virtual --set seed=8 --set link.profile=satellite
+```
+
+- **Names and paths.** `cloudrc run steps` flies a shipped experiment, `cloudrc run ./mine.yaml` a
+  file. A mission, a link profile or a plug-in is a shipped name, or a path: a text with a slash or
+  with the ending `.yaml` (`.py` for a plug-in). Robots and scenes have shipped names only.
+- **Relative paths** start at the folder of the file that contains them, in `--set` at the working
+  folder.
+- **`--set key=value`** sets one value after the file is read. The key has dots, the value is YAML.
+  The option may be repeated in any order. A number selects an entry of a list
+  (`mission.waypoints.0.dwell_s=2`); the number after the last entry appends one. A key below a name
+  opens it: `cloud.controller.speed_max=2` keeps the controller and sets its parameter.
+- **Precedence.** What stands under `link.uplink` and `link.downlink` replaces the values of the
+  profile; `--set` replaces those of every file.
+- **Errors.** An unknown key, a wrong type or a value out of range is refused before anything flies.
+  The message names the line and the nearest known key. All numbers are finite.
+- **Units** are in the name of a key and in the tables. Every delay of a link is one way.
+- **The run's folder** keeps `config.yaml`: the experiment with every value filled in. `cloudrc run`
+  with that file flies the same run again.
+
+The chart takes the same keys under `experiment`. `cloudrc list` prints all shipped names.
+"""
+
+TOPIC_HEAD = """\
+# The topics of a recording
+
+<!-- Written by `make docs` from cloudrc/record/topics.py: edit that, or tools/docs.py. -->
+
+`mission.mcap` holds ROS 2 messages (CDR). Foxglove and Lichtblick open it; Python reads it without
+ROS:
+
+```python
+from pathlib import Path
+
+from cloudrc.record.columns import Recording
+
+recording = Recording.read(Path("runs/latest/mission.mcap"))
+recording["/odometry"]["position"]  # numpy, shape (n, 3)
+```
+
+Every topic is a table. Its first column is `stamp_ns` [ns]; the others are listed below. An `int`
+is an int64, a `float` a float64; a `vector` has three floats, a `quaternion` four (wxyz).
+
+- **Clocks.** Each end writes its own file (`world.mcap`, `cloud.mcap`) with stamps of its own
+  monotonic clock. `mission.mcap` merges both: there every row's stamp is on world's clock. A stamp
+  in another column stays on the clock that its meaning names.
+- **Frames.** World frame: x forward, y left, z up. Body frame: the same axes, fixed to the robot.
+- **Modes.** `/link`, `/link_check` and `/lateness` exist in real time only. In the cluster the
+  topics with a row per period or per datagram are recorded while the robot flies and for 90 s after
+  it.
+- **Messages.** The header's stamp is the row's, its frame is `world`. The messages of
+  `cloudrc_msgs` have the columns as fields. The columns of ROS's own messages are in these fields:
+
+| message | column | field |
+|---|---|---|
+| `nav_msgs/msg/Odometry` | `position` | `pose.pose.position` |
+| | `orientation_wxyz` | `pose.pose.orientation`, in ROS's order xyzw |
+| | `velocity` | `twist.twist.linear`, in the frame `base_link` as ROS has it |
+| | `angular_velocity_body` | `twist.twist.angular`; NaN where the topic has no such column |
+| `geometry_msgs/msg/TwistStamped` | `reference` or `command` | `twist.linear` |
+| | `yaw_rate` | `twist.angular.z` |
+| `geometry_msgs/msg/PointStamped` | `setpoint` | `point` |
+"""
+ENDS = {"world": "world", "cloud": "cloud", "either": "world and cloud"}
+CLOCKS = {"world": "world's", "cloud": "cloud's", "either": "that of the end that writes it"}
+
+
+def outputs() -> dict[Path, str]:
+    """Make everything that `make docs` writes: file -> text."""
+    pages = {
+        ROOT / "docs" / "experiment.md": experiment_page(),
+        ROOT / "docs" / "topics.md": topics_page(),
+        ROOT / "docs" / "metrics.md": metrics.page(),
+    }
+    return pages | chart_docs.outputs()
+
+
+def leftovers() -> list[Path]:
+    """List the copies in the chart whose originals are gone."""
+    return [path for path in (chart_docs.CHART / "files").glob("*/*.yaml") if path not in outputs()]
+
+
+def experiment_page() -> str:
+    """Write the page of all keys of an experiment, a mission and a link profile."""
+    own = [key for key, info in Experiment.model_fields.items() if not _is_section(info.annotation)]
+    blocks = [EXPERIMENT, "## Top level\n", _keys(Experiment, own)]
+    for key, info in Experiment.model_fields.items():
+        if _is_section(info.annotation):
+            blocks += [f"## `{key}`\n", _summary(info.annotation), _keys(Experiment, [key])]
+    blocks += ["## Plug-ins of the cloud\n", _plug_ins()]
+    blocks += ["## A mission\n", _summary(Mission), _keys(Mission)]
+    blocks += ["## A link profile\n", _summary(Profile), _keys(Profile)]
+    blocks += ["## One direction of a link\n", _summary(Direction), _keys(Direction)]
+    blocks += ["How each key acts: [link.md](link.md).\n", "## Shipped files\n", _shipped()]
+    return "\n".join(blocks)
+
+
+def _is_section(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _summary(model: Any) -> str:
+    return f"{(inspect.getdoc(model) or '').partition(chr(10) * 2)[0]}\n"
+
+
+def _keys(model: type[BaseModel], chosen: list[str] | None = None) -> str:
+    """Write the table of a model's keys, or of those at and below the `chosen` ones."""
+    paths = []
+    for leaf, _ in problems.leaves(model):
+        for path in (leaf[:depth] for depth in range(1, len(leaf) + 1)):
+            is_elsewhere = any(key in PARTS for key in path[:-1])
+            if path[-1] != "0" and path not in paths and not is_elsewhere:
+                paths.append(path)
+    rows = [_row(model, path) for path in paths if chosen is None or path[0] in chosen]
+    return table("key | value | unit | default | meaning", filter(None, rows))
+
+
+def _row(model: type[BaseModel], path: tuple[str, ...]) -> tuple[str, ...] | None:
+    info = problems.field_at(model, path)
+    if info is None or not info.description:
+        return None  # a section without a word of its own
+    value, _, unit = problems.expectation(model, path).removeprefix("must be ").partition(" [")
+    unit = unit.removesuffix("]")
+    meaning = info.description.replace(f" [{unit}]", "") if unit else info.description
+    key = ".".join(path).replace(".0", "[]")
+    default = "required" if info.is_required() else f"`{_default(info.default)}`"
+    return f"`{key}`", _value(model, path, value), unit, default, meaning
+
+
+def _default(value: Any) -> str:
+    return "{}" if isinstance(value, BaseModel) else flow(plain(value))
+
+
+def _value(model: type[BaseModel], path: tuple[str, ...], words: str) -> str:
+    """Put what an error message asks for into a cell: shorter, and with a link to its keys."""
+    if words.startswith("a list of"):
+        item = problems.expectation(model, (*path, "0")).partition(" [")[0]
+        words += item.removeprefix("must be a number")
+    for limit in getattr(problems.field_at(model, path), "metadata", ()):
+        if isinstance(limit, MaxLen):
+            words += f" of at most {limit.max_length}"
+    words = re.sub(r">= (\S+) and <= (\S+)", r"\1 to \2", words)
+    words = re.sub(r"\b(?:an?|one of) ", "", words).replace(str(2**53), "2^53")
+    mapping = f"[mapping]({PARTS[path[-1]]})" if path[-1] in PARTS else "mapping"
+    return re.sub(r"'(\w+)'", r"`\1`", words).replace("mapping of keys", mapping)
+
+
+def _plug_ins() -> str:
+    """Write the tables of the shipped plug-ins and their parameters."""
+    blocks = [
+        "A plug-in is a name, or a mapping of `name` and its parameters. A file of your own has\n"
+        "the parameters of its `build`: [plugins.md](plugins.md).\n"
+    ]
+    for key, kind in KINDS.items():
+        rows: list[tuple[str, ...]] = []
+        for name in _files(kind):
+            rows.append((f"`{name}`", "", "", plugins.describe(kind, name)))
+            texts = _arguments(plugins.find(kind, name).build)
+            for parameter in plugins.signature(kind, name).parameters.values():
+                default = f"`{flow(plain(parameter.default))}`"
+                rows.append(("", f"`{parameter.name}`", default, texts[parameter.name]))
+        blocks.append(table(f"`cloud.{key}` | parameter | default | meaning", rows))
+    return "\n".join(blocks)
+
+
+def _files(kind: str) -> list[str]:
+    """Name the plug-ins that ship; `plugins.names` would name the installed ones, too."""
+    folder = ROOT / plugins.PACKAGES[kind].replace(".", "/")
+    return sorted(path.stem for path in folder.glob("[!_]*.py"))
+
+
+def _arguments(function: Any) -> dict[str, str]:
+    """Read the texts of the arguments from a docstring in Google style."""
+    section = (inspect.getdoc(function) or "").partition("Args:\n")[2].partition("\n\n")[0]
+    found = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE)
+    return {name: " ".join(text.split()) for name, text in found}
+
+
+def _shipped() -> str:
+    blocks = []
+    for kind in ("experiment", "mission", "profile"):
+        rows = ((f"`{name}`", shipped.describe(kind, name)) for name in shipped.names(kind))
+        blocks.append(table(f"{kind} | description", rows))
+    for kind in ("robot", "scene"):
+        blocks.append(
+            f"{kind.capitalize()}s: {', '.join(f'`{n}`' for n in shipped.names(kind))}.\n"
+        )
+    return "\n".join(blocks)
+
+
+def topics_page() -> str:
+    """Write the page of all topics."""
+    blocks = [TOPIC_HEAD, "## All topics\n", table(*_overview())]
+    for topic in TOPICS.values():
+        text = re.sub(r", (world's clock|cloud's clock|clock of its end)", "", topic.text)
+        blocks += [f"## `{topic.name}`\n", f"{text}.\n", _facts(topic)]
+        blocks.append(table("field | type | unit | meaning", _columns(topic)))
+    return "\n".join(blocks)
+
+
+def _overview() -> tuple[str, Iterator[tuple[str, ...]]]:
+    rows = (
+        (f"[`{name}`](#{name[1:]})", f"`{topic.ros_type}`", ENDS[topic.end], SAMPLING[name][1])
+        for name, topic in TOPICS.items()
+    )
+    return "topic | message | written by | how often", rows
+
+
+def _facts(topic: Topic) -> str:
+    stamp, often = SAMPLING[topic.name]
+    return (
+        f"- Message: `{topic.ros_type}`, written by {ENDS[topic.end]}, {often}.\n"
+        f"- Stamp: {stamp}. Clock: {CLOCKS[topic.end]}.\n"
+    )
+
+
+def _columns(topic: Topic) -> Iterator[tuple[str, ...]]:
+    for field in topic.fields:
+        meaning = MEANINGS.get((topic.name, field.name), field.text)
+        yield f"`{field.name}`", field.kind, field.unit, meaning
+
+
+if __name__ == "__main__":
+    for target, content in outputs().items():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(content)
+    for leftover in leftovers():
+        leftover.unlink()
