@@ -6,7 +6,7 @@ import errno
 import sys
 from collections.abc import Sequence
 
-from cloudrc.cli.output import harmless, discard_output
+from cloudrc.cli.output import discard_output, harmless
 from cloudrc.cli.parser import COMMANDS, build, unknown
 from cloudrc.errors import BadInputError, CloudrcError
 

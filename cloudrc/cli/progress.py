@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import TextIO
 
-from cloudrc.cli.output import terminal_columns, harmless, is_live, paint, unread_is_fine
+from cloudrc.cli.output import harmless, is_live, paint, terminal_columns, unread_is_fine
 from cloudrc.drivers.feed import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import (

@@ -31,7 +31,7 @@ from cloudrc.cli.runtime import (
     listening,
     open_exporter,
     process_arguments,
-    resolved,
+    resolve_address,
     warn_if_exposed,
 )
 from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
@@ -85,7 +85,10 @@ def execute(options: argparse.Namespace) -> int:
     stop, exporter = StopSignal(), open_exporter(options, "link")
     experiment = read_experiment(str(options.config))
     uplink, downlink = assembly.build_links(experiment)
-    world, cloud = resolved("--world", options.world), resolved("--cloud", options.cloud)
+    world, cloud = (
+        resolve_address("--world", options.world),
+        resolve_address("--cloud", options.cloud),
+    )
     settle()
     if options.fifo:  # before the relay is made, which looks whether it has it
         _run_first()

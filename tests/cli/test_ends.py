@@ -14,7 +14,7 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.cli.main import main
-from cloudrc.cli.runtime import _open_peer, open_exporter, resolved, size
+from cloudrc.cli.runtime import _open_peer, open_exporter, resolve_address, size
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent
@@ -113,7 +113,7 @@ def test_a_name_that_cannot_be_resolved_is_said_at_the_start(
 
 def test_a_label_that_is_too_long_is_no_name() -> None:
     with pytest.raises(BadInputError, match=r"cannot be resolved \(not a name"):
-        resolved("--peer", ("x" * 64 + ".test", 1))
+        resolve_address("--peer", ("x" * 64 + ".test", 1))
 
 
 def test_the_name_of_a_peer_is_asked_for_once_and_never_by_the_loop(

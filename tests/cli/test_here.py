@@ -49,7 +49,7 @@ def test_the_emergency_stop_reaches_the_only_run_from_any_folder(
         assert len(api.alarms) == 1
     said = capsys.readouterr()
     assert said.out.startswith("emergency stop: the robot is told")
-    assert said.err == f"cloudrc: the run that flies in {tmp_path / 'out'}\n"
+    assert said.err == f"cloudrc: using the run in {tmp_path / 'out'}\n"
 
 
 def test_of_several_one_has_to_be_named(tmp_path: Path, capsys: Printed) -> None:
@@ -154,7 +154,7 @@ def test_a_link_is_set_on_the_only_run_that_flies(tmp_path: Path, capsys: Printe
     with local.announced(run), local.announced(tmp_path / "without a link"):
         assert main(SET) == 2
         said = capsys.readouterr().err
-        assert said.startswith(f"cloudrc: the run that flies in {run}\n")
+        assert said.startswith(f"cloudrc: using the run in {run}\n")
         assert f"{run}: no link is up there (yet); wait for the start" in said
         with local.announced(with_link(tmp_path / "b")):
             assert main(SET) == 2
