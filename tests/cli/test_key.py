@@ -33,7 +33,7 @@ def test_a_second_rotation_within_the_overlap_is_refused_so_that_no_end_is_left_
         wall[0] += later
         capsys.readouterr()
         assert main(["key", "new", str(path), "--overlap", "60"]) == 2
-        said = f"key {Key(FIRST).name}, the one before, is valid for {left} s more; wait, or revoke"
+        said = f"the old key {Key(FIRST).name} is valid for {left} s more; wait, or revoke"
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"cloudrc: error: {path}: {said}")
         assert "cloudrc key new FILE --drop" in line
