@@ -17,7 +17,7 @@ _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1", "dim": "2"}
 
 def output_argument(parser: argparse.ArgumentParser, what: str = "") -> None:
     """Declare `--output`; `what` describes further effects of the format."""
-    text = f"{what} (default: table)" if what else "default: table"
+    text = f"{what} (default: table)" if what else "output format (default: table)"
     parser.add_argument("-o", "--output", choices=FORMATS, default="table", help=text)
 
 

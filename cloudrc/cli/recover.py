@@ -1,4 +1,4 @@
-"""`cloudrc recover FILE`: write a clean copy of a truncated or damaged recording."""
+"""`cloudrc recover FILE`: write a clean copy of a damaged recording."""
 
 from __future__ import annotations
 

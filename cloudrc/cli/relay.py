@@ -70,7 +70,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fifo",
         action="store_true",
-        help="use real-time priority (SCHED_FIFO), if permitted: less lateness",
+        help="use real-time priority (SCHED_FIFO), if permitted: less timing error",
     )
 
 
