@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from cloudrc.cli.output import discard_output, harmless
-from cloudrc.cli.parser import COMMANDS, build, unknown
+from cloudrc.cli.parser import COMMANDS, build, describe_unknown
 from cloudrc.errors import BadInputError, CloudrcError
 
 INTERRUPTED = 130
@@ -56,7 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _dispatch(given: Sequence[str]) -> int:
     name = next((word for word in given if not word.startswith("-")), None)
     if name is not None and name not in COMMANDS:
-        raise BadInputError(f"unknown command: {unknown(name, COMMANDS)}; see 'cloudrc --help'")
+        raise BadInputError(
+            f"unknown command: {describe_unknown(name, COMMANDS)}; see 'cloudrc --help'"
+        )
     parser = build([name] if name else [])
     if not given:
         parser.print_help()

@@ -104,7 +104,7 @@ def say(line: str, stream: TextIO | None = None) -> None:
     print(harmless(line), file=stream, flush=True)
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Write a value of any unit with four significant digits, without exponent if possible."""
     if float(value).is_integer() and abs(value) < 1e5:
         return f"{value:.0f}"  # counts

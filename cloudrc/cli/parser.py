@@ -67,11 +67,11 @@ class Parser(argparse.ArgumentParser):
         if choice:
             argument, given, valid = choice.groups()
             names = [name.strip(" '") for name in valid.split(",")]
-            message = f"{argument}: {unknown(given, names)}"
+            message = f"{argument}: {describe_unknown(given, names)}"
         raise BadInputError(f"{message}; see '{self.prog} --help'")
 
 
-def unknown(given: str, names: Iterable[str]) -> str:
+def describe_unknown(given: str, names: Iterable[str]) -> str:
     """Say that a name is unknown and suggest the nearest known one, or all."""
     known = sorted(names)
     near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)

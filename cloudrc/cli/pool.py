@@ -37,7 +37,7 @@ def _hung_up(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def end_with(parent: int) -> None:
+def exit_with_parent(parent: int) -> None:
     """End this worker of a pool as soon as its parent has ended, even if it was killed.
 
     Args:
@@ -54,7 +54,7 @@ def end_with(parent: int) -> None:
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
-AHEAD = 1000
+BATCH_MAX = 1000
 """Maximum number of pieces of work in a pool. Before Python 3.11.6, a pool hangs if it gets more
 than 16,384 at once (cpython issue 105829)."""
 WORKER_KILLED = "a worker was killed, perhaps by the kernel because memory ran out"
@@ -92,7 +92,7 @@ def in_order(
         # No `pool.map`: if a worker dies, it races with the pool over failed calls.
         waiting = iter(work)
         # In batches: a broken pool accepts no more work, and its finished results come first.
-        while futures := deque(pool.submit(function, each) for each in islice(waiting, AHEAD)):
+        while futures := deque(pool.submit(function, each) for each in islice(waiting, BATCH_MAX)):
             while futures:
                 yield futures.popleft().result()
     except KeyboardInterrupt:  # Ctrl-C ends everything at once
@@ -110,4 +110,4 @@ def _begin(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    end_with(parent)
+    exit_with_parent(parent)

@@ -193,7 +193,7 @@ ConfigMap, which holds at most 1 MiB."""
 
 
 class EndRuntime(NamedTuple):
-    """The surroundings of an end: everything it needs before it is built, and to fly.
+    """Everything that an end needs, both to be built and to fly.
 
     Attributes:
         options: The command's options.
@@ -264,7 +264,7 @@ def open_end(options: argparse.Namespace, name: str) -> EndRuntime:
     return EndRuntime(options, name, exporter, experiment, clock, recorder, keys, peer)
 
 
-def suite() -> int:
+def fast_suite() -> int:
     """Give the cipher suite that is fast on this machine."""
     from cloudrc.drivers.machine import has_fast_aes
     from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.find_run import new_folder
-from cloudrc.cli.output import number, say, table, unread_is_fine, written
-from cloudrc.cli.pool import AHEAD, WORKER_KILLED, WorkerDiedError, end_with
+from cloudrc.cli.output import format_number, say, table, unread_is_fine, written
+from cloudrc.cli.pool import BATCH_MAX, WORKER_KILLED, WorkerDiedError, exit_with_parent
 from cloudrc.cli.summary import EXIT_CODES
 
 Report: TypeAlias = Mapping[str, Any]
@@ -80,10 +80,10 @@ def as_table(summary: Mapping[str, Any]) -> str:
     rows = [("number", "median", "95 % interval", "unit")]
     for name, entry in summary["numbers"].items():
         bounds = entry["interval"]
-        between = f"{number(bounds[0])} .. {number(bounds[1])}" if bounds else "-"
+        between = f"{format_number(bounds[0])} .. {format_number(bounds[1])}" if bounds else "-"
         unit = "" if entry["unit"] == "1" else entry["unit"]
         note = "" if entry["count"] == summary["count"] else f"  ({entry['count']} runs)"
-        rows.append((name, number(entry["median"]), between, unit + note))
+        rows.append((name, format_number(entry["median"]), between, unit + note))
     enough = any(entry["interval"] for entry in summary["numbers"].values())
     method = METHOD if enough else "an interval needs 6 seeds or more"
     return f"{table(rows, right=(1, 2))}\n\n{method}\ndone {summary['done']}/{summary['count']}"
@@ -159,13 +159,13 @@ def _reports(
     context = multiprocessing.get_context("spawn")
     workers = min(os.cpu_count() or 1, len(seeds))
     with _isolated_start():  # the pool starts multiprocessing's resource tracker
-        pool = ProcessPoolExecutor(workers, context, end_with, (os.getpid(),))
+        pool = ProcessPoolExecutor(workers, context, exit_with_parent, (os.getpid(),))
     with pool:
         try:
             waiting = (pool.submit(_fly_one, experiment, overrides, folder, seed) for seed in seeds)
             while True:
                 with _isolated_start():
-                    flying = list(islice(waiting, AHEAD))
+                    flying = list(islice(waiting, BATCH_MAX))
                 if not flying:
                     break
                 for future in as_completed(flying):

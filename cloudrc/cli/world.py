@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cloudrc.cli.output import unread_is_fine
 from cloudrc.cli.parser import read_from
-from cloudrc.cli.runtime import end_arguments, open_end, suite
+from cloudrc.cli.runtime import end_arguments, fast_suite, open_end
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +39,7 @@ def execute(options: argparse.Namespace) -> int:
         runtime.clock,
         os.urandom(16),
         ring=runtime.keys.ring,
-        suite=suite(),
+        suite=fast_suite(),
         next_epoch=_epochs(options.epochs) if options.epochs else None,
     )
     world = assembly.build_world(runtime.experiment, identity, time.monotonic_ns)

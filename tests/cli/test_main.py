@@ -10,7 +10,7 @@ import pytest
 
 from cloudrc.cli.faults import SEED_MAX
 from cloudrc.cli.main import INTERNAL, main
-from cloudrc.cli.parser import COMMANDS, build, unknown
+from cloudrc.cli.parser import COMMANDS, build, describe_unknown
 from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError
 
 HEAVY = ("numpy", "mujoco", "matplotlib", "pydantic", "yaml", "kubernetes", "rosbags", "mcap")
@@ -156,4 +156,4 @@ def test_a_closed_pipe_is_no_error() -> None:
 
 
 def test_unknown_lists_all_names_if_none_is_similar() -> None:
-    assert unknown("x", ["bash", "fish"]) == "no 'x'; choose bash or fish"
+    assert describe_unknown("x", ["bash", "fish"]) == "no 'x'; choose bash or fish"

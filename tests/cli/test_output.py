@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from cloudrc.cli.main import main
-from cloudrc.cli.output import is_live, number, paint, table
+from cloudrc.cli.output import format_number, is_live, paint, table
 
 
 class Terminal(io.StringIO):
@@ -35,7 +35,7 @@ def test_columns_line_up_and_numbers_are_right_aligned() -> None:
     [(0.1474, "0.1474"), (26.96, "26.96"), (0.0, "0"), (1234.5, "1234"), (-3e-7, "-3.000e-07")],
 )
 def test_numbers_have_four_digits(value: float, text: str) -> None:
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 @pytest.mark.parametrize("variable", ["NO_COLOR", "CI"])

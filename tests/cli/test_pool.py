@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.cli.pool import AHEAD, WorkerDiedError, in_order
+from cloudrc.cli.pool import BATCH_MAX, WorkerDiedError, in_order
 from cloudrc.faults.document import Result
 from cloudrc.faults.fuzz import Finding
 from cloudrc.faults.scenario import Outcome, find
@@ -59,11 +59,11 @@ class _CountingWork(list[int]):
 
 
 def test_much_work_is_submitted_in_batches() -> None:
-    work = _CountingWork(range(3 * AHEAD))
+    work = _CountingWork(range(3 * BATCH_MAX))
     done = in_order(_process_id, work, 2)
     next(done)
-    assert work.taken == AHEAD
-    assert sum(1 for _ in done) == 3 * AHEAD - 1
+    assert work.taken == BATCH_MAX
+    assert sum(1 for _ in done) == 3 * BATCH_MAX - 1
 
 
 def test_there_are_no_more_processes_than_cores() -> None:
@@ -93,7 +93,7 @@ def _slowly(done: Iterator[int]) -> Iterator[int]:
 
 
 def test_results_before_a_worker_was_killed_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cloudrc.cli.pool.AHEAD", KILLED)
+    monkeypatch.setattr("cloudrc.cli.pool.BATCH_MAX", KILLED)
     results: list[int] = []
     with pytest.raises(WorkerDiedError):
         results.extend(_slowly(in_order(_kill_at_five, range(9), 2)))

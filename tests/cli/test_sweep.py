@@ -43,7 +43,7 @@ def test_many_seeds_become_one_table(folder: Path, capsys: pytest.CaptureFixture
 def test_seeds_beyond_the_first_batch_are_flown_too(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sweep, "AHEAD", 2)
+    monkeypatch.setattr(sweep, "BATCH_MAX", 2)
     assert main(["run", "steps", "--seeds", "5", *SHORT, "--out", "sweep"]) == 0
     document = json.loads((folder / "sweep/sweep.json").read_text())
     assert [run["seed"] for run in document["runs"]] == [1, 2, 3, 4, 5]
