@@ -1,6 +1,5 @@
-"""The command line: arguments come in, text and an exit code go out; one file per command.
+"""The command line: one module per command.
 
-A command's file has `arguments(parser)` and `execute(options) -> exit code`. It imports at its
-top only what is quick; numpy, mujoco, matplotlib, pydantic and yaml are imported where they are
-used, so that `cloudrc --help` answers at once.
+A command's module has `arguments(parser)` and `execute(options) -> exit code`. It imports numpy,
+mujoco, matplotlib, pydantic and yaml only inside functions, so that `cloudrc --help` stays fast.
 """

@@ -1,14 +1,8 @@
-"""`cloudrc bench`: what the closed loop costs on this machine, against physics alone.
+"""`cloudrc bench`: measure what the closed loop and its datagrams cost on this machine.
 
-The yardstick is `mj_step` in C (`mujoco.rollout`, one thread), given the very thrusts and drag that
-the loop gave to the simulator. It has to end in the same bits, or the comparison is not fair. All
-parts are measured in turns, and of each the fastest counts.
-
-What a datagram costs: layout and seal of telemetry, against the paper's pickled ROS message.
-
-Nothing of cloudrc may import pickle. The one exception is the yardstick, a program for a process of
-its own, which unpickles nothing but the constants that it has just pickled itself.
-Classes as ROS 1 generates them, an Odometry of the same numbers, as large as a real one (1 kB).
+The reference of the loop is `mj_step` in C (`mujoco.rollout`, one thread), replaying the thrusts
+and drag of the same flight; it must end in the same bits. The reference of a datagram is the
+paper's pickled ROS message. Parts are measured in turns, and the fastest time of each counts.
 """
 
 from __future__ import annotations
@@ -36,9 +30,11 @@ if TYPE_CHECKING:
 
 
 CALLS = 400
+"""Number of calls that are timed together."""
 REFERENCE_CALLS = 40
-"""Fewer: both then run for about a millisecond, in which a busy machine leaves both alone."""
+"""Likewise for the reference: both take about 1 ms, so a busy machine rarely interrupts them."""
 ROUNDS = 60
+"""Number of timings of each part."""
 
 REFERENCE = """
 import pickle, sys, timeit
@@ -76,17 +72,22 @@ for _ in sys.stdin:
     cost = timeit.timeit(lambda: pickle.loads(pickle.dumps(message, 4)), number=calls) / calls
     print(len(data), cost, flush=True)
 """
+"""The paper's tunnel, run in a separate process: nothing of cloudrc may import pickle.
+
+Its classes are those that ROS 1 generates, with an Odometry of the usual size (1 kB). It unpickles
+only the constants that it has just pickled.
+"""
 
 
 class WireCost(NamedTuple):
-    """What one odometry costs on its way, both ends together.
+    """Processor time of one odometry message, both ends together.
 
     Attributes:
-        sealed: Layout, seal, open and reading [s].
-        unsealed: The same without the seal, as in virtual time [s].
-        pickled: The paper's way: pickled and unpickled [s].
-        size: Of the datagram [bytes].
-        pickled_size: Of the pickled message [bytes].
+        sealed: Encode, seal, open and decode [s].
+        unsealed: Encode and decode without the seal, as in virtual time [s].
+        pickled: Pickle and unpickle, as in the paper [s].
+        size: Size of the datagram [bytes].
+        pickled_size: Size of the pickled message [bytes].
     """
 
     sealed: float
@@ -97,12 +98,12 @@ class WireCost(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Sealed to pickled [1]."""
+        """Give the ratio of sealed to pickled [1]."""
         return self.sealed / self.pickled
 
 
 def measure_wire(rounds: int = ROUNDS) -> WireCost:
-    """Measure all three in turns; of each the fastest round counts."""
+    """Measure all three in turns; the fastest round of each counts."""
     from cloudrc.messages import GuardState, Odometry, Telemetry
     from cloudrc.tunnel import codec
     from cloudrc.tunnel.codec import Direction, Kind
@@ -116,17 +117,17 @@ def measure_wire(rounds: int = ROUNDS) -> WireCost:
         end.begin(1, Agreement(bytes(16), bytes(16)))
 
     def cost(ends: tuple[Session, Session]) -> float:
-        seal, opened = ends[0].seal, ends[1].open
+        seal, unseal = ends[0].seal, ends[1].open
         encode, decode = codec.encode_telemetry, codec.decode_telemetry
 
-        def there() -> None:
-            decode(opened(seal(kind, encode(telemetry)))[4])
+        def send_and_receive() -> None:
+            decode(unseal(seal(kind, encode(telemetry)))[4])
 
-        return timeit.timeit(there, number=CALLS) / CALLS
+        return timeit.timeit(send_and_receive, number=CALLS) / CALLS
 
     costs = []
-    words = interpreter("-c", REFERENCE, str(REFERENCE_CALLS))
-    with subprocess.Popen(words, stdin=-1, stdout=-1, text=True) as child:
+    command = interpreter("-c", REFERENCE, str(REFERENCE_CALLS))
+    with subprocess.Popen(command, stdin=-1, stdout=-1, text=True) as child:
         assert child.stdin is not None
         assert child.stdout is not None
         for _ in range(rounds):
@@ -140,22 +141,30 @@ def measure_wire(rounds: int = ROUNDS) -> WireCost:
 
 
 EPILOG = """\
-raw replays the thrusts and the drag of the very same flight in C and has to
-end in the same bits. Close other programs before you compare two machines;
-ratios of one run can be compared anywhere."""
-STEP = 0.002  # [s] of physics
+'raw mj_step' replays the thrusts and the drag of the same flight in C and must
+end in the same bits. Close other programs before you compare two machines; the
+ratios of one run are comparable between machines."""
+STEP = 0.002
+"""Step of the physics [s]."""
 LIMIT_NS = 120_000_000_000
+"""Time limit of a flight [ns]."""
 CLOCK = bytes(16)
 
-Play = Callable[[], int]  # does its work and says how many physics steps it took
+Play = Callable[[], int]
+"""Does the work of a part and gives its number of physics steps."""
 Keep = Callable[["list[Record]"], object]
+"""Stores records."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     output_argument(parser)
     parser.add_argument(
-        "--repeats", type=count, default=7, metavar="N", help="of each part (default: 7)"
+        "--repeats",
+        type=count,
+        default=7,
+        metavar="N",
+        help="how often to measure each part (default: 7)",
     )
 
 
@@ -182,16 +191,16 @@ def execute(options: argparse.Namespace) -> int:
     print(table(rows, right=(1, 2, 3)))
     print("\nraw replayed the same controls and ended in the same bits")
     print(
-        f"\none odometry, both ends: laid out, sealed, opened and read {wire.sealed * 1e6:.2f} us"
+        f"\none odometry, both ends: encode, seal, open and decode {wire.sealed * 1e6:.2f} us"
         f" ({wire.size} bytes), without the seal {wire.unsealed * 1e6:.2f} us;\n"
-        f"pickled as in the paper {wire.pickled * 1e6:.1f} us ({wire.pickled_size} bytes):"
-        f" {wire.ratio:.3f} of it"
+        f"pickled as in the paper {wire.pickled * 1e6:.1f} us ({wire.pickled_size} bytes),"
+        f" ratio {wire.ratio:.3f}"
     )
     return 0
 
 
 def measure(experiment: ResolvedExperiment, repeats: int) -> dict[str, float]:
-    """Fly and replay in turns.
+    """Measure flights and the replay in turns.
 
     Returns:
         Processor time per physics step [s], by part.
@@ -224,7 +233,7 @@ def _cost(play: Play) -> float:
 
 
 def _replay(experiment: ResolvedExperiment) -> Play:
-    """Fly once with a tape, to be replayed."""
+    """Fly once, record the controls and give the function that replays them."""
     import numpy as np
 
     from cloudrc.world.simulator import replay
@@ -244,7 +253,7 @@ def _replay(experiment: ResolvedExperiment) -> Play:
 
 
 def _flight(experiment: ResolvedExperiment, keep: Keep) -> Play:
-    """Get a flight ready whose records are kept in some way."""
+    """Prepare a flight whose records go to `keep`."""
     _, cloud, run = _assemble(experiment)
 
     def sink(of_world: list[Record], of_cloud: list[Record]) -> None:

@@ -1,4 +1,4 @@
-"""`cloudrc cloud`: the remote controller's process; ends when its mission is over."""
+"""`cloudrc cloud`: run the remote controller's process until its mission is over."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.runtime import end_arguments, open_end, suite
+from cloudrc.cli.runtime import end_arguments, fast_suite, open_end
 
 if TYPE_CHECKING:
     from cloudrc.cloud.endpoint import Operator
@@ -19,12 +19,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--teleop",
         type=Path,
         metavar="DIR",
-        help="missions come from 'cloudrc teleop --socket DIR' (default: the experiment's, here)",
+        help="take missions from 'cloudrc teleop --socket DIR' (default: fly the experiment's)",
     )
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Control."""
+    """Run cloud."""
     from cloudrc.drivers.process import StopSignal
 
     stop = StopSignal()
@@ -36,21 +36,21 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.drivers.teleop import LastWord
     from cloudrc.messages import GuardState
 
-    opened = open_end(options, "cloud")
-    identity = CloudIdentity(opened.clock, os.urandom(16), opened.keys.ring, suite())
-    teleop = _join(options.teleop) if options.teleop else None
-    cloud = assembly.build_cloud(opened.experiment, identity, time.monotonic_ns, teleop)
+    runtime = open_end(options, "cloud")
+    identity = CloudIdentity(runtime.clock, os.urandom(16), runtime.keys.ring, fast_suite())
+    teleop = _connect_teleop(options.teleop) if options.teleop else None
+    cloud = assembly.build_cloud(runtime.experiment, identity, time.monotonic_ns, teleop)
 
     def flies() -> bool:
         return cloud.guard is GuardState.TRACK
 
-    ends = LastWord(stop, flies) if teleop else stop
-    opened.fly(cloud, ends, flies, over=lambda: cloud.mission_over)
+    should_stop = LastWord(stop, flies) if teleop else stop
+    runtime.fly(cloud, should_stop, flies, over=lambda: cloud.mission_over)
     return 0
 
 
-def _join(folder: Path) -> Operator:
-    """Join the process of teleop, which may come and go."""
+def _connect_teleop(folder: Path) -> Operator:
+    """Connect to the process of teleop, which may restart at any time."""
     import time
 
     from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer

@@ -1,4 +1,4 @@
-"""The flags that name a place in a cluster, for every command that goes there."""
+"""The flags that name a release in a cluster."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
 
 READY_LIMIT = 300.0
-"""For the pods of a release to become ready, where the user does not say [s]."""
+"""Default time for the pods of a release to become ready [s]."""
 
 
 def place_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags that name a release; kubectl's own names and defaults."""
-    group = parser.add_argument_group("in a cluster (KUBECONFIG is honoured)")
+    """Declare the flags that name a release, as in kubectl."""
+    group = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
     group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
     group.add_argument(
         "-n", "--namespace", metavar="NAME", help="namespace (default: the context's, or default)"
@@ -28,18 +28,18 @@ def place_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def timeout_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare how long to wait for a release."""
+    """Declare `--timeout`, the time for a release to become ready."""
     parser.add_argument(
         "--timeout",
         type=_seconds,
         default=READY_LIMIT,
         metavar="S",
-        help=f"seconds for the release to become ready (default: {READY_LIMIT:g})",
+        help=f"seconds to wait until the release is ready (default: {READY_LIMIT:g})",
     )
 
 
 def place(options: argparse.Namespace) -> Release:
-    """Find the release that the flags name.
+    """Give the release that the flags name.
 
     Raises:
         MissingPrerequisiteError: If the Kubernetes client or a kubeconfig is missing.
@@ -56,5 +56,5 @@ def _seconds(text: str) -> float:
     except ValueError:
         value = 0.0
     if not 0 < value <= 86_400:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds, above 0")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds above 0")
     return value

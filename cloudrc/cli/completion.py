@@ -1,4 +1,4 @@
-"""`cloudrc completion SHELL`: a static script, so that a press of Tab starts no Python."""
+"""`cloudrc completion SHELL`: print a static script, so that Tab starts no Python."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from cloudrc.errors import MissingPrerequisiteError
 
 SHELLS = ("bash", "zsh", "fish")
 EPILOG = """\
-install it:
+installation:
   cloudrc completion bash > ~/.local/share/bash-completion/completions/cloudrc
   cloudrc completion zsh > ~/.zfunc/_cloudrc     (~/.zfunc must be in $fpath)
   cloudrc completion fish > ~/.config/fish/completions/cloudrc.fish"""
@@ -17,7 +17,7 @@ install it:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("shell", choices=SHELLS, help="the shell that you use")
+    parser.add_argument("shell", choices=SHELLS, help="your shell")
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -1,11 +1,4 @@
-"""`cloudrc doctor`: checks this machine, line by line, and names the mend of what is missing.
-
-One line of the doctor: what was looked at, what is there, and what to do about it.
-
-The doctor's checks of mode cluster: programs, a kubeconfig, and whether a cluster answers.
-
-The checks of `cloudrc doctor`: what this machine has, and the mend for what it has not.
-"""
+"""`cloudrc doctor`: check whether this machine can fly, and say how to fix what is missing."""
 
 from __future__ import annotations
 
@@ -39,13 +32,13 @@ CLUSTER = ("cluster",)
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One line of the doctor.
+    """The result of one check.
 
     Attributes:
-        name: What was looked at.
-        state: "ok"; "warn": it will fly, but see `fix`; "missing".
-        found: What is there, in words.
-        fix: What to do about it; empty if nothing.
+        name: The subject of the check.
+        state: "ok", "missing", or "warn": it can fly, but see `fix`.
+        found: What was found, for people.
+        fix: What to do; empty if nothing.
         modes: Modes that cannot run without it.
     """
 
@@ -60,19 +53,19 @@ NEEDED = {
     "helm": "https://helm.sh/docs/intro/install",
     "kubectl": "https://kubernetes.io/docs/tasks/tools",
 }
-"""Programs that mode cluster calls -> where to get them."""
+"""Programs that mode cluster calls -> their installation pages."""
 HELPFUL = {
     "docker": "https://docs.docker.com/engine/install",
     "kind": "https://kind.sigs.k8s.io",
 }
-"""Programs that make a cluster on this machine; one that is elsewhere needs neither."""
-MAKE_ONE = "kind create cluster --config kind-config.yaml"
+"""Programs that make a cluster on this machine -> likewise; a remote cluster needs neither."""
+MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
 DOCKER_LIMIT = 5.0
-"""For Docker's daemon to answer [s]."""
+"""Time for Docker's daemon to answer [s]."""
 
 
 def programs() -> Iterator[Check]:
-    """Look for the programs that mode cluster uses."""
+    """Check the programs that mode cluster uses."""
     for name, where in NEEDED.items():
         path = shutil.which(name)
         if path is None:
@@ -84,20 +77,20 @@ def programs() -> Iterator[Check]:
         if path is None:
             yield Check(name, "warn", "not in PATH", f"to make a cluster here: {where}")
         elif name == "docker" and not _docker_answers(path):
-            fix = "to make a cluster here, start it: docker info says what is wrong"
+            fix = "to make a cluster here, start it; 'docker info' shows what is wrong"
             yield Check(name, "warn", f"{path}, but its daemon does not answer", fix)
         else:
             yield Check(name, "ok", path)
 
 
 def cluster(context: str | None) -> Iterator[Check]:
-    """Look for a kubeconfig, and ask the cluster that it leads to.
+    """Check the kubeconfig and whether its cluster answers.
 
     Args:
-        context: Of the kubeconfig; None for the current one.
+        context: A context of the kubeconfig; None for the current one.
     """
     if missing("kube"):
-        return  # which is a line of its own, and without it there is no way to look
+        return  # another check reports that
     from cloudrc.cluster.client import connect
 
     try:
@@ -119,10 +112,10 @@ def _answering(release: Release) -> Check:
         version = server_version(release)
     except CloudrcError as error:
         found, _, fix = str(error).partition("; ")
-        return Check("cluster", "missing", _short(found), fix or MAKE_ONE, CLUSTER)
+        return Check("cluster", "missing", _short(found), fix or MAKE_CLUSTER, CLUSTER)
     found = f"Kubernetes {version[0]}.{version[1]}"
     if version < OLDEST:
-        fix = f"the chart needs {oldest}: upgrade it, or {MAKE_ONE}"
+        fix = f"the chart needs {oldest}: upgrade it, or {MAKE_CLUSTER}"
         return Check("cluster", "missing", f"{found}, too old", fix, CLUSTER)
     return Check("cluster", "ok", f"{found} answers", "", CLUSTER)
 
@@ -139,21 +132,21 @@ def _short(text: str) -> str:
     return text if len(text) <= 120 else f"{text[:117]}..."
 
 
-# What a control loop of 10 ms can bear; a quiet desktop stays far below [s].
 LATE_SLEEP = 2e-3
+"""Lateness that a control loop of 10 ms tolerates; an idle desktop stays far below [s]."""
 
-STEP = (
+MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
     "mujoco.mj_step(m, mujoco.MjData(m)); print(mujoco.__version__)"
 )
 
 
 def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Check]:
-    """Run every check, in the order in which they are shown.
+    """Run every check, in the order of display.
 
     Args:
-        mode: That is wanted; a cluster is asked only if it is "cluster".
-        context: Of the kubeconfig; None for the current one.
+        mode: The wanted mode; only "cluster" contacts a cluster.
+        context: A context of the kubeconfig; None for the current one.
     """
     yield python()
     for extra in EXTRAS:
@@ -181,8 +174,8 @@ def python() -> Check:
 def packages(extra: str) -> Check:
     """Check the packages of one extra."""
     everywhere = (*FLYING, *CLUSTER)
-    wanted = {"world": FLYING, "record": everywhere, "report": everywhere, "kube": CLUSTER}
-    modes = wanted.get(extra, ())
+    users = {"world": FLYING, "record": everywhere, "report": everywhere, "kube": CLUSTER}
+    modes = users.get(extra, ())
     absent = missing(extra)
     if absent:
         fix = f"pip install 'cloudrc[{extra}]'"
@@ -192,8 +185,8 @@ def packages(extra: str) -> Check:
 
 
 def mujoco_steps() -> Check:
-    """Load MuJoCo and make one step, in a process of its own: a bad library can abort."""
-    answer = subprocess.run(interpreter("-c", STEP), capture_output=True, text=True)
+    """Run one step of MuJoCo, in a separate process: a broken library can abort it."""
+    answer = subprocess.run(interpreter("-c", MUJOCO_PROGRAM), capture_output=True, text=True)
     if answer.returncode == 0:
         return Check("physics", "ok", "MuJoCo loads and steps", "", FLYING)
     lines = answer.stderr.strip().splitlines() or [f"exit code {answer.returncode}"]
@@ -203,22 +196,22 @@ def mujoco_steps() -> Check:
 
 
 def udp_loopback(rounds: int = 200) -> Check:
-    """Send datagrams over 127.0.0.1 and back, through three free ports."""
+    """Send datagrams over 127.0.0.1 and measure the round trip."""
     try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here:
-            here.bind(("127.0.0.1", 0))
-            here.settimeout(1.0)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as loopback:
+            loopback.bind(("127.0.0.1", 0))
+            loopback.settimeout(1.0)
             trips = []
             for _ in range(rounds):
                 start = time.perf_counter()
-                here.sendto(b"cloudrc", here.getsockname())
-                here.recv(16)
+                loopback.sendto(b"cloudrc", loopback.getsockname())
+                loopback.recv(16)
                 trips.append(time.perf_counter() - start)
     except OSError as error:
-        fix = "allow UDP on 127.0.0.1 (a sandbox or a firewall refuses it)"
+        fix = "allow UDP on 127.0.0.1 (a sandbox or a firewall blocks it)"
         return Check("udp loopback", "missing", str(error), fix, ("local",))
     median = sorted(trips)[rounds // 2] * 1e6
-    return Check("udp loopback", "ok", f"port free, median {median:.0f} us", "", ("local",))
+    return Check("udp loopback", "ok", f"works, median {median:.0f} us", "", ("local",))
 
 
 def timer(rounds: int = 100) -> Check:
@@ -236,47 +229,49 @@ def timer(rounds: int = 100) -> Check:
 
 
 def cores() -> Check:
-    """Compare the cores that this process may use with what already runs."""
+    """Compare the cores that this process may use with the load."""
     count = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
     load = os.getloadavg()[0]
     found = f"{count}, load {load:.1f}"
     if count < 2:
-        return Check("cores", "warn", found, "real time wants two; --mode virtual flies on one")
+        return Check("cores", "warn", found, "real time needs two; --mode virtual flies on one")
     if load > count:
-        return Check("cores", "warn", found, "others use them: close programs or wait")
+        return Check("cores", "warn", found, "other programs use them: close some or wait")
     return Check("cores", "ok", found)
 
 
 def graphics() -> Check:
-    """Look for GL; flying and reporting need none."""
+    """Check for GL, which is optional."""
     found = [name for name in ("EGL", "OSMesa", "GL") if ctypes.util.find_library(name)]
-    return Check("graphics", "ok", ", ".join(found) if found else "no GL, and none is needed")
+    return Check("graphics", "ok", ", ".join(found) if found else "no GL; not needed")
 
 
 def netem() -> Check:
-    """Look for the kernel's network emulator; the userspace relay stands in for it."""
+    """Check for the kernel's network emulator; the relay can replace it."""
     release = platform.release()
     modules = Path("/lib/modules") / release
-    builtin = "sch_netem" in _output_of(modules / "modules.builtin")
+    builtin = "sch_netem" in _text_of(modules / "modules.builtin")
     if builtin or Path("/sys/module/sch_netem").exists():
         return Check("sch_netem", "ok", f"in kernel {release}")
-    if "sch_netem" in _output_of(modules / "modules.dep"):
+    if "sch_netem" in _text_of(modules / "modules.dep"):
         return Check("sch_netem", "ok", "a module, not loaded yet")
-    return Check("sch_netem", "warn", "not found", "the relay shapes the link without it")
+    return Check(
+        "sch_netem", "warn", "not found", "none needed: the relay emulates the link instead"
+    )
 
 
 def cgroup() -> Check:
-    """Look for control groups: what a CPU limit holds back is read from v1 and v2 alike."""
+    """Check for control groups, which report how long a CPU limit has stopped a process."""
     if Path("/sys/fs/cgroup/cgroup.controllers").exists():
         return Check("cgroup", "ok", "v2")
     if Path("/sys/fs/cgroup").is_dir():
         return Check("cgroup", "ok", "v1")
-    return Check("cgroup", "warn", "none", "the metrics of CPU limits stay empty on this machine")
+    return Check("cgroup", "warn", "none", "none needed, but the metrics of CPU limits stay empty")
 
 
-def _output_of(path: Path) -> str:
+def _text_of(path: Path) -> str:
     try:
         return path.read_text(errors="replace")
     except OSError:
@@ -292,9 +287,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--mode",
         choices=("virtual", "local", "cluster"),
         default="local",
-        help="the mode that you want to fly in (default: local)",
+        help="the mode to fly in (default: local)",
     )
-    parser.add_argument("--context", metavar="NAME", help="of the cluster (default: current)")
+    parser.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
     output_argument(parser)
 
 
@@ -305,7 +300,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.output != "table":
         print(written(_document(options.mode, checks, blocking), options.output))
     else:
-        print(_text(options.mode, checks, blocking))
+        print(_as_text(options.mode, checks, blocking))
     return MissingPrerequisiteError.exit_code if blocking else 0
 
 
@@ -318,7 +313,7 @@ def _document(mode: str, checks: list[Check], blocking: list[str]) -> dict[str, 
     }
 
 
-def _text(mode: str, checks: list[Check], blocking: list[str]) -> str:
+def _as_text(mode: str, checks: list[Check], blocking: list[str]) -> str:
     needed = [c for c in checks if mode in c.modes]
     useful = [c for c in checks if mode not in c.modes]
     blocks = {f"Needed for mode {mode}:": needed, "Good to know:": useful}

@@ -1,4 +1,4 @@
-"""What can be installed beside the base, and what to do where it is missing."""
+"""The optional dependencies, and how to install those that are missing."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from cloudrc.errors import MissingPrerequisiteError
 
-# Extra of pyproject.toml -> the modules that it brings (the distributions have the same names).
+# Extra of pyproject.toml -> its modules; the distributions have the same names.
 EXTRAS: dict[str, tuple[str, ...]] = {
     "world": ("mujoco",),
     "record": ("mcap", "rosbags", "zstandard"),
@@ -18,19 +18,19 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 
 
 def missing(extra: str) -> list[str]:
-    """Name the modules of an extra that are not installed; nothing is imported."""
+    """List the modules of an extra that are not installed, without importing any."""
     return [module for module in EXTRAS[extra] if importlib.util.find_spec(module) is None]
 
 
 def require(purpose: str, extras: Iterable[str]) -> None:
-    """Refuse to go on without some extras.
+    """Check that extras are installed.
 
     Args:
         purpose: What needs them: "mode virtual".
         extras: Names in `EXTRAS`.
 
     Raises:
-        MissingPrerequisiteError: If a module is missing; names it and how to install it.
+        MissingPrerequisiteError: If a module is missing; says how to install it.
     """
     absent = {extra: missing(extra) for extra in extras}
     absent = {extra: modules for extra, modules in absent.items() if modules}

@@ -1,6 +1,6 @@
-"""Which run on this machine a command means: flags come in, its API or its link goes out.
+"""Find the run on this machine that a command refers to, and make folders for new runs.
 
-Where a run is written: a folder of its own, which nothing later overwrites.
+A run has a folder of its own, which no later run overwrites.
 """
 
 from __future__ import annotations
@@ -20,67 +20,71 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 _Found = TypeVar("_Found")
 KUBECTL_PLUGIN = "kubectl-cloudrc"
-"""What this program is called when kubectl starts it."""
+"""Name of this program when kubectl starts it."""
 CONNECT_LIMIT = 1.0
-"""For the API of a run on this machine to take a connection [s]."""
+"""Time for the API of a local run to accept a connection [s]."""
 QUIET_LIMIT = 5.0
-"""A relay that has written nothing for so long is gone, if its run is not announced [s]."""
+"""Time without writing after which the relay of an unannounced run counts as gone [s]."""
 
 
 def run_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare the flag."""
-    parser.add_argument("--run", type=Path, metavar="DIR", help="folder of a run that flies here")
+    """Declare `--run`."""
+    parser.add_argument(
+        "--run", type=Path, metavar="DIR", help="folder of a run that is flying on this machine"
+    )
 
 
 def find_here(
-    options: argparse.Namespace, there: Callable[[Path], _Found | None], nobody: str
+    options: argparse.Namespace, look: Callable[[Path], _Found | None], nobody: str
 ) -> _Found | None:
-    """Find what a command wants of the run that flies here, unless a cluster is meant.
+    """Find the API or the link of the run that is flying here, unless the flags name a cluster.
 
-    That of ./runs/latest comes first, then the only other one of this user, wherever it was
-    started.
+    The run in ./runs/latest comes first, then this user's only other run, wherever it was started.
 
     Args:
-        options: With `run_argument` and `cluster_flags.place_arguments`.
-        there: Finds it in the folder of a run; None if none flies there.
-        nobody: What to say of a folder that was named, if so.
+        options: Parsed `run_argument` and `cluster_flags.place_arguments`.
+        look: Gives the API or link of the run in a folder; None if no run is flying there.
+        nobody: Error text if no run is flying in the folder of `--run`.
+
+    Returns:
+        The result of `look`; None if a cluster is meant, or if no run is flying here.
 
     Raises:
-        BadInputError: If there are several others, or none where the flag says.
+        BadInputError: If several runs are flying, or none in the folder of `--run`.
     """
     in_cluster = options.context or options.namespace or options.release
     if options.run is not None:
         if in_cluster:
             raise BadInputError("--run names a run here, the other flags a cluster; give one")
-        if (found := there(options.run)) is None:
+        if (found := look(options.run)) is None:
             raise BadInputError(f"--run {options.run}: {nobody}")
         return found
     if in_cluster or Path(sys.argv[0]).name.startswith(KUBECTL_PLUGIN):
         return None
     from cloudrc.drivers.local import under_way
 
-    if (found := there(RUNS / "latest")) is not None:
+    if (found := look(RUNS / "latest")) is not None:
         return found
-    others = [(run, found) for run in under_way() if (found := there(run)) is not None]
+    others = [(run, found) for run in under_way() if (found := look(run)) is not None]
     if len(others) > 1:
         names = " or ".join(f"--run {run}" for run, _ in others)
-        raise BadInputError(f"{len(others)} runs fly here; say which: {names}")
+        raise BadInputError(f"{len(others)} runs are flying here; choose one: {names}")
     if not others:
         return None
     ((run, found),) = others
-    say(f"cloudrc: the run that flies in {run}", sys.stderr)
+    say(f"cloudrc: using the run in {run}", sys.stderr)
     return found
 
 
 def nobody_here(
     options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
 ) -> MissingPrerequisiteError:
-    """Say beside what a cluster lacks, unless the flags name one, that a run here would do.
+    """Extend a cluster's error: a run on this machine would do, too.
 
     Args:
-        options: As of `find_here`.
-        error: What it lacks.
-        flags: Which would have named a run here.
+        options: As in `find_here`; if they name a cluster, the error stays as it is.
+        error: The cluster's error.
+        flags: The flags that name a local run.
     """
     if options.context or options.namespace:
         return error
@@ -90,25 +94,25 @@ def nobody_here(
 
 
 def link_of(run: Path) -> Path | None:
-    """Find where the relay of the run in this folder is told to change; None if none flies there.
+    """Give the folder that controls the relay of a run; None if the run is not flying.
 
-    A run that was killed leaves that behind, too.
+    A killed run leaves this folder behind.
     """
     from cloudrc.drivers.local import LINK_FOLDER, under_way
 
     folder = run / LINK_FOLDER
     try:
-        quiet = time.time() - folder.stat().st_mtime
+        quiet_time = time.time() - folder.stat().st_mtime
     except OSError:
         return None
-    return folder if run.resolve() in under_way() or quiet < QUIET_LIMIT else None
+    return folder if run.resolve() in under_way() or quiet_time < QUIET_LIMIT else None
 
 
 def url_of(run: Path) -> str | None:
-    """Find where the API of this user's run in this folder is; None if none flies there.
+    """Give the URL of the API of this user's run in a folder; None if the run is not flying.
 
-    What the folder says of that is not believed: the operator's word goes to no server that
-    somebody else has named.
+    The URL comes from this user's runtime folder, never from the run's folder: that may come from
+    somebody else and name a foreign server.
     """
     from cloudrc.drivers.local import under_way
 
@@ -117,7 +121,7 @@ def url_of(run: Path) -> str | None:
 
 
 def _is_gone(url: str) -> bool:
-    """Say whether nobody listens: a run is announced before its API is there."""
+    """Say whether nothing listens at an API's URL: a run is announced before its API is up."""
     from cloudrc.cli.client import UNIX
 
     try:
@@ -127,7 +131,7 @@ def _is_gone(url: str) -> bool:
     except (ConnectionRefusedError, FileNotFoundError):
         return True
     except OSError:
-        return False  # whatever it is, the verb itself says it better
+        return False  # the command itself reports it better
     return False
 
 
@@ -138,9 +142,9 @@ def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
     """Make the folder of a run.
 
     Args:
-        out: As the user asked; None for the next free `runs/<name>-<n>`.
-        name: Experiment, mode and seed in one word.
-        latest: Whether `runs/latest` leads to it from now on.
+        out: The folder that the user wants; None for the next free `runs/<name>-<n>`.
+        name: Experiment, mode and seed, joined.
+        latest: Whether `runs/latest` points to it from now on.
 
     Raises:
         BadInputError: If `out` exists and is not an empty folder, or if it cannot be made.
@@ -149,7 +153,7 @@ def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
         folder = _new_folder(out, name)
     except OSError as error:
         where = f"--out {out}" if out else f"{RUNS}/ in the working folder"
-        remedy = "name another folder" if out else "name a folder that you may write in with --out"
+        remedy = "name another folder" if out else "name a writable folder with --out"
         raise BadInputError(f"{where}: cannot be made: {error.strerror}; {remedy}") from error
     if latest and out is None:
         point_latest_to(folder)
@@ -157,12 +161,12 @@ def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
 
 
 def discard(folder: Path) -> bool:
-    """Remove the folder of a run that has recorded nothing; say whether it is gone."""
+    """Remove the folder of a run that has recorded nothing; say whether it is removed."""
     if any(path.stat().st_size for path in folder.glob("*.mcap")):
         return False
     for path in (*folder.glob("*.mcap"), folder / "config.yaml"):
         path.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):  # there is something else in it
+    with contextlib.suppress(OSError):  # it contains other files
         folder.rmdir()
     return not folder.exists()
 
@@ -171,7 +175,7 @@ def _new_folder(out: Path | None, name: str) -> Path:
     if out is not None:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise BadInputError(
-                f"--out {out}: it is there already; name a new folder, runs are never overwritten"
+                f"--out {out}: already exists; name a new folder, runs are never overwritten"
             )
         out.mkdir(parents=True, exist_ok=True)
         return out
@@ -188,7 +192,7 @@ def _new_folder(out: Path | None, name: str) -> Path:
 
 
 def point_latest_to(folder: Path) -> None:
-    """Let `runs/latest` lead to the newest run; a file system without links goes without."""
+    """Point `runs/latest` to the newest run, if the file system has links."""
     latest = folder.parent / "latest"
     with contextlib.suppress(OSError):
         if latest.is_symlink():

@@ -1,4 +1,4 @@
-"""One flight: an experiment and a folder come in; the folder is filled, its report goes out."""
+"""Fly one experiment on this machine and write its recording and report."""
 
 from __future__ import annotations
 
@@ -18,30 +18,29 @@ if TYPE_CHECKING:
     from cloudrc.report.document import Run
 
 GRACE = 30.0
-"""What a flight may last beyond its mission's limit before it is ended in any case [s]."""
+"""Time after the mission's limit at which a flight is ended in any case [s]."""
 
 See = Callable[["list[Record]"], None]
-"""Shows records of a flight while it lasts."""
+"""Shows records of a flight while it flies."""
 
 
 def fly(
     experiment: ResolvedExperiment, mode: str, folder: Path, see: See, *, page: bool = True
 ) -> dict[str, Any]:
-    """Fly one experiment and write everything that a run leaves.
+    """Fly one experiment and fill its run folder.
 
     Args:
         experiment: Complete and checked.
         mode: "virtual" or "local".
         folder: Empty; gets configuration, recording and report.
-        see: Gets records while it flies: in virtual mode all of them, else a choice.
-        page: Whether to draw figures and page; the numbers are written in any case.
+        see: Called with records during the flight: all in virtual mode, else a selection.
+        page: Whether to write the HTML page with figures; the numbers are always written.
 
     Returns:
-        What report.json holds.
+        The content of report.json.
 
     Raises:
-        CloudrcError: If the flight could not be ended as planned; what was recorded until then is
-            kept, and reported as interrupted.
+        CloudrcError: If the flight broke off; its recording is kept and reported as interrupted.
     """
     from cloudrc.config.load import dump
 
@@ -52,7 +51,7 @@ def fly(
     except OSError as error:
         where = error.filename or folder
         raise CloudrcError(
-            f"{where}: {error.strerror or error}; make room or choose another folder with --out"
+            f"{where}: {error.strerror or error}; free some space or choose another folder: --out"
         ) from error
 
 
@@ -67,7 +66,7 @@ def _fly_virtual(
     world: list[Record] = []
     cloud: list[Record] = []
     digest = RecordHash()
-    # Written while it flies: whatever becomes of the run or its report, the recording is kept.
+    # Record during the flight, so that the recording is kept if the run or its report fails.
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
@@ -100,7 +99,7 @@ def _virtual_run(
     from cloudrc.drivers.virtual import VirtualRun
     from cloudrc.world.endpoint import WorldIdentity
 
-    clock = bytes(16)  # one process, one clock
+    clock = bytes(16)  # both ends share one clock
     world = assembly.build_world(experiment, WorldIdentity(clock, b"world".ljust(16)))
     cloud = assembly.build_cloud(experiment, CloudIdentity(clock, b"cloud".ljust(16)))
     limit_ns = round((experiment.criteria.time_limit_s + GRACE) * 1e9)
@@ -114,8 +113,8 @@ def _fly_local(
     from cloudrc.drivers.local import LocalRun
     from cloudrc.report.document import Run
 
-    run, trouble = Run("local", "relay"), None
-    nothing = InterruptedRunError("interrupted before anything was recorded")
+    run, failure = Run("local", "relay"), None
+    nothing_recorded = InterruptedRunError("interrupted before anything was recorded")
     absent = missing("api")
     if absent:
         print(
@@ -128,10 +127,10 @@ def _fly_local(
     except KeyboardInterrupt:
         run = replace(run, interrupted=True)
     except CloudrcError as error:
-        run, trouble = replace(run, interrupted=True, notes=(str(error),)), error
-    document = _report_ends(folder, experiment, run, page, trouble or nothing)
-    if trouble is not None:
-        raise trouble
+        run, failure = replace(run, interrupted=True, notes=(str(error),)), error
+    document = _report_ends(folder, experiment, run, page, failure or nothing_recorded)
+    if failure is not None:
+        raise failure
     return document
 
 
@@ -140,16 +139,19 @@ def _report_ends(
     experiment: ResolvedExperiment,
     run: Run,
     page: bool,
-    trouble: CloudrcError,
+    failure: CloudrcError,
 ) -> dict[str, Any]:
-    """Merge what both ends recorded, and report on it."""
+    """Merge the recordings of both ends and write the report.
+
+    If an interrupted run has recorded nothing, raise `failure`.
+    """
     from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge
 
     try:
         mission = merge(folder / "world.mcap", folder / "cloud.mcap")
-    except CloudrcError as error:  # nothing was recorded: say why rather than that
-        raise trouble if run.interrupted else error from None
+    except CloudrcError as error:  # nothing was recorded
+        raise failure if run.interrupted else error from None
     run = replace(run, records_sha256=messages_sha256(mission.contents.messages))
     try:
         return _report(folder, mission.recording(), experiment, run, page=page)
@@ -167,12 +169,12 @@ def _report(
         return write_report(folder, recording, experiment, run, own=own, page=page)
     except KeyboardInterrupt:
         raise InterruptedRunError(
-            f"interrupted; the recording is kept, the report is not written: "
+            f"interrupted; the recording is kept but the report is not written: "
             f"run 'cloudrc report {folder}'"
         ) from None
 
 
 def attachments(folder: Path) -> dict[str, bytes]:
-    """What goes into the recording: how it was configured and how it ended."""
+    """Read the attachments of the recording: the configuration and the report."""
     paths = (folder / "config.yaml", folder / "report.json")
     return {path.name: path.read_bytes() for path in paths if path.exists()}

@@ -1,4 +1,4 @@
-"""`cloudrc key`: make the tunnel's pre-shared key, and rotate it."""
+"""`cloudrc key`: make or rotate the tunnel's pre-shared key."""
 
 from __future__ import annotations
 
@@ -9,23 +9,22 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.output import say
 from cloudrc.errors import BadInputError
 
-REMEDY = "name a key file; 'cloudrc key new FILE' makes one where there is no file yet"
+REMEDY = "name a key file; 'cloudrc key new FILE' makes a new one"
 
 if TYPE_CHECKING:
     from cloudrc.tunnel.keys import KeySet
 
 EPILOG = """\
-Both ends of the tunnel read the same key file ('--key FILE', in the cluster
-a Secret) and follow it while they fly. 'new' on a file that is there already
-rotates: the old key stays valid beside the new one for the overlap, counted
-by each process from the moment it reads the file, so that nothing is lost
-while the file is on its way. A process that starts later accepts the old key
-only until the instant that the file holds. A second 'new' within that time is
-refused: an end that has not read the file yet would share no key with one that
-has; wait, or revoke the old key at once with '--drop'. 'retire' takes the old
-key out of the file: who follows it refuses that key within a second. A key that
-has leaked: 'new', and 'retire' once both ends have read the file. In the
-cluster, after each:
+World and cloud read the same key file ('--key FILE'; in a cluster, a Secret)
+and read it again when it changes. 'new' on an existing file rotates the key:
+each end accepts the old key beside the new one for the overlap, counted from
+the moment that it reads the file. So no datagram is lost meanwhile. An end
+that starts later accepts the old key only until the time stored in the file.
+A second 'new' within that time is refused, because an end that has not read
+the file yet would be cut off: wait, or revoke the old key with '--drop'.
+'retire' removes the old key from the file: each end refuses it within a second.
+If a key has leaked: 'new', then 'retire' once both ends have read the file. In
+a cluster, run after each of them:
   kubectl create secret generic NAME --from-file=key=FILE \\
     --dry-run=client -o yaml | kubectl apply -f -"""
 
@@ -34,25 +33,25 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     new = verbs.add_parser("new", help="make a key file, or rotate the key in one")
-    new.add_argument("file", type=Path, metavar="FILE", help="gets mode 0600")
+    new.add_argument("file", type=Path, metavar="FILE", help="key file to write, with mode 0600")
     new.add_argument(
         "--overlap",
         type=_seconds,
         default=None,
         metavar="SECONDS",
-        help="how long the old key stays valid after a rotation (default: 300)",
+        help="time that the old key stays valid after a rotation (default: 300)",
     )
     new.add_argument(
         "--drop",
         action="store_true",
-        help="revoke the old key of a rotation that is not over yet, at once",
+        help="revoke at once the old key of an unfinished rotation",
     )
-    retire = verbs.add_parser("retire", help="drop the old key of a rotation before its time")
-    retire.add_argument("file", type=Path, metavar="FILE", help="made by 'new'")
+    retire = verbs.add_parser("retire", help="remove the old key of a rotation early")
+    retire.add_argument("file", type=Path, metavar="FILE", help="key file made by 'new'")
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Make the key, or leave one alone in its file."""
+    """Make a key, or retire the old one."""
     return _retire(options.file) if options.verb == "retire" else _make(options)
 
 
@@ -64,15 +63,15 @@ def _make(options: argparse.Namespace) -> int:
     from cloudrc.tunnel.keys import KEY_SIZE, OVERLAP, Key, KeySet
 
     path: Path = options.file
-    there, secret = path.exists(), os.urandom(KEY_SIZE)
-    if not there and options.overlap is not None:
-        raise BadInputError(f"--overlap: {path} is not there, so there is no old key to keep")
-    if not there and options.drop:
-        raise BadInputError(f"--drop: {path} is not there, so there is no old key to revoke")
-    if there:
+    exists, secret = path.exists(), os.urandom(KEY_SIZE)
+    if not exists and options.overlap is not None:
+        raise BadInputError(f"--overlap: {path} does not exist, so there is no old key to keep")
+    if not exists and options.drop:
+        raise BadInputError(f"--drop: {path} does not exist, so there is no old key to revoke")
+    if exists:
         keys, wall = read_keys(path, "", REMEDY), time.time()
         if not options.drop:
-            _refuse_if_promised(path, keys, wall)
+            _refuse_early_rotation(path, keys, wall)
         keys = keys.rotated(secret, wall, options.overlap or OVERLAP)
     else:
         keys = KeySet(Key(secret))
@@ -82,14 +81,14 @@ def _make(options: argparse.Namespace) -> int:
     return 0
 
 
-def _refuse_if_promised(path: Path, keys: KeySet, wall: float) -> None:
-    """A file has room for one old key: for whoever knows only that one, it stays its time."""
+def _refuse_early_rotation(path: Path, keys: KeySet, wall: float) -> None:
+    """Refuse to replace an old key that is still valid: an end may know only that key."""
     import math
 
     if keys.previous is not None and keys.until is not None and wall < keys.until:
         left = math.ceil(keys.until - wall)
         raise BadInputError(
-            f"{path}: key {keys.previous.name}, the one before, is valid for {left} s more; wait, "
+            f"{path}: the old key {keys.previous.name} is valid for {left} s more; wait, "
             "or revoke it at once: cloudrc key new FILE --drop"
         )
 
@@ -100,15 +99,15 @@ def _retire(path: Path) -> int:
 
     keys = read_keys(path, "", REMEDY)
     if keys.previous is None:
-        say(f"key {keys.current.name} was alone already: {path}")
+        say(f"key {keys.current.name} is the only key already: {path}")
         return 0
     _replace(path, KeySet(keys.current))
-    say(f"key {keys.current.name} alone, {keys.previous.name} is dropped: {path}")
+    say(f"key {keys.current.name} is the only key now, {keys.previous.name} is removed: {path}")
     return 0
 
 
 def _replace(path: Path, keys: KeySet) -> None:
-    """Put them into the file that a link leads to: there is who follows it by another name."""
+    """Write keys to the target of a link, which a process may read by its own name."""
     import os
 
     from cloudrc.drivers.epochs import replace_durably
@@ -117,7 +116,7 @@ def _replace(path: Path, keys: KeySet) -> None:
     try:
         replace_durably(Path(os.path.realpath(path)), write(keys).encode("ascii"))
     except OSError as error:
-        remedy = "name a file in a folder that is there and that you may write in"
+        remedy = "name a file in an existing, writable folder"
         raise BadInputError(f"{path}: {error.strerror or error}; {remedy}") from None
 
 

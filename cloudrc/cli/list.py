@@ -1,4 +1,4 @@
-"""`cloudrc list`: what can be named in an experiment, one line each, from the files themselves."""
+"""`cloudrc list`: list the names that an experiment may use, with their descriptions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Print every kind that was asked for."""
+    """Print the requested kinds."""
     kinds = [options.what] if options.what else list(KINDS)
     found = {kind: describe_all(kind) for kind in kinds}
     if options.output != "table":
@@ -45,7 +45,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _block(lines: dict[str, str]) -> str:
-    """Lay names and their lines out; on a terminal long ones are wrapped, elsewhere never."""
+    """Lay out names and descriptions; wrap them on a terminal only."""
     indent = max(map(len, lines), default=0) + 4
     columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     wrap = textwrap.TextWrapper(max(columns, indent + 20), subsequent_indent=" " * indent)
@@ -53,7 +53,7 @@ def _block(lines: dict[str, str]) -> str:
 
 
 def describe_all(kind: str) -> dict[str, str]:
-    """Give name -> one line for everything of a kind, sorted by name."""
+    """Give name -> description for everything of a kind, sorted by name."""
     from cloudrc import plugins
     from cloudrc.config import shipped
 
@@ -71,14 +71,14 @@ def describe_all(kind: str) -> dict[str, str]:
 
 
 def _plain(line: str, kind: str) -> str:
-    """Leave out what the heading says already: "Predictor: odometry comes in..."."""
+    """Leave out a prefix that the heading already says, such as "Predictor: "."""
     before, colon, rest = line.rstrip(".").partition(": ")
-    said = colon and kind.startswith(before.lower().rpartition(" ")[2])
-    return rest[:1].upper() + rest[1:] if said else line.rstrip(".")
+    repeated = colon and kind.startswith(before.lower().rpartition(" ")[2])
+    return rest[:1].upper() + rest[1:] if repeated else line.rstrip(".")
 
 
 def _comment(kind: str, name: str) -> str:
-    """Read the first sentence of the comment that an MJCF file opens with."""
+    """Read the first sentence of the first comment of an MJCF file."""
     from cloudrc.config import shipped
 
     text = (shipped.FOLDERS[kind] / f"{name}.xml").read_text("utf-8")

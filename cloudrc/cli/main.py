@@ -1,4 +1,4 @@
-"""The command `cloudrc`: finds the command's file, runs it, and turns errors into one line."""
+"""The command `cloudrc`: run a command and report its errors in one line."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import errno
 import sys
 from collections.abc import Sequence
 
-from cloudrc.cli.output import harmless, silence
-from cloudrc.cli.parser import COMMANDS, build, unknown
+from cloudrc.cli.output import discard_output, harmless
+from cloudrc.cli.parser import COMMANDS, build, describe_unknown
 from cloudrc.errors import BadInputError, CloudrcError
 
 INTERRUPTED = 130
-INTERNAL = 70  # EX_SOFTWARE of sysexits.h: ours to mend, not the user's
+INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
-NOT_ALLOWED = "choose a file or folder that you may use"
+NOT_ALLOWED = "choose a file or folder that you have access to"
 REMEDIES = {
     errno.EACCES: NOT_ALLOWED,
     errno.EPERM: NOT_ALLOWED,
     errno.EROFS: NOT_ALLOWED,
     errno.ENOENT: "check the path",
     errno.ENOTDIR: "check the path",
-    errno.EISDIR: "name a file in it",
-    errno.ENOSPC: "make room or choose another disk",
+    errno.EISDIR: "name a file in this folder",
+    errno.ENOSPC: "free some space or choose another disk",
 }
-"""What to do about errors of the operating system that were not expected."""
+"""Advice for unexpected errors of the operating system, by error number."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,13 +41,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:
-        silence(sys.stdout)  # the reader (head, less) has left
+        discard_output(sys.stdout)  # the reader (head, less) has closed the pipe
         return 0
     except Exception as error:
         if "--debug" in given:
             raise
         message, code = _explain(error)
-        # Names in it may be foreign. Lines of ours behind the first begin with two blanks.
+        # Text from files is escaped. Our own further lines begin with two blanks.
         shown = "\n  ".join(map(harmless, message.split("\n  ")))
         print(f"cloudrc: error: {shown}", file=sys.stderr)
         return code
@@ -56,7 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _dispatch(given: Sequence[str]) -> int:
     name = next((word for word in given if not word.startswith("-")), None)
     if name is not None and name not in COMMANDS:
-        raise BadInputError(f"unknown command: {unknown(name, COMMANDS)}; see 'cloudrc --help'")
+        raise BadInputError(
+            f"unknown command: {describe_unknown(name, COMMANDS)}; see 'cloudrc --help'"
+        )
     parser = build([name] if name else [])
     if not given:
         parser.print_help()
@@ -70,9 +72,9 @@ def _dispatch(given: Sequence[str]) -> int:
 
 
 def _explain(error: Exception) -> tuple[str, int]:
-    """Put an error into words, with the exit code that belongs to it."""
+    """Give the message and the exit code of an error."""
     if isinstance(error, CloudrcError):
-        return str(error).rstrip(), error.exit_code  # one line, or one for each wrong key
+        return str(error).rstrip(), error.exit_code  # one line, or one per wrong key
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         remedy = REMEDIES.get(error.errno or 0, "'--debug' shows where")

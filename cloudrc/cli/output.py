@@ -1,4 +1,4 @@
-"""What commands print: tables and colour for people, JSON and YAML for programs."""
+"""Output of commands: tables and colour for people, JSON and YAML for programs."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1", "dim": "2"}
 
 
 def output_argument(parser: argparse.ArgumentParser, what: str = "") -> None:
-    """Declare how a command prints; `what` says what else the form changes."""
-    text = f"{what} (default: table)" if what else "default: table"
+    """Declare `--output`; `what` describes further effects of the format."""
+    text = f"{what} (default: table)" if what else "output format (default: table)"
     parser.add_argument("-o", "--output", choices=FORMATS, default="table", help=text)
 
 
 def written(document: object, form: str) -> str:
-    """Write plain values for programs, as "json" or "yaml"."""
+    """Write plain values as "json" or "yaml"."""
     text = json.dumps(document, indent=2, ensure_ascii=False)
-    if form == "json":  # the same string, but no terminal obeys what is in it
+    if form == "json":  # escaped: a terminal must not obey control characters
         return re.sub("[\x7f-\x9f]", lambda found: f"\\u{ord(found[0]):04x}", text)
-    from cloudrc.config import document as yaml_text
+    from cloudrc.config.document import write
 
-    return yaml_text.write(json.loads(text)).rstrip("\n")
+    return write(json.loads(text)).rstrip("\n")
 
 
 def is_live(stream: TextIO) -> bool:
-    """Say whether a stream can show a line that is rewritten in place."""
+    """Say whether a stream is a terminal that can rewrite a line in place."""
     dull = os.environ.get("TERM", "") in ("", "dumb") or bool(os.environ.get("CI"))
     return stream.isatty() and not dull
 
 
-def columns(stream: TextIO) -> int:
-    """Count the columns of the terminal that a stream leads to; 80 if it does not say."""
+def terminal_columns(stream: TextIO) -> int:
+    """Give the width of a stream's terminal in columns; 80 if unknown."""
     try:
         return os.get_terminal_size(stream.fileno()).columns or 80
     except (OSError, ValueError):
@@ -47,26 +47,26 @@ def columns(stream: TextIO) -> int:
 
 @contextlib.contextmanager
 def unread_is_fine(stream: TextIO) -> Iterator[None]:
-    """Print what may find no reader: if `head` or `less` has left, nobody is told, now or later.
+    """Ignore that a stream's reader, such as `head`, has closed the pipe.
 
-    Flush inside: what is only buffered fails where nobody expects it.
+    Flush inside the block: buffered text would fail later, outside it.
     """
     try:
         yield
     except OSError:
-        silence(stream)
+        discard_output(stream)
 
 
-def silence(stream: TextIO) -> None:
-    """Let all that is still written to a stream go nowhere; Python flushes once more at exit."""
-    with contextlib.suppress(OSError, ValueError):  # a stream of a test has no file
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
+def discard_output(stream: TextIO) -> None:
+    """Redirect a stream to /dev/null; Python flushes it once more at exit."""
+    with contextlib.suppress(OSError, ValueError):  # a test's stream has no file
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
 
 
 def paint(text: str, colour: str, stream: TextIO | None = None) -> str:
-    """Colour a text, if the stream (default: stdout) is a terminal that wants colour."""
+    """Colour a text if the stream (default: stdout) is a terminal with colour."""
     if os.environ.get("NO_COLOR") or not is_live(stream or sys.stdout):
         return text
     return f"\x1b[{_CODES[colour]}m{text}\x1b[0m"
@@ -76,8 +76,8 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     """Align rows in columns.
 
     Args:
-        rows: Cells, as text, whoever wrote it; all rows of one length.
-        right: Indices of the columns that are aligned to the right: numbers.
+        rows: Cells, escaped here; all rows have the same length.
+        right: Indices of the columns to align right.
 
     Returns:
         Lines without trailing blanks, joined by newlines.
@@ -95,17 +95,17 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
 
 
 def harmless(text: str) -> str:
-    """Write foreign words so that they stay in their line and a terminal does nothing but show."""
+    """Escape what is not printable, so that text keeps to its line and controls no terminal."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def say(line: str, stream: TextIO | None = None) -> None:
-    """Print a line that has foreign words in it, and at once (default: on stdout)."""
+    """Print a line, escaped and flushed at once (default: on stdout)."""
     print(harmless(line), file=stream, flush=True)
 
 
-def number(value: float) -> str:
-    """Write a value of any unit with four significant digits, if possible without an exponent."""
+def format_number(value: float) -> str:
+    """Write a value of any unit with four significant digits, without exponent if possible."""
     if float(value).is_integer() and abs(value) < 1e5:
         return f"{value:.0f}"  # counts
     if 1e-4 <= abs(value) < 1e5:

@@ -1,4 +1,4 @@
-"""The parser of all commands: the table of what there is becomes argparse and its help."""
+"""The parser of all commands, built from a table of their names and help lines."""
 
 from __future__ import annotations
 
@@ -14,41 +14,42 @@ from typing import NoReturn
 from cloudrc import __version__
 from cloudrc.errors import BadInputError
 
-# Name -> one line for the help, by group. The file of a command is `cloudrc/cli/<name>.py`.
+# Name -> help line, by group. A command's module is `cloudrc/cli/<name>.py`.
 GROUPS: dict[str, dict[str, str]] = {
     "fly": {
         "run": "fly an experiment and write its report",
-        "mission": "fly and steer missions, here or in a cluster",
+        "mission": "start, steer and stop missions, here or in a cluster",
         "report": "write the report of a recorded run again",
-        "recover": "make a torn or damaged recording whole again",
-        "bench": "measure how fast the closed loop runs here",
-        "faults": "bring faults about on purpose, and check what follows",
+        "recover": "write a clean copy of a damaged recording",
+        "bench": "measure how fast the simulation runs here",
+        "faults": "inject faults and check that the system handles them",
     },
     "look around, set up": {
-        "list": "experiments, profiles, predictors and what else there is",
-        "doctor": "check whether this machine can fly, and say what to mend",
-        "link": "the emulated network: draw, record, verify and change it",
-        "key": "the key that world and cloud share: 'cloudrc key new FILE'",
+        "list": "list experiments, profiles, predictors and more",
+        "doctor": "check whether this machine can fly; say what to fix",
+        "link": "show, record, verify or change the emulated network",
+        "key": "make or replace the key that world and cloud share",
         "completion": "print a completion script for your shell",
     },
     "processes (started by 'run --mode local')": {
         "world": "the robot: physics, sensors, guard, low-level control",
         "cloud": "the remote controller",
-        "teleop": "missions, operator and their HTTP API",
-        "relay": "the emulated link between them",
+        "teleop": "missions and the operator's HTTP API",
+        "relay": "the emulated link between world and cloud",
     },
 }
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
 COUNT_MAX = 100_000
+"""Largest number of repeats that a flag accepts."""
 
-ABOUT = "Fly a simulated drone from a simulated cloud, over a network that is measured."
+ABOUT = "Fly a simulated drone from a simulated cloud, over an emulated network."
 EXAMPLES = """\
 examples:
   cloudrc run                          the paper's mission in real time
-  cloudrc run --mode virtual           the same in virtual time: a few seconds
+  cloudrc run --mode virtual           the same in virtual time, within seconds
   cloudrc run steps --mode virtual --seeds 10 --set cloud.predictor=last_sample
   cloudrc list predictors
-  cloudrc run --help                   every command explains itself
+  cloudrc run --help                   every command has its own help
 
 exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
   3 missing prerequisite, 4 timeout, 5 cluster or API error,
@@ -58,20 +59,20 @@ _CHOICE = re.compile(r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)
 
 
 class Parser(argparse.ArgumentParser):
-    """An argparse parser that raises its errors in one line, for `main` to print."""
+    """Raise the errors of argparse in one line, for `main` to print."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise what is wrong and where to read on."""
+        """Raise the error and name the help that explains it."""
         choice = _CHOICE.fullmatch(message)
         if choice:
             argument, given, valid = choice.groups()
             names = [name.strip(" '") for name in valid.split(",")]
-            message = f"{argument}: {unknown(given, names)}"
+            message = f"{argument}: {describe_unknown(given, names)}"
         raise BadInputError(f"{message}; see '{self.prog} --help'")
 
 
-def unknown(given: str, names: Iterable[str]) -> str:
-    """Say that a name is unknown, with the nearest known one or all of them."""
+def describe_unknown(given: str, names: Iterable[str]) -> str:
+    """Say that a name is unknown and suggest the nearest known one, or all."""
     known = sorted(names)
     near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
     return f"no '{given}'; " + (f"did you mean '{near[0]}'?" if near else f"choose {_or(known)}")
@@ -82,14 +83,17 @@ def _or(names: Sequence[str]) -> str:
 
 
 def count(text: str) -> int:
-    """Read a number of things that are done one after the other, as argparse calls it."""
+    """Read a whole number from 1 to `COUNT_MAX`; a type for argparse."""
     if not text.isdecimal() or not 1 <= int(text) <= COUNT_MAX:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 1 to {COUNT_MAX}")
     return int(text)
 
 
 def read_from(text: str) -> Path:
-    """Read the name of a file, as argparse calls it: who opens a pipe waits for who writes."""
+    """Read the path of an input file; a type for argparse.
+
+    Refuse a pipe or a device: opening it could wait for ever.
+    """
     if os.path.exists(text) and not os.path.isfile(text):
         raise argparse.ArgumentTypeError(f"{text}: not a regular file")
     return Path(text)
@@ -99,8 +103,8 @@ def build(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
     """Build the parser.
 
     Args:
-        wanted: Commands whose files are imported; of the others only the names are known.
-        for_completion: Let argparse itself list the commands; our help does it in groups.
+        wanted: Commands to import; the others get their names only.
+        for_completion: Let argparse list the commands; the help lists them in groups.
     """
     common = Parser(add_help=False)
     common.add_argument(

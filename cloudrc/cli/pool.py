@@ -1,7 +1,4 @@
-"""Much work on several cores: results in the order of the work, whichever is done first.
-
-What asks a command to end: a person, a batch system, a terminal, or that its parent is gone.
-"""
+"""Run work on several cores, and end commands and their workers on signals."""
 
 from __future__ import annotations
 
@@ -20,14 +17,14 @@ from typing import TypeVar
 
 from cloudrc.errors import InvalidRunError
 
-LOOK_PERIOD = 0.5
-"""How often a worker looks whether its parent is there [s]."""
+PARENT_PERIOD = 0.5
+"""Period in which a worker checks whether its parent still runs [s]."""
 
 
 def end_orderly() -> None:
-    """Take SIGTERM and SIGHUP as Ctrl-C is taken: the command sees a KeyboardInterrupt.
+    """Raise KeyboardInterrupt on SIGTERM and SIGHUP, as on Ctrl-C.
 
-    A SIGHUP that is ignored from the start stays so: that is what `nohup` is for.
+    A SIGHUP that is ignored from the start stays ignored: `nohup` does that.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
@@ -35,50 +32,52 @@ def end_orderly() -> None:
 
 
 def _hung_up(number: int, frame: FrameType | None) -> None:
-    # The shell and the kernel each send one: the second must not interrupt the report.
+    # The shell and the kernel each send a SIGHUP; the second must not interrupt the report.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 
-def end_with(parent: int) -> None:
-    """In a worker of a pool: end when its parent is gone, which may have been killed.
+def exit_with_parent(parent: int) -> None:
+    """End this worker of a pool as soon as its parent has ended, even if it was killed.
 
     Args:
-        parent: Process id of who has made the pool.
+        parent: Process id of the process that made the pool.
     """
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(LOOK_PERIOD)
-        os._exit(1)  # there is nobody to tell, and nothing to end
+            time.sleep(PARENT_PERIOD)
+        os._exit(1)  # without clean-up: nobody waits for this process
 
     threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
-AHEAD = 1000
-"""Pieces of work in a pool, at most; more than any machine has cores. Given all of a long search at
-once, it hangs before Python 3.11.6: each wakes it by a pipe that holds 16,384 (cpython 105829)."""
-KILLED = "a worker was killed, by the kernel if memory ran out"
+BATCH_MAX = 1000
+"""Maximum number of pieces of work in a pool. Before Python 3.11.6, a pool hangs if it gets more
+than 16,384 at once (cpython issue 105829)."""
+WORKER_KILLED = "a worker was killed, perhaps by the kernel because memory ran out"
 
 
 class WorkerDiedError(InvalidRunError):
-    """A process of the pool was ended by somebody else."""
+    """A process of the pool was killed from outside."""
 
 
 def in_order(
     function: Callable[[Work], Result], work: Sequence[Work], jobs: int
 ) -> Iterator[Result]:
-    """Do all of it, some at once. Who stops listening waits for what is under way, no more.
+    """Call a function on each piece of work, in parallel, and yield the results in order.
+
+    Closing the generator waits for the calls that are running and drops the others.
 
     Args:
-        function: Of a module: it is called in other processes.
-        work: Its arguments.
-        jobs: How many at once; more than there are cores or work would only take memory.
+        function: A module's function: other processes call it.
+        work: Its arguments, one for each call.
+        jobs: Number of processes, at most one per core and per piece of work.
 
     Yields:
-        What the function gives for each.
+        The function's results, in the order of `work`.
 
     Raises:
         WorkerDiedError: If one of the processes was killed.
@@ -87,28 +86,28 @@ def in_order(
     if workers <= 1:
         yield from map(function, work)
         return
-    fork = multiprocessing.get_context("fork")  # its workers are children of this process
+    fork = multiprocessing.get_context("fork")  # so that workers are children of this process
     pool = ProcessPoolExecutor(workers, fork, _begin, (os.getpid(),))
     try:
-        # Not `map`: where a worker has died, it cancels what the pool marks as failed just then.
-        left = iter(work)
-        # Batch by batch: a pool that is broken takes no more, and what it has done is told first.
-        while futures := deque(pool.submit(function, each) for each in islice(left, AHEAD)):
+        # No `pool.map`: if a worker dies, it races with the pool over failed calls.
+        waiting = iter(work)
+        # In batches: a broken pool accepts no more work, and its finished results come first.
+        while futures := deque(pool.submit(function, each) for each in islice(waiting, BATCH_MAX)):
             while futures:
                 yield futures.popleft().result()
-    except KeyboardInterrupt:  # who presses Ctrl-C does not want to wait
+    except KeyboardInterrupt:  # Ctrl-C ends everything at once
         for worker in multiprocessing.active_children():
-            worker.kill()  # one that has only begun may still take SIGTERM as Ctrl-C, and lose it
+            worker.kill()  # a worker that just starts may lose a SIGTERM
         raise
     except BrokenProcessPool as error:
-        raise WorkerDiedError(f"{KILLED}: try fewer '--jobs'") from error
+        raise WorkerDiedError(f"{WORKER_KILLED}: try fewer '--jobs'") from error
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _begin(first: int) -> None:
-    """What a terminal sends reaches all processes: the first one says when the others end."""
+def _begin(parent: int) -> None:
+    """Prepare a worker: it ignores the terminal's signals and ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    end_with(first)
+    exit_with_parent(parent)

@@ -1,4 +1,4 @@
-"""What a flight shows while it lasts: records come in, a living line or plain lines go out."""
+"""Progress of a flight: a status line on a terminal, one line per event elsewhere."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import TextIO
 
-from cloudrc.cli.output import columns, harmless, is_live, paint, unread_is_fine
+from cloudrc.cli.output import harmless, is_live, paint, terminal_columns, unread_is_fine
 from cloudrc.drivers.feed import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import (
@@ -22,25 +22,26 @@ from cloudrc.records import (
 )
 
 ENDINGS = ("done", "cancelled", "timed_out")
-REDRAW_PERIOD = 0.1  # [s]: faster than one can read, slow enough to cost nothing
+REDRAW_PERIOD = 0.1
+"""Minimum time between two drawings of the status line [s]."""
 FILE_COLUMNS = 100
-"""What an event's line may take where there is no terminal."""
-NARROW = ("factor", "delay", "place", "waypoint")
-"""What the living line goes without, one after the other, until it fits."""
+"""Maximum width of an event's line where there is no terminal."""
+DROPPED = ("factor", "delay", "position", "waypoint")
+"""Cells of the status line to drop, in this order, until it fits."""
 
 
 class FlightView:
-    """Shows a flight on a stream: a line that is rewritten, or one line per event."""
+    """Show a flight on a stream, as a status line and one line per event."""
 
     def __init__(
         self, stream: TextIO, waypoints: int, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Begin with nothing on the stream.
+        """Start without writing anything.
 
         Args:
-            stream: Where to write; never stdout of a machine-readable output.
-            waypoints: How many the mission has.
-            clock: Rising seconds; for the real-time factor and the rate of redrawing [s].
+            stream: Where to write; never stdout if that carries JSON or YAML.
+            waypoints: Number of the mission's waypoints.
+            clock: Monotonic time, for the real-time factor and the redrawing [s].
         """
         self._stream, self._waypoints, self._clock = stream, waypoints, clock
         self._live = is_live(stream)
@@ -51,18 +52,18 @@ class FlightView:
         self._guard, self._ended = GuardState.GROUND, False
 
     def see(self, records: Iterable[Record]) -> None:
-        """Take in records of either end, oldest first."""
+        """Process records of either end, oldest first."""
         for record in records:
             match record:
                 case TelemetrySent():
                     self._see_telemetry(record)
                 case Control():
-                    # Before the first round trip the horizon is 0 and means nothing.
+                    # The horizon is 0 and meaningless before the first round trip.
                     self._delay = math.nan if math.isnan(record.rtt) else record.horizon
                     self._waypoint = record.waypoint
                 case GuardChange():
                     self._guard = record.state
-                    # That the robot holds once its mission has ended is no news.
+                    # The robot always holds after its mission; that is no event.
                     if record.state > GuardState.TRACK and not self._ended:
                         self._event(f"{record.state.name}: {record.cause}")
                 case Fault():
@@ -74,8 +75,8 @@ class FlightView:
                     self._event(record.text)
         if self._live and self._clock() - self._drawn >= REDRAW_PERIOD:
             self._drawn = self._clock()
-            # One column is left free: some terminals begin a new line once the last is written.
-            self._write("\r\x1b[2K" + self.line(columns(self._stream) - 1))
+            # Leave one column free: some terminals wrap after the last one.
+            self._write("\r\x1b[2K" + self.line(terminal_columns(self._stream) - 1))
 
     def _see_telemetry(self, record: TelemetrySent) -> None:
         if self._first_ns == NEVER_NS:
@@ -85,23 +86,23 @@ class FlightView:
 
     @property
     def flown(self) -> float:
-        """Time since the first telemetry [s], world's clock."""
+        """Give the time since the first telemetry, on world's clock [s]."""
         return (self._now_ns - self._first_ns) * 1e-9
 
     def line(self, width: int = 80) -> str:
-        """Say in one line of at most `width` columns how the flight goes."""
+        """Give the status line, at most `width` columns wide."""
         elapsed = self._clock() - self._began
         moving = elapsed > 0 and self.flown > 0
         number = self._waypoint + 1
         cells = {
             "time": f"{self.flown:6.1f} s",
             "waypoint": f"waypoint {number}/{self._waypoints}" if number else "",
-            "place": self._place(),
-            "delay": self._late(),
+            "position": self._position_text(),
+            "delay": self._delay_text(),
             "guard": f"{self._guard.name:<6}",
             "factor": f"x{self.flown / elapsed:.2f}" if moving else "",
         }
-        for name in NARROW:
+        for name in DROPPED:
             if len(_joined(cells.values())) > width:
                 cells[name] = ""
         fitting = _joined(cells.values())[:width]
@@ -109,20 +110,21 @@ class FlightView:
         guard = paint(self._guard.name, colour, self._stream)
         return fitting.replace(self._guard.name, guard)
 
-    def _place(self) -> str:
-        """Where the robot is [m]."""
-        # Rounded first: 0.0 added to a negative zero is a plain one.
+    def _position_text(self) -> str:
+        """Give the robot's position [m]."""
+        # Round first, then add 0.0: that turns a negative zero into a positive one.
         x, y, z = (round(coordinate, 2) + 0.0 for coordinate in self._position)
         return "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"
 
-    def _late(self) -> str:
+    def _delay_text(self) -> str:
         return "" if math.isnan(self._delay) else f"delay {self._delay * 1e3:3.0f} ms"
 
     def _event(self, text: str) -> None:
-        """Write a line that stays; where it fits also where and how late that was."""
+        """Write an event's line, with position and delay if they fit."""
         text = harmless(text)
-        width = columns(self._stream) if self._live else FILE_COLUMNS
-        lines = [_joined((f"  {text:<44}", self._place(), late)) for late in (self._late(), "")]
+        width = terminal_columns(self._stream) if self._live else FILE_COLUMNS
+        delays = (self._delay_text(), "")
+        lines = [_joined((f"  {text:<44}", self._position_text(), delay)) for delay in delays]
         fitting = [line for line in lines if len(line) <= width]
         if not self._live:
             self._write(f"{fitting[0] if fitting else f'  {text}'}\n")
@@ -131,12 +133,12 @@ class FlightView:
         self._write(f"\r\x1b[2K{fitting[0] if fitting else wrap.fill(f'  {text}')}\n")
 
     def close(self) -> None:
-        """Take the living line away."""
+        """Erase the status line."""
         if self._live:
             self._write("\r\x1b[2K")
 
     def _write(self, text: str) -> None:
-        """Write at once; a flight does not end because nobody looks at it any more."""
+        """Write at once; a flight goes on if the reader has closed the pipe."""
         with unread_is_fine(self._stream):
             self._stream.write(text)
             self._stream.flush()

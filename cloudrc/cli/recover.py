@@ -1,4 +1,4 @@
-"""`cloudrc recover FILE`: a torn or damaged recording comes in, a clean one is left beside it."""
+"""`cloudrc recover FILE`: write a clean copy of a damaged recording."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ if TYPE_CHECKING:
     from cloudrc.record.recover import Recovery
 
 LOSSY = 1
+"""Exit code if data is lost."""
 EPILOG = """\
 examples:
   cloudrc recover runs/latest/world.mcap
   cloudrc recover torn.mcap --to clean.mcap -o json
 
-exit codes: 0 complete, 1 something is lost (it says what), 2 nothing readable"""
+exit codes: 0 complete, 1 some data is lost (printed), 2 nothing readable"""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,13 +34,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--to",
         type=Path,
         metavar="NEW",
-        help="the clean recording (default: FILE with '.recovered' before its ending)",
+        help="file for the clean copy (default: FILE with '.recovered' before its ending)",
     )
     output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Recover; say what is kept and what is not."""
+    """Recover a recording; print what is kept and what is lost."""
     require("a recovery", ("record",))
     from cloudrc.record.recover import recover
 
@@ -49,7 +50,7 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"{target}: already there; name another file with --to")
     try:
         recovery = recover(source, target)
-    except OSError as error:  # which names a draft
+    except OSError as error:  # names a temporary file
         reason = error.strerror or error
         raise BadInputError(f"{target}: {reason}; name another file with --to") from error
     if options.output == "table":
@@ -70,5 +71,5 @@ def _show(recovery: Recovery, target: Path) -> None:
     for note in recovery.notes:
         say(f"lossy: {note}")
     if recovery.complete and recovery.index_is_new:
-        print("its index was missing or damaged and has been written anew; nothing is lost")
+        print("the index was missing or damaged and is rebuilt; nothing is lost")
     say(str(target))

@@ -1,12 +1,12 @@
-"""`cloudrc relay`: the emulated link's process, between world and cloud.
+"""`cloudrc relay`: run the emulated link between world and cloud.
 
-The relay of local mode follows what `cloudrc link set` leaves in a folder, and tells its state.
+With `--link DIR` the relay follows the changes of `cloudrc link set` and publishes its state:
 
-    DIR/profile.json, change.json    what is asked for; not there before the first change
-    DIR/uplink.json, downlink.json   what is in force (`cloudrc/link/state.py`)
-    DIR/uplink.released...           how late its datagrams left so far, every other second
+    DIR/profile.json, change.json    the requested profile; missing before the first change
+    DIR/uplink.json, downlink.json   the state in force (`cloudrc/link/state.py`)
+    DIR/uplink.released...           how late datagrams left so far, written every 2 s
 
-Files are read and written by a thread of its own; the relay's loop only swaps the conditions.
+A separate thread reads and writes these files; the relay's loop only swaps the profiles.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cloudrc.cli.runtime import (
     listening,
     open_exporter,
     process_arguments,
-    resolved,
+    resolve_address,
     warn_if_exposed,
 )
 from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
@@ -45,13 +45,14 @@ if TYPE_CHECKING:
 
 
 COUNT_PERIOD_NS = 1_000_000_000
+"""Period in which the exporter gets the relay's counts [ns]."""
 WAYS = ("uplink", "downlink")
 
 ADDRESSES = {
-    "--world-side": "where to receive from world",
-    "--cloud-side": "where to receive from cloud",
-    "--world": "where world receives; a name is resolved once",
-    "--cloud": "where cloud receives; likewise",
+    "--world-side": "address to receive from world at",
+    "--cloud-side": "address to receive from cloud at",
+    "--world": "address at which world receives; a name is resolved once",
+    "--cloud": "address at which cloud receives; a name is resolved once",
 }
 
 
@@ -64,17 +65,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--link",
         type=Path,
         metavar="DIR",
-        help="tell the link's state here, and follow what 'cloudrc link set' leaves (default: not)",
+        help="folder to write the link's state to and to read changes of 'cloudrc link set' from",
     )
     parser.add_argument(
         "--fifo",
         action="store_true",
-        help="run before ordinary processes (SCHED_FIFO) if this user may: a shorter tail",
+        help="use real-time priority (SCHED_FIFO), if permitted: less timing error",
     )
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Forward."""
+    """Forward datagrams until stopped."""
     from cloudrc import assembly
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.feed import Feed
@@ -85,50 +86,55 @@ def execute(options: argparse.Namespace) -> int:
     stop, exporter = StopSignal(), open_exporter(options, "link")
     experiment = read_experiment(str(options.config))
     uplink, downlink = assembly.build_links(experiment)
-    world, cloud = resolved("--world", options.world), resolved("--cloud", options.cloud)
+    world, cloud = (
+        resolve_address("--world", options.world),
+        resolve_address("--cloud", options.cloud),
+    )
     settle()
-    if options.fifo:  # before the relay is made, which looks whether it has it
-        _run_first()
+    if options.fifo:  # before the relay is made, which reads its own priority
+        _use_fifo()
     relay = Relay(
         uplink,
         downlink,
         peek,
-        world_side=_side("--world-side", options.world_side),
-        cloud_side=_side("--cloud-side", options.cloud_side),
+        world_side=_bind_side("--world-side", options.world_side),
+        cloud_side=_bind_side("--cloud-side", options.cloud_side),
         world_peer=world,
         cloud_peer=cloud,
     )
-    ask: Callable[[], bool] = stop
+    should_stop: Callable[[], bool] = stop
     if options.link:
-        ask = controlled(stop, options.link, experiment, (uplink, downlink), exporter, relay)
+        should_stop = follow_folder(
+            stop, options.link, experiment, (uplink, downlink), exporter, relay
+        )
     Feed.on_stdout().ready()
     if exporter is None:
-        relay.run(ask)
+        relay.run(should_stop)
     else:
-        if not options.link:  # else whoever follows it has told
+        if not options.link:  # else the control has shown it
             show_asked(exporter, experiment)
         for way in WAYS:
             exporter.shaped("relay", way, "relay")
         exporter.runs(fingerprint(experiment))
         exporter.ready(True)
-        relay.run(_counting(ask, relay, exporter))
+        relay.run(_counting(should_stop, relay, exporter))
     counts = ", ".join(f"{name} {count:g}" for name, count in relay.counts().items())
     print(f"cloudrc relay: {counts}", file=sys.stderr)
     return 0
 
 
 def show_asked(exporter: Exporter, experiment: ResolvedExperiment) -> None:
-    """Show the mean delay that each direction is asked to have at its beginning."""
+    """Export the mean delay that the experiment requests of each direction."""
     from cloudrc.assembly import link_profile
     from cloudrc.link.state import summary
 
     for way in WAYS:
-        asked = summary(link_profile(getattr(experiment, way)))
-        exporter.asked(way, asked["delay"] or 0.0)
+        requested = summary(link_profile(getattr(experiment, way)))
+        exporter.asked(way, requested["delay"] or 0.0)
 
 
-def _side(flag: str, listen: tuple[str, int]) -> socket.socket:
-    """Open the socket of one side."""
+def _bind_side(flag: str, listen: tuple[str, int]) -> socket.socket:
+    """Bind the socket of one side."""
     from cloudrc.drivers.realtime import bind
 
     warn_if_exposed(listen)
@@ -136,17 +142,17 @@ def _side(flag: str, listen: tuple[str, int]) -> socket.socket:
         return bind(listen)
 
 
-def _run_first() -> None:
-    """Ask for SCHED_FIFO, and say what came of it."""
+def _use_fifo() -> None:
+    """Ask for SCHED_FIFO and print whether it was granted."""
     from cloudrc.link.relay import ask_for_fifo
 
     refused = ask_for_fifo()
-    said = f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO"
-    print(f"cloudrc relay: {said}", file=sys.stderr, flush=True)
+    result = f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO"
+    print(f"cloudrc relay: {result}", file=sys.stderr, flush=True)
 
 
 def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Callable[[], bool]:
-    """Ask `stop`, and once a second tell the exporter what the relay has counted."""
+    """Wrap `stop`: also export the relay's counts once a second."""
     import time
 
     from cloudrc.records import Counted
@@ -167,10 +173,10 @@ def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Cal
 
 PROFILE_FILE = "profile.json"
 RELEASED_PERIOD = 2.0
-"""Between two tellings of how late datagrams left [s]: as often as an end notes it."""
+"""Period in which the lateness of datagrams is published; an end reads it as often [s]."""
 
 
-def controlled(
+def follow_folder(
     stop: Callable[[], bool],
     folder: Path,
     experiment: ResolvedExperiment,
@@ -178,15 +184,15 @@ def controlled(
     exporter: Exporter | None,
     relay: Relay,
 ) -> Callable[[], bool]:
-    """Make of `stop`, which a relay asks all the time, one that follows a folder as well.
+    """Follow a folder with requested changes, and wrap `stop` so that it applies them.
 
     Args:
-        stop: Whether to end.
-        folder: Where to look, and to tell.
-        experiment: What the relay began with.
-        links: Its uplink and downlink.
-        exporter: Shows what is asked for; None if nobody does.
-        relay: Takes in what has come before it changes, and says how late it is.
+        stop: Says whether to end; the relay calls it all the time.
+        folder: Read for changes; gets the link's state.
+        experiment: The experiment that the relay started with.
+        links: Uplink and downlink.
+        exporter: Exports the requested delay; None without metrics.
+        relay: Queues received datagrams before a change, and gives their lateness.
     """
     from cloudrc.assembly import link_profile
 
@@ -205,7 +211,7 @@ def controlled(
 
 
 class RelayControl:
-    """Both directions of a relay, and the folder from which they are set."""
+    """Apply the changes that a folder requests to both directions of a relay."""
 
     def __init__(
         self,
@@ -216,63 +222,63 @@ class RelayControl:
         take_in: Callable[[], None] = lambda: None,
         released: Callable[[str], dict[str, int]] = lambda way: {},
     ) -> None:
-        """Tell what is in force from the start.
+        """Publish the initial state.
 
         Args:
-            folder: Made if it is not there.
+            folder: Created if missing.
             links: "uplink" and "downlink".
-            first: What they were made with.
-            asked: Learns the mean delay [s] that a direction is asked to have from now on.
-            take_in: Puts on the link what has come, before it changes.
-            released: Says how late the datagrams of a direction left so far.
+            first: The profiles that the links started with.
+            asked: Called with a direction and its newly requested mean delay [s].
+            take_in: Queues received datagrams under the old profile, before a change.
+            released: Gives the lateness of the datagrams of a direction so far.
         """
         self._folder, self._links, self._asked, self._take_in = folder, links, asked, take_in
-        self._released, self._told = released, 0.0
+        self._released, self._released_at = released, 0.0
         folder.mkdir(exist_ok=True)
         file = folder / PROFILE_FILE
         self._files = {way: ProfileFile(file, loader(way), _log) for way in links}
-        self._wanted: deque[tuple[str, Loaded]] = deque()
-        self._done: deque[tuple[str, Loaded, int]] = deque()
+        self._pending: deque[tuple[str, Loaded]] = deque()
+        self._applied: deque[tuple[str, Loaded, int]] = deque()
         self._changes = dict.fromkeys(links, -1)
         for way, loaded in first.items():
-            self._tell(way, loaded, time.monotonic_ns())
+            self._publish(way, loaded, time.monotonic_ns())
 
     def start(self) -> None:
-        """Begin to follow the folder."""
+        """Start the thread that follows the folder."""
         threading.Thread(target=self._follow, name="link control", daemon=True).start()
 
     def swap(self) -> None:
-        """Put what is asked for in force; the relay's loop calls it between datagrams."""
+        """Apply the pending profiles; the relay's loop calls this between datagrams."""
         self._take_in()
-        while self._wanted:
-            way, loaded = self._wanted.popleft()
+        while self._pending:
+            way, loaded = self._pending.popleft()
             self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
-            self._done.append((way, loaded, time.monotonic_ns()))
+            self._applied.append((way, loaded, time.monotonic_ns()))
 
     def stop_after(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Make of `stop`, which the relay asks all the time, one that swaps as well."""
+        """Wrap `stop`, which the relay calls all the time, so that it also applies changes."""
 
         def ask() -> bool:
-            if self._wanted:
+            if self._pending:
                 self.swap()
             return stop()
 
         return ask
 
     def look(self) -> None:
-        """Look once for a change, and tell of those that are in force."""
+        """Check once for a requested change, and publish the applied ones."""
         for way, file in self._files.items():
             if (loaded := file.poll()) is not None:
-                self._wanted.append((way, loaded))
-        with suppress(OSError):  # a full disk: what is not told is told at the next look
-            self._tell_all()
+                self._pending.append((way, loaded))
+        with suppress(OSError):  # such as a full disk: the next check tries again
+            self._publish_all()
 
-    def _tell_all(self) -> None:
-        while self._done:
-            self._tell(*self._done[0])
-            self._done.popleft()
-        if time.monotonic() - self._told >= RELEASED_PERIOD:
-            self._told = time.monotonic()
+    def _publish_all(self) -> None:
+        while self._applied:
+            self._publish(*self._applied[0])
+            self._applied.popleft()
+        if time.monotonic() - self._released_at >= RELEASED_PERIOD:
+            self._released_at = time.monotonic()
             for way in self._links:
                 if released := self._released(way):
                     publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
@@ -280,12 +286,12 @@ class RelayControl:
     def _follow(self) -> None:
         while True:
             self.look()
-            time.sleep(PROFILE_PERIOD / 2 if self._wanted else PROFILE_PERIOD)
+            time.sleep(PROFILE_PERIOD / 2 if self._pending else PROFILE_PERIOD)
 
-    def _tell(self, way: str, loaded: Loaded, since_ns: int) -> None:
+    def _publish(self, way: str, loaded: Loaded, since_ns: int) -> None:
         changes = self._changes[way] + 1
         values: dict[str, Any] = loaded.values
-        asked = summary(loaded.direction)
+        requested = summary(loaded.direction)
         state = LinkState(
             shaper="relay",
             reason="local mode",
@@ -297,11 +303,11 @@ class RelayControl:
             changes=changes,
             change=loaded.change.number,
             cause=loaded.change.cause if changes else "",
-            asked=asked,
-            # A time line that came up with the link counts from its first datagram.
+            asked=requested,
+            # The time line of an initial profile starts with the first datagram.
             origin_ns=since_ns if changes and loaded.change.restart else None,
         )
-        self._asked(way, asked["delay"] or 0.0)
+        self._asked(way, requested["delay"] or 0.0)
         publish(self._folder / f"{way}.json", to_text(state))
         self._changes[way] = changes
 

@@ -1,4 +1,4 @@
-"""`cloudrc report RUN`: a recorded run comes in, its report is written again."""
+"""`cloudrc report RUN`: write the report of a recorded run again."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="measure by this Python file too; may be repeated (files that the run's own"
-        " configuration names are not run)",
+        help="also evaluate the metric in this Python file; repeatable. Files named by the run's"
+        " configuration are never executed",
     )
     output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Write the report again from the recording; exit as the run did."""
+    """Write the report from the recording; give the run's exit code."""
     require("a report", ("record", "report"))
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
@@ -42,9 +42,9 @@ def execute(options: argparse.Namespace) -> int:
 
     metrics.check(options.metric)
     recording, experiment, run = read_run(options.run)
-    # The run may come from somebody else: nothing that it names is run.
-    missed = metrics.not_measured(experiment.report.metrics, options.metric)
-    run = replace(run, notes=(*run.notes, *missed))
+    # The run may come from somebody else: never execute files that it names.
+    unmeasured = metrics.not_measured(experiment.report.metrics, options.metric)
+    run = replace(run, notes=(*run.notes, *unmeasured))
     document = write_report(options.run, recording, experiment, run, own=options.metric)
     if options.output != "table":
         print(written(document, options.output))

@@ -1,4 +1,4 @@
-"""`cloudrc run`: an experiment and a mode come in; its run folder and a verdict go out."""
+"""`cloudrc run`: fly an experiment, write its run folder and print the verdict."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from cloudrc.records import Record
 
 Flight = Callable[[Path, TextIO, int], dict[str, Any]]
-"""Folder to fill, stream to show itself on, number of waypoints -> the report."""
+"""A flight: (folder to fill, stream for its progress, number of waypoints) -> report."""
 
 MODES = ("local", "virtual", "cluster")
 EXTRAS = {
@@ -29,7 +29,7 @@ EXTRAS = {
     "virtual": ("world", "record", "report"),
     "cluster": ("kube", "record", "report"),
 }
-"""What has to be installed, by mode."""
+"""The extras that each mode needs."""
 EPILOG = """\
 modes:
   local    real time: four processes, UDP on 127.0.0.1
@@ -44,8 +44,8 @@ examples:
   cloudrc run --mode cluster --context kind-cloudrc -n demo --release demo
   cloudrc run runs/latest/config.yaml --mode virtual     the same run again
 
-'cloudrc list' names experiments, profiles and plug-ins. The last line that
-is printed is the path of the report."""
+'cloudrc list' shows the names of experiments, profiles and plug-ins. The last
+line of the output is the path of the report."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,34 +55,39 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         default="paper",
         metavar="EXPERIMENT",
-        help="a shipped experiment or a file (default: paper)",
+        help="name of a shipped experiment, or a YAML file (default: paper)",
     )
-    parser.add_argument("--mode", choices=MODES, help="default: local; with --seeds: virtual")
+    parser.add_argument(
+        "--mode", choices=MODES, help="where to fly (default: local; with --seeds: virtual)"
+    )
     many = parser.add_mutually_exclusive_group()
     many.add_argument(
-        "--seed", type=_whole, metavar="S", help="seed of this run, in place of the experiment's"
+        "--seed",
+        type=_seed,
+        metavar="S",
+        help="random seed of this run (default: the experiment's)",
     )
     many.add_argument(
-        "--seeds", type=count, metavar="N", help="fly seeds 1 to N, on all cores, and tabulate"
+        "--seeds", type=count, metavar="N", help="fly seeds 1 to N on all cores and print a table"
     )
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="change one key of the experiment; may be repeated",
+        help="change one key of the experiment; repeatable",
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder to write (default: the next in runs/)"
+        "--out", type=Path, metavar="DIR", help="folder of the run (default: a new one in runs/)"
     )
-    output_argument(parser, "json, yaml: the report on stdout and nothing else")
+    output_argument(parser, "json, yaml: print only the report")
     place_arguments(parser)
     timeout_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Fly once or many times."""
-    end_orderly()  # with a report
+    end_orderly()  # an interrupted flight still gets its report
     mode = options.mode or ("virtual" if options.seeds else "local")
     if options.seeds and mode != "virtual":
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
@@ -105,12 +110,12 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
 
     experiment = load_experiment(options.experiment, overrides)
     metrics.check(experiment.report.metrics)
-    # What is wrong with the place is said before a folder is made for the run.
+    # First prepare the flight: if that fails, no folder must be left.
     flight = _in_cluster(experiment, options) if mode == "cluster" else _here(experiment, mode)
     name = experiment.name
-    # In a cluster much can go wrong before anything is recorded: nothing is left of that.
-    late = mode == "cluster"
-    folder = new_folder(options.out, f"{name}-{mode}-seed{experiment.seed}", latest=not late)
+    # A cluster can fail before anything is recorded; the folder is then removed.
+    removable = mode == "cluster"
+    folder = new_folder(options.out, f"{name}-{mode}-seed{experiment.seed}", latest=not removable)
     for_programs = options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
     mission = experiment.mission
@@ -124,11 +129,11 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
     try:
         report = flight(folder, stream, waypoints)
     except (CloudrcError, KeyboardInterrupt):
-        if not (late and discard(folder)):
-            say(f"what was recorded is in {folder}", sys.stderr)
+        if not (removable and discard(folder)):
+            say(f"the recording is in {folder}", sys.stderr)
         raise
     finally:
-        if late and options.out is None and folder.exists():
+        if removable and options.out is None and folder.exists():
             point_latest_to(folder)
     with unread_is_fine(sys.stdout):
         if for_programs:
@@ -150,7 +155,7 @@ def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
         quiet = stream is sys.stderr and not is_live(stream)
         view = None if quiet else FlightView(stream, waypoints)
         try:
-            return fly(experiment, mode, folder, view.see if view else _see_nothing)
+            return fly(experiment, mode, folder, view.see if view else _ignore)
         finally:
             if view:
                 view.close()
@@ -177,11 +182,11 @@ def _in_cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> 
     return flight
 
 
-def _see_nothing(records: list[Record]) -> None:
-    """Nobody watches."""
+def _ignore(records: list[Record]) -> None:
+    """Show nothing of the flight."""
 
 
-def _whole(text: str) -> int:
+def _seed(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number >= 0")
     return int(text)

@@ -1,7 +1,7 @@
-"""One flight in a cluster: an experiment and a release come in; a folder and a report go out.
+"""Fly one experiment in a cluster.
 
-Install or upgrade the release, wait until it can fly, fly the mission by a Job, fetch what both
-pods recorded, merge it, report.
+Install or upgrade the release, wait until it is ready, fly the mission by a Job, fetch and merge
+the recordings of both pods, and write the report.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ if TYPE_CHECKING:
 Tell = Callable[[str], None]
 
 FLUSH = 1.0
-"""After which a recorder has handed its last half second to the operating system [s]."""
+"""Time in which a recorder surely flushes its buffer of half a second [s]."""
 FETCHES = 4
-"""How often to fetch until the mission's end is in both recordings."""
+"""Maximum number of attempts to fetch recordings that contain the mission's end."""
 FLOWN = (0, 1, 6, 130)
-"""Exit codes of a Job whose mission was flown, well, badly or not to its end."""
+"""Exit codes of a Job whose mission has flown: success, failure, invalid, interrupted."""
 COMPONENTS = ("world", "cloud")
-_SHAPER = re.compile(r'cloudrc_link_info\{[^}]*shaper="(\w+)"')
+_SHAPER_LABEL = re.compile(r'cloudrc_link_info\{[^}]*shaper="(\w+)"')
 
 
 def fly_in_cluster(
     experiment: ResolvedExperiment, folder: Path, release: Release, timeout: float, tell: Tell
 ) -> dict[str, Any]:
-    """Fly one experiment on a release and write everything that a run leaves.
+    """Fly one experiment on a release and fill its run folder.
 
     Args:
         experiment: Complete and checked.
-        folder: Empty, and so until the mission has flown; then it gets configuration, recordings,
+        folder: Empty until the mission has flown; then it gets configuration, recordings,
             metrics, logs and report.
-        release: Where to fly; it is installed if it is not there, and stays.
-        timeout: For the release to become ready [s].
-        tell: Gets a line for people now and then.
+        release: Where to fly; installed if missing, and kept afterwards.
+        timeout: Time for the release to become ready [s].
+        tell: Called with progress, a line at a time.
 
     Returns:
-        What report.json holds.
+        The content of report.json.
 
     Raises:
-        CloudrcError: If the mission could not be flown, or another one is under way there.
+        CloudrcError: If the mission could not be flown, or another one is flying there.
     """
     from cloudrc.cluster.release import current_values, install
     from cloudrc.cluster.tools import chart_folder
@@ -74,21 +74,21 @@ def fly_in_cluster(
 
 
 def values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Say to the chart what to fly; all else of the release stays as it is.
+    """Give the chart's values for an experiment; other values of the release stay.
 
     Args:
-        experiment: Complete; it becomes the chart's `experiment`, and its link the link.
-        before: What the release was installed with.
+        experiment: Complete; it becomes the chart's `experiment`, with its link.
+        before: Values that the release was installed with.
     """
     link = {**before.get("link", {}), "profile": ""}
-    # The chart's own Job would fly its mission in the way of ours.
+    # The chart's own Job would fly its mission at the same time.
     mission = {**before.get("mission", {}), "enabled": False}
     flown = experiment.model_dump(mode="json")
     return {**before, "link": link, "mission": mission, "experiment": flown}
 
 
 def _refuse_busy(release: Release) -> None:
-    """Refuse to end somebody's flight: installing another experiment replaces both pods."""
+    """Refuse to interrupt a flight: installing an experiment replaces both pods."""
     from cloudrc.cluster.jobs import under_way
     from cloudrc.cluster.tools import ClusterError
 
@@ -102,7 +102,7 @@ def _refuse_busy(release: Release) -> None:
 
 
 def mission_document(experiment: ResolvedExperiment) -> dict[str, Any]:
-    """Say to the API what to fly."""
+    """Give the mission of an experiment as the API expects it."""
     mission = experiment.mission.model_dump(mode="json")
     return {
         "name": experiment.name,
@@ -113,10 +113,10 @@ def mission_document(experiment: ResolvedExperiment) -> dict[str, Any]:
 
 
 def refuse_local_files(experiment: ResolvedExperiment) -> None:
-    """Refuse what only this machine has: files outside the package are not in the images.
+    """Refuse an experiment that names local files, which the images do not contain.
 
     Raises:
-        BadInputError: Names the key.
+        BadInputError: Names the key of the file.
     """
     from cloudrc.config.load import FILES
 
@@ -143,7 +143,7 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
-    """Fly by a Job; interrupted, the mission is cancelled before this function ends."""
+    """Fly by a Job; cancel the mission if interrupted."""
     from cloudrc.cluster.jobs import follow, patience, run_job
     from cloudrc.cluster.tools import ClusterError
 
@@ -165,20 +165,20 @@ def _cancel(release: Release, job: JobStatus, tell: Tell) -> None:
     try:
         tell(cancel(release, job.name))
     except CloudrcError as error:
-        tell(f"not cancelled: {error}")
+        tell(f"cannot cancel: {error}")
 
 
 def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Mission:
     """Fetch recordings, metrics and logs, and merge the recordings.
 
     Args:
-        release: Where it flew.
-        folder: Of the run.
-        tell: Gets a line for what could not be fetched.
-        want_end: Whether to fetch again until the mission's end is in the recordings.
+        release: Where the mission flew.
+        folder: The folder of the run.
+        tell: Called with a line for each file that cannot be fetched.
+        want_end: Whether to fetch again until the recordings contain the mission's end.
 
     Raises:
-        CloudrcError: If the recordings cannot be fetched; without the rest there is a report.
+        CloudrcError: If the recordings cannot be fetched; the report needs no other file.
     """
     from cloudrc.cluster.pods import fetch_logs, fetch_metrics
     from cloudrc.record.merge import cut_to_last_mission, merge
@@ -195,7 +195,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
             try:
                 texts = fetch(release, component)
             except CloudrcError as error:
-                tell(f"the report goes without the {component} pod's {suffix}: {error}")
+                tell(f"the report is written without the {component} pod's {suffix}: {error}")
                 continue
             for container, text in texts.items():
                 path = folder / f"{component}-{container}.{suffix}"
@@ -204,7 +204,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
 
 
 def _fetch_recordings(release: Release, folder: Path, tell: Tell) -> None:
-    """Copy both recordings; a way that breaks off is tried again."""
+    """Copy both recordings; retry if a connection breaks."""
     from cloudrc.cluster.pods import fetch_recording
 
     for component in COMPONENTS:
@@ -220,23 +220,23 @@ def _fetch_recordings(release: Release, folder: Path, tell: Tell) -> None:
 
 
 def _fetch_before(release: Release, folder: Path, tell: Tell) -> None:
-    """Copy what led to the end of a container, if one was started again; the report needs none."""
+    """Copy the earlier recording of a restarted container; the report does not need it."""
     from cloudrc.cluster.pods import fetch_before
 
     for component in COMPONENTS:
         path = folder / f"{component}.before.mcap"
         try:
             if fetch_before(release, component, path):
-                tell(f"{component} was started again; what it had recorded before is in {path}")
+                tell(f"{component} was restarted; its earlier recording is in {path}")
         except CloudrcError as error:
             path.unlink(missing_ok=True)
-            tell(f"{component} was started again; no recording from before: {error}")
+            tell(f"{component} was restarted; no earlier recording: {error}")
 
 
-def shaper(folder: Path) -> str:
-    """Read what emulated the link from the metrics of its container."""
+def _shaper(folder: Path) -> str:
+    """Read the link's emulator, such as netem, from its container's metrics."""
     texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("*-link.metrics"))]
-    found = {name for text in texts for name in _SHAPER.findall(text)}
+    found = {name for text in texts for name in _SHAPER_LABEL.findall(text)}
     return "+".join(sorted(found)) or "unknown"
 
 
@@ -249,9 +249,9 @@ def _report(
     from cloudrc.report.write import write_report
 
     digest = messages_sha256(mission.contents.messages)
-    run = replace(Run("cluster", shaper(folder), digest), interrupted=interrupted)
+    run = replace(Run("cluster", _shaper(folder), digest), interrupted=interrupted)
     try:
-        own = experiment.report.metrics  # measured here: the pods need no such file
+        own = experiment.report.metrics  # evaluated here, so the pods do not need the file
         return write_report(folder, mission.recording(), experiment, run, own=own)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))

@@ -1,6 +1,6 @@
-"""What the process commands share: their flags, their socket addresses, their metrics.
+"""Flags, sockets, keys, recordings and metrics that the process commands share.
 
-What world and cloud open before they are built, from their flags, and how they fly then.
+`open_end` opens them for world and cloud; `EndRuntime.fly` then runs the end.
 """
 
 from __future__ import annotations
@@ -32,77 +32,82 @@ if TYPE_CHECKING:
 Address = tuple[str, int]
 LOOPBACK_NAMES = ("localhost", "::1", "[::1]")
 EPILOG = """\
-'cloudrc run --mode local' starts this process with the flags that it needs.
-It ends on SIGTERM, on Ctrl-C, and when the process that started it is gone."""
+'cloudrc run --mode local' starts this process with all the flags it needs.
+It ends on SIGTERM, on Ctrl-C, and when the process that started it ends."""
 
 
 def process_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what every process takes."""
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="the experiment")
+    """Declare the flags of every process."""
     parser.add_argument(
-        "--feed", action="store_true", help="tell a supervisor on stdout; else only events are said"
+        "--config", type=Path, required=True, metavar="FILE", help="experiment file (YAML)"
+    )
+    parser.add_argument(
+        "--feed",
+        action="store_true",
+        help="write status for a supervisor to stdout (default: print events only)",
     )
     parser.add_argument(
         "--metrics",
         type=address,
         metavar="HOST:PORT",
-        help="serve /metrics, /healthz and /readyz here (default: not at all)",
+        help="serve /metrics, /healthz and /readyz at this address (default: off)",
     )
 
 
 def end_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what an end of the tunnel takes."""
+    """Declare the flags of world and cloud."""
     process_arguments(parser)
     parser.add_argument(
         "--record",
         type=Path,
         metavar="FILE",
-        help="MCAP file to write; one that is there is kept, as NAME.before.mcap",
+        help="MCAP file to write; an existing one is renamed to NAME.before.mcap",
     )
     parser.add_argument(
         "--record-flights",
         action="store_true",
-        help="leave out what comes periodically while nothing flies",
+        help="leave out periodic records while the robot is not flying",
     )
     parser.add_argument(
         "--record-max",
         type=size,
         metavar="SIZE",
-        help="end the recording at nine tenths of this, one kept from before counted: 500M, 1Gi "
-        "(default: no limit)",
+        help="size limit, such as 500M or 1Gi, for this recording and the renamed one together;"
+        " recording ends at 90 %% of it (default: no limit)",
     )
     parser.add_argument(
-        "--listen", type=address, required=True, metavar="HOST:PORT", help="where to receive"
+        "--listen", type=address, required=True, metavar="HOST:PORT", help="address to receive at"
     )
     parser.add_argument(
         "--link",
         type=Path,
         metavar="FILE",
-        help="where the link tells its state; its changes are recorded (default: link.json beside"
-        " the route)",
+        help="file with the link's state, to be recorded (default: link.json beside --route)",
     )
     parser.add_argument(
         "--key",
         type=Path,
         required=True,
         metavar="FILE",
-        help="the tunnel's pre-shared key; followed while it flies ('cloudrc key new FILE')",
+        help="the tunnel's pre-shared key ('cloudrc key new FILE'); it may change in flight",
     )
     target = parser.add_mutually_exclusive_group(required=True)
     target.add_argument(
-        "--peer", type=address, metavar="HOST:PORT", help="where to send; a name is resolved once"
+        "--peer",
+        type=address,
+        metavar="HOST:PORT",
+        help="address to send to; a name is resolved once",
     )
     target.add_argument(
         "--route",
         type=Path,
         metavar="FILE",
-        help="file that says where to send, HOST:PORT with the host as a number; it is waited for"
-        " and followed",
+        help="file with the numeric HOST:PORT to send to; it may appear or change later",
     )
 
 
 def address(text: str) -> Address:
-    """Read HOST:PORT, as argparse calls it."""
+    """Read HOST:PORT; a type for argparse."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
         raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT")
@@ -110,16 +115,20 @@ def address(text: str) -> Address:
 
 
 def resolve(name: str) -> list[str]:
-    """Give the IPv4 addresses of a name; raises an OSError if there is none."""
+    """Give the IPv4 addresses of a host name.
+
+    Raises:
+        OSError: If the name has none.
+    """
     try:
         found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_DGRAM)
-    except UnicodeError as error:  # a label that is empty or too long
+    except UnicodeError as error:  # an empty label, or one that is too long
         raise OSError(f"not a name: {error}") from error
     return [str(entry[4][0]) for entry in found]
 
 
-def resolved(flag: str, where: Address) -> Address:
-    """Give an address in numbers, once and before the loop: that cannot wait for a name server.
+def resolve_address(flag: str, where: Address) -> Address:
+    """Resolve an address once, before the loop, which must not wait for a name server.
 
     Raises:
         BadInputError: If its host cannot be resolved; names the flag.
@@ -135,7 +144,7 @@ def resolved(flag: str, where: Address) -> Address:
 
 
 def size(text: str) -> float:
-    """Read an amount of bytes as Kubernetes writes it, as argparse calls it."""
+    """Read a size as Kubernetes writes it [bytes]; a type for argparse."""
     found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti)?", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 500M or 1Gi")
@@ -148,27 +157,27 @@ def size(text: str) -> float:
 
 
 def warn_if_exposed(listen: Address) -> None:
-    """Say so if others than this machine can send to an address."""
+    """Warn if other machines can send to an address."""
     if not listen[0].startswith("127.") and listen[0] not in LOOPBACK_NAMES:
         print(f"cloudrc: warning: {listen[0]} can be reached from outside", file=sys.stderr)
 
 
 def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
-    """Serve a process's metrics where its flags say; None if they do not."""
+    """Serve a process's metrics at the address of its flag; None without the flag."""
     if options.metrics is None:
         return None
     from cloudrc.drivers.exporter import Exporter
 
     warn_if_exposed(options.metrics)
-    elsewhere = getattr(options, "teleop", None) is not None
-    exporter = Exporter(role, missions=not elsewhere)
+    has_teleop_process = getattr(options, "teleop", None) is not None
+    exporter = Exporter(role, missions=not has_teleop_process)
     exporter.serve(options.metrics)
     return exporter
 
 
 @contextmanager
 def listening(flag: str, listen: Address) -> Iterator[None]:
-    """Open a socket at an address inside; if that fails, say which flag asked for what."""
+    """Name the flag and the address if opening a socket inside fails."""
     try:
         yield
     except OSError as error:
@@ -179,21 +188,22 @@ def listening(flag: str, listen: Address) -> Iterator[None]:
 
 
 TRACE_MAX = 2 << 20
-"""Of a trace that the link's container names [bytes]: its own come from a ConfigMap of 1 MiB."""
+"""Maximum size of a trace that the link's container names [bytes]. Its own traces come from a
+ConfigMap, which holds at most 1 MiB."""
 
 
-class Opened(NamedTuple):
-    """What an end has before it is built, and flies with.
+class EndRuntime(NamedTuple):
+    """Everything that an end needs, both to be built and to fly.
 
     Attributes:
-        options: The command's.
+        options: The command's options.
         name: "world" or "cloud".
-        exporter: Of its metrics; None if nobody wants them.
-        experiment: What it flies.
-        clock: Which machine's clock it has.
-        recorder: Where its records go.
-        keys: The tunnel's.
-        peer: Its socket.
+        exporter: Serves the metrics; None without `--metrics`.
+        experiment: The experiment to fly.
+        clock: Identity of the machine's clock.
+        recorder: Writes the records.
+        keys: The tunnel's keys.
+        peer: The socket.
     """
 
     options: argparse.Namespace
@@ -214,7 +224,10 @@ class Opened(NamedTuple):
         over: Callable[[], bool] = lambda: False,
         slip_ns: Callable[[], int] = lambda: 0,
     ) -> None:
-        """Fly the end that was built, as `process.run_end`; `flies` says whether it does now."""
+        """Run an end until it stops; `flies` says whether the robot is flying.
+
+        The other arguments are those of `process.run_end`.
+        """
         from cloudrc.drivers.process import run_end
 
         options = self.options
@@ -228,31 +241,31 @@ class Opened(NamedTuple):
             slip_ns=slip_ns,
             exporter=self.exporter,
             watched=options.feed,
-            choose=_chosen(options, flies),
+            choose=_record_filter(options, flies),
             link=_link_state(options),
             check=_standing_check(options, self.experiment, uplink=self.name == "cloud"),
             keys=self.keys,
         )
 
 
-def open_end(options: argparse.Namespace, name: str) -> Opened:
-    """Open what the "world" or the "cloud" needs; what cannot be had is said by its flag."""
+def open_end(options: argparse.Namespace, name: str) -> EndRuntime:
+    """Open what the "world" or the "cloud" needs; an error names the flag."""
     from cloudrc.config.load import fingerprint, load_experiment, read_experiment
     from cloudrc.drivers.machine import clock_id
 
     exporter, path, clock = open_exporter(options, name), str(options.config), clock_id()
     given = read_experiment(path)
-    # Cloud alone flies by plug-ins, which fill in what the file leaves to them.
+    # Only cloud loads the plug-ins, which fill in their default parameters.
     experiment = load_experiment(path) if name == "cloud" else given
     if exporter is not None:
         exporter.runs(fingerprint(given))
     keys, peer = _open_keys(options), _open_peer(options)
-    recorder = _open_recorder(options, name, clock)  # last: whoever cannot fly moves no recording
-    return Opened(options, name, exporter, experiment, clock, recorder, keys, peer)
+    recorder = _open_recorder(options, name, clock)  # last: it renames an old recording
+    return EndRuntime(options, name, exporter, experiment, clock, recorder, keys, peer)
 
 
-def suite() -> int:
-    """The cipher that this machine is fast at."""
+def fast_suite() -> int:
+    """Give the cipher suite that is fast on this machine."""
     from cloudrc.drivers.machine import has_fast_aes
     from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305
 
@@ -260,12 +273,12 @@ def suite() -> int:
 
 
 def _open_keys(options: argparse.Namespace) -> KeyFile:
-    """Read the key of an end."""
+    """Read the keys of an end."""
     import time
 
     from cloudrc.drivers.keyfile import KeyFile, is_exposed
 
-    # Asked once, before anything flies, and for this alone: how old is a key that was replaced?
+    # The wall clock is read only here, before the flight: it gives the age of a replaced key.
     keys = KeyFile(options.key, time.monotonic_ns(), time.time())
     if is_exposed(options.key):
         print(f"cloudrc: warning: everybody can read {options.key}: chmod 600", file=sys.stderr)
@@ -273,27 +286,29 @@ def _open_keys(options: argparse.Namespace) -> KeyFile:
 
 
 def _open_peer(options: argparse.Namespace) -> Peer:
-    """Bind the socket of an end, which sends to its peer or where its route leads."""
+    """Bind the socket of an end, which sends to its peer or along its route."""
     from cloudrc.drivers.realtime import Peer, Route
 
     warn_if_exposed(options.listen)
-    where = resolved("--peer", options.peer) if options.route is None else Route(options.route)
+    destination = (
+        resolve_address("--peer", options.peer) if options.route is None else Route(options.route)
+    )
     if options.route is not None and not options.route.exists():
-        print(f"cloudrc: nothing is sent until there is {options.route}", file=sys.stderr)
+        print(f"cloudrc: sends nothing until {options.route} exists", file=sys.stderr)
     with listening("--listen", options.listen):
-        return Peer.bind(options.listen, where)
+        return Peer.bind(options.listen, destination)
 
 
 def _open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:
-    """Make the recorder of a process; without a file it writes into nothing."""
+    """Make the recorder of an end; without a file it writes to /dev/null."""
     from cloudrc.record.recorder import Recorder
     from cloudrc.record.writer import McapWriter
 
     path: Path = options.record or Path(os.devnull)
-    before, size_max = _keep_before(path), None
+    size_before, size_max = _keep_before(path), None
     if options.record_max:
         room = round(0.9 * options.record_max)
-        size_max = max(room - before, room // 10)  # both together, which share a volume
+        size_max = max(room - size_before, room // 10)  # both recordings share a volume
     return Recorder(
         path,
         lambda file: McapWriter(file, clock=clock, clock_id=clock_id.hex()),
@@ -302,39 +317,39 @@ def _open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> 
 
 
 def _keep_before(path: Path) -> int:
-    """Keep what the process before this one has recorded, as world.before.mcap; its size [bytes].
+    """Rename the recording of the previous process to NAME.before.mcap; give its size [bytes].
 
-    A container that is started again finds the volume as it was, and so what led to its end.
+    A restarted container finds it on its volume; it shows why the previous process ended.
     """
     try:
         size = path.stat().st_size if path.is_file() else 0
         if size:
             path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
-    except OSError:  # whoever writes meets it again, and says so
+    except OSError:  # the recorder meets the same error and reports it
         return 0
     return size
 
 
-def _chosen(
+def _record_filter(
     options: argparse.Namespace, flies: Callable[[], bool]
 ) -> Callable[[list[Record]], list[Record]]:
-    """What chooses the records for the recording."""
+    """Give the function that selects the records to write."""
     from cloudrc.drivers.recording import FlightsOnly
 
     return FlightsOnly(flies) if options.record_flights else list
 
 
 def _link_state(options: argparse.Namespace) -> Path | None:
-    """Find where the link of an end tells its state: the link's process writes it."""
-    given: Path | None = options.link
+    """Give the file in which the link's process writes its state."""
+    link: Path | None = options.link
     route: Path | None = options.route
-    return given if given is not None or route is None else route.with_name("link.json")
+    return link if link is not None or route is None else route.with_name("link.json")
 
 
 def _standing_check(
     options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
 ) -> StandingCheck:
-    """Judge the direction that an end hears by what is asked of it, and follow what that is."""
+    """Make the monitor of the direction that an end receives, following changes of its profile."""
     import json
 
     from cloudrc.assembly import link_profile
@@ -348,11 +363,11 @@ def _standing_check(
         profile = Profile.model_validate_json(json.dumps(values))
         return link_profile(profile.uplink, file_max), link_profile(profile.downlink, file_max)
 
-    # Where the route is followed the link is a container, which may be anybody's by now.
+    # With a route the link is a container, which is not trusted: its files have a smaller limit.
     file_max = TRACE_MAX if options.link is None else SIZE_MAX
-    asked = link_profile(experiment.uplink), link_profile(experiment.downlink)
+    requested = link_profile(experiment.uplink), link_profile(experiment.downlink)
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     stream = Stream(experiment.seed, uplink, kind, SIZES[kind])
     check = StandingCheck(uplink=uplink, stream=stream)
-    check.begin(asked, _link_state(options), load)
+    check.begin(requested, _link_state(options), load)
     return check

@@ -1,4 +1,4 @@
-"""The last words of a run: a report comes in; verdict, main numbers and an exit code go out."""
+"""Summary of a run: its verdict, main numbers and exit code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cloudrc.cli.output import harmless, paint, say, table
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
 
-# The numbers that one looks at first; the page and report.json have all of them.
+# The most important numbers -> their labels; report.html and report.json show all numbers.
 MAIN = {
     "duration": "mission took",
     "contact_time": "arm touches the board at",
@@ -26,12 +26,12 @@ MAIN = {
 
 
 def exit_code(report: Mapping[str, Any]) -> int:
-    """Give the exit code that belongs to a verdict."""
+    """Give the exit code of a report's verdict."""
     return EXIT_CODES[report["verdict"]]
 
 
 def show(report: Mapping[str, Any], folder: Path) -> None:
-    """Print verdict, main numbers and, as the last line, where to look."""
+    """Print the verdict, the main numbers and, on the last line, the report's path."""
     print()
     print(verdict(report))
     print()
@@ -44,24 +44,24 @@ def show(report: Mapping[str, Any], folder: Path) -> None:
 
 
 def verdict(report: Mapping[str, Any]) -> str:
-    """Say in one line what became of the run; every broken rule follows on its own line."""
+    """Give the verdict with the first failure; further failures follow, one a line."""
     outcome = report["verdict"]
     word = paint(outcome.upper(), COLOURS[outcome])
     failures = report["failures"]
     if not failures:
         return f"{word}: every waypoint reached, every criterion met"
     first, *others = failures
-    return "\n".join([f"{word}: {harmless(first['text'])}", *map(_line, others)])
+    return "\n".join([f"{word}: {harmless(first['text'])}", *map(_further_failure, others)])
 
 
-def _line(failure: Mapping[str, Any]) -> str:
+def _further_failure(failure: Mapping[str, Any]) -> str:
     time = failure.get("time")
     when = f" (at {time:.2f} s)" if time is not None else ""
     return harmless(f"  also: {failure['text']}{when}")
 
 
 def main_numbers(report: Mapping[str, Any]) -> str:
-    """Lay out the numbers that one looks at first; those that are unknown are left out."""
+    """Lay out the main numbers as a table, without those that are unknown."""
     numbers = report["numbers"]
     rows = [
         (f"  {label}", *_cells(name, numbers[name]))

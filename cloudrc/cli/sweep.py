@@ -1,7 +1,4 @@
-"""`cloudrc run --seeds N`: one experiment under N seeds, on all cores, becomes one table.
-
-Many reports of one experiment become one table: medians with their intervals.
-"""
+"""`cloudrc run --seeds N`: fly N seeds on all cores; tabulate medians with their intervals."""
 
 from __future__ import annotations
 
@@ -24,19 +21,20 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.find_run import new_folder
-from cloudrc.cli.output import number, say, table, unread_is_fine, written
-from cloudrc.cli.pool import AHEAD, KILLED, WorkerDiedError, end_with
+from cloudrc.cli.output import format_number, say, table, unread_is_fine, written
+from cloudrc.cli.pool import BATCH_MAX, WORKER_KILLED, WorkerDiedError, exit_with_parent
 from cloudrc.cli.summary import EXIT_CODES
 
 Report: TypeAlias = Mapping[str, Any]
-"""A `report.json`."""
+"""The content of a `report.json`."""
 
 CONFIDENCE = 0.95
+"""Confidence level of the intervals [1]."""
 METHOD = "95 % interval of the median, by order statistics"
 
 
 def interval(values: Sequence[float]) -> tuple[float, float] | None:
-    """Bound the median of what the values were drawn from, without assuming a distribution.
+    """Compute the confidence interval of the median, for any distribution.
 
     The k-th smallest and the k-th largest of n values enclose the median with probability
     1 - 2 * sum_{i<k} C(n, i) / 2^n; k is the largest for which that is at least 95 %.
@@ -44,7 +42,7 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
     Source: H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., 2003, section 7.1.
 
     Returns:
-        Lower and upper bound, or None for fewer than 6 values, which cannot tell.
+        Lower and upper bound, or None for fewer than 6 values: too few for 95 %.
     """
     ordered, n = sorted(values), len(values)
     outside, k = 0.0, 0
@@ -57,7 +55,7 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
 
 
 def summarise(reports: Sequence[Report]) -> dict[str, Any]:
-    """Give done, count, and per number its median, interval, unit and how many runs have it."""
+    """Summarise reports: runs done, all runs, and statistics of each number."""
     units: dict[str, str] = {}
     values: dict[str, list[float]] = {}
     for report in reports:
@@ -78,21 +76,21 @@ def summarise(reports: Sequence[Report]) -> dict[str, Any]:
 
 
 def as_table(summary: Mapping[str, Any]) -> str:
-    """Lay a summary out: number, median, interval, unit, and below how many runs were done."""
+    """Lay out a summary as a table, with the share of successful runs below."""
     rows = [("number", "median", "95 % interval", "unit")]
     for name, entry in summary["numbers"].items():
         bounds = entry["interval"]
-        between = f"{number(bounds[0])} .. {number(bounds[1])}" if bounds else "-"
+        between = f"{format_number(bounds[0])} .. {format_number(bounds[1])}" if bounds else "-"
         unit = "" if entry["unit"] == "1" else entry["unit"]
         note = "" if entry["count"] == summary["count"] else f"  ({entry['count']} runs)"
-        rows.append((name, number(entry["median"]), between, unit + note))
+        rows.append((name, format_number(entry["median"]), between, unit + note))
     enough = any(entry["interval"] for entry in summary["numbers"].values())
     method = METHOD if enough else "an interval needs 6 seeds or more"
     return f"{table(rows, right=(1, 2))}\n\n{method}\ndone {summary['done']}/{summary['count']}"
 
 
 def as_csv(reports: Sequence[Report]) -> str:
-    """Write one line per run: seed, verdict, and every number that any run has."""
+    """Write one line per run: seed, verdict and all numbers."""
     columns = list(dict.fromkeys(name for report in reports for name in report["numbers"]))
     units = {name: e["unit"] for report in reports for name, e in report["numbers"].items()}
     text = io.StringIO()
@@ -106,14 +104,14 @@ def as_csv(reports: Sequence[Report]) -> str:
 
 
 def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
-    """Fly seeds 1 to N; exit 0 only if each of them succeeds.
+    """Fly seeds 1 to N and give the exit code, 0 only if all succeed.
 
-    Who interrupts gets the table of the seeds that are finished; so does who loses a worker.
+    If the user interrupts or a worker dies, the table covers the finished seeds.
     """
     from cloudrc import metrics
     from cloudrc.config.load import load_experiment
 
-    # Loaded here too: a mistake is told once, not N times.
+    # Load the experiment here too, so that a mistake is reported once, not N times.
     loaded = load_experiment(options.experiment, overrides)
     metrics.check(loaded.report.metrics)
     name = loaded.name
@@ -125,13 +123,15 @@ def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
         with closing(_reports(options.experiment, overrides, folder, seeds)) as finished:
             for report in finished:
                 reports.append(report)
-                _tell(options, report, f"{len(reports)}/{len(seeds)}")
+                _show_run(options, report, f"{len(reports)}/{len(seeds)}")
     except (KeyboardInterrupt, BrokenProcessPool) as error:
         killed = isinstance(error, BrokenProcessPool)
         code = WorkerDiedError.exit_code if killed else EXIT_CODES["interrupted"]
-        told = f"{KILLED if killed else 'interrupted'}: {len(reports)} of {len(seeds)} seeds"
+        reason = (
+            f"{WORKER_KILLED if killed else 'interrupted'}: {len(reports)} of {len(seeds)} seeds"
+        )
         with unread_is_fine(sys.stderr):
-            print(f"\ncloudrc: {told} are finished", file=sys.stderr, flush=True)
+            print(f"\ncloudrc: {reason} are finished", file=sys.stderr, flush=True)
     reports.sort(key=lambda report: int(report["seed"]))
     summary = _write(folder, name, reports, bool(code))
     with unread_is_fine(sys.stdout):
@@ -143,60 +143,60 @@ def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
     return code or max(EXIT_CODES[report["verdict"]] for report in reports)
 
 
-def _tell(options: argparse.Namespace, report: dict[str, Any], count: str) -> None:
+def _show_run(options: argparse.Namespace, report: dict[str, Any], progress: str) -> None:
     stream = sys.stdout if options.output == "table" else sys.stderr
     if options.output == "table" or stream.isatty():
         failures = "".join(f": {f['text']}" for f in report["failures"][:1])
         with unread_is_fine(stream):
-            say(f"{count:>7}  seed {report['seed']}  {report['verdict']}{failures}", stream)
+            say(f"{progress:>7}  seed {report['seed']}  {report['verdict']}{failures}", stream)
 
 
 def _reports(
     experiment: str, overrides: list[str], folder: Path, seeds: range
 ) -> Generator[dict[str, Any]]:
-    """Fly every seed; reports come as they are finished. Who stops listening ends the flights."""
-    # Spawned, not forked: a child starts clean, whatever threads the libraries here have begun.
+    """Fly every seed and yield reports as they finish; closing the generator ends the flights."""
+    # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
     workers = min(os.cpu_count() or 1, len(seeds))
-    with _born_apart():  # it begins a process that sweeps up behind the others
-        pool = ProcessPoolExecutor(workers, context, end_with, (os.getpid(),))
+    with _isolated_start():  # the pool starts multiprocessing's resource tracker
+        pool = ProcessPoolExecutor(workers, context, exit_with_parent, (os.getpid(),))
     with pool:
         try:
-            left = (pool.submit(_fly_one, experiment, overrides, folder, seed) for seed in seeds)
+            waiting = (pool.submit(_fly_one, experiment, overrides, folder, seed) for seed in seeds)
             while True:
-                with _born_apart():
-                    flying = list(islice(left, AHEAD))
+                with _isolated_start():
+                    flying = list(islice(waiting, BATCH_MAX))
                 if not flying:
                     break
                 for future in as_completed(flying):
                     yield future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
-            # Leaving `with` waits for the workers, and they for the end of their flights.
+            # Leaving `with` would wait until all workers have finished their flights.
             for worker in multiprocessing.active_children():
                 worker.terminate()
             raise
 
 
 @contextmanager
-def _born_apart() -> Iterator[None]:
-    """Let processes that begin here be disturbed by nobody but their parent, which ends them.
+def _isolated_start() -> Iterator[None]:
+    """Isolate processes that start inside from the terminal and from the working folder.
 
-    They ignore what a terminal sends to all of a group: a signal that is ignored stays so across
-    the start of a program. Until they have their parent's path, they take no Python from the
-    working folder, which may be a run got from somebody else.
+    They ignore a terminal's signals to the process group, since ignored signals stay ignored in a
+    new program; the parent ends them. They import no Python from the working folder, which may
+    come from somebody else.
     """
     numbers = (signal.SIGINT, signal.SIGHUP)
     before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
-    safe = os.environ.get("PYTHONSAFEPATH")
+    safe_path = os.environ.get("PYTHONSAFEPATH")
     os.environ["PYTHONSAFEPATH"] = "1"
     try:
         yield
     finally:
-        if safe is None:
+        if safe_path is None:
             del os.environ["PYTHONSAFEPATH"]
         else:
-            os.environ["PYTHONSAFEPATH"] = safe
+            os.environ["PYTHONSAFEPATH"] = safe_path
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
 
@@ -206,9 +206,9 @@ def _fly_one(experiment: str, overrides: list[str], folder: Path, seed: int) -> 
     from cloudrc.config.load import load_experiment
 
     loaded = load_experiment(experiment, [*overrides, f"seed={seed}"])
-    own = folder / f"seed-{seed}"
-    own.mkdir()
-    return fly(loaded, "virtual", own, lambda records: None, page=False)
+    run_folder = folder / f"seed-{seed}"
+    run_folder.mkdir()
+    return fly(loaded, "virtual", run_folder, lambda records: None, page=False)
 
 
 def _write(

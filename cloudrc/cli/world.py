@@ -1,4 +1,4 @@
-"""`cloudrc world`: the robot's process; flies until it is told to stop."""
+"""`cloudrc world`: run the robot's process until it is stopped."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cloudrc.cli.output import unread_is_fine
 from cloudrc.cli.parser import read_from
-from cloudrc.cli.runtime import end_arguments, open_end, suite
+from cloudrc.cli.runtime import end_arguments, fast_suite, open_end
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,12 +19,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--epochs",
         type=read_from,
         metavar="FILE",
-        help="keeps the highest number of a session through a restart (default: not kept)",
+        help="file that keeps the session number across restarts (default: none)",
     )
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Fly."""
+    """Run world."""
     from cloudrc.drivers.process import StopSignal
 
     stop = StopSignal()
@@ -34,25 +34,25 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc import assembly
     from cloudrc.world.endpoint import WorldIdentity
 
-    opened = open_end(options, "world")
+    runtime = open_end(options, "world")
     identity = WorldIdentity(
-        opened.clock,
+        runtime.clock,
         os.urandom(16),
-        ring=opened.keys.ring,
-        suite=suite(),
+        ring=runtime.keys.ring,
+        suite=fast_suite(),
         next_epoch=_epochs(options.epochs) if options.epochs else None,
     )
-    world = assembly.build_world(opened.experiment, identity, time.monotonic_ns)
-    opened.fly(world, stop, lambda: world.robot.guard.armed, slip_ns=lambda: world.slip_ns)
+    world = assembly.build_world(runtime.experiment, identity, time.monotonic_ns)
+    runtime.fly(world, stop, lambda: world.robot.guard.armed, slip_ns=lambda: world.slip_ns)
     return 0
 
 
 def _epochs(path: Path) -> Callable[[], int | None]:
-    """Take epochs from a file; say so if they cannot be kept."""
+    """Give the function that takes epochs from a file; warn if the file cannot be written."""
     from cloudrc.drivers.epochs import EpochFile
 
-    def say(trouble: str) -> None:
+    def warn(problem: str) -> None:
         with unread_is_fine(sys.stderr):
-            print(f"cloudrc: warning: {trouble}", file=sys.stderr, flush=True)
+            print(f"cloudrc: warning: {problem}", file=sys.stderr, flush=True)
 
-    return EpochFile(path, say).take
+    return EpochFile(path, warn).take

@@ -1,4 +1,4 @@
-"""A disk for the journal with no more room than it is given, which refuses and kills as told."""
+"""A disk model for the journal: limited space, refused operations and kills."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ MIB = 1 << 20
 
 
 class KilledError(BaseException):
-    """The process is gone: nothing catches it."""
+    """Stands for the death of the process; nothing may catch it."""
 
 
 class Volume(Disk):
-    """A real folder with no more room than it is given, which refuses and kills as it is told.
+    """A real folder with limited space, which refuses operations or kills the process.
 
     Attributes:
-        room: For all files of the folder [bytes].
-        error: With which it says that there is no more.
-        refused: Which operation fails, on which ending of a name, and with what.
-        steps: How many operations there have been.
-        kill_at: The operation before which the process is killed.
+        room: Space for all files of the folder [bytes].
+        error: The errno of a full disk.
+        refused: The operation that fails, the ending of the file's name, and the errno.
+        steps: Number of operations so far.
+        kill_at: Number of the operation before which the process is killed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -54,10 +54,10 @@ class Volume(Disk):
             raise OSError(self.error, "No space left on device")
         return super().write(
             file, data[: min(room, (len(data) + 1) // 2)]
-        )  # as the journal's tests do
+        )  # at most half of it, as in the tests of the journal
 
     def sync(self, file: int) -> None:
-        self._step("sync")  # what survives the machine is not asked here
+        self._step("sync")  # a crash of the machine is not modelled
 
     def replace(self, new: Path, path: Path) -> None:
         self._step("replace", path)

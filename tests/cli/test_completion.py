@@ -1,4 +1,4 @@
-"""Completion: a static script for each shell, and a word when shtab is missing."""
+"""Completion: a script for each shell, and an error if shtab is missing."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_bash_completes_a_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert done.stdout.strip() == "doctor"
 
 
-def test_without_shtab_it_is_named(
+def test_an_error_names_the_missing_shtab(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)

@@ -1,4 +1,4 @@
-"""The doctor: every line has a mend, and only what the mode needs blocks it."""
+"""The doctor: every problem has a fix; only what the mode needs blocks it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import doctor, extras
-from cloudrc.cli import doctor as checks
 from cloudrc.cli.doctor import Check
 from cloudrc.cli.main import main
 from cloudrc.errors import MissingPrerequisiteError
@@ -28,7 +27,7 @@ NO_UDP = Check("udp loopback", "missing", "refused", "allow UDP", ("local",))
         ("virtual", [GOOD, NO_UDP], 0),
     ],
 )
-def test_only_what_the_mode_needs_ends_with_3(
+def test_only_a_needed_check_gives_exit_code_3(
     mode: str,
     found: list[Check],
     code: int,
@@ -44,21 +43,21 @@ def test_only_what_the_mode_needs_ends_with_3(
     assert json.loads(capsys.readouterr().out)["ready"] is (code == 0)
 
 
-def test_whatever_is_not_ok_says_how_to_mend_it() -> None:
-    for check in checks.all_checks():
+def test_every_problem_says_how_to_fix_it() -> None:
+    for check in doctor.all_checks():
         assert check.state == "ok" or check.fix, check.name
         assert len(f"  missing  {check.name}  {check.found}") < 160
 
 
-def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_reported_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(extras.EXTRAS, "world", ("no_such_module",))
-    assert checks.packages("world").fix == "pip install 'cloudrc[world]'"
-    assert checks.packages("world").modes == ("virtual", "local")
+    assert doctor.packages("world").fix == "pip install 'cloudrc[world]'"
+    assert doctor.packages("world").modes == ("virtual", "local")
     with pytest.raises(MissingPrerequisiteError, match=r"mode virtual needs no_such_module.*world"):
         extras.require("mode virtual", ["world", "record"])
 
 
-def test_the_table_of_extras_is_that_of_pyproject() -> None:
+def test_the_extras_are_those_of_pyproject() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     declared = project["optional-dependencies"]
     for extra, modules in extras.EXTRAS.items():

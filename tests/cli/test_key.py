@@ -1,4 +1,4 @@
-"""`cloudrc key`: what was promised of the key before is kept, and so is a link."""
+"""`cloudrc key`: an old key stays valid for its overlap, and a link stays a link."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "key"
 
 
-def test_a_second_rotation_within_the_overlap_is_refused_so_that_no_end_is_left_behind(
+def test_a_second_rotation_within_the_overlap_is_refused(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Else an end that reads the file late would share no key with the other."""
     early, late = KeyFile(path, 0), KeyFile(path, 0)
     wall = [1_800_000_000.0]
     monkeypatch.setattr(time, "time", lambda: wall[0])
@@ -33,9 +34,9 @@ def test_a_second_rotation_within_the_overlap_is_refused_so_that_no_end_is_left_
         wall[0] += later
         capsys.readouterr()
         assert main(["key", "new", str(path), "--overlap", "60"]) == 2
-        said = f"key {Key(FIRST).name}, the one before, is valid for {left} s more; wait, or revoke"
+        error = f"the old key {Key(FIRST).name} is valid for {left} s more; wait, or revoke"
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith(f"cloudrc: error: {path}: {said}")
+        assert line.startswith(f"cloudrc: error: {path}: {error}")
         assert "cloudrc key new FILE --drop" in line
         assert path.read_bytes() == rotated
     assert not early.follow(2 * PERIOD_NS)
@@ -46,7 +47,7 @@ def test_a_second_rotation_within_the_overlap_is_refused_so_that_no_end_is_left_
     assert read_keys(path).previous == second
 
 
-def test_a_key_is_revoked_before_its_time_by_a_flag(path: Path) -> None:
+def test_drop_revokes_the_old_key_at_once(path: Path) -> None:
     assert main(["key", "new", str(path)]) == 0
     follower, second = KeyFile(path, 0), read_keys(path).current
     assert main(["key", "new", str(path), "--drop"]) == 0
@@ -56,14 +57,14 @@ def test_a_key_is_revoked_before_its_time_by_a_flag(path: Path) -> None:
     assert follower.ring.accepted(PERIOD_NS) == (keys.current, second)
 
 
-def test_the_flag_needs_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_drop_needs_an_existing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["key", "new", str(tmp_path / "none"), "--drop"]) == 2
     assert "there is no old key to revoke" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize("verb", ["new", "retire"])
-def test_a_file_that_holds_no_key_is_left_alone_and_told_in_a_line(
+def test_a_file_without_a_key_is_kept_and_gives_one_line(
     verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "odd\x1b[31m"
@@ -78,14 +79,14 @@ def test_a_file_that_holds_no_key_is_left_alone_and_told_in_a_line(
     assert "\x1b" not in capsys.readouterr().out
 
 
-def test_a_file_that_says_no_time_can_be_rotated(path: Path) -> None:
-    """Nobody could tell for how long to wait."""
+def test_a_file_without_a_time_can_be_rotated(path: Path) -> None:
+    """Nothing says how long to wait."""
     path.write_text(write(KeySet(Key(SECOND), Key(FIRST))))
     assert main(["key", "new", str(path)]) == 0
     assert read_keys(path).previous == Key(SECOND)
 
 
-def test_a_link_stays_one_and_what_it_leads_to_gets_the_key(path: Path) -> None:
+def test_a_link_stays_a_link_and_its_target_gets_the_key(path: Path) -> None:
     link = path.with_name("link")
     link.symlink_to("key")
     follower = KeyFile(path, 0)

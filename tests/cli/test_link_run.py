@@ -11,7 +11,7 @@ class EndOfTestError(Exception):
     """Who acts for ever never ends."""
 
 
-def test_it_acts_for_ever_with_a_pause_of_its_own_after_each_time(
+def test_the_runner_repeats_with_a_pause_after_each_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     done: list[object] = []

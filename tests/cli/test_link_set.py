@@ -43,7 +43,7 @@ def test_single_values_leave_all_else_as_it_is() -> None:
     assert made.notes == []
 
 
-def test_what_is_set_by_hand_is_not_changed_by_the_time_line_any_more() -> None:
+def test_the_time_line_does_not_change_a_value_set_by_hand() -> None:
     made = edit(Document(dict(TIMED)), None, ["downlink.delay_ms=120"])
     assert made.values["downlink"]["delay_ms"] == 120.0
     assert made.values["downlink"]["changes"] == [
@@ -172,7 +172,7 @@ def test_a_relay_that_does_not_answer_is_said(
     )
 
 
-def test_a_change_that_the_link_refuses_is_an_error_with_its_words(
+def test_a_change_that_the_link_refuses_is_an_error(
     flight: Flight, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = Path("runs/latest/link")

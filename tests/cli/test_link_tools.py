@@ -122,7 +122,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     assert not (here / "t.csv").exists()
 
 
-def test_a_small_file_that_unpacks_to_any_size_is_not_unpacked_whole(
+def test_a_compressed_file_is_not_unpacked_without_limit(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_record, "UNPACKED_MAX", 1 << 20)

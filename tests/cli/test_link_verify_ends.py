@@ -151,7 +151,7 @@ def test_what_the_links_find_on_the_way_is_named(
 
 
 @pytest.mark.parametrize(("applied", "told_so"), [(0.090, True), (0.0452, False)])
-def test_a_shaper_that_was_told_otherwise_is_told_from_one_that_does_otherwise(
+def test_a_misinformed_shaper_differs_from_a_wrong_one(
     release: Release, applied: float, told_so: bool
 ) -> None:
     said = write_told(Told("relay", "", DirectionProfile(applied)))
@@ -164,7 +164,7 @@ def test_a_shaper_that_was_told_otherwise_is_told_from_one_that_does_otherwise(
     assert ("it was told so" in cause.text) is told_so
 
 
-def test_once_one_direction_is_off_the_other_is_not_waited_for_in_full(
+def test_once_one_direction_fails_the_other_is_not_awaited(
     release: Release, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_verify_ends, "OTHER_LIMIT", 0.0)
@@ -270,9 +270,7 @@ def test_what_is_undecided_says_how_long_it_takes(release: Release) -> None:
     ("needs", "why"),
     [(115_000.0, "takes 115000 datagrams, 1150 s"), (math.inf, "the ends may add")],
 )
-def test_what_can_never_be_decided_is_said_and_keeps_nobody_waiting(
-    release: Release, needs: float, why: str
-) -> None:
+def test_an_undecidable_check_is_reported_at_once(release: Release, needs: float, why: str) -> None:
     release.hears("world", "ok")
     release.hears("cloud", "ok")
     for name, asked in (("round_trip", 0.09), ("round_trip_takes", needs), ("correlation", 0.9)):

@@ -1,4 +1,4 @@
-"""The front door: help, versions, errors in one line, exit codes, broken pipes."""
+"""The command `cloudrc`: help, errors in one line, exit codes, broken pipes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from cloudrc.cli.faults import SEED_MAX
 from cloudrc.cli.main import INTERNAL, main
-from cloudrc.cli.parser import COMMANDS, build, unknown
+from cloudrc.cli.parser import COMMANDS, build, describe_unknown
 from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError
 
 HEAVY = ("numpy", "mujoco", "matplotlib", "pydantic", "yaml", "kubernetes", "rosbags", "mcap")
@@ -31,7 +31,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_help_answers_within_150_ms() -> None:
-    """Of processor time: what else the machine does is no part of it."""
+    """Measured in processor time, so that other load does not matter."""
     took = []
     for _ in range(3):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -51,11 +51,21 @@ def test_help_fits_80_columns(command: str, capsys: pytest.CaptureFixture[str]) 
     assert all(name in text for name in COMMANDS) or command
 
 
-def test_every_command_is_built_with_its_file() -> None:
+def test_every_command_has_its_own_execute() -> None:
     parser = build(COMMANDS)
-    needy = {"report", "world", "cloud", "teleop", "relay", "link", "mission", "completion", "key"}
-    needy.add("recover")
-    for name in set(COMMANDS) - needy:
+    with_required = {
+        "report",
+        "world",
+        "cloud",
+        "teleop",
+        "relay",
+        "link",
+        "mission",
+        "completion",
+        "key",
+    }
+    with_required.add("recover")
+    for name in set(COMMANDS) - with_required:
         assert callable(parser.parse_args([name]).execute)
 
 
@@ -80,7 +90,7 @@ def test_no_argument_prints_help(capsys: pytest.CaptureFixture[str]) -> None:
         (f"faults fuzz --first {2**63}", f"is not a whole number from 0 to {SEED_MAX}"),
     ],
 )
-def test_a_wrong_line_is_refused_in_one_line(
+def test_a_wrong_command_line_is_one_line_of_error(
     line: str, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(line.split()) == 2
@@ -111,7 +121,7 @@ def test_a_wrong_line_is_refused_in_one_line(
         (ZeroDivisionError("two\nlines"), INTERNAL, "ZeroDivisionError: two lines"),
     ],
 )
-def test_an_error_is_one_line_and_its_exit_code(
+def test_an_error_prints_one_line_and_sets_its_exit_code(
     error: Exception,
     code: int,
     words: str,
@@ -139,11 +149,11 @@ def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
     assert main(["list"]) == 130
 
 
-def test_a_reader_that_leaves_does_no_harm() -> None:
+def test_a_closed_pipe_is_no_error() -> None:
     line = f"{sys.executable} -m cloudrc list -o json | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("0\n", "")
 
 
-def test_unknown_names_all_when_none_is_near() -> None:
-    assert unknown("x", ["bash", "fish"]) == "no 'x'; choose bash or fish"
+def test_unknown_lists_all_names_if_none_is_similar() -> None:
+    assert describe_unknown("x", ["bash", "fish"]) == "no 'x'; choose bash or fish"

@@ -201,7 +201,7 @@ def test_list_status_and_logs(
     assert "no mission 'm9'" in capsys.readouterr().err
 
 
-def test_the_run_that_flies_here_is_found_by_itself_and_wants_no_token(
+def test_the_local_run_is_found_and_needs_no_token(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with running(unix=True) as api:
@@ -239,7 +239,7 @@ def test_emergency_stop_and_acknowledgement(
     ]
 
 
-def test_the_token_comes_from_a_file_of_the_flag_or_the_environment(
+def test_the_token_file_comes_from_flag_or_environment(
     api: Running,
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,

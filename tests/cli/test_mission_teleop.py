@@ -28,7 +28,7 @@ def test_without_fastapi_the_api_is_refused_and_the_extra_named(
 
 
 @pytest.mark.parametrize("entry", [{"a": 1}, {"mission": "m1"}, {"entry": "order", "id": 7}])
-def test_a_journal_of_another_shape_is_refused_and_stays_as_it_is(
+def test_a_journal_of_another_format_is_refused_and_kept(
     entry: dict[str, Any], tmp_path: Path
 ) -> None:
     file = tmp_path / "journal"

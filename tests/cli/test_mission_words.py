@@ -53,7 +53,7 @@ def test_a_missions_name_is_shown_and_does_nothing(
 
 
 @pytest.mark.parametrize("form", ["json", "yaml"])
-def test_programs_get_the_name_as_it_is_in_a_form_that_a_terminal_may_show(
+def test_json_gives_names_unchanged_but_safe_for_a_terminal(
     form: str, api: Running, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["mission", "list", "--api", api.url, "-o", form]) == 0

@@ -1,4 +1,4 @@
-"""Text: columns that line up, numbers one can read, colour only where it is wanted."""
+"""Output: aligned columns, readable numbers, colour only on request."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from cloudrc.cli.main import main
-from cloudrc.cli.output import is_live, number, paint, table
+from cloudrc.cli.output import format_number, is_live, paint, table
 
 
 class Terminal(io.StringIO):
@@ -35,17 +35,19 @@ def test_columns_line_up_and_numbers_are_right_aligned() -> None:
     [(0.1474, "0.1474"), (26.96, "26.96"), (0.0, "0"), (1234.5, "1234"), (-3e-7, "-3.000e-07")],
 )
 def test_numbers_have_four_digits(value: float, text: str) -> None:
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 @pytest.mark.parametrize("variable", ["NO_COLOR", "CI"])
-def test_colour_is_left_out_on_request(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_environment_variable_turns_colour_off(
+    variable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert paint("x", "red", Terminal()) == "\x1b[31mx\x1b[0m"
     monkeypatch.setenv(variable, "1")
     assert paint("x", "red", Terminal()) == "x"
 
 
-def test_a_dumb_terminal_and_a_file_get_no_living_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dumb_terminal_and_a_file_get_no_status_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert is_live(Terminal())
     assert not is_live(io.StringIO())
     monkeypatch.setenv("TERM", "dumb")
@@ -53,7 +55,7 @@ def test_a_dumb_terminal_and_a_file_get_no_living_line(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("line", [["list"], ["faults", "list"]])
-def test_yaml_says_what_json_says(line: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_yaml_has_the_content_of_json(line: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     documents = []
     for form, read in (("json", json.loads), ("yaml", yaml.safe_load)):
         main([*line, "-o", form])

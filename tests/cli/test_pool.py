@@ -1,4 +1,4 @@
-"""Work on several cores: its order, how many processes it takes, and one that is killed."""
+"""Work on several cores: order, number of processes, killed workers, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.cli.pool import AHEAD, WorkerDiedError, in_order
+from cloudrc.cli.pool import BATCH_MAX, WorkerDiedError, in_order
 from cloudrc.faults.document import Result
 from cloudrc.faults.fuzz import Finding
 from cloudrc.faults.scenario import Outcome, find
 from cloudrc.faults.schedule import Schedule
 
 KILLED = 5
-"""The seed whose flight kills its process."""
+"""The piece of work, or seed, that kills its process."""
 
 
 @pytest.fixture(autouse=True)
@@ -33,22 +33,22 @@ def _slow_first(number: int) -> int:
     return number
 
 
-def _who(number: int) -> int:
+def _process_id(number: int) -> int:
     return os.getpid()
 
 
-def _end_one(number: int) -> int:
+def _kill_at_five(number: int) -> int:
     if number == KILLED:
         os.kill(os.getpid(), signal.SIGKILL)
     return number
 
 
-def test_results_come_in_the_order_of_the_work() -> None:
+def test_results_have_the_order_of_the_work() -> None:
     assert list(in_order(_slow_first, range(6), 2)) == list(range(6))
 
 
-class _Asked(list[int]):
-    """Work that knows how much of it has been taken."""
+class _CountingWork(list[int]):
+    """Work that counts how much of it has been taken."""
 
     taken = 0
 
@@ -58,16 +58,16 @@ class _Asked(list[int]):
             yield each
 
 
-def test_a_long_search_is_not_handed_in_at_once() -> None:
-    work = _Asked(range(3 * AHEAD))
-    done = in_order(_who, work, 2)
+def test_much_work_is_submitted_in_batches() -> None:
+    work = _CountingWork(range(3 * BATCH_MAX))
+    done = in_order(_process_id, work, 2)
     next(done)
-    assert work.taken == AHEAD
-    assert sum(1 for _ in done) == 3 * AHEAD - 1
+    assert work.taken == BATCH_MAX
+    assert sum(1 for _ in done) == 3 * BATCH_MAX - 1
 
 
-def test_there_are_no_more_processes_than_cores_however_many_are_asked_for() -> None:
-    done = in_order(_who, range(6), 100_000)
+def test_there_are_no_more_processes_than_cores() -> None:
+    done = in_order(_process_id, range(6), 100_000)
     pids = {next(done)}
     assert len(multiprocessing.active_children()) == 2
     assert os.getpid() not in pids.union(done)
@@ -75,39 +75,39 @@ def test_there_are_no_more_processes_than_cores_however_many_are_asked_for() -> 
 
 
 @pytest.mark.parametrize(("pieces", "jobs"), [(1, 100_000), (6, 1), (0, 2)])
-def test_where_one_is_enough_it_is_this_one(pieces: int, jobs: int) -> None:
-    assert list(in_order(_who, range(pieces), jobs)) == [os.getpid()] * pieces
+def test_work_for_one_process_runs_in_this_one(pieces: int, jobs: int) -> None:
+    assert list(in_order(_process_id, range(pieces), jobs)) == [os.getpid()] * pieces
 
 
-def test_a_process_that_is_killed_is_told_of() -> None:
+def test_a_killed_worker_is_an_error() -> None:
     with pytest.raises(WorkerDiedError, match=r"a worker was killed.*fewer '--jobs'"):
-        list(in_order(_end_one, range(9), 2))
+        list(in_order(_kill_at_five, range(9), 2))
     assert multiprocessing.active_children() == []
 
 
 def _slowly(done: Iterator[int]) -> Iterator[int]:
-    """Listen more slowly than they work."""
+    """Take results more slowly than the workers produce them."""
     for each in done:
         yield each
         time.sleep(0.1)
 
 
-def test_what_was_done_before_a_process_was_killed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cloudrc.cli.pool.AHEAD", KILLED)
-    told: list[int] = []
+def test_results_before_a_worker_was_killed_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cloudrc.cli.pool.BATCH_MAX", KILLED)
+    results: list[int] = []
     with pytest.raises(WorkerDiedError):
-        told.extend(_slowly(in_order(_end_one, range(9), 2)))
-    assert told[:KILLED] == list(range(KILLED))
+        results.extend(_slowly(in_order(_kill_at_five, range(9), 2)))
+    assert results[:KILLED] == list(range(KILLED))
 
 
 def _fly(schedule: Schedule, keep: bool = False) -> Finding:
     if schedule.seed == KILLED:
-        time.sleep(0.5)  # until those before are told
-    _end_one(schedule.seed)
+        time.sleep(0.5)  # until earlier results are delivered
+    _kill_at_five(schedule.seed)
     return Finding(schedule, (), "", 1.0, 1.0, 0, 0, 0.0)
 
 
-def test_a_search_that_loses_a_process_keeps_what_was_flown(
+def test_a_fault_search_with_a_killed_worker_keeps_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -139,7 +139,7 @@ def _interrupt(which: tuple[str, str, int]) -> Result:
     ("how", "jobs", "code", "word", "flown"),
     [(_kill, 2, 6, "a worker was killed", 0), (_interrupt, 1, 130, "interrupted", 1)],
 )
-def test_faults_that_are_cut_off_keep_what_was_run(
+def test_an_interrupted_fault_run_keeps_its_results(
     how: object,
     jobs: int,
     code: int,
@@ -158,10 +158,10 @@ def test_faults_that_are_cut_off_keep_what_was_run(
     assert f"; {flown} of " in captured.err
     assert len(json.loads(captured.out)["faults"]) == flown
     assert Path("f.xml").read_text().count("<testcase") == flown
-    assert not Path("f.md").exists(), "a page is of all of them"
+    assert not Path("f.md").exists(), "a page needs all results"
 
 
-def test_ctrl_c_ends_the_processes_at_once() -> None:
+def test_ctrl_c_ends_the_workers_at_once() -> None:
     started = time.monotonic()
     done = in_order(time.sleep, [0.0, 60.0, 60.0], 2)
     next(done)
@@ -171,16 +171,16 @@ def test_ctrl_c_ends_the_processes_at_once() -> None:
     assert multiprocessing.active_children() == []
 
 
-def test_ctrl_c_ends_a_process_that_has_not_heard_of_sigterm(
+def test_ctrl_c_ends_a_worker_that_ignores_sigterm(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Before it has begun, a worker has its parent's handlers, whose interrupt may be lost."""
-    deaf = lambda first: signal.signal(signal.SIGTERM, signal.SIG_IGN)  # noqa: E731
-    monkeypatch.setattr("cloudrc.cli.pool._begin", deaf)
-    test_ctrl_c_ends_the_processes_at_once()
+    """A worker has its parent's handlers at first and may lose their interrupt."""
+    ignore_sigterm = lambda parent: signal.signal(signal.SIGTERM, signal.SIG_IGN)  # noqa: E731
+    monkeypatch.setattr("cloudrc.cli.pool._begin", ignore_sigterm)
+    test_ctrl_c_ends_the_workers_at_once()
 
 
-def test_a_store_that_is_no_folder_is_refused(
+def test_a_store_that_is_not_a_folder_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

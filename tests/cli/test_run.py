@@ -1,4 +1,4 @@
-"""`cloudrc run`: what is refused before anything flies, what is printed, where it is written."""
+"""`cloudrc run` and `cloudrc report`: refused input, output and written files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cloudrc.cli import extras
 from cloudrc.cli.main import main
 
 SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
-"""Over `steps`: one second of flight."""
+"""Overrides of `steps` for one second of flight."""
 
 
 @pytest.fixture(autouse=True)
@@ -23,7 +23,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the figures out, which take longer than the flight."""
+    """Leave out the figures, which take longer than the flight."""
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
 
 
@@ -44,7 +44,7 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
         ("--set nonsense", 2, "key=value"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line_before_anything_is_written(
+def test_bad_input_gives_one_line_and_writes_nothing(
     line: str, code: int, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["run", *line.split()]) == code
@@ -72,9 +72,7 @@ def test_a_full_folder_is_refused(folder: Path, capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.usefixtures("no_page")
-def test_json_is_the_report_and_nothing_else(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_output_is_only_the_report(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = ["run", "steps", "--mode", "virtual", "--out", "here", "-o", "json", *SHORT]
     assert main(line) == 0
     captured = capsys.readouterr()
@@ -118,14 +116,14 @@ def test_the_resolved_file_flies_the_same_run_again(folder: Path) -> None:
 
 @pytest.mark.parametrize("output", ["table", "json"])
 @pytest.mark.usefixtures("no_page")
-def test_a_reader_that_leaves_does_not_end_the_run(
+def test_a_closed_pipe_does_not_end_the_run(
     output: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in `cloudrc run | head -1`; the exit code stays that of the verdict: 1 here."""
+    """As in `cloudrc run | head -1`; the exit code still follows the verdict, here 1."""
     reader, writer = os.pipe()
     os.close(reader)
-    with os.fdopen(writer, "w") as nobody:
-        monkeypatch.setattr("sys.stdout", nobody)
+    with os.fdopen(writer, "w") as closed_pipe:
+        monkeypatch.setattr("sys.stdout", closed_pipe)
         line = ["run", "steps", "--mode", "virtual", "--out", "here", "-o", output, *SHORT]
         assert main([*line, "--set", "criteria.contact=true"]) == 1
     left = {path.name for path in (folder / "here").iterdir()}
@@ -152,7 +150,7 @@ def test_a_report_is_written_again(
 
 
 @pytest.mark.parametrize("name", ["missing", "empty"])
-def test_a_report_of_nothing_is_refused(
+def test_a_report_needs_a_recorded_run(
     name: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "empty").mkdir()

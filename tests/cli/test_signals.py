@@ -1,7 +1,4 @@
-"""A terminal that is closed ends a command as Ctrl-C does, unless `nohup` has started it.
-
-Its workers end with it, however it ends.
-"""
+"""Signals: SIGHUP and SIGTERM act like Ctrl-C, except under `nohup`; workers end, too."""
 
 from __future__ import annotations
 
@@ -22,20 +19,20 @@ from cloudrc.cli.pool import _hung_up, end_orderly
 
 @pytest.fixture(autouse=True)
 def not_ignored() -> None:
-    """Begin as a program in a terminal does; conftest.py gives back what was before."""
+    """Start with the default handler, as in a terminal; conftest.py restores the old one."""
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
-def test_the_first_hang_up_interrupts_and_those_after_it_do_not() -> None:
+def test_only_the_first_hang_up_interrupts() -> None:
     end_orderly()
     with pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGHUP)
     os.kill(os.getpid(), signal.SIGHUP)
-    with pytest.raises(KeyboardInterrupt):  # who asks again means it
+    with pytest.raises(KeyboardInterrupt):  # a second request still counts
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def test_who_was_started_by_nohup_hears_of_no_hang_up() -> None:
+def test_under_nohup_a_hang_up_is_ignored() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     end_orderly()
     os.kill(os.getpid(), signal.SIGHUP)
@@ -49,7 +46,7 @@ def test_who_was_started_by_nohup_hears_of_no_hang_up() -> None:
         ["link", "verify", "none"],
     ],
 )
-def test_who_flies_takes_a_hang_up_for_an_interrupt(
+def test_flying_commands_treat_a_hang_up_as_ctrl_c(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -61,9 +58,7 @@ def test_who_flies_takes_a_hang_up_for_an_interrupt(
 @pytest.mark.parametrize(
     "words", [["faults", "fuzz", "--seeds", "99", "--jobs", "2"], ["run", "steps", "--seeds", "9"]]
 )
-def test_workers_end_though_what_has_started_them_was_killed(
-    words: list[str], tmp_path: Path
-) -> None:
+def test_workers_end_if_their_parent_is_killed(words: list[str], tmp_path: Path) -> None:
     command = [sys.executable, "-m", "cloudrc", *words]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE) as first:
         assert first.stdout is not None
@@ -73,13 +68,13 @@ def test_workers_end_though_what_has_started_them_was_killed(
             assert first.poll() is None
             assert time.monotonic() < until
             time.sleep(0.1)
-        time.sleep(3.0)  # they fly
+        time.sleep(3.0)  # until they are flying
         first.kill()
         first.wait()
-        while select.select([first.stdout], [], [], 20.0)[0]:  # nobody else can write to it
+        while select.select([first.stdout], [], [], 20.0)[0]:  # ends once all workers have ended
             if not first.stdout.read1():
                 return
     for worker in workers:
         with suppress(ProcessLookupError):
             os.kill(int(worker), signal.SIGKILL)
-    pytest.fail("they wait for work")
+    pytest.fail("workers still wait for work")

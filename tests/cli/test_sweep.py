@@ -1,4 +1,4 @@
-"""`cloudrc run --seeds N`: all cores fly, one table comes out, also if it is cut short."""
+"""`cloudrc run --seeds N`: one table of all seeds, or of the finished ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cloudrc.cli import sweep
 from cloudrc.cli.main import main
 
 SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
-"""Over `steps`: one second of flight."""
+"""Overrides of `steps` for one second of flight."""
 
 
 @pytest.fixture(autouse=True)
@@ -40,10 +40,10 @@ def test_many_seeds_become_one_table(folder: Path, capsys: pytest.CaptureFixture
     assert len((folder / "sweep/sweep.csv").read_text().splitlines()) == 3
 
 
-def test_seeds_that_are_handed_in_later_are_flown_too(
+def test_seeds_beyond_the_first_batch_are_flown_too(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sweep, "AHEAD", 2)
+    monkeypatch.setattr(sweep, "BATCH_MAX", 2)
     assert main(["run", "steps", "--seeds", "5", *SHORT, "--out", "sweep"]) == 0
     document = json.loads((folder / "sweep/sweep.json").read_text())
     assert [run["seed"] for run in document["runs"]] == [1, 2, 3, 4, 5]
@@ -94,14 +94,14 @@ def _begin_sweep() -> subprocess.Popen[str]:
 @pytest.mark.process
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_sweep_at_once(number: int, folder: Path) -> None:
-    """Ctrl-C and SIGHUP go to the whole group of processes, from a terminal; SIGTERM to one."""
+    """A terminal sends SIGINT and SIGHUP to the whole process group, but SIGTERM goes to one."""
     process = _begin_sweep()
     start = time.monotonic()
     if number != signal.SIGTERM:
         os.killpg(process.pid, number)
     else:
         process.send_signal(number)
-    _, errors = process.communicate(timeout=20)  # ends only when no worker holds the pipes
+    _, errors = process.communicate(timeout=20)  # returns only once no worker holds the pipes
     assert time.monotonic() - start < 3.0
     assert process.returncode == 130
     assert "Traceback" not in errors

@@ -85,7 +85,7 @@ def names(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT])
-def test_a_journal_that_has_filled_its_volume_is_shortened_by_a_restart(
+def test_a_restart_shortens_a_journal_that_filled_its_volume(
     error: int, path: Path, reserve: Path, volume: Volume, capsys: Printed
 ) -> None:
     start(path)
@@ -102,7 +102,7 @@ def test_a_journal_that_has_filled_its_volume_is_shortened_by_a_restart(
     assert capsys.readouterr().err == ""
 
 
-def test_the_reserve_takes_what_a_start_leaves_of_the_papers_missions() -> None:
+def test_the_reserve_fits_beside_a_start_with_paper_missions() -> None:
     """Its waypoints are reached, and its missions kept, by entries like these."""
     entries: list[Entry] = []
     plan = build_plan(load_experiment("paper"))
@@ -122,7 +122,7 @@ def test_the_reserve_is_real_room_and_made_once(path: Path, reserve: Path, volum
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
 
-def test_one_that_a_crash_has_left_half_or_that_leads_elsewhere_is_made_anew(
+def test_a_partial_or_linked_reserve_is_made_again(
     path: Path, reserve: Path, volume: Volume
 ) -> None:
     precious = path.parent.with_name("precious")
@@ -137,7 +137,7 @@ def test_one_that_a_crash_has_left_half_or_that_leads_elsewhere_is_made_anew(
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_where_even_that_does_not_help_it_is_told_and_teleop_goes_on(
+def test_teleop_goes_on_and_warns_if_the_reserve_is_too_small(
     there: bool, path: Path, reserve: Path, volume: Volume, capsys: Printed
 ) -> None:
     """No reserve was made, or somebody else takes its room."""
@@ -159,7 +159,7 @@ def test_where_even_that_does_not_help_it_is_told_and_teleop_goes_on(
     assert reserve.stat().st_size == RESERVE
 
 
-def test_a_journal_that_cannot_be_shortened_is_told_where_all_is_told(
+def test_a_journal_that_cannot_be_shortened_is_reported(
     path: Path, volume: Volume, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, handlers: None
 ) -> None:
     fill(path, volume)

@@ -146,7 +146,7 @@ def test_what_a_container_recorded_before_it_was_started_again_is_brought_along(
     out, said = tmp_path / "out", capsys.readouterr().err
     assert not (out / "cloud.before.mcap").exists()
     assert (out / "world.before.mcap").exists() is left
-    assert "world was started again" in said
+    assert "world was restarted" in said
     if left:
         assert (out / "world.before.mcap").read_text() == "before\n"
 

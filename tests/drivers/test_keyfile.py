@@ -240,14 +240,14 @@ def test_a_key_that_is_retired_is_gone_from_the_file_and_from_who_follows_it(
     path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["key", "retire", str(path)]) == 0
-    assert "was alone already" in capsys.readouterr().out
+    assert "is the only key already" in capsys.readouterr().out
     assert path.read_bytes() == FIRST
     assert main(["key", "new", str(path)]) == 0
     follower, made = KeyFile(path, 0, time.time()), read_keys(path)
     assert len(follower.ring.accepted(0)) == 2
     capsys.readouterr()
     assert main(["key", "retire", str(path)]) == 0
-    said = f"key {made.current.name} alone, {Key(FIRST).name} is dropped: {path}\n"
+    said = f"key {made.current.name} is the only key now, {Key(FIRST).name} is removed: {path}\n"
     assert capsys.readouterr().out == said
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert read_keys(path) == KeySet(made.current)

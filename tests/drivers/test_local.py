@@ -129,7 +129,7 @@ def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
     assert "flying" in operate(folder, "resume").stdout
     anywhere = [sys.executable, "-m", "cloudrc", "mission", "status", "-o", "json"]
     found = subprocess.run(anywhere, capture_output=True, text=True, cwd="/")
-    assert found.stderr == f"cloudrc: the run that flies in {folder}\n"
+    assert found.stderr == f"cloudrc: using the run in {folder}\n"
     assert json.loads(found.stdout)["mission"]["state"] == "flying"
     assert "INTERRUPTED" in operate(folder, "cancel").stdout
     run.communicate(timeout=60)

@@ -1,4 +1,4 @@
-"""What runs foreign bytes as code is nowhere in the tree: read from the syntax tree."""
+"""No code of the repository runs foreign data as code; checked in the syntax trees."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from cloudrc.cluster.link import INSIDE
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = [*sorted((ROOT / "cloudrc").rglob("*.py")), *sorted((ROOT / "tools").rglob("*.py"))]
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
-YARDSTICK = ROOT / "cloudrc" / "cli" / "bench.py"
+BENCH = ROOT / "cloudrc" / "cli" / "bench.py"
 
 MODULES = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "jsonpickle"}
 CALLS = {"eval", "exec", "compile", "__import__"}
 LOADERS = {"load", "load_all", "full_load", "full_load_all", "unsafe_load", "unsafe_load_all"}
 SHELLS = {"os": {"system", "popen"}, "subprocess": {"getoutput", "getstatusoutput"}}
 NAMES = {"builtins": CALLS, "yaml": LOADERS, **SHELLS}
-"""What is banned of modules that are not; by module."""
+"""Banned names of modules that are allowed themselves."""
 SH = {"sh", "bash", "dash", "busybox", "ash", "zsh"}
 SAFE_LOADERS = {"SafeLoader", "CSafeLoader"}
 
 
 def breaches(tree: ast.Module) -> Iterator[str]:
-    """What in a file may not be there."""
+    """Find what is banned in a file."""
     safe = _safe_loaders(tree)
     for node in ast.walk(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
@@ -46,7 +46,7 @@ def breaches(tree: ast.Module) -> Iterator[str]:
 
 
 def _of_names(node: ast.Import | ast.ImportFrom) -> Iterator[str]:
-    """What would be called under a name that does not show whose it is."""
+    """Find imports of banned names, or under a name that hides the module."""
     for alias in node.names:
         if isinstance(node, ast.ImportFrom) and node.module in NAMES:
             if alias.name in NAMES[node.module] | {"*"}:
@@ -56,7 +56,7 @@ def _of_names(node: ast.Import | ast.ImportFrom) -> Iterator[str]:
 
 
 def programs(tree: ast.Module) -> Iterator[ast.Module]:
-    """Texts in a file that are Python themselves: another process is to run them."""
+    """Find texts in a file that are Python programs, for another process."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             if "import " in node.value:
@@ -91,7 +91,7 @@ def _is_safe(loader: ast.expr, safe: set[str]) -> bool:
 
 
 def _safe_loaders(tree: ast.Module) -> set[str]:
-    """Names in a file that stand for nothing but safe loaders, or derive from them."""
+    """Find names in a file that are always safe loaders, or derive from them."""
     found: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef) and node.bases:
@@ -105,7 +105,7 @@ def _safe_loaders(tree: ast.Module) -> set[str]:
 
 
 def shells(tree: ast.Module) -> Iterator[str]:
-    """What is given to a shell as its command."""
+    """Find the commands that are given to a shell."""
     for node in ast.walk(tree):
         if isinstance(node, ast.List | ast.Tuple):
             words = [each.value if isinstance(each, ast.Constant) else None for each in node.elts]
@@ -115,28 +115,27 @@ def shells(tree: ast.Module) -> Iterator[str]:
 
 
 def found_in(paths: list[Path]) -> dict[str, list[str]]:
-    every = {p: list(breaches(ast.parse(p.read_text())))
-             for p in paths}  # fmt: skip
+    every = {path: list(breaches(ast.parse(path.read_text()))) for path in paths}
     return {path.relative_to(ROOT).as_posix(): found for path, found in every.items() if found}
 
 
 @pytest.mark.promise("foreign-files-run-nothing")
-def test_nothing_that_ships_runs_foreign_bytes() -> None:
-    """But for the bench, which times what the paper's tunnel did."""
-    yardstick = YARDSTICK.relative_to(ROOT).as_posix()
-    assert found_in(SHIPPED) == {yardstick: ["in a program: 2: imports pickle"]}
+def test_the_package_runs_no_foreign_bytes() -> None:
+    """The one exception: the bench measures the pickle of the paper's tunnel."""
+    bench = BENCH.relative_to(ROOT).as_posix()
+    assert found_in(SHIPPED) == {bench: ["in a program: 2: imports pickle"]}
 
 
-def test_a_shell_gets_one_fixed_text_that_ships() -> None:
-    """What comes from outside are its arguments, which it does not take apart."""
+def test_a_shell_gets_only_one_fixed_program() -> None:
+    """Foreign text comes in as arguments, which the program does not split."""
     given = {text for path in SHIPPED for text in shells(ast.parse(path.read_text()))}
     assert given == {"INSIDE"}
     quoted = re.sub(r'"(?:\\.|[^"\\])*"', "", INSIDE)
-    assert not re.search(r"\$[0-9@*]", quoted), "an argument is one word, whatever it holds"
+    assert not re.search(r"\$[0-9@*]", quoted), "an argument stays one word"
 
 
-def test_the_bench_unpickles_only_what_it_has_just_pickled_itself() -> None:
-    (program,) = programs(ast.parse(YARDSTICK.read_text()))
+def test_the_bench_unpickles_only_its_own_pickles() -> None:
+    (program,) = programs(ast.parse(BENCH.read_text()))
     calls = [ast.unparse(node) for node in ast.walk(program) if isinstance(node, ast.Call)]
     assert {call for call in calls if call.startswith("pickle.")} == {
         "pickle.dumps(message, 4)",
@@ -144,15 +143,15 @@ def test_the_bench_unpickles_only_what_it_has_just_pickled_itself() -> None:
     }
     mentioned = [n for n in ast.walk(program) if isinstance(n, ast.Name) and n.id == "pickle"]
     assert len(mentioned) == len([call for call in calls if call.startswith("pickle.")])
-    # From outside come the number of calls, and lines that say when.
+    # Its input is the number of calls, and one line per round.
     given = [ast.unparse(n) for n in ast.walk(program) if isinstance(n, ast.Attribute)]
     assert {name for name in given if name.startswith("sys.")} == {"sys.argv", "sys.stdin"}
     assert "int(sys.argv[1])" in calls
     assert not {"open", "input"} & {call.partition("(")[0] for call in calls}
 
 
-def test_nor_does_a_test() -> None:
-    """But for those that name what is banned, to see that it is found."""
+def test_no_test_runs_foreign_bytes() -> None:
+    """The one exception: a test that checks that banned imports are found."""
     found = found_in([path for path in TESTS if path != Path(__file__).resolve()])
     assert found == {"tests/test_architecture.py": ["in a program: 1: imports pickle"]}
 
@@ -209,5 +208,5 @@ def test_a_breach_is_found(code: str) -> None:
         "json.load(file)",
     ],
 )
-def test_what_is_harmless_is_not(code: str) -> None:
+def test_harmless_code_is_no_breach(code: str) -> None:
     assert list(breaches(ast.parse(code))) == []

@@ -1,4 +1,4 @@
-"""Keys and tokens that are known to the test are in nothing that a flight shows or leaves."""
+"""No output and no file of a flight contains its key or its token."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from cloudrc.teleop.auth import Tokens
 from cloudrc.tunnel.keys import Key
 from tests.drivers.conftest import KEY, TOKEN, Release
 
-OURS = ("operator", "key")
-"""The files that may hold them."""
+SECRET_FILES = ("operator", "key")
+"""The files that contain the token and the key."""
 
 
-def shapes(secret: bytes) -> Iterator[bytes]:
-    """How a secret could be written down."""
+def encodings(secret: bytes) -> Iterator[bytes]:
+    """Give the forms in which a secret could appear."""
     yield secret
     yield secret.hex().encode()
     yield secret.hex().upper().encode()
@@ -34,45 +34,45 @@ def shapes(secret: bytes) -> Iterator[bytes]:
     yield repr(secret)[2:-1].encode()
 
 
-CANARIES = [shape for secret in (KEY, TOKEN.encode()) for shape in shapes(secret)]
+CANARIES = [form for secret in (KEY, TOKEN.encode()) for form in encodings(secret)]
 
 
 def found_in(data: bytes) -> list[bytes]:
     return [canary for canary in CANARIES if canary in data]
 
 
-def what_is_in(path: Path) -> bytes:
-    """Its bytes; of a recording, which is compressed, all records as well."""
+def content_of(path: Path) -> bytes:
+    """Read a file's bytes, and the decompressed records of a recording."""
     data = path.read_bytes()
     if path.suffix != ".mcap":
         return data
-    with path.open("rb") as stream:  # records of a torn one as far as they go
+    with path.open("rb") as stream:  # a truncated recording ends early
         with suppress(McapError):
             for record in StreamReader(stream).records:
                 data += bytes(getattr(record, "data", b"")) + repr(record).encode()
     return data
 
 
-def test_what_a_recording_has_is_seen(tmp_path: Path) -> None:
-    """Once among much else, as it would be."""
+def test_a_secret_in_a_compressed_recording_is_found(tmp_path: Path) -> None:
+    """Among many other records, so that it is compressed."""
     path = tmp_path / "a.mcap"
     with McapWriter(path, clock="world") as writer:
         writer.write(Fault(n, "journal", f"line {n}") for n in range(50))
         writer.write([Fault(50, "journal", f"token {TOKEN}")])
     assert found_in(path.read_bytes()) == [], "compressed"
-    assert TOKEN.encode() in found_in(what_is_in(path))
+    assert TOKEN.encode() in found_in(content_of(path))
 
 
 @pytest.mark.promise("secrets-stay-secret")
-def test_what_holds_a_secret_does_not_show_it(tmp_path: Path) -> None:
+def test_objects_with_a_secret_do_not_print_it(tmp_path: Path) -> None:
     (tmp_path / "operator").write_text(TOKEN)
     for holder in (Key(KEY), Tokens(tmp_path)):
         shown = f"{holder} {holder!r} {[holder]} {getattr(holder, '__dict__', '')}"
         assert found_in(shown.encode()) == []
 
 
-class Watched(Release):
-    """As the release, with metrics, and with recordings."""
+class ObservedRelease(Release):
+    """A release with metrics and recordings."""
 
     def run(self, *words: str):  # type: ignore[no-untyped-def]
         if words[0] in ("world", "cloud", "teleop"):
@@ -86,8 +86,8 @@ class Watched(Release):
 
 @pytest.mark.process
 @pytest.mark.promise("secrets-stay-secret")
-def test_a_flight_shows_and_leaves_none(tmp_path: Path) -> None:
-    release = Watched(tmp_path)
+def test_a_flight_exposes_no_secret(tmp_path: Path) -> None:
+    release = ObservedRelease(tmp_path)
     shown: dict[str, bytes] = {}
     try:
         release.fly()
@@ -107,8 +107,8 @@ def test_a_flight_shows_and_leaves_none(tmp_path: Path) -> None:
             out, errors = process.communicate(timeout=20)
             shown[f"output of {number}"] = (out + errors).encode()
     for path in tmp_path.rglob("*"):
-        if path.is_file() and path.name not in OURS:
-            shown[str(path.relative_to(tmp_path))] = what_is_in(path)
+        if path.is_file() and path.name not in SECRET_FILES:
+            shown[str(path.relative_to(tmp_path))] = content_of(path)
     assert {"world.mcap", "cloud.mcap", "audit.jsonl", "journal/missions"} <= shown.keys()
     assert len(shown["world.mcap"]) > 1000
     assert {place: found_in(data) for place, data in shown.items() if found_in(data)} == {}

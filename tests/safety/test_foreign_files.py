@@ -1,4 +1,4 @@
-"""Files got from somebody else: pipes are not waited for, bounds are kept, errors are one line."""
+"""Files from somebody else: no waiting for pipes, size limits, errors in one line."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from tests.metrics.conftest import flown
 
 
 @pytest.fixture(autouse=True)
-def patience() -> Iterator[None]:
-    """Let whoever waits for a pipe fail, and go on."""
+def no_waiting() -> Iterator[None]:
+    """Fail a test that waits for a pipe."""
 
     def give_up(number: int, frame: FrameType | None) -> None:
         raise TimeoutError("it waits")
@@ -47,7 +47,7 @@ READERS: list[Callable[[Path], object]] = [read_experiment, load_profile, read_t
 
 @pytest.mark.parametrize("what", ["pipe", "/dev/zero"])
 @pytest.mark.parametrize("read", READERS)
-def test_what_is_no_file_is_refused_at_once(
+def test_a_pipe_or_device_is_refused_at_once(
     tmp_path: Path, read: Callable[[Path], object], what: str
 ) -> None:
     path = tmp_path / what
@@ -59,7 +59,7 @@ def test_what_is_no_file_is_refused_at_once(
 
 @pytest.mark.parametrize("key", ["trace", "table"])
 @pytest.mark.parametrize("named", ["./pipe", "/dev/zero", "./loop", "~nobody/x.csv", "x" * 300])
-def test_nor_is_one_that_a_configuration_names(tmp_path: Path, key: str, named: str) -> None:
+def test_one_named_by_a_configuration_is_refused(tmp_path: Path, key: str, named: str) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "loop").symlink_to("loop")
     for where in (f"link: {{uplink: {{{key}: '{named}'}}}}", f"mission: ./{named}.yaml"):
@@ -68,7 +68,7 @@ def test_nor_is_one_that_a_configuration_names(tmp_path: Path, key: str, named: 
             read_experiment(tmp_path / "config.yaml")
 
 
-def test_a_path_has_no_nul(tmp_path: Path) -> None:
+def test_a_path_with_nul_is_refused(tmp_path: Path) -> None:
     for key in ("mission", "cloud: {predictor", "link: {profile", "link: {uplink: {trace"):
         (tmp_path / "c.yaml").write_text(key + ': "a\\0/b.py"' + "}" * key.count("{"))
         with pytest.raises(BadInputError, match=r"c\.yaml:1: a text with the character NUL"):
@@ -76,9 +76,11 @@ def test_a_path_has_no_nul(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "read"), [(document, read_experiment), (traces, read_trace)], ids=["yaml", "csv"]
+    ("module", "read"),
+    [(document, read_experiment), (traces, read_trace)],
+    ids=["yaml", "csv"],
 )
-def test_no_file_is_read_beyond_its_bound(tmp_path: Path, module: Any, read: Any) -> None:
+def test_no_file_is_read_beyond_its_size_limit(tmp_path: Path, module: Any, read: Any) -> None:
     path = tmp_path / "long.yaml"
     with path.open("wb") as file:
         file.truncate(module.SIZE_MAX + 1)
@@ -86,13 +88,13 @@ def test_no_file_is_read_beyond_its_bound(tmp_path: Path, module: Any, read: Any
         read(path)
 
 
-def test_values_are_counted_before_they_take_memory(tmp_path: Path) -> None:
+def test_too_many_values_are_refused(tmp_path: Path) -> None:
     (tmp_path / "many.yaml").write_text(f"name: [{'[],' * 500_000}]")
     with pytest.raises(BadInputError, match="more than 300000 values"):
         read_experiment(tmp_path / "many.yaml")
 
 
-def test_a_file_is_closed_if_it_is_none(tmp_path: Path) -> None:
+def test_a_refused_device_is_closed(tmp_path: Path) -> None:
     before = os.listdir("/proc/self/fd")
     with pytest.raises(ValueError, match="not a file"):
         open_file(Path("/dev/null"))
@@ -101,7 +103,7 @@ def test_a_file_is_closed_if_it_is_none(tmp_path: Path) -> None:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A run that has no report yet."""
+    """A run without a report."""
     (tmp_path / "config.yaml").write_text("name: theirs")
     log = flown()
     records = (sorted(part, key=lambda record: record.stamp_ns) for part in (log.world, log.cloud))
@@ -125,9 +127,7 @@ GOOD = {"mode": "local", "shaper": "netem", "notes": ["seen"], "records_sha256":
     ]
     + ["[" * 100_000, "null", "7", '{"mode":', "\udcff", '["mode"]'],
 )
-def test_a_report_that_was_there_before_is_believed_whole_or_not_at_all(
-    run: Path, before: str
-) -> None:
+def test_an_old_report_is_used_completely_or_not_at_all(run: Path, before: str) -> None:
     _, _, anew = read_run(run)
     (run / "report.json").write_text(before, errors="surrogateescape")
     assert read_run(run)[2] == anew
@@ -136,7 +136,7 @@ def test_a_report_that_was_there_before_is_believed_whole_or_not_at_all(
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_what_cannot_be_drawn_is_told_in_one_line(run: Path) -> None:
+def test_undrawable_data_gives_one_line_of_error(run: Path) -> None:
     nowhere = Odometry(1, (nan, nan, nan), UPRIGHT, ZERO, ZERO)
     world = [
         record._replace(odometry=nowhere) if isinstance(record, GroundTruth) else record
@@ -148,7 +148,7 @@ def test_what_cannot_be_drawn_is_told_in_one_line(run: Path) -> None:
     assert json.loads((run / "report.json").read_text())["verdict"] == "failure"
 
 
-def test_a_report_of_a_folder_of_pipes_waits_for_none(
+def test_a_report_does_not_wait_for_pipes(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *words: None)

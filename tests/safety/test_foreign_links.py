@@ -1,4 +1,4 @@
-"""What is written into a folder got from somebody else follows no link that lies there."""
+"""Writing into a folder from somebody else follows no link there."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def umask() -> Iterator[None]:
 
 @pytest.fixture
 def mine(tmp_path: Path) -> Path:
-    """A file of the user's that nobody may touch."""
+    """A file of the user that must not change."""
     path = tmp_path / "mine"
     path.write_text("mine")
     return path
@@ -42,7 +42,7 @@ def mine(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def theirs(tmp_path: Path) -> Path:
-    """A folder got from somebody else."""
+    """A folder from somebody else."""
     folder = tmp_path / "theirs"
     folder.mkdir()
     return folder
@@ -63,7 +63,7 @@ WRITERS: list[Callable[[Path], object]] = [
 
 
 @pytest.mark.parametrize("writes", WRITERS)
-def test_a_link_is_replaced_and_what_it_leads_to_stays(
+def test_a_link_is_replaced_and_its_target_kept(
     theirs: Path, mine: Path, monkeypatch: pytest.MonkeyPatch, writes: Callable[[Path], object]
 ) -> None:
     path = theirs / "file"
@@ -74,7 +74,7 @@ def test_a_link_is_replaced_and_what_it_leads_to_stays(
     assert mine.read_text() == "mine"
     assert not path.is_symlink()
     assert path.stat().st_size
-    # Even who knows the name of the draft has it refused, not followed.
+    # Even a link with the name of the temporary file is refused, not followed.
     monkeypatch.setattr(os, "urandom", lambda size: HEX)
     (theirs / f".file.{HEX.hex()}").symlink_to(mine)
     with pytest.raises(FileExistsError):
@@ -83,10 +83,12 @@ def test_a_link_is_replaced_and_what_it_leads_to_stays(
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o644])
-def test_a_secret_has_its_mode_from_the_beginning(theirs: Path, mode: int) -> None:
+def test_a_secret_file_has_its_mode_from_the_start(theirs: Path, mode: int) -> None:
     path = theirs / "key"
     path.touch(0o644)
-    path.with_name(f".key.{os.getpid()}").touch(0o666)  # whose mode the draft once had
+    path.with_name(f".key.{os.getpid()}").touch(
+        0o666
+    )  # the temporary file once took over this mode
     with draft(path, mode) as file:
         assert stat.S_IMODE(os.fstat(file.fileno()).st_mode) == mode
     assert stat.S_IMODE(path.stat().st_mode) == mode
@@ -94,7 +96,7 @@ def test_a_secret_has_its_mode_from_the_beginning(theirs: Path, mode: int) -> No
     assert stat.S_IMODE((theirs / "new").stat().st_mode) == 0o600
 
 
-def test_what_fails_leaves_neither_draft_nor_damage(theirs: Path) -> None:
+def test_a_failed_write_leaves_no_trace(theirs: Path) -> None:
     put(theirs / "file", b"old")
     with suppress(KeyboardInterrupt), draft(theirs / "file") as file:
         file.write(b"half")
@@ -103,7 +105,7 @@ def test_what_fails_leaves_neither_draft_nor_damage(theirs: Path) -> None:
     assert (theirs / "file").read_bytes() == b"old"
 
 
-def test_recover_refuses_a_link_that_leads_nowhere(
+def test_recover_refuses_a_broken_link(
     theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     torn = write(theirs / "run.mcap", world_records(20))
@@ -113,7 +115,7 @@ def test_recover_refuses_a_link_that_leads_nowhere(
     assert not (tmp_path / "nothing").exists()
 
 
-def test_a_report_is_written_through_no_link(
+def test_a_report_follows_no_link(
     theirs: Path, mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))

@@ -1,4 +1,4 @@
-"""A run's folder got from somebody else: whatever lies in it, to read it runs none of that."""
+"""A run's folder from somebody else: reading it executes none of its code."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ report:
 
 
 @pytest.fixture
-def told(tmp_path: Path) -> Path:
-    """The file that is there once anything of the run was run."""
-    return tmp_path / "told"
+def trace(tmp_path: Path) -> Path:
+    """The file that exists once any code of the run was executed."""
+    return tmp_path / "trace"
 
 
 @pytest.fixture
-def spy(told: Path) -> str:
-    """A program that gives itself away."""
-    return f"from pathlib import Path\nPath({str(told)!r}).touch()\ndef build(): ...\n"
+def spy(trace: Path) -> str:
+    """A program that leaves a trace when executed."""
+    return f"from pathlib import Path\nPath({str(trace)!r}).touch()\ndef build(): ...\n"
 
 
 @pytest.fixture
 def run(tmp_path: Path, spy: str) -> Path:
-    """A run whose configuration names a program that lies beside it."""
+    """A run whose configuration names a program in its folder."""
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "spy.py").write_text(spy)
@@ -57,33 +57,35 @@ def run(tmp_path: Path, spy: str) -> Path:
     return folder
 
 
-def test_a_report_runs_nothing_of_the_run(
-    run: Path, told: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_report_executes_nothing_of_the_run(
+    run: Path, trace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cloudrc.report.page.b64encode", lambda svg: b"")  # a lighter page
+    monkeypatch.setattr("cloudrc.report.page.b64encode", lambda svg: b"")  # a smaller page
     assert main(["report", str(run)]) == 1
-    assert not told.exists()
+    assert not trace.exists()
     assert json.loads((run / "report.json").read_text())["experiment"] == "config"
     assert "metric spy is not measured" in (run / "report.json").read_text()
-    assert f"<dd>{run / 'spy.py'}</dd>" in (run / "report.html").read_text(), "named all the same"
+    assert f"<dd>{run / 'spy.py'}</dd>" in (run / "report.html").read_text(), (
+        "it is named, but not executed"
+    )
 
 
-def test_a_link_is_verified_without_what_flies_over_it(run: Path, told: Path) -> None:
+def test_link_verify_executes_nothing_of_the_run(run: Path, trace: Path) -> None:
     experiment = find(str(run / "config.yaml"), ["link.uplink.delay_ms=200"])
     assert experiment.uplink.delay_ms == 200
-    # What its processes are started with says where the file lies, and they read it likewise.
+    # Its processes get a file that names the same program, and read it in the same way.
     (run / "again.yaml").write_text(dump(experiment))
     assert read_experiment(run / "again.yaml") == experiment
-    assert not told.exists()
+    assert not trace.exists()
 
 
-def test_what_is_read_is_what_the_file_says(run: Path) -> None:
+def test_an_experiment_is_read_as_the_file_says(run: Path) -> None:
     spy = str(run / "spy.py")
     controller = PlugIn.model_validate({"name": spy, "share": 2.5})
     assert read_experiment(run / "config.yaml").cloud.controller == controller
     flown = load_experiment("paper")
     (run / "config.yaml").write_text(dump(flown))
-    assert read_experiment(run / "config.yaml") == flown, "a run's own names all parameters"
+    assert read_experiment(run / "config.yaml") == flown, "a run's file names all parameters"
 
 
 @pytest.mark.parametrize(
@@ -94,18 +96,18 @@ def test_what_is_read_is_what_the_file_says(run: Path) -> None:
         ("cloud", "report: {metrics: ./spy.py}", False),
     ],
 )
-def test_of_the_ends_cloud_alone_imports_what_flies_it(
-    run: Path, told: Path, monkeypatch: pytest.MonkeyPatch, end: str, config: str, imports: bool
+def test_only_cloud_imports_plug_ins(
+    run: Path, trace: Path, monkeypatch: pytest.MonkeyPatch, end: str, config: str, imports: bool
 ) -> None:
     for name in ("_open_keys", "_open_peer", "_open_recorder", "open_exporter"):
         monkeypatch.setattr(runtime, name, lambda *words: None)
     (run / "config.yaml").write_text(config)
     runtime.open_end(argparse.Namespace(config=run / "config.yaml"), end)
-    assert told.exists() == imports
+    assert trace.exists() == imports
 
 
-def test_only_what_flies_imports_plug_ins() -> None:
-    """Whoever else needs an experiment reads it."""
+def test_only_flying_code_loads_an_experiment_with_plug_ins() -> None:
+    """All other code uses `read_experiment`, which imports none."""
     flies = {"cli/run.py", "cli/sweep.py", "cli/runtime.py", "cli/bench.py"}
     flies |= {"faults/flight.py", "faults/real/processes.py"}
     imports = {
@@ -118,32 +120,32 @@ def test_only_what_flies_imports_plug_ins() -> None:
     assert imports == flies
 
 
-def test_a_process_of_its_own_takes_no_python_from_the_working_folder(
-    run: Path, told: Path, spy: str, monkeypatch: pytest.MonkeyPatch
+def test_a_new_process_imports_nothing_from_the_working_folder(
+    run: Path, trace: Path, spy: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("cloudrc.py", "yaml.py", "argparse.py"):
         (run / name).write_text(spy)
     monkeypatch.chdir(run)
     done = subprocess.run(interpreter("-m", "cloudrc", "list"), capture_output=True, check=False)
-    assert (done.returncode, told.exists()) == (0, False), done.stderr
+    assert (done.returncode, trace.exists()) == (0, False), done.stderr
     monkeypatch.syspath_prepend(str(run))
-    assert "-P" not in interpreter("-m", "cloudrc"), "it is where this process looks, too"
+    assert "-P" not in interpreter("-m", "cloudrc"), "this process uses that path, too"
 
 
-def test_nor_does_a_process_of_a_sweep(
-    run: Path, told: Path, spy: str, monkeypatch: pytest.MonkeyPatch
+def test_a_sweep_worker_imports_nothing_from_there_either(
+    run: Path, trace: Path, spy: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It loads the pool's own modules before it has its parent's path."""
+    """It imports the pool's modules before it gets its parent's path."""
     (run / "pickle.py").write_text(spy)
     monkeypatch.chdir(run)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
     assert main(["run", "hover", "--seeds", "1", "--out", "sweep"]) == 0
-    assert not told.exists()
+    assert not trace.exists()
     assert "PYTHONSAFEPATH" not in os.environ
 
 
-def test_every_process_is_started_so() -> None:
-    """But for those of a fault suite, which fly in a new folder of their own."""
+def test_every_process_is_started_by_the_safe_function() -> None:
+    """Except in the fault suite, which flies in new folders."""
     starts = {
         path.relative_to(PACKAGE).as_posix()
         for path in PACKAGE.rglob("*.py")

@@ -1,4 +1,4 @@
-"""The promises of guard and link, from end to end: bytes arrive, and a robot moves or does not."""
+"""Promises of guard and link, end to end: from received bytes to the robot's motion."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FLOATS = st.one_of(
 
 
 def fly(talk: Talk, seconds: float, velocity: tuple[float, float, float]) -> None:
-    """A command every 10 ms."""
+    """Send a command every 10 ms."""
     for _ in range(round(seconds * 100)):
         talk.wait(talk.now_ns + PERIOD)
         talk.send(talk.command(velocity))
@@ -40,10 +40,10 @@ def test_without_fresh_commands_the_robot_brakes_and_holds() -> None:
     assert AGE_MAX < hold.stamp_ns - basis_ns <= AGE_MAX + 2 * MS
     flown = [r for r in talk.take(GroundTruth) if r.stamp_ns >= last]
     speeds = [hypot(*r.odometry.velocity) for r in flown]
-    assert speeds[0] > 0.5, "it flies when its commands end"
+    assert speeds[0] > 0.5, "it is flying when the commands end"
     before = [s for r, s in zip(flown, speeds, strict=True) if r.stamp_ns <= hold.stamp_ns]
     braked = [s for r, s in zip(flown, speeds, strict=True) if r.stamp_ns > hold.stamp_ns]
-    assert max(braked) <= max(before) + 0.05, "from then on it only slows down"
+    assert max(braked) <= max(before) + 0.05, "it only slows down after HOLD"
     path = [r for r in flown if r.stamp_ns >= hold.stamp_ns + 1_000 * MS]
     assert max(hypot(*r.odometry.velocity) for r in path) < 0.05
     assert path[-1].stamp_ns > last + 19_000 * MS
@@ -55,7 +55,7 @@ def test_without_fresh_commands_the_robot_brakes_and_holds() -> None:
 @pytest.mark.promise("commands-within-caps")
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(FLOATS, FLOATS, FLOATS), min_size=20, max_size=60))
-def test_whatever_the_cloud_sends_what_is_flown_is_finite_and_within_the_caps(velocities) -> None:
+def test_any_command_is_flown_finite_and_within_the_caps(velocities) -> None:
     talk = talking()
     fly(talk, 0.3, (0.0, 0.0, 0.5))
     for velocity in velocities:
@@ -66,7 +66,7 @@ def test_whatever_the_cloud_sends_what_is_flown_is_finite_and_within_the_caps(ve
 
 
 @pytest.mark.promise("forged-datagrams-do-nothing")
-def test_a_datagram_of_which_any_bit_differs_changes_nothing() -> None:
+def test_a_datagram_with_a_changed_bit_has_no_effect() -> None:
     talk = talking()
     fly(talk, 0.2, (0.0, 0.0, 0.5))
     applied = len(talk.take(CommandApplied))
@@ -78,7 +78,7 @@ def test_a_datagram_of_which_any_bit_differs_changes_nothing() -> None:
     for cut in range(len(valid)):
         talk.send(valid[:cut])
     talk.wait(talk.now_ns + 100 * MS)
-    assert len(talk.take(CommandApplied)) <= applied + 1  # one was waiting
+    assert len(talk.take(CommandApplied)) <= applied + 1  # one was already queued
     assert all(r.velocity != (3.0, 3.0, 3.0) for r in talk.take(CommandApplied))
     talk.send(valid)
     talk.wait(talk.now_ns + 20 * MS)
@@ -86,7 +86,7 @@ def test_a_datagram_of_which_any_bit_differs_changes_nothing() -> None:
 
 
 @pytest.mark.promise("old-datagrams-do-nothing")
-def test_what_was_captured_is_worth_nothing_after_a_restart_of_both_ends() -> None:
+def test_a_replay_after_a_restart_of_both_ends_has_no_effect() -> None:
     captured: list[bytes] = []
     talk = talking()
     send = talk.send

@@ -1,4 +1,4 @@
-"""The guard's limits are what world's experiment says, whatever comes through the tunnel."""
+"""The guard's limits come from world's experiment; nothing in the tunnel changes them."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from cloudrc.messages import GuardState
 from cloudrc.world.guard.state import Guard
 
 HOSTILE = {"stop-and-go": 1, "false-basis": 8, "strange-numbers": 64}
-"""Policies, each with a seed: together they bring about all of ANSWERS, CAUSES and states."""
+"""Hostile policies with a seed each; together they cause all ANSWERS, CAUSES and states."""
 ANSWERS = (
     *("used", "limited_speed", "limited_yaw_rate"),
     *("range", "future", "stale", "start_refused"),
 )
-"""What commands and requests, flown, shortened and refused, are counted under."""
+"""Counters of applied, limited and refused commands and requests."""
 CAUSES = {
     *("mission starts from spawn", "mission ended"),
     *("emergency stop", "acknowledged before touch-down"),
 }
-"""What requests have the guard do."""
+"""Causes of state changes that requests bring about."""
 
 
 def bounds(guard: Guard) -> dict[str, Any]:
-    """What a guard goes by: its limits, and what it has made of them when it was made."""
+    """Copy a guard's limits and the values that it derived from them."""
     parts = (
         (guard, ("_limits", "_speed_max", "_high", "_floor")),
         (guard._rest, ("_low", "_high", "_pull_max")),
@@ -41,9 +41,9 @@ def bounds(guard: Guard) -> dict[str, Any]:
 
 
 def fly_hostile(policy: str, seed: int) -> Flight:
-    """A cloud with valid keys commands by a policy, and speaks in the operator's name.
+    """Fly with a hostile cloud that has valid keys and sends the operator's requests.
 
-    Its guard ends with the bounds that it began with.
+    Check that the guard's bounds are the same before and after.
     """
     lie, words = POLICIES[policy](generator(seed, 666)), at_bad_moments(generator(seed, 667))
     flight = Flight(seed=seed, honest=False, tempt=tempting(lie, words))
@@ -57,7 +57,7 @@ def fly_hostile(policy: str, seed: int) -> Flight:
 
 
 @pytest.mark.promise("commands-within-caps")
-def test_nothing_that_comes_through_the_tunnel_changes_the_limits() -> None:
+def test_nothing_in_the_tunnel_changes_the_limits() -> None:
     answers, changes = Counter[str](), []
     for policy, seed in HOSTILE.items():
         flight = fly_hostile(policy, seed)

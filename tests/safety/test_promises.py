@@ -25,7 +25,7 @@ def marks(nodes: list[ast.expr]) -> list[ast.expr]:
 
 
 def promises_of(path: Path) -> list[tuple[str, bool]]:
-    """List the promise marks of a file's tests: name, and whether the test runs by day."""
+    """List the promise marks of a file's tests, and whether they run before a landing."""
     body = ast.parse(path.read_text(encoding="utf-8")).body
     shared = [
         mark
@@ -37,17 +37,17 @@ def promises_of(path: Path) -> list[tuple[str, bool]]:
     for test in body:
         if isinstance(test, ast.FunctionDef) and test.name.startswith("test_"):
             own = [*shared, *marks(test.decorator_list)]
-            by_day = not {ast.unparse(mark).split(".")[2] for mark in own} & NIGHTLY
+            daily = not {ast.unparse(mark).split(".")[2] for mark in own} & NIGHTLY
             for mark in own:
                 if isinstance(mark, ast.Call) and ast.unparse(mark.func).endswith(".promise"):
-                    found.append((ast.literal_eval(mark.args[0]), by_day))
+                    found.append((ast.literal_eval(mark.args[0]), daily))
     return found
 
 
-def test_every_promise_has_a_test_by_day_and_every_mark_a_promise() -> None:
+def test_promises_and_their_marks_match() -> None:
     files = (ROOT / "tests").rglob("test_*.py")
     found = [each for path in files for each in promises_of(path)]
     names = promised()
     assert 15 <= len(names) == len(set(names)) <= 25
     assert {name for name, _ in found} - set(names) == set()
-    assert set(names) - {name for name, by_day in found if by_day} == set()
+    assert set(names) - {name for name, daily in found if daily} == set()

@@ -1,4 +1,4 @@
-"""Which run `cloudrc mission` and `cloudrc link set` mean, wherever started, whoever else flies."""
+"""The run that `cloudrc mission` and `cloudrc link set` find on this machine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SET = ["link", "set", "uplink.loss=0.1"]
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The user's folder, where no run is."""
+    """A working folder without a run."""
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     monkeypatch.chdir(folder)
@@ -35,7 +35,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @contextlib.contextmanager
 def flying(folder: Path) -> Iterator[Running]:
-    """A run that flies in this folder."""
+    """A run that is flying in this folder."""
     folder.mkdir(parents=True)
     with running(unix=True) as api, local.announced(folder, api.url):
         yield api
@@ -49,10 +49,10 @@ def test_the_emergency_stop_reaches_the_only_run_from_any_folder(
         assert len(api.alarms) == 1
     said = capsys.readouterr()
     assert said.out.startswith("emergency stop: the robot is told")
-    assert said.err == f"cloudrc: the run that flies in {tmp_path / 'out'}\n"
+    assert said.err == f"cloudrc: using the run in {tmp_path / 'out'}\n"
 
 
-def test_of_several_one_has_to_be_named(tmp_path: Path, capsys: Printed) -> None:
+def test_with_several_runs_one_has_to_be_named(tmp_path: Path, capsys: Printed) -> None:
     with flying(tmp_path / "a") as a, flying(tmp_path / "b") as b:
         assert main(["mission", "estop"]) == 2
         (line,) = capsys.readouterr().err.splitlines()
@@ -72,9 +72,7 @@ def test_the_newest_run_of_this_folder_comes_first(
         assert capsys.readouterr().err == ""
 
 
-def test_runs_whose_api_is_not_up_or_that_have_none_are_not_asked_about(
-    tmp_path: Path, elsewhere: Path
-) -> None:
+def test_runs_without_an_answering_api_are_ignored(tmp_path: Path, elsewhere: Path) -> None:
     with flying(tmp_path / "out") as api:
         not_yet = f"unix:{tmp_path / 'api.sock'}"
         with (
@@ -86,7 +84,7 @@ def test_runs_whose_api_is_not_up_or_that_have_none_are_not_asked_about(
 
 
 @pytest.mark.parametrize("folder", ["runs/latest", "foreign"])
-def test_the_operators_word_goes_to_no_server_that_a_folder_names(
+def test_no_request_goes_to_a_server_that_a_folder_names(
     elsewhere: Path, capsys: Printed, folder: str
 ) -> None:
     (elsewhere / folder).mkdir(parents=True)
@@ -102,10 +100,10 @@ def test_the_operators_word_goes_to_no_server_that_a_folder_names(
 
 
 @pytest.mark.parametrize("by", ["flag", "environment"])
-def test_a_run_here_is_sent_no_token_not_even_one_that_is_named(
+def test_a_local_run_gets_no_token(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str
 ) -> None:
-    unread = str(tmp_path / "there is none")  # to send it one would have to read it
+    unread = str(tmp_path / "there is none")  # sending it would mean reading it
     words = ["--token-file", unread] if by == "flag" else []
     monkeypatch.setenv("CLOUDRC_TOKEN_FILE", unread)
     with flying(tmp_path / "out") as api:
@@ -115,7 +113,7 @@ def test_a_run_here_is_sent_no_token_not_even_one_that_is_named(
         assert main(["mission", "estop", "--api", api.url]) == 2
 
 
-def test_where_none_flies_one_is_told_how_to_name_it(capsys: Printed) -> None:
+def test_without_a_run_the_error_says_how_to_name_one(capsys: Printed) -> None:
     assert main(["mission", "estop"]) == 3
     (line,) = capsys.readouterr().err.splitlines()
     assert "no run flies here" in line
@@ -131,30 +129,28 @@ def test_where_none_flies_one_is_told_how_to_name_it(capsys: Printed) -> None:
         ([*SET, "-n", "demo"], "the other flags a cluster; give one"),
     ],
 )
-def test_a_run_that_is_not_there_is_one_sentence(
-    words: list[str], said: str, capsys: Printed
-) -> None:
+def test_a_wrong_run_flag_gives_one_line(words: list[str], said: str, capsys: Printed) -> None:
     assert main([*words, "--run", "nowhere"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
 
 
 def with_link(folder: Path, *, killed: bool = False) -> Path:
-    """A run's folder whose relay tells nothing (yet), or that a killed one has left behind."""
+    """The folder of a run whose relay is silent so far, or whose relay was killed."""
     link = folder / "link"
     link.mkdir(parents=True)
     if killed:
-        begun = link.stat().st_mtime - QUIET_LIMIT
-        os.utime(link, (begun, begun))
+        start = link.stat().st_mtime - QUIET_LIMIT
+        os.utime(link, (start, start))
     return folder
 
 
-def test_a_link_is_set_on_the_only_run_that_flies(tmp_path: Path, capsys: Printed) -> None:
+def test_link_set_finds_the_only_run(tmp_path: Path, capsys: Printed) -> None:
     run = with_link(tmp_path / "a", killed=True)
     with local.announced(run), local.announced(tmp_path / "without a link"):
         assert main(SET) == 2
         said = capsys.readouterr().err
-        assert said.startswith(f"cloudrc: the run that flies in {run}\n")
+        assert said.startswith(f"cloudrc: using the run in {run}\n")
         assert f"{run}: no link is up there (yet); wait for the start" in said
         with local.announced(with_link(tmp_path / "b")):
             assert main(SET) == 2
@@ -164,7 +160,7 @@ def test_a_link_is_set_on_the_only_run_that_flies(tmp_path: Path, capsys: Printe
 
 
 @pytest.mark.parametrize("kubectl", ["perhaps there", "missing"])
-def test_the_link_of_a_run_that_was_killed_is_not_set(
+def test_link_set_ignores_a_killed_run(
     tmp_path: Path,
     elsewhere: Path,
     capsys: Printed,
@@ -185,15 +181,13 @@ def test_the_link_of_a_run_that_was_killed_is_not_set(
     assert f"{tmp_path / 'out'}: no link is up there" in capsys.readouterr().err
 
 
-def test_a_run_that_could_not_announce_itself_is_known_by_what_it_tells(
-    elsewhere: Path, capsys: Printed
-) -> None:
+def test_link_set_finds_an_unannounced_run_by_its_files(elsewhere: Path, capsys: Printed) -> None:
     with_link(elsewhere / "runs" / "latest")
     assert main(SET) == 2
     assert "runs/latest: no link is up there (yet)" in capsys.readouterr().err
 
 
-def test_kubectl_never_means_a_run_here(
+def test_the_kubectl_plugin_never_uses_a_local_run(
     elsewhere: Path, monkeypatch: pytest.MonkeyPatch, capsys: Printed
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc", *SET])

@@ -1,4 +1,4 @@
-"""Files that commands read: no pipe, which might never be written to; a redirected one is fine."""
+"""Input files of commands: a pipe or device is refused, a redirected file is read."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tests.record.conftest import world_records, write
 
 
 @pytest.fixture
-def patience() -> Iterator[None]:
-    """Let whoever waits for a pipe fail, and go on."""
+def no_waiting() -> Iterator[None]:
+    """Fail a test that waits for a pipe."""
 
     def give_up(number: int, frame: FrameType | None) -> None:
         raise TimeoutError("it waits")
@@ -31,11 +31,11 @@ def patience() -> Iterator[None]:
 
 @pytest.mark.parametrize("words", ["recover", "faults replay"])
 @pytest.mark.parametrize("what", ["pipe", "/dev/null", "."])
-def test_what_is_no_file_is_refused_and_not_waited_for(
+def test_a_pipe_device_or_folder_is_refused_at_once(
     words: str,
     what: str,
     tmp_path: Path,
-    patience: None,
+    no_waiting: None,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -47,16 +47,16 @@ def test_what_is_no_file_is_refused_and_not_waited_for(
     assert os.listdir() == ["pipe"]
 
 
-def test_a_device_keeps_no_epochs(capsys: pytest.CaptureFixture[str]) -> None:
-    """What holds no epoch is set aside under another name: root would have lost its /dev/null."""
+def test_a_device_is_refused_for_epochs(capsys: pytest.CaptureFixture[str]) -> None:
+    """A file without epochs is renamed; for root that would be /dev/null itself."""
     words = "world --config none.json --listen 127.0.0.1:9 --epochs /dev/null"
     assert main(words.split()) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--epochs: /dev/null: not a regular file" in line
 
 
-def test_a_file_that_is_handed_over_is_read(tmp_path: Path) -> None:
-    """As `/dev/stdin` is one behind '<'."""
+def test_a_redirected_file_is_read(tmp_path: Path) -> None:
+    """As with `/dev/stdin` and '<'."""
     run = write(tmp_path / "run.mcap", world_records(50))
     with run.open("rb") as handed:
         words = ["recover", f"/dev/fd/{handed.fileno()}", "--to", str(tmp_path / "new.mcap")]

@@ -1,4 +1,4 @@
-"""The last words of a run: verdict, main numbers, faults, and the exit code of each verdict."""
+"""The summary of a run: verdict, main numbers, faults and exit code."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def test_each_verdict_has_its_exit_code(outcome: str, code: int) -> None:
     assert exit_code(report(outcome)) == code
 
 
-def test_every_broken_rule_is_told() -> None:
-    told = verdict(report("failure", "the robot touched pipe_2", "too slow"))
-    assert told == "FAILURE: the robot touched pipe_2\n  also: too slow (at 3.25 s)"
+def test_every_failure_is_printed() -> None:
+    text = verdict(report("failure", "the robot touched pipe_2", "too slow"))
+    assert text == "FAILURE: the robot touched pipe_2\n  also: too slow (at 3.25 s)"
 
 
-def test_numbers_come_in_handy_units_and_unknown_ones_are_left_out() -> None:
+def test_numbers_have_handy_units_and_unknown_ones_are_absent() -> None:
     text = main_numbers(report("success", duration=(30.9, "s"), rtt_mean=(0.0697, "s")))
     assert [line.split()[-2:] for line in text.splitlines()] == [["30.90", "s"], ["69.70", "ms"]]
 
 
-def test_faults_are_not_passed_over(capsys: pytest.CaptureFixture[str]) -> None:
+def test_faults_are_mentioned(capsys: pytest.CaptureFixture[str]) -> None:
     show(report("success", fault_count=(0.0, "1")), Path("runs/a"))
     assert "faults" not in capsys.readouterr().out
     show(report("success", fault_count=(41.0, "1")), Path("runs/a"))

@@ -1,4 +1,4 @@
-"""World, cloud and relay as commands: an address that cannot be used is said with its flag."""
+"""World, cloud and relay as commands: addresses, stopping at start, sizes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.cli.main import main
-from cloudrc.cli.runtime import _open_peer, open_exporter, resolved, size
+from cloudrc.cli.runtime import _open_peer, open_exporter, resolve_address, size
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent
@@ -38,7 +38,7 @@ def taken() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("elsewhere", [None, Path("sockets")])
-def test_a_cloud_whose_teleop_is_elsewhere_has_no_metrics_of_missions(
+def test_cloud_with_a_teleop_process_exports_no_mission_metrics(
     elsewhere: Path | None,
 ) -> None:
     options = argparse.Namespace(metrics=("127.0.0.1", 0), teleop=elsewhere)
@@ -49,7 +49,7 @@ def test_a_cloud_whose_teleop_is_elsewhere_has_no_metrics_of_missions(
     exporter.close()
 
 
-# The socket that could not be bound is closed by the end of the process, which here goes on.
+# The process would close the socket at its end, but here the test process goes on.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
     ("command", "flag", "others"),
@@ -59,7 +59,7 @@ def test_a_cloud_whose_teleop_is_elsewhere_has_no_metrics_of_missions(
         ("relay", "--world-side", ["--cloud-side", FREE, "--world", FREE, "--cloud", FREE]),
     ],
 )
-def test_an_address_in_use_is_named_with_its_flag(
+def test_an_address_in_use_is_reported_with_its_flag(
     command: str,
     flag: str,
     others: list[str],
@@ -71,9 +71,11 @@ def test_an_address_in_use_is_named_with_its_flag(
     (tmp_path / "key").chmod(0o600)
     others = [str(tmp_path / "key") if word == "KEY" else word for word in others]
     assert main([command, *CONFIG, flag, taken, *others]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"cloudrc: error: {flag} {taken}: cannot receive there: Address already")
-    assert said.endswith("; name an address of this machine and a port that is free\n")
+    error = capsys.readouterr().err
+    assert error.startswith(
+        f"cloudrc: error: {flag} {taken}: cannot receive there: Address already"
+    )
+    assert error.endswith("; name an address of this machine and a port that is free\n")
 
 
 def no_such_name(*asked: object) -> None:
@@ -89,7 +91,7 @@ def no_such_name(*asked: object) -> None:
         ("relay", "--cloud", ["--world-side", FREE, "--cloud-side", FREE, "--world", FREE]),
     ],
 )
-def test_a_name_that_cannot_be_resolved_is_said_at_the_start(
+def test_an_unresolvable_name_is_reported_at_the_start(
     command: str,
     flag: str,
     others: list[str],
@@ -111,15 +113,15 @@ def test_a_name_that_cannot_be_resolved_is_said_at_the_start(
     )
 
 
-def test_a_label_that_is_too_long_is_no_name() -> None:
+def test_a_name_with_too_long_a_label_is_refused() -> None:
     with pytest.raises(BadInputError, match=r"cannot be resolved \(not a name"):
-        resolved("--peer", ("x" * 64 + ".test", 1))
+        resolve_address("--peer", ("x" * 64 + ".test", 1))
 
 
-def test_the_name_of_a_peer_is_asked_for_once_and_never_by_the_loop(
+def test_the_peer_is_resolved_once_before_the_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With every datagram a name server was asked, and the control loop waited for it."""
+    """The control loop once asked a name server for every datagram, and waited for it."""
     asked: list[object] = []
 
     def look_up(name: str, *rest: object) -> list[tuple[Any, ...]]:
@@ -134,21 +136,21 @@ def test_the_name_of_a_peer_is_asked_for_once_and_never_by_the_loop(
         assert (peer.address, asked) == (("127.0.0.9", 7400), ["cloud"])
 
 
-# Here too a socket outlives the command.
+# Here, too, the socket stays open after the command.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("end", ["world", "cloud"])
-def test_whoever_is_stopped_while_it_starts_leaves_a_whole_recording(
+def test_an_end_stopped_at_its_start_completes_its_recording(
     end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The first process of a container ignores a signal that it does not handle yet."""
+    """The first process of a container ignores signals without a handler."""
     build = getattr(assembly, f"build_{end}")
 
-    def stopped(*arguments: Any) -> Any:
+    def stop_and_build(*arguments: Any) -> Any:
         os.kill(os.getpid(), signal.SIGTERM)
         return build(*arguments)
 
-    monkeypatch.setattr(assembly, f"build_{end}", stopped)
+    monkeypatch.setattr(assembly, f"build_{end}", stop_and_build)
     record = tmp_path / "end.mcap"
     (tmp_path / "key").write_bytes(bytes(32))
     (tmp_path / "key").chmod(0o644)
@@ -156,19 +158,19 @@ def test_whoever_is_stopped_while_it_starts_leaves_a_whole_recording(
     free = [free_port(), "--peer", FREE, "--record", str(record), *key]
     assert main([end, *CONFIG, "--listen", *free]) == 0
     assert record.read_bytes().endswith(MCAP_MAGIC)
-    said = f"cloudrc: warning: everybody can read {tmp_path / 'key'}: chmod 600"
-    assert said in capsys.readouterr().err.splitlines()
+    warning = f"cloudrc: warning: everybody can read {tmp_path / 'key'}: chmod 600"
+    assert warning in capsys.readouterr().err.splitlines()
 
 
 @pytest.mark.parametrize(
     ("text", "bytes_"),
     [("1Gi", 2**30), ("500M", 5e8), ("1.5Ki", 1536), ("4096", 4096), ("2k", 2e3)],
 )
-def test_a_size_is_written_as_in_kubernetes(text: str, bytes_: float) -> None:
+def test_sizes_are_read_as_in_kubernetes(text: str, bytes_: float) -> None:
     assert size(text) == bytes_
 
 
 @pytest.mark.parametrize("text", ["", "1GB", "-1", "1 Gi", "nan"])
-def test_another_size_is_refused(text: str) -> None:
+def test_other_sizes_are_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="such as 500M or 1Gi"):
         size(text)

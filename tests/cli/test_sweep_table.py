@@ -1,4 +1,4 @@
-"""Tables over seeds: the interval's hand-worked bounds, absent numbers, the CSV."""
+"""Tables of a sweep: the interval of the median, missing numbers, the CSV file."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def report(seed: int, verdict: str = "success", **numbers: float) -> dict[str, A
 @pytest.mark.parametrize(
     ("n", "bounds"),
     [
-        (5, None),  # the extremes enclose the median with 1 - 2/32 = 0.9375 only
+        (5, None),  # minimum and maximum enclose the median with 1 - 2/32 = 0.9375 only
         (6, (1, 6)),  # 1 - 2/64 = 0.969
         (9, (2, 8)),  # 1 - 2 * 10/512 = 0.961
         (10, (2, 9)),  # 1 - 2 * 11/1024 = 0.979; (3, 8) has 0.891
-        (20, (6, 15)),  # the textbooks' 0.9586
+        (20, (6, 15)),  # 0.9586 in textbooks
     ],
 )
-def test_the_interval_holds_its_hand_worked_bounds(
+def test_the_interval_has_the_bounds_computed_by_hand(
     n: int, bounds: tuple[float, float] | None
 ) -> None:
     assert interval([float(i) for i in range(n, 0, -1)]) == bounds
@@ -46,7 +46,7 @@ def test_the_interval_encloses_the_median(values: list[float]) -> None:
     assert bounds[0] <= median <= bounds[1]
 
 
-def test_a_number_that_some_runs_lack_is_taken_over_the_others() -> None:
+def test_statistics_skip_runs_that_lack_a_number() -> None:
     summary = summarise([report(1, x=1.0), report(2, "failure"), report(3, x=3.0)])
     assert (summary["done"], summary["count"]) == (2, 3)
     assert summary["numbers"]["x"]["median"] == 2.0

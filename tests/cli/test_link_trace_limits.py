@@ -1,4 +1,4 @@
-"""What an end reads because the link's container names it is a file, and no longer than its own."""
+"""Traces that the link's container names: regular files of limited size only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cloudrc.link.verify.monitor import Asked, Load, StandingCheck
 
 @pytest.fixture
 def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
-    """What the standing check reads the profile in link.json with."""
+    """The function with which an end loads the profile in link.json."""
     kept: list[Load] = []
 
     def begin(self: StandingCheck, asked: Asked, path: Path | None, load: Load) -> None:
@@ -28,7 +28,7 @@ def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
 
 
 @pytest.mark.parametrize("key", ["trace", "table"])
-def test_what_the_link_names_as_a_trace_is_read_within_bounds(
+def test_a_trace_named_by_the_link_is_read_within_bounds(
     tmp_path: Path, load: Load, key: str
 ) -> None:
     path, text = tmp_path / "trace.csv", "time_s,delay_ms\n0,45\n1,50\n"
@@ -38,6 +38,6 @@ def test_what_the_link_names_as_a_trace_is_read_within_bounds(
     path.write_text(text + "\n" * runtime.TRACE_MAX)
     with pytest.raises(BadInputError, match="longer than 2097152 bytes; give a CSV file"):
         load(profile)
-    profile["uplink"][key] = "/dev/null"  # any device or pipe: one without an end takes all memory
+    profile["uplink"][key] = "/dev/null"  # an endless device would fill the memory
     with pytest.raises(BadInputError, match="not a file; give a CSV file"):
         load(profile)

@@ -1,4 +1,4 @@
-"""Run folders: counted up, never overwritten, `latest` leads to the newest."""
+"""Run folders: numbered, never overwritten; `latest` points to the newest."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cloudrc.cli.find_run import new_folder
 from cloudrc.errors import BadInputError
 
 
-def test_folders_are_counted_and_latest_is_the_newest(
+def test_folders_are_numbered_and_latest_is_the_newest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -19,12 +19,12 @@ def test_folders_are_counted_and_latest_is_the_newest(
     assert Path("runs/latest").resolve() == Path(names[-1]).resolve()
 
 
-def test_an_empty_or_new_folder_is_taken(tmp_path: Path) -> None:
+def test_an_empty_or_new_folder_is_accepted(tmp_path: Path) -> None:
     assert new_folder(tmp_path, "x") == tmp_path
     assert new_folder(tmp_path / "a" / "b", "x").is_dir()
 
 
-def test_what_cannot_be_made_is_said_with_a_remedy(
+def test_an_error_says_which_folder_and_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -36,7 +36,7 @@ def test_what_cannot_be_made_is_said_with_a_remedy(
 
 
 @pytest.mark.parametrize("name", ["full", "file"])
-def test_what_is_there_is_not_overwritten(name: str, tmp_path: Path) -> None:
+def test_existing_files_are_not_overwritten(name: str, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "report.json").write_text("{}")
     (tmp_path / "file").write_text("x")

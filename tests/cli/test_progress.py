@@ -1,4 +1,4 @@
-"""What a flight shows: one living line on a terminal, one plain line per event elsewhere."""
+"""Progress of a flight: a status line on a terminal, one line per event elsewhere."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def flying(stamp_ns: int = 3 * SECOND) -> FlightView:
     return seen(io.StringIO(), telemetry(SECOND), CONTROL, guard, telemetry(stamp_ns))
 
 
-def test_the_line_says_where_the_flight_is() -> None:
-    # Two seconds of flight; the clock above gave one second between first telemetry and now.
+def test_the_status_line_shows_the_state_of_the_flight() -> None:
+    # Two seconds of flight within one second of the clock above.
     assert flying().line() == (
         "   2.0 s  waypoint 3/7  (-1.00,  2.50, 0.70) m  delay  96 ms  TRACK   x2.00"
     )
@@ -68,12 +68,12 @@ def test_the_line_says_where_the_flight_is() -> None:
         (12, "1000.0 s  TR"),
     ],
 )
-def test_a_narrow_terminal_gets_less_in_one_line(width: int, line: str) -> None:
+def test_a_narrow_terminal_gets_a_shorter_line(width: int, line: str) -> None:
     assert flying(1001 * SECOND).line(width) == line
     assert len(line) <= width
 
 
-def test_what_is_not_known_yet_is_not_shown() -> None:
+def test_unknown_values_are_not_shown() -> None:
     early = CONTROL._replace(horizon=0.0, rtt=math.nan, waypoint=-1)
     assert seen(io.StringIO(), telemetry(0), early).line() == (
         "   0.0 s  (-1.00,  2.50, 0.70) m  GROUND"
@@ -81,14 +81,14 @@ def test_what_is_not_known_yet_is_not_shown() -> None:
     assert seen(io.StringIO()).line() == "   0.0 s  GROUND"
 
 
-def test_no_zero_has_a_sign() -> None:
+def test_zero_has_no_sign() -> None:
     sent = telemetry(0)
     odometry = sent.telemetry.odometry._replace(position=(-0.004, -0.0, -1e-9))
     sent = sent._replace(telemetry=sent.telemetry._replace(odometry=odometry))
     assert "( 0.00,  0.00, 0.00) m" in seen(io.StringIO(), sent).line()
 
 
-def test_a_terminal_gets_a_line_that_is_rewritten_and_taken_away() -> None:
+def test_a_terminal_gets_a_status_line_that_is_erased() -> None:
     stream = Terminal()
     seen(stream, telemetry(0), CONTROL).close()
     assert stream.getvalue().startswith("\r\x1b[2K")
@@ -112,14 +112,14 @@ def test_a_file_gets_plain_lines_for_events_only() -> None:
 
 
 @pytest.mark.parametrize("length", [10, 44, 45, 60])
-def test_a_text_is_never_glued_to_the_position(length: int) -> None:
+def test_blanks_separate_a_text_from_the_position(length: int) -> None:
     stream = io.StringIO()
     seen(stream, telemetry(0), CONTROL, MissionEvent(0, "reached", 1, "x" * length))
     assert "x  " in stream.getvalue()
     assert len(stream.getvalue().rstrip("\n")) <= FILE_COLUMNS
 
 
-def test_a_long_text_stands_alone_and_is_wrapped_on_a_terminal_only() -> None:
+def test_a_long_text_is_wrapped_on_a_terminal_only() -> None:
     text, file, terminal = " ".join(["plug-in"] * 20), io.StringIO(), Terminal()
     for stream in (file, terminal):
         seen(stream, telemetry(0), CONTROL, Fault(0, "late", text))
@@ -129,7 +129,7 @@ def test_a_long_text_stands_alone_and_is_wrapped_on_a_terminal_only() -> None:
     assert all(line.startswith("    plug-in") for line in lines[1:])
 
 
-def test_a_stream_that_nobody_reads_does_not_end_the_flight() -> None:
+def test_a_closed_pipe_does_not_end_the_flight() -> None:
     class Closed(Terminal):
         def write(self, text: str) -> int:
             raise BrokenPipeError

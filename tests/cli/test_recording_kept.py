@@ -1,4 +1,4 @@
-"""An end that is started again with the same flags keeps what was recorded before."""
+"""An end that restarts with the same flags keeps its earlier recording."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def started(path: Path | None, size_max: float | None = None) -> Recorder:
     return _open_recorder(options, "world", b"id")
 
 
-def drained(recorder: Recorder, seconds: int = 1) -> Recorder:
+def record(recorder: Recorder, seconds: int = 1) -> Recorder:
     for start in range(0, 1000 * seconds, 500):
         recorder.put(world_records(50, start * MS))
         while recorder.drain():
@@ -25,9 +25,9 @@ def drained(recorder: Recorder, seconds: int = 1) -> Recorder:
     return recorder
 
 
-def test_the_recording_of_a_crash_outlives_the_next_start(tmp_path: Path) -> None:
+def test_a_restart_keeps_the_recording_of_a_crash(tmp_path: Path) -> None:
     path, before = tmp_path / "world.mcap", tmp_path / "world.before.mcap"
-    killed = drained(started(path))
+    killed = record(started(path))
     left = path.read_bytes()
     again = started(path)
     again.put(counted(3))
@@ -38,21 +38,21 @@ def test_the_recording_of_a_crash_outlives_the_next_start(tmp_path: Path) -> Non
     killed.close()
     left = path.read_bytes()
     started(path).close()
-    assert before.read_bytes() == left, "the one before, and no more than that"
+    assert before.read_bytes() == left, "only the previous one is kept"
 
 
-def test_both_together_keep_within_the_limit(tmp_path: Path) -> None:
+def test_both_recordings_together_stay_within_the_limit(tmp_path: Path) -> None:
     path, limit = tmp_path / "world.mcap", 200_000
     for _ in range(3):
-        recorder = drained(started(path, limit), 30)
+        recorder = record(started(path, limit), 30)
         recorder.close()
         assert "it has grown to its limit" in recorder.error
         sizes = [each.stat().st_size for each in tmp_path.iterdir()]
-        assert sum(sizes) < limit + 2 * 16_000, "each ends with the chunk that was open"
+        assert sum(sizes) < limit + 2 * 16_000, "each recording ends with its open chunk"
     assert len(sizes) == 2
 
 
-def test_an_empty_file_or_none_is_not_kept(tmp_path: Path) -> None:
+def test_an_empty_recording_is_not_kept(tmp_path: Path) -> None:
     path = tmp_path / "world.mcap"
     path.touch()
     started(path).close()

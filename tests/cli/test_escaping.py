@@ -1,4 +1,4 @@
-"""Whatever a foreign file says or is called, a terminal shows it and does nothing else."""
+"""Text from files is escaped: it cannot control the terminal or fake a line of output."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def printed(capsys: Printed) -> Printing:
-    """What was printed, once it is known to hold the words, and nothing that a terminal obeys."""
+    """Check the output and give it: it contains the escaped text and no control characters."""
 
     def check() -> str:
         out, err = capsys.readouterr()
@@ -69,7 +69,7 @@ def test_names_in_an_error_of_several_lines(here: Path, printed: Printing) -> No
     assert [line.startswith("  ./a.yaml:") for line in lines] == [True, True]
 
 
-def test_what_a_recording_says_that_it_lacks(here: Path, printed: Printing) -> None:
+def test_the_note_of_a_recording(here: Path, printed: Printing) -> None:
     with McapWriter(here / "a.mcap", clock="world") as writer:
         writer.write(world_records(5))
         writer.note({MISSING: EVIL})
@@ -83,20 +83,20 @@ def test_the_description_of_a_profile(here: Path, printed: Printing) -> None:
     assert printed().startswith(f"a: {SHOWN}\n")
 
 
-def test_why_a_run_has_failed(printed: Printing) -> None:
+def test_the_failures_of_a_run(printed: Printing) -> None:
     failures = [{"code": "x", "text": EVIL}] * 2
     report = {"verdict": "failure", "failures": failures, "numbers": {}}
     summary.show(report, Path(EVIL))
     assert printed().count(SHOWN) == 3
 
 
-def test_what_happens_in_a_flight() -> None:
+def test_the_events_of_a_flight() -> None:
     stream = io.StringIO()
     FlightView(stream, 1).see([Fault(0, "bad", EVIL)])
     assert_harmless(stream.getvalue())
 
 
-def test_what_a_link_container_tells_of_itself() -> None:
+def test_the_state_of_a_link_container() -> None:
     cause = Cause("wrong_interface", "uplink", EVIL)
     row = Row("mean", "s", 0.1, 0.1, 0.1, 0.1, 0.1, "ok")
     ways, probes = {"uplink": Findings([row], Evidence("relay"))}, {"uplink": EVIL}
