@@ -19,7 +19,7 @@ from cloudrc.records import Record
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from cloudrc.drivers import flights
+from cloudrc.drivers import local as flights
 with flights.announced(Path(sys.argv[1])):
     assert flights.under_way()
     os.kill(os.getpid(), signal.SIGKILL)
