@@ -116,8 +116,8 @@ class Direction(Section):
     )
     jitter_ms: NotNegative = Field(
         0.0,
-        description="Spread of the delay [ms]; the half width of uniform, the standard deviation of "
-        "the other distributions. A delay below 0 becomes 0, which raises the mean",
+        description="Spread of the delay [ms]; half width of uniform, standard deviation of the "
+        "other distributions. A delay below 0 becomes 0, which raises the mean",
     )
     distribution: Literal["uniform", "normal", "pareto", "table"] = Field(
         "uniform",
