@@ -71,7 +71,7 @@ def test_nor_is_one_that_a_configuration_names(tmp_path: Path, key: str, named: 
 def test_a_path_has_no_nul(tmp_path: Path) -> None:
     for key in ("mission", "cloud: {predictor", "link: {profile", "link: {uplink: {trace"):
         (tmp_path / "c.yaml").write_text(key + ': "a\\0/b.py"' + "}" * key.count("{"))
-        with pytest.raises(BadInputError, match=r"c\.yaml:1: a text with the character NUL"):
+        with pytest.raises(BadInputError, match=r"c\.yaml:1: text with the character NUL"):
             read_experiment(tmp_path / "c.yaml")
 
 
