@@ -1,44 +1,44 @@
-# What there is to do; `make` alone prints it. Needs Python 3.11 or newer, make and git.
+# Targets for developers; `make` alone lists them. Needs Python 3.11 or newer, make and git.
 PYTHON ?= python3
 VENV ?= .venv
 EXPERIMENT ?= paper
 bin := $(VENV)/bin
 VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' cloudrc/__init__.py)
-# Put before the images' names, with a slash at its end: make images REGISTRY=ghcr.io/me/
+# Prefix of the images' names, with a slash at the end: make images REGISTRY=ghcr.io/me/
 REGISTRY ?=
-# What the images stand on, if not their Dockerfiles' tag: BASE=python:3.11-slim-bookworm@sha256:...
+# Base image, if not that of the Dockerfiles: BASE=python:3.11-slim-bookworm@sha256:...
 BASE :=
 CLUSTER ?= cloudrc
 IMAGES := world cloud
 SCRIPTS := .ci/run
-# Flights at once in the search for faults.
+# Number of flights at once in the search for faults.
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
-# Where the results of `make faults`, `make mutants` and `make nightly` go.
+# Folder for the results of `make faults`, `make mutants` and `make nightly`.
 EVIDENCE := build/evidence
-# A failing schedule is shrunk and kept there; moved to tests/faults/regressions it is a test.
+# A failing schedule is shrunk and kept in --store; in tests/faults/regressions it becomes a test.
 FUZZ = $(bin)/cloudrc faults fuzz --jobs $(JOBS) --store $(EVIDENCE)/regressions
 # The seeds of each search of `make faults`.
 SEEDS ?= 200
 # The tests of one part: make test T=tunnel, make test T=tests/cli/test_run.py.
 T ?=
 PART = $(if $(T),$(if $(wildcard tests/$(T)),tests/$(T),$(T)))
-# What tests guard, tunnel and journal in seconds.
+# Tests of guard, tunnel and journal that take seconds.
 SLOW := %_any_input.py %_falls.py %_flight.py %_machine.py %_proof.py %_hostile.py
 CORE := $(filter-out $(SLOW),$(wildcard \
 	tests/world/guard/test_*.py tests/tunnel/test_*.py tests/teleop/test_journal*.py))
 BUILD_ARGS := $(BASE:%=--build-arg BASE=%) --build-arg VERSION=$(VERSION) \
 	--build-arg SOURCE=$(or $(filter https://%,$(shell git config remote.origin.url)),unpublished) \
 	--build-arg REVISION=$(or $(shell git rev-parse HEAD 2>/dev/null),unknown)
-# Universal in the processor: the hashes of all wheels for Linux are in the lock.
+# Independent of the processor: the lock has the hashes of all wheels for Linux.
 COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python-platform linux \
 	--generate-hashes --no-emit-index-url --custom-compile-command 'make lock'
-# MuJoCo's viewers: a pod draws nothing, and they are a tenth of the image.
+# MuJoCo's viewers, a tenth of the image: a pod draws nothing.
 DRAWING := glfw pyopengl mujoco-studio websockets
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults coverage mutants nightly lint types bench bench-link pictures docs images kind-load lock clean
 
-help: ## print this list
+help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(VENV)/all ## fly the paper's mission in real time and write its report
@@ -50,24 +50,24 @@ test: $(VENV)/dev ## run the default tests on all cores; of one part: make test 
 process: $(VENV)/dev ## run the tests that start processes and take real time
 	$(bin)/pytest -m 'process and not full'
 
-# With KUBECONFIG set, the release goes into that cluster, and nothing is made or removed but ours.
-e2e: $(VENV)/dev ## fly on a kind cluster of its own, or that of KUBECONFIG (KEEP=1 leaves it)
+# With KUBECONFIG set, the tests use that cluster and make and remove only their own objects.
+e2e: $(VENV)/dev ## fly on a new kind cluster, or on that of KUBECONFIG (KEEP=1 keeps it)
 	$(bin)/pytest -m 'e2e and not full' tests/e2e $(if $(KEEP),--keep)
 
-e2e-full: $(VENV)/dev ## the same with every fault of the cluster's suite, its Secret rotated: minutes
+e2e-full: $(VENV)/dev ## as e2e, with all faults on the cluster and a new Secret: minutes
 	$(bin)/pytest -m e2e tests/e2e $(if $(KEEP),--keep)
 
-# Without root or sch_netem pytest exits with 3; make turns every failure into its own 2.
-test-netem: $(VENV)/dev ## run the tests of the kernel's netem; needs root and sch_netem
+# Without root or sch_netem, pytest ends with 3; make turns every failure into 2.
+test-netem: $(VENV)/dev ## run the tests of netem in the kernel; needs root and sch_netem
 	$(bin)/pytest -m 'netem and not full' -rP tests/link
 
 smoke-netem: $(VENV)/dev ## of these the few that every push runs: shape, measure, verify a profile
 	$(bin)/pytest -m smoke tests/link/test_netem_*.py tests/link/verify/test_netem.py
 
-test-netem-full: $(VENV)/dev ## the same, and every shipped profile for a minute
+test-netem-full: $(VENV)/dev ## as test-netem, and every shipped profile for a minute
 	$(bin)/pytest -m netem -rP tests/link
 
-faults: $(VENV)/dev ## bring every fault about, compose 2 x SEEDS (200) at random
+faults: $(VENV)/dev ## inject every fault, then fly 2 x SEEDS (200) random schedules of faults
 	mkdir -p $(EVIDENCE)
 	$(bin)/cloudrc faults run --all --jobs $(JOBS) --document $(EVIDENCE)/faults.md
 	$(FUZZ) --seeds $(SEEDS)
@@ -76,8 +76,8 @@ faults: $(VENV)/dev ## bring every fault about, compose 2 x SEEDS (200) at rando
 coverage: $(VENV)/dev ## make test, and fail unless every branch of guard, tunnel and journal is tested
 	$(bin)/pytest -n auto --hypothesis-seed=0 --cov --cov-report=term
 
-# mutmut writes where it runs. `mutmut show NAME`, called in build/mutants, shows a mutant.
-mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways, list what tests notice
+# mutmut writes into its working folder. `mutmut show NAME` in build/mutants shows a mutant.
+mutants: $(VENV)/dev ## mutate guard, tunnel and journal, list the mutants that tests find
 	rm -rf build/mutants && mkdir -p build/mutants $(EVIDENCE)
 	cp -r cloudrc tests pyproject.toml build/mutants
 	find build/mutants/tests -name 'test_*.py' -delete && cp --parents $(CORE) build/mutants
@@ -85,8 +85,8 @@ mutants: $(VENV)/dev ## change guard, tunnel and journal in small ways, list wha
 	cd build/mutants && $(abspath $(bin))/python -m mutmut results --all true \
 		> $(CURDIR)/$(EVIDENCE)/mutants.txt
 
-# In this order, each part even if one before it has failed: without Docker, kind, helm and kubectl
-# all but the cluster's is done.
+# In this order; each part runs even if an earlier one has failed. The part on a cluster needs Docker,
+# kind, helm and kubectl.
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults-virtual.json faults-real.json \
 	faults-flood.json search-clean.json search-adversarial.json search-random.json link.json) \
 	mutants night-netem e2e-full $(EVIDENCE)/index.md
@@ -146,11 +146,11 @@ types: $(VENV)/dev ## check types
 bench: $(VENV)/all ## measure the closed loop against raw physics
 	$(bin)/cloudrc bench
 
-# Without a C compiler it exits with 3; make turns every failure into its own 2.
-bench-link: $(VENV)/all ## measure the relay against what was asked, and C anchors; needs cc
+# Without a C compiler, the bench ends with 3; make turns every failure into 2.
+bench-link: $(VENV)/all ## compare the relay with its profiles and with C programs; needs cc
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 
-pictures: $(VENV)/all ## draw the README's picture from a flight
+pictures: $(VENV)/all ## draw the README's picture of a flight
 	rm -rf build/pictures
 	$(bin)/cloudrc run paper --mode virtual --out build/pictures
 	cp build/pictures/figures/flight.png docs/flight.png
@@ -158,7 +158,7 @@ pictures: $(VENV)/all ## draw the README's picture from a flight
 docs: $(VENV)/dev ## write the generated pages of docs/, and the chart's values, schema and table
 	$(bin)/python -m tools.docs
 
-images: ## build the containers' images; needs Docker
+images: ## build the container images; needs Docker
 	@command -v docker >/dev/null || { \
 		echo "make images needs Docker: https://docs.docker.com/engine/install" >&2; exit 3; }
 	for role in $(IMAGES); do \
@@ -174,7 +174,7 @@ kind-load: ## load the images into the kind cluster CLUSTER (cloudrc)
 		exit 3; }
 	kind load docker-image --name $(CLUSTER) $(IMAGES:%=$(REGISTRY)cloudrc/%:$(VERSION))
 
-lock: $(VENV)/bin/python ## write the requirements of images and tests again
+lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(bin)/python -m pip install --quiet uv
 	$(COMPILE) pyproject.toml --extra world --extra record --output-file images/world/requirements.txt \
 		$(DRAWING:%=--no-emit-package %)
@@ -183,10 +183,10 @@ lock: $(VENV)/bin/python ## write the requirements of images and tests again
 	$(COMPILE) pyproject.toml --extra dev --no-emit-package cloudrc \
 		--output-file tests/requirements.txt
 
-clean: ## remove the environment and what tools left
+clean: ## remove the environment and generated folders
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-# The stamps are newer than pyproject.toml while the environment is what it asks for.
+# A stamp newer than pyproject.toml means that the environment is up to date.
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "cloudrc needs Python 3.11 or newer; name one: make PYTHON=python3.12 ..." >&2; exit 3; }

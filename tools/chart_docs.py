@@ -1,7 +1,7 @@
-"""Writes what the chart says about its values, from `chart_values.py`; `make docs` runs it.
+"""Generate values.yaml, values.schema.json and the table of the chart's README (`make docs`).
 
-values.yaml, values.schema.json and the tables of README.md come from the models; profiles and
-missions that ship with the package are copied, since a chart can only read its own files.
+They come from the models in `chart_values.py`. Shipped profiles and missions are copied, because a
+chart can read only its own files.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from tools.chart_values import ChartValues
 
 ROOT = Path(__file__).resolve().parents[1]
 CHART = ROOT / "charts" / "cloudrc"
-HEAD = "# Written by `make docs` from tools/chart_values.py: change that, not this.\n"
+HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"
 COPIED = {"profiles": FOLDERS["profile"], "missions": FOLDERS["mission"]}
 WIDTH = 96
 COMPACT = (Resources, Quantities)
 
 
 def outputs() -> dict[Path, str]:
-    """Make everything that this writes: file -> text."""
+    """Generate all files: path -> text."""
     found = {
         CHART / "values.yaml": HEAD + values_text(ChartValues()),
         CHART / "values.schema.json": json.dumps(schema(), indent=2) + "\n",
@@ -43,7 +43,7 @@ def outputs() -> dict[Path, str]:
 
 
 def values_text(part: BaseModel, depth: int = 0) -> str:
-    """Write a part of the values as YAML, each key under its description."""
+    """Format a part of the values as YAML, each key below its description."""
     lines = []
     for name, info in type(part).model_fields.items():
         value, key = getattr(part, name), info.alias or name
@@ -64,7 +64,7 @@ def values_text(part: BaseModel, depth: int = 0) -> str:
 
 
 def schema() -> dict[str, Any]:
-    """Make the JSON schema of the values: closed at every level, in Helm's oldest dialect."""
+    """Generate the JSON schema of the values, in draft 7, without unknown keys at any level."""
     made = ChartValues.model_json_schema(by_alias=True)
     made = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc", **made}
     made["$defs"] = {name: _adapt(part) for name, part in made.pop("$defs").items()}
@@ -80,18 +80,18 @@ def schema() -> dict[str, Any]:
 
 
 def _is_own(name: str) -> bool:
-    """Whether a definition is a part of the values, neither Kubernetes' nor the experiment's."""
+    """Whether a definition is from `chart_values`, not from Kubernetes or the experiment."""
     kind = getattr(chart_values, name, None)
     return getattr(kind, "__module__", "") == chart_values.__name__
 
 
 def _subparts(part: dict[str, Any]) -> list[str]:
-    """Name what templates look into: whoever sets it to null is told so, not shown a template."""
+    """List the keys that templates need as mappings: the schema then refuses null for them."""
     return [key for key, value in part["properties"].items() if "$ref" in value]
 
 
 def _adapt(part: Any) -> Any:
-    """Drop pydantic's titles and defaults; write fixed tuples as draft 7 knows them."""
+    """Remove pydantic's titles and defaults; convert fixed tuples to draft 7."""
     if isinstance(part, list):
         return [_adapt(item) for item in part]
     if not isinstance(part, dict):
@@ -103,13 +103,13 @@ def _adapt(part: Any) -> Any:
         for key, value in part.items()
         if key != "default" and not (key == "title" and value != "cloudrc")
     }
-    if "prefixItems" in kept:  # vectors: all their items are alike
+    if "prefixItems" in kept:  # a vector: all items have one type
         kept["items"] = kept.pop("prefixItems")[0]
     return kept
 
 
 def readme(page: str) -> str:
-    """Put the table of values between its marks."""
+    """Insert the table of values between its marks."""
     head, mark, rest = page.partition("<!-- values: make docs -->\n")
     _, end, tail = rest.partition("<!-- end -->")
     if not end:
@@ -137,7 +137,7 @@ def table(columns: str, rows: Iterable[tuple[str, ...]]) -> str:
 
 
 def plain(value: Any) -> Any:
-    """What a default looks like in YAML."""
+    """Convert a default to plain YAML values."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", by_alias=True, exclude_none=True)
     if isinstance(value, tuple | list):
@@ -146,7 +146,7 @@ def plain(value: Any) -> Any:
 
 
 def flow(value: Any) -> str:
-    """Write a value on one line, as people write YAML."""
+    """Format a value as YAML on one line."""
     if isinstance(value, dict):
         inner = ", ".join(f"{key}: {flow(item)}" for key, item in value.items())
         return f"{{{inner}}}"

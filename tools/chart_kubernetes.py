@@ -1,4 +1,4 @@
-"""Values of the chart that Kubernetes defines: amounts of resources, selectors, peers."""
+"""Define the values that Kubernetes specifies: resources, selectors, NetworkPolicy peers."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ Texts = dict[str, str]
 
 
 class Values(BaseModel):
-    """A part of the values: closed, camelCase."""
+    """A part of the values: camelCase keys, no unknown ones."""
 
     model_config = ConfigDict(extra="forbid", alias_generator=to_camel, populate_by_name=True)
 
 
 class Quantities(Values):
-    """Amounts of what a container uses."""
+    """Amounts of CPU and memory."""
 
-    cpu: Quantity | None = Field(None, description="Processor time [cores; 250m is a quarter]")
+    cpu: Quantity | None = Field(None, description="CPU [cores; 250m is a quarter of one]")
     memory: Quantity | None = Field(None, description="Memory [bytes; 64Mi is 64 * 2^20]")
 
 
 class Resources(Values):
-    """Requests and limits of one container; equal ones everywhere make the pod Guaranteed."""
+    """Requests and limits of one container; if they are equal everywhere, the pod is Guaranteed."""
 
-    requests: Quantities = Field(Quantities(), description="What the scheduler sets aside")
+    requests: Quantities = Field(Quantities(), description="Amounts that the scheduler reserves")
     limits: Quantities = Field(
-        Quantities(), description="What it cannot exceed; CPU above it is throttled, not refused"
+        Quantities(),
+        description="Largest amounts; above them CPU is throttled, and memory ends the container",
     )
 
 
 def resources(cpu: str, memory: str, cpu_limit: str, memory_limit: str) -> Any:
-    """Declare a container's resources with their defaults."""
+    """Declare the resources of a container with their defaults."""
     default = Resources(
         requests=Quantities(cpu=cpu, memory=memory),
         limits=Quantities(cpu=cpu_limit, memory=memory_limit),
@@ -49,27 +50,31 @@ class Expression(Values):
     """One condition of a selector."""
 
     key: str = Field(description="Label")
-    operator: Literal["In", "NotIn", "Exists", "DoesNotExist"] = Field(description="Relation")
+    operator: Literal["In", "NotIn", "Exists", "DoesNotExist"] = Field(
+        description="Relation of the label to the values"
+    )
     values: tuple[str, ...] | None = Field(None, description="Values for In and NotIn")
 
 
 class Selector(Values):
-    """Kubernetes' label selector."""
+    """A label selector of Kubernetes."""
 
-    match_labels: Texts | None = Field(None, description="Labels with their values")
+    match_labels: Texts | None = Field(None, description="Labels and their values")
     match_expressions: tuple[Expression, ...] | None = Field(None, description="Conditions")
 
 
 class IpBlock(Values):
     """A range of addresses."""
 
-    cidr: str = Field(description="Range, such as 10.0.0.0/8")
-    except_: tuple[str, ...] | None = Field(None, alias="except", description="Ranges left out")
+    cidr: str = Field(description="Address range, such as 10.0.0.0/8")
+    except_: tuple[str, ...] | None = Field(None, alias="except", description="Excluded ranges")
 
 
 class Peer(Values):
-    """Who may connect, as in a NetworkPolicy; both selectors together mean both at once."""
+    """A peer of a NetworkPolicy; with both selectors, a pod must match both."""
 
-    pod_selector: Selector | None = Field(None, description="Pods of this namespace, or those of")
-    namespace_selector: Selector | None = Field(None, description="these namespaces")
-    ip_block: IpBlock | None = Field(None, description="Addresses, in place of selectors")
+    pod_selector: Selector | None = Field(
+        None, description="Selects pods: of this namespace, or of the selected ones"
+    )
+    namespace_selector: Selector | None = Field(None, description="Selects namespaces")
+    ip_block: IpBlock | None = Field(None, description="Address range, in place of selectors")

@@ -1,7 +1,7 @@
-"""The chart's values as objects: the one place that knows every value, its unit and its default.
+"""Define every value of the chart, with its unit and default.
 
-`chart_docs.py` writes values.yaml, values.schema.json and the README's tables from here. Keys are
-camelCase in the chart; below `experiment` they are those of an experiment file.
+`chart_docs.py` writes values.yaml, values.schema.json and the README's tables from these models.
+Keys are camelCase in the chart; below `experiment` they are those of an experiment file.
 """
 
 from __future__ import annotations
@@ -19,57 +19,57 @@ Name = Annotated[str, Field(pattern=r"^$|^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")]
 
 
 class ImageOf(Values):
-    """The image of one role."""
+    """The image of one pod."""
 
-    repository: str = Field(description="Name below the registry")
+    repository: str = Field(description="Name of the image in the registry")
     digest: Annotated[str, Field(pattern=r"^$|^sha256:[0-9a-f]{64}$")] = Field(
-        "", description="sha256:...; wins over the tag"
+        "", description="Digest of the image, sha256:...; if set, the tag is ignored"
     )
 
 
 class Image(Values):
-    """Which images the pods run."""
+    """The images of the pods."""
 
-    registry: str = Field(
-        "", description="Put before both repositories, without a slash at its end"
-    )
+    registry: str = Field("", description="Registry of both images, without a slash at the end")
     tag: Annotated[str, Field(pattern=r"^$|^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")] = Field(
-        "", description="Tag of both images; default: the chart's appVersion"
+        "", description="Tag of both images; empty: the chart's appVersion"
     )
     pull_policy: Literal["Always", "IfNotPresent", "Never"] = Field(
-        "IfNotPresent", description="When to pull"
+        "IfNotPresent", description="When Kubernetes pulls the images"
     )
     pull_secrets: tuple[str, ...] = Field(
         (), description="Names of Secrets with the registry's credentials"
     )
-    world: ImageOf = Field(ImageOf(repository="cloudrc/world"), description="Of the world pod")
+    world: ImageOf = Field(
+        ImageOf(repository="cloudrc/world"), description="Image of the world pod"
+    )
     cloud: ImageOf = Field(
-        ImageOf(repository="cloudrc/cloud"), description="Of the cloud pod and of missions"
+        ImageOf(repository="cloudrc/cloud"), description="Image of the cloud pod and of missions"
     )
 
 
 class LinkContainer(Values):
-    """The emulated network, in a container beside each end; it shapes what its pod sends."""
+    """The emulated network: a container in each pod that shapes what the pod sends."""
 
     mode: Literal["auto", "netem", "relay"] = Field(
         "auto",
-        description="netem: the kernel's, needs NET_ADMIN; relay: a process, needs no privilege; "
-        "auto: relay where the namespace enforces Pod Security baseline or restricted (or cannot "
-        "be seen at install), elsewhere netem if the kernel has it, else relay",
+        description="How the link is shaped; netem: by the kernel, needs NET_ADMIN; relay: by a "
+        "process without privileges; auto: relay if the namespace enforces Pod Security baseline "
+        "or restricted, or is unknown at install; otherwise netem if the kernel has it, else relay",
     )
     profile: str | Profile | None = Field(
         None,
-        description="A shipped profile's name, or one written here as in link/profiles/*.yaml; "
-        "followed in flight, nothing restarts. null: the experiment's own link",
+        description="Name of a shipped profile, or a profile as in link/profiles/*.yaml. A change "
+        "acts in flight and restarts nothing. null: the experiment's own link",
     )
     traces: Texts = Field(
         {},
-        description="CSV files (name: text) that a profile written here, or the experiment's own "
-        "link, names as trace or table",
+        description="CSV files, as name: text, that link.profile or the experiment's link names "
+        "as trace or table",
         json_schema_extra={
             "propertyNames": {
                 "pattern": r"^[-._a-zA-Z0-9]+$",
-                # They lie beside these.
+                # Names of other files in the same folder.
                 "not": {"enum": ["profile.yaml", "change.json", "experiment.yaml"]},
             }
         },
@@ -78,150 +78,175 @@ class LinkContainer(Values):
 
 
 class Placement(Values):
-    """Where a pod may run, and what is written on it."""
+    """Nodes, annotations and labels of a pod."""
 
-    node_selector: Texts = Field({}, description="Labels that the node must have")
-    tolerations: tuple[dict[str, Any], ...] = Field((), description="Kubernetes' tolerations")
-    affinity: dict[str, Any] = Field({}, description="Kubernetes' affinity")
-    pod_annotations: Texts = Field({}, description="More annotations of the pod")
+    node_selector: Texts = Field({}, description="Labels that the pod's node must have")
+    tolerations: tuple[dict[str, Any], ...] = Field(
+        (), description="Tolerations of the pod, as in Kubernetes"
+    )
+    affinity: dict[str, Any] = Field({}, description="Affinity of the pod, as in Kubernetes")
+    pod_annotations: Texts = Field({}, description="Further annotations of the pod")
     pod_labels: Texts = Field(
         {},
-        description="More labels of the pod; those of app.kubernetes.io are the chart's",
+        description="Further labels of the pod; app.kubernetes.io/* is refused",
         json_schema_extra={"propertyNames": {"not": {"pattern": r"^app\.kubernetes\.io/"}}},
     )
 
 
 class Epochs(Values):
-    """The volume on which the highest number of a session outlives the pod."""
+    """The volume that keeps the highest session number when the pod is replaced."""
 
-    existing_claim: Name = Field("", description="A claim to use in place of one made here")
-    storage_class_name: str = Field("", description="Class of the volume; empty: the cluster's own")
+    existing_claim: Name = Field(
+        "", description="Existing claim to use; empty: the chart makes one"
+    )
+    storage_class_name: str = Field(
+        "", description="Storage class of the volume; empty: the cluster's default"
+    )
     size: Quantity = Field("1Mi", description="Size of the volume [bytes]")
 
 
 class WorldPod(Placement):
-    """The robot's pod."""
+    """The pod of the robot."""
 
-    epochs: Epochs = Field(
-        Epochs(), description="Where the highest number of a session outlives the pod"
-    )
+    epochs: Epochs = Field(Epochs(), description="Volume that keeps the highest session number")
     resources: Resources = resources("60m", "96Mi", "1", "256Mi")
     recording_size_limit: Quantity = Field(
         "1Gi",
-        description="Room for recordings: with one kept from before, nine tenths of it [bytes]",
+        description="Size limit of the volume for recordings [bytes]; a recording ends at nine "
+        "tenths of it, together with one from before a restart",
     )
 
 
 class BackgroundLoad(Values):
-    """A container that burns CPU beside the controller: the loaded cloud of the paper."""
+    """A container that burns CPU beside the controller, for a cloud under load."""
 
-    enabled: bool = Field(False, description="Whether to add it")
+    enabled: bool = Field(False, description="Whether the pod has this container")
     workers: Annotated[int, Field(ge=1, le=64)] = Field(
-        1, description="Busy loops; each wants one core, the limit decides what they get [count]"
+        1,
+        description="Number of busy loops [count]; each uses up to one core, within the CPU limit",
     )
     resources: Resources = resources("10m", "8Mi", "1", "16Mi")
 
 
 class CloudPod(Placement):
-    """The remote controller's pod."""
+    """The pod of the remote controller."""
 
     resources: Resources = resources("60m", "64Mi", "1", "192Mi")
     recording_size_limit: Quantity = Field(
         "1Gi",
-        description="Room for recordings: with one kept from before, nine tenths of it [bytes]",
+        description="Size limit of the volume for recordings [bytes]; a recording ends at nine "
+        "tenths of it, together with one from before a restart",
     )
-    background_load: BackgroundLoad = Field(BackgroundLoad(), description="CPU load beside it")
+    background_load: BackgroundLoad = Field(
+        BackgroundLoad(), description="CPU load in the cloud pod"
+    )
 
 
 class Journal(Values):
-    """The volume on which missions outlive the pod."""
+    """The volume that keeps missions when the pod is replaced."""
 
-    existing_claim: Name = Field("", description="A claim to use in place of one made here")
-    storage_class_name: str = Field("", description="Class of the volume; empty: the cluster's own")
+    existing_claim: Name = Field(
+        "", description="Existing claim to use; empty: the chart makes one"
+    )
+    storage_class_name: str = Field(
+        "", description="Storage class of the volume; empty: the cluster's default"
+    )
     size: Quantity = Field("64Mi", description="Size of the volume [bytes]")
 
 
 class Service(Values):
     """The Service of the API."""
 
-    type: Literal["ClusterIP", "NodePort", "LoadBalancer"] = Field("ClusterIP", description="Type")
-    port: Annotated[int, Field(ge=1, le=65_535)] = Field(8080, description="TCP port")
+    type: Literal["ClusterIP", "NodePort", "LoadBalancer"] = Field(
+        "ClusterIP", description="Type of the Service"
+    )
+    port: Annotated[int, Field(ge=1, le=65_535)] = Field(
+        8080, description="TCP port of the Service"
+    )
     annotations: Texts = Field({}, description="Annotations of the Service")
 
 
 class Tokens(Values):
-    """Who may call the API."""
+    """The tokens of the API."""
 
     existing_secret: Name = Field(
         "",
-        description="A Secret with a token under `operator`, who commands, and if you like one "
-        "under `reader`, who looks; empty: both are made once and kept",
+        description="Existing Secret with a token under `operator`, which may command, and "
+        "optionally one under `reader`, which may only read; empty: the chart makes both once",
     )
 
 
 class Teleop(Values):
-    """Missions, operator's hand and HTTP API, in the cloud pod."""
+    """Missions, operator's commands and HTTP API, in the cloud pod."""
 
     resources: Resources = resources("30m", "72Mi", "1", "192Mi")
-    journal: Journal = Field(Journal(), description="Where missions outlive the pod")
-    tokens: Tokens = Field(Tokens(), description="Who may call the API")
-    service: Service = Field(Service(), description="Where the API is reached")
+    journal: Journal = Field(Journal(), description="Volume that keeps missions")
+    tokens: Tokens = Field(Tokens(), description="Tokens of the API")
+    service: Service = Field(Service(), description="Service of the API")
     allow_from: tuple[Peer, ...] = Field(
-        (), description="Who may call the API besides this release's missions; NetworkPolicy peers"
+        (),
+        description="NetworkPolicy peers that may call the API; this release's missions always may",
     )
 
 
 class MissionJob(Values):
     """A mission that flies as a Job when the release is installed."""
 
-    enabled: bool = Field(False, description="Whether to fly it")
+    enabled: bool = Field(False, description="Whether to fly the mission")
     plan: str | Mission | None = Field(
-        None, description="A shipped mission's name, or one written here; null: the experiment's"
+        None, description="Name of a shipped mission, or a mission; null: the experiment's"
     )
-    queue: bool = Field(False, description="Wait where another mission flies; else be refused")
+    queue: bool = Field(
+        False, description="Whether to wait while another mission flies; else it is refused"
+    )
     active_deadline_seconds: Seconds = Field(
-        600, description="The Job is ended after this time, waiting included [s]"
+        600, description="Time limit of the Job, waiting included [s]; then it fails"
     )
     ttl_seconds_after_finished: Seconds = Field(
         86_400,
-        description="The finished Job is kept for this long; an upgrade after it flies again [s]",
+        description="Time for which the finished Job is kept [s]; a later upgrade flies again",
     )
     resources: Resources = resources("10m", "48Mi", "500m", "128Mi")
 
 
 class Monitor(Values):
-    """Objects of the Prometheus operator; made only where the cluster knows their kind."""
+    """An object of the Prometheus operator, made only if the cluster knows its kind."""
 
-    enabled: bool = Field(False, description="Whether to make it")
-    force: bool = Field(False, description="Also where the kind cannot be seen (helm template)")
-    labels: Texts = Field({}, description="Labels by which your Prometheus finds it")
+    enabled: bool = Field(False, description="Whether to make the object")
+    force: bool = Field(
+        False, description="Whether to make it even if the kind is unknown (helm template)"
+    )
+    labels: Texts = Field({}, description="Labels by which your Prometheus selects it")
 
 
 class PodMonitor(Monitor):
     """Scraping by the Prometheus operator."""
 
     interval: Annotated[str, Field(pattern=r"^[0-9]+(ms|s|m)$")] = Field(
-        "5s", description="Between two scrapes [ms, s or m]"
+        "5s", description="Time between two scrapes, with its unit [ms, s or m]"
     )
 
 
 class Metrics(Values):
-    """Who reads the metrics, and how they find them."""
+    """Access to the metrics."""
 
     annotations: bool = Field(
-        True, description="Write prometheus.io/scrape, port and path on the pods"
+        True,
+        description="Whether the pods have the annotations prometheus.io/scrape, port and path",
     )
     allow_from: tuple[Peer, ...] = Field(
-        (), description="Who may scrape; NetworkPolicy peers; empty: nobody"
+        (), description="NetworkPolicy peers that may scrape; empty: none"
     )
-    pod_monitor: PodMonitor = Field(PodMonitor(), description="Of the Prometheus operator")
-    prometheus_rule: Monitor = Field(Monitor(), description="Alerts, of the Prometheus operator")
+    pod_monitor: PodMonitor = Field(
+        PodMonitor(), description="PodMonitor of the Prometheus operator"
+    )
+    prometheus_rule: Monitor = Field(Monitor(), description="Alerts for the Prometheus operator")
 
 
 class NetworkPolicy(Values):
-    """What the pods may send and receive: tunnel, names, API, metrics, and nothing else."""
+    """NetworkPolicies: the pods exchange tunnel, DNS, API and metrics, nothing else."""
 
-    enabled: bool = Field(True, description="Whether to forbid everything else")
+    enabled: bool = Field(True, description="Whether to make the policies")
     dns: tuple[Peer, ...] = Field(
         (
             Peer(
@@ -230,7 +255,8 @@ class NetworkPolicy(Values):
                 )
             ),
         ),
-        description="Where names are resolved (port 53); a node-local cache is an ipBlock",
+        description="NetworkPolicy peers that resolve names (port 53); an ipBlock for a node-local "
+        "cache",
     )
 
 
@@ -238,46 +264,50 @@ class Secret(Values):
     """The tunnel's pre-shared key."""
 
     existing_secret: Name = Field(
-        "", description="A Secret with 32 bytes under `key`; empty: one is made once and kept"
+        "", description="Existing Secret with 32 bytes under `key`; empty: the chart makes one once"
     )
 
 
 class ServiceAccount(Values):
-    """The pods' accounts; they carry no token."""
+    """The pods' service accounts, without tokens."""
 
-    create: bool = Field(True, description="Whether to make one for each pod")
-    name: Name = Field("", description="One to use for both where none is made; empty: default")
-    annotations: Texts = Field({}, description="Annotations of those made here")
+    create: bool = Field(True, description="Whether to make a service account for each pod")
+    name: Name = Field("", description="Account of both pods if none is made; empty: default")
+    annotations: Texts = Field({}, description="Annotations of the accounts that the chart makes")
 
 
 class ChartValues(Values):
-    """Values of the chart cloudrc."""
+    """All values of the chart."""
 
     fullname_override: ObjectName = Field(
-        "", description="Put in place of RELEASE-cloudrc in all names"
+        "", description="Start of all names; empty: RELEASE-cloudrc"
     )
-    image: Image = Field(Image(), description="Which images the pods run")
+    image: Image = Field(Image(), description="Images of the pods")
     experiment: Experiment = Field(
         Experiment(),
-        description="What to fly: the same mapping as in a file that 'cloudrc run' takes. "
-        "What is not here is the paper's",
+        description="The experiment, as in a file for 'cloudrc run'. Missing keys have the values "
+        "of the paper",
     )
     link: LinkContainer = Field(
         LinkContainer(), description="The emulated network between the pods"
     )
-    world: WorldPod = Field(WorldPod(), description="The robot's pod")
-    cloud: CloudPod = Field(CloudPod(), description="The remote controller's pod")
+    world: WorldPod = Field(WorldPod(), description="Pod of the robot")
+    cloud: CloudPod = Field(CloudPod(), description="Pod of the remote controller")
     teleop: Teleop = Field(Teleop(), description="Missions and API, in the cloud pod")
-    mission: MissionJob = Field(
-        MissionJob(), description="A mission that flies as a Job at install"
+    mission: MissionJob = Field(MissionJob(), description="Mission that flies as a Job at install")
+    metrics: Metrics = Field(Metrics(), description="Access to the metrics")
+    network_policy: NetworkPolicy = Field(
+        NetworkPolicy(), description="Limits on the pods' traffic"
     )
-    metrics: Metrics = Field(Metrics(), description="Who reads the metrics")
-    network_policy: NetworkPolicy = Field(NetworkPolicy(), description="What the pods may exchange")
-    secret: Secret = Field(Secret(), description="The tunnel's pre-shared key")
-    service_account: ServiceAccount = Field(ServiceAccount(), description="The pods' accounts")
+    secret: Secret = Field(Secret(), description="Pre-shared key of the tunnel")
+    service_account: ServiceAccount = Field(
+        ServiceAccount(), description="Service accounts of the pods"
+    )
     termination_grace_period_seconds: Seconds = Field(
-        10, description="Time for the pods to end; they need about two seconds [s]"
+        10, description="Time for the pods to end [s], after which they are killed; they need 2 s"
     )
     global_: dict[str, Any] | None = Field(
-        None, alias="global", description="Helm's own, for charts that contain this one; not read"
+        None,
+        alias="global",
+        description="Values that Helm passes to subcharts; this chart ignores them",
     )

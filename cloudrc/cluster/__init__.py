@@ -1,6 +1,5 @@
-"""Kubernetes: a release of the chart is found, installed, flown by Jobs, and read out.
+"""Work with a release of the chart on Kubernetes: install it, fly missions, fetch recordings.
 
-The entry points: `access.connect` names a release, `jobs.run_job` flies a mission on it,
-`follow.follow` tells how it goes, `deploy.install` puts it there, `fetch` brings back what it
-recorded.
+Entry points: `client.connect` selects a release, `release.install` installs it, `jobs.run_job`
+flies a mission, `jobs.follow` follows it, `pods.fetch_recording` copies a recording.
 """

@@ -1,9 +1,4 @@
-"""Which cluster, which namespace, which release: flags come in, clients of that place go out.
-
-How old a cluster is: a place comes in, the version of its API server goes out.
-
-The experiment of a release: its ConfigMap is found, the text in it goes out as it was given.
-"""
+"""Select a release by context, namespace and name, and provide Kubernetes clients for it."""
 
 from __future__ import annotations
 
@@ -20,7 +15,15 @@ from cloudrc.errors import MissingPrerequisiteError
 
 DEFAULT_RELEASE = "cloudrc"
 REQUEST_TIMEOUT = 15.0
-"""For the API server to answer one request [s]."""
+"""Time limit for one request to the API server [s]."""
+OLDEST = (1, 29)
+"""Oldest Kubernetes version that the chart supports, as kubeVersion in Chart.yaml."""
+ANSWER_LIMIT = 5.0
+"""Time limit for the API server to return its version [s]."""
+COMPONENT = "experiment"
+"""Label `component` of the experiment's ConfigMap."""
+FILE = "experiment.yaml"
+"""Key of the experiment in that ConfigMap."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +31,9 @@ class Release:
     """One release of the chart: one robot and its cloud.
 
     Attributes:
-        context: Of the kubeconfig; None for its current one.
-        namespace: Where the release is.
-        name: Of the release, as Helm knows it.
+        context: Context of the kubeconfig; None for the current one.
+        namespace: Namespace of the release.
+        name: Name of the Helm release.
     """
 
     context: str | None
@@ -39,29 +42,29 @@ class Release:
 
     @property
     def where(self) -> str:
-        """The place in words, for messages."""
+        """Namespace and context in words, for messages."""
         context = f" of context '{self.context}'" if self.context else ""
         return f"in namespace '{self.namespace}'{context}"
 
     @property
     def flags(self) -> list[str]:
-        """What kubectl has to be told to look at the same place."""
+        """Flags of kubectl that select context and namespace."""
         context = [f"--context={self.context}"] if self.context else []
         return [*context, f"--namespace={self.namespace}"]
 
     @property
     def helm_flags(self) -> list[str]:
-        """Likewise for helm."""
+        """Flags of helm that select context and namespace."""
         context = [f"--kube-context={self.context}"] if self.context else []
         return [*context, f"--namespace={self.namespace}"]
 
     @property
     def cloudrc_flags(self) -> list[str]:
-        """Likewise for cloudrc."""
+        """Flags of cloudrc that select context, namespace and release."""
         return [*self.flags, f"--release={self.name}"]
 
     def selector(self, component: str) -> str:
-        """Select by label what belongs to a part of this release: "world", "cloud", "mission"."""
+        """Return the label selector of a component of this release: "world", "cloud", "mission"."""
         return (
             f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={self.name},"
             f"app.kubernetes.io/component={component}"
@@ -72,10 +75,10 @@ class Release:
         from kubernetes import client, config
 
         configuration = client.Configuration()
-        with explained("read the kubeconfig", self.where), _logging_in(self.where):
+        with explained("read the kubeconfig", self.where), _login_errors(self.where):
             load: Any = config.load_kube_config  # not annotated
             load(context=self.context, client_configuration=configuration)
-        configuration.retries = False  # the caller repeats what is worth repeating, and says so
+        configuration.retries = False  # callers repeat a request themselves, with a message
         return client.ApiClient(configuration)
 
     @cached_property
@@ -108,20 +111,20 @@ class Release:
 
 
 @contextmanager
-def _logging_in(where: str) -> Iterator[None]:
-    """Raise what the client only logs: that a login program did not run or gave nothing.
+def _login_errors(where: str) -> Iterator[None]:
+    """Raise an error that the client only logs: a failure of the kubeconfig's login program.
 
     Raises:
-        MissingPrerequisiteError: With the client's words, which name the program.
+        MissingPrerequisiteError: With the client's message, which names the program.
     """
-    heard: list[str] = []
+    messages: list[str] = []
 
     class Listener(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            heard.append(" ".join(record.getMessage().split()))
+            messages.append(" ".join(record.getMessage().split()))
 
-    # It logs to the root logger, which prints by itself once it is used without a handler; and
-    # again when a token has expired, so that one handler stays.
+    # The client logs to the root logger, which prints when it has no handler. The NullHandler
+    # stays, because the client logs again after a token has expired.
     root, listener = logging.getLogger(), Listener(logging.ERROR)
     if not any(isinstance(handler, logging.NullHandler) for handler in root.handlers):
         root.addHandler(logging.NullHandler())
@@ -130,32 +133,32 @@ def _logging_in(where: str) -> Iterator[None]:
         yield
     finally:
         root.removeHandler(listener)
-    if heard:
+    if messages:
         raise MissingPrerequisiteError(
             f"cannot log in to the cluster {where}: the kubeconfig's login program failed: "
-            f"{heard[0]}; install it, or run it by hand to see why"
+            f"{messages[0]}; install it, or run it by hand to see why"
         )
 
 
 def connect(
     context: str | None = None, namespace: str | None = None, release: str = DEFAULT_RELEASE
 ) -> Release:
-    """Find a place in the kubeconfig; nothing is sent to the cluster yet.
+    """Select a release by the kubeconfig; sends nothing to the cluster.
 
     Args:
-        context: As the flag `--context`; None for the current one.
-        namespace: As the flag `-n`; None for the context's own, or "default".
+        context: Value of `--context`; None for the current context.
+        namespace: Value of `-n`; None for that of the context, or "default".
         release: Name of the Helm release.
 
     Raises:
-        MissingPrerequisiteError: If there is no usable kubeconfig or no such context.
+        MissingPrerequisiteError: If there is no valid kubeconfig or no such context.
     """
     from kubernetes import config
 
     try:
         contexts: Any = config.list_kube_config_contexts  # not annotated
         known, current = contexts()
-    except Exception as error:  # a kubeconfig can be broken in any way, and the client tells little
+    except Exception as error:  # the client raises many kinds for a broken kubeconfig
         raise MissingPrerequisiteError(
             f"no cluster is configured ({' '.join(str(error).split())}); set KUBECONFIG, or make "
             "a cluster: kind create cluster --config kind-config.yaml"
@@ -170,40 +173,32 @@ def connect(
 
 def _unknown_context(context: str, known: Sequence[str]) -> str:
     names = ", ".join(sorted(known)) or "none"
-    return f"no context '{context}' in the kubeconfig; there are: {names}; choose with --context"
-
-
-OLDEST = (1, 29)
-"""Kubernetes that the chart runs on; the same as kubeVersion in its Chart.yaml."""
-ANSWER_LIMIT = 5.0
-"""For the API server to say its version [s]."""
+    return f"no context '{context}' in the kubeconfig; known: {names}; choose with --context"
 
 
 def server_version(release: Release) -> tuple[int, int]:
     """Ask the API server for its version.
 
     Returns:
-        Major and minor.
+        Major and minor version.
 
     Raises:
-        ClusterError: If it does not answer, or refuses.
+        ClusterError: If the API server does not answer, or refuses.
     """
     with explained("get the version", release.where):
         code = release.version.get_code(_request_timeout=ANSWER_LIMIT)
-    # Minor is "29+" where the cluster's vendor has added something.
+    # The minor version of some vendors has a suffix: "29+".
     found = [re.match(r"\d+", str(text)) for text in (code.major, code.minor)]
     if not all(found):
-        raise ClusterError(f"the API server {release.where} calls itself {code.git_version}")
+        raise ClusterError(
+            f"the API server {release.where} has the unknown version {code.git_version}"
+        )
     major, minor = (int(match.group()) for match in found if match)
     return major, minor
 
 
-COMPONENT = "experiment"
-FILE = "experiment.yaml"
-
-
 def experiment_text(release: Release) -> str:
-    """Read what a release was told to fly, as YAML; "" if it does not say.
+    """Read the experiment of a release as YAML; "" if its ConfigMap is missing.
 
     Raises:
         ClusterError: If the ConfigMap cannot be read.

@@ -1,12 +1,7 @@
-"""Missions as Jobs: a mission comes in; a Job posts it, and how it stands goes out.
+"""Fly missions as Kubernetes Jobs: create, list, follow, cancel and delete them.
 
-A mission as Kubernetes objects: mission, release and image come in, Job and ConfigMap go out.
-
-The same objects as `charts/cloudrc/examples/mission-job.yaml` shows by hand.
-
-A Job followed to its end: its name comes in; its lines, its verdict or its trouble go out.
-
-Missions from outside: a Job's name comes in and it ends; or a release, and what it flies.
+The container of a Job posts the mission to the release's API, follows it and ends with its verdict.
+`charts/cloudrc/examples/mission-job.yaml` shows the same objects, written by hand.
 """
 
 from __future__ import annotations
@@ -41,35 +36,54 @@ from cloudrc.cluster.pods import (
 from cloudrc.cluster.tools import ClusterError, WaitedTooLongError, explained, insist
 
 COMPONENT = "mission"
+"""Label `component` of missions' Jobs, pods and ConfigMaps."""
 FOLDER = "/etc/cloudrc-mission"
+"""Folder of the mission's file in the container."""
 FILE = "mission.yaml"
+"""Key of the mission in the ConfigMap, and name of its file."""
 TOKENS = "/etc/cloudrc-tokens"
+"""Folder of the API's tokens in the container."""
 KEY = "MISSION_KEY"
+"""Environment variable with the key under which the mission is posted."""
 UID_LABEL = "batch.kubernetes.io/controller-uid"
-"""Kubernetes puts the Job's UID under it on the Job's pod."""
+"""Label with the Job's UID, which Kubernetes sets on the Job's pod."""
 START_ALLOWANCE = 120
-"""Beyond the mission's own limit, for the pod to start and the robot to be seen [s]."""
+"""Time to start the pod and to see the robot, added to the mission's time limit [s]."""
 QUEUE_ALLOWANCE = 3600
-"""Beyond that, for the missions before it to end, where it waits in the queue [s]."""
+"""Time for earlier missions to end, added for a queued mission [s]."""
 DEADLINE_MAX = 2**31 - 1
-"""What Kubernetes takes [s]."""
+"""Largest deadline that Kubernetes accepts [s]."""
 KEEP = 3600
-"""How long a finished Job stays to be looked at [s]."""
+"""Time for which Kubernetes keeps a finished Job [s]."""
 USER = 10001
+"""User and group id in the container."""
+API_CONTAINER = "teleop"
+"""Container of the cloud pod that serves the API."""
+API_PORT_NAME = "api"
+"""Name of the API's port in its Service."""
+LOOK_PERIOD = 0.5
+"""Time between two looks at a Job [s]."""
+READ_LIMIT = 30.0
+"""Time limit to read a pod's log [s]."""
+END_ALLOWANCE = 60.0
+"""Time for Kubernetes to end a Job after its deadline [s]."""
+ANSWER_LIMIT = 10.0
+"""Time limit for the release's API to answer [s]."""
 
 
 @dataclass(frozen=True)
 class Follower:
-    """What runs in the Job's container.
+    """Settings of the Job's pod, taken from the release.
 
     Attributes:
-        image: Image with cloudrc in it: that of the release's teleop container.
-        pull_policy: Of that image.
+        image: Image of the release's teleop container.
+        pull_policy: Pull policy of that image.
         pull_secrets: Names of Secrets for the image's registry.
         api: URL of the release's API inside the cluster.
         tokens: Name of the Secret with the API's tokens.
         placement: `nodeSelector`, `tolerations` and `affinity` of the release's cloud pod.
-        owner: Reference to the release's cloud Deployment: missions go when the release goes.
+        owner: Reference to the release's cloud Deployment, so that uninstalling the release deletes
+            its missions.
     """
 
     image: str
@@ -82,7 +96,7 @@ class Follower:
 
 
 def labels(release: Release) -> dict[str, str]:
-    """Label what belongs to a mission of a release; the NetworkPolicies go by it."""
+    """Return the labels of a mission's objects; the NetworkPolicies select by them."""
     return {
         "app.kubernetes.io/name": "cloudrc",
         "app.kubernetes.io/instance": release.name,
@@ -93,12 +107,12 @@ def labels(release: Release) -> dict[str, str]:
 
 
 def config_map(release: Release, name: str, mission: Mapping[str, Any]) -> dict[str, Any]:
-    """Put the mission into a ConfigMap of the Job's name.
+    """Build the ConfigMap with the mission.
 
     Args:
-        release: Whose mission it is.
-        name: Of Job and ConfigMap.
-        mission: As the API takes it; JSON is YAML too.
+        release: Release that flies it.
+        name: Name of Job and ConfigMap.
+        mission: Mission in the API's format.
     """
     return {
         "apiVersion": "v1",
@@ -109,11 +123,11 @@ def config_map(release: Release, name: str, mission: Mapping[str, Any]) -> dict[
 
 
 def deadline(limit: float, queue: bool) -> int:
-    """Say how long a Job may last [s].
+    """Compute the time limit of a Job [s].
 
     Args:
-        limit: The mission's own limit of time [s].
-        queue: Whether it may have to wait for others.
+        limit: Time limit of the mission [s].
+        queue: Whether the mission may wait for others.
     """
     return min(ceil(limit) + START_ALLOWANCE + queue * QUEUE_ALLOWANCE, DEADLINE_MAX)
 
@@ -121,14 +135,14 @@ def deadline(limit: float, queue: bool) -> int:
 def job(
     release: Release, name: str, follower: Follower, *, limit: float, queue: bool
 ) -> dict[str, Any]:
-    """Make the Job that posts the mission, follows it and ends with its verdict.
+    """Build the Job that posts the mission, follows it and ends with its verdict.
 
     Args:
-        release: Whose mission it is.
-        name: Of Job and ConfigMap.
-        follower: What runs in it.
-        limit: The mission's own limit of time [s].
-        queue: Whether to wait where another mission flies, in place of being refused.
+        release: Release that flies it.
+        name: Name of Job and ConfigMap.
+        follower: Settings of the pod.
+        limit: Time limit of the mission [s].
+        queue: Whether to wait while another mission flies; else the mission is refused.
     """
     owners = [dict(follower.owner)] if follower.owner else []
     return {
@@ -136,7 +150,7 @@ def job(
         "kind": "Job",
         "metadata": {"name": name, "labels": labels(release), "ownerReferences": owners},
         "spec": {
-            # The mission is posted under the Job's UID: a second try would only read its verdict.
+            # The key is the Job's UID: a second pod would only read the first one's verdict.
             "backoffLimit": 0,
             "activeDeadlineSeconds": deadline(limit, queue),
             "ttlSecondsAfterFinished": KEEP,
@@ -165,12 +179,12 @@ def _pod(name: str, follower: Follower, queue: bool) -> dict[str, Any]:
         "containers": [_container(follower, queue)],
         "volumes": [
             {"name": "mission", "configMap": {"name": name}},
-            {"name": VOLUME, "secret": _operators_alone(follower.tokens)},
+            {"name": VOLUME, "secret": _operator_secret(follower.tokens)},
         ],
     }
 
 
-def _operators_alone(secret: str) -> dict[str, Any]:
+def _operator_secret(secret: str) -> dict[str, Any]:
     return {
         "secretName": secret,
         "defaultMode": 0o440,
@@ -210,21 +224,17 @@ def _container(follower: Follower, queue: bool) -> dict[str, Any]:
     }
 
 
-API_CONTAINER = "teleop"
-API_PORT_NAME = "api"
-
-
 @dataclass(frozen=True, slots=True)
 class JobStatus:
-    """How a mission's Job stands.
+    """State of a mission's Job.
 
     Attributes:
-        name: Of the Job.
-        uid: Of the Job: the key under which the API knows the mission.
+        name: Name of the Job.
+        uid: UID of the Job, and key of the mission in the API.
         state: "pending", "flying", "complete" or "failed".
-        created: When, as the cluster's clock wrote it (RFC 3339).
-        exit_code: Of its container; None until it has ended.
-        message: The verdict in words; "" until there is one.
+        created: Time of creation on the cluster's clock (RFC 3339).
+        exit_code: Exit code of the container; None until it has ended.
+        message: Verdict in words; "" until there is one.
     """
 
     name: str
@@ -243,22 +253,22 @@ def run_job(
     limit: float = 60.0,
     queue: bool = False,
 ) -> JobStatus:
-    """Create the Job of a mission; it flies whether or not anybody follows it.
+    """Create the Job of a mission; it needs nobody to follow it.
 
     Args:
-        release: To fly on.
-        mission: As the API takes it: name, start, time_limit_s, waypoints.
-        name: Of the Job; default: one that is free.
-        limit: The mission's own limit of time [s].
-        queue: Whether to wait where another mission flies, in place of being refused.
+        release: Release that flies it.
+        mission: Mission in the API's format: name, start, time_limit_s, waypoints.
+        name: Name of the Job; default: an unused one.
+        limit: Time limit of the mission [s].
+        queue: Whether to wait while another mission flies; else the mission is refused.
 
     Returns:
-        The Job as created.
+        The new Job.
 
     Raises:
         ClusterError: If the cluster refuses, or there is no such release.
     """
-    # A pod is named for its Job, and no name is longer than 63 characters.
+    # A Job's pod has a longer name than the Job; the limit is 63 characters.
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
     follower = find_follower(release)
     body = job(release, name, follower, limit=limit, queue=queue)
@@ -268,13 +278,13 @@ def run_job(
         )
     owner = {"apiVersion": "batch/v1", "kind": "Job", "name": name, "uid": created.metadata.uid}
     plan = config_map(release, name, mission)
-    plan["metadata"]["ownerReferences"] = [owner]  # the plan goes when the Job goes
+    plan["metadata"]["ownerReferences"] = [owner]  # deleted with the Job
     _create_plan(release, plan)
     return _status(created, None)
 
 
 def _create_plan(release: Release, plan: Mapping[str, Any]) -> None:
-    """Create the ConfigMap; without it the Job would wait for it in vain, and goes too."""
+    """Create the ConfigMap; if that fails, delete the Job, which would wait for it forever."""
     try:
         with explained("create configmaps", release.where):
             release.core.create_namespaced_config_map(
@@ -287,30 +297,30 @@ def _create_plan(release: Release, plan: Mapping[str, Any]) -> None:
 
 
 def find_follower(release: Release) -> Follower:
-    """Learn from the release's own cloud pod which image a Job needs and where the API is."""
+    """Read a Job's settings from the release's cloud pod and Services."""
     spec = find_pod(release, "cloud").spec
     teleop = next((c for c in spec.containers if c.name == API_CONTAINER), None)
     if teleop is None:
         raise ClusterError(
-            f"release '{release.name}' {release.where} has no container '{API_CONTAINER}': it is "
-            "of another version; upgrade it: helm upgrade"
+            f"release '{release.name}' {release.where} has no container '{API_CONTAINER}': it has "
+            "another version of the chart; upgrade it: helm upgrade"
         )
     pull_secrets = tuple(secret.name for secret in spec.image_pull_secrets or [])
     policy = teleop.image_pull_policy or "IfNotPresent"
-    home = _home(release)
+    deployment = _cloud_deployment(release)
     return Follower(
         teleop.image,
         policy,
         pull_secrets,
         _api_url(release),
         secret_name(release),
-        _placement(release, home),
-        _reference(home),
+        _placement(release, deployment),
+        _reference(deployment),
     )
 
 
-def _home(release: Release) -> Any:
-    """The release's cloud Deployment; None if what runs is of nobody."""
+def _cloud_deployment(release: Release) -> Any:
+    """Find the release's cloud Deployment; None if there is none."""
     with explained("list deployments", release.where):
         found = release.apps.list_namespaced_deployment(
             release.namespace,
@@ -320,10 +330,10 @@ def _home(release: Release) -> Any:
     return found[0] if found else None
 
 
-def _reference(home: Any) -> dict[str, Any] | None:
-    if home is None:
+def _reference(deployment: Any) -> dict[str, Any] | None:
+    if deployment is None:
         return None
-    metadata = home.metadata
+    metadata = deployment.metadata
     return {
         "apiVersion": "apps/v1",
         "kind": "Deployment",
@@ -332,11 +342,11 @@ def _reference(home: Any) -> dict[str, Any] | None:
     }
 
 
-def _placement(release: Release, home: Any) -> dict[str, Any]:
-    """Where the release may run, as it was written."""
-    if home is None:
+def _placement(release: Release, deployment: Any) -> dict[str, Any]:
+    """Copy the keys that select nodes from a Deployment's pod."""
+    if deployment is None:
         return {}
-    spec = release.apps.api_client.sanitize_for_serialization(home.spec.template.spec) or {}
+    spec = release.apps.api_client.sanitize_for_serialization(deployment.spec.template.spec) or {}
     return {key: spec[key] for key in ("nodeSelector", "tolerations", "affinity") if key in spec}
 
 
@@ -358,7 +368,7 @@ def _api_url(release: Release) -> str:
 
 
 def list_jobs(release: Release) -> list[JobStatus]:
-    """List the missions' Jobs of a release, the oldest first."""
+    """List the Jobs of a release's missions, the oldest first."""
     with explained("list jobs", release.where):
         jobs = release.batch.list_namespaced_job(
             release.namespace,
@@ -371,7 +381,7 @@ def list_jobs(release: Release) -> list[JobStatus]:
 
 
 def read_job(release: Release, name: str) -> JobStatus:
-    """Look at one Job.
+    """Read the state of one Job.
 
     Raises:
         ClusterError: If there is no such Job.
@@ -384,7 +394,7 @@ def read_job(release: Release, name: str) -> JobStatus:
 
 
 def delete_job(release: Release, name: str) -> None:
-    """Delete a Job with its pod and its plan; what it has posted flies on unless cancelled."""
+    """Delete a Job with its pod and ConfigMap; a mission that it has posted continues."""
     with explained("delete jobs", release.where):
         release.batch.delete_namespaced_job(
             name,
@@ -395,13 +405,13 @@ def delete_job(release: Release, name: str) -> None:
 
 
 def has_started(pod: Any) -> bool:
-    """Say whether a container of a pod runs or has run."""
+    """Whether a container of a pod runs or has run."""
     statuses = pod.status.container_statuses or []
     return any(status.state.running or status.state.terminated for status in statuses)
 
 
 def pod_of(release: Release, uid: str) -> Any:
-    """Find the pod of the Job of this UID; None if there is none."""
+    """Find the pod of the Job with this UID; None if there is none."""
     pods = list_pods(release, COMPONENT)
     return next((pod for pod in pods if _owner(pod) == uid), None)
 
@@ -431,7 +441,7 @@ def _status(job: Any, pod: Any) -> JobStatus:
 
 
 def _verdict(pod: Any) -> tuple[int | None, str]:
-    """Exit code and termination message of the Job's container."""
+    """Return exit code and termination message of the Job's container."""
     for status in (pod.status.container_statuses or []) if pod is not None else []:
         ended = status.state.terminated
         if ended is not None:
@@ -440,26 +450,18 @@ def _verdict(pod: Any) -> tuple[int | None, str]:
 
 
 def _failure(condition: Any) -> str:
-    """Why Kubernetes itself gave a Job up."""
+    """Say why Kubernetes ended a Job."""
     if condition.reason == "DeadlineExceeded":
         return "the Job took longer than its activeDeadlineSeconds"
     return f"{condition.reason}: {condition.message}"
 
 
-LOOK_PERIOD = 0.5
-"""Between two looks at a Job [s]."""
-READ_LIMIT = 30.0
-"""For a log to say anything before the Job itself is looked at again [s]."""
-END_ALLOWANCE = 60.0
-"""For Kubernetes to end a Job that is past its deadline [s]."""
-
-
 def patience(limit: float, queue: bool) -> float:
-    """Say how long to follow a Job: until Kubernetes itself has ended it [s].
+    """Compute the time within which Kubernetes has ended a Job [s].
 
     Args:
-        limit: As given to `run_job` [s].
-        queue: Likewise.
+        limit: Time limit of the mission, as in `run_job` [s].
+        queue: Whether the mission may wait for others.
     """
     return deadline(limit, queue) + END_ALLOWANCE
 
@@ -467,46 +469,46 @@ def patience(limit: float, queue: bool) -> float:
 def follow(
     release: Release, name: str, write: Callable[[str], None], *, timeout: float
 ) -> JobStatus:
-    """Pass on what a Job says, line by line, until it has ended.
+    """Follow a Job's log until the Job has ended.
 
     Args:
-        release: Where the Job is.
-        name: Of the Job.
-        write: Gets each line of its log once.
-        timeout: How long to follow at most [s].
+        release: Release of the Job.
+        name: Name of the Job.
+        write: Gets each line of the log once.
+        timeout: Time limit [s].
 
     Returns:
-        The Job's end.
+        The final state of the Job.
 
     Raises:
-        ClusterError: If the Job's pod cannot run; says why.
-        WaitedTooLongError: If it has not ended in time.
+        ClusterError: If the Job's pod cannot run; with the cause.
+        WaitedTooLongError: If the Job has not ended in time.
     """
-    until, told = time.monotonic() + timeout, 0
+    until, written = time.monotonic() + timeout, 0
     while True:
-        status, lines = insist(lambda: _look(release, name), write)
-        for line in lines[told:]:
+        status, lines = insist(lambda: _read_job_and_log(release, name), write)
+        for line in lines[written:]:
             write(line)
-        told = max(told, len(lines))
+        written = max(written, len(lines))
         if status.state in ("complete", "failed"):
             return status
         if status.state == "pending":
-            insist(partial(_refuse_hopeless, release, status), write)
+            insist(partial(_check_can_start, release, status), write)
         if time.monotonic() > until:
             raise WaitedTooLongError(
-                f"Job '{name}' has not ended within {timeout:g} s, it goes on; "
-                f"look: cloudrc mission status {name} {' '.join(release.cloudrc_flags)}"
+                f"Job '{name}' has not ended within {timeout:g} s; it continues; "
+                f"see: cloudrc mission status {name} {' '.join(release.cloudrc_flags)}"
             )
         time.sleep(LOOK_PERIOD)
 
 
-def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
+def _read_job_and_log(release: Release, name: str) -> tuple[JobStatus, list[str]]:
     status = read_job(release, name)
     return status, _log(release, status.uid)
 
 
 def logs(release: Release, name: str) -> list[str]:
-    """Read what a Job has said so far.
+    """Read the log of a Job.
 
     Raises:
         ClusterError: If there is no such Job.
@@ -525,7 +527,8 @@ def _log(release: Release, uid: str) -> list[str]:
     return text.splitlines()
 
 
-def _refuse_hopeless(release: Release, status: JobStatus) -> None:
+def _check_can_start(release: Release, status: JobStatus) -> None:
+    """Raise a ClusterError if the Job's pod will never run."""
     pod = pod_of(release, status.uid)
     if pod is None:
         why = refusal(release, "Job", status.name)
@@ -533,28 +536,24 @@ def _refuse_hopeless(release: Release, status: JobStatus) -> None:
         why = trouble(pod) or missing_secret(release, pod)
     if why:
         raise ClusterError(
-            f"Job '{status.name}' cannot start: {why}; then delete it: "
+            f"Job '{status.name}' cannot start: {why}; then delete the Job: "
             f"kubectl {' '.join(release.flags)} delete job {status.name}"
         )
 
 
-ANSWER_LIMIT = 10.0
-"""For the API to answer [s]."""
-
-
 def cancel(release: Release, name: str, token: str | None = None) -> str:
-    """Cancel the mission of a Job, or the Job itself where it has not posted its mission yet.
+    """Cancel the mission of a Job, or delete the Job if it has not posted its mission yet.
 
     Args:
-        release: Where it flies.
-        name: Of the Job.
-        token: Of an operator; None to read the release's own.
+        release: Release that flies it.
+        name: Name of the Job.
+        token: Token of an operator; None to read the release's own.
 
     Returns:
-        What was done, in words.
+        The result in words.
 
     Raises:
-        ClusterError: If there is no such Job, or the API of a pod that runs does not answer.
+        ClusterError: If there is no such Job, or the API does not answer although the pod runs.
     """
     status = read_job(release, name)
     if status.state in ("complete", "failed"):
@@ -562,10 +561,10 @@ def cancel(release: Release, name: str, token: str | None = None) -> str:
     pod = _running_cloud(release)
     if not pod:
         delete_job(release, name)
-        end = f"cloudrc mission cancel {' '.join(release.cloudrc_flags)}"
+        command = f"cloudrc mission cancel {' '.join(release.cloudrc_flags)}"
         return (
-            f"Job '{name}' is deleted; no cloud pod runs now: if its mission was posted before, "
-            f"it goes on when one does, then: {end}"
+            f"Job '{name}' is deleted; no cloud pod runs: a mission that it has posted continues "
+            f"when one runs; cancel it then: {command}"
         )
     token = token or operator_token(release)
     with forwarded(release, pod, [API_PORT]) as ports:
@@ -576,20 +575,20 @@ def cancel(release: Release, name: str, token: str | None = None) -> str:
             _ask(f"{api}/{found['id']}/cancel", token, post=True)
             return f"mission {found['id']} ({found['name']}) of Job '{name}' is cancelled"
     delete_job(release, name)
-    return f"Job '{name}' had not posted its mission: deleted"
+    return f"Job '{name}' is deleted; it had not posted its mission"
 
 
 def under_way(release: Release) -> tuple[str, str]:
-    """Say what flies on a release, or is about to.
+    """Find the mission that flies on a release, or is about to.
 
     Args:
-        release: Which need not be there yet.
+        release: The release; it need not exist.
 
     Returns:
-        It in words, "" if nothing is known to fly; and the name of its Job, "" if it is not known.
+        The mission in words, "" if none is known; and the name of its Job, "" if it is unknown.
 
     Raises:
-        ClusterError: If the cluster does not say which Jobs there are.
+        ClusterError: If the cluster does not list the Jobs.
     """
     jobs = [job.name for job in list_jobs(release) if job.state in ("pending", "flying")]
     if jobs:
@@ -602,14 +601,14 @@ def under_way(release: Release) -> tuple[str, str]:
         with forwarded(release, pod, [API_PORT]) as ports:
             missions = _ask(f"http://127.0.0.1:{ports[API_PORT]}/v1/missions", token)["missions"]
     except (ClusterError, WaitedTooLongError):
-        return "", ""  # a release that is broken may be mended by installing it again
+        return "", ""  # unknown: a broken release must not prevent its own repair by an install
     ended = ("done", "failed", "cancelled")
     found = next((m["id"] for m in missions if m["state"] not in ended), None)
     return (f"mission {found}" if found else ""), ""
 
 
 def _running_cloud(release: Release) -> str:
-    """Name the newest cloud pod that runs; "" if none does."""
+    """Return the name of the newest running cloud pod; "" if there is none."""
     pods = list_pods(release, "cloud")
     return next((str(pod.metadata.name) for pod in pods if pod.status.phase == "Running"), "")
 
@@ -621,7 +620,7 @@ def _ask(url: str, token: str, *, post: bool = False) -> Any:
         with DIRECTLY.open(request, timeout=ANSWER_LIMIT) as answer:
             return json.loads(answer.read() or b"null")
     except urllib.error.HTTPError as error:
-        said = error.read().decode(errors="replace")
-        raise ClusterError(f"the API refuses ({error.code}): {said}") from error
+        answer_text = error.read().decode(errors="replace")
+        raise ClusterError(f"the API refuses ({error.code}): {answer_text}") from error
     except (urllib.error.URLError, OSError, ValueError) as error:
         raise ClusterError(f"the API does not answer: {error}") from error

@@ -1,23 +1,12 @@
-"""The link of a release while it flies: its profile's ConfigMap, and what its containers tell.
+"""Change the link of a release in flight: `cloudrc link set` in a cluster.
 
-kubectl does all of it: it starts in a tenth of a second, the Python client in half of one, and a
-change of the link is to be in force within a second.
+The new profile goes into both running link containers, so that it is in force within a second, and
+then into the ConfigMap, so that it survives a restart. If only one direction accepts a change, both
+get the old files again: the one that accepted it, and the other one, which would otherwise read the
+refused files when it restarts. Traces are files beside the profile.
 
-A change of the link goes into a pod's link container; what that tells of itself comes out.
-
-What is done inside is a few lines of `sh`, which every image has: two Pythons that start in pods
-at once take as long as all else of `cloudrc link set`, 0.5 s where a processor is slow.
-
-Both link containers of a release at once: a profile goes in, what each says of it comes out.
-
-A link is set whole or not at all. Where only one direction takes a change, the files of before are
-handed to both: to the one that took it, and to the other one, which would else find in a restart
-what it has refused.
-
-`cloudrc link set` in a cluster: the ConfigMap's files become a profile, and that becomes files.
-
-They go straight to both link containers, so that the change is in force within a second, and then
-into the ConfigMap, so that it lasts. A trace lies beside the profile, and is named relative to it.
+For speed, this module uses kubectl, which starts in 0.1 s, not the Python client, which takes
+0.5 s; and a few lines of `sh` in the containers, not Python.
 """
 
 from __future__ import annotations
@@ -33,8 +22,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 from cloudrc.cluster.tools import ClusterError, run
-from cloudrc.config import document
-from cloudrc.config import document as yaml_text
+from cloudrc.config.document import parse as parse_yaml
+from cloudrc.config.document import read as read_document
+from cloudrc.config.document import write as write_yaml
 from cloudrc.config.edit import DIRECTIONS, TIME_LINES, Edit, edit
 from cloudrc.config.load import FILES
 from cloudrc.errors import BadInputError, CloudrcError
@@ -42,22 +32,34 @@ from cloudrc.link.follow import HANDED_FILE, Handed, write_handed
 from cloudrc.link.state import CHANGE_FILE, STATE_FILE, Change, LinkState, from_text, read_change
 
 PROFILE = "profile.yaml"
-"""Key of the ConfigMap."""
+"""Key of the profile in the ConfigMap."""
 COMPONENTS = ("world", "cloud")
-"""Whose link containers shape uplink and downlink."""
+"""Components whose link containers shape uplink and downlink, in this order."""
 READ_LIMIT = 15.0
-"""For the API server to answer [s]."""
+"""Time limit for the API server to answer [s]."""
+FOLDER = "/run/cloudrc"
+"""Folder in a link container with its route, its state and the change that it gets."""
+PATIENCE = 5.0
+"""Time limit for the sidecar to apply a change [s]; it takes 0.2 s."""
+HAND_LIMIT = 25.0
+"""Time limit to send a change to a container and to read the answer [s]."""
+SIZE_MAX = 1_000_000
+"""Largest size of a ConfigMap's files, a little less than its limit of 1 MiB [bytes]."""
 _COMPONENT = "app.kubernetes.io/component"
+_LOOK_PERIOD = 0.02
+"""Time between two looks at the sidecar's state [s]."""
+_KEY = re.compile(r"[^-._a-zA-Z0-9]")
+"""A character that no key of a ConfigMap may have."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a release is, as kubectl is told; None is its own default.
+    """Context, namespace and name of a release; None is kubectl's default.
 
     Attributes:
-        context: Of the kubeconfig.
-        namespace: Where the release is.
-        name: Of the release, as Helm knows it.
+        context: Context of the kubeconfig.
+        namespace: Namespace of the release.
+        name: Name of the Helm release.
     """
 
     context: str | None
@@ -66,19 +68,19 @@ class Place:
 
     @property
     def flags(self) -> list[str]:
-        """What kubectl has to be told."""
+        """Flags of kubectl that select context and namespace."""
         context = [f"--context={self.context}"] if self.context else []
         return context + ([f"--namespace={self.namespace}"] if self.namespace else [])
 
 
 @dataclass(frozen=True)
 class LinkParts:
-    """What there is of a release's link.
+    """ConfigMap and pods of a release's link.
 
     Attributes:
-        name: Of the ConfigMap that the link containers follow.
-        files: Its files: the profile, its traces, who changed it.
-        pods: The newest running pod of each component.
+        name: Name of the ConfigMap that the link containers follow.
+        files: Its files: the profile, its traces, the record of the last change.
+        pods: Component -> name of its newest running pod.
     """
 
     name: str
@@ -87,79 +89,75 @@ class LinkParts:
 
 
 def read_link(place: Place) -> LinkParts | None:
-    """Look at a release with one request of kubectl; None if its link is not there, or in part.
+    """Read a release's link with one kubectl command; None if a part of it is missing.
 
     Raises:
-        ClusterError: If kubectl fails; with what it said.
+        ClusterError: If kubectl fails; with its message.
     """
     selector = f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={place.name}"
     words = [*place.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
     found = json.loads(run("kubectl", words, timeout=READ_LIMIT))["items"]
-    maps = [one for one in found if one["kind"] == "ConfigMap" and PROFILE in one.get("data", {})]
-    pods = {part: _newest(found, part) for part in COMPONENTS}
+    maps = [
+        item for item in found if item["kind"] == "ConfigMap" and PROFILE in item.get("data", {})
+    ]
+    pods = {component: _newest(found, component) for component in COMPONENTS}
     if not maps or None in pods.values():
         return None
-    named = {part: str(name) for part, name in pods.items()}
-    return LinkParts(str(maps[0]["metadata"]["name"]), dict(maps[0]["data"]), named)
+    names = {component: str(name) for component, name in pods.items()}
+    return LinkParts(str(maps[0]["metadata"]["name"]), dict(maps[0]["data"]), names)
 
 
 def write_files(place: Place, name: str, files: Mapping[str, str]) -> None:
-    """Put files into the ConfigMap; those not named stay.
+    """Write files into the ConfigMap; its other files stay.
 
     Raises:
-        ClusterError: If it is refused.
+        ClusterError: If the cluster refuses.
     """
     words = ["patch", "configmap", name, "--type=merge", "--patch-file=/dev/stdin"]
     run("kubectl", [*place.flags, *words], timeout=READ_LIMIT, given=json.dumps({"data": files}))
 
 
 def _newest(found: list[dict[str, Any]], component: str) -> str | None:
-    """Name the newest running pod of a component."""
+    """Return the name of the newest running pod of a component."""
     pods = [
-        one["metadata"]
-        for one in found
-        if one["kind"] == "Pod"
-        and one["metadata"]["labels"].get(_COMPONENT) == component
-        and one["status"].get("phase") == "Running"
-        and "deletionTimestamp" not in one["metadata"]
+        item["metadata"]
+        for item in found
+        if item["kind"] == "Pod"
+        and item["metadata"]["labels"].get(_COMPONENT) == component
+        and item["status"].get("phase") == "Running"
+        and "deletionTimestamp" not in item["metadata"]
     ]
-    newest = max(pods, key=lambda one: str(one["creationTimestamp"]), default=None)
+    newest = max(pods, key=lambda metadata: str(metadata["creationTimestamp"]), default=None)
     return str(newest["name"]) if newest else None
 
 
-FOLDER = "/run/cloudrc"
-"""In a link container: where the chart lets route, state and what is handed over lie."""
-PATIENCE = 5.0
-"""For the sidecar to take a change over [s]; it takes 0.2."""
-HAND_LIMIT = 25.0
-"""For a container to take a change over and tell of it [s]."""
-_LOOK_PERIOD = 0.02
 INSIDE = f"""\
 cd "$1" 2>/dev/null && test -f {STATE_FILE} || {{
-    echo 'error: no link is shaped here;' >&2; exit 2; }}
+    echo 'error: no link runs here;' >&2; exit 2; }}
 draft=.{HANDED_FILE}.$$
 cat > $draft && test "$(wc -c < $draft)" -eq "$3" && mv $draft {HANDED_FILE} || {{
-    rm -f $draft; echo 'error: the change did not arrive whole;' >&2; exit 2; }}
+    rm -f $draft; echo 'error: the change arrived incomplete;' >&2; exit 2; }}
 for _ in $(seq {round(PATIENCE / _LOOK_PERIOD)}); do
     grep -qF "\\"$2\\"" {STATE_FILE} && break
     sleep {_LOOK_PERIOD}
 done
 cat {STATE_FILE}
 """
-"""For `sh`, with folder, number of the change and length of the document, which it reads: leaves it
-where the sidecar looks, in one step, and tells what holds once the sidecar has decided."""
+"""Script for `sh` in a link container. Its arguments are folder, number of the change and length of
+the document on its standard input. It puts the document where the sidecar reads it, in one step,
+waits until the sidecar has accepted or refused it, and prints the sidecar's state."""
 
 
 def hand_over(place: Place, pod: str, handed: Handed) -> str:
-    """Hand a change to a pod's link container, and wait until it has decided.
+    """Send a change to a pod's link container, and wait until it has accepted or refused it.
 
     Args:
-        place: Of the release.
-        pod: Its name.
+        place: The release.
+        pod: Name of the pod.
         handed: The change.
 
     Returns:
-        What the link tells of itself then, as JSON.
+        The state of the link after that, as JSON.
 
     Raises:
         ClusterError: If kubectl or the container refuses.
@@ -171,48 +169,48 @@ def hand_over(place: Place, pod: str, handed: Handed) -> str:
 
 
 WAYS = dict(zip(COMPONENTS, DIRECTIONS, strict=True))
-"""What the link container of a component shapes."""
+"""Component -> direction that its link container shapes."""
 Answer: TypeAlias = LinkState | CloudrcError
-"""What a link container tells of itself, or why it tells nothing."""
+"""State that a link container reports, or the error if it reports none."""
 
 
 @dataclass(frozen=True)
 class Given:
-    """A change that both containers were asked to take over.
+    """A change that was sent to both link containers.
 
     Attributes:
-        change: Number, cause, and whether time lines begin anew.
-        answers: What each of the components' containers said.
+        change: Number, cause, and whether time lines start again.
+        answers: Component -> answer of its container.
     """
 
     change: Change
     answers: Mapping[str, Answer]
 
     def took(self, part: str) -> bool:
-        """Whether a component's container has it in force."""
-        told = self.answers[part]
-        return isinstance(told, LinkState) and told.change == self.change.number
+        """Whether the change is in force in a component's container."""
+        answer = self.answers[part]
+        return isinstance(answer, LinkState) and answer.change == self.change.number
 
     def refused(self, part: str) -> bool:
-        """Whether a component's container has said that it cannot."""
-        told = self.answers[part]
-        return isinstance(told, LinkState) and told.refused == self.change.number
+        """Whether a component's container has refused the change."""
+        answer = self.answers[part]
+        return isinstance(answer, LinkState) and answer.refused == self.change.number
 
 
 class StrangeStateError(ClusterError):
-    """A link container that tells of itself in another way than this version's."""
+    """A link container reports a state in the format of another version."""
 
 
 def hand_to_both(place: Place, link: LinkParts, given: Mapping[str, Handed]) -> dict[str, Answer]:
-    """Hand a document to each link container, and wait until both have decided.
+    """Send a change to each link container, and wait until both have accepted or refused it.
 
     Args:
-        place: Of the release.
+        place: The release.
         link: Its link.
-        given: By component.
+        given: Component -> change for its container.
 
     Returns:
-        By component.
+        Component -> answer of its container.
     """
 
     def hand(part: str) -> Answer:
@@ -221,43 +219,43 @@ def hand_to_both(place: Place, link: LinkParts, given: Mapping[str, Handed]) -> 
         except CloudrcError as error:
             return error
         except ValueError as error:
-            return StrangeStateError(f"a link container is of another version: {error}")
+            return StrangeStateError(f"a link container has another version: {error}")
 
     with ThreadPoolExecutor(len(COMPONENTS)) as pool:
         return dict(zip(COMPONENTS, pool.map(hand, COMPONENTS), strict=True))
 
 
 def needed(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
-    """Choose from a ConfigMap's files the profile and what it names.
+    """Select the profile and the files that it names from a ConfigMap's files.
 
     Args:
-        values: The profile, read.
-        files: All there are.
+        values: Values of the profile.
+        files: All files.
     """
-    ways = [one for one in values.values() if isinstance(one, dict)]
-    named = {Path(str(one[key])).name for one in ways for key in FILES if one.get(key)}
+    ways = [value for value in values.values() if isinstance(value, dict)]
+    named = {Path(str(way[key])).name for way in ways for key in FILES if way.get(key)}
     return {name: text for name, text in files.items() if name == PROFILE or name in named}
 
 
 def take_back(place: Place, link: LinkParts, given: Given) -> str:
-    """Hand the files of before to both link containers again.
+    """Send the old files to both link containers again.
 
     Args:
-        place: Of the release.
-        link: Its link as it was before.
-        given: What was not taken over by both.
+        place: The release.
+        link: Its link before the change.
+        given: The change, which not both containers accepted.
 
     Returns:
-        What holds now where that is not just as before, and what to do; "" if there is nothing.
+        The differences from the state before the change, and what to do; "" if there are none.
     """
-    values, _ = document.parse(link.files[PROFILE], PROFILE)
+    values, _ = parse_yaml(link.files[PROFILE], PROFILE)
     values = values if isinstance(values, dict) else {}
     files = needed(values, link.files)
     before = read_change(link.files.get(CHANGE_FILE, "")).number
     number, cause = f"{given.change.number}-back", f"taken back: {given.change.cause}"
     documents = {}
     for part in COMPONENTS:
-        # Where it never took force, the old time line goes on.
+        # A direction that never applied the change continues its old time line.
         restart = given.change.restart and given.took(part)
         change = {"number": number, "cause": cause, "restart": restart}
         documents[part] = Handed(json.dumps(change) + "\n", before, files)
@@ -268,51 +266,47 @@ def take_back(place: Place, link: LinkParts, given: Given) -> str:
 def _words(
     place: Place, link: LinkParts, values: Mapping[str, Any], given: Given, again: Given
 ) -> Iterator[str]:
-    """Say for each direction what it has in the end."""
+    """Describe the final state of each direction."""
     for part, way in WAYS.items():
-        own, told = values.get(way) or {}, again.answers[part]
+        own, answer = values.get(way) or {}, again.answers[part]
         if again.took(part):
             if given.took(part):
-                anew = given.change.restart and any(own.get(key) for key in TIME_LINES)
-                timed = ", its time line begins anew" if anew else ""
-                yield f"the {way} had taken the change, and has its old profile back{timed}"
-        elif isinstance(told, LinkState) and not again.refused(part):
-            yield f"the {way} (pod {link.pods[part]}) finds its old profile once it moves again"
+                restarted = given.change.restart and any(own.get(key) for key in TIME_LINES)
+                timed = "; its time line starts again" if restarted else ""
+                yield f"the {way} had the change for a moment and has its old profile again{timed}"
+        elif isinstance(answer, LinkState) and not again.refused(part):
+            yield f"the {way} (pod {link.pods[part]}) gets its old profile when it responds"
         else:
             keeps = "keeps the change" if given.took(part) else "may have the change"
             if given.refused(part):
-                keeps = "may take what it refused when its container starts again"
-            why = told.refusal if isinstance(told, LinkState) else str(told)
+                keeps = "may apply the refused change when its container restarts"
+            why = answer.refusal if isinstance(answer, LinkState) else str(answer)
             yield (
-                f"the {way} (pod {link.pods[part]}) {keeps}, as it could not be taken back: {why}; "
-                f"hand both the old profile again: {_command(place, way, own)}"
+                f"the {way} (pod {link.pods[part]}) {keeps}, because the old profile could not be "
+                f"restored: {why}; send the old profile to both again: {_command(place, way, own)}"
             )
 
 
 def _command(place: Place, way: str, own: Mapping[str, Any]) -> str:
-    """Give the command that sets a value as it is, and so hands over the profile that lasts.
+    """Return a command that sets a value to its present value, and so sends the whole profile.
 
-    The order is on no time line, and setting it leaves all else as it is.
+    The value is `keep_order`, which no time line changes.
     """
     order = "true" if own.get("keep_order") else "false"
     words = ["cloudrc link set", f"{way}.keep_order={order}", f"--release={place.name}"]
     return " ".join([*words, *place.flags])
 
 
-SIZE_MAX = 1_000_000
-"""What a ConfigMap takes in all, a little less than its 1 MiB [bytes]."""
-_KEY = re.compile(r"[^-._a-zA-Z0-9]")
-
-
 class HandedOver(NamedTuple):
-    """A change that the link containers have been given.
+    """A change that was sent to both link containers.
 
     Attributes:
-        edit: What was changed.
-        told: What uplink and downlink tell of themselves then.
-        keep: Writes it into the ConfigMap, so that it lasts; raises a ClusterError.
-        take_back: Hands the files of before over again, and says what holds then; "" if that is
-            just what held before.
+        edit: The edited profile.
+        told: States of uplink and downlink after the change.
+        keep: Writes the change into the ConfigMap, so that it survives a restart; raises a
+            ClusterError.
+        take_back: Sends the old files again, and returns the differences from the state before;
+            "" if there are none.
     """
 
     edit: Edit
@@ -328,39 +322,39 @@ def hand_profile(
     settings: Sequence[str],
     change: Callable[[Edit], str],
 ) -> HandedOver:
-    """Change the profile of a release, and wait until both directions have decided.
+    """Change the profile of a release, and wait until both directions have accepted or refused it.
 
     Args:
-        place: Where the release is.
-        link: Its link as it is.
-        profile: As `link_edit.edit` takes it.
-        settings: Likewise.
-        change: Says who changed it and why, as the text of the file beside the profile.
+        place: The release.
+        link: Its present link.
+        profile: New profile, as in `cloudrc.config.edit.edit`.
+        settings: Values to set, as in `cloudrc.config.edit.edit`.
+        change: Returns the text of the file beside the profile: who changed it, and why.
 
     Raises:
-        CloudrcError: If what is asked for is not valid, or the cluster refuses.
+        CloudrcError: If the request is not valid, or the cluster refuses.
     """
-    made, files = with_files(link.files, profile, settings)
-    files[CHANGE_FILE] = change(made)
-    whole = needed(made.values, {**link.files, **files})
+    edited, files = with_files(link.files, profile, settings)
+    files[CHANGE_FILE] = change(edited)
+    whole = needed(edited.values, {**link.files, **files})
     before = read_change(link.files.get(CHANGE_FILE, "")).number
     handed = Handed(files[CHANGE_FILE], before, whole)
     answers = hand_to_both(place, link, dict.fromkeys(COMPONENTS, handed))
     given = Given(read_change(files[CHANGE_FILE]), answers)
     keep = partial(write_files, place, link.name, files)
     back = partial(take_back, place, link, given)
-    if failed := [one for one in answers.values() if isinstance(one, CloudrcError)]:
+    if failed := [answer for answer in answers.values() if isinstance(answer, CloudrcError)]:
         _keep_or_take_back(failed, given, keep, back)
-    told = [one for one in answers.values() if isinstance(one, LinkState)]
-    return HandedOver(made, told, partial(_keep_all, keep), back)
+    told = [answer for answer in answers.values() if isinstance(answer, LinkState)]
+    return HandedOver(edited, told, partial(_keep_applied, keep), back)
 
 
-def _keep_all(keep: Callable[[], None]) -> None:
-    """Make a change last that both directions have in force."""
+def _keep_applied(keep: Callable[[], None]) -> None:
+    """Write a change that is in force in both directions into the ConfigMap."""
     try:
         keep()
     except CloudrcError as error:
-        raise ClusterError(f"{error}; the link changes, until its pods are replaced") from None
+        raise ClusterError(f"{error}; the change is in force until the pods are replaced") from None
 
 
 def _keep_or_take_back(
@@ -369,14 +363,14 @@ def _keep_or_take_back(
     keep: Callable[[], None],
     back: Callable[[], str],
 ) -> NoReturn:
-    """Let the change reach by the ConfigMap whom it did not reach straight, or nobody.
+    """Write the change into the ConfigMap if no container refused it; else take it back.
 
     Raises:
-        ClusterError: Always; it says what holds.
+        ClusterError: Always; it describes the final state.
     """
     error: CloudrcError = failed[0]
-    strange = any(isinstance(one, StrangeStateError) for one in failed)
-    if not strange and not any(map(given.refused, COMPONENTS)):
+    other_version = any(isinstance(each, StrangeStateError) for each in failed)
+    if not other_version and not any(map(given.refused, COMPONENTS)):
         try:
             keep()
         except CloudrcError as refusal:
@@ -385,7 +379,7 @@ def _keep_or_take_back(
             error = refusal
         else:
             raise ClusterError(
-                f"{error}; the ConfigMap has the change, and the pods follow it within 2 minutes"
+                f"{error}; the ConfigMap has the change, and the pods apply it within 2 minutes"
             )
     raise ClusterError("; ".join(filter(None, [str(error), back()])))
 
@@ -396,33 +390,33 @@ def with_files(
     """Edit the profile among these files.
 
     Returns:
-        The edit, and the files that are new: the profile and the traces that it needs.
+        The edited profile, and the new files: the profile and its new traces.
 
     Raises:
-        BadInputError: If what is asked for is not valid, or too large for a ConfigMap.
+        BadInputError: If the request is not valid, or the files are too large for a ConfigMap.
     """
     with TemporaryDirectory(prefix="cloudrc-") as name:
         folder = Path(name).resolve()
         for key, text in files.items():
             (folder / key).write_text(text, encoding="utf-8")
-        made = edit(document.read(folder / PROFILE, PROFILE), profile, settings)
+        edited = edit(read_document(folder / PROFILE, PROFILE), profile, settings)
         new: dict[str, str] = {}
         for way in DIRECTIONS:
             for key in FILES:
-                path = made.values.get(way, {}).get(key)
+                path = edited.values.get(way, {}).get(key)
                 if path is not None:
-                    made.values[way][key] = _bring(Path(path), folder, way, new)
+                    edited.values[way][key] = _add_file(Path(path), folder, way, new)
     size = sum(len(text) for text in {**files, **new}.values())
     if size > SIZE_MAX:
         raise BadInputError(
-            f"traces and profile have {size} bytes, a ConfigMap takes {SIZE_MAX}; give a trace "
+            f"traces and profile have {size} bytes, a ConfigMap takes {SIZE_MAX}; use a trace "
             "with fewer rows, for example one per 20 ms"
         )
-    return made, {PROFILE: yaml_text.write(made.values), **new}
+    return edited, {PROFILE: write_yaml(edited.values), **new}
 
 
-def _bring(path: Path, folder: Path, way: str, new: dict[str, str]) -> str:
-    """Name a trace as it lies beside the profile, where it is put if it comes from here."""
+def _add_file(path: Path, folder: Path, way: str, new: dict[str, str]) -> str:
+    """Return a trace's name beside the profile; add its text to `new` if it is not there yet."""
     if path.parent == folder:
         return path.name
     key = f"{way}-{_KEY.sub('_', path.name)}"

@@ -1,13 +1,7 @@
-"""The pods of a release: a component comes in, its pod, or why it does not run, goes out.
+"""Access the pods of a release: find them, explain failures, forward ports, read tokens and files.
 
-Tokens of a release's API: the Secret that its cloud pod mounts, read with the user's rights.
-
-Ports of a pod on this machine: a pod comes in, local ports that lead to it go out.
-
-Brings back what a flight left in the pods: recordings, metrics, logs.
-
-The recordings are open and growing while they are copied: the copy is torn at its end, as that of a
-process that was killed is, and as readable.
+A recording is copied while it grows. The copy may be cut off at its end, as after a kill; it can be
+read up to there.
 """
 
 from __future__ import annotations
@@ -47,18 +41,18 @@ FATAL = {
     "CrashLoopBackOff": "crash",
     "Error": "crash",
 }
-"""Why a container does not run and never will by waiting -> what kind of mistake that is."""
+"""Kubernetes' reason for which a container will never run -> kind of failure."""
 SECRETS = {
     "secret": ("key", "head -c 32 /dev/urandom"),
     "tokens": ("operator", "openssl rand -hex 32"),
 }
-"""Volume of the chart's pods -> file that its Secret has to have, and what makes one."""
+"""Volume of the chart's pods -> key that its Secret must have, and a command that makes it."""
 RESTARTS_MAX = 2
-"""A container that ended more often than this is not about to settle."""
+"""Largest number of restarts of a container that may still start."""
 
 
 def list_pods(release: Release, component: str) -> list[Any]:
-    """List the pods of a component that are not about to end, the newest first."""
+    """List the pods of a component that are not being deleted, the newest first."""
     with explained("list pods", release.where):
         found = release.core.list_namespaced_pod(
             release.namespace,
@@ -73,7 +67,7 @@ def find_pod(release: Release, component: str) -> Any:
     """Find the newest running pod of a component.
 
     Raises:
-        ClusterError: If there is none; says whether the release is there at all.
+        ClusterError: If there is none; says whether the release exists.
     """
     pods = list_pods(release, component)
     for pod in pods:
@@ -89,10 +83,10 @@ def find_pod(release: Release, component: str) -> Any:
 
 
 def require_release(release: Release) -> None:
-    """Make sure that there is a release, whether or not its pods run.
+    """Check that a release exists, whether or not its pods run.
 
     Raises:
-        ClusterError: If there is none; says how to install it.
+        ClusterError: If it does not exist; says how to install it.
     """
     with explained("list deployments", release.where):
         found = release.apps.list_namespaced_deployment(
@@ -113,38 +107,40 @@ def _no_release(release: Release) -> ClusterError:
 
 
 def is_ready(pod: Any) -> bool:
-    """Say whether all of a pod's containers are ready."""
+    """Whether all containers of a pod are ready."""
     conditions = pod.status.conditions or []
     return any(c.type == "Ready" and c.status == "True" for c in conditions)
 
 
 def trouble(pod: Any) -> str | None:
-    """Say in one sentence why a pod will not run by waiting; None if it may."""
+    """Say in one sentence why a pod will never run; None if it may."""
     for status in _containers(pod):
         why = _container_trouble(status)
         if why:
             return why
     for condition in pod.status.conditions or []:
         if condition.type == "PodScheduled" and condition.status == "False":
-            return None if _binds_soon(condition) else f"no node takes it: {condition.message}"
+            return (
+                None if _waits_for_volume(condition) else f"no node takes it: {condition.message}"
+            )
     return None
 
 
 def refusal(release: Release, kind: str, name: str) -> str | None:
-    """Say why the cluster does not make an object's pod: Pod Security, a quota; None if it may."""
+    """Say why the cluster refuses an object's pod: Pod Security, a quota; None if it does not."""
     refused = _events(release, kind, name, "FailedCreate")
     return refused[-1] if refused else None
 
 
 def missing_secret(release: Release, pod: Any) -> str | None:
-    """Say which Secret a pod waits for that is not there, and what makes it; None if for none."""
+    """Say which missing Secret a pod waits for, and how to make it; None if it waits for none."""
     if any(status.state.running or status.state.terminated for status in _containers(pod)):
         return None
-    said: list[str] = []
-    with suppress(ClusterError):  # who may not read events may still fly
-        said = _events(release, "Pod", pod.metadata.name, "FailedMount")
-    for words in said:
-        found = re.search(r'volume "(secret|tokens)".* secret "([^"]+)" not found', words)
+    messages: list[str] = []
+    with suppress(ClusterError):  # the right to read events is not needed to fly
+        messages = _events(release, "Pod", pod.metadata.name, "FailedMount")
+    for message in messages:
+        found = re.search(r'volume "(secret|tokens)".* secret "([^"]+)" not found', message)
         if found and not _has_secret(release, found[2]):
             file, content = SECRETS[found[1]]
             return (
@@ -155,7 +151,7 @@ def missing_secret(release: Release, pod: Any) -> str | None:
 
 
 def _has_secret(release: Release, name: str) -> bool:
-    """Events outlive their cause: the kubelet looks again after up to two minutes."""
+    """Whether a Secret exists now: an event may be up to two minutes older than that."""
     with suppress(ClusterError), explained("get secrets", release.where):
         release.core.read_namespaced_secret(
             name, release.namespace, _request_timeout=REQUEST_TIMEOUT
@@ -165,7 +161,7 @@ def _has_secret(release: Release, name: str) -> bool:
 
 
 def _events(release: Release, kind: str, name: str, reason: str) -> list[str]:
-    """What was told of an object for this reason."""
+    """List the messages of an object's events with this reason."""
     with explained("list events", release.where):
         events = release.core.list_namespaced_event(
             release.namespace,
@@ -175,8 +171,8 @@ def _events(release: Release, kind: str, name: str, reason: str) -> list[str]:
     return [event.message for event in events if event.reason == reason]
 
 
-def _binds_soon(condition: Any) -> bool:
-    """A volume that is made on first use is no reason to give up."""
+def _waits_for_volume(condition: Any) -> bool:
+    """Whether a pod only waits for a volume that is made on first use."""
     return "volume" in (condition.message or "") and "unbound" in (condition.message or "")
 
 
@@ -195,48 +191,49 @@ def _container_trouble(status: Any) -> str | None:
         )
     if waiting and kind == "configuration":
         return (
-            f"container '{status.name}' cannot be made: {' '.join((waiting.message or '').split())}"
+            f"container '{status.name}' cannot be created: "
+            f"{' '.join((waiting.message or '').split())}"
         )
     if kind == "crash" or (status.restart_count or 0) > RESTARTS_MAX:
-        return f"container '{status.name}' ends again and again{_last_end(status)}"
+        return f"container '{status.name}' ends repeatedly{_last_end(status)}"
     return None
 
 
 def _last_end(status: Any) -> str:
-    """What the container said when it last ended, if it left a message."""
+    """Return exit code and message of the container's last end in words; "" if unknown."""
     ended = getattr(status.last_state, "terminated", None)
     if ended is None:
         return ""
-    said = " ".join((ended.message or "").split())
-    return f" (exit code {ended.exit_code}): {said}" if said else f" (exit code {ended.exit_code})"
+    message = " ".join((ended.message or "").split())
+    return f" (exit code {ended.exit_code})" + (f": {message}" if message else "")
 
 
 VOLUME = "tokens"
-"""In the cloud pod and in missions' pods."""
+"""Volume with the API's tokens in the pods of cloud and missions."""
 OPERATOR = "operator"
-"""Key of the Secret, and name of the file."""
+"""Key of the operator's token in the Secret, and name of its file."""
 
 
 def secret_name(release: Release) -> str:
-    """Say which Secret has the tokens.
+    """Find the name of the Secret with the API's tokens.
 
     Raises:
-        ClusterError: If the release has none.
+        ClusterError: If the cloud pod mounts none.
     """
     for volume in find_pod(release, "cloud").spec.volumes or []:
         if volume.name == VOLUME and volume.secret is not None:
             return str(volume.secret.secret_name)
     raise ClusterError(
-        f"release '{release.name}' {release.where} mounts no tokens: it is of another version; "
-        "upgrade it: helm upgrade"
+        f"release '{release.name}' {release.where} mounts no tokens: it has another version of "
+        "the chart; upgrade it: helm upgrade"
     )
 
 
 def operator_token(release: Release) -> str:
-    """Read the operator's token; needs the right to get Secrets.
+    """Read the operator's token; this needs the right to get Secrets.
 
     Raises:
-        ClusterError: If it cannot be read; the text has no token in it.
+        ClusterError: If it cannot be read; the message never contains a token.
     """
     name = secret_name(release)
     with explained("get secrets", release.where):
@@ -250,37 +247,37 @@ def operator_token(release: Release) -> str:
     except (KeyError, ValueError, binascii.Error):
         raise ClusterError(
             f"Secret '{name}' {release.where} has no token under '{OPERATOR}'; "
-            "name a file that has it: --token-file"
+            "give a file with it: --token-file"
         ) from None
 
 
 API_PORT = 8080
-"""Where teleop serves its API in the cloud pod."""
+"""TCP port of teleop's API in the cloud pod."""
 DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-"""Opens URLs on this machine, whatever proxy the environment names."""
+"""Opens URLs on this machine, without the proxy of the environment."""
 START_LIMIT = 20.0
-"""For kubectl to open the way [s]."""
+"""Time limit for kubectl to forward the ports [s]."""
 STOP_LIMIT = 2.0
-"""For kubectl to end once it is asked to [s]."""
+"""Time for kubectl to end after SIGTERM, before SIGKILL [s]."""
 LOOK_PERIOD = 0.05
-"""Between two looks at what kubectl says [s]."""
-_OPENED = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")
+"""Time between two looks at kubectl's output [s]."""
+_FORWARDING = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")
 
 
 @contextmanager
 def api_url(context: str | None, namespace: str | None, release: str) -> Iterator[str]:
-    """Open the way to a release's API for as long as the block lasts.
+    """Forward a port to a release's API while the block runs.
 
     Args:
-        context: Of the kubeconfig; None for the current one.
-        namespace: None for the context's own.
+        context: Context of the kubeconfig; None for the current one.
+        namespace: Namespace; None for that of the context.
         release: Name of the Helm release.
 
     Yields:
-        The API's URL, without a slash at its end.
+        URL of the API, without a slash at the end.
 
     Raises:
-        CloudrcError: If there is no such release or no way to it.
+        CloudrcError: If there is no such release, or the port cannot be forwarded.
     """
     place = connect(context, namespace, release)
     with forwarded(place, find_pod(place, "cloud").metadata.name, [API_PORT]) as ports:
@@ -289,54 +286,56 @@ def api_url(context: str | None, namespace: str | None, release: str) -> Iterato
 
 @contextmanager
 def forwarded(release: Release, pod: str, ports: Sequence[int]) -> Iterator[dict[int, int]]:
-    """Forward ports of a pod, also those that it binds to its own loopback only.
+    """Forward ports of a pod while the block runs, including ports on its loopback device.
 
     Args:
-        release: Where the pod is.
-        pod: Its name.
-        ports: In the pod.
+        release: Release of the pod.
+        pod: Name of the pod.
+        ports: Ports in the pod.
 
     Yields:
-        Port in the pod -> port on 127.0.0.1 here.
+        Port in the pod -> port on 127.0.0.1 of this machine.
     """
     command = [program("kubectl"), *release.flags, "port-forward", f"pod/{pod}"]
     command += ["--address=127.0.0.1", *(f":{port}" for port in ports)]
-    # Files, not pipes: kubectl writes a line per connection, and a full pipe would stop it.
-    with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as complaint:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=complaint)
+    # Files, not pipes: kubectl writes a line per connection, and a full pipe would block it.
+    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=errors)
         try:
-            _wait_until_open(process, said, len(ports), pod)
-            yield _opened(said)
+            _wait_until_open(process, output, len(ports), pod)
+            yield _forwarded_ports(output)
         except _NotOpenError:
-            complaint.seek(0)
-            why = last_words(complaint.read().decode(errors="replace"))
-            raise ClusterError(f"no way to pod '{pod}' {release.where}: {why}") from None
+            errors.seek(0)
+            why = last_words(errors.read().decode(errors="replace"))
+            raise ClusterError(
+                f"cannot forward ports of pod '{pod}' {release.where}: {why}"
+            ) from None
         finally:
             _end(process)
 
 
 class _NotOpenError(Exception):
-    """The program ended before the way was open."""
+    """kubectl ended before it forwarded the ports."""
 
 
 def _wait_until_open(
-    process: subprocess.Popen[bytes], said: IO[bytes], count: int, pod: str
+    process: subprocess.Popen[bytes], output: IO[bytes], count: int, pod: str
 ) -> None:
     until = time.monotonic() + START_LIMIT
-    while len(_opened(said)) < count:
+    while len(_forwarded_ports(output)) < count:
         if process.poll() is not None:
             raise _NotOpenError
         if time.monotonic() > until:
             raise WaitedTooLongError(
-                f"kubectl port-forward to pod '{pod}' was not open within {START_LIMIT:g} s"
+                f"kubectl port-forward to pod '{pod}' has not started within {START_LIMIT:g} s"
             )
         time.sleep(LOOK_PERIOD)
 
 
-def _opened(said: IO[bytes]) -> dict[int, int]:
-    """Port in the pod -> port here, as far as kubectl has told."""
-    text = os.pread(said.fileno(), 4096, 0)
-    return {int(there): int(here) for here, there in _OPENED.findall(text)}
+def _forwarded_ports(output: IO[bytes]) -> dict[int, int]:
+    """Read from kubectl's output: port in the pod -> port on this machine."""
+    text = os.pread(output.fileno(), 4096, 0)
+    return {int(remote): int(local) for local, remote in _FORWARDING.findall(text)}
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -349,23 +348,26 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 DATA = "/var/lib/cloudrc"
+"""Folder of the recordings in the pods of world and cloud."""
 METRICS = {
     "world": {"world": 9100, "link": 9102},
     "cloud": {"cloud": 9100, "teleop": 9101, "link": 9102},
 }
 """Component -> container -> port of its metrics."""
 COPY_LIMIT = 120.0
-"""For one recording to be copied [s]."""
+"""Time limit to copy one recording [s]."""
 SCRAPE_LIMIT = 10.0
+"""Time limit to read the metrics of one container [s]."""
 LOG_LIMIT = 30.0
+"""Time limit to read the log of one container [s]."""
 
 
 def fetch_recording(release: Release, component: str, target: Path) -> None:
-    """Copy the recording of one end as it is at this instant.
+    """Copy the present recording of one end.
 
     Args:
-        release: Where it flew.
-        component: "world" or "cloud", which is its container's name, too.
+        release: The release.
+        component: "world" or "cloud"; also the name of the container.
         target: File to write.
 
     Raises:
@@ -375,18 +377,18 @@ def fetch_recording(release: Release, component: str, target: Path) -> None:
 
 
 def fetch_before(release: Release, component: str, target: Path) -> bool:
-    """Copy what the container before this one had recorded in the same pod.
+    """Copy the recording that the container made before its last restart.
 
     Args:
-        release: Where it flew.
-        component: As of `fetch_recording`.
+        release: The release.
+        component: "world" or "cloud", as in `fetch_recording`.
         target: File to write.
 
     Returns:
-        Whether there was one.
+        False if the container has not restarted in its pod.
 
     Raises:
-        ClusterError: If there was, and it has left no file.
+        ClusterError: If it has restarted and there is no such file.
     """
     pod = find_pod(release, component)
     statuses = pod.status.container_statuses or []
@@ -396,25 +398,25 @@ def fetch_before(release: Release, component: str, target: Path) -> bool:
     return True
 
 
-def _copy(release: Release, component: str, pod: str, which: str, target: Path) -> None:
-    path = f"{DATA}/{component}{which}.mcap"
+def _copy(release: Release, component: str, pod: str, suffix: str, target: Path) -> None:
+    path = f"{DATA}/{component}{suffix}.mcap"
     arguments = [*release.flags, "exec", pod, f"--container={component}", "--", "cat", path]
     with target.open("wb") as file:
         run("kubectl", arguments, timeout=COPY_LIMIT, stdout=file)
 
 
 def fetch_metrics(release: Release, component: str) -> dict[str, str]:
-    """Read the metrics of every container of a pod, in Prometheus' text format.
+    """Read the metrics of each container of a pod, in Prometheus' text format.
 
     Args:
-        release: Where it flies.
+        release: The release.
         component: "world" or "cloud".
 
     Returns:
-        Container -> text.
+        Name of the container -> text.
 
     Raises:
-        ClusterError: If one does not answer.
+        ClusterError: If a container does not answer.
     """
     pod, ports = find_pod(release, component).metadata.name, METRICS[component]
     texts = {}
@@ -426,16 +428,16 @@ def fetch_metrics(release: Release, component: str) -> dict[str, str]:
                     texts[container] = answer.read().decode()
             except (urllib.error.URLError, OSError) as error:
                 raise ClusterError(
-                    f"container '{container}' of pod '{pod}' gives no metrics: {error}"
+                    f"cannot read the metrics of container '{container}' of pod '{pod}': {error}"
                 ) from error
     return texts
 
 
 def fetch_logs(release: Release, component: str) -> dict[str, str]:
-    """Read the log of every container of a pod.
+    """Read the log of each container of a pod.
 
     Returns:
-        Container -> text.
+        Name of the container -> text.
     """
     pod = find_pod(release, component)
     names = [c.name for c in [*(pod.spec.init_containers or []), *pod.spec.containers]]

@@ -1,4 +1,4 @@
-"""Puts a release on the cluster: values come in, both pods run, or why they do not is said."""
+"""Install a release on the cluster and wait until both pods are ready."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from cloudrc.cluster.tools import ClusterError, WaitedTooLongError, explained, i
 
 COMPONENTS = ("world", "cloud")
 LOOK_PERIOD = 1.0
-"""Between two looks at the pods [s]."""
+"""Time between two looks at the pods [s]."""
 HELM_LIMIT = 120.0
-"""For helm to hand everything over; it does not wait for pods [s]."""
+"""Time limit for one helm command, which does not wait for pods [s]."""
 HINTS = {
     "cluster unreachable": "is the cluster up? ask it: kubectl cluster-info",
     "incompatible with Kubernetes": "make a newer one: kind create cluster",
@@ -25,9 +25,9 @@ HINTS = {
     "the specifications of the schema": "see what there is: helm show values charts/cloudrc",
     "already exists": "is it another release's? see: helm list --all-namespaces",
 }
-"""Words in what helm complains about -> what to do next."""
+"""Words in an error message of helm -> what to do next."""
 PATIENCE = 5.0
-"""How long trouble has to last to be believed: a Secret may be a moment later than its pod [s]."""
+"""Time for which a failure must last to be reported: a Secret may appear after its pod [s]."""
 
 
 def install(
@@ -39,15 +39,15 @@ def install(
     timeout: float = 300.0,
     tell: Callable[[str], None] = lambda text: None,
 ) -> None:
-    """Install or upgrade a release and wait until it can fly.
+    """Install or upgrade a release and wait until it is ready to fly.
 
     Args:
-        release: What to call it and where to put it; the namespace is made if there is none.
+        release: Name and place; a missing namespace is created.
         chart: Folder of the chart.
-        values: Laid over the chart's own.
+        values: Values that override the chart's defaults.
         extra: More arguments of helm, such as `--set=...`.
-        timeout: For the pods to become ready [s].
-        tell: Gets a line when something is worth telling.
+        timeout: Time limit for the pods to become ready [s].
+        tell: Gets a line about each change of the pods' state.
 
     Raises:
         CloudrcError: If helm or the cluster refuses, or a pod cannot run; in one sentence.
@@ -59,7 +59,7 @@ def install(
 
 
 def current_values(release: Release) -> dict[str, Any]:
-    """Read what a release was installed with; empty if there is none.
+    """Read the values that a release was installed with; empty if there is no release.
 
     Raises:
         CloudrcError: If helm or the cluster refuses.
@@ -72,30 +72,30 @@ def current_values(release: Release) -> dict[str, Any]:
 
 
 def _helm(arguments: Sequence[str], given: str = "") -> str:
-    """Run helm; where it fails, what to do next is added to what it says."""
+    """Run helm; add a hint to its error message."""
     try:
         return run("helm", arguments, timeout=HELM_LIMIT, given=given)
     except ClusterError as error:
-        said = str(error)
-        hint = next((hint for words, hint in HINTS.items() if words in said), "")
-        raise ClusterError(f"{said}; {hint}" if hint else said) from error
+        message = str(error)
+        hint = next((hint for words, hint in HINTS.items() if words in message), "")
+        raise ClusterError(f"{message}; {hint}" if hint else message) from error
 
 
 def wait_ready(
     release: Release, *, timeout: float, tell: Callable[[str], None] = lambda text: None
 ) -> None:
-    """Wait until both pods of a release are of its newest version, and ready.
+    """Wait until both pods of a release have its newest version and are ready.
 
     Args:
-        release: To wait for.
-        timeout: How long at most [s].
-        tell: Gets a line when something is worth telling.
+        release: The release.
+        timeout: Time limit [s].
+        tell: Gets a line about each change of the pods' state.
 
     Raises:
-        ClusterError: If a pod cannot run by waiting; says why.
-        WaitedTooLongError: If they are not ready in time; says what is known.
+        ClusterError: If a pod cannot run however long one waits; with the cause.
+        WaitedTooLongError: If the pods are not ready in time; with their states.
     """
-    until, hopeless_since, said = time.monotonic() + timeout, None, ""
+    until, failing_since, last = time.monotonic() + timeout, None, ""
     while True:
         states = insist(lambda: {each: _state(release, each) for each in COMPONENTS}, tell)
         waiting = {component: why for component, (why, _) in states.items() if why}
@@ -103,30 +103,30 @@ def wait_ready(
             return
         now = time.monotonic()
         fatal = [f"the {c} pod cannot run: {w}" for c, (w, bad) in states.items() if bad]
-        hopeless_since = (hopeless_since or now) if fatal else None
-        if hopeless_since is not None and now - hopeless_since >= PATIENCE:
-            raise ClusterError(f"{'; '.join(fatal)}; look: {_look(release)}")
+        failing_since = (failing_since or now) if fatal else None
+        if failing_since is not None and now - failing_since >= PATIENCE:
+            raise ClusterError(f"{'; '.join(fatal)}; see: {_describe(release)}")
         words = "; ".join(f"{component}: {why}" for component, why in waiting.items())
         if now > until:
             raise WaitedTooLongError(
                 f"release '{release.name}' is not ready after {timeout:g} s: {words}; "
-                f"look: {_look(release)}, or allow more: --timeout"
+                f"see: {_describe(release)}, or wait longer: --timeout"
             )
-        if words != said:
+        if words != last:
             tell(words)
-            said = words
+            last = words
         time.sleep(LOOK_PERIOD)
 
 
-def _look(release: Release) -> str:
+def _describe(release: Release) -> str:
     selector = f"app.kubernetes.io/instance={release.name}"
     return f"kubectl {' '.join(release.flags)} describe pods -l {selector}"
 
 
 def _state(release: Release, component: str) -> tuple[str, bool]:
-    """Why a component is not ready, and whether waiting is hopeless; "" if it is ready."""
+    """Say why a component is not ready, "" if it is; and whether waiting cannot help."""
     deployment = _deployment(release, component)
-    refused = _refused(deployment)
+    refused = _refusal(deployment)
     if refused:
         return refused, True
     pods = list_pods(release, component)
@@ -138,7 +138,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
     current = (status.observed_generation or 0) >= deployment.metadata.generation
     settled = current and status.updated_replicas == 1 and status.replicas == 1
     if not settled or not pods:
-        return "its pod is being made", False
+        return "its pod is being created", False
     return ("", False) if is_ready(pods[0]) else (_not_ready(pods[0]), False)
 
 
@@ -157,8 +157,8 @@ def _deployment(release: Release, component: str) -> Any:
     return found[0]
 
 
-def _refused(deployment: Any) -> str:
-    """Why the cluster does not even make the pod: Pod Security, a quota."""
+def _refusal(deployment: Any) -> str:
+    """Return why the cluster does not create the pod, for example Pod Security or a quota."""
     for condition in deployment.status.conditions or []:
         if condition.type == "ReplicaFailure" and condition.status == "True":
             return str(condition.message)

@@ -1,9 +1,4 @@
-"""The programs that are called rather than rebuilt: arguments of kubectl or helm in, text out.
-
-What goes wrong with a cluster, in one sentence: an exception comes in, a cause goes out.
-
-Where the Helm chart is: in an installed wheel, or in the repository beside the package.
-"""
+"""Run kubectl and helm, turn errors of the cluster into one sentence, and find the Helm chart."""
 
 from __future__ import annotations
 
@@ -19,43 +14,50 @@ from typing import IO, TypeVar
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 
 OUTAGE_MAX = 30.0
-"""How long the API server may be away while something is waited for: it may choose a leader [s]."""
+"""Time for which requests are repeated while the API server does not answer [s]."""
 OUTAGE_PERIOD = 1.0
-"""Between two tries [s]."""
+"""Time between two tries [s]."""
 TOO_MANY_REQUESTS = 429
 SERVER_ERROR = 500
-"""This HTTP status and all above it."""
+"""Lowest HTTP status of a server error."""
+WHERE_TO_GET = {
+    "kubectl": "https://kubernetes.io/docs/tasks/tools/",
+    "helm": "https://helm.sh/docs/intro/install/",
+}
+"""Program -> page with its installation."""
+PACKAGE = Path(__file__).resolve().parents[1]
+CHART_FILE = "Chart.yaml"
 
 _Answer = TypeVar("_Answer")
 
 
 class ClusterError(CloudrcError):
-    """The cluster, or something in it, refused or failed."""
+    """The cluster, or an object in it, refused or failed."""
 
     exit_code = 5
 
 
 class AwayError(ClusterError):
-    """The API server does not answer, or has no time: it may a moment later."""
+    """The API server does not answer or is overloaded; a later try may succeed."""
 
 
 class WaitedTooLongError(CloudrcError):
-    """Something did not happen within the time that was allowed for it."""
+    """A timeout expired."""
 
     exit_code = 4
 
 
 @contextmanager
 def explained(doing: str, where: str) -> Iterator[None]:
-    """Turn the Kubernetes client's exceptions into one sentence.
+    """Convert exceptions of the Kubernetes client to a ClusterError with one sentence.
 
     Args:
-        doing: What was tried, as a verb: "list Jobs".
-        where: Cluster and namespace, as `Release.where` says it.
+        doing: Verb and kind of object: "list Jobs".
+        where: Cluster and namespace, from `Release.where`.
 
     Raises:
-        ClusterError: In place of what the client raises; other exceptions pass. It is an
-            `AwayError` where it may pass by waiting.
+        ClusterError: In place of an exception of the client; other exceptions pass. It is an
+            `AwayError` if a later try may succeed.
     """
     from kubernetes.client.exceptions import ApiException
     from kubernetes.config.config_exception import ConfigException
@@ -78,14 +80,14 @@ def explained(doing: str, where: str) -> Iterator[None]:
 
 
 def insist(ask: Callable[[], _Answer], tell: Callable[[str], None]) -> _Answer:
-    """Ask again while the API server is away, for `OUTAGE_MAX` at most.
+    """Repeat a request while the API server does not answer, for `OUTAGE_MAX` at most.
 
     Args:
-        ask: Reads something, and changes nothing.
-        tell: Gets a line when the API server is away.
+        ask: A request that changes nothing.
+        tell: Gets a line when the API server does not answer.
 
     Raises:
-        ClusterError: What `ask` raises, if it does not pass.
+        ClusterError: The last error of `ask`.
     """
     until = None
     while True:
@@ -101,28 +103,28 @@ def insist(ask: Callable[[], _Answer], tell: Callable[[str], None]) -> _Answer:
 
 
 def _refusal(error: Exception, doing: str) -> str:
-    status, said = int(getattr(error, "status", 0) or 0), _message(error)
+    status, message = int(getattr(error, "status", 0) or 0), _message(error)
     if status == 401:
         return "the API server does not know you; log in to the cluster again"
-    if status == 403 and "exceeded quota" in said:
-        return f"{said}; free some of the namespace's quota"
+    if status == 403 and "exceeded quota" in message:
+        return f"{message}; free some of the namespace's quota"
     if status == 403:
         verb, _, kind = doing.partition(" ")
-        return f"{said}; ask for the permission, and check it: kubectl auth can-i {verb} {kind}"
-    return said or f"the API server answered {status}"
+        return f"{message}; ask for the permission, and check it: kubectl auth can-i {verb} {kind}"
+    return message or f"the API server answered {status}"
 
 
 def _message(error: Exception) -> str:
-    """What the API server says about the error, in one line."""
+    """Return the API server's message about the error, in one line."""
     try:
-        said = json.loads(getattr(error, "body", "") or "")["message"]
+        message = json.loads(getattr(error, "body", "") or "")["message"]
     except (ValueError, KeyError, TypeError):
-        said = getattr(error, "reason", "") or ""
-    return " ".join(str(said).split())
+        message = getattr(error, "reason", "") or ""
+    return " ".join(str(message).split())
 
 
 def _root(error: BaseException) -> str:
-    """The innermost reason: the outer ones only say that something was tried again."""
+    """Return the innermost reason; the outer ones only report repeated tries."""
     reason = getattr(error, "reason", None)
     if isinstance(reason, BaseException):
         return _root(reason)
@@ -134,21 +136,15 @@ def _first_line(text: str) -> str:
     return text.strip().partition("\n")[0]
 
 
-WHERE_TO_GET = {
-    "kubectl": "https://kubernetes.io/docs/tasks/tools/",
-    "helm": "https://helm.sh/docs/intro/install/",
-}
-
-
 def program(name: str) -> str:
-    """Find a program.
+    """Find a program on the PATH.
 
     Raises:
-        MissingPrerequisiteError: If it is not installed; says where it is to be had.
+        MissingPrerequisiteError: If it is not installed; names the page with its installation.
     """
     path = shutil.which(name)
     if path is None:
-        raise MissingPrerequisiteError(f"{name} is not installed; get it: {WHERE_TO_GET[name]}")
+        raise MissingPrerequisiteError(f"{name} is not installed; install it: {WHERE_TO_GET[name]}")
     return path
 
 
@@ -165,16 +161,16 @@ def run(
     Args:
         name: "kubectl" or "helm".
         arguments: Its arguments.
-        timeout: How long it may take [s].
-        given: What it reads from its standard input.
-        stdout: A file for what it writes; default: it is returned.
+        timeout: Time limit [s].
+        given: Text for its standard input.
+        stdout: File for its output; None to return the output.
 
     Returns:
-        What it wrote; "" if that went into a file.
+        Its output; "" if `stdout` is given.
 
     Raises:
-        ClusterError: If it fails; with what it said.
-        WaitedTooLongError: If it takes too long.
+        ClusterError: If the program fails; with its error message.
+        WaitedTooLongError: If it takes longer than `timeout`.
         MissingPrerequisiteError: If it is not installed.
     """
     command = [program(name), *arguments]
@@ -188,40 +184,35 @@ def run(
             f"'{_short(name, arguments)}' took more than {timeout:g} s"
         ) from error
     if done.returncode != 0:
-        said = last_words(done.stderr.decode(errors="replace"))
-        raise ClusterError(f"'{_short(name, arguments)}' failed: {said}")
+        message = last_words(done.stderr.decode(errors="replace"))
+        raise ClusterError(f"'{_short(name, arguments)}' failed: {message}")
     return (done.stdout or b"").decode(errors="replace")
 
 
 def last_words(stderr: str) -> str:
-    """Put what a program complained about into one line, without warnings and log lines."""
+    """Extract the error message of a program in one line, without warnings and log lines."""
     lines = [" ".join(line.split()) for line in stderr.splitlines() if line.strip()]
     first = next((i for i, line in enumerate(lines) if line.lower().startswith("error")), None)
-    wanted = lines[first:] if first is not None else lines[-1:]
-    text = " ".join(wanted)
-    return text.removeprefix("Error: ").removeprefix("error: ") or "it left no message"
+    text = " ".join(lines[first:] if first is not None else lines[-1:])
+    return text.removeprefix("Error: ").removeprefix("error: ") or "no error message"
 
 
 def _short(name: str, arguments: Sequence[str]) -> str:
-    """The command as a person would say it: its verb and what it is about."""
+    """Shorten a command to program, verb and object."""
     words = [word for word in arguments if not word.startswith("-")][:2]
     return " ".join([name, *words])
 
 
-PACKAGE = Path(__file__).resolve().parents[1]
-CHART_FILE = "Chart.yaml"
-
-
 def chart_folder(package: Path = PACKAGE) -> Path:
-    """Find the chart.
+    """Find the Helm chart.
 
     Args:
-        package: The folder `cloudrc`, wherever it is installed.
+        package: Folder of the package `cloudrc`.
 
     Raises:
-        MissingPrerequisiteError: If it is in neither place.
+        MissingPrerequisiteError: If the chart is missing.
     """
-    # A wheel carries the chart inside the package; an editable install leaves it where it is.
+    # A wheel has the chart inside the package; a repository has it beside the package.
     places = (package / "_chart", package.parent / "charts" / "cloudrc")
     for place in places:
         if (place / CHART_FILE).is_file():

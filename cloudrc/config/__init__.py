@@ -1,1 +1,1 @@
-"""Configuration: files go in, one frozen and complete description of an experiment comes out."""
+"""Configuration files: read, complete and check them; the result is one frozen experiment."""

@@ -1,8 +1,6 @@
-"""A configuration file in memory: plain values, and for each where it was written.
+"""Read and write YAML, and keep the file and line of each value.
 
-YAML in and out: text becomes plain values that know their lines, values become text.
-
-Deviation: scalars follow YAML 1.2's core schema, not PyYAML's 1.1: `1e-3` is a number, `on`, `yes`
+Deviation: scalars follow YAML 1.2's core schema, not PyYAML's 1.1: `1e-3` is a number; `on`, `yes`
 and `12:30` are text. Duplicate keys are refused.
 """
 
@@ -21,7 +19,12 @@ from cloudrc.config.schema import MAX_WAYPOINTS
 from cloudrc.errors import BadInputError
 
 KeyPath = tuple[str, ...]
-"""Keys from the top of a document down to a value; indices are written as text."""
+"""Keys from the top of a document down to a value; list indices are text."""
+
+SIZE_MAX = 8 << 20
+"""Largest file that is read [bytes]: four times a mission with MAX_WAYPOINTS waypoints."""
+SETTING = "--set"
+"""Label of a value that was set on the command line."""
 
 _SCALARS = (
     ("null", r"~|null|Null|NULL|", "~nN\0"),
@@ -34,12 +37,15 @@ _SCALARS = (
         "-+.0123456789",
     ),
 )
-"""Tag, pattern, first characters. Source: YAML 1.2.2, section 10.3.2."""
+"""Tag, pattern and possible first characters of each kind of scalar; "\\0": an empty scalar.
+Source: YAML 1.2.2, section 10.3.2."""
 
 _MAX_DEPTH = 50
+"""Deepest nesting of lists and mappings."""
 _MAX_VALUES = 300_000
+"""Largest number of values in a document."""
 _MAX_EVENTS = 3 * _MAX_VALUES
-"""Of a value: the ends of a list or mapping, or itself; and its key."""
+"""Largest number of parser events: a value has up to two, and its key one."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -50,7 +56,7 @@ class _Dumper(yaml.SafeDumper):
     yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write every value out: a resolved file is read by people."""
+        """Write every value out, without YAML aliases: people read resolved files."""
         return True
 
 
@@ -65,17 +71,17 @@ _Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.v
 
 
 def parse(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
-    """Read one YAML document.
+    """Parse one YAML document.
 
     Args:
         text: The document.
-        name: What to call it in messages.
+        name: Its name in messages.
 
     Returns:
-        Dictionaries with text keys, lists and scalars; and the line of each of them, from 1.
+        Dictionaries with text keys, lists and scalars; and the line of each value, from 1.
 
     Raises:
-        BadInputError: If it is not YAML, has a key twice or an object that is not plain.
+        BadInputError: If the text is not YAML, repeats a key or has an object that is not plain.
     """
     try:
         loader = _Loader(text)
@@ -85,14 +91,14 @@ def parse(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"{name}:{mark.line + 1}" if mark else name
-        raise BadInputError(f"{place}: {error.problem}; mend the YAML there") from error
+        raise BadInputError(f"{place}: {error.problem}; fix the YAML there") from error
     except (yaml.YAMLError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise BadInputError(f"{name}: not readable as YAML: {reason}") from error
 
 
 def write(value: Any) -> str:
-    """Write plain values as a YAML document that `parse` reads back as they were."""
+    """Write plain values as YAML; `parse` returns equal values."""
     return yaml.dump(
         value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None,
         width=100,
@@ -100,7 +106,7 @@ def write(value: Any) -> str:
 
 
 def _check_bounds(text: str) -> None:
-    """Refuse what would overflow the stack of libyaml's composer, which is recursive, or memory."""
+    """Refuse a document that would exhaust memory or the stack: libyaml's composer recurses."""
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=_Loader)):
         if count > _MAX_EVENTS:
@@ -108,39 +114,38 @@ def _check_bounds(text: str) -> None:
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > _MAX_DEPTH:
-                problem = f"nested more than {_MAX_DEPTH} deep"
-                raise _refuse(event, problem)
+                raise _refuse(event, f"nested more than {_MAX_DEPTH} deep")
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
 
 
 def _value(
-    loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int], above: tuple[Any, ...]
+    loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int], parents: tuple[Any, ...]
 ) -> Any:
     if node is None:
         return None
     lines[path] = node.start_mark.line + 1
-    if len(lines) > _MAX_VALUES:  # aliases of aliases of aliases
+    if len(lines) > _MAX_VALUES:  # nested aliases multiply values
         raise _refuse(node, f"more than {_MAX_VALUES} values")
-    if node in above:
+    if node in parents:
         raise _refuse(node, "a value contains itself")
     if isinstance(node, yaml.MappingNode):
-        return _mapping(loader, node, path, lines, (*above, node))
+        return _mapping(loader, node, path, lines, (*parents, node))
     if isinstance(node, yaml.SequenceNode):
         return [
-            _value(loader, item, (*path, str(index)), lines, (*above, node))
+            _value(loader, item, (*path, str(index)), lines, (*parents, node))
             for index, item in enumerate(node.value)
         ]
     value = loader.construct_object(node)
     if value is not None and not isinstance(value, bool | int | float | str):
         raise _refuse(node, f"{node.tag} is not a plain value")
     if isinstance(value, str) and "\0" in value:
-        raise _refuse(node, "a text with the character NUL, which no path can have")
+        raise _refuse(node, "text with the character NUL, which no path can contain")
     return value
 
 
 def _mapping(
-    loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int], above: tuple[Any, ...]
+    loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int], parents: tuple[Any, ...]
 ) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for key_node, value_node in node.value:
@@ -150,53 +155,47 @@ def _mapping(
         if key == "<<":
             raise _refuse(key_node, "merge keys are not supported; write the keys out")
         if key in result:
-            raise _refuse(key_node, f"the key {key!r} stands here twice; keep one of them")
-        result[key] = _value(loader, value_node, (*path, key), lines, above)
+            raise _refuse(key_node, f"the key {key!r} is given twice; keep one of them")
+        result[key] = _value(loader, value_node, (*path, key), lines, parents)
         lines[(*path, key)] = key_node.start_mark.line + 1
     return result
 
 
-def _refuse(place: Any, problem: str) -> yaml.MarkedYAMLError:
-    return yaml.MarkedYAMLError(problem=problem, problem_mark=place.start_mark)
-
-
-SIZE_MAX = 8 << 20
-"""Longest file that is read [bytes]: as many waypoints as may be, spelled out, are a quarter."""
-SETTING = "--set"
-"""Label of what was set over a file."""
+def _refuse(node: Any, problem: str) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a value was written.
+    """The place where a value is written.
 
     Attributes:
-        label: For messages: "paper.yaml:12", "--set".
-        folder: What a relative path there is relative to.
+        label: The place in messages: "paper.yaml:12", "--set".
+        folder: Folder at which a relative path in the value starts.
     """
 
     label: str
     folder: Path
 
     def absolute(self, path: str) -> Path:
-        """Say which file is meant by a path that stands there; of no home or loop nothing comes."""
+        """Resolve a path that is written at this place; never raises, whatever the path."""
         return Path(os.path.realpath(self.folder / os.path.expanduser(path)))
 
 
 @dataclass(slots=True)
 class Document:
-    """Values of a file that may have been put together from others.
+    """Values of a configuration file, possibly combined from several files.
 
     Attributes:
         tree: Dictionaries with text keys, lists and scalars.
-        sources: Path of a value -> where it stands; what is missing stands where its parent does.
+        sources: Path of a value -> its place; a value without an entry has its parent's place.
     """
 
     tree: dict[str, Any]
     sources: dict[KeyPath, Source] = field(default_factory=dict)
 
     def source(self, path: KeyPath) -> Source:
-        """Say where the value at `path` was last touched, or else the nearest one above it."""
+        """Find the place of a value: a `--set` at or below `path`, else the nearest place above."""
         for key, source in self.sources.items():
             if source.label == SETTING and key[: len(path)] == path:
                 return source
@@ -206,7 +205,7 @@ class Document:
         return Source("default", Path())
 
     def get(self, *path: str) -> Any:
-        """Give the value at `path`; None if it, or one above it, is not there."""
+        """Return the value at `path`; None if it or one of its parents is missing."""
         value: Any = self.tree
         for key in path:
             if not isinstance(value, dict):
@@ -215,12 +214,12 @@ class Document:
         return value
 
     def graft(self, path: KeyPath, value: Any, origin: Document | Source) -> None:
-        """Put `value` at `path`; the keys above it must be there.
+        """Set the value at `path`; its parents must exist.
 
         Args:
-            path: Where to, at least one key.
+            path: At least one key.
             value: A scalar or a tree.
-            origin: Where the value was written: a place, or the document whose tree it is.
+            origin: Place of the value, or the document whose tree it is.
         """
         parent: Any = self.tree
         for key in path[:-1]:
@@ -236,7 +235,7 @@ class Document:
             self.sources |= {(*path, *key): source for key, source in origin.sources.items()}
 
     def forget_sources(self, path: KeyPath) -> None:
-        """Forget where the value at `path` and those below it were written."""
+        """Delete the places of the value at `path` and of all values below it."""
         for key in [key for key in self.sources if key[: len(path)] == path]:
             del self.sources[key]
 
@@ -246,10 +245,10 @@ def read(path: Path, name: str) -> Document:
 
     Args:
         path: The file.
-        name: What to call it in messages.
+        name: Its name in messages.
 
     Raises:
-        BadInputError: If it cannot be read, is not such YAML, or is absurdly large.
+        BadInputError: If the file cannot be read, is not such YAML, or is too large.
     """
     try:
         text = files.read(path, SIZE_MAX).decode("utf-8")
@@ -259,8 +258,8 @@ def read(path: Path, name: str) -> Document:
         raise BadInputError(f"{name}: is not UTF-8 text") from error
     except ValueError as error:
         reason = str(error).removeprefix(f"{path}: ")
-        raise BadInputError(f"{name}: cannot be read: {reason}; name a file of YAML") from error
-    # Counted in the text: to parse and check a hundred thousand points takes half a minute.
+        raise BadInputError(f"{name}: cannot be read: {reason}; name a YAML file") from error
+    # Counted in the text, because parsing and checking 100,000 waypoints takes half a minute.
     points = text.count("position_m")
     if points > MAX_WAYPOINTS:
         raise BadInputError(

@@ -1,7 +1,7 @@
-"""What `cloudrc link set` thinks: a profile and what is to change go in, a new profile comes out.
+"""Edit a link profile for `cloudrc link set`.
 
-What is set by hand holds from then on: where the time line sets the same value it is dropped from
-there, else nothing would be seen of it. What else is on the time line goes on.
+A value set by hand stays in force: if the time line (changes, trace) sets the same value, it is
+removed there. The rest of the time line continues.
 """
 
 from __future__ import annotations
@@ -21,21 +21,23 @@ from cloudrc.errors import BadInputError
 
 DIRECTIONS = ("uplink", "downlink")
 ON_TIME_LINE = Change.model_fields.keys() - {"at_s"}
-"""Values that a time line's changes may set."""
+"""Keys of a direction that an entry of `changes` may set."""
 TIME_LINES = ("changes", "trace", "blackouts")
+"""Keys of a direction that make its conditions depend on time."""
 _HERE = "link set"
 _EXAMPLE = "for example downlink.delay_ms=120, or --profile handover"
 
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A new profile.
+    """An edited profile.
 
     Attributes:
-        values: As in a profile's file, defaults left out; paths are absolute.
-        cause: What was asked for, in words.
-        restart: Whether its time line counts from when it takes force; else it goes on.
-        notes: What a person should know.
+        values: Values as in a profile file, without defaults; paths are absolute.
+        cause: The request in words.
+        restart: Whether the time line starts again when the profile takes effect; else it
+            continues.
+        notes: Sentences for the user about side effects.
     """
 
     values: dict[str, Any]
@@ -48,45 +50,45 @@ def edit(before: Document, profile: str | None, settings: Sequence[str]) -> Edit
     """Change a profile.
 
     Args:
-        before: What holds now.
-        profile: Name or path of one that takes its place; None changes the old one.
-        settings: "downlink.delay_ms=120" texts over it.
+        before: The present profile.
+        profile: Name or path of a profile that replaces it; None edits the present one.
+        settings: Values to set, as "downlink.delay_ms=120".
 
     Raises:
-        BadInputError: If nothing is asked for, or what is asked for is not valid.
+        BadInputError: If the request is empty or not valid.
     """
     if profile is None and not settings:
-        raise BadInputError(f"nothing to set; say what, {_EXAMPLE}")
+        raise BadInputError(f"nothing to set; name a value, {_EXAMPLE}")
     notes: list[str] = []
     document = before if profile is None else _load(profile, notes)
     restart = profile is not None
-    changes = [_checked(change) for change in overrides.parse(settings)]
+    changes = [_without_prefix(change) for change in overrides.parse(settings)]
     for change in changes:
         restart |= change.path[1] in TIME_LINES
-        _take_over(document, change, notes)
+        _drop_from_time_line(document, change, notes)
     overrides.apply(document, changes)
     document.sources = {
         path: Source(_HERE, source.folder) if source.label == SETTING else source
         for path, source in document.sources.items()
     }
-    made = check_profile(document, _HERE).model_dump(mode="json", exclude_defaults=True)
+    values = check_profile(document, _HERE).model_dump(mode="json", exclude_defaults=True)
     words = [f"profile {profile}"] if profile else []
-    return Edit(made, ", ".join([*words, *settings]), restart, notes)
+    return Edit(values, ", ".join([*words, *settings]), restart, notes)
 
 
 def check(profile: str | None, settings: Sequence[str]) -> None:
-    """Refuse what is wrong whatever the link is now, as far as that can be told.
+    """Refuse a request that is wrong for every present profile.
 
     Raises:
         BadInputError: As `edit`.
     """
-    alone = [
+    independent = [
         text
         for text in settings
         if text.partition("=")[0].rpartition(".")[2] not in ("distribution", *FILES)
     ]
-    if profile is not None or alone or not settings:
-        edit(Document({}), profile, alone)
+    if profile is not None or independent or not settings:
+        edit(Document({}), profile, independent)
 
 
 def _load(name: str, notes: list[str]) -> Document:
@@ -94,35 +96,34 @@ def _load(name: str, notes: list[str]) -> Document:
     age_max = profile.command_age_max_ms
     if age_max is not None:
         notes.append(
-            f"profile {name} wants guard.command_age_max_ms={age_max:g}; the guard of this flight "
-            "keeps the limit that it began with, and may hold"
+            f"profile {name} needs guard.command_age_max_ms={age_max:g}; the guard keeps the limit "
+            "that it started with, so the robot may hold"
         )
     document = shipped.read("profile", name, Path())
     document.tree = profile.model_dump(mode="json", exclude_defaults=True)
     return document
 
 
-def _checked(change: Override) -> Override:
-    """Take a leading "link." away; refuse what is no direction's."""
+def _without_prefix(change: Override) -> Override:
+    """Remove a leading "link."; refuse a key that belongs to no direction."""
     path = change.path[1:] if change.path[0] == "link" else change.path
     if len(path) < 2 or path[0] not in DIRECTIONS:
-        raise BadInputError(
-            f"{'.'.join(change.path)}: give a value of uplink or downlink, {_EXAMPLE}"
-        )
+        raise BadInputError(f"{'.'.join(change.path)}: set a key of uplink or downlink, {_EXAMPLE}")
     return Override(path, change.value)
 
 
-def _take_over(document: Document, change: Override, notes: list[str]) -> None:
-    """Drop from a direction's time line what is set by hand."""
+def _drop_from_time_line(document: Document, change: Override, notes: list[str]) -> None:
+    """Remove from a direction's time line the key that is set by hand."""
     way, key = change.path[:2]
     direction = document.get(way)
     if not isinstance(direction, dict) or key not in ON_TIME_LINE:
         return
     direction = document.tree[way] = copy.deepcopy(direction)
-    dropped = [one for one in direction.get("changes") or () if one.pop(key, None) is not None]
+    changes = direction.get("changes") or ()
+    dropped = [entry for entry in changes if entry.pop(key, None) is not None]
     if dropped:
-        notes.append(f"the {way}'s time line does not change {key} any more")
+        notes.append(f"the time line of the {way} no longer changes {key}")
     if key == "delay_ms" and direction.pop("trace", None) is not None:
-        notes.append(f"the {way} does not follow its trace any more")
+        notes.append(f"the {way} no longer follows its trace")
     elif key == "loss" and direction.get("trace"):
-        notes.append(f"if the {way}'s trace has a column loss, that goes on setting it")
+        notes.append(f"if the trace of the {way} has a column loss, it still sets the loss")

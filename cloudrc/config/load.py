@@ -1,15 +1,11 @@
-"""Loads experiments: a name or path and `--set` texts go in, a resolved experiment comes out.
+"""Load an experiment and resolve it: names and defaults are replaced by values.
 
-In this order: the file is read; `--set` is applied; mission and profile are looked up and put in
-their places, under the values that the experiment gives itself; plug-ins are completed from their
-signatures; and the whole is checked against the schema, the scene and the disk. All that is wrong
-is said at once, each with the line it stands in.
+The steps: read the file; apply `--set`; insert mission and profile under the experiment's own
+values; add the missing parameters of plug-ins; check everything against the schema, the scene and
+the disk. One error lists all problems, each with its line.
 
-An experiment with nothing left to look up: what the ends, the link and the report are made from.
-
-Names have become what they stand for: the mission is inline, the link's directions are spelled
-out, plug-ins carry all their parameters, limits have their values. Written to a file it is still
-an experiment file, and flies the same run again.
+A resolved experiment has its mission and both directions of the link inline, all parameters of the
+plug-ins and all limits. Written to a file it is an experiment file that gives the same run.
 """
 
 from __future__ import annotations
@@ -23,10 +19,9 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
-from cloudrc.config import document as yaml_text
 from cloudrc.config import overrides, problems, shipped
-from cloudrc.config import overrides as parameters
-from cloudrc.config.document import Document
+from cloudrc.config.document import Document, KeyPath
+from cloudrc.config.document import write as write_yaml
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import (
@@ -46,26 +41,26 @@ from cloudrc.geometry.scene import load_scene
 from cloudrc.link.traces import read_table, read_trace
 
 COMMAND_AGE_MAX_MS = 250.0
-"""Default where neither the experiment nor the profile says [ms].
+"""Default of guard.command_age_max_ms without a value in experiment or profile [ms].
 Source: docs/reference/plant.md, "Command age"."""
 
 
 def speed_cap(command_age_max_ms: float) -> float:
-    """Give the speed [m/s] at which the robot still comes to rest in time.
+    """Compute the largest speed from which the robot stops within 8.7 m [m/s].
 
-    It flies on for `command_age_max_ms` [ms] and 0.2 s, then brakes at 3 m/s^2:
+    It flies for T = `command_age_max_ms` [ms] and 0.2 s before it brakes at 3 m/s^2:
     v (T + 0.2) + v^2 / 6 = 8.7 m.
     Source: docs/reference/plant.md, "Speed cap".
     """
-    blind = command_age_max_ms * 1e-3 + 0.2
-    return round(3.0 * (sqrt(blind * blind + 8.7 / 1.5) - blind), 6)
+    delay = command_age_max_ms * 1e-3 + 0.2
+    return round(3.0 * (sqrt(delay * delay + 8.7 / 1.5) - delay), 6)
 
 
 class ResolvedGuard(Guard):
-    """A guard whose limits are all known."""
+    """A guard with a value for each limit."""
 
     command_age_max_ms: CommandAge = Field(
-        COMMAND_AGE_MAX_MS, description="A command whose basis is older is not flown [ms]"
+        COMMAND_AGE_MAX_MS, description="Age limit of a command [ms]"
     )
     speed_max_mps: Speed = Field(
         speed_cap(COMMAND_AGE_MAX_MS), description="Cap on the commanded speed [m/s]"
@@ -73,18 +68,18 @@ class ResolvedGuard(Guard):
 
     @field_validator("speed_max_mps")
     @classmethod
-    def _can_be_stopped(cls, speed_max: float, info: ValidationInfo) -> float:
+    def _check_stopping(cls, speed_max: float, info: ValidationInfo) -> float:
         age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
         if speed_max > speed_cap(age_max) + 1e-6:
             raise ValueError(
-                f"at most {speed_cap(age_max):g} m/s can be stopped from in time while commands "
-                f"may be {age_max:g} ms old; lower it, or guard.command_age_max_ms"
+                f"must be at most {speed_cap(age_max):g} m/s: above it the robot does not stop in "
+                f"time with commands {age_max:g} ms old; lower it, or guard.command_age_max_ms"
             )
         return speed_max
 
 
 class ResolvedCloud(Cloud):
-    """Plug-ins with all their parameters, those of the defaults too."""
+    """Plug-ins with all their parameters, defaults included."""
 
     estimator: PlugIn
     predictor: PlugIn
@@ -92,7 +87,7 @@ class ResolvedCloud(Cloud):
 
 
 class ResolvedExperiment(Experiment):
-    """An experiment with nothing left to look up."""
+    """An experiment with values in place of all names and defaults."""
 
     mission: Mission
     guard: ResolvedGuard
@@ -100,79 +95,78 @@ class ResolvedExperiment(Experiment):
 
     @property
     def uplink(self) -> Direction:
-        """World to cloud, complete."""
+        """All conditions from world to cloud."""
         return self.link.uplink
 
     @property
     def downlink(self) -> Direction:
-        """Cloud to world, complete."""
+        """All conditions from cloud to world."""
         return self.link.downlink
 
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _DIRECTIONS = ("uplink", "downlink")
 FILES: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
-"""Keys of a direction whose values are paths, and what reads them."""
+"""Key of a direction whose value is a path -> function that reads the file."""
 
 
 def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment whose cloud is to be flown: the plug-ins that it names are imported.
+    """Load an experiment to fly it; imports the plug-ins that it names.
 
     Args:
-        name: Of a shipped experiment, or the path of a file.
-        settings: `key=value` texts over it, in any order.
+        name: Name of a shipped experiment, or path of a file.
+        settings: `key=value` texts that override the file, in any order.
 
     Returns:
-        The experiment, complete and checked; paths in it are absolute.
+        The complete, checked experiment; its paths are absolute.
 
     Raises:
-        BadInputError: One line, or a summary and one line for each thing that is wrong.
+        BadInputError: One line, or a summary and one line for each problem.
     """
-    return _load_experiment(str(name), settings, parameters.resolve)
+    return _load_experiment(str(name), settings, overrides.resolve)
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment of which nothing is run, as whoever flies no cloud does.
+    """Load an experiment without its plug-ins, for a process that runs no cloud.
 
-    As `load_experiment`, but its plug-ins are left as it names them: neither imported nor checked,
-    and with those parameters alone that it gives. A run's own config.yaml gives all of them.
+    As `load_experiment`, but plug-ins are neither imported nor checked, and have only the
+    parameters that the file gives. The config.yaml of a run gives all of them.
     """
-    return _load_experiment(str(name), settings, parameters.leave)
+    return _load_experiment(str(name), settings, overrides.leave)
 
 
 def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
-    """Load a link profile by its name or path (relative to `folder`); raises BadInputError."""
+    """Load a link profile by name or path (relative to `folder`); raises BadInputError."""
     return _load_profile(str(name), folder or Path())[1]
 
 
 def check_profile(document: Document, name: str) -> Profile:
-    """Check a link profile that was put together in memory; raises BadInputError."""
+    """Check a link profile that was built in memory; raises BadInputError."""
     return _validate(document, Profile, name, _resolve_traces(document, ()))
 
 
 def load_mission(name: str | Path, folder: Path | None = None) -> Mission:
-    """Load a mission by its name or path (relative to `folder`); raises BadInputError.
+    """Load a mission by name or path (relative to `folder`); raises BadInputError.
 
-    Whether a scene lets it be flown is for `config.mission_check.check_mission` to say.
+    `config.mission_check.check_mission` checks it against a scene.
     """
     document = shipped.read("mission", str(name), folder or Path())
     return _validate(document, Mission, str(name), [])
 
 
 def dump(experiment: ResolvedExperiment) -> str:
-    """Write an experiment as YAML that loads to an equal one and needs no other configuration.
+    """Write an experiment as YAML that loads as an equal experiment without other files.
 
-    Traces and plug-ins that lie outside the package are named by their absolute paths; whoever
-    keeps the text may copy a trace beside it and name it relative to it.
+    Exceptions are traces and plug-ins outside the package: the text has their absolute paths.
     """
-    return yaml_text.write(experiment.model_dump(mode="json"))
+    return write_yaml(experiment.model_dump(mode="json"))
 
 
 def fingerprint(experiment: ResolvedExperiment) -> str:
-    """Hash all that an experiment sets: two with the same one are flown alike.
+    """Compute the hash of an experiment; experiments with equal hashes give equal flights.
 
     Returns:
-        SHA-256 of what `dump` writes, in hexadecimal digits.
+        SHA-256 of the text from `dump`, in hexadecimal digits.
     """
     return hashlib.sha256(dump(experiment).encode()).hexdigest()
 
@@ -183,17 +177,17 @@ def _load_experiment(
     document = shipped.read("experiment", name, Path())
     changes = overrides.parse(settings)
     _default(document, ("name",), Path(name).stem)
-    before = [change for change in changes if not change.inside_name]
-    if any(change.path in (("link",), ("link", "profile")) for change in before):
-        _forget_profile(document)
-    overrides.apply(document, before)
+    outer = [change for change in changes if not change.inside_name]
+    if any(change.path in (("link",), ("link", "profile")) for change in outer):
+        _remove_profile_values(document)
+    overrides.apply(document, outer)
     for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
     found = [*_inline_mission(document), *_inline_profile(document)]
     overrides.apply(document, [change for change in changes if change.inside_name])
-    for key in parameters.KINDS:
+    for key in overrides.KINDS:
         _default(document, ("cloud", key), Experiment().cloud.model_dump()[key])
-    parameters.locate_metrics(document)
+    overrides.locate_metrics(document)
     found += [*plug_ins(document), *_resolve_traces(document, ("link",))]
     found += _check_files(document)
     experiment = _validate(document, ResolvedExperiment, name, found)
@@ -212,12 +206,12 @@ def _load_profile(name: str, folder: Path) -> tuple[Document, Profile]:
 
 
 def _validate(document: Document, model: type[_Model], name: str, found: list[Problem]) -> _Model:
-    """Check a document against its model; raise with `found` and all that is wrong with it."""
+    """Check a document against its model; raise a BadInputError with `found` and new problems."""
     result = None
-    # What is resolved is still described as what a file may say: a mission has a name, too.
+    # Messages describe what a file may contain: in a file, a mission may be a name, too.
     file_model = Experiment if model is ResolvedExperiment else model
     try:
-        # YAML's values are JSON's: in its JSON mode pydantic takes lists for tuples, and is strict.
+        # In JSON mode pydantic accepts lists for tuples and is still strict.
         result = model.model_validate_json(json.dumps(document.tree))
     except ValidationError as error:
         known = {problem.path for problem in found}
@@ -231,13 +225,13 @@ def _validate(document: Document, model: type[_Model], name: str, found: list[Pr
     return result
 
 
-def _default(document: Document, path: yaml_text.KeyPath, value: Any) -> None:
+def _default(document: Document, path: KeyPath, value: Any) -> None:
     if document.get(*path) is None and isinstance(document.get(*path[:-1]), dict):
         document.graft(path, value, document.source(path))
 
 
 def _inline_mission(document: Document) -> list[Problem]:
-    """Put the mission's file in the place of its name."""
+    """Replace the mission's name by the contents of its file."""
     _default(document, ("mission",), Experiment().mission)
     name = document.tree["mission"]
     if not isinstance(name, str):
@@ -254,7 +248,7 @@ def _inline_mission(document: Document) -> list[Problem]:
 
 
 def _inline_profile(document: Document) -> list[Problem]:
-    """Put the profile under what the experiment itself says about the two directions."""
+    """Insert the profile's values where the experiment gives none for a direction."""
     _default(document, ("link", "profile"), Experiment().link.profile)
     name = document.get("link", "profile")
     given = {key: document.get("link", key) for key in _DIRECTIONS}
@@ -269,7 +263,7 @@ def _inline_profile(document: Document) -> list[Problem]:
         document.graft(("link", "profile"), str(source.absolute(name)), source)
     for key in _DIRECTIONS:
         if isinstance(given[key], dict | None):
-            _lay_under(document, ("link", key), file, key)
+            _fill_from(document, ("link", key), file, key)
     age_max = profile.command_age_max_ms or COMMAND_AGE_MAX_MS
     _default(document, ("guard", "command_age_max_ms"), age_max)
     _default(document, ("guard", "speed_max_mps"), speed_cap(_age_max(document)))
@@ -277,15 +271,15 @@ def _inline_profile(document: Document) -> list[Problem]:
 
 
 def _age_max(document: Document) -> float:
-    """The age that the guard allows [ms]; what cannot be one is refused later, and alone."""
+    """Return the guard's age limit [ms], or the default if the value will be refused later."""
     age_max = document.get("guard", "command_age_max_ms")
     least, largest = COMMAND_AGE_MS
-    usable = type(age_max) in (int, float) and least <= age_max <= largest  # true is no number
+    usable = type(age_max) in (int, float) and least <= age_max <= largest  # excludes true
     return age_max if usable else COMMAND_AGE_MAX_MS
 
 
-def _lay_under(document: Document, path: yaml_text.KeyPath, file: Document, key: str) -> None:
-    """Fill what is not given at `path` from `key` of another file."""
+def _fill_from(document: Document, path: KeyPath, file: Document, key: str) -> None:
+    """Fill missing keys at `path` from `key` of another file."""
     _default(document, path, {})
     given = document.get(*path)
     for name, value in (file.get(key) or {}).items():
@@ -298,8 +292,8 @@ def _lay_under(document: Document, path: yaml_text.KeyPath, file: Document, key:
             }
 
 
-def _forget_profile(document: Document) -> None:
-    """Undo in a resolved file what its profile gave, before another profile takes its place."""
+def _remove_profile_values(document: Document) -> None:
+    """Remove the profile's values from a resolved file, before another profile replaces it."""
     link, guard = document.get("link"), document.get("guard")
     if not isinstance(link, dict):
         return
@@ -310,7 +304,7 @@ def _forget_profile(document: Document) -> None:
     try:
         age_max = load_profile(str(link.get("profile"))).command_age_max_ms
     except BadInputError:
-        age_max = None  # the label of a profile that is gone
+        age_max = None  # the profile's file no longer exists
     age_max = age_max or COMMAND_AGE_MAX_MS
     if isinstance(guard, dict):
         for key, implied in (
@@ -321,8 +315,8 @@ def _forget_profile(document: Document) -> None:
                 del guard[key]
 
 
-def _resolve_traces(document: Document, above: yaml_text.KeyPath) -> list[Problem]:
-    """Make the paths of traces and tables absolute, and read them to see whether they can be."""
+def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
+    """Make the paths of traces and tables absolute; check that the files can be read."""
     found = []
     for path in ((*above, key, name) for key in _DIRECTIONS for name in FILES):
         given = document.get(*path)
@@ -339,7 +333,7 @@ def _resolve_traces(document: Document, above: yaml_text.KeyPath) -> list[Proble
 
 
 def _check_files(document: Document) -> list[Problem]:
-    """Check that robot and scene are files that ship."""
+    """Check that robot and scene are shipped files."""
     found = []
     for key in ("robot", "scene"):
         name = document.get("world", key)

@@ -1,9 +1,9 @@
-"""Whether a mission can be flown: mission and scene go in, what is wrong comes out.
+"""Check whether a mission can be flown in a scene.
 
-Checked are the fence and, with the base's box and the arm, the walls of the pipes, and that no
-straight way from one waypoint to the next leads through a wall. The board is
-exempt: the paper's last waypoint lies behind it. The rotors are too: they have no say in where the
-base can be asked to go, only in how near the flight comes, which the metrics judge.
+Each waypoint must be inside the fence, the base's box and the arm must be clear of the pipes'
+walls, and no straight way between waypoints may cross a wall. The board is not checked: the
+paper's last waypoint is behind it. The rotors are not checked either: the metrics report how close
+a flight comes.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 
 _YAW = "the onboard controller holds yaw at 0, as the published one does; leave it out"
-_REPORTED = 20  # a mission in wrong units is wrong everywhere: enough is enough
+_REPORTED = 20
+"""Largest number of problems of one kind that are listed."""
 
 
 def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
-    """List what makes a mission impossible in a scene.
+    """List the problems of a mission in a scene.
 
     Args:
         mission: Waypoints or steps.
-        scene: Where it is to be flown.
+        scene: The scene to fly in.
 
     Returns:
-        Problems, their paths below the mission; none if it can be flown.
+        Problems with paths relative to the mission; empty if it can be flown.
     """
     count = len(mission.waypoints)
     if mission.steps is not None:
@@ -46,7 +47,7 @@ def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
     if count == 0:
         return [Problem(("waypoints",), "", "none given; give at least one, or steps")]
     if count > MAX_WAYPOINTS:
-        reason = f"at most {MAX_WAYPOINTS}; split the mission"
+        reason = f"must be at most {MAX_WAYPOINTS}; split the mission"
         return [Problem(("waypoints",), str(count), reason)]
     return _check_waypoints(mission, scene)
 
@@ -79,7 +80,7 @@ def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
 
 
 def _check_ways(positions: Array, scene: Scene) -> list[Problem]:
-    """Each straight way between waypoints that can be flown to [m], shape (n, 3)."""
+    """List the straight ways between waypoints [m], shape (n, 3), that cross a wall."""
     through = crossed_pipe(scene, positions[:-1], positions[1:])
     problems = []
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
@@ -87,7 +88,7 @@ def _check_ways(positions: Array, scene: Scene) -> list[Problem]:
         name = scene.pipes[through[index]].name
         reason = (
             f"the straight way there from waypoint {index} leads through the wall of {name}; "
-            "go round it, or through the bore, by waypoints in between"
+            "add waypoints in between that lead around it or through the pipe"
         )
         path = ("waypoints", str(index + 1), "position_m")
         problems.append(Problem(path, _point((x, y, z)), reason))
@@ -98,7 +99,7 @@ def _check_steps(steps: Steps, scene: Scene) -> list[Problem]:
     centre, reach = np.array(steps.centre_m), np.array(steps.range_m)
     axis = np.linspace(-1, 1, 9)
     box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    with np.errstate(over="ignore"):  # a point at infinity is beyond the fence too
+    with np.errstate(over="ignore"):  # infinity is beyond the fence
         positions = centre + box * reach
     if outside_fence(positions).any():
         reason = f"steps reach beyond the fence, {_fence_in_words()}; choose a smaller range_m"

@@ -1,10 +1,11 @@
-"""`--set key=value`: single values put over those of a file, before anything is checked.
+"""Apply `--set key=value` to a document, and complete the parameters of plug-ins.
 
-Shorter keys are set first, so that `mission=steps` and `mission.steps.count=3` may come in any
-order. A key below a name opens it: `cloud.controller.speed_max=2` turns `pid` into
-`{name: pid, speed_max: 2}`. One index above the last appends to a list.
+Shorter keys are set first, so the order of `mission=steps` and `mission.steps.count=3` does not
+matter. A key below a name turns the name into a mapping: `cloud.controller.speed_max=2` turns `pid`
+into `{name: pid, speed_max: 2}`. The index after the last appends to a list.
 
-Parameters of plug-ins: what the file says is checked against `build` and completed from it.
+Parameters of a plug-in are checked against the signature of its `build`, which also gives their
+defaults.
 """
 
 from __future__ import annotations
@@ -20,15 +21,18 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from cloudrc import plugins
-from cloudrc.config import document as yaml_text
 from cloudrc.config import problems
-from cloudrc.config.document import SETTING, Document, Source
+from cloudrc.config.document import SETTING, Document, KeyPath, Source
+from cloudrc.config.document import parse as parse_yaml
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Direction, Experiment, PlugIn
 from cloudrc.errors import BadInputError
 
 _PLUGINS = {("cloud", key) for key in ("estimator", "predictor", "controller")}
 _DIRECTIONS = (("link", "uplink"), ("link", "downlink"))
+_DEFAULTS = Experiment().model_dump(mode="json")
+KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
+"""Key under `cloud` -> kind of plug-in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +40,16 @@ class Override:
     """One value to set.
 
     Attributes:
-        path: Keys down to it.
-        value: As YAML reads it.
+        path: Keys down to the value.
+        value: The value as parsed from YAML.
     """
 
-    path: yaml_text.KeyPath
+    path: KeyPath
     value: Any
 
     @property
     def inside_name(self) -> bool:
-        """Whether it lies inside of what a file can give by name: the mission, the profile."""
+        """Whether the key is inside a part that a file may give by name: mission or profile."""
         inside_mission = self.path[0] == "mission" and len(self.path) > 1
         return inside_mission or (self.path[:2] in _DIRECTIONS and len(self.path) > 2)
 
@@ -54,7 +58,7 @@ def parse(texts: Iterable[str]) -> list[Override]:
     """Read `key=value` texts, values as YAML; shorter keys come first.
 
     Raises:
-        BadInputError: If one has no key or no `=`, or its value is not YAML.
+        BadInputError: If a text has no key or no `=`, or its value is not YAML.
     """
     result = []
     for text in texts:
@@ -64,7 +68,7 @@ def parse(texts: Iterable[str]) -> list[Override]:
             raise BadInputError(
                 f"{SETTING} {text}: must be key=value; for example cloud.predictor=last_sample"
             )
-        result.append(Override(path, yaml_text.parse(value, f"{SETTING} {key}")[0]))
+        result.append(Override(path, parse_yaml(value, f"{SETTING} {key}")[0]))
     return sorted(result, key=lambda override: len(override.path))
 
 
@@ -72,25 +76,25 @@ def apply(document: Document, overrides: Iterable[Override]) -> None:
     """Set values in a document.
 
     Args:
-        document: Of an experiment; changed in place.
-        overrides: What to set; relative paths in them are relative to the working folder.
+        document: An experiment; changed in place.
+        overrides: The values; relative paths in them start at the working folder.
 
     Raises:
-        BadInputError: If an index points behind a list's end, or is none.
+        BadInputError: If an index is not a number or beyond the end of its list.
     """
     for override in overrides:
-        _open(document, override.path)
+        _make_parents(document, override.path)
         value = copy.deepcopy(override.value)
         document.graft(override.path, value, Source(SETTING, Path.cwd()))
 
 
 def is_spelled_out(direction: Any) -> bool:
-    """Say whether a direction has every key: then a resolved file wrote it, not a person."""
+    """Whether a direction has every key, as in a resolved file."""
     return isinstance(direction, dict) and direction.keys() >= Direction.model_fields.keys()
 
 
-def _open(document: Document, path: yaml_text.KeyPath) -> None:
-    """Make the containers above `path`, from the schema's defaults where there are some."""
+def _make_parents(document: Document, path: KeyPath) -> None:
+    """Create missing containers above `path`, with the schema's defaults if it has any."""
     node: Any = document.tree
     default: Any = _DEFAULTS
     for depth, key in enumerate(path):
@@ -109,15 +113,15 @@ def _open(document: Document, path: yaml_text.KeyPath) -> None:
         node = _put(node, key, child)
 
 
-def _check_index(node: Any, path: yaml_text.KeyPath, depth: int) -> None:
+def _check_index(node: Any, path: KeyPath, depth: int) -> None:
     key = path[depth]
     if not isinstance(node, list):
         return
     if not key.isdecimal() or int(key) > len(node):
-        above = ".".join(path[:depth])
-        have = f"0 to {len(node) - 1}" if node else "none yet"
+        parent = ".".join(path[:depth])
+        entries = f"entries 0 to {len(node) - 1}" if node else "no entries"
         raise BadInputError(
-            f"{SETTING}: {above}.{key}: {above} is a list with entries {have}; "
+            f"{SETTING}: {parent}.{key}: {parent} is a list with {entries}; "
             f"use one of these, or {len(node)} to append"
         )
     if int(key) == len(node):
@@ -137,21 +141,14 @@ def _put(node: Any, key: str, child: Any) -> Any:
     return child
 
 
-_DEFAULTS = Experiment().model_dump(mode="json")
-
-
-KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
-"""Key under `cloud` -> kind of plug-in."""
-
-
 def resolve(document: Document) -> list[Problem]:
-    """Turn every plug-in of an experiment into a mapping with its name and all its parameters.
+    """Replace each plug-in of an experiment by a mapping with its name and all its parameters.
 
     Args:
-        document: Of an experiment, its `cloud.*` names or mappings; changed in place.
+        document: An experiment; changed in place.
 
     Returns:
-        What is wrong with names and parameters; those of a wrong form are left to the schema.
+        Problems of names and parameters; the schema finds values of a wrong type.
     """
     found: list[Problem] = []
     for key, name, parameters in _choices(document):
@@ -163,15 +160,15 @@ def resolve(document: Document) -> list[Problem]:
         except BadInputError as error:
             found.append(Problem(path, "", str(error)))
         else:
-            # Completed in place: what was given keeps the line it was written in.
+            # Not by `graft`: the given parameters keep their places in the file.
             document.tree["cloud"][key] = {"name": name, **complete}
     return found
 
 
 def leave(document: Document) -> list[Problem]:
-    """Turn every plug-in into a mapping as `resolve` does, but with what is given alone.
+    """Replace each plug-in by a mapping as `resolve` does, with the given parameters only.
 
-    Nothing is imported: the file may be somebody else's, and so may be what it names.
+    Nothing is imported: file and plug-ins may come from somebody else.
     """
     for key, name, parameters in _choices(document):
         document.tree["cloud"][key] = {"name": name, **parameters}
@@ -179,11 +176,11 @@ def leave(document: Document) -> list[Problem]:
 
 
 def locate_metrics(document: Document) -> None:
-    """Make the paths of the user's metrics absolute, and one name a list; nothing is imported."""
+    """Make the paths of the user's metrics absolute, and a single name a list; import nothing."""
     names = document.get("report", "metrics")
     names = [names] if isinstance(names, str) else names
     if not isinstance(names, list):
-        return  # missing, or left to the schema
+        return  # missing, or refused by the schema later
     document.tree["report"]["metrics"] = names
     for index, name in enumerate(names):
         if isinstance(name, str) and plugins.is_path(name):
@@ -192,18 +189,18 @@ def locate_metrics(document: Document) -> None:
 
 
 def build(kind: str, choice: PlugIn) -> Any:
-    """Build the plug-in that a resolved experiment names, with the types that its `build` asks for.
+    """Build a plug-in of a resolved experiment; converts parameters to the types of its `build`.
 
     Args:
         kind: One of `cloudrc.plugins.PACKAGES`.
-        choice: Name and parameters, as `load_experiment` leaves them.
+        choice: Name and parameters from `load_experiment`.
     """
     checked = _check(kind, choice.name, choice.model_extra or {})
     return plugins.load(kind, choice.name, **_values(checked))
 
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
-    """Make a model of a plug-in's parameters from the signature of its `build`."""
+    """Create a model of a plug-in's parameters from the signature of its `build`."""
     fields: dict[str, Any] = {}
     for parameter in plugins.signature(kind, name).parameters.values():
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
@@ -221,7 +218,7 @@ def parameter_model(kind: str, name: str) -> type[BaseModel]:
 
 
 def _choices(document: Document) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Give key, name and parameters of every plug-in that is named; the name of a file absolute."""
+    """Yield key, name and parameters of each plug-in; a path as name becomes absolute."""
     for key in KINDS:
         path = ("cloud", key)
         choice = document.get(*path)
@@ -236,7 +233,7 @@ def _choices(document: Document) -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 def _complete(kind: str, name: str, parameters: dict[str, Any]) -> dict[str, Any]:
     checked = _check(kind, name, parameters)
-    # Built once here, so that what only build() can refuse is refused with the file's other errors.
+    # Built here once, so that an error of build() is listed with the file's other problems.
     plugins.load(kind, name, **_values(checked))
     return checked.model_dump(mode="json")
 

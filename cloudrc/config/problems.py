@@ -1,6 +1,6 @@
-"""What is wrong with a configuration, in words: pydantic's errors in, one line for each out.
+"""Describe the problems of a configuration: one line each, with place, reason and remedy.
 
-What a key may hold: the schema goes in, words with type, range, unit and neighbours come out.
+The schema gives the words: a key's type, range and unit, and the known key nearest to a typo.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
 
 
 def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPath, FieldInfo]]:
-    """List all keys that hold no further keys, with their fields; index 0 stands for any."""
+    """List all keys without keys below them, with their fields; index 0 stands for any index."""
     for key, info in model.model_fields.items():
         inner = list(_models(info.annotation))
         many = ("0",) if _is_list(info.annotation) else ()
@@ -42,7 +42,7 @@ def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPat
 
 
 def field_at(model: type[BaseModel], path: KeyPath) -> FieldInfo | None:
-    """Give the field that the last key of `path` names; None if there is none."""
+    """Find the field of the last key of `path`; None if there is none."""
     field = None
     models = [model]
     for key in path:
@@ -57,7 +57,7 @@ def field_at(model: type[BaseModel], path: KeyPath) -> FieldInfo | None:
 
 
 def expectation(model: type[BaseModel], path: KeyPath) -> str:
-    """Say what the value at `path` must be: "must be a number >= 0 [ms]"."""
+    """Describe what the value at `path` must be: "must be a number >= 0 [ms]"."""
     field = field_at(model, path)
     if field is None:
         return "is not valid"
@@ -70,12 +70,12 @@ def expectation(model: type[BaseModel], path: KeyPath) -> str:
     if any(_models(field.annotation)):
         words.append("a mapping of keys")
     if _is_list(field.annotation) and not inside_list:
-        words = [_list_in_words(field.annotation)]
+        words = [_describe_list(field.annotation)]
     return " ".join(["must be", " or ".join(words), _unit(field)]).strip()
 
 
 def nearest_key(model: type[BaseModel], path: KeyPath) -> str:
-    """Say which known key an unknown one may have been meant for."""
+    """Suggest a known key in place of an unknown one."""
     *above, key = path
     siblings = _keys_at(model, tuple(above))
     near = _near(key, siblings)
@@ -87,21 +87,21 @@ def nearest_key(model: type[BaseModel], path: KeyPath) -> str:
     near = _near(key, list(everywhere))
     if near:
         return f"did you mean {everywhere[near]}?"
-    return f"known here: {', '.join(siblings)}" if siblings else "no key is known here"
+    return f"known here: {', '.join(siblings)}" if siblings else "no keys are known here"
 
 
 def nearest_choice(detail: ErrorDetails) -> str:
-    """Say which of the allowed words a wrong one may have been meant for."""
+    """List the allowed words, and suggest the one nearest to a wrong word."""
     expected = detail["ctx"]["expected"]
     near = _near(str(detail["input"]), re.findall(r"'([^']*)'", expected))
     return f"must be {expected}" + (f"; did you mean {near}?" if near else "")
 
 
 def _near(key: str, known: list[str]) -> str | None:
-    # `delay` means `delay_ms`: units are forgotten more often than letters are swapped.
-    begun = [name for name in known if name.startswith(f"{key}_")]
+    # `delay` is nearest to `delay_ms`: a forgotten unit is more likely than a typo.
+    without_unit = [name for name in known if name.startswith(f"{key}_")]
     close = difflib.get_close_matches(key, known, n=1)
-    return next(iter(begun or close), None)
+    return next(iter(without_unit or close), None)
 
 
 def _keys_at(model: type[BaseModel], path: KeyPath) -> list[str]:
@@ -111,7 +111,7 @@ def _keys_at(model: type[BaseModel], path: KeyPath) -> list[str]:
 
 
 def _types(annotation: Any) -> Iterator[Any]:
-    """List the plain types, models and literals in an annotation, aliases and unions opened."""
+    """List the plain types and models in an annotation, inside aliases and unions, too."""
     if get_origin(annotation) is Literal:
         return
     arguments = [argument for argument in get_args(annotation) if argument is not Ellipsis]
@@ -135,7 +135,7 @@ def _is_list(annotation: Any) -> bool:
     )
 
 
-def _list_in_words(annotation: Any) -> str:
+def _describe_list(annotation: Any) -> str:
     size = len(get_args(annotation)) if get_origin(annotation) is tuple else 0
     numbers = " numbers" if float in _types(annotation) else ""
     fixed = size and Ellipsis not in get_args(annotation)
@@ -163,21 +163,22 @@ def _limits(part: Any) -> Iterator[str]:
 
 
 def _unit(field: FieldInfo) -> str:
-    found = re.search(r"\[[^\],]+\]$|\[[^\],]+\](?=[,; ])", field.description or "")
+    found = re.search(r"\[[^\],]+\]$|\[[^\],]+\](?=[,;. ])", field.description or "")
     return found.group() if found else ""
 
 
-_LISTED = 50  # a mission of thousands of points in wrong units is wrong thousands of times
+_LISTED = 50
+"""Largest number of problems that are listed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong.
+    """One problem of a configuration.
 
     Attributes:
         path: Keys down to the value.
-        value: The value in words; empty if it is not there.
-        reason: What it must be, and what to do.
+        value: The value in words; empty if there is none.
+        reason: What the value must be, and what to do.
     """
 
     path: KeyPath
@@ -191,21 +192,21 @@ class Problem:
 def from_pydantic(
     error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
 ) -> list[Problem]:
-    """Put pydantic's errors into words.
+    """Convert pydantic's errors to problems.
 
     Args:
-        error: As raised by `model`.
-        model: Whose keys, ranges and units are named.
-        prefix: Keys above the model's own.
-        limit: How many problems are put into words; None for all.
+        error: The error that `model` raised.
+        model: The model with keys, ranges and units.
+        prefix: Keys above those of the model.
+        limit: Largest number of problems; None for all.
     """
     details = error.errors(include_url=False)[:limit]
     return [_problem(detail, model, prefix) for detail in details]
 
 
 def refuse(document: Document, problems: Iterable[Problem], name: str) -> None:
-    """Raise a BadInputError that lists all problems, each with its place; none raises nothing."""
-    every = _finest(problems)
+    """Raise a BadInputError that lists all problems with their places; do nothing without any."""
+    every = _deepest(problems)
     lines = [f"{document.source(problem.path).label}: {problem}" for problem in every[:_LISTED]]
     if len(every) == 1:
         raise BadInputError(lines[0])
@@ -215,10 +216,10 @@ def refuse(document: Document, problems: Iterable[Problem], name: str) -> None:
         raise BadInputError("\n  ".join([f"{name} has {len(every)} problems:", *lines]))
 
 
-def _finest(problems: Iterable[Problem]) -> list[Problem]:
-    """Leave out what follows from another problem: a value is wrong where a part of it is.
+def _deepest(problems: Iterable[Problem]) -> list[Problem]:
+    """Drop the problem of a value if a part of the value has a problem, too.
 
-    A plug-in that lacks a parameter, say, stays a name, and the schema asks for what it would be.
+    For example, a plug-in that lacks a parameter stays a name, which the schema then refuses.
     """
     every = list(problems)
     above = {problem.path[:n] for problem in every for n in range(1, len(problem.path))}
@@ -226,7 +227,7 @@ def _finest(problems: Iterable[Problem]) -> list[Problem]:
 
 
 def in_words(value: Any) -> str:
-    """Show a value from a file, shortened."""
+    """Describe a value from a file, shortened."""
     if isinstance(value, dict):
         return "a mapping"
     if isinstance(value, list | tuple):
@@ -240,7 +241,7 @@ def in_words(value: Any) -> str:
 def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> Problem:
     kind, value = detail["type"], in_words(detail["input"])
     keys = tuple(map(str, detail["loc"]))
-    # Names of a union's members are tagged with <>: they are no keys. What nobody knows is one.
+    # A union's members have tags such as <name>, which are not keys; an unknown key is kept as is.
     unknown = keys[-1:] if kind == "extra_forbidden" else ()
     known = keys[: len(keys) - len(unknown)]
     path = tuple(key for key in known if not key.startswith("<")) + unknown
@@ -252,7 +253,9 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> P
     if kind == "value_error":
         return Problem(prefix + path, "", str(detail["ctx"]["error"]))
     if kind == "too_long":
-        return Problem(prefix + path, "", f"at most {detail['ctx']['max_length']} entries")
+        return Problem(
+            prefix + path, "", f"must have at most {detail['ctx']['max_length']} entries"
+        )
     if kind == "string_too_long":
         longest = detail["ctx"]["max_length"]
         return Problem(prefix + path, value, f"must be text of at most {longest} characters")

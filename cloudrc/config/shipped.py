@@ -1,4 +1,4 @@
-"""Where configuration files are: a name or a path goes in, the file's document comes out."""
+"""Find configuration files by name or path, and read them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FOLDERS = {
     "scene": _PACKAGE / "world" / "scenes",
     "robot": _PACKAGE / "world" / "robots",
 }
-"""Kind of file -> where those lie that ship."""
+"""Kind of file -> folder of the shipped files."""
 
 
 def names(kind: str) -> list[str]:
@@ -27,7 +27,7 @@ def names(kind: str) -> list[str]:
 
 
 def describe(kind: str, name: str) -> str:
-    """Give the first line of a shipped YAML file's `description`."""
+    """Return the first line of a shipped YAML file's `description`."""
     text = read(kind, name, Path()).tree.get("description", "")
     return str(text).strip().partition("\n")[0]
 
@@ -37,16 +37,16 @@ def read(kind: str, name: str, folder: Path) -> Document:
 
     Args:
         kind: "experiment", "mission" or "profile".
-        name: Of a shipped file; or a path, if there is a slash or `.yaml` in it.
-        folder: What a relative path is relative to.
+        name: Name of a shipped file, or a path: it contains a slash or ends with `.yaml`.
+        folder: Folder at which a relative path starts.
 
     Raises:
         BadInputError: If there is no such file, or it cannot be read.
     """
     if is_path(name):
         path = folder / os.path.expanduser(name)
-        if not os.path.exists(path):  # which says no to a name that no file can have
-            raise BadInputError(f"no such file: {path}; {_shipped_instead(kind, path.stem)}")
+        if not os.path.exists(path):  # False, not an exception, for an impossible name
+            raise BadInputError(f"no such file: {path}; {_shipped_names(kind, path.stem)}")
         return document.read(path, name)
     check_name(kind, name)
     return document.read(FOLDERS[kind] / f"{name}.yaml", f"{name}.yaml")
@@ -59,13 +59,12 @@ def check_name(kind: str, name: str) -> None:
         raise BadInputError(unknown(kind, name, available))
 
 
-def _shipped_instead(kind: str, name: str) -> str:
-    """Say how the shipped files are named, to one who gave a path that leads nowhere."""
+def _shipped_names(kind: str, name: str) -> str:
+    """List the shipped files in words, and the one whose name is nearest to `name`."""
     available = names(kind)
-    there = ", ".join(available)
-    return f"shipped {kind}s go by their names: {there}{meant(name, available)}"
+    return f"names of shipped {kind}s: {', '.join(available)}{meant(name, available)}"
 
 
 def is_path(name: str) -> bool:
-    """Say whether a name means a file outside the package."""
+    """Whether a name is the path of a file outside the package."""
     return "/" in name or "\\" in name or name.endswith((".yaml", ".yml"))

@@ -125,7 +125,7 @@ def test_the_experiment_has_the_files_that_it_names_and_no_others() -> None:
         ({"link": {"profile": "wify"}}, "link.profile: no profile 'wify' ships.*choose one of 5g"),
         (
             {"experiment": {"link": {"profile": "./mine.yaml"}}},
-            "experiment.link.profile: no profile './mine.yaml'.*write it out under link.profile",
+            "experiment.link.profile: no profile './mine.yaml'.*write the profile under link.profile",
         ),
         ({"mission": {"enabled": True, "plan": "pipe"}}, "no mission 'pipe'.*one of hover, pipes"),
     ],
@@ -175,7 +175,7 @@ def test_the_profile_is_a_directory_of_its_own() -> None:
             {"experiment": {"mission": "nonsense"}},
             "experiment.mission: no mission 'nonsense' .*pipe",
         ),
-        ({"experiment": {"mission": "./mine.yaml"}}, "experiment.mission: .*write it out there"),
+        ({"experiment": {"mission": "./mine.yaml"}}, "experiment.mission: .*write the mission there"),
         ({"experiment": {"cloud": {"predictor": "./my.py"}}}, r"cloud.predictor: '\./my.py' is a"),
         (
             {"experiment": {"cloud": {"controller": {"name": "a/b.py"}}}},
@@ -184,14 +184,14 @@ def test_the_profile_is_a_directory_of_its_own() -> None:
         *(
             (
                 {"link": {"profile": {"downlink": {key: "t.csv"}}}},
-                f"link.profile: downlink.{key} names 't.csv', and link.traces has no such",
+                f"link.profile: downlink.{key} names 't.csv', but link.traces has no such",
             )
             for key in FILES
         ),
         *(
             (
                 {"link": {"profile": over}, "experiment": {"link": {"uplink": {key: "/my/t.csv"}}}},
-                f"experiment.link: uplink.{key} names '/my/t.csv', and link.traces has no",
+                f"experiment.link: uplink.{key} names '/my/t.csv', but link.traces has no",
             )
             for key in FILES
             for over in ("wifi", None)

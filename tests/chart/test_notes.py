@@ -71,7 +71,7 @@ def test_a_slow_profile_asks_for_its_command_age(values: Object, warns: bool) ->
 
 
 def test_open_networks_and_closed_metrics_are_told() -> None:
-    assert "Nobody may scrape" in notes()
+    assert "No Prometheus may scrape" in notes()
     admitted = {"metrics": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]}}
-    assert "Nobody may scrape" not in notes(admitted)
+    assert "No Prometheus may scrape" not in notes(admitted)
     assert "WARNING: networkPolicy.enabled is false" in notes({"networkPolicy": {"enabled": False}})

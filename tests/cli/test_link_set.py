@@ -50,7 +50,7 @@ def test_the_time_line_does_not_change_a_value_set_by_hand() -> None:
         {"at_s": 9.0, "jitter_ms": 20.0},
         {"at_s": 12.0, "loss": 0.1},
     ]
-    assert made.notes == ["the downlink's time line does not change delay_ms any more"]
+    assert made.notes == ["the time line of the downlink no longer changes delay_ms"]
     assert not made.restart, "blackouts and the other values go on when they were due"
 
 
@@ -60,7 +60,7 @@ def test_a_delay_by_hand_ends_a_trace(tmp_path: Path) -> None:
     before = Document({"uplink": {"trace": str(trace)}})
     made = edit(before, None, ["uplink.delay_ms=20"])
     assert made.values == {"uplink": {"delay_ms": 20.0}}
-    assert made.notes == ["the uplink does not follow its trace any more"]
+    assert made.notes == ["the uplink no longer follows its trace"]
 
 
 def test_a_profile_takes_the_old_ones_place_and_begins_anew() -> None:
@@ -76,8 +76,8 @@ def test_a_profile_takes_the_old_ones_place_and_begins_anew() -> None:
     ("profile", "settings", "words"),
     [
         (None, [], "nothing to set"),
-        (None, ["delay_ms=3"], "delay_ms: give a value of uplink or downlink"),
-        (None, ["uplink=3"], "uplink: give a value of uplink or downlink"),
+        (None, ["delay_ms=3"], "delay_ms: set a key of uplink or downlink"),
+        (None, ["uplink=3"], "uplink: set a key of uplink or downlink"),
         (None, ["uplink.delay=3"], "delay_ms"),
         (None, ["uplink.loss=1.5"], "link set: uplink.loss: 1.5"),
         ("nowhere", [], "nowhere"),

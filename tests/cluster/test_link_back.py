@@ -33,8 +33,8 @@ def test_what_one_direction_refuses_the_other_does_not_keep(
     cluster.make("cannot", "cloud-1", "corrupt")
     assert set_link("downlink.corrupt=0.5", "uplink.delay_ms=9") == 2
     assert error(capsys) == (
-        "cloudrc: error: the downlink is as it was: netem cannot do that; the uplink had taken the "
-        "change, and has its old profile back"
+        "cloudrc: error: the downlink is as it was: netem cannot do that; the uplink had the "
+        "change for a moment and has its old profile again"
     )
     assert not cluster.kept(), "it does not last either"
     for pod in ("world-1", "cloud-1"):  # what is refused must not be found by a restart
@@ -78,7 +78,7 @@ def test_the_old_profile_comes_back_with_its_traces_and_begins_anew(
     cluster.tell()
     cluster.make("cannot", "cloud-1", "reorder")
     assert set_link("--profile", "wifi", "downlink.reorder=0.1") == 2
-    assert error(capsys).endswith("has its old profile back, its time line begins anew")
+    assert error(capsys).endswith("has its old profile again; its time line starts again")
     back = cluster.handed("world-1")[-1]
     assert back["files"] == {"profile.yaml": old, "t.csv": TRACE}
     assert json.loads(back["change"])["restart"], "the one that was under way is over"
@@ -92,7 +92,10 @@ def test_what_cannot_be_taken_back_is_said_with_the_command_that_does_it(
     cluster.make("broken", "world-1", "1")
     assert set_link("downlink.corrupt=0.5", "uplink.delay_ms=9") == 2
     said, _, command = error(capsys).rpartition(": ")
-    assert "the uplink (pod world-1) keeps the change, as it could not be taken back: " in said
+    assert (
+        "the uplink (pod world-1) keeps the change, because the old profile could not be restored: "
+        in said
+    )
     assert "the pod is gone" in said
     assert command == (
         "cloudrc link set uplink.keep_order=false --release=cloudrc --namespace=demo"
@@ -117,7 +120,7 @@ def test_a_pod_that_is_not_reached_keeps_nobody_on_half_a_change(
         cluster.refuse("patch", "Error from server (Forbidden): this is forbidden")
     assert set_link("downlink.delay_ms=120") == 5
     said = error(capsys)
-    assert ("has its old profile back" in said) is not refused
+    assert ("has its old profile again" in said) is not refused
     assert "the downlink (pod cloud-1) may have the change" in said
     assert not cluster.kept()
     assert cluster.handed("world-1")[-1]["files"] == {"profile.yaml": PROFILE}
@@ -130,8 +133,8 @@ def test_a_container_that_does_not_take_it_over_was_waited_for(
     assert set_link("downlink.delay_ms=120") == 4
     assert error(capsys) == (
         "cloudrc: error: the downlink did not take the change over within 5 s; see the logs of the "
-        "link containers; the uplink had taken the change, and has its old profile back; the "
-        "downlink (pod cloud-1) finds its old profile once it moves again"
+        "link containers; the uplink had the change for a moment and has its old profile again; "
+        "the downlink (pod cloud-1) gets its old profile when it responds"
     )
     assert cluster.handed("cloud-1")[-1]["files"] == {"profile.yaml": PROFILE}
     assert not cluster.kept()

@@ -65,7 +65,7 @@ def test_what_was_cut_off_on_its_way_is_not_handed_over(tmp_path: Path) -> None:
     tell(tmp_path, change="a1")
     running = start(tmp_path)
     _, err = running.communicate(DOCUMENT[:-1])
-    assert (running.returncode, err) == (2, "error: the change did not arrive whole;\n")
+    assert (running.returncode, err) == (2, "error: the change arrived incomplete;\n")
     assert os.listdir(tmp_path) == [STATE_FILE]
 
 
@@ -73,5 +73,5 @@ def test_what_was_cut_off_on_its_way_is_not_handed_over(tmp_path: Path) -> None:
 def test_nothing_happens_where_no_link_is(tmp_path: Path, folder: str) -> None:
     running = start(tmp_path / folder)
     _, err = running.communicate("")
-    assert (running.returncode, err) == (2, "error: no link is shaped here;\n")
+    assert (running.returncode, err) == (2, "error: no link runs here;\n")
     assert os.listdir(tmp_path) == []

@@ -79,8 +79,8 @@ def test_a_trace_that_is_too_long_for_a_config_map_is_refused(
 @pytest.mark.parametrize(
     ("verb", "beside"),
     [
-        ("patch", "the link changes, until its pods are replaced"),
-        ("exec", "the ConfigMap has the change, and the pods follow it within 2 minutes"),
+        ("patch", "the change is in force until the pods are replaced"),
+        ("exec", "the ConfigMap has the change, and the pods apply it within 2 minutes"),
     ],
 )
 def test_where_only_a_part_is_allowed_it_is_said_what_holds(
@@ -100,8 +100,8 @@ def test_a_container_of_another_version_is_said(
     (cluster.folder / "state-cloud-1.json").write_text("{}")
     assert main(["link", "set", "downlink.delay_ms=120", "-n", "demo"]) == 5
     (line,) = capsys.readouterr().err.splitlines()
-    assert "a link container is of another version: not the state of a link" in line
-    assert "the uplink had taken the change, and has its old profile back" in line
+    assert "a link container has another version: not the state of a link" in line
+    assert "the uplink had the change for a moment and has its old profile again" in line
     assert not cluster.kept()
 
 

@@ -25,7 +25,9 @@ def test_a_missing_program_is_named_with_where_to_get_it(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(MissingPrerequisiteError, match=f"{name} is not installed; get it: http"):
+    with pytest.raises(
+        MissingPrerequisiteError, match=f"{name} is not installed; install it: http"
+    ):
         tools.run(name, ["version"], timeout=1.0)
 
 
@@ -40,7 +42,7 @@ def test_a_program_that_hangs_is_ended(pretend: Pretend) -> None:
     [
         ("W1120 06:00 warnings.go:70] beware\nError: UPGRADE FAILED: no\n  - way", "no - way"),
         ("error: context is missing", "'helm upgrade' failed: context is missing"),
-        ("", "it left no message"),
+        ("", "no error message"),
     ],
 )
 def test_what_a_program_complains_about_becomes_one_line(
@@ -109,7 +111,7 @@ def test_a_way_to_a_port_is_open_while_the_block_lasts(
 def test_a_way_that_does_not_open_is_told(release: Release, pretend: Pretend) -> None:
     pretend("kubectl", "echo 'error: unable to forward port: pod is gone' >&2; exit 1")
     with (
-        pytest.raises(ClusterError, match=r"no way to pod 'cloud-1'.*pod is gone"),
+        pytest.raises(ClusterError, match=r"cannot forward ports of pod 'cloud-1'.*pod is gone"),
         pods.forwarded(release, "cloud-1", [8080]),
     ):
         pytest.fail("there is no way")
@@ -122,7 +124,7 @@ def test_a_way_that_takes_for_ever_is_given_up(
     pretend("kubectl", "exec sleep 60")
     began = time.monotonic()
     with (
-        pytest.raises(WaitedTooLongError, match="not open within"),
+        pytest.raises(WaitedTooLongError, match="has not started within"),
         pods.forwarded(release, "cloud-1", [8080]),
     ):
         pytest.fail("there is no way")

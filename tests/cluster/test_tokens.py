@@ -46,7 +46,7 @@ def test_a_token_that_is_no_text_is_not_shown(running: FakeApi, release: Release
 def test_a_release_of_another_version_has_none(running: FakeApi, release: Release) -> None:
     running.get("pods", "cloud-1")["spec"]["volumes"] = []
     with pytest.raises(
-        ClusterError, match="mounts no tokens: it is of another version; upgrade it"
+        ClusterError, match="mounts no tokens: it has another version of the chart; upgrade it"
     ):
         secret_name(release)
 

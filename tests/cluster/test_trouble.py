@@ -29,16 +29,16 @@ def unscheduled(message: str) -> list[dict[str, str]]:
         ({"state": waiting("ErrImageNeverPull")}, "make kind-load"),
         (
             {"state": waiting("CreateContainerConfigError", 'secret "mine" not found')},
-            'cannot be made: secret "mine" not found',
+            'cannot be created: secret "mine" not found',
         ),
         (
             {
                 "state": waiting("CrashLoopBackOff"),
                 "last": {"terminated": {"exitCode": 3, "message": "port 9100 is\ntaken"}},
             },
-            r"again and again \(exit code 3\): port 9100 is taken",
+            r"ends repeatedly \(exit code 3\): port 9100 is taken",
         ),
-        ({"restarts": 5}, "again and again"),
+        ({"restarts": 5}, "ends repeatedly"),
         ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
     ],
 )
@@ -82,7 +82,7 @@ def test_the_old_pods_readiness_is_not_the_new_ones(
     running: FakeApi, release: Release, status: dict[str, int]
 ) -> None:
     running.put("deployments", "demo", deployment("cloud", **status))
-    with pytest.raises(WaitedTooLongError, match="its pod is being made"):
+    with pytest.raises(WaitedTooLongError, match="its pod is being created"):
         wait_ready(release, timeout=0.03)
 
 

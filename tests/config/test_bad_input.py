@@ -114,7 +114,7 @@ def test_unknown_keys_and_forgotten_units(mine: Path, typo: str, meant: str) -> 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("seed: 1\nseed: 2", "mine.yaml:2: the key 'seed' stands here twice"),
+        ("seed: 1\nseed: 2", "mine.yaml:2: the key 'seed' is given twice"),
         ("seed: [", "mine.yaml:"),
         ("", "mine.yaml: must be a mapping"),
         ("- 1", "mine.yaml: must be a mapping"),
@@ -159,7 +159,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("nosuch.yaml", "nosuch.yaml; shipped experiments go by their names: hover, paper"),
+        ("nosuch.yaml", "nosuch.yaml; names of shipped experiments: hover, paper"),
         ("no/papper.yaml", "did you mean paper?"),
     ],
 )

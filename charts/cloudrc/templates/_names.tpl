@@ -1,16 +1,16 @@
-{{/* Names, labels and images: what everything in the release is called. */}}
+{{/* Names, labels and images of the release. */}}
 
-{{/* Begins the names of all objects; the longest goes on with "-mission-" and 8 digits, up to 63. */}}
+{{/* Start of all names, cut to 46 characters: "-mission-" and 8 digits follow, and 63 is the limit. */}}
 {{- define "cloudrc.fullname" -}}
 {{- $name := .Values.fullnameOverride | default (contains "cloudrc" .Release.Name | ternary .Release.Name (printf "%s-cloudrc" .Release.Name)) -}}
 {{- $name = $name | trunc 46 | trimSuffix "-" -}}
 {{- if not (regexMatch "^[a-z]([-a-z0-9]*[a-z0-9])?$" $name) -}}
-{{- fail (printf "the name '%s' begins with no letter, or has others than a-z, 0-9 and '-': choose another release name, or set fullnameOverride" $name) -}}
+{{- fail (printf "the name '%s' must start with a letter and contain only a-z, 0-9 and '-': choose another release name, or set fullnameOverride" $name) -}}
 {{- end -}}
 {{- $name -}}
 {{- end }}
 
-{{/* Selector of a component's pods. Takes (dict "root" $ "component" NAME), as all below. */}}
+{{/* Selector of a component's pods. Argument, also below: (dict "root" $ "component" NAME). */}}
 {{- define "cloudrc.selector" -}}
 app.kubernetes.io/name: cloudrc
 app.kubernetes.io/instance: {{ .root.Release.Name }}
@@ -25,13 +25,13 @@ app.kubernetes.io/part-of: cloudrc
 app.kubernetes.io/managed-by: {{ .root.Release.Service }}
 {{- end }}
 
-{{/* Labels of a pod: those that do not change with the chart's version, so that it alone rolls nothing. */}}
+{{/* Labels of a pod, without the version: a new version alone must not restart the pod. */}}
 {{- define "cloudrc.podLabels" -}}
 {{ include "cloudrc.selector" . }}
 app.kubernetes.io/part-of: cloudrc
 {{- end }}
 
-{{/* Image of a role, "world" or "cloud": its digest, else the tag. */}}
+{{/* Image of a role, "world" or "cloud", by digest if set, else by tag. */}}
 {{- define "cloudrc.image" -}}
 {{- $image := .root.Values.image -}}
 {{- $of := index $image .role -}}

@@ -1,6 +1,6 @@
-{{/* What the pods share: who they run as, their probes, their volumes. */}}
+{{/* Common parts of the pods: security contexts, probes, volumes. */}}
 
-{{/* The head of a pod's spec; it passes Pod Security "restricted". */}}
+{{/* Start of a pod's spec; it satisfies Pod Security "restricted". */}}
 {{- define "cloudrc.pod" -}}
 serviceAccountName: {{ include "cloudrc.serviceAccountName" . }}
 automountServiceAccountToken: false
@@ -27,8 +27,8 @@ capabilities:
   drop: [ALL]
 {{- end }}
 
-{{/* Probes on the metrics port. Readiness waits for the peer, liveness never: losing the link is for
-     the guard to handle, in milliseconds. */}}
+{{/* Probes on the metrics port. Readiness needs the peer, liveness does not: the guard handles a lost
+     link, and a restart would not help. */}}
 {{- define "cloudrc.probes" -}}
 startupProbe:
   httpGet: {path: /healthz, port: {{ . }}}
@@ -60,7 +60,7 @@ affinity:
 {{- end }}
 {{- end }}
 
-{{/* Annotations of a pod. A change of the experiment rolls it; one of the link's profile does not. */}}
+{{/* Annotations of a pod. A changed experiment restarts the pod, a changed link profile does not. */}}
 {{- define "cloudrc.podAnnotations" -}}
 {{- $made := dict "checksum/experiment" (toYaml .root.Values.experiment | sha256sum) -}}
 {{- $_ := set $made "cloudrc/link-mode" (include "cloudrc.linkMode" .root) -}}
@@ -69,11 +69,11 @@ affinity:
 {{- $scrape := dict "prometheus.io/scrape" "true" "prometheus.io/path" "/metrics" "prometheus.io/port" "9100" -}}
 {{- $made = merge $made $scrape -}}
 {{- end -}}
-{{- /* Whoever writes an annotation of these names means it. */ -}}
+{{- /* The user's podAnnotations override the ones made here. */ -}}
 {{ toYaml (merge (deepCopy (index .root.Values .component).podAnnotations) $made) }}
 {{- end }}
 
-{{/* Volumes of both pods: the experiment, the link's profile, the key, the route between link and end. */}}
+{{/* Volumes of both pods: experiment, link profile, key, the route file of the link, recordings. */}}
 {{- define "cloudrc.volumes" -}}
 {{- $name := include "cloudrc.fullname" .root -}}
 - name: experiment
@@ -95,7 +95,7 @@ affinity:
     sizeLimit: {{ (index .root.Values .component).recordingSizeLimit }}
 {{- end }}
 
-{{/* Mounts of an end of the tunnel. */}}
+{{/* Volume mounts of world and cloud. */}}
 {{- define "cloudrc.endMounts" -}}
 - {name: experiment, mountPath: /etc/cloudrc, readOnly: true}
 - {name: secret, mountPath: /etc/cloudrc-secret, readOnly: true}

@@ -8,7 +8,7 @@
     - {port: 53, protocol: TCP}
 {{- end }}
 
-{{/* The tunnel to or from the other end: takes (dict "root" $ "component" PEER "way" "from"|"to"). */}}
+{{/* The tunnel to or from the other end. Argument: (dict "root" $ "component" PEER "way" "from"|"to"). */}}
 {{- define "cloudrc.tunnel" -}}
 - {{ .way }}:
     - podSelector:
@@ -18,7 +18,7 @@
     - {port: 7400, protocol: UDP}
 {{- end }}
 
-{{/* `helm test` asks both ends what they hear of the link, and the link containers what they do. */}}
+{{/* `helm test` reads the metrics of world, cloud and the link containers. */}}
 {{- define "cloudrc.linkTest" -}}
 - from:
     - podSelector:
@@ -29,7 +29,7 @@
     - {port: 9102, protocol: TCP}
 {{- end }}
 
-{{/* Scraping, where somebody is admitted: takes (dict "root" $ "ports" LIST). */}}
+{{/* Scraping, if metrics.allowFrom is set. Argument: (dict "root" $ "ports" LIST). */}}
 {{- define "cloudrc.scrape" -}}
 {{- with .root.Values.metrics.allowFrom }}
 - from:

@@ -104,7 +104,7 @@ def test_the_file_refuses_it_too_and_names_the_key(key, value):
 
 
 def test_the_file_refuses_a_speed_or_an_age_beyond_the_stop_rule():
-    with pytest.raises(BadInputError, match=r"guard\.speed_max_mps: at most 6 m/s can be stopped"):
+    with pytest.raises(BadInputError, match=r"guard\.speed_max_mps: must be at most 6 m/s: "):
         load_experiment("paper", ["guard.speed_max_mps=6.5"])
     with pytest.raises(BadInputError, match="command_age_max_ms"):
         load_experiment("paper", ["guard.command_age_max_ms=10001"])

@@ -1,8 +1,8 @@
-{{/* The link container: it shapes what its pod sends. */}}
+{{/* The link container, which shapes what its pod sends. */}}
 
-{{/* How it shapes. auto is relay where NET_ADMIN would be refused, or where that cannot be known:
-     the namespace is not there yet, or this is `helm template`. An upgrade keeps what the first
-     install has chosen, unless the namespace forbids it since. */}}
+{{/* Mode of the link. "auto" becomes relay if the namespace refuses NET_ADMIN, or if that is unknown:
+     the namespace does not exist yet, or this is `helm template`. An upgrade keeps the mode of the
+     install, unless the namespace now forbids it. */}}
 {{- define "cloudrc.linkMode" -}}
 {{- if ne .Values.link.mode "auto" -}}
 {{ .Values.link.mode }}
@@ -21,8 +21,8 @@ auto
 {{- end -}}
 {{- end }}
 
-{{/* The profile as a file: a shipped one as it is, else as written in the values, else the
-     experiment's with its single values over it. */}}
+{{/* The profile as a file: the shipped one, the one in the values, or the experiment's with its
+     single values. */}}
 {{- define "cloudrc.linkProfile" -}}
 {{- $profile := .Values.link.profile -}}
 {{- if kindIs "map" $profile -}}
@@ -37,7 +37,7 @@ auto
 {{- define "cloudrc.experimentProfile" -}}
 {{- $link := .Values.experiment.link | default dict -}}
 {{- $text := "{}" -}}
-{{- /* A resolved experiment spells both directions out; its profile's name is only a label. */ -}}
+{{- /* A resolved experiment has all keys of both directions; its profile's name is only a label. */ -}}
 {{- if not (and (hasKey ($link.uplink | default dict) "blackouts") (hasKey ($link.downlink | default dict) "blackouts")) -}}
 {{- $text = include "cloudrc.shippedProfile" (dict "root" . "name" ($link.profile | default "paper-p2") "key" "experiment.link.profile") -}}
 {{- end -}}
@@ -62,13 +62,13 @@ auto
 {{- range $path, $_ := .root.Files.Glob "files/profiles/*.yaml" -}}
 {{- $known = append $known (base $path | trimSuffix ".yaml") -}}
 {{- end -}}
-{{- fail (printf "%s: no profile '%s' ships with the chart; choose one of %s, or write it out under link.profile" .key .name (join ", " $known)) -}}
+{{- fail (printf "%s: no profile '%s' ships with the chart; choose one of %s, or write the profile under link.profile" .key .name (join ", " $known)) -}}
 {{- end -}}
 {{ $text | trimSuffix "\n" }}
 {{- end }}
 
-{{/* The files that a profile names, as a mapping of name to text. One that is not there would be
-     refused by the containers when they start. */}}
+{{/* The files that a profile names, as a mapping of name to text. A missing file fails here, not
+     when the containers start. */}}
 {{- define "cloudrc.linkFiles" -}}
 {{- $found := dict -}}
 {{- range $way := list "uplink" "downlink" -}}
@@ -76,7 +76,7 @@ auto
 {{- $name := get (get $.profile $way | default dict) $kind -}}
 {{- if $name -}}
 {{- if not (hasKey $.root.Values.link.traces $name) -}}
-{{- fail (printf "%s: %s.%s names '%s', and link.traces has no such file; put its text there, under a name without folders" $.key $way $kind $name) -}}
+{{- fail (printf "%s: %s.%s names '%s', but link.traces has no such file; add its text there, under a name without folders" $.key $way $kind $name) -}}
 {{- end -}}
 {{- $_ := set $found $name (get $.root.Values.link.traces $name) -}}
 {{- end -}}
@@ -85,8 +85,8 @@ auto
 {{ toYaml $found }}
 {{- end }}
 
-{{/* A native sidecar: it starts before the ends and stops after them. The only container that may
-     have NET_ADMIN, and then uid 0, since an added capability is not effective for another. */}}
+{{/* A native sidecar: it starts before world or cloud and stops after it. Only this container may have
+     NET_ADMIN; it then runs as uid 0, because an added capability has no effect for other users. */}}
 {{- define "cloudrc.linkContainer" -}}
 {{- $mode := include "cloudrc.linkMode" .root -}}
 - name: link

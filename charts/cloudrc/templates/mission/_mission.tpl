@@ -1,4 +1,4 @@
-{{/* A mission as a file: takes (dict "root" $ "plan" NAME-OR-MAPPING "key" WHERE-IT-STANDS). */}}
+{{/* A mission as a file. Argument: (dict "root" $ "plan" NAME-OR-MAPPING "key" KEY-IN-THE-VALUES). */}}
 {{- define "cloudrc.missionFile" -}}
 {{- if kindIs "map" .plan -}}
 {{ toYaml .plan }}
@@ -9,14 +9,14 @@
 {{- range $path, $_ := .root.Files.Glob "files/missions/*.yaml" -}}
 {{- $known = append $known (base $path | trimSuffix ".yaml") -}}
 {{- end -}}
-{{- fail (printf "%s: no mission '%s' ships with the chart; choose one of %s, or write it out there" .key .plan (join ", " $known)) -}}
+{{- fail (printf "%s: no mission '%s' ships with the chart; choose one of %s, or write the mission there" .key .plan (join ", " $known)) -}}
 {{- end -}}
 {{ $text | trimSuffix "\n" }}
 {{- end -}}
 {{- end }}
 
-{{/* The container that posts a mission, follows it and ends with its verdict:
-     takes (dict "root" $ "name" NAME "uid" FIELD "queue" BOOL). */}}
+{{/* The container that posts a mission, follows it and ends with its verdict.
+     Argument: (dict "root" $ "name" NAME "uid" FIELD "queue" BOOL). */}}
 {{- define "cloudrc.missionContainer" -}}
 - name: {{ .name }}
   image: {{ include "cloudrc.image" (dict "root" .root "role" "cloud") }}
@@ -47,7 +47,7 @@
     - {name: tokens, mountPath: /etc/cloudrc-tokens, readOnly: true}
 {{- end }}
 
-{{/* Volumes of a pod that flies a mission: takes (dict "root" $ "name" CONFIGMAP). */}}
+{{/* Volumes of a pod that flies a mission. Argument: (dict "root" $ "name" CONFIGMAP). */}}
 {{- define "cloudrc.missionVolumes" -}}
 - name: mission
   configMap:
