@@ -1,7 +1,7 @@
-"""Renders the chart without helm: values go in, Kubernetes objects come out.
+"""Render the chart without helm.
 
-gotpl plays the template engine; values are laid over the defaults and checked against the schema
-as helm does. A cluster is a function that answers `lookup`.
+gotpl is the template engine. As in helm, values are merged with the defaults and checked against
+the schema. A cluster is a function that answers `lookup`.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class Versions:
 
 
 def nothing(version: str, kind: str, namespace: str, name: str) -> Object:
-    """No cluster, as under `helm template`."""
+    """Answer `lookup` as without a cluster (`helm template`)."""
     return {}
 
 
 def a_namespace(level: str = "") -> Lookup:
-    """A cluster with nothing but the namespace, which may enforce Pod Security."""
+    """Make a cluster with only the namespace, which may enforce a level of Pod Security."""
     labels = {"pod-security.kubernetes.io/enforce": level} if level else {}
 
     def lookup(version: str, kind: str, namespace: str, name: str) -> Object:
@@ -65,7 +65,7 @@ def a_namespace(level: str = "") -> Lookup:
 
 
 def holding(objects: Iterable[Object], otherwise: Lookup) -> Lookup:
-    """A cluster with these objects."""
+    """Make a cluster with these objects."""
 
     def lookup(version: str, kind: str, namespace: str, name: str) -> Object:
         for found in objects:
@@ -77,7 +77,7 @@ def holding(objects: Iterable[Object], otherwise: Lookup) -> Lookup:
 
 
 def laid_over(base: Any, values: Any) -> Any:
-    """Merge as helm does: mappings key by key, null takes away."""
+    """Merge values as helm does: mappings key by key; null removes a key."""
     if not isinstance(base, dict) or not isinstance(values, dict):
         return values
     merged = {key: laid_over(base.get(key), value) for key, value in values.items()}
@@ -91,7 +91,7 @@ def sources() -> Mapping[str, str]:
 
 
 cluster: list[Lookup] = []
-"""Who answers `lookup` now: templates are compiled once, clusters come and go."""
+"""The function that answers `lookup`, last in the list; templates are compiled only once."""
 
 
 @cache
@@ -115,7 +115,7 @@ def render_texts(
     lookup: Lookup = nothing,
     apis: Iterable[str] = (),
 ) -> dict[str, str]:
-    """Render every template: path -> text. Values that the schema refuses raise."""
+    """Render every template: path -> text; raise if the schema refuses the values."""
     import jsonschema
 
     merged = laid_over(values_of(CHART / "values.yaml"), values or {})
@@ -150,13 +150,13 @@ def notes(values: Object | None = None, **where: Any) -> str:
 
 
 def of_kind(objects: Iterable[Object], kind: str) -> dict[str, Object]:
-    """Objects of a kind by the last part of their names: world, cloud, api..."""
+    """Select the objects of a kind, by the last part of their names: world, cloud, api..."""
     found = [thing for thing in objects if thing["kind"] == kind]
     return {thing["metadata"]["name"].removeprefix("demo-cloudrc-"): thing for thing in found}
 
 
 def pod_specs(objects: Iterable[Object]) -> dict[str, Object]:
-    """Pods of every object that makes one, by its component; one on its own by its container."""
+    """Return all pod specs: those of Deployments and Jobs by component, a Pod's by container."""
     specs = {}
     for thing in objects:
         if thing["kind"] in ("Deployment", "Job"):

@@ -1,4 +1,4 @@
-"""World's epoch outlives its pod on a volume of its own; both ends read the key from a file."""
+"""World keeps its epoch on a volume; world and cloud read the key from a file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def argument(objects: list[Object], end: str, flag: str) -> str:
 
 
 def volume_at(objects: list[Object], end: str, path: str) -> Object:
-    """The volume that holds a file, by where it is mounted."""
+    """Find the volume of a file by its mount path."""
     pod = pod_specs(objects)[end]
     mounts = containers(pod)[end]["volumeMounts"]
     name = next(m["name"] for m in mounts if path.startswith(m["mountPath"] + "/"))
@@ -21,7 +21,7 @@ def volume_at(objects: list[Object], end: str, path: str) -> Object:
 
 
 @pytest.mark.parametrize("end", ["world", "cloud"])
-def test_an_end_reads_its_key_from_the_secret_and_not_from_its_arguments(end: str) -> None:
+def test_world_and_cloud_read_the_key_from_the_secret(end: str) -> None:
     objects = render()
     volume = volume_at(objects, end, argument(objects, end, "--key"))
     assert volume["secret"]["secretName"] == "demo-cloudrc-tunnel"
@@ -34,21 +34,21 @@ def test_the_link_sees_no_key() -> None:
         assert "secret" not in {mount["name"] for mount in mounts}
 
 
-def test_the_epoch_is_on_a_claim_that_the_chart_makes() -> None:
+def test_the_epoch_is_on_a_claim_of_the_chart() -> None:
     objects = render()
     volume = volume_at(objects, "world", argument(objects, "world", "--epochs"))
     assert volume["persistentVolumeClaim"]["claimName"] == "demo-cloudrc-epochs"
     assert "epochs" in of_kind(objects, "PersistentVolumeClaim")
 
 
-def test_ones_own_claim_comes_first() -> None:
+def test_an_existing_claim_is_used() -> None:
     objects = render({"world": {"epochs": {"existingClaim": "mine"}}})
     volume = volume_at(objects, "world", argument(objects, "world", "--epochs"))
     assert volume["persistentVolumeClaim"]["claimName"] == "mine"
     assert "epochs" not in of_kind(objects, "PersistentVolumeClaim")
 
 
-def test_class_and_size_are_values() -> None:
+def test_class_and_size_of_the_claim_are_values() -> None:
     epochs = {"storageClassName": "fast", "size": "8Mi"}
     claim = of_kind(render({"world": {"epochs": epochs}}), "PersistentVolumeClaim")["epochs"]
     assert claim["spec"]["storageClassName"] == "fast"

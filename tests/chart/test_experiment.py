@@ -1,4 +1,4 @@
-"""Experiment and link profile reach the pods as the package reads them, each in its own way."""
+"""Experiment and link profile reach the pods in files that the package reads."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ NAMING: dict[str, Object] = {
         }
     },
 }
-"""Profiles by the key with which they name a file of `MEASURED`."""
+"""Key -> profile that names a file of `MEASURED` with this key."""
 
 
 def config(objects: list[Object], name: str, folder: Path) -> Path:
-    """Write a ConfigMap as the pod sees it."""
+    """Write the files of a ConfigMap as a pod sees them."""
     for file, text in of_kind(objects, "ConfigMap")[name]["data"].items():
         (folder / file).write_text(text)
     return folder
@@ -44,8 +44,8 @@ def templates(values: Object) -> dict[str, Object]:
 
 
 @pytest.mark.parametrize("name", names("experiment"))
-def test_the_values_hold_the_file_that_run_takes(name: str, tmp_path: Path) -> None:
-    """Also a resolved one, with everything spelled out."""
+def test_the_configmap_loads_as_the_same_experiment(name: str, tmp_path: Path) -> None:
+    """The same holds for a resolved experiment."""
     resolved = load_experiment(name)
     values = {"experiment": yaml.safe_load(dump(resolved))}
     written = config(render(values), "experiment", tmp_path) / "experiment.yaml"
@@ -54,14 +54,14 @@ def test_the_values_hold_the_file_that_run_takes(name: str, tmp_path: Path) -> N
     assert (link.uplink, link.downlink) == (resolved.uplink, resolved.downlink)
 
 
-def test_no_experiment_is_the_papers_scheme(tmp_path: Path) -> None:
+def test_the_default_experiment_is_the_papers_scheme(tmp_path: Path) -> None:
     written = config(render(), "experiment", tmp_path) / "experiment.yaml"
     loaded, paper = load_experiment(written), load_experiment("paper")
     for key in ("mission", "world", "guard", "tunnel", "link", "cloud", "criteria"):
         assert getattr(loaded, key) == getattr(paper, key)
 
 
-def test_a_large_seed_stays_whole(tmp_path: Path) -> None:
+def test_a_large_seed_stays_an_integer(tmp_path: Path) -> None:
     written = config(render({"experiment": {"seed": 12_000_000}}), "experiment", tmp_path)
     assert load_experiment(written / "experiment.yaml").seed == 12_000_000
 
@@ -71,7 +71,7 @@ def test_a_shipped_profile_by_name(name: str, tmp_path: Path) -> None:
     assert profile({"link": {"profile": name}}, tmp_path) == load_profile(name)
 
 
-def test_without_a_profile_the_link_is_the_experiments(tmp_path: Path) -> None:
+def test_without_a_profile_the_experiments_link_is_used(tmp_path: Path) -> None:
     loss = {"bad_start": 0.1, "bad_end": 0.5}
     given = {"profile": "wifi", "uplink": {"delay_ms": 80, "loss": loss}}
     made, wifi = profile({"experiment": {"link": given}}, tmp_path), load_profile("wifi")
@@ -81,7 +81,7 @@ def test_without_a_profile_the_link_is_the_experiments(tmp_path: Path) -> None:
     assert made.downlink == wifi.downlink
 
 
-def test_a_profile_stands_in_place_of_the_experiments_link(tmp_path: Path) -> None:
+def test_a_profile_replaces_the_experiments_link(tmp_path: Path) -> None:
     values = {
         "experiment": {"link": {"uplink": {"delay_ms": 80}}},
         "link": {"profile": {"downlink": {"delay_ms": 5}}},
@@ -91,14 +91,14 @@ def test_a_profile_stands_in_place_of_the_experiments_link(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("key", FILES)
-def test_a_file_lies_beside_the_profile_that_names_it(key: str, tmp_path: Path) -> None:
+def test_a_profiles_file_is_in_its_configmap(key: str, tmp_path: Path) -> None:
     made = profile({"link": {"profile": NAMING[key], "traces": MEASURED}}, tmp_path)
     assert getattr(made.uplink, key) == str(tmp_path / "drive.csv")
 
 
 @pytest.mark.parametrize("key", FILES)
-def test_a_file_lies_beside_the_experiment_that_names_it(key: str, tmp_path: Path) -> None:
-    """Every process loads the experiment whole, also where a profile stands in its link's place."""
+def test_an_experiments_file_is_in_its_configmap(key: str, tmp_path: Path) -> None:
+    """Every process loads the whole experiment, even if a profile replaces its link."""
     for link in ({"traces": MEASURED}, {"traces": MEASURED, "profile": "wifi"}):
         values = {"experiment": {"link": NAMING[key]}, "link": link}
         folder = config(render(values), "experiment", tmp_path)
@@ -107,12 +107,12 @@ def test_a_file_lies_beside_the_experiment_that_names_it(key: str, tmp_path: Pat
 
 
 @pytest.mark.parametrize("key", FILES)
-def test_a_file_lies_beside_the_experiments_own_link(key: str, tmp_path: Path) -> None:
+def test_a_file_of_the_experiments_link_is_in_its_configmap(key: str, tmp_path: Path) -> None:
     made = profile({"experiment": {"link": NAMING[key]}, "link": {"traces": MEASURED}}, tmp_path)
     assert getattr(made.uplink, key) == str(tmp_path / "drive.csv")
 
 
-def test_the_experiment_has_the_files_that_it_names_and_no_others() -> None:
+def test_the_experiment_has_only_the_files_that_it_names() -> None:
     link = {"profile": NAMING["trace"], "traces": MEASURED}
     assert set(of_kind(render({"link": link}), "ConfigMap")["experiment"]["data"]) == {
         "experiment.yaml"
@@ -125,17 +125,17 @@ def test_the_experiment_has_the_files_that_it_names_and_no_others() -> None:
         ({"link": {"profile": "wify"}}, "link.profile: no profile 'wify' ships.*choose one of 5g"),
         (
             {"experiment": {"link": {"profile": "./mine.yaml"}}},
-            "experiment.link.profile: no profile './mine.yaml'.*write the profile under link.profile",
+            "experiment.link.profile: no profile './mine.yaml'.*profile under link.profile",
         ),
         ({"mission": {"enabled": True, "plan": "pipe"}}, "no mission 'pipe'.*one of hover, pipes"),
     ],
 )
-def test_an_unknown_name_is_refused_with_the_known_ones(values: Object, said: str) -> None:
+def test_an_unknown_profile_lists_the_known_ones(values: Object, said: str) -> None:
     with pytest.raises(Exception, match=said):
         render(values)
 
 
-def test_a_changed_experiment_rolls_both_pods() -> None:
+def test_a_changed_experiment_restarts_both_pods() -> None:
     before, after = templates({}), templates({"experiment": {"seed": 2}})
     for name in ("world", "cloud"):
         assert before[name] != after[name]
@@ -147,7 +147,7 @@ def test_a_changed_experiment_rolls_both_pods() -> None:
 
 
 @pytest.mark.parametrize("link", [{"profile": "lossy"}, {"profile": {"uplink": {"delay_ms": 9}}}])
-def test_a_changed_profile_changes_one_configmap_and_nothing_else(link: Object) -> None:
+def test_a_changed_profile_changes_only_one_configmap(link: Object) -> None:
     before = {thing["metadata"]["name"]: thing for thing in render() if thing["kind"] != "Secret"}
     after = {
         thing["metadata"]["name"]: thing
@@ -157,8 +157,8 @@ def test_a_changed_profile_changes_one_configmap_and_nothing_else(link: Object) 
     assert {name for name in before if before[name] != after[name]} == {"demo-cloudrc-link"}
 
 
-def test_the_profile_is_a_directory_of_its_own() -> None:
-    """So that the kubelet swaps it under a running container."""
+def test_the_profile_is_mounted_as_a_directory() -> None:
+    """The kubelet updates only directories in a running container."""
     for end in ("world", "cloud"):
         (link,) = pod_specs(render())[end]["initContainers"]
         mounts = {mount["mountPath"]: mount["name"] for mount in link["volumeMounts"]}
@@ -175,7 +175,10 @@ def test_the_profile_is_a_directory_of_its_own() -> None:
             {"experiment": {"mission": "nonsense"}},
             "experiment.mission: no mission 'nonsense' .*pipe",
         ),
-        ({"experiment": {"mission": "./mine.yaml"}}, "experiment.mission: .*write the mission there"),
+        (
+            {"experiment": {"mission": "./mine.yaml"}},
+            "experiment.mission: .*write the mission there",
+        ),
         ({"experiment": {"cloud": {"predictor": "./my.py"}}}, r"cloud.predictor: '\./my.py' is a"),
         (
             {"experiment": {"cloud": {"controller": {"name": "a/b.py"}}}},
@@ -198,6 +201,6 @@ def test_the_profile_is_a_directory_of_its_own() -> None:
         ),
     ],
 )
-def test_what_the_pods_could_not_find_is_refused_at_once(values: Object, said: str) -> None:
+def test_names_that_pods_could_not_find_are_refused(values: Object, said: str) -> None:
     with pytest.raises(Exception, match=said):
         render(values)

@@ -1,4 +1,4 @@
-"""`helm test` asks both ends for their verdict on the link: with time enough, without rights."""
+"""`helm test` verifies the link: with enough time, and without rights in the cluster."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from cloudrc.cli.parser import build
 from tests.chart.conftest import Object, containers, pod_specs, render
 
 HELM_WAITS = 300.0
-"""For one hook, unless --timeout says otherwise [s]."""
+"""Default timeout of helm for one hook [s]."""
 
 
 def link_test(values: Object | None = None) -> Object:
@@ -19,7 +19,7 @@ def link_test(values: Object | None = None) -> Object:
     return found
 
 
-def test_it_comes_after_the_flight_and_is_kept_where_it_failed() -> None:
+def test_it_runs_after_the_flight_and_stays_if_it_fails() -> None:
     annotations = link_test()["metadata"]["annotations"]
     assert annotations["helm.sh/hook"] == "test"
     assert int(annotations["helm.sh/hook-weight"]) > 0, "commands flow once a mission has flown"
@@ -27,12 +27,12 @@ def test_it_comes_after_the_flight_and_is_kept_where_it_failed() -> None:
     assert link_test()["spec"]["restartPolicy"] == "Never"
 
 
-def test_it_has_the_time_that_a_verdict_takes_and_helm_waits_for_it() -> None:
+def test_its_deadline_is_between_the_measurement_and_helms() -> None:
     deadline = link_test()["spec"]["activeDeadlineSeconds"]
     assert ENDS_LIMIT + 10.0 <= deadline < HELM_WAITS
 
 
-def test_its_command_is_one_of_ours_and_asks_this_releases_ends() -> None:
+def test_its_command_verifies_the_link_of_this_release() -> None:
     (container,) = link_test()["spec"]["containers"]
     options = build(["link"]).parse_args(container["args"])
     names = {name.rsplit("-", 1)[-1] for name in options.ends.split(",")}

@@ -1,4 +1,4 @@
-"""Missions as Jobs: in the chart, in the example, in `helm test`; each flies once."""
+"""Missions as Jobs of the chart, of the examples and of `helm test`; each flies once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def jobs(values: Object | None = None) -> list[Object]:
 
 
 def plan(values: Object, folder: Path) -> object:
-    """The mission in the ConfigMap that the Job mounts."""
+    """Load the mission from the ConfigMap that the Job mounts."""
     objects = render(values)
     (job,) = of_kind(objects, "Job").values()
     name = job["spec"]["template"]["spec"]["volumes"][0]["configMap"]["name"]
@@ -41,12 +41,12 @@ each_job = pytest.mark.parametrize(
 )
 
 
-def test_none_flies_unasked() -> None:
+def test_no_mission_flies_by_default() -> None:
     assert jobs() == []
 
 
 @each_job
-def test_a_job_flies_once_ends_in_time_and_goes(job: Object) -> None:
+def test_a_job_flies_once_and_has_time_limits(job: Object) -> None:
     spec = job["spec"]
     assert spec["backoffLimit"] == 0
     assert spec["activeDeadlineSeconds"] > 60
@@ -59,7 +59,7 @@ def test_a_job_flies_once_ends_in_time_and_goes(job: Object) -> None:
 
 
 @each_job
-def test_its_uid_is_the_key(job: Object) -> None:
+def test_the_jobs_uid_is_the_key(job: Object) -> None:
     (container,) = job["spec"]["template"]["spec"]["containers"]
     (variable,) = container["env"]
     field = variable["valueFrom"]["fieldRef"]["fieldPath"]
@@ -67,7 +67,7 @@ def test_its_uid_is_the_key(job: Object) -> None:
     assert f"--key=$({variable['name']})" in container["args"]
 
 
-def test_it_calls_the_releases_api() -> None:
+def test_a_job_calls_the_releases_api() -> None:
     objects = render({**ENABLED, "teleop": {"service": {"port": 80}}})
     (container,) = pod_specs(objects)["mission"]["containers"]
     service = of_kind(objects, "Service")["api"]
@@ -83,20 +83,22 @@ def test_it_calls_the_releases_api() -> None:
         ({"mission": {"plan": "hover"}}, "hover"),
     ],
 )
-def test_the_plan_is_the_experiments_unless_said(values: Object, name: str, tmp_path: Path) -> None:
+def test_the_plan_defaults_to_the_experiments_mission(
+    values: Object, name: str, tmp_path: Path
+) -> None:
     values = {**values, "mission": {**values.get("mission", {}), "enabled": True}}
     assert plan(values, tmp_path) == load_mission(name)
 
 
-def test_a_plan_may_be_written_out(tmp_path: Path) -> None:
+def test_a_plan_may_be_a_mission(tmp_path: Path) -> None:
     point = {"position_m": [0.0, 0.0, 1.0], "dwell_s": 2.0}
     values = {"mission": {"enabled": True, "plan": {"start": "here", "waypoints": [point]}}}
     mission = plan(values, tmp_path)
     assert mission.start == "here"  # type: ignore[attr-defined]
 
 
-def test_another_mission_is_another_job_and_the_same_the_same() -> None:
-    """A Job cannot be changed: an upgrade with a new plan would be refused."""
+def test_only_another_mission_makes_another_job() -> None:
+    """A Job is immutable: with the same name, an upgrade with a new plan would fail."""
     names = [
         job["metadata"]["name"]
         for values in (
@@ -117,7 +119,7 @@ def test_queueing_is_a_flag() -> None:
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_an_example_is_for_the_release_of_the_readme(name: str, tmp_path: Path) -> None:
+def test_an_example_fits_the_release_of_the_readme(name: str, tmp_path: Path) -> None:
     release = render(release="cloudrc")
     service = next(t for t in release if t["metadata"]["name"] == "cloudrc-api")
     config, job = EXAMPLES[name]
@@ -135,13 +137,13 @@ def test_an_example_is_for_the_release_of_the_readme(name: str, tmp_path: Path) 
     assert len(mission.waypoints) == {"mission-job": 3, "mission-paper": 7}[name]
 
 
-def test_the_papers_mission_is_the_one_that_ships(tmp_path: Path) -> None:
+def test_the_papers_mission_equals_the_shipped_one(tmp_path: Path) -> None:
     (tmp_path / "mission.yaml").write_text(EXAMPLES["mission-paper"][0]["data"]["mission.yaml"])
     assert load_mission(tmp_path / "mission.yaml").waypoints == load_mission("pipes").waypoints
 
 
-def test_the_chart_makes_the_same_job_as_the_program() -> None:
-    """`cloudrc mission run` and the chart differ in names and times only."""
+def test_the_chart_makes_the_same_job_as_mission_run() -> None:
+    """The Job of `cloudrc mission run` differs only in names and times."""
     from cloudrc.cluster import jobs as manifest
     from cloudrc.cluster.client import Release
 
@@ -166,7 +168,7 @@ def test_the_chart_makes_the_same_job_as_the_program() -> None:
     assert theirs["resources"] == ours["resources"]
 
 
-def test_helm_test_flies_and_leaves_nothing_behind() -> None:
+def test_helm_test_flies_and_leaves_nothing() -> None:
     pod = of_kind(render(), "Pod")["test"]
     annotations = pod["metadata"]["annotations"]
     assert annotations["helm.sh/hook"] == "test"
@@ -177,7 +179,7 @@ def test_helm_test_flies_and_leaves_nothing_behind() -> None:
     assert pod["spec"]["activeDeadlineSeconds"] <= 180
 
 
-def test_its_mission_takes_seconds_and_can_be_flown(tmp_path: Path) -> None:
+def test_the_test_mission_can_be_flown_in_seconds(tmp_path: Path) -> None:
     text = of_kind(render(), "ConfigMap")["test"]["data"]["mission.yaml"]
     (tmp_path / "mission.yaml").write_text(text)
     mission = load_mission(tmp_path / "mission.yaml")
@@ -186,7 +188,7 @@ def test_its_mission_takes_seconds_and_can_be_flown(tmp_path: Path) -> None:
     assert mission.waypoints[0].dwell_s <= 2
 
 
-def test_the_missions_pods_are_not_found_by_the_services() -> None:
+def test_the_services_do_not_select_mission_pods() -> None:
     objects = render(ENABLED)
     for service in of_kind(objects, "Service").values():
         for template in [

@@ -1,4 +1,4 @@
-"""Metrics are found by annotation, or by the Prometheus operator where there is one."""
+"""Prometheus finds the metrics by annotations, or by the objects of its operator."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ def operated(objects: list[Object]) -> set[str]:
     return {thing["kind"] for thing in objects} & KINDS
 
 
-def test_made_only_when_asked_for_and_known() -> None:
+def test_monitors_need_the_value_and_the_kind() -> None:
     assert operated(render()) == set()
     assert operated(render(apis=[OPERATOR])) == set()
     assert operated(render(BOTH)) == set()
     assert operated(render(BOTH, apis=[OPERATOR])) == KINDS
 
 
-def test_or_when_forced() -> None:
+def test_monitors_can_be_forced() -> None:
     forced = {key: {"enabled": True, "force": True} for key in ("podMonitor", "prometheusRule")}
     assert operated(render({"metrics": forced})) == KINDS
 
 
-def test_the_monitor_names_the_ports_of_the_pods() -> None:
+def test_the_monitor_has_the_ports_of_the_pods() -> None:
     (monitor,) = of_kind(render(BOTH, apis=[OPERATOR]), "PodMonitor").values()
     asked = {endpoint["port"] for endpoint in monitor["spec"]["podMetricsEndpoints"]}
     served = {
@@ -49,7 +49,7 @@ def test_the_monitor_names_the_ports_of_the_pods() -> None:
 
 
 @pytest.mark.parametrize("wanted", [True, False])
-def test_annotations_are_the_fallback(wanted: bool) -> None:
+def test_scrape_annotations_are_optional(wanted: bool) -> None:
     for thing in of_kind(render({"metrics": {"annotations": wanted}}), "Deployment").values():
         template = thing["spec"]["template"]
         found = {k: v for k, v in template["metadata"]["annotations"].items() if "prometheus" in k}
@@ -68,7 +68,7 @@ def rules() -> list[Object]:
     return [rule for group in groups for rule in group["rules"]]
 
 
-def test_the_rules_ask_for_metrics_that_exist() -> None:
+def test_the_rules_use_existing_metrics() -> None:
     known = set(METRICS) | {rule["record"] for rule in rules() if "record" in rule}
     for name, metric in METRICS.items():
         if metric.kind is Kind.HISTOGRAM:
@@ -79,7 +79,7 @@ def test_the_rules_ask_for_metrics_that_exist() -> None:
         assert set(asked) <= known
 
 
-def test_alerts_say_how_bad_what_and_what_to_do() -> None:
+def test_alerts_have_severity_summary_and_runbook() -> None:
     for rule in rules():
         if "record" in rule:
             assert rule["record"].count(":") == 2  # level:metric:operation

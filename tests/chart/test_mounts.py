@@ -1,4 +1,4 @@
-"""What each container mounts, exactly: who owns one of them has what it mounts and no more."""
+"""The exact mounts of each container: an attacker in a container gets no more than these."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def pods(mode: str) -> dict[str, Object]:
 
 
 def mounts(container: Object) -> set[str]:
-    """Volumes by name, with "ro" if it may only read them."""
+    """Return the names of the mounted volumes, with " ro" added if read-only."""
     found = container.get("volumeMounts", [])
     return {mount["name"] + " ro" * mount.get("readOnly", False) for mount in found}
 
 
 @each_mode
-def test_a_container_mounts_what_it_needs_and_no_more(mode: str) -> None:
+def test_a_container_mounts_only_what_it_needs(mode: str) -> None:
     assert MOUNTS == {
         pod: {name: mounts(container) for name, container in containers(spec).items()}
         for pod, spec in pods(mode).items()
@@ -55,7 +55,7 @@ def test_a_container_mounts_what_it_needs_and_no_more(mode: str) -> None:
 
 
 @each_mode
-def test_a_secret_is_read_by_its_owner_and_the_pods_group_alone(mode: str) -> None:
+def test_only_owner_and_group_can_read_a_secret(mode: str) -> None:
     assert SECRETS == {
         pod: {v["name"]: v["secret"] for v in spec.get("volumes", ()) if "secret" in v}
         for pod, spec in pods(mode).items()
@@ -63,7 +63,7 @@ def test_a_secret_is_read_by_its_owner_and_the_pods_group_alone(mode: str) -> No
 
 
 @each_mode
-def test_who_owns_a_link_has_neither_key_nor_token_nor_the_sockets_of_teleop(mode: str) -> None:
+def test_the_link_mounts_no_key_no_token_and_no_teleop_socket(mode: str) -> None:
     found = pods(mode)
     for end in ("world", "cloud"):
         volumes = {volume["name"]: volume for volume in found[end]["volumes"]}
@@ -79,7 +79,7 @@ def test_who_owns_a_link_has_neither_key_nor_token_nor_the_sockets_of_teleop(mod
         assert where[folder] == "teleop", "no folder above it, which a link may mount"
 
 
-def test_what_lies_in_memory_is_small() -> None:
+def test_volumes_in_memory_are_small() -> None:
     memory = {
         pod: {v["name"]: v["emptyDir"] for v in spec.get("volumes", ()) if "emptyDir" in v}
         for pod, spec in pods("relay").items()

@@ -1,4 +1,4 @@
-"""The policies let through tunnel, names, API and scraping, and nothing else."""
+"""The NetworkPolicies allow tunnel, DNS, API and scraping, nothing else."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def ports(rule: Object) -> set[tuple[str, int]]:
 
 
 def peers(rule: Object) -> list[str]:
-    """Components of this release that a rule names; anything else as it stands."""
+    """Return the peers of a rule: components of this release by name, others unchanged."""
     found = rule.get("from") or rule.get("to")
     assert found, "a rule without peers admits everybody"
     return sorted(map(_peer, found))
@@ -37,7 +37,7 @@ def said(spec: Object, way: str) -> list[tuple[list[str], set[tuple[str, int]]]]
     return [(peers(rule), ports(rule)) for rule in spec.get(way, [])]
 
 
-def test_every_pod_is_selected_both_ways() -> None:
+def test_every_pod_has_ingress_and_egress_policies() -> None:
     found = policies()
     assert found.keys() == {"world", "cloud", "mission", "test"}
     for name, spec in found.items():
@@ -47,7 +47,7 @@ def test_every_pod_is_selected_both_ways() -> None:
         assert labels["app.kubernetes.io/instance"] == "demo"
 
 
-def test_only_the_tunnel_and_the_api_come_in() -> None:
+def test_ingress_is_tunnel_and_api_only() -> None:
     found = policies()
     test = (["test"], LINK_TEST)
     assert said(found["world"], "ingress") == [(["cloud"], TUNNEL), test]
@@ -59,7 +59,7 @@ def test_only_the_tunnel_and_the_api_come_in() -> None:
     assert said(found["mission"], "ingress") == said(found["test"], "ingress") == []
 
 
-def test_only_the_tunnel_names_and_the_api_go_out() -> None:
+def test_egress_is_tunnel_dns_and_api_only() -> None:
     found = policies()
     kube_system = str(
         {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "kube-system"}}}
@@ -75,7 +75,7 @@ def test_only_the_tunnel_names_and_the_api_go_out() -> None:
     ]
 
 
-def test_scraping_is_admitted_by_name_and_to_all_metrics_ports() -> None:
+def test_allowed_peers_may_scrape_all_metrics_ports() -> None:
     found = policies({"metrics": {"allowFrom": [PROMETHEUS]}})
     for end in ("world", "cloud"):
         rule = found[end]["ingress"][-1]
@@ -89,11 +89,11 @@ def test_scraping_is_admitted_by_name_and_to_all_metrics_ports() -> None:
         assert ports(rule) == {("TCP", port) for port in served}
 
 
-def test_others_may_call_the_api_when_named() -> None:
+def test_allowed_peers_may_call_the_api() -> None:
     found = policies({"teleop": {"allowFrom": [PROMETHEUS]}})
     assert PROMETHEUS in found["cloud"]["ingress"][1]["from"]
     assert all(PROMETHEUS not in rule["from"] for rule in found["world"]["ingress"])
 
 
-def test_they_can_be_left_out() -> None:
+def test_policies_can_be_disabled() -> None:
     assert policies({"networkPolicy": {"enabled": False}}) == {}

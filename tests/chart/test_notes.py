@@ -1,4 +1,4 @@
-"""What helm prints after an install: three commands for release and namespace, and warnings."""
+"""The notes that helm prints after an install: three commands, and warnings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_three_commands_name_release_and_namespace() -> None:
     assert found[1][found[1].index("--release") + 1] == "flight"
 
 
-def test_the_first_waits_for_both_pods() -> None:
+def test_the_first_command_waits_for_both_pods() -> None:
     words = commands(notes())[0]
     key, value = words[words.index("--selector") + 1].split("=")
     deployments = of_kind(render(), "Deployment")
@@ -31,7 +31,7 @@ def test_the_first_waits_for_both_pods() -> None:
     assert sorted(selected) == ["cloud", "world"]
 
 
-def test_the_second_is_parsed_by_our_own_program() -> None:
+def test_the_second_command_is_valid() -> None:
     from cloudrc.cli.parser import build
 
     words = commands(notes())[1]
@@ -40,7 +40,7 @@ def test_the_second_is_parsed_by_our_own_program() -> None:
     assert (options.namespace, options.release) == ("lab", "demo")
 
 
-def test_the_third_names_a_deployment_and_a_container_that_exist() -> None:
+def test_the_third_command_names_existing_objects() -> None:
     words = commands(notes())[2]
     deployment = next(w.partition("/")[2] for w in words if w.startswith("deployment/"))
     (thing,) = (
@@ -65,12 +65,12 @@ def test_the_third_names_a_deployment_and_a_container_that_exist() -> None:
         ({"experiment": {"link": {"profile": "satellite"}}}, False),
     ],
 )
-def test_a_slow_profile_asks_for_its_command_age(values: Object, warns: bool) -> None:
-    """The guard is the experiment's, so that a change of the link restarts nothing."""
+def test_a_slow_profile_warns_about_its_command_age(values: Object, warns: bool) -> None:
+    """The guard's limit is in the experiment, because a change of the link restarts nothing."""
     assert ("experiment.guard.command_age_max_ms=800" in notes(values)) is warns
 
 
-def test_open_networks_and_closed_metrics_are_told() -> None:
+def test_the_notes_warn_of_open_networks_and_closed_metrics() -> None:
     assert "No Prometheus may scrape" in notes()
     admitted = {"metrics": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]}}
     assert "No Prometheus may scrape" not in notes(admitted)

@@ -1,4 +1,4 @@
-"""Names, labels, selectors, images and flags: the objects fit together, and with the processes."""
+"""Names, labels, selectors, images and arguments fit together."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_the_chart_has_the_version_of_the_package() -> None:
 
 
 @pytest.mark.parametrize("path", CI_VALUES, ids=lambda path: path.stem)
-def test_labels_and_selectors(path: Path) -> None:
+def test_objects_have_the_labels_that_selectors_need(path: Path) -> None:
     objects = render(values_of(path))
     for thing in objects:
         assert thing["metadata"]["labels"].keys() >= LABELS, thing["metadata"]["name"]
@@ -47,7 +47,7 @@ def test_labels_and_selectors(path: Path) -> None:
             assert sum(selector.items() <= labels.items() for labels in pods) == 1
 
 
-def test_a_new_chart_version_alone_rolls_no_pod() -> None:
+def test_a_new_chart_version_alone_restarts_no_pod() -> None:
     for thing in of_kind(render(), "Deployment").values():
         labels = thing["spec"]["template"]["metadata"]["labels"]
         assert not labels.keys() & {"helm.sh/chart", "app.kubernetes.io/version"}
@@ -63,20 +63,20 @@ def test_a_new_chart_version_alone_rolls_no_pod() -> None:
         ("d" * 53, {}, "d" * 46 + "-world"),
     ],
 )
-def test_names(release: str, values: dict[str, str], name: str) -> None:
+def test_names_follow_release_and_override(release: str, values: dict[str, str], name: str) -> None:
     objects = render({**values, "mission": {"enabled": True}}, release=release)
     assert name in {thing["metadata"]["name"] for thing in objects}
     assert max(len(thing["metadata"]["name"]) for thing in objects) <= 63
 
 
 @pytest.mark.parametrize("release", ["1rel", "my.rel"])
-def test_a_release_whose_services_could_have_no_name_is_refused(release: str) -> None:
+def test_an_invalid_name_is_refused(release: str) -> None:
     with pytest.raises(Exception, match=f"the name '{release}-cloudrc' .* set fullnameOverride"):
         render(release=release)
     assert render({"fullnameOverride": "robot"}, release=release)
 
 
-def test_what_is_written_on_a_pod_wins_over_the_charts_own() -> None:
+def test_annotations_of_the_user_override_the_charts() -> None:
     mine = {"prometheus.io/scrape": "false", "example.org/owner": "me"}
     pods = of_kind(render({"cloud": {"podAnnotations": mine}}), "Deployment")
     found = pods["cloud"]["spec"]["template"]["metadata"]["annotations"]
@@ -84,7 +84,7 @@ def test_what_is_written_on_a_pod_wins_over_the_charts_own() -> None:
     assert found["prometheus.io/port"] == "9100"
 
 
-def test_missions_run_where_the_cloud_does() -> None:
+def test_missions_have_the_placement_of_cloud() -> None:
     where = {
         "nodeSelector": {"disk": "fast"},
         "tolerations": [{"key": "lab", "operator": "Exists"}],
@@ -105,7 +105,7 @@ def images(values: dict[str, object]) -> dict[str, str]:
     }
 
 
-def test_the_image_is_that_of_make_images() -> None:
+def test_the_image_is_the_one_from_make_images() -> None:
     assert images({})["world"] == f"cloudrc/world:{cloudrc.__version__}"
     for name in ("teleop", "test", "test-link"):
         assert images({})[name] == f"cloudrc/cloud:{cloudrc.__version__}"
@@ -114,7 +114,7 @@ def test_the_image_is_that_of_make_images() -> None:
     } == {"IfNotPresent"}
 
 
-def test_a_tag_wins_over_the_version_and_a_digest_over_the_tag() -> None:
+def test_a_digest_overrides_the_tag_and_a_tag_the_version() -> None:
     digest = "sha256:" + "0" * 64
     found = images({"registry": "ghcr.io/me", "tag": "9.9.9", "world": {"digest": digest}})
     assert found["world"] == f"ghcr.io/me/cloudrc/world@{digest}"
@@ -122,12 +122,12 @@ def test_a_tag_wins_over_the_version_and_a_digest_over_the_tag() -> None:
 
 
 def test_each_pod_has_one_image() -> None:
-    """The link of the world pod runs the world's image: one to pull for each node."""
+    """A node pulls one image per pod, because the link uses that of its pod."""
     for pod in pod_specs(render()).values():
         assert len({container["image"] for container in containers(pod).values()}) == 1
 
 
-def test_the_tunnel_is_pod_to_pod_before_the_pods_are_ready() -> None:
+def test_the_tunnels_services_are_headless_and_early() -> None:
     services = of_kind(render(), "Service")
     for end in ("world", "cloud"):
         spec = services[end]["spec"]
@@ -136,7 +136,7 @@ def test_the_tunnel_is_pod_to_pod_before_the_pods_are_ready() -> None:
         assert [(port["port"], port["protocol"]) for port in spec["ports"]] == [(7400, "UDP")]
 
 
-def test_the_link_is_a_native_sidecar_that_shapes_its_pods_egress() -> None:
+def test_the_link_is_a_native_sidecar_for_its_pods_egress() -> None:
     pods = pod_specs(render())
     for end, direction, peer in (("world", "uplink", "cloud"), ("cloud", "downlink", "world")):
         (link,) = pods[end]["initContainers"]
@@ -156,8 +156,8 @@ def test_cloud_and_teleop_are_two_containers() -> None:
     assert "seq 3" in load["command"][-1]
 
 
-def test_the_role_of_link_set_changes_the_links_config_map_alone() -> None:
-    """The experiment's holds the guard's limits."""
+def test_the_link_set_role_may_change_one_configmap() -> None:
+    """The experiment's ConfigMap has the guard's limits."""
     role = values_of(CHART / "examples" / "link-set-role.yaml")
     changing = [rule for rule in role["rules"] if set(rule["verbs"]) - {"get", "list", "create"}]
     assert changing == [
@@ -171,7 +171,7 @@ def test_the_role_of_link_set_changes_the_links_config_map_alone() -> None:
     assert "cloudrc-link" in of_kind(render(release="cloudrc"), "ConfigMap")
 
 
-def test_every_mount_has_its_volume_and_every_volume_its_object() -> None:
+def test_mounts_have_volumes_and_volumes_have_objects() -> None:
     objects = render()
     names = {(thing["kind"], thing["metadata"]["name"]) for thing in objects}
     kinds = {"configMap": ("ConfigMap", "name"), "secret": ("Secret", "secretName"),
@@ -186,15 +186,15 @@ def test_every_mount_has_its_volume_and_every_volume_its_object() -> None:
                     assert (kind, volume[key][field]) in names
 
 
-def test_no_file_is_mounted_alone() -> None:
-    """A subPath would never see a changed ConfigMap."""
+def test_no_mount_has_a_sub_path() -> None:
+    """A mount with a subPath never gets a changed ConfigMap."""
     for pod in pod_specs(render()).values():
         for container in containers(pod).values():
             assert not any("subPath" in mount for mount in container.get("volumeMounts", ()))
 
 
-def test_the_flags_are_those_of_the_commands() -> None:
-    """Every container's arguments are parsed by the command line that the image runs."""
+def test_containers_use_valid_arguments() -> None:
+    """The parser of the command line accepts every container's arguments."""
     from cloudrc.cli.parser import build
 
     pods = pod_specs(render({"mission": {"enabled": True, "queue": True}}))

@@ -1,4 +1,4 @@
-"""Every values file renders, as helm would, into objects that Kubernetes knows."""
+"""Every values file renders to valid Kubernetes objects, as with helm."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ each_file = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 
 @pytest.fixture(scope="module", autouse=True)
 def _quick() -> Any:
-    """The library reads two megabytes of definitions for each object anew."""
+    """Cache the definitions: the library reads two megabytes for each object."""
     utils = kubernetes_validate.utils
     slow = utils.schema_contents
     utils.schema_contents = functools.cache(slow)
@@ -71,7 +71,7 @@ def test_an_example_is_valid(name: str, version: str) -> None:
 
 
 class Once(yaml.SafeLoader):
-    """Reads YAML in which no mapping has a key twice."""
+    """Loads YAML and refuses duplicate keys."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         mapping = super().construct_mapping(node, deep)
@@ -80,8 +80,8 @@ class Once(yaml.SafeLoader):
 
 
 @each_file
-def test_nothing_is_said_twice(path: Path) -> None:
-    """Server-side apply refuses ports, names and keys that occur twice."""
+def test_rendered_objects_have_no_duplicates(path: Path) -> None:
+    """Server-side apply refuses duplicate ports, names and keys."""
     annotations = {"podAnnotations": {"prometheus.io/scrape": "false"}}
     for name, text in render_texts(laid_over(values_of(path), {"cloud": annotations})).items():
         if not name.endswith("NOTES.txt"):
@@ -104,7 +104,7 @@ def helm(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @each_file
-def test_helm_renders_the_same(path: Path) -> None:
+def test_helm_renders_the_same_objects(path: Path) -> None:
     flags = ("--namespace", "lab", "--kube-version", OLDEST, "--values", str(path))
     done = helm("template", "demo", str(CHART), *flags)
     assert done.returncode == 0, done.stderr
@@ -117,7 +117,7 @@ def test_helm_renders_the_same(path: Path) -> None:
 
 
 @each_file
-def test_helm_lint_has_nothing_to_say(path: Path) -> None:
+def test_helm_lint_is_silent(path: Path) -> None:
     done = helm("lint", "--strict", "--values", str(path), "--kube-version", OLDEST, str(CHART))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "WARNING" not in done.stdout
@@ -129,14 +129,14 @@ def test_helm_refuses_an_older_cluster() -> None:
     assert f"requires kubeVersion: {METADATA['kubeVersion']}" in done.stderr
 
 
-def test_helm_refuses_an_unknown_value_and_names_it() -> None:
+def test_helm_names_an_unknown_value() -> None:
     done = helm("template", "demo", str(CHART), "--kube-version", OLDEST, "--set", "link.mod=netem")
     assert done.returncode != 0
     assert "'mod'" in done.stderr or "mod is not allowed" in done.stderr, done.stderr
 
 
 def test_helm_keeps_a_large_seed() -> None:
-    """Numbers above a million are not written as powers of ten, which is no whole number."""
+    """Helm writes numbers above a million as powers of ten, which are no integers."""
     flags = ("--kube-version", OLDEST, "--set-json", 'experiment={"seed": 4503599627370495}')
     done = helm(
         "template", "demo", str(CHART), "--show-only", "templates/shared/experiment.yaml", *flags
@@ -145,7 +145,7 @@ def test_helm_keeps_a_large_seed() -> None:
 
 
 def _comparable(objects: Iterable[Object]) -> dict[tuple[str, str], Object]:
-    """Helm writes 1.0 as 1, and the mission's Job is named by the hash of its text."""
+    """Ignore the hash in the Job's name: Helm writes 1.0 as 1, which changes the hash."""
     found = {}
     for original in objects:
         text = re.sub(r"-mission-[0-9a-f]{8}", "-mission", json.dumps(original))

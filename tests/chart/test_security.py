@@ -1,4 +1,4 @@
-"""The pods ask for what Pod Security "restricted" allows; only the link of netem asks for more."""
+"""The pods satisfy Pod Security "restricted", except a link with netem."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ VOLUMES = {"configMap", "emptyDir", "secret", "persistentVolumeClaim"}
 
 
 def breaches(pod: Object) -> list[str]:
-    """What Pod Security "restricted" has against a pod: container and reason."""
+    """List the violations of Pod Security "restricted": container and reason."""
     found = []
     shared = pod["securityContext"]
     for key in ("hostNetwork", "hostPID", "hostIPC"):
@@ -57,7 +57,7 @@ def test_a_release_passes_restricted_with_the_relay(path: Path) -> None:
     assert {name: breaches(pod) for name, pod in pods.items() if breaches(pod)} == {}
 
 
-def test_the_default_passes_restricted_where_the_namespace_is_unknown() -> None:
+def test_the_default_is_restricted_if_the_namespace_is_unknown() -> None:
     assert not any(map(breaches, pod_specs(render()).values()))
 
 
@@ -77,7 +77,7 @@ def test_netem_adds_one_capability_to_one_container(mode: str) -> None:
 
 
 @each_file
-def test_root_file_systems_are_read_only_and_nobody_has_a_token(path: Path) -> None:
+def test_root_is_read_only_and_no_account_token_is_mounted(path: Path) -> None:
     objects = render(values_of(path))
     for pod in pod_specs(objects).values():
         assert pod["automountServiceAccountToken"] is False
@@ -89,7 +89,7 @@ def test_root_file_systems_are_read_only_and_nobody_has_a_token(path: Path) -> N
 
 
 @each_file
-def test_users_are_not_those_of_the_machine(path: Path) -> None:
+def test_user_ids_are_not_those_of_the_node(path: Path) -> None:
     for pod in pod_specs(render(values_of(path))).values():
         assert pod["securityContext"]["runAsUser"] >= 10_000
         assert pod["securityContext"]["runAsGroup"] >= 10_000
@@ -112,7 +112,7 @@ def test_a_pod_can_be_guaranteed() -> None:
         assert container["resources"]["requests"] == container["resources"]["limits"]
 
 
-def test_no_role_is_bound_and_no_budget_guards_one_replica() -> None:
+def test_the_chart_has_no_role_and_no_disruption_budget() -> None:
     objects = render()
     kinds = {thing["kind"] for thing in objects}
     assert not kinds & {"Role", "RoleBinding", "ClusterRole", "PodDisruptionBudget"}
@@ -121,7 +121,7 @@ def test_no_role_is_bound_and_no_budget_guards_one_replica() -> None:
         assert deployment["spec"]["strategy"] == {"type": "Recreate"}
 
 
-def test_accounts_are_made_or_taken() -> None:
+def test_service_accounts_are_made_or_named() -> None:
     made = render()
     names = {pod["serviceAccountName"] for pod in pod_specs(made).values()}
     assert names == {
@@ -133,7 +133,7 @@ def test_accounts_are_made_or_taken() -> None:
 
 
 @each_file
-def test_probes_ask_the_metrics_port_and_liveness_never_asks_for_the_peer(path: Path) -> None:
+def test_probes_use_the_metrics_port_and_liveness_needs_no_peer(path: Path) -> None:
     for thing in render(values_of(path)):
         if thing["kind"] != "Deployment":
             continue

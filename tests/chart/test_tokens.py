@@ -1,4 +1,4 @@
-"""The API's tokens: made once and kept, or somebody else's; each pod gets those that it needs."""
+"""The API's tokens: made once and kept, or an existing Secret; a pod gets only what it needs."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ def mounted(pod: Object) -> Object | None:
     return found[0] if found else None
 
 
-def test_two_that_differ_are_made() -> None:
+def test_two_different_tokens_are_made() -> None:
     data = tokens(render())["data"]
     operator, reader = (base64.b64decode(data[role]) for role in ("operator", "reader"))
     assert len(operator) == len(reader) == 48
     assert operator != reader
 
 
-def test_an_upgrade_finds_them_and_uninstalling_keeps_them() -> None:
+def test_upgrade_and_uninstall_keep_the_tokens() -> None:
     installed = render(lookup=a_namespace())
     upgraded = render(lookup=holding(installed, a_namespace()))
     assert tokens(upgraded) == tokens(installed)
     assert tokens(upgraded)["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"
 
 
-def test_ones_own_come_first() -> None:
+def test_existing_tokens_are_used() -> None:
     there = holding([{"kind": "Secret", "metadata": {"name": "lab-tokens"}}], a_namespace())
     objects = render({**OURS, **MISSION}, lookup=there)
     assert "tokens" not in of_kind(objects, "Secret")
@@ -53,13 +53,13 @@ def test_ones_own_come_first() -> None:
     assert names == {"lab-tokens"}
 
 
-def test_missing_ones_are_refused_with_the_command_that_makes_them() -> None:
+def test_missing_tokens_are_refused_with_a_command() -> None:
     said = "no Secret 'lab-tokens' in namespace 'lab'; make it: .* --from-file=operator"
     with pytest.raises(Exception, match=said):
         render(OURS, lookup=a_namespace())
 
 
-def test_teleop_has_all_missions_the_operators_and_nobody_else_any() -> None:
+def test_teleop_mounts_all_tokens_and_missions_the_operators() -> None:
     pods = pod_specs(render(MISSION))
     assert mounted(pods["world"]) is None
     assert "items" not in (mounted(pods["cloud"]) or {})
@@ -75,13 +75,13 @@ def test_teleop_has_all_missions_the_operators_and_nobody_else_any() -> None:
     assert [name for name, found in mounts.items() if "tokens" in found] == ["teleop"]
 
 
-def test_the_api_in_the_pod_is_served_with_tokens_and_audited() -> None:
+def test_the_api_has_tokens_and_an_audit_log() -> None:
     teleop = containers(pod_specs(render())["cloud"])["teleop"]
     assert "--tokens=/etc/cloudrc-tokens" in teleop["args"]
     assert [a for a in teleop["args"] if a.startswith("--audit=/var/lib/cloudrc-journal/")]
 
 
-def test_they_are_not_printed_and_in_no_environment() -> None:
+def test_tokens_are_in_no_output_and_no_environment() -> None:
     objects = render(MISSION)
     data = tokens(objects)["data"]
     for pod in pod_specs(objects).values():

@@ -1,4 +1,4 @@
-"""Values, schema and tables come from the models; what is not in them is refused by name."""
+"""Values, schema and tables come from the models; an unknown value is refused by name."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from tests.chart.conftest import (
 jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-validate, extra dev")
 
 DEFAULTS = values_of(CHART / "values.yaml")
-# Helm's own, and what Kubernetes or a plug-in defines and checks.
+# Values that Helm, Kubernetes or a plug-in defines and checks.
 OPEN = {"global", "affinity", "tolerations"}
 
 
 def parts(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Object]]:
-    """Every object of the schema that says something about values."""
+    """Yield every part of the schema with its path."""
     if isinstance(node, dict):
         yield path, node
         for key, inner in node.items():
@@ -67,7 +67,7 @@ def test_the_experiments_units_are_in_the_schema(key: str) -> None:
             assert unit in part["properties"][key]["description"]
 
 
-def test_own_numbers_have_a_unit() -> None:
+def test_numbers_of_the_chart_have_a_unit() -> None:
     for path, part in parts(schema()):
         for name, value in part.get("properties", {}).items():
             if value.get("type") == "integer" and not path[:2] == ("$defs", "Experiment"):
@@ -124,5 +124,5 @@ def test_a_wrong_value_is_refused_and_named(values: Object, named: str) -> None:
     assert any(named in error.message for error in errors)
 
 
-def test_a_chart_that_contains_this_one_may_have_globals() -> None:
+def test_globals_of_a_parent_chart_are_accepted() -> None:
     assert render({"global": {"anything": {"goes": True}}})

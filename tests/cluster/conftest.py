@@ -1,11 +1,7 @@
-"""A fake API server, a kubeconfig that leads to it, and programs that only pretend.
+"""A fake Kubernetes API server with objects in memory, a kubeconfig for it, and fake programs.
 
-A Kubernetes API server that a test can look into: objects in memory, selectors, logs, refusals.
-
-kmock was tried first: it does not select by label, and its pytest plug-in needs a second one that
-warns in every run of the suite.
-
-A pretended kubectl: what a release's link is told goes in, what its containers say comes out.
+kmock does not fit: it does not select by label, and its pytest plug-in needs another one that
+warns in every run.
 """
 
 from __future__ import annotations
@@ -38,7 +34,7 @@ VERSION_KEYS = (
 
 
 def _merge(target: dict[str, Any], patch: dict[str, Any]) -> None:
-    """Lay a patch over an object, as RFC 7396 says."""
+    """Merge a patch into an object (RFC 7396)."""
     for key, value in patch.items():
         if isinstance(value, dict):
             _merge(target.setdefault(key, {}), value)
@@ -49,7 +45,7 @@ def _merge(target: dict[str, Any], patch: dict[str, Any]) -> None:
 
 
 class FakeApi:
-    """Holds objects by (plural, namespace, name); `refuse` answers a verb with a code."""
+    """Objects by (plural, namespace, name); `refuse` maps a method and plural to an error."""
 
     def __init__(self) -> None:
         self.objects: dict[tuple[str, str, str], dict[str, Any]] = {}
@@ -147,7 +143,7 @@ class FakeApi:
 
 
 def kubeconfig(url: str, namespace: str = "demo") -> str:
-    """A kubeconfig with two contexts: `here`, which is the current one, and `elsewhere`."""
+    """Build a kubeconfig with two contexts: `here`, the current one, and `elsewhere`."""
     contexts = [
         {"name": "here", "context": {"cluster": "fake", "user": "me", "namespace": namespace}},
         {"name": "elsewhere", "context": {"cluster": "fake", "user": "me"}},
@@ -181,7 +177,7 @@ def pod(
     phase: str = "Running",
     **more: Any,
 ) -> dict[str, Any]:
-    """A pod with one container, in a state as the kubelet writes it."""
+    """Build a pod with one container in a state that the kubelet writes."""
     status = {
         "name": component,
         "image": "cloudrc/cloud:0.1.0",
@@ -257,7 +253,7 @@ def item(kind: str, name: str, component: str, **rest: Any) -> dict[str, Any]:
 
 
 class Cluster:
-    """What the pretended kubectl knows, and what it was asked for."""
+    """The cluster of the fake kubectl, and a record of its calls."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -287,11 +283,11 @@ class Cluster:
         return data
 
     def make(self, what: str, pod: str, how: str = "") -> None:
-        """Let a pod be `deaf`; `broken` (at its Nth call); or one that `cannot` do a word."""
+        """Make a pod `deaf`, `broken` (at its Nth call), or one that `cannot` apply a text."""
         (self.folder / f"{what}-{pod}").write_text(how)
 
     def handed(self, pod: str) -> list[dict[str, Any]]:
-        """What a pod was given, the newest last."""
+        """Return the changes that a pod received, the newest last."""
         paths = sorted(self.folder.glob(f"handed-{pod}-*.json"))
         return [json.loads(path.read_text()) for path in paths]
 
@@ -303,12 +299,12 @@ class Cluster:
         return (self.folder / "patched.json").exists()
 
     def asked(self) -> list[str]:
-        """All command lines of kubectl."""
+        """Return all command lines of kubectl."""
         return (self.folder / "asked").read_text().splitlines()
 
 
 def pretended(folder: Path, pretend: Callable[[str, str], Path]) -> Cluster:
-    """Put a release and its kubectl into a folder."""
+    """Write a release and its fake kubectl into a folder."""
     script = folder / "kubectl.py"
     script.write_text(KUBECTL)
     pretend("kubectl", f'exec {sys.executable} -S {script} {folder} "$@"')
@@ -339,7 +335,7 @@ def release(api: FakeApi) -> Release:
 
 @pytest.fixture
 def running(api: FakeApi, release: Release) -> FakeApi:
-    """The fake with a release that is ready to fly."""
+    """The fake API server with a release that is ready to fly."""
     for component in ("world", "cloud"):
         api.put("deployments", "demo", deployment(component))
         api.put("pods", "demo", pod(f"{component}-1", component))
@@ -356,7 +352,7 @@ def running(api: FakeApi, release: Release) -> FakeApi:
 
 @pytest.fixture
 def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Make a program that is a shell script; it is found before the real one."""
+    """Make a fake program from a shell script; the PATH has it before the real one."""
     folder = tmp_path / "bin"
     folder.mkdir()
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
@@ -372,5 +368,5 @@ def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture
 def cluster(tmp_path: Path, pretend: Callable[[str, str], Path]) -> Cluster:
-    """A release whose link flies, and a kubectl that knows it."""
+    """A release with a running link, and a fake kubectl for it."""
     return pretended(tmp_path, pretend)

@@ -1,4 +1,4 @@
-"""Which cluster and release is meant, and how it is said that there is none."""
+"""The selection of cluster and release, and the errors if there is none."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ def test_the_current_context_gives_the_namespace(api: FakeApi) -> None:
     assert connect().namespace == "demo"
 
 
-def test_flags_win(api: FakeApi) -> None:
+def test_flags_override_the_kubeconfig(api: FakeApi) -> None:
     release = connect("elsewhere", "mine", "paper")
     assert release == Release("elsewhere", "mine", "paper")
     assert release.flags == ["--context=elsewhere", "--namespace=mine"]
     assert release.helm_flags == ["--kube-context=elsewhere", "--namespace=mine"]
 
 
-def test_a_context_without_a_namespace_means_default(api: FakeApi) -> None:
+def test_a_context_without_a_namespace_uses_default(api: FakeApi) -> None:
     assert connect("elsewhere").namespace == "default"
 
 
-def test_an_unknown_context_is_named_with_those_there_are(api: FakeApi) -> None:
+def test_an_unknown_context_lists_the_known_ones(api: FakeApi) -> None:
     with pytest.raises(MissingPrerequisiteError, match=r"no context 'x'.*elsewhere, here"):
         connect("x")
 
 
 @pytest.mark.parametrize("text", [None, "", "contexts: 3", ":\n  - x: ["])
-def test_without_a_kubeconfig_one_sentence_says_what_to_do(
+def test_a_missing_kubeconfig_is_reported_with_a_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str | None
 ) -> None:
     path = tmp_path / "config"
@@ -63,10 +63,10 @@ def test_without_a_kubeconfig_one_sentence_says_what_to_do(
     ],
     ids=["missing", "failing", "giving nothing"],
 )
-def test_a_login_program_that_fails_is_named_and_nothing_else_is_printed(
+def test_a_failing_login_program_is_named_in_one_line(
     tmp_path: Path, script: str | None, words: str
 ) -> None:
-    """In a process of its own: here pytest listens to what is logged."""
+    """Runs in its own process, because pytest captures log records."""
     program = tmp_path / "login-to-nowhere"
     if script is not None:
         program.write_text(f"#!/bin/sh\n{script}\n")
@@ -89,11 +89,11 @@ def test_a_login_program_that_fails_is_named_and_nothing_else_is_printed(
     assert re.search(words, line)
 
 
-def test_a_cluster_that_does_not_answer_is_said_in_one_sentence(
+def test_a_silent_cluster_is_reported_in_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "config"
-    path.write_text(kubeconfig("http://127.0.0.1:9"))  # discard: nobody listens
+    path.write_text(kubeconfig("http://127.0.0.1:9"))  # the discard port: nobody listens
     monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", str(path))
     with pytest.raises(ClusterError, match=r"does not answer.*refused.*kubectl") as caught:
         list_pods(connect(), "cloud")
@@ -118,19 +118,21 @@ def test_a_refusal_names_cause_and_next_command(
     assert "\n" not in str(caught.value)
 
 
-def test_no_release_is_said_with_the_way_to_one(api: FakeApi, release: Release) -> None:
+def test_a_missing_release_is_reported_with_the_install_command(
+    api: FakeApi, release: Release
+) -> None:
     with pytest.raises(ClusterError, match=r"no release 'cloudrc' in namespace 'demo'; install it"):
         find_pod(release, "cloud")
 
 
-def test_the_newest_pod_counts_and_one_that_ends_does_not(api: FakeApi, release: Release) -> None:
+def test_the_newest_pod_that_is_not_ending_is_found(api: FakeApi, release: Release) -> None:
     for name in ("old", "new", "ending"):
         api.put("pods", "demo", pod(name, "cloud"))
     api.get("pods", "ending")["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:59Z"
     assert find_pod(release, "cloud").metadata.name == "new"
 
 
-def test_pods_of_another_release_are_not_seen(api: FakeApi, release: Release) -> None:
+def test_pods_of_another_release_are_ignored(api: FakeApi, release: Release) -> None:
     other = pod("other", "cloud", labels={"app.kubernetes.io/instance": "other"})
     api.put("pods", "demo", other)
     assert list_pods(release, "cloud") == []

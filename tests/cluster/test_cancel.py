@@ -1,4 +1,4 @@
-"""A mission is cancelled through its Job's name, in whatever state the Job is."""
+"""A mission is cancelled by its Job's name, in every state of the Job."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.cluster.test_jobs import MISSION, end
 
 
 class FakeTeleop(ThreadingHTTPServer):
-    """Teleop's API: what it knows, and what was asked of it."""
+    """A fake API of teleop, with a record of its requests."""
 
     def __init__(self) -> None:
         self.missions: list[dict[str, str]] = []
@@ -80,7 +80,7 @@ def test_a_job_that_has_not_posted_yet_is_deleted(
 def test_without_a_cloud_pod_the_job_is_deleted(
     running: FakeApi, teleop: FakeTeleop, release: Release
 ) -> None:
-    """Nobody could be asked to cancel its mission, and the Job would wait for its deadline."""
+    """No API can cancel the mission, and the Job would wait until its deadline."""
     run_job(release, MISSION, name="first")
     running.get("pods", "cloud-1")["status"]["phase"] = "Pending"
     said = cancel(release, "first")
@@ -90,7 +90,7 @@ def test_without_a_cloud_pod_the_job_is_deleted(
     assert teleop.posted == []
 
 
-def test_a_job_that_has_ended_is_left_alone(
+def test_cancelling_an_ended_job_changes_nothing(
     running: FakeApi, teleop: FakeTeleop, release: Release
 ) -> None:
     run_job(release, MISSION, name="first")
@@ -99,14 +99,14 @@ def test_a_job_that_has_ended_is_left_alone(
     assert teleop.posted == []
 
 
-def test_what_the_api_refuses_is_told(teleop: FakeTeleop, release: Release) -> None:
+def test_a_refusal_of_the_api_is_reported(teleop: FakeTeleop, release: Release) -> None:
     job = run_job(release, MISSION, name="first")
     teleop.missions, teleop.refuses = [{"id": "m1", "key": job.uid, "name": ""}], True
     with pytest.raises(ClusterError, match="it is over"):
         cancel(release, "first")
 
 
-def test_a_token_that_is_given_is_sent(teleop: FakeTeleop, release: Release) -> None:
+def test_a_given_token_is_sent(teleop: FakeTeleop, release: Release) -> None:
     job = run_job(release, MISSION, name="first")
     teleop.missions = [{"id": "m2", "name": "hop", "key": job.uid}]
     cancel(release, "first", "a-token-of-mine-alone")

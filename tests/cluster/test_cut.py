@@ -1,4 +1,4 @@
-"""Of a long recording that is still open, the last mission is kept, and called whole if it is."""
+"""The last mission is cut from a recording that is still open, with a mark if it is complete."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def later(given: list[Record], by_ns: int) -> list[Record]:
 
 
 def merged(folder: Path, *flights: tuple[list[Record], list[Record]], torn: bool) -> Mission:
-    """What two pods recorded of some flights; torn: the files have no end, as fetched in flight."""
+    """Record flights as two pods do; torn: the files have no end, as when copied in flight."""
     for number, end in enumerate(("world", "cloud")):
         path = folder / f"{end}.mcap"
         with McapWriter(path, clock=end, clock_id="same") as writer:
@@ -54,7 +54,7 @@ def test_a_recording_with_the_missions_end_is_complete(tmp_path: Path, torn: boo
     assert cloud
 
 
-def test_a_recording_without_the_missions_end_is_not(tmp_path: Path) -> None:
+def test_a_recording_without_the_missions_end_is_incomplete(tmp_path: Path) -> None:
     world, cloud = flown()
     mission = merged(tmp_path, (world[: len(world) // 2], cloud[: len(cloud) // 2]), torn=True)
     cut, ended = cut_to_last_mission(mission)
@@ -62,7 +62,7 @@ def test_a_recording_without_the_missions_end_is_not(tmp_path: Path) -> None:
     assert not cut.recording().complete
 
 
-def test_of_two_missions_the_last_is_judged(tmp_path: Path) -> None:
+def test_only_the_last_of_two_missions_is_kept(tmp_path: Path) -> None:
     world, cloud = flown()
     gap = world[-1].stamp_ns + 5 * SECOND
     second = later(world, gap), later(cloud, gap)
@@ -79,7 +79,7 @@ def test_of_two_missions_the_last_is_judged(tmp_path: Path) -> None:
 
 
 def test_a_mission_that_a_new_pod_resumed_is_kept_as_a_whole(tmp_path: Path) -> None:
-    """Its start is in the old pod's recording, which is gone."""
+    """The mission's start was in the old pod's recording, which is lost."""
     world, cloud = flown()
     half = cloud[len(cloud) // 3 :]
     after = later(world[-300:], SECOND), []

@@ -1,4 +1,4 @@
-"""`cloudrc doctor --mode cluster` says "can run" exactly where `cloudrc run` can."""
+"""`cloudrc doctor --mode cluster` says "can run" if and only if `cloudrc run` can."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ LINE = ["doctor", "--mode", "cluster", "-o", "json"]
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without what has nothing to do with a cluster and takes its time."""
+    """Skip slow checks that have nothing to do with a cluster."""
     for name in ("mujoco_steps", "udp_loopback", "timer", "graphics"):
         monkeypatch.setattr(checks, name, lambda name=name: checks.Check(name, "ok", ""))
 
 
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Let only some programs be there."""
+    """Make only the given programs available."""
 
     def install(*names: str) -> None:
         found = {name: f"/nowhere/{name}" for name in names}
@@ -60,14 +60,14 @@ def test_a_cluster_elsewhere_needs_neither_docker_nor_kind(
 
 
 @pytest.mark.parametrize("program", ["helm", "kubectl"])
-def test_what_the_run_calls_is_needed(
+def test_a_missing_program_blocks_the_mode(
     api: FakeApi, installed: Callable[..., None], capsys: Printed, program: str
 ) -> None:
     installed(*{"helm", "kubectl"} - {program})
     assert doctor(capsys, 3)[program]["state"] == "missing"
 
 
-def test_docker_without_its_daemon_is_not_ok(
+def test_docker_without_a_daemon_is_not_ok(
     api: FakeApi, pretend: Callable[[str, str], Path], capsys: Printed
 ) -> None:
     for name in ("helm", "kubectl", "kind"):
@@ -80,7 +80,7 @@ def test_docker_without_its_daemon_is_not_ok(
     assert doctor(capsys, 0)["docker"]["state"] == "ok"
 
 
-def test_without_a_kubeconfig_it_cannot_run(
+def test_a_missing_kubeconfig_blocks_the_mode(
     tmp_path: Path,
     installed: Callable[..., None],
     capsys: Printed,
@@ -95,7 +95,7 @@ def test_without_a_kubeconfig_it_cannot_run(
     assert "cluster" not in found
 
 
-def test_a_cluster_that_does_not_answer_cannot_be_flown_on(
+def test_a_silent_cluster_blocks_the_mode(
     tmp_path: Path,
     installed: Callable[..., None],
     capsys: Printed,
@@ -113,7 +113,7 @@ def test_a_cluster_that_does_not_answer_cannot_be_flown_on(
 @pytest.mark.parametrize(
     ("minor", "code"), [("28", 3), ("28+", 3), ("29", 0), ("30+", 0), ("100", 0)]
 )
-def test_a_cluster_that_is_too_old_is_said_to_be(
+def test_a_cluster_that_is_too_old_is_reported(
     api: FakeApi, installed: Callable[..., None], capsys: Printed, minor: str, code: int
 ) -> None:
     installed("helm", "kubectl")
@@ -123,7 +123,7 @@ def test_a_cluster_that_is_too_old_is_said_to_be(
     assert not code or "needs 1.29" in cluster["fix"]
 
 
-def test_another_context_can_be_asked_for(
+def test_the_context_can_be_selected(
     api: FakeApi, installed: Callable[..., None], capsys: Printed
 ) -> None:
     installed("helm", "kubectl")
@@ -132,22 +132,22 @@ def test_another_context_can_be_asked_for(
 
 
 @pytest.mark.parametrize("mode", run.MODES)
-def test_the_extras_that_block_a_mode_are_those_that_its_run_asks_for(mode: str) -> None:
+def test_a_mode_is_blocked_by_the_extras_that_its_run_needs(mode: str) -> None:
     blocking = {extra for extra in extras.EXTRAS if mode in checks.packages(extra).modes}
     assert blocking == set(run.EXTRAS[mode])
 
 
-def test_other_modes_leave_the_cluster_alone(api: FakeApi) -> None:
+def test_other_modes_do_not_contact_the_cluster(api: FakeApi) -> None:
     names = [check.name for check in checks.all_checks("local")]
     assert "cluster" not in names
     assert "kubeconfig" not in names
 
 
-def test_either_version_of_cgroups_is_read_and_none_is_wanted() -> None:
+def test_no_version_of_cgroups_is_required() -> None:
     assert "want" not in checks.cgroup().fix
 
 
-def test_the_oldest_version_is_that_of_the_chart() -> None:
+def test_the_oldest_version_equals_that_of_the_chart() -> None:
     wanted = yaml.safe_load(CHART.read_text())["kubeVersion"]
     found = re.fullmatch(r">=(\d+)\.(\d+)\.0-0", wanted)
     assert found is not None

@@ -1,4 +1,4 @@
-"""`cloudrc run --mode cluster` from the flags to the report, against what only pretends."""
+"""`cloudrc run --mode cluster` from the flags to the report, on a fake cluster."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.cluster.test_jobs import at_look, end, start_pod, terminated
 Patch = pytest.MonkeyPatch
 NAME, (SETTING,) = HOVER
 MISSIONS: list[dict[str, str]] = []
-"""What teleop knows of."""
+"""Missions that the fake API of teleop returns."""
 LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]
 
 
@@ -61,7 +61,7 @@ def metrics_port() -> Iterator[int]:
 def pods(
     running: FakeApi, pretend: Callable[[str, str], Path], tmp_path: Path, metrics_port: int
 ) -> FakeApi:
-    """A release whose pods have recorded a flight, and whose Jobs fly it as soon as created."""
+    """A release whose pods have recorded a flight, and whose Jobs end at once."""
     world, _ = flown()
     merged(tmp_path, flown(), (later(world[-300:], SECOND), []), torn=True)
     pretend("helm", f"echo $@ >> {tmp_path}/helm; test $1 = list && echo '[]' || cat > /dev/null")
@@ -87,7 +87,7 @@ def ending(api: FakeApi, kind: str, exit_code: int, message: str) -> Callable[[]
     return action
 
 
-def test_a_flight_leaves_what_a_run_leaves(
+def test_a_flight_on_a_cluster_writes_a_whole_run(
     pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "two.py").write_text("UNIT = '1'\ndef measure(flight):\n    return 2.0\n")
@@ -96,7 +96,7 @@ def test_a_flight_leaves_what_a_run_leaves(
     captured = capsys.readouterr()
     assert "waypoint 1 of 1 reached" in captured.err
     report = json.loads(captured.out)
-    # What was recorded was flown in virtual time: nothing in it proves that it kept real time.
+    # The recording was made in virtual time, so it does not prove real time.
     assert (code, report["verdict"]) == (6, "invalid")
     assert (report["mode"], report["shaper"]) == ("cluster", "relay")
     assert report["complete"]
@@ -110,7 +110,7 @@ def test_a_flight_leaves_what_a_run_leaves(
 
 
 @pytest.mark.parametrize("out", [[], ["--out", "out"]], ids=["runs", "out"])
-def test_a_mission_that_was_refused_leaves_nothing_and_claims_nothing(
+def test_a_refused_mission_leaves_no_run(
     pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: list[str]
 ) -> None:
     at_look(pods, 2, ending(pods, "Failed", 5, "mission m-1 is under way"))
@@ -122,14 +122,14 @@ def test_a_mission_that_was_refused_leaves_nothing_and_claims_nothing(
     assert list((tmp_path / "runs").glob("*")) == []
 
 
-def test_a_run_in_runs_is_the_latest_one(pods: FakeApi, tmp_path: Path) -> None:
+def test_a_run_on_a_cluster_becomes_the_latest_one(pods: FakeApi, tmp_path: Path) -> None:
     at_look(pods, 2, ending(pods, "Complete", 0, "mission done"))
     assert main(LINE) == 6
     assert (tmp_path / "runs" / "latest" / "report.json").is_file()
 
 
 @pytest.mark.parametrize("left", [True, False], ids=["left", "nothing"])
-def test_what_a_container_recorded_before_it_was_started_again_is_brought_along(
+def test_the_recording_from_before_a_restart_is_copied(
     pods: FakeApi,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -151,7 +151,7 @@ def test_what_a_container_recorded_before_it_was_started_again_is_brought_along(
         assert (out / "world.before.mcap").read_text() == "before\n"
 
 
-def test_a_way_that_breaks_off_costs_the_metrics_and_not_the_report(
+def test_a_broken_port_forward_loses_metrics_but_no_report(
     pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Patch
 ) -> None:
     calls: list[str] = []
@@ -177,7 +177,7 @@ def test_a_way_that_breaks_off_costs_the_metrics_and_not_the_report(
     assert (tmp_path / "out" / "cloud-teleop.log").is_file()
 
 
-def test_a_flight_that_is_under_way_is_not_ended_by_another(
+def test_a_run_does_not_end_a_flight_in_progress(
     pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Patch
 ) -> None:
     monkeypatch.setattr(sys.modules[__name__], "MISSIONS", [{"id": "m7", "state": "held"}])
@@ -202,7 +202,7 @@ def test_a_flight_that_is_under_way_is_not_ended_by_another(
         (["steps"], "mission.steps"),
     ],
 )
-def test_what_the_pods_cannot_have_is_refused_before_anything_is_done(
+def test_what_pods_cannot_have_is_refused_before_the_install(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: list[str], words: str
 ) -> None:
     plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"
@@ -212,7 +212,7 @@ def test_what_the_pods_cannot_have_is_refused_before_anything_is_done(
     assert not (tmp_path / "runs").exists()
 
 
-def test_what_a_release_was_installed_with_is_kept() -> None:
+def test_an_upgrade_keeps_the_values_of_a_release() -> None:
     before = {"metrics": {"allowFrom": ["x"]}, "link": {"mode": "relay", "profile": "paper-p1"}}
     given = run_cluster.values(load_experiment("hover"), before)
     assert given["metrics"] == before["metrics"]
@@ -220,7 +220,7 @@ def test_what_a_release_was_installed_with_is_kept() -> None:
     assert given["experiment"]["name"] == "hover"
 
 
-def test_the_charts_own_mission_does_not_fly_in_the_way() -> None:
+def test_a_run_disables_the_charts_own_mission() -> None:
     before = {"mission": {"enabled": True, "queue": True}}
     given = run_cluster.values(load_experiment("hover"), before)
     assert given["mission"] == {"enabled": False, "queue": True}

@@ -1,4 +1,4 @@
-"""Jobs: what is created, how it is followed, how it ends; against the fake API server."""
+"""Jobs of missions on the fake API server: created, followed, listed, deleted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def end(api: FakeApi, name: str, kind: str, **condition: str) -> None:
 
 
 def start_pod(api: FakeApi, name: str, **given: Any) -> None:
-    """The Job's pod, as Kubernetes would make it."""
+    """Create the pod of a Job as Kubernetes does."""
     uid = api.get("jobs", name)["metadata"]["uid"]
     api.put("pods", "demo", pod(f"{name}-x", "mission", labels={jobs.UID_LABEL: uid}, **given))
 
@@ -35,7 +35,7 @@ def terminated(exit_code: int, message: str) -> dict[str, Any]:
 
 
 def at_look(api: FakeApi, number: int, action: Callable[[], None]) -> None:
-    """Do something when the Job is looked at for the n-th time."""
+    """Call `action` at the n-th request for the Job."""
     original, looks = api.answer, iter(range(1, 1000))
     lock = threading.Lock()
 
@@ -48,7 +48,7 @@ def at_look(api: FakeApi, number: int, action: Callable[[], None]) -> None:
     api.answer = answer  # type: ignore[method-assign]
 
 
-def test_a_job_is_made_from_the_release_itself(running: FakeApi, release: Release) -> None:
+def test_a_job_uses_image_and_api_of_the_release(running: FakeApi, release: Release) -> None:
     status = run_job(release, MISSION, name="first", limit=60.0)
     assert status.state == "pending"
     job, plan = running.get("jobs", "first"), running.get("configmaps", "first")
@@ -59,9 +59,7 @@ def test_a_job_is_made_from_the_release_itself(running: FakeApi, release: Releas
     assert plan["metadata"]["ownerReferences"][0]["uid"] == status.uid
 
 
-def test_a_job_goes_with_its_release_and_runs_where_that_does(
-    running: FakeApi, release: Release
-) -> None:
+def test_a_job_has_owner_and_placement_of_its_release(running: FakeApi, release: Release) -> None:
     cloud = running.get("deployments", "cloudrc-cloud")
     where = {"nodeSelector": {"disk": "fast"}, "tolerations": [{"key": "lab"}]}
     cloud["spec"]["template"] = {"spec": {**where, "containers": []}}
@@ -72,14 +70,16 @@ def test_a_job_goes_with_its_release_and_runs_where_that_does(
     assert where.items() <= job["spec"]["template"]["spec"].items()
 
 
-def test_a_long_release_has_missions_too(running: FakeApi, release: Release) -> None:
+def test_a_job_of_a_release_with_a_long_name_is_short_enough(
+    running: FakeApi, release: Release
+) -> None:
     for body in list(running.objects.values()):
         body["metadata"].setdefault("labels", {})["app.kubernetes.io/instance"] = "r" * 53
     status = run_job(replace(release, name="r" * 53), MISSION)
     assert len(status.name) <= 63 - len("-xxxxx")
 
 
-def test_a_job_without_a_name_gets_one_that_is_free(running: FakeApi, release: Release) -> None:
+def test_a_job_without_a_name_gets_an_unused_one(running: FakeApi, release: Release) -> None:
     names = {run_job(release, MISSION).name for _ in range(5)}
     assert len(names) == 5
 
@@ -97,7 +97,7 @@ def test_a_job_passes_pod_security_restricted(running: FakeApi, release: Release
     assert container["securityContext"]["allowPrivilegeEscalation"] is False
 
 
-def test_a_job_is_tried_once_ends_in_time_and_goes_away(running: FakeApi, release: Release) -> None:
+def test_a_job_is_tried_once_and_has_time_limits(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="first", limit=60.0)
     spec = running.get("jobs", "first")["spec"]
     assert spec["backoffLimit"] == 0
@@ -115,7 +115,7 @@ def test_the_jobs_uid_is_the_missions_key(running: FakeApi, release: Release) ->
     assert path == "metadata.labels['batch.kubernetes.io/controller-uid']"
 
 
-def test_only_who_asks_for_the_queue_waits_in_it(running: FakeApi, release: Release) -> None:
+def test_only_a_queued_job_waits(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="impatient")
     run_job(release, MISSION, name="patient", queue=True)
 
@@ -129,7 +129,7 @@ def test_only_who_asks_for_the_queue_waits_in_it(running: FakeApi, release: Rele
 @pytest.mark.parametrize(
     ("kind", "code", "state"), [("Complete", 0, "complete"), ("Failed", 1, "failed")]
 )
-def test_every_line_is_passed_on_once_and_the_verdict_comes_out(
+def test_follow_writes_each_line_once_and_returns_the_verdict(
     running: FakeApi, release: Release, kind: str, code: int, state: str
 ) -> None:
     run_job(release, MISSION, name="first")
@@ -151,24 +151,20 @@ def test_every_line_is_passed_on_once_and_the_verdict_comes_out(
     assert (ended.state, ended.exit_code, ended.message) == (state, code, "the verdict")
 
 
-def test_a_job_that_never_ends_is_not_waited_for_without_end(
-    running: FakeApi, release: Release
-) -> None:
+def test_follow_has_a_timeout(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="first")
     with pytest.raises(WaitedTooLongError, match=r"'first' has not ended within 0\.05 s"):
         follow(release, "first", print, timeout=0.05)
 
 
-def test_a_job_whose_image_is_missing_is_given_up_at_once(
-    running: FakeApi, release: Release
-) -> None:
+def test_follow_ends_at_once_if_the_image_is_missing(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="first")
     start_pod(running, "first", state={"waiting": {"reason": "ErrImagePull"}}, ready=False)
     with pytest.raises(ClusterError, match=r"cannot start: the image.*make kind-load"):
         follow(release, "first", print, timeout=10.0)
 
 
-def test_a_job_whose_pod_is_refused_is_given_up(running: FakeApi, release: Release) -> None:
+def test_follow_ends_if_the_pod_is_refused(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="first")
     event = {
         "metadata": {"name": "first.1"},
@@ -182,7 +178,7 @@ def test_a_job_whose_pod_is_refused_is_given_up(running: FakeApi, release: Relea
         follow(release, "first", print, timeout=10.0)
 
 
-def test_a_job_that_ran_out_of_time_says_so(running: FakeApi, release: Release) -> None:
+def test_a_job_past_its_deadline_names_the_deadline(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="first")
     end(running, "first", "Failed", reason="DeadlineExceeded", message="...")
     assert "activeDeadlineSeconds" in read_job(release, "first").message
@@ -204,13 +200,13 @@ def test_a_deleted_job_is_gone(running: FakeApi, release: Release) -> None:
         logs(release, "first")
 
 
-def test_without_permission_the_refusal_is_told(running: FakeApi, release: Release) -> None:
+def test_a_missing_permission_is_reported(running: FakeApi, release: Release) -> None:
     running.refuse["POST", "jobs"] = 403, "jobs.batch is forbidden"
     with pytest.raises(ClusterError, match="can-i create jobs") as caught:
         run_job(release, MISSION)
     assert caught.value.exit_code == 5
 
 
-def test_without_a_release_there_is_nothing_to_fly_on(api: FakeApi, release: Release) -> None:
+def test_a_job_needs_a_release(api: FakeApi, release: Release) -> None:
     with pytest.raises(ClusterError, match="no release"):
         run_job(release, MISSION)

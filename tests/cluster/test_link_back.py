@@ -1,4 +1,4 @@
-"""`cloudrc link set` where one direction cannot follow: the link is set whole or not at all."""
+"""`cloudrc link set` if one direction refuses: both directions change, or none."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ def set_link(*words: str) -> int:
 
 
 def error(capsys: pytest.CaptureFixture[str]) -> str:
-    """What is said of an error: one line."""
+    """Return the one line of an error message."""
     (line,) = capsys.readouterr().err.splitlines()
     return line
 
 
-def test_what_one_direction_refuses_the_other_does_not_keep(
+def test_a_refusal_by_one_direction_rolls_the_other_back(
     cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each would be judged by a profile that the other one does not have."""
+    """Both directions must have the same profile."""
     cluster.items[0]["data"]["change.json"] = '{"number": "a1", "cause": "x", "restart": true}'
     cluster.tell()
     cluster.make("cannot", "cloud-1", "corrupt")
@@ -37,7 +37,7 @@ def test_what_one_direction_refuses_the_other_does_not_keep(
         "change for a moment and has its old profile again"
     )
     assert not cluster.kept(), "it does not last either"
-    for pod in ("world-1", "cloud-1"):  # what is refused must not be found by a restart
+    for pod in ("world-1", "cloud-1"):  # a restart must not read the refused files
         asked, back = cluster.handed(pod)
         assert "corrupt" in asked["files"]["profile.yaml"]
         assert back["files"] == {"profile.yaml": PROFILE}
@@ -46,7 +46,7 @@ def test_what_one_direction_refuses_the_other_does_not_keep(
         assert cluster.state(pod).cause == "taken back: downlink.corrupt=0.5, uplink.delay_ms=9"
 
 
-def test_a_container_that_refused_begins_with_the_old_profile_when_it_starts_again(
+def test_a_refusing_container_restarts_with_the_old_profile(
     cluster: Cluster, tmp_path: Path
 ) -> None:
     cluster.make("cannot", "cloud-1", "corrupt")
@@ -60,7 +60,7 @@ def test_a_container_that_refused_begins_with_the_old_profile_when_it_starts_aga
     assert said == []
 
 
-def test_a_refusal_by_both_leaves_nothing_to_say(
+def test_a_refusal_by_both_needs_no_further_words(
     cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for pod in ("world-1", "cloud-1"):
@@ -70,7 +70,7 @@ def test_a_refusal_by_both_leaves_nothing_to_say(
     assert not cluster.kept()
 
 
-def test_the_old_profile_comes_back_with_its_traces_and_begins_anew(
+def test_a_rollback_restores_traces_and_restarts_the_time_line(
     cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = "uplink: {trace: t.csv}\ndownlink: {corrupt: 0.1, delay_ms: 3}\n"
@@ -85,7 +85,7 @@ def test_the_old_profile_comes_back_with_its_traces_and_begins_anew(
     assert not json.loads(cluster.handed("cloud-1")[-1]["change"])["restart"], "this one goes on"
 
 
-def test_what_cannot_be_taken_back_is_said_with_the_command_that_does_it(
+def test_a_failed_rollback_is_reported_with_a_command(
     cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cluster.make("cannot", "cloud-1", "corrupt")
@@ -109,10 +109,10 @@ def test_what_cannot_be_taken_back_is_said_with_the_command_that_does_it(
 
 
 @pytest.mark.parametrize("refused", [True, False])
-def test_a_pod_that_is_not_reached_keeps_nobody_on_half_a_change(
+def test_an_unreachable_pod_rolls_the_other_back(
     refused: bool, cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Either the other pod refuses, or the ConfigMap does: nothing brings it to both then."""
+    """The other pod or the ConfigMap refuses, so the change cannot reach both pods."""
     cluster.make("broken", "cloud-1")
     if refused:
         cluster.make("cannot", "world-1", "delay_ms: 120")
@@ -126,7 +126,7 @@ def test_a_pod_that_is_not_reached_keeps_nobody_on_half_a_change(
     assert cluster.handed("world-1")[-1]["files"] == {"profile.yaml": PROFILE}
 
 
-def test_a_container_that_does_not_take_it_over_was_waited_for(
+def test_a_silent_container_is_waited_for_and_rolled_back(
     cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cluster.make("deaf", "cloud-1")

@@ -1,4 +1,4 @@
-"""What `link set` runs in a link container, by a real `sh`: a document in, the state out."""
+"""The script that `link set` runs in a link container, with a real `sh`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def tell(folder: Path, **state: str) -> str:
 
 
 @pytest.mark.parametrize("state", [{"change": "b2"}, {"change": "a1", "refused": "b2"}])
-def test_the_change_is_left_beside_the_route_and_what_the_sidecar_decides_is_told(
+def test_the_script_hands_over_a_change_and_prints_the_state(
     tmp_path: Path, state: dict[str, str]
 ) -> None:
     tell(tmp_path, change="a1", refused="b2-back")
@@ -55,13 +55,13 @@ def test_the_change_is_left_beside_the_route_and_what_the_sidecar_decides_is_tol
 
 
 @pytest.mark.process
-def test_a_link_that_does_not_follow_is_told_as_it_is(tmp_path: Path) -> None:
+def test_a_silent_sidecar_leaves_the_old_state(tmp_path: Path) -> None:
     told = tell(tmp_path, change="a1")
     out, _ = start(tmp_path).communicate(DOCUMENT, timeout=10 * PATIENCE)
     assert out == told
 
 
-def test_what_was_cut_off_on_its_way_is_not_handed_over(tmp_path: Path) -> None:
+def test_an_incomplete_change_is_not_handed_over(tmp_path: Path) -> None:
     tell(tmp_path, change="a1")
     running = start(tmp_path)
     _, err = running.communicate(DOCUMENT[:-1])
@@ -70,7 +70,7 @@ def test_what_was_cut_off_on_its_way_is_not_handed_over(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("folder", [".", "none"])
-def test_nothing_happens_where_no_link_is(tmp_path: Path, folder: str) -> None:
+def test_a_container_without_a_link_is_refused(tmp_path: Path, folder: str) -> None:
     running = start(tmp_path / folder)
     _, err = running.communicate("")
     assert (running.returncode, err) == (2, "error: no link runs here;\n")

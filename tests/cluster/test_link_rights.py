@@ -1,4 +1,4 @@
-"""What `cloudrc link set` may have to be allowed in a cluster: the Role among the examples."""
+"""The rights that `cloudrc link set` needs, and the Role among the chart's examples."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ KUBECTL_NEEDS = {
     "patch configmap NAME": {("configmaps", "get"), ("configmaps", "patch")},
     "exec NAME": {("pods", "get"), ("pods/exec", "create")},
 }
-"""Command of kubectl, as `short` gives it -> what the API server has to allow for it."""
+"""Command of kubectl, from `short` -> rights that it needs."""
 
 
 def allowed() -> set[tuple[str, str]]:
-    """What the Role allows: resource and verb."""
+    """Return the rights of the Role: resource and verb."""
     rules = yaml.safe_load(ROLE.read_text())["rules"]
     return {(what, verb) for rule in rules for what in rule["resources"] for verb in rule["verbs"]}
 
 
 def short(line: str) -> str:
-    """Leave of a command line of kubectl what decides which rights it takes."""
+    """Shorten a command line of kubectl to the words that decide its rights."""
     words = [word for word in line.partition(" -- ")[0].split() if word != "--stdin"]
     plain = [word for word in words if not word.startswith("-")]
     if plain[0] == "get":
@@ -41,14 +41,14 @@ def short(line: str) -> str:
     return " ".join([*plain[:-1], "NAME"])
 
 
-def test_the_role_allows_what_its_commands_take_and_no_more(cluster: Cluster) -> None:
+def test_the_role_allows_just_what_its_commands_need(cluster: Cluster) -> None:
     assert main(LINE) == 0
     commands = {short(line) for line in cluster.asked()}
     assert set().union(*(KUBECTL_NEEDS[command] for command in commands)) == allowed()
 
 
 class Server(FakeApi):
-    """An API server that notes which rights were asked for; `pods/exec` it refuses to all."""
+    """An API server that records the rights of each request; it refuses `pods/exec`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -73,7 +73,7 @@ class Server(FakeApi):
 
 
 def _discovered(place: str) -> tuple[int, Any]:
-    """Say what kinds of things there are."""
+    """Answer kubectl's discovery of resources."""
     kinds = {"pods": "Pod", "configmaps": "ConfigMap"}
     listed = [
         {"name": name, "kind": kind, "namespaced": True, "verbs": ["get", "list", "patch"]}
@@ -93,12 +93,12 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     found = Server()
     (tmp_path / "kubeconfig").write_text(kubeconfig(found.url))
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "kubeconfig"))
-    monkeypatch.setenv("HOME", str(tmp_path))  # kubectl keeps there what it has discovered
+    monkeypatch.setenv("HOME", str(tmp_path))  # kubectl caches its discovery there
     yield found
     found.close()
 
 
-def test_kubectl_asks_for_what_the_role_allows_and_no_more(server: Server) -> None:
+def test_kubectl_needs_just_what_the_role_allows(server: Server) -> None:
     if shutil.which("kubectl") is None:
         pytest.skip("kubectl is missing: https://kubernetes.io/docs/tasks/tools/")
     for component in ("world", "cloud"):
@@ -108,5 +108,5 @@ def test_kubectl_asks_for_what_the_role_allows_and_no_more(server: Server) -> No
     server.put("configmaps", "demo", {"metadata": metadata, "data": {"profile.yaml": PROFILE}})
     assert main(LINE) == 5, "exec is refused"
     assert "delay_ms: 120" in server.get("configmaps", "cloudrc-link")["data"]["profile.yaml"]
-    # It tries a WebSocket first, which is a get, and creates where that is refused.
+    # kubectl first tries a WebSocket, which is a get, then a create.
     assert server.rights - {("pods/exec", "get")} == allowed()

@@ -1,4 +1,4 @@
-"""`cloudrc link set` in a cluster: the ConfigMap, the way straight to the pods, the read-back."""
+"""`cloudrc link set` in a cluster: the change in the pods and in the ConfigMap, and its answer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cloudrc.errors import BadInputError
 from tests.cluster.conftest import PROFILE, TRACE, Cluster, FakeApi
 
 
-def test_the_profile_changes_for_good_and_both_pods_get_it_at_once(
+def test_a_change_reaches_both_pods_and_the_configmap(
     cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["link", "set", "downlink.delay_ms=120", "-n", "demo", "--context", "kind"]) == 0
@@ -36,7 +36,7 @@ def test_the_profile_changes_for_good_and_both_pods_get_it_at_once(
     assert shown[2].split()[:4] == ["downlink", "netem", "120", "ms"]
 
 
-def test_a_trace_goes_to_the_pods_and_the_change_before_is_named(
+def test_a_trace_goes_to_the_pods_with_the_previous_change(
     cluster: Cluster, tmp_path: Path
 ) -> None:
     (tmp_path / "t.csv").write_text(TRACE)
@@ -52,7 +52,7 @@ def test_a_trace_goes_to_the_pods_and_the_change_before_is_named(
     assert handed["files"]["uplink-t.csv"] == cluster.patched()["uplink-t.csv"] == TRACE
 
 
-def test_a_trace_of_this_machine_goes_with_the_profile(tmp_path: Path) -> None:
+def test_a_local_trace_is_stored_beside_the_profile(tmp_path: Path) -> None:
     (tmp_path / "my trace.csv").write_text(TRACE)
     made, new = with_files(
         {"profile.yaml": PROFILE}, None, [f"uplink.trace={tmp_path / 'my trace.csv'}"]
@@ -60,14 +60,14 @@ def test_a_trace_of_this_machine_goes_with_the_profile(tmp_path: Path) -> None:
     assert made.restart
     assert new["uplink-my_trace.csv"] == TRACE
     assert yaml.safe_load(new["profile.yaml"])["uplink"]["trace"] == "uplink-my_trace.csv"
-    # From now on it lies beside the profile and is named as it lies.
+    # The profile now has the name of the file beside it.
     again, newer = with_files({**new, "change.json": "{}"}, None, ["downlink.loss=0.1"])
     assert again.values["uplink"]["trace"] == "uplink-my_trace.csv"
     assert set(newer) == {"profile.yaml"}
     assert not again.restart
 
 
-def test_a_trace_that_is_too_long_for_a_config_map_is_refused(
+def test_a_trace_too_long_for_a_configmap_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "t.csv").write_text(TRACE)
@@ -83,7 +83,7 @@ def test_a_trace_that_is_too_long_for_a_config_map_is_refused(
         ("exec", "the ConfigMap has the change, and the pods apply it within 2 minutes"),
     ],
 )
-def test_where_only_a_part_is_allowed_it_is_said_what_holds(
+def test_a_partly_allowed_change_reports_the_final_state(
     cluster: Cluster, capsys: pytest.CaptureFixture[str], verb: str, beside: str
 ) -> None:
     cluster.refuse(verb, "Error from server (Forbidden): this is forbidden")
@@ -94,7 +94,7 @@ def test_where_only_a_part_is_allowed_it_is_said_what_holds(
     assert len(said.splitlines()) == 1
 
 
-def test_a_container_of_another_version_is_said(
+def test_a_container_of_another_version_is_reported(
     cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (cluster.folder / "state-cloud-1.json").write_text("{}")
@@ -105,7 +105,7 @@ def test_a_container_of_another_version_is_said(
     assert not cluster.kept()
 
 
-def test_a_release_that_is_not_there_is_said(
+def test_a_missing_release_is_reported(
     cluster: Cluster, api: FakeApi, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cluster.items.clear()

@@ -1,4 +1,4 @@
-"""`cloudrc mission run` on a cluster: what is checked, and waited for, before a Job is made."""
+"""`cloudrc mission run` on a cluster: checks and waits before the Job is created."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def lands(running: FakeApi, monkeypatch: pytest.MonkeyPatch) -> FakeApi:
-    """A release whose Jobs end well as soon as they are followed."""
+    """A release whose Jobs succeed as soon as they are followed."""
     original = following.follow
 
     def follow(release: Release, name: str, *given: Any, timeout: float) -> Any:
@@ -45,7 +45,7 @@ def lands(running: FakeApi, monkeypatch: pytest.MonkeyPatch) -> FakeApi:
 
 
 def experiment(api: FakeApi, given: dict[str, Any]) -> None:
-    """The release's experiment, as the chart writes it down."""
+    """Write the release's experiment as the chart does."""
     data = {"experiment.yaml": yaml.safe_dump(given)}
     metadata = {"name": "cloudrc-experiment", "labels": labels("experiment")}
     api.put("configmaps", "demo", {"metadata": metadata, "data": data})
@@ -89,7 +89,7 @@ def test_a_mission_that_cannot_be_flown_makes_no_job(
     ids=["the experiment's", "its own", "the default"],
 )
 @pytest.mark.parametrize("queue", [[], ["--queue"]], ids=["at once", "queued"])
-def test_a_job_lasts_as_long_as_its_mission_may(
+def test_a_jobs_deadline_follows_the_missions_time_limit(
     lands: FakeApi, folder: Path, mission: str, given: dict[str, Any], limit: int, queue: list[str]
 ) -> None:
     experiment(lands, given)
@@ -103,7 +103,7 @@ def test_a_job_lasts_as_long_as_its_mission_may(
     assert job["metadata"]["patience"] > deadline
 
 
-def test_an_experiment_that_may_not_be_read_gives_time_enough(lands: FakeApi, folder: Path) -> None:
+def test_an_unreadable_experiment_gives_a_long_deadline(lands: FakeApi, folder: Path) -> None:
     lands.refuse["GET", "configmaps"] = 403, "configmaps is forbidden"
     (folder / "one.yaml").write_text(WAYPOINTS)
     assert main(["mission", "run", "one.yaml"]) == 0
@@ -111,14 +111,14 @@ def test_an_experiment_that_may_not_be_read_gives_time_enough(lands: FakeApi, fo
     assert job["spec"]["activeDeadlineSeconds"] >= 600
 
 
-def test_an_absurd_limit_is_one_that_kubernetes_takes() -> None:
+def test_a_huge_limit_is_cut_to_what_kubernetes_accepts() -> None:
     assert patience(1e300, queue=True) < 2**31 + 100
 
 
-def test_a_release_that_is_not_ready_yet_is_waited_for(
+def test_run_waits_until_the_release_is_ready(
     lands: FakeApi, folder: Path, capsys: Printed
 ) -> None:
-    """As after `helm install`, which does not wait."""
+    """`helm install` does not wait for the pods."""
     original, looks = lands.answer, 0
     lands.put("pods", "demo", pod("cloud-1", "cloud", ready=False, phase="Pending"))
 
@@ -135,7 +135,7 @@ def test_a_release_that_is_not_ready_yet_is_waited_for(
     assert "container cloud is not ready yet" in capsys.readouterr().out
 
 
-def test_one_that_never_is_is_not_waited_for_without_end(
+def test_the_wait_for_a_release_has_a_timeout(
     running: FakeApi, folder: Path, capsys: Printed
 ) -> None:
     running.put("pods", "demo", pod("world-1", "world", ready=False))
@@ -145,14 +145,14 @@ def test_one_that_never_is_is_not_waited_for_without_end(
     assert made(running) == []
 
 
-def test_a_job_without_its_plan_is_not_left_behind(running: FakeApi, release: Release) -> None:
+def test_a_job_without_its_configmap_is_deleted(running: FakeApi, release: Release) -> None:
     running.refuse["POST", "configmaps"] = 403, "configmaps is forbidden"
     with pytest.raises(ClusterError, match="can-i create configmaps"):
         run_job(release, MISSION, name="first")
     assert made(running) == []
 
 
-def test_an_interrupted_follower_says_that_the_job_flies_on(
+def test_an_interrupted_run_says_that_the_job_continues(
     running: FakeApi, folder: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*arguments: object, **more: object) -> None:
@@ -169,7 +169,7 @@ def test_an_interrupted_follower_says_that_the_job_flies_on(
     )
 
 
-def test_the_shipped_mission_is_posted_as_it_is(lands: FakeApi) -> None:
+def test_the_shipped_mission_is_posted_unchanged(lands: FakeApi) -> None:
     assert main(["mission", "run", "pipes"]) == 0
     (job,) = made(lands)
     plan = lands.get("configmaps", job["metadata"]["name"])["data"]["mission.yaml"]

@@ -1,4 +1,4 @@
-"""`cloudrc mission` in a cluster, as it is typed: what is printed, and what it ends with."""
+"""`cloudrc mission` in a cluster: its output and exit codes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def fly(api: FakeApi, code: int = 0) -> int:
-    """Type `mission run`; the Job that it makes ends with this code."""
+    """Call `mission run`; its Job ends with this code."""
 
     def land() -> None:
         *_, (_, _, job) = (key for key in api.objects if key[0] == "jobs")
@@ -49,7 +49,7 @@ def job_of(printed: str) -> str:
 
 
 @pytest.mark.parametrize("code", [0, 1])
-def test_run_names_the_job_passes_its_lines_on_and_ends_with_its_verdict(
+def test_run_prints_job_and_log_and_ends_with_the_verdict(
     running: FakeApi, capsys: Printed, code: int
 ) -> None:
     assert fly(running, code) == code
@@ -81,9 +81,7 @@ def test_an_empty_list_says_how_to_fly(running: FakeApi, capsys: Printed) -> Non
     assert capsys.readouterr().err.startswith("cloudrc: error: no missions ")
 
 
-def test_logs_are_those_of_the_newest_job_unless_one_is_named(
-    running: FakeApi, capsys: Printed
-) -> None:
+def test_logs_default_to_the_newest_job(running: FakeApi, capsys: Printed) -> None:
     fly(running, 1)
     first = job_of(capsys.readouterr().out)
     fly(running)
@@ -95,7 +93,7 @@ def test_logs_are_those_of_the_newest_job_unless_one_is_named(
 
 
 @pytest.mark.parametrize("verb", ["status", "cancel", "logs"])
-def test_a_job_that_is_not_there_is_an_error_of_the_cluster(
+def test_a_missing_job_is_an_error_of_the_cluster(
     running: FakeApi, capsys: Printed, verb: str
 ) -> None:
     assert main(["mission", verb, "nothing"]) == 5
@@ -104,7 +102,7 @@ def test_a_job_that_is_not_there_is_an_error_of_the_cluster(
     assert "nothing" in line
 
 
-def test_without_a_release_the_next_command_is_told(api: FakeApi, capsys: Printed) -> None:
+def test_a_missing_release_is_reported_with_a_command(api: FakeApi, capsys: Printed) -> None:
     assert main(["mission", "run", "one.yaml"]) == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert "no release" in line

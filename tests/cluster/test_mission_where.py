@@ -1,4 +1,4 @@
-"""Whether `cloudrc mission` means the run that flies here or a release in the cluster."""
+"""`cloudrc mission` selects the run on this machine or a release in the cluster."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def flies_here(tmp_path: Path) -> Iterator[None]:
-    """Somebody listens where the run says, and never answers."""
+    """A run on this machine whose API accepts connections and never answers."""
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(f"{tmp_path}/silent.sock")
         server.listen()
@@ -35,7 +35,7 @@ def flies_here(tmp_path: Path) -> Iterator[None]:
 
 @pytest.fixture
 def was_killed(tmp_path: Path) -> None:
-    """A run that could not clean up after itself."""
+    """A killed run that has left its files."""
     with local.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
         (file,) = local.places()[0].iterdir()
         left = file.read_text()
@@ -49,9 +49,7 @@ def no_patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("flies_here", "no_patience")
-def test_the_run_here_is_meant_unless_something_says_otherwise(
-    running: FakeApi, capsys: Printed
-) -> None:
+def test_the_local_run_is_the_default(running: FakeApi, capsys: Printed) -> None:
     assert main(["mission", "list"]) == 5
     assert "silent.sock" in capsys.readouterr().err
     assert running.seen == []
@@ -59,7 +57,7 @@ def test_the_run_here_is_meant_unless_something_says_otherwise(
 
 @pytest.mark.usefixtures("flies_here", "no_patience")
 @pytest.mark.parametrize("flags", [["--release", "cloudrc"], ["-n", "demo"], ["--context", "here"]])
-def test_a_flag_of_the_cluster_means_the_cluster(
+def test_a_flag_of_the_cluster_selects_the_cluster(
     running: FakeApi, capsys: Printed, flags: list[str]
 ) -> None:
     assert main(["mission", "list", *flags]) == 0
@@ -67,7 +65,7 @@ def test_a_flag_of_the_cluster_means_the_cluster(
 
 
 @pytest.mark.usefixtures("flies_here", "no_patience")
-def test_the_plugin_of_kubectl_means_the_cluster(
+def test_the_plugin_of_kubectl_selects_the_cluster(
     running: FakeApi, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc", "mission", "list"])
@@ -75,14 +73,12 @@ def test_the_plugin_of_kubectl_means_the_cluster(
     assert IN_CLUSTER in capsys.readouterr().out
 
 
-def test_a_run_that_was_killed_is_not_in_the_way(
-    running: FakeApi, was_killed: None, capsys: Printed
-) -> None:
+def test_a_killed_run_is_ignored(running: FakeApi, was_killed: None, capsys: Printed) -> None:
     assert main(["mission", "list"]) == 0
     assert IN_CLUSTER in capsys.readouterr().out
 
 
-def test_without_a_cluster_a_run_that_was_killed_is_no_run(
+def test_a_killed_run_without_a_cluster_is_no_run(
     was_killed: None, capsys: Printed, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     nowhere = str(tmp_path / "none")

@@ -1,4 +1,4 @@
-"""An API server that is away for a moment costs neither a flight's lines nor its verdict."""
+"""A short outage of the API server loses no line and no verdict of a flight."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.cluster.test_jobs import MISSION, end, start_pod, terminated
 
 
 def away(api: FakeApi, plural: str, code: int, times: int) -> Callable[[], int]:
-    """Refuse to read something so many times; gives how many refusals are left."""
+    """Refuse a number of read requests; return a function that counts those left."""
     original, left = api.answer, times
 
     def answer(method: str, path: str, body: Any) -> tuple[int, Any]:
@@ -33,7 +33,7 @@ def away(api: FakeApi, plural: str, code: int, times: int) -> Callable[[], int]:
 
 @pytest.mark.parametrize("plural", ["jobs", "pods"])
 @pytest.mark.parametrize("code", [429, 500, 503])
-def test_a_job_is_followed_through_it(
+def test_follow_survives_an_outage(
     running: FakeApi, release: Release, plural: str, code: int
 ) -> None:
     run_job(release, MISSION, name="first")
@@ -50,13 +50,13 @@ def test_a_job_is_followed_through_it(
     assert last == "waypoint 1 of 1 reached"
 
 
-def test_a_release_is_waited_for_through_it(running: FakeApi, release: Release) -> None:
+def test_the_wait_for_a_release_survives_an_outage(running: FakeApi, release: Release) -> None:
     left = away(running, "deployments", 500, 2)
     wait_ready(release, timeout=10.0)
     assert left() == 0
 
 
-def test_what_is_refused_is_not_asked_again(running: FakeApi, release: Release) -> None:
+def test_a_refusal_is_not_repeated(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="first")
     left = away(running, "jobs", 403, 5)
     with pytest.raises(ClusterError, match="can-i get jobs"):
@@ -64,7 +64,7 @@ def test_what_is_refused_is_not_asked_again(running: FakeApi, release: Release) 
     assert left() == 4
 
 
-def test_one_that_does_not_come_back_ends_it(
+def test_a_long_outage_ends_the_wait(
     running: FakeApi, release: Release, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tools, "OUTAGE_MAX", 0.05)

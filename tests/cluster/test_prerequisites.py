@@ -1,4 +1,4 @@
-"""What the end-to-end tests need is named where it is missing; what users type is installed."""
+"""End-to-end tests name missing programs; the command and its kubectl plug-in are installed."""
 
 from __future__ import annotations
 
@@ -20,6 +20,6 @@ def test_e2e_says_which_programs_are_missing(tmp_path: Path) -> None:
         assert f"{tool}: https://" in done.stdout + done.stderr
 
 
-def test_our_command_is_a_plugin_of_kubectl_too() -> None:
+def test_cloudrc_is_a_plugin_of_kubectl() -> None:
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert scripts["kubectl-cloudrc"] == scripts["cloudrc"]

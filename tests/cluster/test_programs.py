@@ -1,4 +1,4 @@
-"""kubectl and helm are called, watched and ended; what they complain about is one line."""
+"""Calls of kubectl and helm: results, time limits, and errors in one line."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Pretend = Callable[[str, str], Path]
 
 
 @pytest.mark.parametrize("name", ["helm", "kubectl"])
-def test_a_missing_program_is_named_with_where_to_get_it(
+def test_a_missing_program_is_named_with_its_page(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     monkeypatch.setenv("PATH", "")
@@ -31,7 +31,7 @@ def test_a_missing_program_is_named_with_where_to_get_it(
         tools.run(name, ["version"], timeout=1.0)
 
 
-def test_a_program_that_hangs_is_ended(pretend: Pretend) -> None:
+def test_a_hanging_program_is_ended(pretend: Pretend) -> None:
     pretend("helm", "exec sleep 60")
     with pytest.raises(WaitedTooLongError, match=r"'helm list' took more than 0\.1 s"):
         tools.run("helm", ["list", "--all"], timeout=0.1)
@@ -45,7 +45,7 @@ def test_a_program_that_hangs_is_ended(pretend: Pretend) -> None:
         ("", "no error message"),
     ],
 )
-def test_what_a_program_complains_about_becomes_one_line(
+def test_the_error_message_of_a_program_becomes_one_line(
     pretend: Pretend, stderr: str, expected: str
 ) -> None:
     pretend("helm", f"cat >&2 <<'END'\n{stderr}\nEND\nexit 1")
@@ -67,7 +67,7 @@ def test_what_a_program_complains_about_becomes_one_line(
         ("values don't meet the specifications of the schema(s)\n- link: mdoe", "helm show values"),
     ],
 )
-def test_what_helm_refuses_comes_with_the_next_command(
+def test_a_refusal_of_helm_has_a_hint(
     release: Release, pretend: Pretend, said: str, hint: str
 ) -> None:
     pretend("helm", f"cat >&2 <<'END'\nError: {said}\nEND\nexit 1")
@@ -78,7 +78,7 @@ def test_what_helm_refuses_comes_with_the_next_command(
     assert said.split()[0] in str(caught.value)
 
 
-def test_install_hands_the_values_to_helm_and_waits_for_the_pods(
+def test_install_passes_values_to_helm_and_waits_for_pods(
     running: FakeApi, release: Release, pretend: Pretend, tmp_path: Path
 ) -> None:
     pretend("helm", f'cat > {tmp_path}/values; echo "$@" > {tmp_path}/line')
@@ -90,7 +90,7 @@ def test_install_hands_the_values_to_helm_and_waits_for_the_pods(
     assert "--set=a=b" in line
 
 
-def test_a_way_to_a_port_is_open_while_the_block_lasts(
+def test_a_port_is_forwarded_while_the_block_runs(
     release: Release, pretend: Pretend, tmp_path: Path
 ) -> None:
     pretend(
@@ -108,7 +108,7 @@ def test_a_way_to_a_port_is_open_while_the_block_lasts(
     assert "--namespace=demo port-forward pod/world-1" in (tmp_path / "line").read_text()
 
 
-def test_a_way_that_does_not_open_is_told(release: Release, pretend: Pretend) -> None:
+def test_a_failed_port_forward_is_reported(release: Release, pretend: Pretend) -> None:
     pretend("kubectl", "echo 'error: unable to forward port: pod is gone' >&2; exit 1")
     with (
         pytest.raises(ClusterError, match=r"cannot forward ports of pod 'cloud-1'.*pod is gone"),
@@ -117,7 +117,7 @@ def test_a_way_that_does_not_open_is_told(release: Release, pretend: Pretend) ->
         pytest.fail("there is no way")
 
 
-def test_a_way_that_takes_for_ever_is_given_up(
+def test_a_port_forward_has_a_timeout(
     release: Release, pretend: Pretend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pods, "START_LIMIT", 0.1)
@@ -131,15 +131,13 @@ def test_a_way_that_takes_for_ever_is_given_up(
     assert time.monotonic() - began < 2.0
 
 
-def test_an_error_inside_the_block_is_not_taken_for_one_of_the_way(
-    release: Release, pretend: Pretend
-) -> None:
+def test_an_error_inside_the_block_passes_unchanged(release: Release, pretend: Pretend) -> None:
     pretend("kubectl", "echo 'Forwarding from 127.0.0.1:40001 -> 8080'; exec sleep 60")
     with pytest.raises(KeyError), pods.forwarded(release, "cloud-1", [8080]):
         raise KeyError
 
 
-def test_a_recording_is_copied_byte_by_byte(
+def test_a_recording_is_copied_unchanged(
     api: FakeApi, release: Release, pretend: Pretend, tmp_path: Path
 ) -> None:
     api.put("pods", "demo", pod("world-1", "world"))

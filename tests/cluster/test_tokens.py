@@ -1,4 +1,4 @@
-"""The token of a release's API is read from its Secret; what is wrong is told without it."""
+"""The token of a release's API is read from its Secret; errors never contain it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from cloudrc.cluster.tools import ClusterError
 from tests.cluster.conftest import FakeApi
 
 
-def test_it_is_the_one_that_the_pod_mounts(running: FakeApi, release: Release) -> None:
+def test_the_token_is_from_the_secret_that_the_pod_mounts(
+    running: FakeApi, release: Release
+) -> None:
     assert secret_name(release) == "cloudrc-tokens"
     assert operator_token(release) == "operator-token-of-the-release"
 
 
-def test_without_the_right_to_read_it_the_refusal_is_told(
-    running: FakeApi, release: Release
-) -> None:
+def test_a_missing_right_to_read_the_token_is_reported(running: FakeApi, release: Release) -> None:
     running.refuse["GET", "secrets"] = (403, "secrets is forbidden")
     with pytest.raises(ClusterError, match="secrets"):
         operator_token(release)
@@ -35,7 +35,7 @@ def test_a_secret_without_a_token_is_named(
         operator_token(release)
 
 
-def test_a_token_that_is_no_text_is_not_shown(running: FakeApi, release: Release) -> None:
+def test_a_token_that_is_not_text_is_not_printed(running: FakeApi, release: Release) -> None:
     data = {"operator": base64.b64encode(b"\xff\xfe secret").decode()}
     running.get("secrets", "cloudrc-tokens")["data"] = data
     with pytest.raises(ClusterError) as refused:
@@ -43,7 +43,7 @@ def test_a_token_that_is_no_text_is_not_shown(running: FakeApi, release: Release
     assert "secret'" not in str(refused.value)
 
 
-def test_a_release_of_another_version_has_none(running: FakeApi, release: Release) -> None:
+def test_a_release_without_tokens_is_reported(running: FakeApi, release: Release) -> None:
     running.get("pods", "cloud-1")["spec"]["volumes"] = []
     with pytest.raises(
         ClusterError, match="mounts no tokens: it has another version of the chart; upgrade it"
@@ -51,7 +51,7 @@ def test_a_release_of_another_version_has_none(running: FakeApi, release: Releas
         secret_name(release)
 
 
-def test_a_job_mounts_the_operators_token_and_no_other(running: FakeApi, release: Release) -> None:
+def test_a_job_mounts_only_the_operators_token(running: FakeApi, release: Release) -> None:
     run_job(release, {"waypoints": []}, name="first")
     pod = running.get("jobs", "first")["spec"]["template"]["spec"]
     volume = next(v["secret"] for v in pod["volumes"] if v["name"] == "tokens")

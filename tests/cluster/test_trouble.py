@@ -1,4 +1,4 @@
-"""Why a pod does not run, in one sentence with the way out; and what is not trouble."""
+"""Failures of pods are explained in one sentence with a remedy; others are waited for."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def unscheduled(message: str) -> list[dict[str, str]]:
         ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
     ],
 )
-def test_trouble_is_put_into_words(
+def test_a_failure_of_a_pod_is_explained(
     api: FakeApi, release: Release, given: dict[str, Any], expected: str
 ) -> None:
     api.put("pods", "demo", pod("cloud-1", "cloud", ready=False, phase="Pending", **given))
@@ -62,14 +62,14 @@ def test_trouble_is_put_into_words(
         {"restarts": 1},
     ],
 )
-def test_what_passes_by_waiting_is_no_trouble(
+def test_a_pod_that_may_still_start_has_no_failure(
     api: FakeApi, release: Release, given: dict[str, Any]
 ) -> None:
     api.put("pods", "demo", pod("cloud-1", "cloud", ready=False, **given))
     assert trouble(list_pods(release, "cloud")[0]) is None
 
 
-def test_a_release_that_is_ready_is_not_waited_for(running: FakeApi, release: Release) -> None:
+def test_a_ready_release_needs_no_wait(running: FakeApi, release: Release) -> None:
     wait_ready(release, timeout=0.0)
 
 
@@ -78,7 +78,7 @@ def test_a_release_that_is_ready_is_not_waited_for(running: FakeApi, release: Re
     [{"updatedReplicas": 0}, {"replicas": 2}, {"observedGeneration": 0}],
     ids=["not updated", "old pod beside it", "not seen yet"],
 )
-def test_the_old_pods_readiness_is_not_the_new_ones(
+def test_a_ready_old_pod_does_not_count(
     running: FakeApi, release: Release, status: dict[str, int]
 ) -> None:
     running.put("deployments", "demo", deployment("cloud", **status))
@@ -86,25 +86,21 @@ def test_the_old_pods_readiness_is_not_the_new_ones(
         wait_ready(release, timeout=0.03)
 
 
-def test_what_is_not_ready_in_time_is_named(running: FakeApi, release: Release) -> None:
+def test_a_timeout_names_what_is_not_ready(running: FakeApi, release: Release) -> None:
     running.put("pods", "demo", pod("world-1", "world", ready=False))
     with pytest.raises(WaitedTooLongError, match="container world is not ready") as caught:
         wait_ready(release, timeout=0.03)
     assert caught.value.exit_code == 4
 
 
-def test_a_pod_that_will_never_run_ends_the_waiting_at_once(
-    running: FakeApi, release: Release
-) -> None:
+def test_a_pod_that_will_never_run_ends_the_wait(running: FakeApi, release: Release) -> None:
     state = waiting("ImagePullBackOff")
     running.put("pods", "demo", pod("world-1", "world", ready=False, state=state))
     with pytest.raises(ClusterError, match="the world pod cannot run: the image"):
         wait_ready(release, timeout=60.0)
 
 
-def test_a_pod_that_is_refused_ends_the_waiting_with_the_reason(
-    running: FakeApi, release: Release
-) -> None:
+def test_a_refused_pod_ends_the_wait_with_the_reason(running: FakeApi, release: Release) -> None:
     refused = {"type": "ReplicaFailure", "status": "True", "message": "violates PodSecurity"}
     running.put("deployments", "demo", deployment("cloud", conditions=[refused]))
     with pytest.raises(ClusterError, match="violates PodSecurity"):
@@ -112,7 +108,7 @@ def test_a_pod_that_is_refused_ends_the_waiting_with_the_reason(
 
 
 def wait_for_secret(running: FakeApi, name: str) -> None:
-    """Let the world's pod wait for a Secret, as the kubelet tells it."""
+    """Make world's pod wait for a Secret, with the kubelet's event."""
     state = waiting("ContainerCreating")
     running.put("pods", "demo", pod("world-1", "world", ready=False, state=state))
     said = f'MountVolume.SetUp failed for volume "secret" : secret "{name}" not found'
@@ -120,9 +116,7 @@ def wait_for_secret(running: FakeApi, name: str) -> None:
     running.put("events", "demo", {**event, "type": "Warning", "reason": "FailedMount"})
 
 
-def test_a_secret_that_is_missing_ends_the_waiting_with_what_makes_it(
-    running: FakeApi, release: Release
-) -> None:
+def test_a_missing_secret_ends_the_wait_with_a_command(running: FakeApi, release: Release) -> None:
     wait_for_secret(running, "mine")
     with pytest.raises(
         ClusterError, match="the world pod cannot run: there is no Secret"
@@ -134,19 +128,21 @@ def test_a_secret_that_is_missing_ends_the_waiting_with_what_makes_it(
     assert caught.value.exit_code == 5
 
 
-def test_a_secret_that_came_later_is_missed_no_more(running: FakeApi, release: Release) -> None:
+def test_a_secret_that_exists_by_now_is_not_missing(running: FakeApi, release: Release) -> None:
     wait_for_secret(running, "cloudrc-tokens")
     with pytest.raises(WaitedTooLongError, match="container world is not ready"):
         wait_ready(release, timeout=0.03)
 
 
-def test_who_may_not_read_events_waits_as_before(running: FakeApi, release: Release) -> None:
+def test_without_the_right_to_read_events_the_wait_continues(
+    running: FakeApi, release: Release
+) -> None:
     wait_for_secret(running, "mine")
     running.refuse["GET", "events"] = 403, "events is forbidden"
     with pytest.raises(WaitedTooLongError, match="container world is not ready"):
         wait_ready(release, timeout=0.03)
 
 
-def test_a_release_of_something_else_is_told(api: FakeApi, release: Release) -> None:
+def test_a_release_of_another_chart_is_reported(api: FakeApi, release: Release) -> None:
     with pytest.raises(ClusterError, match="no Deployment 'world'"):
         wait_ready(release, timeout=1.0)

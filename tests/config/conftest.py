@@ -1,4 +1,4 @@
-"""Every key of the schema with a valid value and what it needs beside it: for generated tests."""
+"""For each key of the schema: a valid value, and the keys that it needs; for generated tests."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SPECIAL: dict[str, Any] = {
 
 
 def valid(key: str) -> Any:
-    """A value that this key takes and that is not its default, if there is another."""
+    """Return a valid value of the key, different from its default if possible."""
     if key in SPECIAL:
         return SPECIAL[key]
     field = LEAVES[key]
@@ -50,7 +50,7 @@ def valid(key: str) -> Any:
 
 
 def beside(key: str) -> list[str]:
-    """Settings without which the key makes no sense."""
+    """List the settings that the key needs."""
     above, _, last = key.rpartition(".")
     if above.endswith(".loss") and last in ("loss_bad", "loss_good", "delay_bad_ms"):
         return [f"{above}.bad_start=.1", f"{above}.bad_end=.5", *beside(above)]
@@ -66,7 +66,7 @@ def beside(key: str) -> list[str]:
 
 
 def base(key: str) -> str:
-    """The shipped experiment to set the key in."""
+    """Return the shipped experiment in which to set the key."""
     return "steps" if key.startswith("mission.steps") else "paper"
 
 

@@ -1,4 +1,4 @@
-"""Bad input ends in one clear message: what, where, how to mend it; all of a file's at once."""
+"""Bad input gives one message with place, reason and remedy, for all problems of a file at once."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_all_problems_are_listed_with_their_lines(mine: Path) -> None:
         ("hold_max_s", ("0", "1e-10", "1e30"), ">= 0.1 and <= 3600"),
     ],
 )
-def test_limits_of_the_guard_have_bounds_and_a_wrong_one_is_the_only_problem(
+def test_guard_limits_outside_their_bounds_are_one_problem(
     mine: Path, key: str, values: tuple[str, ...], bounds: str
 ) -> None:
     for value in values:
@@ -76,7 +76,7 @@ def test_limits_of_the_guard_have_bounds_and_a_wrong_one_is_the_only_problem(
         assert f"must be a number {bounds}" in line
 
 
-def test_a_profile_cannot_take_the_guards_limit_away(tmp_path: Path) -> None:
+def test_a_profile_cannot_disable_the_age_limit(tmp_path: Path) -> None:
     path = tmp_path / "slow.yaml"
     for age in ("0", "1e-9", "1e9"):
         path.write_text(f"command_age_max_ms: {age}\n")
@@ -84,12 +84,12 @@ def test_a_profile_cannot_take_the_guards_limit_away(tmp_path: Path) -> None:
             load_profile(path)
 
 
-def test_no_dwell_is_so_long_that_its_leg_has_no_limit(mine: Path) -> None:
+def test_a_huge_dwell_is_refused(mine: Path) -> None:
     text = refused(mine, "mission: {waypoints: [{position_m: [0, 0, 1], dwell_s: 1.0e+308}]}\n")
     assert "dwell_s: 1e+308: must be a number >= 0 and <= 1000000 [s]" in text
 
 
-def test_thousands_of_problems_are_not(mine: Path) -> None:
+def test_at_most_fifty_problems_are_listed(mine: Path) -> None:
     points = ", ".join(["{position_m: [0, 0, 1], dwell_s: -1}"] * 2000)
     text = refused(mine, f"mission: {{waypoints: [{points}]}}\n")
     assert "mine.yaml has 2000 problems:" in text
@@ -107,7 +107,7 @@ def test_thousands_of_problems_are_not(mine: Path) -> None:
         ("zzz: 3", "known here: name, description, seed, mission"),
     ],
 )
-def test_unknown_keys_and_forgotten_units(mine: Path, typo: str, meant: str) -> None:
+def test_an_unknown_key_gets_a_suggestion(mine: Path, typo: str, meant: str) -> None:
     assert meant in refused(mine, typo)
 
 
@@ -132,21 +132,19 @@ def test_unknown_keys_and_forgotten_units(mine: Path, typo: str, meant: str) -> 
         ("mission: ./nowhere.yaml", "mission: no such file:"),
     ],
 )
-def test_files_that_cannot_be_used(mine: Path, text: str, reason: str) -> None:
+def test_an_invalid_file_is_one_line(mine: Path, text: str, reason: str) -> None:
     found = refused(mine, text)
     assert reason in found
     assert "\n" not in found
 
 
-def test_aliases_of_aliases_do_not_fill_the_memory(
-    mine: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nested_aliases_do_not_exhaust_memory(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cloudrc.config.document._MAX_VALUES", 10_000)
     levels = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 10)]
     assert "more than 10000 values" in refused(mine, "\n".join(["a0: &a0 [1]", *levels]))
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_an_unreadable_file_is_reported(tmp_path: Path) -> None:
     for name, reason in ((tmp_path / "no.yaml", "no such file"), (tmp_path / ".", "cannot be read"),
                          ("papr", "did you mean paper?")):  # fmt: skip
         with pytest.raises(BadInputError, match=reason.replace("?", r"\?")):
@@ -163,25 +161,25 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         ("no/papper.yaml", "did you mean paper?"),
     ],
 )
-def test_a_path_that_leads_nowhere_says_what_there_is(name: str, words: str) -> None:
+def test_a_missing_file_lists_the_shipped_names(name: str, words: str) -> None:
     with pytest.raises(BadInputError, match=r"^no such file: ") as caught:
         load_experiment(name)
     assert words in str(caught.value)
 
 
-def test_a_missing_parameter_of_a_plug_in_is_told_once(mine: Path) -> None:
+def test_a_missing_parameter_is_reported_once(mine: Path) -> None:
     (mine.parent / "strict.py").write_text("def build(share: float): ...")
     text = refused(mine, "seed: 1\ncloud: {predictor: ./strict.py}\n")
     assert text == "mine.yaml:2: cloud.predictor.share: is missing; must be a number"
 
 
 @pytest.mark.parametrize("text", ["seed", "=3", "a..b=1", ".=1", "seed=["])
-def test_settings_that_are_none(text: str) -> None:
+def test_an_invalid_setting_is_refused(text: str) -> None:
     with pytest.raises(BadInputError, match="--set"):
         load_experiment("paper", [text])
 
 
-def test_an_index_behind_the_end() -> None:
+def test_an_index_beyond_the_end_is_refused() -> None:
     with pytest.raises(BadInputError, match="entries 0 to 6; use one of these, or 7 to append"):
         load_experiment("paper", ["mission.waypoints.9.dwell_s=1"])
 
@@ -205,7 +203,7 @@ def test_an_index_behind_the_end() -> None:
         ('uplink: {"<chance>": 3}', "uplink.<chance>: unknown key; "),
     ],
 )
-def test_bad_profiles(mine: Path, text: str, reason: str) -> None:
+def test_an_invalid_profile_is_refused_with_the_reason(mine: Path, text: str, reason: str) -> None:
     mine.write_text(text)
     with pytest.raises(BadInputError) as caught:
         load_profile(mine)
@@ -216,17 +214,17 @@ def test_bad_profiles(mine: Path, text: str, reason: str) -> None:
     assert reason in str(caught.value)
 
 
-def test_a_trace_out_of_order_is_refused_with_the_key_that_names_it(tmp_path: Path) -> None:
+def test_an_unsorted_trace_is_refused_with_its_key(tmp_path: Path) -> None:
     trace = tmp_path / "trace.csv"
     trace.write_text("time_s,delay_ms\n1,20\n0,20\n")
     with pytest.raises(BadInputError, match=r"link\.uplink\.trace: .*line 3"):
         load_experiment("paper", [f"link.uplink.trace={trace}"])
 
 
-def test_nesting_without_end_is_refused(mine: Path) -> None:
+def test_deep_nesting_is_refused(mine: Path) -> None:
     found = refused(mine, "[" * 100_000)
     assert found.startswith("mine.yaml:1: ")
-    assert "nest" in found  # a newer libyaml looks ahead, and counts before we do: its words
+    assert "nest" in found  # a newer libyaml has its own limit and message
 
 
 @pytest.mark.parametrize(
@@ -244,13 +242,15 @@ def test_nesting_without_end_is_refused(mine: Path) -> None:
          "nearest legal point found: [-0.78, 0, 0.8]"),
     ],
 )  # fmt: skip
-def test_bad_missions(mine: Path, waypoints: str, reason: str) -> None:
+def test_an_invalid_mission_is_refused_with_the_reason(
+    mine: Path, waypoints: str, reason: str
+) -> None:
     found = refused(mine, f"mission: {{waypoints: {waypoints}}}")
     assert reason in found
     assert found.startswith("mine.yaml:1: mission.waypoints")
 
 
-def test_a_hundred_thousand_waypoints_are_refused_at_once(tmp_path: Path) -> None:
+def test_100_000_waypoints_are_refused_quickly(tmp_path: Path) -> None:
     mission = tmp_path / "long.yaml"
     mission.write_text("waypoints:\n" + "- {position_m: [0.5, 0.0, 0.7], dwell_s: 0}\n" * 100_000)
     start = time.perf_counter()

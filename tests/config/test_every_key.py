@@ -1,4 +1,4 @@
-"""Every key of the schema: it can be set, and its typo, wrong type and wrong range are refused."""
+"""Every key of the schema can be set; a typo, a wrong type and a wrong range are refused."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_typo_is_refused_with_the_nearest_key(key: str) -> None:
     typo = f"{above}{dot}{last[:-1]}{'x' if last[-1] != 'x' else 'y'}{last[-1]}"
     text = refusal(typo, valid(key), *beside(key))
     assert f"{typo}: unknown key" in text
-    plug_in = above.startswith("cloud.")  # its parameters depend on the plug-in; see test_plugins
+    plug_in = above.startswith("cloud.")  # parameters depend on the plug-in; see test_plugins
     assert plug_in or f"did you mean {last}" in text
 
 
@@ -67,7 +67,7 @@ def test_wrong_type_is_refused(key: str) -> None:
 @pytest.mark.parametrize(
     "key", [key for key in LEAVES if words(key).startswith("must be a number")]
 )
-def test_text_is_no_number_but_an_integer_is(key: str) -> None:
+def test_text_is_refused_as_a_number_an_integer_is_not(key: str) -> None:
     assert "must be a number" in refusal(key, "1", *beside(key))
     load_experiment(base(key), [*beside(key), setting(key, 0 if key.endswith("yaw_deg") else 1)])
 
@@ -89,7 +89,7 @@ def test_above_the_upper_limit_is_refused(key: str) -> None:
 
 
 @pytest.mark.parametrize("key", RANGED)
-def test_every_ranged_number_has_a_unit_or_is_a_share_or_a_count(key: str) -> None:
+def test_every_number_has_a_unit_or_is_a_share_or_a_count(key: str) -> None:
     assert "[" in words(key) or "<=" in words(key) or key == "seed"
 
 
@@ -97,7 +97,7 @@ def test_every_key_is_described() -> None:
     assert [key for key, field in LEAVES.items() if not field.description] == []
 
 
-def test_what_is_dumped_names_every_key_outside_of_alternatives() -> None:
+def test_a_dump_has_every_key_outside_of_alternatives() -> None:
     text = dump(load_experiment("paper"))
     alternatives = ("mission.steps", ".loss.", ".changes.0", ".blackouts.0")
     missing = [

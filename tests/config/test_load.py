@@ -1,4 +1,4 @@
-"""Loading experiments: what is looked up, what is laid over what, and that a dump flies again."""
+"""Experiments are resolved, values override each other in order, and a dump loads again."""
 
 from __future__ import annotations
 
@@ -73,18 +73,18 @@ def test_paper_is_the_published_scheme() -> None:
     assert (paper.guard.command_age_max_ms, paper.criteria.contact) == (250, True)
 
 
-def test_verbatim_lets_the_last_arrival_win() -> None:
+def test_paper_verbatim_uses_the_last_arrival() -> None:
     verbatim = load_experiment("paper-verbatim")
     assert (verbatim.tunnel.order, verbatim.guard.command_age_max_ms) == ("arrival", 400)
 
 
 @pytest.mark.parametrize("name", ["steps", "hover"])
-def test_free_air_has_nothing_to_touch(name: str) -> None:
+def test_free_flights_need_no_contact(name: str) -> None:
     experiment = load_experiment(name)
     assert (experiment.world.scene, experiment.criteria.contact) == ("empty", False)
 
 
-def test_age_limit_is_the_experiments_own_else_the_profiles_else_250() -> None:
+def test_age_limit_comes_from_experiment_then_profile_then_250() -> None:
     def age(experiment: str, profile: str) -> float:
         loaded = load_experiment(experiment, [f"link.profile={profile}"])
         return loaded.guard.command_age_max_ms
@@ -94,14 +94,14 @@ def test_age_limit_is_the_experiments_own_else_the_profiles_else_250() -> None:
     assert age("paper-verbatim", "satellite") == 400
 
 
-def test_another_profile_takes_the_place_of_a_resolved_one(tmp_path: Path) -> None:
+def test_a_new_profile_replaces_a_resolved_one(tmp_path: Path) -> None:
     for experiment in ("paper", "paper-verbatim"):
         flown = load_experiment(experiment, ["link.profile=satellite"])
         changed = again(flown, tmp_path, "link.profile=paper-p3")
         assert changed == load_experiment(experiment, ["link.profile=paper-p3"])
 
 
-def test_single_values_lie_over_the_profile(tmp_path: Path) -> None:
+def test_single_values_override_the_profile(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("link: {profile: lossy, uplink: {delay_ms: 120}}\n")
     experiment = load_experiment(path)
@@ -112,7 +112,7 @@ def test_single_values_lie_over_the_profile(tmp_path: Path) -> None:
     assert (other.uplink.delay_ms, other.uplink.jitter_ms) == (120, 10)
 
 
-def test_set_opens_a_name(tmp_path: Path) -> None:
+def test_set_turns_a_name_into_a_mapping(tmp_path: Path) -> None:
     experiment = load_experiment("paper", ["cloud.controller.speed_max=2"])
     assert experiment.cloud.controller.name == "pid"
     assert (experiment.cloud.controller.model_extra or {})["speed_max"] == 2.0
@@ -134,7 +134,7 @@ def test_set_reaches_into_mission_and_time_line_by_index() -> None:
     assert gains == (4, 5, 10)
 
 
-def test_set_appends_one_behind_the_last() -> None:
+def test_set_appends_to_a_list() -> None:
     experiment = load_experiment("hover", ["mission.waypoints.1.position_m=[0, 1, 1]"])
     assert experiment.mission.waypoints[1].position_m == (0, 1, 1)
 
@@ -144,7 +144,7 @@ def test_the_order_of_settings_does_not_matter() -> None:
     assert load_experiment("paper", texts) == load_experiment("paper", texts[::-1])
 
 
-def test_paths_are_relative_to_the_file_that_names_them(
+def test_paths_start_at_the_file_that_names_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     links = tmp_path / "links"
@@ -177,7 +177,7 @@ def test_paths_are_relative_to_the_file_that_names_them(
     )
 
 
-def test_a_mission_by_path(tmp_path: Path) -> None:
+def test_a_mission_is_loaded_by_path(tmp_path: Path) -> None:
     path, mine = tmp_path / "line.yaml", tmp_path / "mine.yaml"
     path.write_text("waypoints:\n- position_m: [1, 0, 1]\n")
     mine.write_text("mission: ./line.yaml\n")
@@ -186,7 +186,7 @@ def test_a_mission_by_path(tmp_path: Path) -> None:
     assert load_experiment(mine).mission == mission
 
 
-# PyYAML itself turns Unicode's other line ends into line feeds; NUL is refused.
+# PyYAML converts Unicode's other line ends to line feeds; NUL is refused.
 ODD = "\0\x85\u2028\u2029"
 texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters=ODD))
 plain = st.recursive(
@@ -198,7 +198,7 @@ plain = st.recursive(
 
 @settings(max_examples=40, deadline=None)
 @given(plain)
-def test_yaml_comes_back_as_it_was_written(value: object) -> None:
+def test_written_yaml_parses_to_equal_values(value: object) -> None:
     if "<<" not in repr(value):
         assert document.parse(document.write(value), "text")[0] == value
 
@@ -208,7 +208,7 @@ def test_yaml_comes_back_as_it_was_written(value: object) -> None:
     [("1e-3", 1e-3), (".2", 0.2), ("-3", -3), ("on", "on"), ("12:30", "12:30"), ("~", None),
      ("true", True), ("2024-01-01", "2024-01-01"), ("010", 10), ("'1'", "1")],
 )  # fmt: skip
-def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
+def test_scalars_follow_yaml_1_2(text: str, value: object) -> None:
     found = document.parse(text, "text")[0]
     assert (found, type(found)) == (value, type(value))
 
@@ -222,12 +222,12 @@ def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
         (("link.profile=satellite", "guard.speed_max_mps=2"), 2.0),
     ],
 )
-def test_the_speed_cap_falls_with_the_age_that_commands_may_have(settings, cap) -> None:
+def test_the_speed_cap_falls_with_the_age_limit(settings, cap) -> None:
     # v (T + 0.2) + v^2 / 6 = 8.7 m, solved by hand for T = 0.25, 0.4 and 0.8 s.
     assert load_experiment("paper", settings).guard.speed_max_mps == pytest.approx(cap, abs=1e-5)
 
 
-def test_another_profile_on_a_resolved_file_brings_its_own_limits(tmp_path: Path) -> None:
+def test_a_new_profile_on_a_resolved_file_sets_its_limits(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(
         dump(load_experiment("paper", ["link.profile=satellite"]))
     )
@@ -235,7 +235,7 @@ def test_another_profile_on_a_resolved_file_brings_its_own_limits(tmp_path: Path
     assert (again.guard.command_age_max_ms, again.guard.speed_max_mps) == (250.0, 6.0)
 
 
-def test_paths_of_metrics_are_relative_to_their_file_or_the_working_folder(
+def test_metric_paths_start_at_their_file_or_the_working_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "mine.yaml").write_text("report: {metrics: [a.py, duration]}")
@@ -246,15 +246,13 @@ def test_paths_of_metrics_are_relative_to_their_file_or_the_working_folder(
     assert load_experiment("paper", ["report.metrics=b.py"]).report.metrics == ("/b.py",)
 
 
-def test_a_heading_that_would_not_be_flown_is_refused() -> None:
+def test_a_yaw_other_than_0_is_refused() -> None:
     with pytest.raises(BadInputError, match="holds yaw at 0"):
         load_experiment("paper", ["mission.waypoints.2.yaw_deg=90"])
 
 
 @pytest.mark.parametrize("settings", [[], ["link.profile=satellite", "seed=7"]])
-def test_a_configuration_has_the_hash_of_its_own_file_whoever_reads_it(
-    settings: list[str], tmp_path: Path
-) -> None:
+def test_a_configuration_has_the_hash_of_its_file(settings: list[str], tmp_path: Path) -> None:
     experiment, path = load_experiment("paper", settings), tmp_path / "config.yaml"
     path.write_text(dump(experiment), "utf-8")
     expected = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -264,10 +262,10 @@ def test_a_configuration_has_the_hash_of_its_own_file_whoever_reads_it(
     assert fingerprint(load_experiment(path, ["guard.speed_max_mps=1.4"])) != expected
 
 
-def test_a_configuration_that_leaves_parameters_to_plug_ins_has_the_hash_of_what_it_gives(
+def test_a_short_file_has_the_hash_of_its_given_parameters(
     tmp_path: Path,
 ) -> None:
-    """The chart's is such a one, and cloud alone could fill it up."""
+    """The chart's experiment has only given parameters; only cloud could complete it."""
     path = tmp_path / "short.yaml"
     path.write_text("seed: 5\n")
     given = fingerprint(read_experiment(str(path)))

@@ -1,4 +1,4 @@
-"""Plug-ins: found by a file's name, an entry point or a path; refused with what there is."""
+"""Plug-ins are found by name, entry point or path; an unknown one lists the known ones."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ def test_every_kind_has_plug_ins_with_a_line_each(kind: str) -> None:
         assert not plugins.describe(kind, name).startswith("(not usable")
 
 
-def test_names_says_what_ships() -> None:
+def test_names_lists_the_shipped_plug_ins() -> None:
     assert {"last_sample", "constant_velocity"} <= set(plugins.names("predictors"))
     assert "pid" in plugins.names("controllers")
 
 
-def test_an_unknown_name_is_answered_with_the_known_and_the_nearest() -> None:
+def test_an_unknown_name_lists_known_names_and_the_nearest() -> None:
     with pytest.raises(BadInputError) as caught:
         plugins.load("predictors", "last_sampel")
     assert str(caught.value).startswith("no predictor named 'last_sampel'; available: ")
@@ -74,19 +74,19 @@ def test_an_unknown_name_is_answered_with_the_known_and_the_nearest() -> None:
 
 
 @pytest.mark.parametrize("name", ["_rotation", "__init__", "os", "..", ""])
-def test_helpers_and_other_modules_are_no_plug_ins(name: str) -> None:
+def test_helpers_and_other_modules_are_refused(name: str) -> None:
     with pytest.raises(BadInputError):
         plugins.load("predictors", name)
 
 
-def test_a_file_by_its_path(share: Path) -> None:
+def test_a_plug_in_is_loaded_by_path(share: Path) -> None:
     assert plugins.load("predictors", str(share), share=0.25).share == 0.25
     assert plugins.describe("predictors", str(share)) == "Looks ahead by a share of the horizon."
     parameters = plugins.signature("predictors", str(share)).parameters
     assert parameters["share"].annotation is float  # evaluated: config checks values against it
 
 
-def test_an_experiment_spells_out_the_parameters(share: Path) -> None:
+def test_an_experiment_has_all_parameters(share: Path) -> None:
     predictor = load_experiment("paper", [f"cloud.predictor={share}"]).cloud.predictor
     assert predictor.model_extra == {"share": 0.5, "axes": [True, True, False]}
     built = build("predictors", predictor)
@@ -106,7 +106,7 @@ def test_parameters_are_checked_against_build(share: Path) -> None:
         assert reason in refused(choice, setting)
 
 
-def test_an_integer_is_a_number(share: Path) -> None:
+def test_an_integer_is_accepted_as_a_number(share: Path) -> None:
     choice = PlugIn.model_validate({"name": str(share), "share": 1})
     assert build("predictors", choice).share == 1.0
 
@@ -123,7 +123,7 @@ def test_an_integer_is_a_number(share: Path) -> None:
         ("def build():\n    return 1 / 0\n", "cannot be built: ZeroDivisionError"),
     ],
 )  # fmt: skip
-def test_a_broken_file_is_one_line(share: Path, text: str, reason: str) -> None:
+def test_a_broken_plug_in_is_one_line(share: Path, text: str, reason: str) -> None:
     share.write_text(text)
     found = refused(f"cloud.predictor={share}")
     assert reason in found
@@ -134,7 +134,7 @@ def test_a_broken_file_is_one_line(share: Path, text: str, reason: str) -> None:
         )
 
 
-def test_a_file_that_is_none(tmp_path: Path) -> None:
+def test_a_missing_plug_in_file_is_refused(tmp_path: Path) -> None:
     assert "there is no such file" in refused(f"cloud.predictor={tmp_path}/no.py")
     (tmp_path / "notes.txt").write_text("no")
     assert "name it *.py" in refused(f"cloud.predictor={tmp_path}/notes.txt")
@@ -156,6 +156,6 @@ def test_installed_packages_add_plug_ins(share: Path, monkeypatch: pytest.Monkey
     assert plugins.names("predictors").count("last_sample") == 1
     assert plugins.load("predictors", "as_module").share == 0.5
     assert load_experiment("paper", ["cloud.predictor=as_function"]).cloud.predictor.name
-    # What ships cannot be replaced behind the user's back.
+    # An installed package cannot replace a shipped plug-in.
     assert "share" not in plugins.signature("predictors", "last_sample").parameters
     sys.modules.pop("share", None)

