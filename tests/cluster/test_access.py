@@ -63,7 +63,7 @@ def test_without_a_kubeconfig_one_sentence_says_what_to_do(
     ],
     ids=["missing", "failing", "giving nothing"],
 )
-def test_a_login_program_that_fails_is_named_and_nothing_else_is_printed(
+def test_a_failing_login_program_is_the_only_thing_reported(
     tmp_path: Path, script: str | None, words: str
 ) -> None:
     """In a process of its own: here pytest listens to what is logged."""

@@ -132,7 +132,7 @@ def test_another_context_can_be_asked_for(
 
 
 @pytest.mark.parametrize("mode", run.MODES)
-def test_the_extras_that_block_a_mode_are_those_that_its_run_asks_for(mode: str) -> None:
+def test_a_mode_needs_the_extras_that_its_run_requires(mode: str) -> None:
     blocking = {extra for extra in extras.EXTRAS if mode in checks.packages(extra).modes}
     assert blocking == set(run.EXTRAS[mode])
 

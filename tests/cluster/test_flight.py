@@ -110,7 +110,7 @@ def test_a_flight_leaves_what_a_run_leaves(
 
 
 @pytest.mark.parametrize("out", [[], ["--out", "out"]], ids=["runs", "out"])
-def test_a_mission_that_was_refused_leaves_nothing_and_claims_nothing(
+def test_a_refused_mission_leaves_no_files(
     pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: list[str]
 ) -> None:
     at_look(pods, 2, ending(pods, "Failed", 5, "mission m-1 is under way"))
@@ -129,7 +129,7 @@ def test_a_run_in_runs_is_the_latest_one(pods: FakeApi, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("left", [True, False], ids=["left", "nothing"])
-def test_what_a_container_recorded_before_it_was_started_again_is_brought_along(
+def test_the_recording_before_a_restart_is_fetched_too(
     pods: FakeApi,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -151,7 +151,7 @@ def test_what_a_container_recorded_before_it_was_started_again_is_brought_along(
         assert (out / "world.before.mcap").read_text() == "before\n"
 
 
-def test_a_way_that_breaks_off_costs_the_metrics_and_not_the_report(
+def test_a_broken_connection_loses_metrics_but_not_the_report(
     pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Patch
 ) -> None:
     calls: list[str] = []
@@ -202,7 +202,7 @@ def test_a_flight_that_is_under_way_is_not_ended_by_another(
         (["steps"], "mission.steps"),
     ],
 )
-def test_what_the_pods_cannot_have_is_refused_before_anything_is_done(
+def test_a_setting_that_pods_cannot_have_is_refused_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: list[str], words: str
 ) -> None:
     plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"

@@ -33,7 +33,7 @@ def test_what_one_direction_refuses_the_other_does_not_keep(
     cluster.make("cannot", "cloud-1", "corrupt")
     assert set_link("downlink.corrupt=0.5", "uplink.delay_ms=9") == 2
     assert error(capsys) == (
-        "cloudrc: error: the downlink is as it was: netem cannot do that; the uplink had taken the "
+        "cloudrc: error: the downlink is unchanged: netem cannot do that; the uplink had taken the "
         "change, and has its old profile back"
     )
     assert not cluster.kept(), "it does not last either"
@@ -46,9 +46,7 @@ def test_what_one_direction_refuses_the_other_does_not_keep(
         assert cluster.state(pod).cause == "taken back: downlink.corrupt=0.5, uplink.delay_ms=9"
 
 
-def test_a_container_that_refused_begins_with_the_old_profile_when_it_starts_again(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_a_restart_after_a_refusal_uses_the_old_profile(cluster: Cluster, tmp_path: Path) -> None:
     cluster.make("cannot", "cloud-1", "corrupt")
     assert set_link("downlink.corrupt=0.5") == 2
     (tmp_path / "profile.yaml").write_text(PROFILE)
@@ -66,11 +64,11 @@ def test_a_refusal_by_both_leaves_nothing_to_say(
     for pod in ("world-1", "cloud-1"):
         cluster.make("cannot", pod, "corrupt")
     assert set_link("downlink.corrupt=0.5") == 2
-    assert error(capsys).endswith("the uplink is as it was: netem cannot do that")
+    assert error(capsys).endswith("the uplink is unchanged: netem cannot do that")
     assert not cluster.kept()
 
 
-def test_the_old_profile_comes_back_with_its_traces_and_begins_anew(
+def test_the_old_profile_returns_with_traces_and_starts_anew(
     cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = "uplink: {trace: t.csv}\ndownlink: {corrupt: 0.1, delay_ms: 3}\n"
@@ -85,7 +83,7 @@ def test_the_old_profile_comes_back_with_its_traces_and_begins_anew(
     assert not json.loads(cluster.handed("cloud-1")[-1]["change"])["restart"], "this one goes on"
 
 
-def test_what_cannot_be_taken_back_is_said_with_the_command_that_does_it(
+def test_a_failed_take_back_names_the_command_that_does_it(
     cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cluster.make("cannot", "cloud-1", "corrupt")
@@ -129,7 +127,7 @@ def test_a_container_that_does_not_take_it_over_was_waited_for(
     cluster.make("deaf", "cloud-1")
     assert set_link("downlink.delay_ms=120") == 4
     assert error(capsys) == (
-        "cloudrc: error: the downlink did not take the change over within 5 s; see the logs of the "
+        "cloudrc: error: the downlink did not apply the change within 5 s; see the logs of the "
         "link containers; the uplink had taken the change, and has its old profile back; the "
         "downlink (pod cloud-1) finds its old profile once it moves again"
     )

@@ -33,7 +33,7 @@ def tell(folder: Path, **state: str) -> str:
 
 
 @pytest.mark.parametrize("state", [{"change": "b2"}, {"change": "a1", "refused": "b2"}])
-def test_the_change_is_left_beside_the_route_and_what_the_sidecar_decides_is_told(
+def test_a_change_is_handed_over_and_the_answer_is_printed(
     tmp_path: Path, state: dict[str, str]
 ) -> None:
     tell(tmp_path, change="a1", refused="b2-back")

@@ -14,7 +14,7 @@ from cloudrc.errors import BadInputError
 from tests.cluster.conftest import PROFILE, TRACE, Cluster, FakeApi
 
 
-def test_the_profile_changes_for_good_and_both_pods_get_it_at_once(
+def test_a_change_is_permanent_and_reaches_both_pods_at_once(
     cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["link", "set", "downlink.delay_ms=120", "-n", "demo", "--context", "kind"]) == 0

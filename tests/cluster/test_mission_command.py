@@ -49,7 +49,7 @@ def job_of(printed: str) -> str:
 
 
 @pytest.mark.parametrize("code", [0, 1])
-def test_run_names_the_job_passes_its_lines_on_and_ends_with_its_verdict(
+def test_run_prints_the_jobs_lines_and_ends_with_its_verdict(
     running: FakeApi, capsys: Printed, code: int
 ) -> None:
     assert fly(running, code) == code

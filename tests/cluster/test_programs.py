@@ -129,9 +129,7 @@ def test_a_way_that_takes_for_ever_is_given_up(
     assert time.monotonic() - began < 2.0
 
 
-def test_an_error_inside_the_block_is_not_taken_for_one_of_the_way(
-    release: Release, pretend: Pretend
-) -> None:
+def test_an_error_inside_the_block_is_raised_unchanged(release: Release, pretend: Pretend) -> None:
     pretend("kubectl", "echo 'Forwarding from 127.0.0.1:40001 -> 8080'; exec sleep 60")
     with pytest.raises(KeyError), pods.forwarded(release, "cloud-1", [8080]):
         raise KeyError

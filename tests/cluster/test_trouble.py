@@ -120,9 +120,7 @@ def wait_for_secret(running: FakeApi, name: str) -> None:
     running.put("events", "demo", {**event, "type": "Warning", "reason": "FailedMount"})
 
 
-def test_a_secret_that_is_missing_ends_the_waiting_with_what_makes_it(
-    running: FakeApi, release: Release
-) -> None:
+def test_a_missing_secret_ends_the_wait_with_the_fix(running: FakeApi, release: Release) -> None:
     wait_for_secret(running, "mine")
     with pytest.raises(
         ClusterError, match="the world pod cannot run: there is no Secret"
