@@ -152,7 +152,7 @@ def test_a_job_without_its_plan_is_not_left_behind(running: FakeApi, release: Re
     assert made(running) == []
 
 
-def test_an_interrupted_follower_says_that_the_job_flies_on(
+def test_an_interrupted_follower_says_that_the_job_still_runs(
     running: FakeApi, folder: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*arguments: object, **more: object) -> None:
@@ -164,7 +164,7 @@ def test_an_interrupted_follower_says_that_the_job_flies_on(
     (job,) = made(running)
     name = job["metadata"]["name"]
     assert capsys.readouterr().err == (
-        f"Job {name} flies on; end it: "
+        f"Job {name} is still running; cancel it: "
         f"cloudrc mission cancel {name} --namespace=demo --release=cloudrc\n"
     )
 
