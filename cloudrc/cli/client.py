@@ -192,7 +192,7 @@ def token_file(options: argparse.Namespace) -> Path | None:
 
 
 def reader(path: Path | None) -> Callable[[], str]:
-    """Make the function that reads the token, each time anew as it may change; "" without a file."""
+    """Make the function that reads the token anew for each request; "" without a file."""
     return (lambda: "") if path is None else (lambda: _read(path))
 
 

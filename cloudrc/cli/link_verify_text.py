@@ -226,7 +226,10 @@ def on_jitter(way: str, share: float) -> Iterator[str]:
     if not share:
         yield f"{way}: jitter {NOT_JUDGED}: jitter is too small a part of the delay variation"
     elif share > usual:
-        yield f"{way}: jitter judged within {share:.0%} only: the tail of its distribution hides {usual:.0%}"
+        yield (
+            f"{way}: jitter judged within {share:.0%} only: the tail of its distribution hides "
+            f"{usual:.0%}"
+        )
 
 
 def on_correlation(way: str, asked: float) -> Iterator[str]:

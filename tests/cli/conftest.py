@@ -1,4 +1,4 @@
-"""A disk for the journal with no more room than it is given, which refuses and kills as told."""
+"""A disk for the journal with limited room, which can fail or kill the process."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ MIB = 1 << 20
 
 
 class KilledError(BaseException):
-    """The process is gone: nothing catches it."""
+    """Stand for the end of the process: nothing catches it."""
 
 
 class Volume(Disk):
-    """A real folder with no more room than it is given, which refuses and kills as it is told.
+    """A real folder with limited room, which can fail or kill the process.
 
     Attributes:
-        room: For all files of the folder [bytes].
-        error: With which it says that there is no more.
-        refused: Which operation fails, on which ending of a name, and with what.
-        steps: How many operations there have been.
-        kill_at: The operation before which the process is killed.
+        room: Room for all files of the folder [bytes].
+        error: Error number when the room is used up.
+        refused: Operation that fails, for names with an ending, and the error number.
+        steps: Number of operations so far.
+        kill_at: Number of the operation before which the process is killed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -57,7 +57,7 @@ class Volume(Disk):
         )  # as the journal's tests do
 
     def sync(self, file: int) -> None:
-        self._step("sync")  # what survives the machine is not asked here
+        self._step("sync")  # a crash of the machine is not tested here
 
     def replace(self, new: Path, path: Path) -> None:
         self._step("replace", path)
