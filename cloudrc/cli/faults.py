@@ -91,9 +91,9 @@ def folder(text: str) -> Path:
 
 def _modes(parser: argparse.ArgumentParser) -> None:
     mode = parser.add_mutually_exclusive_group()
-    text = "use real processes, signals and sockets on this machine"
+    text = "faults with real processes, signals and sockets on this machine"
     mode.add_argument("--real", action="store_true", help=text)
-    text = "use a release in a cluster; F38 rotates its key"
+    text = "faults on a release in a cluster (F38 rotates its key)"
     mode.add_argument("--cluster", action="store_true", help=text)
 
 

@@ -28,6 +28,7 @@ ACTIONS = {
     "run": "shape one direction of the link until SIGTERM",
 }
 """Help line of each action, in the order of the help."""
+DEBUG = "show the traceback of an error"
 MODES = ("auto", "netem", "relay")
 
 
@@ -44,12 +45,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
             formatter_class=parser.formatter_class,
             allow_abbrev=False,
         )
-        action.add_argument(
-            "--debug",
-            action="store_true",
-            default=argparse.SUPPRESS,
-            help="show the traceback of an error",
-        )
+        action.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=DEBUG)
         (module.arguments if module else _run_arguments)(action)
         action.set_defaults(act=module.execute if module else _run)
 

@@ -28,8 +28,8 @@ EPILOG = """\
 where:
   a run on this machine ('cloudrc run --mode local'): found automatically, or
   named by --run
-  a release in a cluster: with --context, -n or --release; if no run flies here;
-  and always as 'kubectl cloudrc link set'
+  a release in a cluster: if --context, -n or --release is given, or if no run
+  flies on this machine; always with 'kubectl cloudrc link set'
 
 examples:
   cloudrc link set downlink.delay_ms=120 uplink.loss=0.02

@@ -18,8 +18,8 @@ EPILOG = """\
 where:
   a run on this machine ('cloudrc run --mode local'): found automatically (first
   ./runs/latest), or named by --run DIR or --api URL
-  a release in a cluster: with --context, -n or --release; if no run flies here;
-  and always as 'kubectl cloudrc mission'
+  a release in a cluster: if --context, -n or --release is given, or if no run
+  flies on this machine; always with 'kubectl cloudrc mission'
 
 examples:
   cloudrc mission run pipes
@@ -37,6 +37,7 @@ mission. An API in a network asks for a token: give --token-file or
 CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your rights
 in the cluster. A run that is found on this machine needs no token."""
 
+DEBUG = "show the traceback of an error"
 NO_API = "no run with an API flies there; name another folder, or --api URL"
 
 
@@ -52,12 +53,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
             formatter_class=parser.formatter_class,
             allow_abbrev=False,
         )
-        verb.add_argument(
-            "--debug",
-            action="store_true",
-            default=argparse.SUPPRESS,
-            help="show the traceback of an error",
-        )
+        verb.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=DEBUG)
         verb.add_argument(
             "--api", metavar="URL", help="http://HOST:PORT or unix:PATH of a run or release"
         )
