@@ -64,19 +64,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         return verb
 
     run = add("run", "fly a mission and show its progress until the verdict")
-    run.add_argument(
-        "mission", metavar="FILE", help="mission file, or the name of a shipped mission"
-    )
+    run.add_argument("mission", metavar="FILE", help="mission file, or name of a shipped mission")
     timeout_argument(run)
     run.add_argument("--name", default="", help="name shown to people (default: the file's name)")
-    for name in ("list", "status"):
-        line = {
-            "list": "list all missions",
-            "status": "show the robot's state, or the state of a mission",
-        }[name]
-        shown = add(name, line)
-        output_argument(shown)
-    shown.add_argument("id", nargs="?", metavar="ID", help="mission (in a cluster: name of a Job)")
+    output_argument(add("list", "list all missions"))
+    status = add("status", "show the robot's state, or the state of a mission")
+    output_argument(status)
+    status.add_argument("id", nargs="?", metavar="ID", help="mission (in a cluster: name of a Job)")
     cancel = add("cancel", "cancel a mission; the robot holds its position")
     cancel.add_argument("id", nargs="?", metavar="ID", help="mission (default: the current one)")
     logs = add("logs", "show the events of missions")
@@ -84,21 +78,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     logs.add_argument("-f", "--follow", action="store_true", help="keep printing new events")
     goto = add("goto", "fly to a point; a held mission then holds there")
     for axis in "XYZ":
-        goto.add_argument(
-            axis.lower(), type=_metres, metavar=axis, help="coordinate [m], world frame"
-        )
+        goto.add_argument(axis.lower(), type=_metres, metavar=axis, help="[m], world frame")
     add("hold", "hold the robot where it is, at least 0.35 m above the ground")
     add("resume", "resume the held mission")
     add("estop", "stop the rotors at once: the robot falls and its mission fails")
     add("acknowledge", "allow flights again after a stop or a landing; does not start the rotors")
     fly = add("fly", "fly a mission inside a Job: post it, follow it, exit with the verdict")
     fly.add_argument("--mission", required=True, metavar="FILE", help="mission file")
-    fly.add_argument(
-        "--key", default="", help="a mission posted twice with the same key flies once"
-    )
+    fly.add_argument("--key", default="", help="a mission posted twice under one key flies once")
     for verb in (run, fly):
         verb.add_argument(
-            "--queue", action="store_true", help="wait until the current mission has ended"
+            "--queue", action="store_true", help="wait for the current mission to end"
         )
 
 
