@@ -1,11 +1,8 @@
-"""The client of teleop's API: paths come in, JSON goes out, and errors become one sentence.
+"""Call teleop's API over HTTP.
 
-The API is at http://HOST:PORT, where every request carries a token, or at unix:PATH, a socket file
-that its owner alone can open.
-
-The token that a command sends to teleop's API: a flag comes in, the token's reader goes out.
-
-It comes from a file, so that neither the process table nor a shell's history has it.
+The API is at http://HOST:PORT, where each request carries a token, or at unix:PATH, a socket file
+that only its owner can open. The token is read from a file, so that it appears neither in the list
+of processes nor in a shell's history.
 """
 
 from __future__ import annotations
@@ -26,36 +23,36 @@ from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.files import read
 
 ANSWER_LIMIT = 10.0
-"""For the API to answer one request [s]."""
+"""Time limit of one request [s]."""
 STREAM_LIMIT = 30.0
-"""Without a word from a stream it is dead [s]; alive it says something every 10 s."""
+"""Longest silence of a stream of events [s]; the API sends something every 10 s."""
 LATER = (408, 429, 502, 503, 504)
-"""What is worth another try."""
+"""HTTP status codes after which a request is worth repeating."""
 UNIX = "unix:"
 
 
 class ApiError(CloudrcError):
-    """The API does not do what was asked."""
+    """Report that the API refuses a request."""
 
     exit_code = 5
 
 
 class UnreachableError(ApiError):
-    """The API does not answer, or not yet: to be tried again."""
+    """Report that the API does not answer yet: try again."""
 
 
 class Api:
-    """Teleop's API at one address."""
+    """Call teleop's API at one address."""
 
     def __init__(self, url: str, token: Callable[[], str] = lambda: "") -> None:
-        """Ask nothing yet.
+        """Check and store the address.
 
         Args:
             url: "http://HOST:PORT" or "unix:PATH".
-            token: Asked with every request, since a token may change; "" for none.
+            token: Returns the token for each request, as it may change; "" for none.
 
         Raises:
-            BadInputError: If it is no such address.
+            BadInputError: If the address is invalid.
         """
         self.url, self._token = url.rstrip("/"), token
         parts = urlsplit(self.url)
@@ -64,24 +61,24 @@ class Api:
             raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH")
 
     def get(self, path: str) -> Any:
-        """Ask for something; raises as `post`."""
-        return self._ask("GET", path)
+        """Send a GET request; raises like `post`."""
+        return self._request("GET", path)
 
     def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
-        """Ask for something to be done.
+        """Send a POST request.
 
         Raises:
-            UnreachableError: If nobody answers, or teleop is not ready or busy.
-            BadInputError: If a value cannot be used.
-            ApiError: If it is refused.
+            UnreachableError: If there is no answer, or teleop is not ready or busy.
+            BadInputError: If a value is invalid.
+            ApiError: If the request is refused.
         """
-        return self._ask("POST", path, b"" if body is None else json.dumps(body).encode())
+        return self._request("POST", path, b"" if body is None else json.dumps(body).encode())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
-        """Give events as they happen, from the one after this number; ends when teleop ends.
+        """Yield events as they happen, after the one with number `after`, until teleop ends.
 
         Raises:
-            UnreachableError: If the stream breaks off.
+            UnreachableError: If the connection breaks.
         """
         connection, stream = self._open("GET", f"/v1/events?after={after}", None, STREAM_LIMIT)
         try:
@@ -89,11 +86,13 @@ class Api:
                 if line.startswith(b"data: "):
                     yield json.loads(line.removeprefix(b"data: "))
         except (OSError, http.client.HTTPException) as error:
-            raise UnreachableError(f"the API at {self.url} broke off: {error}") from error
+            raise UnreachableError(
+                f"the connection to the API at {self.url} broke: {error}"
+            ) from error
         finally:
             connection.close()
 
-    def _ask(self, method: str, path: str, body: bytes | None = None) -> Any:
+    def _request(self, method: str, path: str, body: bytes | None = None) -> Any:
         connection, answer = self._open(method, path, body, ANSWER_LIMIT)
         try:
             return json.loads(answer.read())
@@ -124,7 +123,7 @@ class Api:
         return connection, answer
 
     def _connection(self, limit: float) -> http.client.HTTPConnection:
-        """Not yet open; straight to the API: it is next door or in the cluster, no proxy is."""
+        """Make a connection without a proxy: the API is on this machine or in the cluster."""
         if self.url.startswith(UNIX):
             return _UnixConnection(Path(self.url.removeprefix(UNIX)), limit)
         parts = urlsplit(self.url)
@@ -134,7 +133,7 @@ class Api:
 
 
 def path_of(mission_id: str) -> str:
-    """Where a mission is, whatever somebody has typed for its id."""
+    """Return the URL path of a mission; quote any character of its id."""
     return f"/v1/missions/{quote(mission_id, safe='', errors='surrogateescape')}"
 
 
@@ -151,49 +150,49 @@ class _UnixConnection(http.client.HTTPConnection):
 
 def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcError:
     try:
-        said = json.loads(answer.read())
+        body = json.loads(answer.read())
     except (OSError, ValueError, http.client.HTTPException):
-        said = {}
-    detail = said.get("detail") or f"the API answered {answer.status} {answer.reason}"
+        body = {}
+    detail = body.get("detail") or f"the API answered {answer.status} {answer.reason}"
     detail = harmless(str(detail))
-    problems = said.get("problems") or []
+    problems = body.get("problems") or []
     if len(problems) > 1:
-        told = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)
-        lines = [harmless(": ".join(words)) for words in told]
+        parts = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)
+        lines = [harmless(": ".join(words)) for words in parts]
         detail = "\n  ".join([f"the mission has {len(lines)} problems:", *lines])
     if answer.status in (400, 413, 422):
         return BadInputError(detail)
     if answer.status == 401:
-        which = "does not know this token" if with_token else "wants a token"
+        which = "does not know this token" if with_token else "asks for a token"
         detail = f"the API {which}; name its file: --token-file FILE or CLOUDRC_TOKEN_FILE"
     return UnreachableError(detail) if answer.status in LATER else ApiError(detail)
 
 
 VARIABLE = "CLOUDRC_TOKEN_FILE"
 SIZE_MAX = 4096
-"""Longest token file that is read [bytes]; it may end in blanks."""
+"""Largest token file [bytes], with white space at its end."""
 _TOKEN = re.compile(r"[!-~]{16,512}")
 
 
 def token_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare the flag."""
+    """Declare the argument --token-file."""
     parser.add_argument(
         "--token-file",
         type=Path,
         metavar="FILE",
-        help=f"file with the API's token (default: that of {VARIABLE}, or the release's Secret)",
+        help=f"file with the API's token (default: from {VARIABLE}, or the release's Secret)",
     )
 
 
 def token_file(options: argparse.Namespace) -> Path | None:
-    """Say which file has the token: the flag's, else the environment's, else none."""
+    """Return the token file of the command line, else of the environment, else None."""
     if options.token_file is not None:
         return Path(options.token_file)
     return Path(os.environ[VARIABLE]) if os.environ.get(VARIABLE) else None
 
 
 def reader(path: Path | None) -> Callable[[], str]:
-    """Give what reads the token from its file, every time, since it may change; "" without one."""
+    """Make the function that reads the token anew for each request; "" without a file."""
     return (lambda: "") if path is None else (lambda: _read(path))
 
 

@@ -1,6 +1,6 @@
-"""`cloudrc faults`: what goes wrong is brought about on purpose, what has to follow is checked.
+"""Run `cloudrc faults`: inject faults and check how the system reacts.
 
-`cloudrc faults list` and `run`: scenarios by name, their results as text, JSON and JUnit.
+This module has the command line and the actions `list` and `run`; `faults_fuzz` has the others.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 examples:
-  cloudrc faults list                        of all three modes
-  cloudrc faults run cloud-killed            or its number: F13
+  cloudrc faults list                        faults of all three modes
+  cloudrc faults run cloud-killed            or by its number: F13
   cloudrc faults run --all --seed 2 --junit faults.xml
   cloudrc faults run --all --real            with processes, signals and sockets
-  cloudrc faults fuzz --seeds 200 --jobs 2   random compositions, invariants
+  cloudrc faults fuzz --seeds 200 --jobs 2   random combinations of faults
   cloudrc faults fuzz --seeds 200 --adversarial
   cloudrc faults fuzz --first 201 --seeds 200
 
-exit codes: 0 no check failed, 1 one did, 2 bad input,
-  3 or 5 no cluster or no release there (--cluster),
+exit codes: 0 all checks passed, 1 a check failed, 2 bad input,
+  3 or 5 no cluster or no release (--cluster),
   6 a worker was killed, 130 interrupted"""
-JOBS = "at once, one a core at most (default: 1)"
+JOBS = "number of parallel processes, at most one per core (default: 1)"
 SEED_MAX = 2**53 - 1 - COUNT_MAX
-"""Of the first one: an experiment takes those counted from it, too, which are below 2^53."""
+"""Largest first seed: the seeds counted from it must stay below 2^53."""
 ACTIONS = {
-    "list": "all faults, what is done and what has to follow",
-    "run": "bring faults about and check what follows",
-    "fuzz": "compose faults at random, look at the invariants in every step",
-    "replay": "fly a stored schedule again",
+    "list": "list all faults with their injection and the expected reaction",
+    "run": "inject faults and check the reaction",
+    "fuzz": "fly random combinations of faults and check the invariants in every step",
+    "replay": "fly a stored schedule of faults again",
 }
 
 
@@ -61,81 +61,89 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     _run_arguments(parsers["run"])
     _fuzz_arguments(parsers["fuzz"])
     parsers["replay"].add_argument(
-        "file", type=read_from, metavar="FILE", help="a schedule (.yaml)"
+        "file", type=read_from, metavar="FILE", help="schedule of faults (.yaml)"
     )
 
 
 def seed(text: str) -> int:
-    """Read the seed of a generator of chance, as argparse calls it."""
+    """Parse a seed for argparse."""
     if not text.isdecimal() or int(text) > SEED_MAX:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {SEED_MAX}")
     return int(text)
 
 
 def written_to(text: str) -> Path:
-    """Read the name of a file that is written at the end: said now, if that cannot be."""
+    """Parse the name of an output file; refuse one that cannot be written."""
     path = Path(text)
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise argparse.ArgumentTypeError(f"{text}: no file can be written there")
+        raise argparse.ArgumentTypeError(f"{text}: this file cannot be written")
     return path
 
 
 def folder(text: str) -> Path:
-    """Read the name of a folder that is made when something is found: said now, if it cannot be."""
+    """Parse the name of an output folder; refuse one that cannot be made."""
     path = Path(text)
-    there = next(each for each in (path, *path.absolute().parents) if each.exists())
-    if not (there.is_dir() and os.access(there, os.W_OK)):
-        raise argparse.ArgumentTypeError(f"{text}: no folder can be made there")
+    existing = next(each for each in (path, *path.absolute().parents) if each.exists())
+    if not (existing.is_dir() and os.access(existing, os.W_OK)):
+        raise argparse.ArgumentTypeError(f"{text}: this folder cannot be made")
     return path
 
 
 def _modes(parser: argparse.ArgumentParser) -> None:
     mode = parser.add_mutually_exclusive_group()
-    text = "with real processes, signals and sockets on this machine"
+    text = "faults with real processes, signals and sockets on this machine"
     mode.add_argument("--real", action="store_true", help=text)
-    text = "on a release in a cluster; F38 rotates its key"
+    text = "faults on a release in a cluster (F38 rotates its key)"
     mode.add_argument("--cluster", action="store_true", help=text)
 
 
 def _run_arguments(parser: argparse.ArgumentParser) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("name", nargs="?", metavar="NAME", help="of the fault, or its number: F13")
+    what.add_argument(
+        "name", nargs="?", metavar="NAME", help="name of the fault, or its number: F13"
+    )
     what.add_argument("--all", action="store_true", help="every fault of the mode")
     _modes(parser)
-    parser.add_argument("--seed", type=seed, default=1, metavar="N", help="default: 1")
+    parser.add_argument("--seed", type=seed, default=1, metavar="N", help="seed (default: 1)")
     parser.add_argument("--jobs", type=count, default=1, metavar="J", help=JOBS)
     parser.add_argument(
-        "--junit", type=written_to, metavar="FILE", help="write the results as JUnit"
+        "--junit", type=written_to, metavar="FILE", help="write the results as JUnit XML"
     )
-    text = "write the result as a page of Markdown; with --all"
+    text = "write the results as a Markdown page (needs --all)"
     parser.add_argument("--document", type=written_to, metavar="FILE", help=text)
     place_arguments(parser)
 
 
 def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seeds", type=count, default=200, metavar="N", help="default: 200")
-    parser.add_argument("--first", type=seed, default=1, metavar="N", help="default: 1")
+    parser.add_argument(
+        "--seeds", type=count, default=200, metavar="N", help="number of seeds (default: 200)"
+    )
+    parser.add_argument(
+        "--first", type=seed, default=1, metavar="N", help="first seed (default: 1)"
+    )
     parser.add_argument("--jobs", type=count, default=1, metavar="J", help=JOBS)
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument(
-        "--adversarial", action="store_true", help="the cloud holds valid keys and wants a breach"
+        "--adversarial",
+        action="store_true",
+        help="the cloud has valid keys and tries to break the invariants",
     )
     kind.add_argument(
-        "--clean", action="store_true", help="nothing goes wrong: any HOLD is a false alarm"
+        "--clean", action="store_true", help="inject no faults: any HOLD is a false alarm"
     )
-    text = "write the result as a page of Markdown"
+    text = "write the results as a Markdown page"
     parser.add_argument("--document", type=written_to, metavar="FILE", help=text)
     parser.add_argument(
         "--store",
         type=folder,
         default=Path("faults-found"),
         metavar="DIR",
-        help="where a failing schedule is kept, once it is shrunk (default: ./faults-found)",
+        help="folder for failing schedules, after reduction (default: ./faults-found)",
     )
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Do what the action says."""
+    """Run the chosen action."""
     if options.action is None:
         names = ", ".join(ACTIONS)
         raise BadInputError(f"an action is missing: {names}; see 'cloudrc faults --help'")
@@ -154,11 +162,11 @@ def execute(options: argparse.Namespace) -> int:
 COLOURS = {"passed": "green", "FAILED": "red", "skipped": "yellow"}
 FAILED, INTERRUPTED = 1, 130
 PLACE = ("context", "namespace", "release")
-"""Flags that name a place in a cluster."""
+"""Options that select a release in a cluster."""
 
 
 def show(options: argparse.Namespace) -> int:
-    """List the faults."""
+    """Print the list of faults."""
     from cloudrc.faults.scenario import scenarios
 
     found = scenarios(_mode(options) if options.real or options.cluster else None)
@@ -167,32 +175,32 @@ def show(options: argparse.Namespace) -> int:
         faults = [{n: getattr(each, n) for n in names} for each in found]
         print(written({"schemaVersion": 1, "faults": faults}, options.output))
         return 0
-    rows = [("fault", "name", "mode", "what is done", "what has to follow")]
+    rows = [("fault", "name", "mode", "injection", "expected reaction")]
     rows += [(each.id, each.name, each.mode, each.injects, each.expects) for each in found]
     print(table(rows))
     return 0
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run one fault or all of them; 1 if a check did not pass, 130 if interrupted."""
+    """Run one fault or all; return 1 if a check failed, 130 if interrupted."""
     from cloudrc.faults import document
     from cloudrc.faults.scenario import called, scenarios
 
     mode = _mode(options)
     if options.document is not None and not options.all:
-        raise BadInputError("--document writes a page of all faults: add --all in place of a name")
+        raise BadInputError("--document writes a page of all faults: give --all instead of a name")
     if mode == "cluster":
         _look_for_release(options)
     elif any(_place(options).values()):
         flags = ", ".join(f"--{name}" for name in PLACE)
-        raise BadInputError(f"{flags} say which robot of a cluster: add --cluster")
+        raise BadInputError(f"{flags} select a release in a cluster: add --cluster")
     chosen = scenarios(mode) if options.all else called(options.name, mode)
     say = print if options.output == "table" else _silent
     results, cause, code = [], "", 0
     try:
         for result in _results(chosen, options):
             results.append(result)
-            _say(result, options.all, say)
+            _print_result(result, options.all, say)
     except KeyboardInterrupt:
         cause, code = "interrupted", INTERRUPTED
     except WorkerDiedError as error:
@@ -208,13 +216,13 @@ def run(options: argparse.Namespace) -> int:
     passed = sum(result.passed for result in results)
     say(f"\nseed {options.seed}: {passed} of {len(results)} passed, {failed} failed")
     if cause:
-        told = f"cloudrc: {cause}; {len(results)} of {len(chosen)} were run before"
-        print(told, file=sys.stderr, flush=True)
+        message = f"cloudrc: {cause}; {len(results)} of {len(chosen)} faults were run before"
+        print(message, file=sys.stderr, flush=True)
     return code or (FAILED if failed else 0)
 
 
 def _look_for_release(options: argparse.Namespace) -> None:
-    """Say it once, and not with every fault, if there is no cluster or no release in it."""
+    """Report a missing cluster or release once, not with every fault."""
     require("faults in a cluster", ("kube",))
     from cloudrc.cluster.pods import find_pod
     from cloudrc.faults.cluster.release import place, release_there
@@ -237,21 +245,21 @@ def _results(chosen: Sequence[Scenario], options: argparse.Namespace) -> Iterato
     return in_order(_run, names, jobs)
 
 
-def _run(which: tuple[str, Mode, int]) -> Result:
-    """Run one, in this process or in one of a pool; what breaks it is part of the result."""
+def _run(job: tuple[str, Mode, int]) -> Result:
+    """Run one fault, in this process or in a worker; an exception becomes a failed result."""
     from cloudrc.faults.document import Result
     from cloudrc.faults.scenario import Outcome, find
 
-    name, mode, seed = which
+    name, mode, seed = job
     scenario, began = find(name, mode), time.monotonic()
     try:
         return Result(scenario, scenario.run(seed), time.monotonic() - began)
-    except Exception as error:  # a broken scenario has failed, and the others still run
+    except Exception as error:  # this scenario fails, the others still run
         text = f"{type(error).__name__}: {error}"
         return Result(scenario, Outcome(), time.monotonic() - began, text)
 
 
-def _say(result: Result, briefly: bool, say: Callable[[str], object]) -> None:
+def _print_result(result: Result, briefly: bool, say: Callable[[str], object]) -> None:
     scenario, outcome = result.scenario, result.outcome
     word = paint(result.word, COLOURS[result.word])
     sha = f"  {outcome.sha256[:12]}" if outcome.sha256 else ""
@@ -268,4 +276,4 @@ def _say(result: Result, briefly: bool, say: Callable[[str], object]) -> None:
 
 
 def _silent(text: str) -> None:
-    """Nothing but JSON on stdout."""
+    """Print nothing: stdout is for the document alone."""

@@ -1,4 +1,4 @@
-"""`cloudrc faults fuzz` and `replay`: random schedules of faults, and stored ones."""
+"""Run `cloudrc faults fuzz` and `replay`: fly random or stored schedules of faults."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 FAILED = 1
 INTERRUPTED = 130
 PROGRESS_PERIOD = 10.0
-"""Between two lines of progress [s]."""
+"""Pause between two lines of progress [s]."""
 
 
 def fuzz(options: argparse.Namespace) -> int:
-    """Fly many random schedules; 1 if an invariant broke, 130 if told to stop, 6 if killed."""
+    """Fly random schedules; return 1 if an invariant broke, 130 if stopped, 6 if killed."""
     say = options.output == "table"
     search = Search(options)
     cause, code = "stopped", INTERRUPTED
@@ -37,22 +37,22 @@ def fuzz(options: argparse.Namespace) -> int:
         try:
             _fly_all(search, say, stop)
         except WorkerDiedError as error:
-            if not stop():  # else it was the same wish that has ended the worker
+            if not stop():  # else the same signal has ended the worker
                 cause, code = str(error), error.exit_code
-    document, cut = search.document(), len(search.findings) < options.seeds
-    if cut and not search.findings:
-        print(f"cloudrc: {cause}; not one schedule was flown", file=sys.stderr)
+    document, partial = search.document(), len(search.findings) < options.seeds
+    if partial and not search.findings:
+        print(f"cloudrc: {cause}; no schedule was flown", file=sys.stderr)
         return code
-    if options.document is not None and not cut:
-        by = f"{page.command(document)} --document {options.document}"
-        options.document.write_text(page.markdown(document, by), encoding="utf-8")
-    if cut:
-        then = page.command(document | _rest(document, options))
-        told = f"{cause}; {document['count']} of {options.seeds} were flown"
-        with unread_is_fine(sys.stderr):  # else nothing of what follows was written to a file
-            print(f"cloudrc: {told}; go on with '{then}'", file=sys.stderr, flush=True)
+    if options.document is not None and not partial:
+        written_by = f"{page.command(document)} --document {options.document}"
+        options.document.write_text(page.markdown(document, written_by), encoding="utf-8")
+    if partial:
+        rest = page.command(document | _rest(document, options))
+        message = f"{cause}; {document['count']} of {options.seeds} were flown"
+        with unread_is_fine(sys.stderr):  # a closed terminal must not prevent the output below
+            print(f"cloudrc: {message}; continue with '{rest}'", file=sys.stderr, flush=True)
     _print(document, options)
-    return code if cut else FAILED if search.failures else 0
+    return code if partial else FAILED if search.failures else 0
 
 
 def _print(document: dict[str, Any], options: argparse.Namespace) -> None:
@@ -64,42 +64,42 @@ def _print(document: dict[str, Any], options: argparse.Namespace) -> None:
 
 
 def _rest(document: dict[str, Any], options: argparse.Namespace) -> dict[str, int]:
-    """The seeds that were not flown."""
+    """Return the range of seeds that were not flown."""
     count = document["count"]
     return {"first": options.first + count, "count": options.seeds - count}
 
 
 def _fly_all(search: Search, say: bool, stop: Callable[[], bool]) -> None:
-    """Fly what is to be flown, in the order of the seeds, until it is done or told to stop."""
-    options, told = search.options, time.monotonic()
+    """Fly all schedules in the order of the seeds, until done or stopped."""
+    options, printed = search.options, time.monotonic()
     seeds = range(options.first, options.first + options.seeds)
     for finding in _findings(seeds, options):
         search.take(finding, say, stop)
-        if stop():  # what is printed may have no reader: a terminal that was closed
+        if stop():  # do not print progress: the terminal may be closed
             return
-        if say and time.monotonic() - told > PROGRESS_PERIOD:
-            told = time.monotonic()
+        if say and time.monotonic() - printed > PROGRESS_PERIOD:
+            printed = time.monotonic()
             flown, failed = len(search.findings), len(search.failures)
             print(f"{flown} of {options.seeds} flown, {failed} failed", flush=True)
 
 
 class Search:
-    """What was flown so far: always all seeds from the first one on, without a gap."""
+    """Collect the flights so far, of consecutive seeds from the first one."""
 
     def __init__(self, options: argparse.Namespace) -> None:
-        """Begin, with the options of the command."""
+        """Start the search with the options of the command."""
         self.options, self._began = options, time.monotonic()
         self.findings: list[dict[str, Any]] = []
         self.failures: list[dict[str, Any]] = []
 
     def take(self, finding: Finding, say: bool, stop: Callable[[], bool]) -> None:
-        """Add the flight of the next seed; one that failed is shrunk unless there is no time."""
+        """Add the flight of the next seed; reduce a failing schedule unless stopped."""
         if finding.breaches:
             self.failures.append(_report(finding, self.options.store, say, stop))
         self.findings.append(_brief(finding))
 
     def document(self) -> dict[str, Any]:
-        """Tell all of it."""
+        """Summarise all flights as plain values."""
         return page.document(
             self.findings,
             self.failures,
@@ -111,37 +111,37 @@ class Search:
 
 @contextmanager
 def stopping() -> Iterator[Callable[[], bool]]:
-    """Take a signal for a wish to stop after the flight under way, the second at once.
+    """Turn the first signal into a request to stop after the current flight; the second kills.
 
-    A terminal that is closed sends two, which are one wish; what `nohup` has started hears none.
+    A closed terminal sends two signals, which count as one. Under `nohup`, SIGHUP stays ignored.
     """
-    asked: list[int] = []
+    received: list[int] = []
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
 
-    def ask(number: int, frame: FrameType | None) -> None:
-        asked.append(number)
+    def request_stop(number: int, frame: FrameType | None) -> None:
+        received.append(number)
         for each in numbers:
             hung_up = each == signal.SIGHUP
             signal.signal(each, signal.SIG_IGN if hung_up else signal.default_int_handler)
 
-    before = [signal.signal(number, ask) for number in numbers]
+    before = [signal.signal(number, request_stop) for number in numbers]
     try:
-        yield lambda: bool(asked)
+        yield lambda: bool(received)
     finally:
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
 
 
 def replay(options: argparse.Namespace) -> int:
-    """Fly a stored schedule; 1 if an invariant breaks."""
+    """Fly a stored schedule; return 1 if an invariant breaks."""
     from cloudrc.faults.fuzz import fly
     from cloudrc.faults.schedule import load
 
     try:
         finding = fly(load(options.file), keep=True)
-    except BadInputError as error:  # a profile or a policy that there is not
+    except BadInputError as error:  # an unknown profile or policy
         where = "" if str(options.file) in str(error) else f"{options.file}: "
         raise BadInputError(f"{where}{error}") from error
     breaches = [breach._asdict() for breach in finding.breaches]
@@ -164,12 +164,12 @@ def _kind(options: argparse.Namespace) -> str:
     return "adversarial" if options.adversarial else "clean" if options.clean else "random"
 
 
-def _fly(which: tuple[int, str]) -> Finding:
+def _fly(job: tuple[int, str]) -> Finding:
     from cloudrc.faults.adversary import choose
     from cloudrc.faults.fuzz import fly
     from cloudrc.faults.schedule import calm, compose
 
-    seed, kind = which
+    seed, kind = job
     return fly({"adversarial": choose, "clean": calm, "random": compose}[kind](seed))
 
 
@@ -191,7 +191,7 @@ def _brief(finding: Finding) -> dict[str, Any]:
 
 
 def _report(finding: Finding, store: Path, say: bool, stop: Callable[[], bool]) -> dict[str, Any]:
-    """Shrink a failing schedule, print it, and keep it; as it is when there is a wish to stop."""
+    """Reduce a failing schedule, unless stopped; print and store it."""
     from cloudrc.faults.fuzz import fly
     from cloudrc.faults.schedule import dump, shrink
 
@@ -217,7 +217,7 @@ def _report(finding: Finding, store: Path, say: bool, stop: Callable[[], bool]) 
 
 
 def _keep(text: str, store: Path, name: str) -> Path:
-    """Write a schedule down; one of its name that says something else is a test, and stays."""
+    """Store a schedule; never overwrite a different one of the same name."""
     store.mkdir(parents=True, exist_ok=True)
     path, number = store / f"{name}.yaml", 2
     while path.exists() and path.read_text(encoding="utf-8") != text:

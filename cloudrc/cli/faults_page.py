@@ -1,4 +1,4 @@
-"""Sum up a search for faults: as plain values, as a table, in a sentence and as a page."""
+"""Summarise a search for faults as plain values, a table, a sentence or a Markdown page."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ INVARIANTS = {
     "stop": "too fast towards the fence",
     "stale": "motion on stale commands",
     "rest": "motion long after the last command",
-    "latch": "rotors on without the operator's word",
+    "latch": "rotors on without an acknowledgement",
     "hold": "HOLDs that end too early or too late",
     "tick": "steps without the guard",
-    "obeyed": "emergency stops that were not obeyed",
+    "obeyed": "emergency stops without effect",
     "order": "commands applied out of order",
     "waypoint": "waypoints reached out of order, or twice",
     "stuck": "stuck states",
     "alarm": "false alarms",
-    "recording": "recordings that do not hold what happened",
+    "recording": "incomplete or wrong recordings",
     "error": "errors in an end",
 }
 
@@ -35,14 +35,14 @@ def document(
     first: int,
     seconds: float,
 ) -> dict[str, Any]:
-    """Sum up some flights.
+    """Summarise flights as plain values.
 
     Args:
-        findings: Of each flight, in brief.
-        failures: The flights that broke an invariant, shrunk.
+        findings: Short result of each flight.
+        failures: Flights that broke an invariant, with their reduced schedules.
         kind: "random", "adversarial" or "clean".
         first: Seed of the first flight.
-        seconds: How long the search took [s].
+        seconds: Duration of the search [s].
     """
     return {
         "schemaVersion": 1,
@@ -70,13 +70,13 @@ def _judge(name: str, findings: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Count the flights in which an invariant was checked, and those in which it broke."""
     judged = sum(name in each["judged"] for each in findings)
     broken = sum(name in each["kinds"] for each in findings)
-    # The rule of three: 0 events in N runs, p < 3/N with 95 % confidence.
+    # Rule of three: 0 events in N runs mean p < 3/N with 95 % confidence.
     bound = min(3.0 / judged, 1.0) if judged and not broken else None
     return {"judged": judged, "broken": broken if judged else None, "bound": bound}
 
 
 def rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Each invariant with its bound."""
+    """Lay out a table: each invariant with its upper bound of failure probability."""
     lines: list[tuple[str, ...]]
     lines = [("invariant", "broken in", "of N", "95 % bound")]
     for kind, words in INVARIANTS.items():
@@ -91,16 +91,16 @@ def rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def summary(document: dict[str, Any]) -> str:
-    """How much was flown, and the extremes."""
+    """Describe in one sentence how much was flown, and the extreme values."""
     fallen, thrown = (
-        f"; {document[key]} stopped by {cause} came to lie outside of it, at most "
+        f"; {document[key]} came to rest outside of it after {cause}, at most "
         f"by {document[f'{key}_m']:.2f} m"
-        for key, cause in (("fallen", "the operator's word"), ("thrown", "a hit"))
+        for key, cause in (("fallen", "an emergency stop"), ("thrown", "a collision"))
     )
-    landed = f"; {document['landed_on']} came down on something other than the floor"
+    landed = f"; {document['landed_on']} landed on something other than the floor"
     return (
-        f"{document['hours']:.2f} virtual hours of {document['kind']} schedules from seed "
-        f"{document['first']} on in {document['seconds']:.0f} s: "
+        f"{document['hours']:.2f} virtual hours of {document['kind']} schedules, first seed "
+        f"{document['first']}, in {document['seconds']:.0f} s: "
         f"{document['missions_done']} missions done, {document['holds']} HOLDs, "
         f"nearest to the fence {document['smallest_margin_m']:.3f} m, "
         f"fastest {document['largest_speed_mps']:.2f} m/s"
@@ -111,7 +111,7 @@ def summary(document: dict[str, Any]) -> str:
 
 
 def command(document: dict[str, Any]) -> str:
-    """The command that flies the same once more; where it keeps what it finds changes nothing."""
+    """Return the command that repeats this search."""
     kind, first = document["kind"], document["first"]
     words = ["cloudrc faults fuzz", *([f"--{kind}"] if kind != "random" else [])]
     words += [f"--first {first}"] if first != 1 else []
@@ -131,9 +131,9 @@ def markdown(document: dict[str, Any], written_by: str) -> str:
             f"# The search for faults: {document['kind']} schedules",
             "",
             f"Written by `{written_by}` with cloudrc {document['version']}. Each schedule is one",
-            "minute of flight; every step of 2 ms is checked. N counts the schedules to which an",
-            "invariant applies. The bound is the rule of three: 0 events in N runs, p < 3/N with",
-            "95 % confidence.",
+            "minute of flight; each step of 2 ms is checked. N counts the schedules to which an",
+            "invariant applies. The bound is the rule of three: 0 events in N runs mean p < 3/N",
+            "with 95 % confidence.",
             "",
             f"| {' | '.join(head)} |",
             "|---|---|---|---|",

@@ -1,4 +1,4 @@
-"""`cloudrc link ACTION`: the table of actions; the file of an action is `cli/link_<name>.py`."""
+"""Parse `cloudrc link ACTION` and run the action; each action is in `cli/link_<name>.py`."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ examples:
   cloudrc link verify paper-p3
   cloudrc link set downlink.delay_ms=120
 
-All delays are one way. The chart starts 'cloudrc link run' in each pod, where
-it shapes what the pod sends: the uplink in world's, the downlink in cloud's. It
-follows its profile's file and its peer's name, and ends on SIGTERM."""
+All delays are one way. The chart starts 'cloudrc link run' in each pod. It
+shapes what the pod sends: the uplink in the world pod, the downlink in the
+cloud pod. It watches its profile file and the address of its peer, and ends on
+SIGTERM."""
 ACTIONS = {
-    "show": "draw a profile, and print its numbers",
+    "show": "draw a profile and print its delay and loss statistics",
     "record": "turn measured delays into a trace that a profile can replay",
-    "verify": "prove that a link is what was asked for",
-    "set": "change the link of a flight under way",
-    "run": "shape one direction until told to stop",
+    "verify": "check by measurement that a link does what its profile says",
+    "set": "change the link during a flight",
+    "run": "shape one direction of the link until SIGTERM",
 }
-"""What there is, in the order of the help."""
+"""Help line of each action, in the order of the help."""
+DEBUG = "show the traceback of an error"
 MODES = ("auto", "netem", "relay")
 
 
@@ -43,13 +45,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
             formatter_class=parser.formatter_class,
             allow_abbrev=False,
         )
-        action.add_argument("--debug", action="store_true", default=argparse.SUPPRESS)
+        action.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=DEBUG)
         (module.arguments if module else _run_arguments)(action)
         action.set_defaults(act=module.execute if module else _run)
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Do what the action says."""
+    """Run the chosen action."""
     if options.action is None:
         raise BadInputError("an action is missing; see 'cloudrc link --help'")
     code: int = options.act(options)
@@ -62,35 +64,45 @@ def _run(options: argparse.Namespace) -> int:
     return run(options)
 
 
-def _run_arguments(run: argparse.ArgumentParser) -> None:
-    process_arguments(run)
-    run.add_argument("--profile", type=Path, required=True, metavar="FILE", help="is followed")
-    run.add_argument(
+def _run_arguments(parser: argparse.ArgumentParser) -> None:
+    process_arguments(parser)
+    parser.add_argument(
+        "--profile",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="profile of the link; watched for changes",
+    )
+    parser.add_argument(
         "--direction",
         choices=("uplink", "downlink"),
         required=True,
-        help="which of the profile's two to shape",
+        help="direction of the profile to shape",
     )
-    run.add_argument(
+    parser.add_argument(
         "--mode",
         choices=MODES,
         default="auto",
-        help="auto (default) takes netem where this container may and the kernel can",
+        help="auto (default) takes netem if permissions and kernel allow it, else relay",
     )
-    run.add_argument(
-        "--peer", type=address, required=True, metavar="HOST:PORT", help="the other tunnel end"
+    parser.add_argument(
+        "--peer",
+        type=address,
+        required=True,
+        metavar="HOST:PORT",
+        help="address of the other tunnel end",
     )
-    run.add_argument(
+    parser.add_argument(
         "--listen",
         type=address,
         default=("127.0.0.1", 7401),
         metavar="HOST:PORT",
-        help="where the relay takes in (default: 127.0.0.1:7401)",
+        help="where the relay receives datagrams (default: 127.0.0.1:7401)",
     )
-    run.add_argument(
+    parser.add_argument(
         "--route",
         type=Path,
         required=True,
         metavar="FILE",
-        help="written when ready: where this pod's tunnel end sends to",
+        help="write the address to which this pod's tunnel end must send, once ready",
     )

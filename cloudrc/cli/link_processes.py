@@ -1,7 +1,7 @@
-"""The two processes of a link, started for a test of themselves: each shapes one way, as in pods.
+"""Start and stop the two processes of a link for `cloudrc link verify`, one per direction.
 
-world's shore --> `cloudrc link run --direction uplink`   --> cloud's shore
-cloud's shore --> `cloudrc link run --direction downlink` --> world's shore
+world's end --> `cloudrc link run --direction uplink`   --> cloud's end
+cloud's end --> `cloudrc link run --direction downlink` --> world's end
 """
 
 from __future__ import annotations
@@ -39,25 +39,26 @@ if TYPE_CHECKING:
 LOOPBACK = "127.0.0.1"
 WAYS = ("uplink", "downlink")
 START_LIMIT = 90.0
-"""For both to shape; a slow machine takes many seconds to load Python [s]."""
+"""Time limit for both processes to start [s]; a slow machine loads Python for many seconds."""
 STOP_LIMIT = 2.0
-_LOOK = 0.02
-_PATIENCE = 3.0
+"""Time limit for both processes to stop before they are killed [s]."""
+_POLL_PERIOD = 0.02
+_METRICS_TIMEOUT = 3.0
 _KINDS = {kind.exit_code: kind for kind in (BadInputError, MissingPrerequisiteError, TimedOutError)}
-"""Exit codes of a link's process that say whose fault its end is."""
+"""Exit codes of a link's process that stand for an error of their own."""
 _CHART_ADVICE, _ADVICE = "set link.mode=relay", "use --shaper relay"
-"""What a link's process advises is a value of the chart; here it is a flag."""
+"""A link's process advises a value of the chart; this command has a flag instead."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where one direction's shaper runs.
+    """Addresses of one direction's shaper.
 
     Attributes:
-        peer: Where its datagrams end.
-        listen: Where it takes them in, if it is a relay.
-        metrics: Where it tells of itself.
-        inside: Words before its command line: "ip netns exec NAME", or none.
+        peer: Destination of its datagrams.
+        listen: Where a relay receives datagrams.
+        metrics: Where it serves its metrics.
+        inside: Prefix of its command line: "ip netns exec NAME", or empty.
     """
 
     peer: tuple[str, int]
@@ -68,12 +69,13 @@ class Place:
 
 @dataclass(slots=True)
 class Shaping:
-    """One direction's process.
+    """Process that shapes one direction.
 
     Attributes:
-        place: Where it runs.
-        folder: Its files: route, state, log.
-        process: Running or ended.
+        place: Its addresses.
+        folder: Folder of its files: route, state, log.
+        process: The process, running or ended.
+        log: File with its output.
     """
 
     place: Place
@@ -85,20 +87,20 @@ class Shaping:
         self.log = self.folder / "log"
 
     def route(self) -> tuple[str, int] | None:
-        """Where to send, once it shapes."""
+        """Return the address to send to; None until it shapes."""
         try:
             return parse((self.folder / "route").read_text(encoding="ascii"))
         except (OSError, ValueError):
             return None
 
     def state(self) -> LinkState:
-        """What it says that it does."""
+        """Read the state that the process has written."""
         return from_text((self.folder / STATE_FILE).read_text(encoding="utf-8"))
 
     def metrics(self) -> str:
-        """What it counts, in Prometheus' text; "" if it does not answer."""
+        """Return its metrics as Prometheus text; "" without an answer."""
         host, port = self.place.metrics
-        if self.place.inside:  # its loopback is not ours
+        if self.place.inside:  # the namespace has its own loopback
             reader = (
                 "import urllib.request as u; ask = u.build_opener(u.ProxyHandler({})).open; "
                 f"print(ask('http://{host}:{port}/metrics', timeout=3).read().decode())"
@@ -107,26 +109,26 @@ class Shaping:
             done = subprocess.run(words, capture_output=True, text=True, check=False)
             return done.stdout
         try:
-            with DIRECTLY.open(f"http://{host}:{port}/metrics", timeout=_PATIENCE) as page:
+            with DIRECTLY.open(f"http://{host}:{port}/metrics", timeout=_METRICS_TIMEOUT) as page:
                 return str(page.read().decode())
         except OSError:
             return ""
 
     def last_words(self) -> str:
-        """The last line of its log."""
+        """Return the last line of its log."""
         lines = self.log.read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else "it left no message"
 
 
 def refuse_impossible(asked: Profile | ResolvedExperiment, mode: str) -> None:
-    """Refuse what a shaper cannot be, before anything is planned or started for it.
+    """Refuse a profile that the shaper cannot realise.
 
     Args:
-        asked: Has what is asked of both directions.
+        asked: Profile of both directions.
         mode: "relay", "netem" or "auto".
 
     Raises:
-        BadInputError: Names the direction and what of it netem cannot do.
+        BadInputError: Names the direction and what netem cannot do.
     """
     for way in WAYS if mode == "netem" else ():
         try:
@@ -139,17 +141,17 @@ def refuse_impossible(asked: Profile | ResolvedExperiment, mode: str) -> None:
 def shaping(
     places: Mapping[str, Place], config: str, profile: str, mode: str
 ) -> Iterator[dict[str, Shaping]]:
-    """Run both directions' shapers; they have ended afterwards.
+    """Run the shapers of both directions; stop them at the end.
 
     Args:
-        places: By direction.
+        places: Addresses by direction.
         config: The experiment, as YAML.
-        profile: The profile in force, as YAML.
+        profile: The profile to apply, as YAML.
         mode: "relay", "netem" or "auto".
 
     Raises:
-        CloudrcError: If one cannot shape: it says why, and its exit code is the error's.
-        TimedOutError: If one does not begin to.
+        CloudrcError: If a shaper ends early; with its message and exit code.
+        TimedOutError: If a shaper does not start in time.
     """
     running: dict[str, Shaping] = {}
     with tempfile.TemporaryDirectory(prefix="cloudrc-verify-") as text:
@@ -187,25 +189,25 @@ def _start(folder: Path, way: str, place: Place, mode: str) -> Shaping:
             stdout=log,
             stderr=log,
             env={**os.environ, PARENT: str(os.getpid())},
-            start_new_session=True,  # Ctrl-C reaches this process alone, which ends them
+            start_new_session=True,  # Ctrl-C reaches this process alone, which stops them
         )
     return Shaping(place, own, process)
 
 
 def _wait(running: Mapping[str, Shaping]) -> None:
-    until = time.monotonic() + START_LIMIT
+    deadline = time.monotonic() + START_LIMIT
     while not all(one.route() for one in running.values()):
         for way, one in running.items():
             code = one.process.poll()
             if code is not None:
                 raise _ended(way, code, one.last_words())
-        if time.monotonic() > until:
+        if time.monotonic() > deadline:
             raise TimedOutError(f"the link was not up within {START_LIMIT:g} s; try again")
-        time.sleep(_LOOK)
+        time.sleep(_POLL_PERIOD)
 
 
 def _ended(way: str, code: int, words: str) -> CloudrcError:
-    """Say why a direction's process has ended, with its own exit code where that says why."""
+    """Make the error for a process that ended early, with its exit code if that has a meaning."""
     words = words.removeprefix("cloudrc: error: ").replace(_CHART_ADVICE, _ADVICE)
     kind = _KINDS.get(code)
     if kind is None:
@@ -218,10 +220,10 @@ def _stop(processes: Sequence[subprocess.Popen[bytes]]) -> None:
         with contextlib.suppress(OSError):
             os.kill(process.pid, signal.SIGCONT)
         process.terminate()
-    until = time.monotonic() + STOP_LIMIT
+    deadline = time.monotonic() + STOP_LIMIT
     for process in processes:
         try:
-            process.wait(max(0.0, until - time.monotonic()))
+            process.wait(max(0.0, deadline - time.monotonic()))
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

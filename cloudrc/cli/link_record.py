@@ -1,6 +1,6 @@
-"""`cloudrc link record SOURCE`: measured delays come in, a trace for a profile goes out.
+"""Run `cloudrc link record SOURCE`: turn measured delays into a trace for a profile.
 
-Where a trace comes from: a run, an MCAP file or a log is recognised, its packets come out.
+The source is a run, an MCAP file, a log of ping or irtt, or a CSV file; its content says which.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 sources:
-  a run         its folder or mission.mcap: all datagrams that arrived, one way,
-                and those that did not
+  a run         its folder or mission.mcap: one-way delays of the datagrams that
+                arrived, and the losses
   ping -D HOST  its output, with --halve-rtt
   irtt client -o FILE.json HOST
                 with --direction, or with --halve-rtt
-  a CSV file    time_s and delay_ms, or with _s, _ms, _us or _ns at the end;
-                rtt_ms with --halve-rtt; lost: 0 or 1, or an empty delay
+  a CSV file    columns time_s and delay_ms (units: _s, _ms, _us or _ns);
+                rtt_ms with --halve-rtt; a loss: lost = 1, or an empty delay
 
 examples:
   cloudrc link record runs/latest -o trace.csv
   cloudrc link record ping.log --halve-rtt -o lte.csv
   cloudrc run --set link.profile=ideal --set link.uplink.trace=trace-uplink.csv
 
-A trace is one way. A run has both ways: without --direction both are written,
-the direction's name added to the file's."""
+A trace describes one direction. A run has two: without --direction the command
+writes both, and adds the direction to each file name."""
 DIRECTIONS: tuple[Direction, ...] = ("uplink", "downlink")
 
 
@@ -44,19 +44,21 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="the trace to write"
     )
-    parser.add_argument("--direction", choices=DIRECTIONS, help="take one direction alone")
+    parser.add_argument("--direction", choices=DIRECTIONS, help="take this direction only")
     parser.add_argument(
         "--halve-rtt",
         action="store_true",
-        help="take half of each round trip: right only if both directions are alike",
+        help="take half of each round trip; correct only if both directions are equal",
     )
     parser.add_argument(
-        "--trust-units", action="store_true", help="take values that look like another unit"
+        "--trust-units",
+        action="store_true",
+        help="accept values that look as if they had another unit",
     )
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Read the source, write the trace or traces, and say what is in them."""
+    """Read the source, write the traces, and print a summary of each."""
     source: Path = options.source
     if not (source.is_dir() or source.is_file()):
         raise BadInputError(f"{source}: no such file or folder; name a run, a log or a CSV file")
@@ -77,7 +79,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _write(packets: Packets, path: Path, direction: str, *, halve: bool) -> None:
-    """Write one trace; say what is in it and how a profile asks for it, as a replay or a table."""
+    """Write one trace; print its statistics and the settings that use it."""
     from statistics import fmean, pstdev
 
     from cloudrc.link.traces import trace_of, write_trace
@@ -99,18 +101,18 @@ def _write(packets: Packets, path: Path, direction: str, *, halve: bool) -> None
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 UNPACKED_MAX = 64 << 20
-"""Longest log that is unpacked [bytes], 10 min of irtt at 100 Hz; a small file may hold any."""
+"""Longest log that is unpacked [bytes]: 10 min of irtt at 100 Hz."""
 SETTLING_NS = 2_000_000_000
-"""What was sent this long before its session's last datagram [ns] and did not arrive is lost."""
+"""Time before a session's last datagram [ns]; a datagram sent later may still be under way."""
 TOPICS = {
     "uplink": ("/telemetry", "/uplink_delay"),
     "downlink": ("/delay_estimate", "/downlink_delay"),
 }
-"""By direction: one row per datagram sent, and one per datagram that arrived."""
+"""Topics by direction: one has a row per sent datagram, the other per arrived datagram."""
 
 
 def is_run(path: Path) -> bool:
-    """Say whether a path is a run's folder or a recording: those have both directions."""
+    """Tell whether a path is a run's folder or a recording, which have both directions."""
     if path.is_dir():
         return True
     with path.open("rb") as file:
@@ -122,9 +124,9 @@ def from_run(path: Path, direction: Direction, *, halve: bool) -> Packets:
 
     Args:
         path: Folder or file.
-        direction: Which of the two.
-        halve: Whether to take half of each round trip that cloud measured in place of the one-way
-            delays, which are known only where both ends share a clock.
+        direction: Direction of the link.
+        halve: Take half of each round trip that cloud measured. One-way delays are known only if
+            both ends share a clock.
 
     Raises:
         BadInputError: If it holds no such delays.
@@ -135,10 +137,10 @@ def from_run(path: Path, direction: Direction, *, halve: bool) -> Packets:
 
 
 def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_units: bool) -> Packets:
-    """Read a log of ping or irtt, or a CSV file; which of them it is says its content.
+    """Read a log of ping or irtt, or a CSV file; its content says which.
 
     Raises:
-        BadInputError: If it is none of them, or cannot be used.
+        BadInputError: If it is none of these or cannot be used.
     """
     from cloudrc.link.traces import is_ping, read_csv, read_irtt, read_lines, read_ping
 
@@ -148,8 +150,8 @@ def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_unit
     if lines and lines[0].lstrip().startswith("{"):
         if direction is None and not halve:
             raise BadInputError(
-                f"{name}: irtt measures both ways; choose --direction uplink (what its client "
-                "sent) or downlink"
+                f"{name}: irtt measures both directions; choose --direction uplink (sent by its "
+                "client) or downlink"
             )
         return read_irtt("\n".join(lines), name, direction or "uplink", halve=halve)
     if is_ping(lines):
@@ -158,7 +160,7 @@ def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_unit
 
 
 def _lines(path: Path) -> list[str]:
-    """Unpack what irtt packs on its own; nothing if it is not packed."""
+    """Unpack a file that irtt has compressed; empty if it is not compressed."""
     import gzip
     import zlib
 
@@ -171,7 +173,9 @@ def _lines(path: Path) -> list[str]:
             raise OSError(f"it holds more than {UNPACKED_MAX >> 20} MiB")
         return data.decode().splitlines()
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
-        raise BadInputError(f"{path}: cannot be unpacked: {error}; give the file itself") from None
+        raise BadInputError(
+            f"{path}: cannot be unpacked: {error}; give the unpacked file"
+        ) from None
 
 
 def _recording(path: Path) -> Recording:
@@ -184,12 +188,12 @@ def _recording(path: Path) -> Recording:
 
 
 def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
-    """Join what was sent with what arrived, by epoch and counter; of copies the first counts.
+    """Match sent and arrived datagrams by epoch and counter; of duplicates the first counts.
 
     Args:
-        recording: Of both ends.
-        path: Where it is from, for messages.
-        direction: Which of the two.
+        recording: Recording of both ends.
+        path: Its path, for messages.
+        direction: Direction of the link.
 
     Raises:
         BadInputError: If it holds no such delays.
@@ -203,7 +207,7 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     if not len(sent) or not len(arrivals):
         missing = sent_topic if not len(sent) else topic
         raise BadInputError(
-            f"{path}: nothing on {missing}, so no {direction}; "
+            f"{path}: no rows on {missing}, so no {direction}; "
             "give the run's folder or its mission.mcap"
         )
     delays: dict[tuple[float, float], float] = {}
@@ -215,10 +219,10 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
             )
         delays[epoch, counter] = min(delay, delays.get((epoch, counter), delay))
     rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
-    # Of a session, what was sent before it was open at the far end, or near its close, may have
-    # been refused there: it is left out, for the link did not lose it.
-    first = reversed(list(_columns(arrivals, "epoch", "stamp_ns")))
-    opened_ns = {epoch: stamp_ns for epoch, stamp_ns in first}
+    # The far end may refuse datagrams sent before the session was open there, or near its end. The
+    # link did not lose these: leave them out.
+    latest_first = reversed(list(_columns(arrivals, "epoch", "stamp_ns")))
+    opened_ns = {epoch: stamp_ns for epoch, stamp_ns in latest_first}  # the first arrival remains
     last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
     entries = [
         ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter)))
@@ -230,9 +234,9 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
 
 
 def _halves(recording: Recording, path: Path) -> Packets:
-    """Take half of each round trip, at the instant at which its command left; losses are not known.
+    """Take half of each round trip, at the time its command was sent; losses are unknown.
 
-    The echo of an applied command is repeated until the next: each counts once.
+    Telemetry repeats the echo of a command until the next one: count each once.
     """
     from math import isnan
 
@@ -240,10 +244,10 @@ def _halves(recording: Recording, path: Path) -> Packets:
 
     estimates = recording["/delay_estimate"]
     rows: list[tuple[float, float]] = []
-    before = None
+    previous = None
     for stamp_ns, rtt, loop in _columns(estimates, "stamp_ns", "rtt", "loop_delay"):
-        if not isnan(rtt) and (rtt, loop) != before:
-            before = (rtt, loop)
+        if not isnan(rtt) and (rtt, loop) != previous:
+            previous = (rtt, loop)
             rows.append((stamp_ns - round(loop * 1e9), rtt))
     if not rows:
         raise BadInputError(f"{path}: holds no round trip; give the folder of a run that flew")
@@ -252,5 +256,5 @@ def _halves(recording: Recording, path: Path) -> Packets:
 
 
 def _columns(table: Table, *names: str) -> Iterator[tuple[float, ...]]:
-    """Walk over some columns row by row; integers stay integers."""
+    """Iterate over columns row by row; integers stay integers."""
     return zip(*(table[name].tolist() for name in names), strict=True)

@@ -1,14 +1,11 @@
-"""What `cloudrc link run` does: it gives the sidecar its clock, sockets, programs and threads.
+"""Run `cloudrc link run`: the sidecar with its clock, sockets, programs and threads.
 
-tc kept running: commands go in as lines, answers come out without starting a process for each.
+A step of a profile's time line must take effect within milliseconds, and starting a process takes
+longer. Therefore one `tc -batch -` keeps running: it reads commands from a pipe. A listing follows
+each command; its line marks the end of the answer.
 
-A step of a time line has to be in force within milliseconds, and a process takes longer than that
-to start. `tc -batch -` reads its commands from a pipe and answers each as soon as it is done; after
-each a listing is asked for, whose line marks the end of the answer.
-
-What `cloudrc link run` answers at /link.json of its metrics' port: who shapes, by what, and how.
-
-Tools are started for each answer, so that nobody may have one more often than once a second.
+/link.json on the metrics port shows the state of the shaper. Each answer starts external tools, so
+it is renewed at most once a second.
 """
 
 from __future__ import annotations
@@ -43,45 +40,46 @@ if TYPE_CHECKING:
 
 def run(options: argparse.Namespace) -> int:
     """Shape one direction of the link until SIGTERM."""
-    stop = StopSignal()  # first: the first process of a container ignores SIGTERM until then
+    stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
     from cloudrc.link.follow import HANDED_FILE, HandedProfile, ProfileFile, Profiles
     from cloudrc.link.sidecar import Settings, Sidecar
     from cloudrc.link.tc import write_tables
 
     warn_if_exposed(options.listen)
     exporter = open_exporter(options, "link")
-    watcher = Metrics(exporter, options.direction, options.mode) if exporter else None
-    load, handed = loader(options.direction), options.route.with_name(HANDED_FILE)
-    file = Profiles(ProfileFile(options.profile, load, log), HandedProfile(handed, load, log))
-    profile, state = file.first(), options.route.with_name("link.json")
-    settings = Settings(options.mode, options.direction, options.route, state)
+    metrics = Metrics(exporter, options.direction, options.mode) if exporter else None
+    load, handed_path = loader(options.direction), options.route.with_name(HANDED_FILE)
+    profile_file = ProfileFile(options.profile, load, log)
+    profiles = Profiles(profile_file, HandedProfile(handed_path, load, log))
+    profile, state_path = profiles.first(), options.route.with_name("link.json")
+    settings = Settings(options.mode, options.direction, options.route, state_path)
     with TemporaryDirectory(prefix="tc-", dir=options.route.parent) as tables:
         write_tables(Path(tables))
         programs = runner(tables)
         machine = _machine(options, programs, Path(tables))
-        sidecar = Sidecar(settings, machine, profile, watcher)
+        sidecar = Sidecar(settings, machine, profile, metrics)
         if exporter:
             exporter.tells(Teller(sidecar).text)
         try:
-            sidecar.run(stop, lambda: _follow(sidecar, file, options, watcher))
+            sidecar.run(stop, lambda: _start_watching(sidecar, profiles, options, metrics))
         finally:
             programs.close()
     return 0
 
 
 def log(line: str) -> None:
-    """Say one line to people."""
+    """Write one line to the log."""
     say(f"cloudrc link: {line}", sys.stderr)
 
 
 def loader(direction: str) -> Load:
-    """Make what reads a profile's file and takes one direction of it."""
+    """Make the function that reads one direction of a profile file."""
     from cloudrc.assembly import link_profile
     from cloudrc.config.load import load_profile
     from cloudrc.link.follow import Loaded
 
     def load(path: Path) -> Loaded:
-        profile = load_profile(path.absolute())  # with a slash: no shipped profile's name
+        profile = load_profile(path.absolute())  # absolute: never the name of a shipped profile
         values = profile.model_dump(mode="json", exclude_defaults=True)
         return Loaded(link_profile(getattr(profile, direction)), values)
 
@@ -103,7 +101,7 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
 
     def relay(profile: DirectionProfile, origin_ns: int) -> RelayShaper:
         settle()
-        if not ask_for_fifo():  # most pods may not, and need not
+        if not ask_for_fifo():  # most pods lack the permission and do not need it
             log("the relay runs under SCHED_FIFO")
         uplink = options.direction == "uplink"
         return RelayShaper(options.listen, LinkDirection(profile, seed, uplink, origin_ns), peek)
@@ -131,35 +129,36 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
     )
 
 
-def _follow(
-    sidecar: Sidecar, file: Profiles, options: argparse.Namespace, watcher: Metrics | None
+def _start_watching(
+    sidecar: Sidecar, profiles: Profiles, options: argparse.Namespace, metrics: Metrics | None
 ) -> None:
-    """Let threads of their own look after the profile's file and the peer's name."""
+    """Start the threads that watch the profile file and resolve the peer's name."""
     from cloudrc.link.follow import PEER_PAUSE, PROFILE_PERIOD, PeerName
 
     name = PeerName(options.peer, resolve, log)
 
-    def look() -> None:
-        sidecar.profile = file.poll() or sidecar.profile
+    def poll_profile() -> None:
+        sidecar.profile = profiles.poll() or sidecar.profile
 
-    def ask() -> None:
+    def resolve_peer() -> None:
         sidecar.peer = name.poll() or sidecar.peer
-        if watcher is not None:
-            watcher.unresolved(name.failures)
+        if metrics is not None:
+            metrics.unresolved(name.failures)
 
-    for action, pause in ((look, (PROFILE_PERIOD, PROFILE_PERIOD)), (ask, PEER_PAUSE)):
-        threading.Thread(target=_again_and_again, args=(pause, action), daemon=True).start()
+    tasks = ((poll_profile, (PROFILE_PERIOD, PROFILE_PERIOD)), (resolve_peer, PEER_PAUSE))
+    for action, pause in tasks:
+        threading.Thread(target=_repeat_forever, args=(pause, action), daemon=True).start()
 
 
-def _again_and_again(pause: tuple[float, float], action: Callable[[], None]) -> None:
-    """Act for ever, with a pause between that is drawn from a range [s]."""
+def _repeat_forever(pause: tuple[float, float], action: Callable[[], None]) -> None:
+    """Repeat an action; each pause is drawn at random from a range [s]."""
     while True:
         action()
         time.sleep(random.uniform(*pause))
 
 
 class Metrics:
-    """Keeps the metrics of a sidecar; a `Watcher`."""
+    """Export the metrics of a sidecar; implements `Watcher`."""
 
     def __init__(self, exporter: Exporter, direction: str, mode: str) -> None:
         self._exporter = exporter
@@ -167,52 +166,53 @@ class Metrics:
         self._mode = mode
 
     def shapes(self, shaper: str) -> None:
-        """Show who shapes, and be ready."""
+        """Export which shaper is in use, and report ready."""
         self._exporter.shaped(shaper, self._direction, self._mode)
         self._exporter.ready(True)
 
     def asked(self, delay: float) -> None:
-        """Show the mean delay that is asked for [s]."""
+        """Export the mean of the requested delay [s]."""
         self._exporter.asked(self._direction, delay)
 
     def unresolved(self, count: int) -> None:
-        """Show how often the peer's name could not be resolved."""
+        """Export how often the peer's name could not be resolved."""
         self._exporter.unresolved(count)
 
     def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
-        """Show what became of the datagrams."""
+        """Export the counters of datagrams."""
         self._exporter.see([Counted(stamp_ns, "link", name, n) for name, n in counts.items()])
 
 
 PATIENCE = 5.0
-"""How long tc and ip may take [s]."""
+"""Time limit of one call of tc or ip [s]."""
 NOT_FOUND = 127
+"""Exit code when the program does not exist."""
 _FAILED = b"Command failed -:"
-_PIPE = 65_536
+_READ_SIZE = 65_536
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
-_END = "qdisc show dev lo"
+_END = "qdisc show dev lo"  # its listing marks the end of an answer
 
 
 def runner(tables: str, prefix: Sequence[str] = ()) -> Programs:
-    """Make what runs tc and ip.
+    """Make the runner of tc and ip.
 
     Args:
-        tables: Folder in which tc finds its distributions.
-        prefix: Words before each program, such as "ip netns exec NAME".
+        tables: Folder with the distribution tables of tc.
+        prefix: Words before each command, such as "ip netns exec NAME".
     """
     return Programs({**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}, prefix)
 
 
 class Programs:
-    """Runs tc and ip; changes and listings of qdiscs through one tc that keeps running."""
+    """Run tc and ip; changes and listings of qdiscs go through one lasting tc process."""
 
     def __init__(self, environment: Mapping[str, str], prefix: Sequence[str] = ()) -> None:
-        """Start nothing yet."""
+        """Store the environment and the prefix; start no process."""
         self._environment, self._prefix = environment, tuple(prefix)
         self._session: Session | None = None
 
     def __call__(self, words: Sequence[str]) -> Answer:
-        """Run a program to its end."""
+        """Run a command and return its answer."""
         line = _for_batch(words)
         if line is None:
             return self._once(words)
@@ -221,12 +221,12 @@ class Programs:
                 self._session = Session((*self._prefix, *_BATCH), self._environment)
             return self._session.ask(line, lists=words[1].startswith("-"))
         except (OSError, SessionError):
-            # It was killed, or is too old for this: once more, as everybody does it.
+            # The tc process was killed, or is too old for -batch: start one for this command.
             self.close()
             return self._once(words)
 
     def close(self) -> None:
-        """End the tc that keeps running, if there is one."""
+        """End the lasting tc process, if there is one."""
         if self._session is not None:
             self._session.close()
             self._session = None
@@ -243,7 +243,7 @@ class Programs:
             )
         except FileNotFoundError:
             return Answer(NOT_FOUND, "", "")
-        except OSError as error:  # no leave to run it, or no process left
+        except OSError as error:  # no permission, or the limit of processes is reached
             return Answer(1, "", error.strerror or str(error))
         except subprocess.TimeoutExpired:
             return Answer(1, "", f"no answer within {PATIENCE:g} s")
@@ -251,14 +251,14 @@ class Programs:
 
 
 class SessionError(Exception):
-    """The tc that keeps running does not answer as expected."""
+    """The lasting tc process does not answer as expected."""
 
 
 class Session:
-    """One `tc -batch -`."""
+    """Talk to one `tc -batch -` process."""
 
     def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
-        """Start it; raises an OSError."""
+        """Start the process; raises OSError."""
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -272,44 +272,44 @@ class Session:
         self._in, self._out = self._process.stdin.fileno(), self._process.stdout.fileno()
 
     def ask(self, line: str, *, lists: bool) -> Answer:
-        """Have one command done.
+        """Run one command.
 
         Args:
-            line: The words after `tc`, options left out.
-            lists: Whether a line of JSON is its answer; else it says nothing if all is well.
+            line: The words after `tc`, without options.
+            lists: Whether it answers with a line of JSON; else it is silent on success.
 
         Raises:
-            SessionError: If there is no answer, or none that makes sense; then close it.
+            SessionError: If there is no valid answer; close the session then.
         """
         os.write(self._in, f"{line}\n{_END}\n".encode())
-        until, said, answer = time.monotonic() + PATIENCE, b"", ""
+        deadline, unread, text = time.monotonic() + PATIENCE, b"", ""
         listings: list[str] = []
-        complaints: list[str] = []
-        while len(listings) < (2 if lists and not complaints else 1):
-            end = said.find(b"\n")
+        failed = False
+        while len(listings) < (2 if lists and not failed else 1):
+            end = unread.find(b"\n")
             if end < 0:
-                said += self._read(until)
+                unread += self._read(deadline)
                 continue
-            one, said = said[:end], said[end + 1 :]
+            one, unread = unread[:end], unread[end + 1 :]
             if one.startswith(_FAILED):
-                complaints.append("")
+                failed = True
             elif one.startswith(b"["):
                 listings.append(one.decode())
             elif one.strip():
-                answer += one.decode(errors="replace") + "\n"
-        if complaints:
-            return Answer(2, "", answer)
-        return Answer(0, listings[0] if lists else answer, "")
+                text += one.decode(errors="replace") + "\n"
+        if failed:
+            return Answer(2, "", text)
+        return Answer(0, listings[0] if lists else text, "")
 
-    def _read(self, until: float) -> bytes:
-        ready, _, _ = select.select([self._out], [], [], max(0.0, until - time.monotonic()))
-        said = os.read(self._out, _PIPE) if ready else b""
-        if not said:
-            raise SessionError("it has ended" if ready else "no answer")
-        return said
+    def _read(self, deadline: float) -> bytes:
+        ready, _, _ = select.select([self._out], [], [], max(0.0, deadline - time.monotonic()))
+        data = os.read(self._out, _READ_SIZE) if ready else b""
+        if not data:
+            raise SessionError("the process has ended" if ready else "no answer")
+        return data
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         process = self._process
         process.kill()
         process.wait()
@@ -319,7 +319,7 @@ class Session:
 
 
 def _for_batch(words: Sequence[str]) -> str | None:
-    """Put a command into a line for the tc that keeps running; None if that is not worth it."""
+    """Translate a command into a line for the lasting tc; None for rare commands."""
     match list(words):
         case ["tc", "qdisc", "change", *rest]:
             return " ".join(["qdisc", "change", *rest])
@@ -329,17 +329,17 @@ def _for_batch(words: Sequence[str]) -> str | None:
 
 
 PERIOD = 1.0
-"""For so long an answer is given again [s]."""
+"""How long an answer of /link.json stays valid [s]."""
 NOTHING = "{}\n"
-"""Before anything is shaped."""
+"""Answer of /link.json before anything is shaped."""
 
 
 def look(host: str, inside: Sequence[str] = ()) -> Near | None:
-    """Ask a network namespace for its netems and its way to a host, with tools of our own.
+    """Find the netem qdiscs of a network namespace and its route to a host.
 
     Args:
         host: IPv4 address.
-        inside: Words that lead there, "ip netns exec NAME"; none: this one.
+        inside: Prefix of commands, "ip netns exec NAME"; empty for this namespace.
     """
     programs = runner("", inside)
     try:
@@ -349,7 +349,7 @@ def look(host: str, inside: Sequence[str] = ()) -> Near | None:
 
 
 class Teller:
-    """Tells what a sidecar does, to any thread."""
+    """Describe the state of a sidecar as JSON; for any thread."""
 
     def __init__(
         self,
@@ -358,22 +358,22 @@ class Teller:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._sidecar, self._look, self._clock = sidecar, look, clock
-        self._guard, self._text, self._until = threading.Lock(), NOTHING, -PERIOD
+        self._lock, self._text, self._valid_until = threading.Lock(), NOTHING, -PERIOD
 
     def text(self) -> str:
-        """Say all there is to know now, as JSON; the last answer where tools hang."""
-        if not self._guard.acquire(timeout=PERIOD):
+        """Return the state as JSON; the previous answer if the tools hang."""
+        if not self._lock.acquire(timeout=PERIOD):
             return self._text
         try:
-            if self._clock() >= self._until:
+            if self._clock() >= self._valid_until:
                 self._text = self._ask()
-                self._until = self._clock() + PERIOD
+                self._valid_until = self._clock() + PERIOD
             return self._text
         finally:
-            self._guard.release()
+            self._lock.release()
 
     def _ask(self) -> str:
-        told, peer = self._sidecar.told(), self._sidecar.peer
-        if told is None or peer is None:
+        status, peer = self._sidecar.told(), self._sidecar.peer
+        if status is None or peer is None:
             return NOTHING
-        return write_told(replace(told, near=self._look(peer[0])))
+        return write_told(replace(status, near=self._look(peer[0])))

@@ -1,4 +1,4 @@
-"""`cloudrc link set`: change the link of a flight under way, here or in a cluster."""
+"""Run `cloudrc link set`: change the link during a flight, on this machine or in a cluster."""
 
 from __future__ import annotations
 
@@ -26,22 +26,23 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 where:
-  the run that flies here ('cloudrc run --mode local'), found by itself or by
-  --run; or a release: with --context, -n or --release, if none flies here, and
-  always as 'kubectl cloudrc link set'
+  a run on this machine ('cloudrc run --mode local'): found automatically, or
+  named by --run
+  a release in a cluster: if --context, -n or --release is given, or if no run
+  flies on this machine; always with 'kubectl cloudrc link set'
 
 examples:
   cloudrc link set downlink.delay_ms=120 uplink.loss=0.02
   cloudrc link set --profile handover
   cloudrc link set --profile wifi uplink.rate_kbit=400 -n demo
 
-Keys are those of a profile's direction. A profile's time line counts from now;
-single values leave it as it goes. The change is recorded, and lasts until the
-next one, the end of the run, or 'helm upgrade'."""
+KEY is a key of a direction in a profile file. With --profile, time lines start
+anew; single values leave them running. The change is recorded. It lasts until
+the next change, the end of the run, or 'helm upgrade'."""
 LOCAL_PATIENCE = 5.0
-"""For the relay of a run here to take a change over [s]; it takes 0.2."""
+"""Time limit for a local relay to apply a change [s]; it needs about 0.2 s."""
 LOOK_PERIOD = 0.05
-"""Between two looks [s]."""
+"""Pause between two reads of the link's state [s]."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,14 +50,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "settings", nargs="*", metavar="KEY=VALUE", help="uplink.KEY=VALUE or downlink.KEY=VALUE"
     )
-    parser.add_argument("--profile", metavar="NAME", help="a profile that ships, or a file")
+    parser.add_argument("--profile", metavar="NAME", help="shipped profile, or a file")
     run_argument(parser)
     output_argument(parser)
     place_arguments(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Set the link, and say what is in force then."""
+    """Change the link and print its new state."""
     began, number = monotonic(), secrets.token_hex(4)
     folder = find_here(options, link_of, "no run flies there")
     if folder is not None:
@@ -66,7 +67,7 @@ def execute(options: argparse.Namespace) -> int:
         took = monotonic() - began
     else:
         handed = _set_in_cluster(options, number)
-        edit, states = handed.edit, _whole_or_not_at_all(handed, number)
+        edit, states = handed.edit, _apply_or_take_back(handed, number)
         took = monotonic() - began
         handed.keep()
     for note in edit.notes:
@@ -79,7 +80,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[Edit, Look]:
-    """Leave a new profile where the run's relay looks for it."""
+    """Write a new profile where the run's relay looks for it."""
     from cloudrc.cli.relay import PROFILE_FILE
     from cloudrc.config.document import Document
     from cloudrc.config.edit import DIRECTIONS, edit
@@ -102,7 +103,7 @@ def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[E
 
 
 def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
-    """Hand a new profile to both link containers."""
+    """Give a new profile to both link containers."""
     from concurrent.futures import ThreadPoolExecutor
 
     from cloudrc.cluster.client import DEFAULT_RELEASE
@@ -111,12 +112,12 @@ def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
     where = Place(options.context, options.namespace, options.release or DEFAULT_RELEASE)
     with ThreadPoolExecutor(1) as pool:
         looking = pool.submit(_link_of, options, where)
-        # Meanwhile, since it takes as long: a change is to be in force within a second.
+        # Import while the cluster answers: a change should be in force within a second.
         from cloudrc.cluster.link import hand_profile
         from cloudrc.config.edit import check
 
         if looking.exception() is not None:
-            check(options.profile, options.settings)  # what is wrong here comes first
+            check(options.profile, options.settings)  # report a wrong command line first
         link = looking.result()
     return hand_profile(
         where,
@@ -127,19 +128,19 @@ def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
     )
 
 
-def _whole_or_not_at_all(handed: HandedOver, number: str) -> list[LinkState]:
-    """See that both directions have a change; what one cannot be the other does not stay."""
+def _apply_or_take_back(handed: HandedOver, number: str) -> list[LinkState]:
+    """Wait for the change in both directions; if one refuses, take it back in both."""
     from cloudrc.cluster.link import PATIENCE
 
     late = f"within {PATIENCE:g} s; see the logs of the link containers"
     try:
-        return _await(lambda: handed.told, number, 0.0, late)  # the containers have waited
+        return _await(lambda: handed.told, number, 0.0, late)  # the containers have waited already
     except CloudrcError as error:
         raise type(error)("; ".join(filter(None, [str(error), handed.take_back()]))) from None
 
 
 def _link_of(options: argparse.Namespace, where: Place) -> LinkParts:
-    """Look at the release's link; if it is not there find out why."""
+    """Read the release's link; if there is none, raise the error that says why."""
     from cloudrc.cluster.link import read_link
 
     failed: CloudrcError
@@ -149,7 +150,7 @@ def _link_of(options: argparse.Namespace, where: Place) -> LinkParts:
             f"release '{where.name}' has no link to change; is it a release of cloudrc? see: "
             "helm list --all-namespaces"
         )
-    except (ClusterError, MissingPrerequisiteError) as error:  # that kubectl is missing, too
+    except (ClusterError, MissingPrerequisiteError) as error:  # or kubectl is missing
         found, failed = None, error
     if found is not None:
         return found
@@ -158,7 +159,7 @@ def _link_of(options: argparse.Namespace, where: Place) -> LinkParts:
     try:
         release = place(options)
         for part in ("world", "cloud"):
-            find_pod(release, part)  # says best what is wrong
+            find_pod(release, part)  # raises the most precise error
     except MissingPrerequisiteError as error:
         raise nobody_here(options, error, "--run") from None
     raise failed
@@ -169,33 +170,33 @@ def _change(edit: Edit, number: str) -> str:
 
 
 def _await(look: Look, number: str, patience: float, remedy: str) -> list[LinkState]:
-    """Wait until both directions say that the change is in force.
+    """Wait until both directions report that the change is in force.
 
     Args:
-        look: Reads what they tell of themselves.
-        number: Of the change.
-        patience: For it to take force [s].
-        remedy: How long was waited in all, and where to look why.
+        look: Reads the state of both directions.
+        number: Number of the change.
+        patience: Time limit [s].
+        remedy: End of the error message: the total waiting time and where to look.
 
     Raises:
-        CloudrcError: If it is refused, or not in force in time.
+        CloudrcError: If the change is refused or late.
     """
-    until = monotonic() + patience
+    deadline = monotonic() + patience
     while True:
         states = look()
         for state in states:
             if state.refused == number:
-                raise _RefusedError(f"the {state.direction} is as it was: {state.refusal}")
+                raise _RefusedError(f"the {state.direction} is unchanged: {state.refusal}")
         if states and all(state.change == number for state in states):
             return states
-        if monotonic() > until:
+        if monotonic() > deadline:
             late = [s.direction for s in states if s.change != number] or ["link"]
-            raise TimedOutError(f"the {' and '.join(late)} did not take the change over {remedy}")
+            raise TimedOutError(f"the {' and '.join(late)} did not apply the change {remedy}")
         sleep(LOOK_PERIOD)
 
 
 class _RefusedError(CloudrcError):
-    """The link cannot be what was asked for."""
+    """The link refuses the change."""
 
     exit_code = 2
 
@@ -210,7 +211,7 @@ def _document(states: list[LinkState], number: str, took: float) -> dict[str, ob
 def _show(states: list[LinkState], took: float) -> None:
     from cloudrc.cli.output import table
 
-    heads = ("DIRECTION", "SHAPER", "DELAY", "JITTER", "LOSS", "RATE", "BESIDE")
+    heads = ("DIRECTION", "SHAPER", "DELAY", "JITTER", "LOSS", "RATE", "OTHER")
     print(table([heads, *map(_row, states)]))
     print(f"in force after {took:.1f} s")
 
@@ -227,12 +228,12 @@ def _row(state: LinkState) -> tuple[str, ...]:
         f"{jitter * 1e3:g} ms{shape}",
         f"{loss * 100:.3g} %",
         f"{rate * 1e-3:g} kbit/s" if rate else "-",
-        ", ".join(_beside(own)) or "-",
+        ", ".join(_other_settings(own)) or "-",
     )
 
 
-def _beside(own: Mapping[str, Any]) -> Iterator[str]:
-    """Name what else a direction is asked for: its time line, and what befalls single packets."""
+def _other_settings(own: Mapping[str, Any]) -> Iterator[str]:
+    """Name the other settings of a direction: its time line and its impairments of packets."""
     for key in ("changes", "blackouts"):
         if own.get(key):
             yield f"{len(own[key])} {key}"

@@ -1,4 +1,4 @@
-"""`cloudrc link show PROFILE`: a profile comes in; its picture and its numbers go out."""
+"""Run `cloudrc link show PROFILE`: draw a profile and print its statistics."""
 
 from __future__ import annotations
 
@@ -24,44 +24,58 @@ examples:
   cloudrc link show trace.csv
   cloudrc link show ./my.yaml --packets 300000 --rate 200
 
-The model of the link itself is asked, packet by packet, so a flight with the
-same seed meets these delays. All delays are one way."""
+The delays come from the same link model as in a flight, packet by packet: a
+flight with the same seed has exactly these delays. All delays are one way."""
 RATE_HZ = 100.0
+"""Default rate of packets [1/s]."""
 WAYS = ("uplink", "downlink")
 STEADY = 100_000
-"""Packets for the numbers of a link that does not change."""
+"""Default number of packets for the statistics of a link that does not change."""
 PACKETS_MAX, RATE_MAX = 10_000_000, 10_000.0
 SECONDS = 30.0
-"""Time that the picture shows at least [s]."""
+"""Shortest time that the picture shows by default [s]."""
 KINDS = ("png", "svg", "pdf")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the action's arguments."""
     parser.add_argument(
-        "profile", metavar="PROFILE", help="a shipped profile, a file, or a trace in CSV"
+        "profile", metavar="PROFILE", help="shipped profile, a file, or a trace in CSV"
     )
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="FILE", help=".png, .svg or .pdf (default: NAME.png)"
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FILE",
+        help="the picture: .png, .svg or .pdf (default: NAME.png)",
     )
     parser.add_argument(
-        "--seconds", type=float, metavar="S", help="to show (default: 30, or until all has changed)"
+        "--seconds",
+        type=float,
+        metavar="S",
+        help="time to show (default: 30, or the whole time line)",
     )
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="default: 1")
     parser.add_argument(
-        "--rate", type=float, default=RATE_HZ, metavar="HZ", help="packets a second (default: 100)"
+        "--seed", type=int, default=1, metavar="S", help="seed of the random draws (default: 1)"
+    )
+    parser.add_argument(
+        "--rate",
+        type=float,
+        default=RATE_HZ,
+        metavar="HZ",
+        help="packets per second (default: 100)",
     )
     parser.add_argument(
         "--packets",
         type=int,
         default=STEADY,
         metavar="N",
-        help=f"for the numbers of a link that does not change (default: {STEADY})",
+        help=f"packets for the statistics of a link that does not change (default: {STEADY})",
     )
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Draw the profile and print its numbers; the last line is the picture's path."""
+    """Draw the profile and print its statistics; the last line is the picture's path."""
     require("a picture of a link", ("report",))
     output = options.output or Path(f"{Path(options.profile).stem}.png")
     if output.suffix[1:] not in KINDS:
@@ -83,7 +97,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse numbers that make no sense."""
+    """Refuse numbers outside their range."""
     if options.seconds is not None and not 0.0 < options.seconds <= 86_400.0:
         raise BadInputError(f"--seconds {options.seconds:g}: give a number above 0, at most 86400")
     if options.seed < 0:
@@ -111,7 +125,7 @@ def _profile(name: str) -> Profile:
 
 
 def _way(asked: Direction, name: str, options: argparse.Namespace) -> tuple[Way, Numbers]:
-    """Send a stream one way, and for the numbers of a steady link a longer one."""
+    """Simulate one direction; a longer stream gives the statistics of a steady link."""
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import numbers
     from cloudrc.link.profile import Timeline
@@ -119,8 +133,9 @@ def _way(asked: Direction, name: str, options: argparse.Namespace) -> tuple[Way,
 
     profile = link_profile(asked)
     starts_ns = Timeline(profile).starts_ns
-    last, seed, rate = starts_ns[-1] * 1e-9, options.seed, options.rate
-    default = last if profile.trace and last else max(SECONDS, 1.1 * last)
+    last_change, seed, rate = starts_ns[-1] * 1e-9, options.seed, options.rate
+    is_trace = profile.trace and last_change
+    default = last_change if is_trace else max(SECONDS, 1.1 * last_change)
     count = round((options.seconds or default) * rate)
     shown = stream(profile, name, seed, count, rate)
     steady = len(starts_ns) == 1
@@ -132,14 +147,14 @@ def _way(asked: Direction, name: str, options: argparse.Namespace) -> tuple[Way,
 def stream(
     profile: DirectionProfile, name: str, seed: int, count: int, rate: float = RATE_HZ
 ) -> Stream:
-    """Send packets of a flight's kind and size one way.
+    """Simulate packets of a flight's kind and size in one direction.
 
     Args:
-        profile: Conditions.
-        name: Of the way.
-        seed: Of the experiment.
-        count: Packets.
-        rate: At which they are sent [1/s].
+        profile: Conditions of the link.
+        name: "uplink" or "downlink".
+        seed: Seed of the experiment.
+        count: Number of packets.
+        rate: Rate of packets [1/s].
     """
     from cloudrc.link.model import LinkDirection, sample
     from cloudrc.tunnel.codec import SIZES, Kind

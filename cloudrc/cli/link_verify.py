@@ -1,4 +1,4 @@
-"""`cloudrc link verify`: a profile comes in; probes go through its link; a verdict goes out."""
+"""Run `cloudrc link verify`: measure a link with probes and compare it with its profile."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ examples:
   cloudrc link verify satellite
   cloudrc link verify paper --set link.uplink.loss=0.05 -o json
 
-Starts the link's own processes on this machine, one per direction as in pods,
-and sends numbered probes of the tunnel's size through each. As many are sent as
-it takes: a link that is off by max(2 ms, 5 %) in its mean delay, 10 % in its
-jitter or max(2 percentage points, 25 %) in its loss is believed once in a
-thousand times, a true one is refused once in a hundred thousand.
+The command starts the link's processes on this machine, one per direction, and
+sends numbered probes of the tunnel's size through each. It sends enough probes
+to decide: it believes a wrong link in 1 of 1000 cases and refuses a correct one
+in 1 of 100,000. Wrong means off by max(2 ms, 5 %) in the mean delay, 10 % in
+the jitter, or max(2 percentage points, 25 %) in the loss.
 
-With --mode cluster a release that flies is judged by the tunnel's own
-datagrams: those of 15 to 30 s where a relay shapes, whose draws are known; of
-20 s to 4 min where netem does. What cannot be judged is said.
+With --mode cluster the command judges the link of a release in flight by the
+tunnel's own datagrams. This takes 15 to 30 s with a relay, whose random draws
+are known, and 20 s to 4 min with netem. It reports what it cannot judge.
 
-exit codes: 0 believed, 1 not, or undecided, 2 bad input,
+exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
 3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
 DEFAULT = "paper"
 SHAPERS = ("relay", "netem")
 ENDS_LIMIT = 270.0
-"""For the ends of a release to come to a verdict, if the user does not say [s]."""
+"""Default time limit for the verdict on a release [s]."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +47,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         default=DEFAULT,
         metavar="PROFILE|EXPERIMENT",
-        help=f"a shipped one's name, or a file (default: {DEFAULT})",
+        help=f"name of a shipped one, or a file (default: {DEFAULT})",
     )
     parser.add_argument(
         "--set",
@@ -61,53 +61,53 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds",
         type=float,
         metavar="S",
-        help="how long to probe (default: as long as it takes, at most 600; of a release: how long "
-        "to wait for a verdict, default 270)",
+        help="time to send probes (default: as long as needed, at most 600); with --mode cluster: "
+        "time to wait for a verdict (default: 270)",
     )
     parser.add_argument(
         "--shaper",
         choices=SHAPERS,
         default="relay",
-        help="relay (default), or netem between two network namespaces, which needs root",
+        help="relay (default), or netem between two network namespaces (needs root)",
     )
     parser.add_argument(
         "--mode",
         choices=("local", "cluster"),
         default="local",
-        help="a link started here (default), or that of a release in a cluster",
+        help="a link started on this machine (default), or the link of a release",
     )
     parser.add_argument(
         "--ends",
         metavar="WORLD,CLOUD",
-        help="hosts of a release's two pods, from inside its cluster: what 'helm test' gives",
+        help="hosts of a release's two pods, from inside its cluster; used by 'helm test'",
     )
     place_arguments(parser)
     output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Probe, judge, tell; exit 0 if the link is believed."""
+    """Measure the link, print the verdict; return 0 if the link is believed."""
     if options.seconds is not None and not 1.0 <= options.seconds <= 3600.0:
         raise BadInputError(f"--seconds {options.seconds:g}: give a number from 1 to 3600")
     from cloudrc.cli.link_verify_text import as_document, as_text
 
-    end_orderly()  # without the namespaces and processes that it has made
+    end_orderly()  # on a signal, remove namespaces and processes
     if options.ends or options.mode == "cluster":
-        said = _ends(options)
+        report = _verify_release(options)
     else:
         from cloudrc.cli.link_verify_run import verify
 
         experiment = find(options.target, options.settings)
-        said = verify(experiment, options.target, options.shaper, options.seconds, _progress)
+        report = verify(experiment, options.target, options.shaper, options.seconds, _progress)
     if options.output == "table":
-        print(as_text(said))
+        print(as_text(report))
     else:
-        print(written(as_document(said), options.output))
-    return 0 if said.verdict == "believed" else 1
+        print(written(as_document(report), options.output))
+    return 0 if report.verdict == "believed" else 1
 
 
-def _ends(options: argparse.Namespace) -> Said:
-    """Ask the ends of a release: by their hosts, or through the cluster's API."""
+def _verify_release(options: argparse.Namespace) -> Said:
+    """Query the ends of a release, at given hosts or through the cluster's API."""
     from cloudrc.cli.link_verify_ends import END_PORT, LINK_PORT, Pod, verify_ends
 
     limit = options.seconds or ENDS_LIMIT
@@ -125,18 +125,18 @@ def _ends(options: argparse.Namespace) -> Said:
     release = place(options)
     from cloudrc.cluster.pods import find_pod, forwarded
 
-    with ExitStack() as ways:
+    with ExitStack() as stack:
         pods = {}
         for end in ("world", "cloud"):
             pod = find_pod(release, end).metadata.name
-            ports = ways.enter_context(forwarded(release, pod, [END_PORT, LINK_PORT]))
+            ports = stack.enter_context(forwarded(release, pod, [END_PORT, LINK_PORT]))
             urls = [f"http://127.0.0.1:{ports[port]}" for port in (END_PORT, LINK_PORT)]
             pods[end] = Pod(*urls)
         return verify_ends(pods, release.name, limit, _progress)
 
 
 def find(target: str, settings: list[str]) -> ResolvedExperiment:
-    """Find the experiment that is meant: a profile's name or file stands for its link alone."""
+    """Find the experiment; a profile replaces the link of the default experiment."""
     from cloudrc.config import shipped
     from cloudrc.config.load import read_experiment
     from cloudrc.config.schema import Experiment, Profile
@@ -161,6 +161,6 @@ def _here() -> Path:
 
 
 def _progress(line: str) -> None:
-    """Say what is going on, on a terminal only, in place."""
+    """Show progress in one line, on a terminal only."""
     if sys.stderr.isatty():
         print(f"\r\x1b[K{harmless(line)}", end="", file=sys.stderr, flush=True)

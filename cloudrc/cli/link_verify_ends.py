@@ -1,8 +1,8 @@
-"""The link of a release in flight: both ends are asked what they hear; a verdict goes out.
+"""Verify the link of a release in flight, from what its pods report over HTTP.
 
-The tunnel's own datagrams are the probes, so that nothing but the shaped flow is measured. Each end
-judges the direction that it hears and serves the rows at /link.json of its metrics port; there the
-link containers say who shapes, by what, and which qdiscs are near, in metrics what has passed.
+The tunnel's own datagrams are the probes, so only the shaped flow is measured. Each end judges the
+direction that it receives and serves the result at /link.json of its metrics port. There the link
+containers report the shaper, its settings and the qdiscs of the pod; their metrics count datagrams.
 """
 
 from __future__ import annotations
@@ -42,76 +42,76 @@ from cloudrc.tunnel.codec import SIZES, Kind
 
 END_PORT, LINK_PORT = METRICS["world"]["world"], METRICS["world"]["link"]
 LOOK_PERIOD = 2.0
-"""Between two questions [s]."""
+"""Pause between two polls of the ends [s]."""
 OTHER_LIMIT = 30.0
-"""Once one direction is off, what the other is may tell why, and is waited for so long [s]."""
-_PATIENCE = 3.0
-_SENT_MIN = 1500
+"""Longest wait for the second verdict once the first is "off" [s]; both help to find the cause."""
+_HTTP_TIMEOUT = 3.0
+_SENT_MIN = 1500  # counts of fewer datagrams are too inexact to compare
 _SHARES = ("loss", "reordered", "duplicated")
-_FLIES = {"uplink": Kind.TELEMETRY, "downlink": Kind.COMMAND}
+_KINDS = {"uplink": Kind.TELEMETRY, "downlink": Kind.COMMAND}
 
 Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Pod:
-    """Where an end and its link container answer: URLs without a path."""
+    """URLs of an end and of its link container, without a path."""
 
     end: str
     link: str
 
 
 def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -> Said:
-    """Wait until both ends have a verdict.
+    """Wait for the verdicts of both ends and combine them.
 
     Args:
         pods: "world" and "cloud".
-        title: Names the release.
-        limit: How long to wait [s].
-        tell: Hears what is going on.
+        title: Name of the release.
+        limit: Time to wait [s].
+        tell: Receives progress as text.
 
     Raises:
-        TimedOutError: If an end cannot be asked within the time.
+        TimedOutError: If an end does not answer in time.
     """
-    hears = {"uplink": "cloud", "downlink": "world"}
-    sends = {"uplink": "world", "downlink": "cloud"}
-    until, off_until, seen = time.monotonic() + limit, inf, dict[str, dict[str, Any]]()
-    before = {way: _counters(pods[end], way) for way, end in sends.items()}
+    receiver = {"uplink": "cloud", "downlink": "world"}
+    sender = {"uplink": "world", "downlink": "cloud"}
+    deadline, off_deadline, seen = time.monotonic() + limit, inf, dict[str, dict[str, Any]]()
+    before = {way: _counters(pods[end], way) for way, end in sender.items()}
     while True:
-        tell(", ".join(_progress(way, seen.get(way, {})) for way in hears))
+        tell(", ".join(_progress(way, seen.get(way, {})) for way in receiver))
         time.sleep(LOOK_PERIOD)
-        seen |= {way: found for way, end in hears.items() if (found := _ask(pods[end]))}
+        seen |= {way: found for way, end in receiver.items() if (found := _ask(pods[end]))}
         verdicts = {way: found["verdict"] for way, found in seen.items()}
-        if len(seen) == len(hears) and "open" not in verdicts.values():
+        if len(seen) == len(receiver) and "open" not in verdicts.values():
             break
-        off = len(seen) == len(hears) and "off" in verdicts.values()
-        off_until = min(off_until, time.monotonic() + OTHER_LIMIT) if off else inf
-        if time.monotonic() > min(until, off_until):
+        off = len(seen) == len(receiver) and "off" in verdicts.values()
+        off_deadline = min(off_deadline, time.monotonic() + OTHER_LIMIT) if off else inf
+        if time.monotonic() > min(deadline, off_deadline):
             break
     tell("")
-    silent = [end for way, end in hears.items() if way not in seen]
+    silent = [end for way, end in receiver.items() if way not in seen]
     if silent:
         raise TimedOutError(
-            f"{' and '.join(silent)} could not be asked within {limit:g} s: are the pods ready?"
+            f"{' and '.join(silent)} did not answer within {limit:g} s: are the pods ready?"
         )
     findings = {
-        way: _findings(seen[way], way, before[way], _counters(pods[end], way), _told(pods[end]))
-        for way, end in sends.items()
+        way: _findings(seen[way], way, before[way], _counters(pods[end], way), _status(pods[end]))
+        for way, end in sender.items()
     }
-    names = sorted({one.evidence.shaper or "nobody knows" for one in findings.values()})
+    names = sorted({one.evidence.shaper or "an unknown shaper" for one in findings.values()})
     return Said(
         title=title,
         shaper=f"shaped by {' and '.join(names)}",
         findings=findings,
-        probes={way: _describe(seen[way]) for way in hears},
-        notes=[note for way in hears for note in _notes(way, seen[way], findings[way])],
+        probes={way: _describe(seen[way]) for way in receiver},
+        notes=[note for way in receiver for note in _notes(way, seen[way], findings[way])],
         causes=find_causes(findings),
-        more="too few datagrams yet: the ends go on judging, ask again (above: when)",
+        more="too few datagrams so far: the ends continue to measure; ask again (time: above)",
     )
 
 
 def _ask(pod: Pod) -> dict[str, Any] | None:
-    """What an end thinks of the direction that it hears; None if it does not answer."""
+    """Fetch an end's verdict on the direction that it receives; None without an answer."""
     try:
         found: dict[str, Any] = json.loads(_get(f"{pod.end}/link.json"))
     except (OSError, ValueError):
@@ -120,29 +120,29 @@ def _ask(pod: Pod) -> dict[str, Any] | None:
 
 
 def _get(url: str) -> str:
-    with DIRECTLY.open(url, timeout=_PATIENCE) as page:
+    with DIRECTLY.open(url, timeout=_HTTP_TIMEOUT) as page:
         return str(page.read().decode())
 
 
 class _Counters(NamedTuple):
-    """What has been counted of a direction: sent by its end; and all that its link tells."""
+    """Counters of a direction: datagrams sent by its end, and the metrics of its link."""
 
     sent: int | None
     link: Samples
 
 
 def _counters(sender: Pod, way: str) -> _Counters:
-    """Ask the end that sends and the link that shapes it; what does not answer tells nothing."""
+    """Fetch the counters of a direction from the sending pod; empty without an answer."""
     try:
-        ours, link = samples(_get(f"{sender.end}/metrics")), samples(_get(f"{sender.link}/metrics"))
+        end, link = samples(_get(f"{sender.end}/metrics")), samples(_get(f"{sender.link}/metrics"))
     except OSError:
         return _Counters(None, {})
-    sent = ours.get(("cloudrc_datagrams_total", f'direction="{way}",outcome="sent"'))
+    sent = end.get(("cloudrc_datagrams_total", f'direction="{way}",outcome="sent"'))
     return _Counters(None if sent is None else int(sent), link)
 
 
-def _told(sender: Pod) -> Told | None:
-    """Ask the link of a pod what it says of itself; None if it does not."""
+def _status(sender: Pod) -> Told | None:
+    """Fetch the status of a pod's link container; None without an answer."""
     try:
         return read_told(_get(f"{sender.link}/link.json"))
     except (OSError, ValueError):
@@ -150,26 +150,26 @@ def _told(sender: Pod) -> Told | None:
 
 
 def _findings(
-    found: Mapping[str, Any], way: str, before: _Counters, after: _Counters, told: Told | None
+    found: Mapping[str, Any], way: str, before: _Counters, after: _Counters, status: Told | None
 ) -> Findings:
-    """Join what one end heard with what the other's link container tells."""
-    known = of_told(told) if told else Evidence(shaper=shaper_of(after.link, way))
+    """Combine the receiver's verdict with the evidence of the sender's link container."""
+    known = of_told(status) if status else Evidence(shaper=shaper_of(after.link, way))
     known = of_metrics(after.link, 0, known, before.link)
     earlier = of_metrics(before.link, 0, known).passed
     sent = after.sent - before.sent if after.sent and before.sent else 0
     passed = known.passed - earlier if known.passed and earlier else None
-    # Counts are told once a second each, so that few say nothing.
+    # Both counters are updated once a second: a small difference means nothing.
     enough = sent >= _SENT_MIN and passed is not None
     known = replace(
         known,
         sent=sent if enough else None,
         passed=passed if enough else None,
-        unread=None,  # since it began: long ago
+        unread=None,  # counted since its start, long before this test
     )
-    applied = shown(known.applied, SIZES[_FLIES[way]], known.shaper) if known.applied else {}
+    applied = shown(known.applied, SIZES[_KINDS[way]], known.shaper) if known.applied else {}
     rows = _rows(found, applied)
-    told_of = {row["quantity"] for row in found["rows"]}  # a time line may have had other rates
-    if (asked := _rate_asked(found)) and known.applied and "time_line" not in told_of:
+    quantities = {row["quantity"] for row in found["rows"]}  # a time line may change the rate
+    if (asked := _rate_asked(found)) and known.applied and "time_line" not in quantities:
         rows += rate_in_force(asked, known.applied.rate or inf)
     return Findings(rows, known)
 
@@ -182,13 +182,13 @@ def _rows(found: Mapping[str, Any], applied: Mapping[str, float]) -> list[Row]:
         name = str(row["quantity"])
         values = [float(row.get(key, nan)) for key in ("asked", "measured", "low", "high")]
         asked, measured, low, high = values
-        unit, says = "1" if name in _SHARES else "s", applied.get(name, nan)
-        rows.append(Row(name, unit, asked, says, measured, low, high, row["verdict"]))
+        unit, in_force = "1" if name in _SHARES else "s", applied.get(name, nan)
+        rows.append(Row(name, unit, asked, in_force, measured, low, high, row["verdict"]))
     return rows
 
 
 def _rate_asked(found: Mapping[str, Any]) -> float | None:
-    """Look up what an end asks of the bottleneck [bit/s]; None without one."""
+    """Return the requested rate of the bottleneck [bit/s]; None without one."""
     rates = (float(row["asked"]) for row in found["rows"] if row["quantity"] == "rate")
     return next(rates, None)
 
@@ -202,18 +202,22 @@ def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> list[str]:
     if not found["rows"]:
         what = "commands" if way == "downlink" else "telemetry"
         hint = "fly a mission first" if way == "downlink" else "is the other end ready?"
-        return [f"{way}: no {what} to judge it by, or its profile changes by itself; {hint}"]
+        return [f"{way}: no {what} to measure, or its profile is a time line; {hint}"]
     rows = {str(row["quantity"]): row for row in found["rows"]}
     notes = []
-    if rows.get("round_trip", _TOLD)["verdict"] != "told":
-        notes.append(f"{way}: the ends do not share a clock: round trips are judged, not one way")
+    if rows.get("round_trip", _NO_ROW)["verdict"] != "told":
+        notes.append(
+            f"{way}: the ends do not share a clock: judged by round trips, not one-way delays"
+        )
     elif "mean" not in rows and "loss" in rows:
         notes.append(f"{way}: delays {NOT_JUDGED}: the ends do not share a clock")
     asked, judged = _rate_asked(found), any(row.name == "rate" for row in finding.rows)
     if asked and not judged:
         applied = finding.evidence.applied
-        says = f" (applied: {kbit(applied.rate or inf)})" if applied else ""
-        notes.append(f"{way}: rate of {kbit(asked)}{says} {NOT_JUDGED}: its datagrams come alone")
+        in_force = f" (applied: {kbit(applied.rate or inf)})" if applied else ""
+        notes.append(
+            f"{way}: rate of {kbit(asked)}{in_force} {NOT_JUDGED}: needs datagrams in trains"
+        )
     if "deviation" in rows and not {"variation", "middle"} & rows.keys():
         notes += on_deviation(way, float(rows["deviation"]["asked"]))
     if "jitter_share" in rows:
@@ -224,30 +228,30 @@ def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> list[str]:
         if name.endswith(TAKES):
             needs = float(rows[name].get("asked", inf))
             notes += on_patience(way, name.removesuffix(TAKES), needs)
-    if "time_line" in rows and (share := float(rows["time_line"]["measured"])) < _WATCHED:
+    if "time_line" in rows and (share := float(rows["time_line"]["measured"])) < _MEASURED_MIN:
         notes.append(
-            f"{way}: of its time line {share:.0%} was watched and as asked, the rest {NOT_JUDGED}; "
+            f"{way}: {share:.0%} of its time line was measured and correct, the rest {NOT_JUDGED}; "
             "'cloudrc link set --profile' starts it anew"
         )
     return notes + _needed(way, found)
 
 
-_TOLD: Mapping[str, str] = {"verdict": "told"}
-_WATCHED = 0.85
-"""A time line of which so much was seen is as good as seen: a session takes 2 s to settle."""
+_NO_ROW: Mapping[str, str] = {"verdict": "told"}
+_MEASURED_MIN = 0.85
+"""Share of a time line that counts as all of it [1]: a session needs 2 s to settle."""
 
 
 def _progress(way: str, found: Mapping[str, Any]) -> str:
-    """Say in a few words how far an end is."""
+    """Describe the progress of an end in a few words."""
     needed = _needed(way, found)
     return needed[0] if needed else f"{way}: {found.get('verdict', 'silent')}"
 
 
 def _needed(way: str, found: Mapping[str, Any]) -> list[str]:
-    """Say how long it takes, if there is no verdict yet."""
+    """Describe how much longer it takes, if there is no verdict yet."""
     rows = {row["quantity"]: row for row in found.get("rows", ())}
     if found.get("verdict") != "open" or "datagrams" not in rows:
         return []
-    needs, there = int(rows["datagrams"]["asked"]), int(rows["datagrams"]["measured"])
-    seconds = max(0, needs - there) * PERIOD
-    return [f"{way}: {there} of {needs} datagrams, {seconds:.0f} s more"]
+    needs, count = int(rows["datagrams"]["asked"]), int(rows["datagrams"]["measured"])
+    seconds = max(0, needs - count) * PERIOD
+    return [f"{way}: {count} of {needs} datagrams, {seconds:.0f} s more"]

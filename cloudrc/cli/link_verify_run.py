@@ -1,19 +1,15 @@
-"""What `cloudrc link verify` does: plan, start the link, probe it both ways, read back, judge.
+"""Verify a link on this machine: plan, start the link, probe both directions, judge.
 
-How late the link's relays were while probes flew: asked all along, the worst is kept.
+A probe repeats its header to its full length. If the link flips a bit, most copies of the header
+are still intact: they identify the probe and show the damage.
 
-A relay tells of its last ten seconds only, and one that starves early may be well again at the end.
+A relay reports its lateness of the last ten seconds only, so it is polled during the whole test.
 
-What a probe of the link looks like: its header over and over, so that damage to it is seen.
-
-A link may be asked to flip bits. Whichever bit it is, most copies of the header are whole: they say
-which probe it was, and that it is not as it was sent.
-
-Two network namespaces joined by a cable, in which netem is verified as between two pods.
+netem is verified between two network namespaces, joined by a veth pair, as between two pods:
 
     [world's namespace] tunnel ======= tunnel [cloud's namespace]
 
-They live as long as the test. Needs root; nothing outside them is touched.
+This needs root, changes nothing outside the namespaces, and deletes them at the end.
 """
 
 from __future__ import annotations
@@ -37,7 +33,7 @@ from cloudrc.assembly import link_profile
 from cloudrc.cli.link_processes import LOOPBACK, WAYS, Place, Shaping, refuse_impossible, shaping
 from cloudrc.cli.link_run import look
 from cloudrc.cli.link_verify_text import Said, describe, notes, on_correlation, shaper_in_words
-from cloudrc.config import document
+from cloudrc.config.document import write
 from cloudrc.config.load import dump
 from cloudrc.config.schema import Profile
 from cloudrc.drivers.realtime import free_ports
@@ -64,91 +60,91 @@ if TYPE_CHECKING:
 
 
 PERIOD = 4.0
-"""Between two questions [s]; each answer is of the ten seconds before."""
+"""Pause between two polls of the lateness [s]; an answer covers the last ten seconds."""
 _UNKNOWN = Evidence()
 
 
 class Told(Protocol):
-    """Who tells how late it is: see `Shaping`."""
+    """A source of metrics, such as `Shaping`."""
 
     def metrics(self) -> str:
-        """What it counts, in Prometheus' text; "" if it does not answer."""
+        """Return the metrics as Prometheus text; "" without an answer."""
         ...
 
 
 class LateWatch:
-    """Asks both directions' relays on a thread of its own while it is entered."""
+    """Poll the lateness of both relays on its own thread, as a context manager."""
 
     def __init__(self, running: Mapping[str, Told], period: float = PERIOD) -> None:
-        """Set up for the shapers of both directions; one question per `period` [s]."""
+        """Store the shapers of both directions; poll them once per `period` [s]."""
         self._running, self._period = running, period
         self._late: dict[str, float] = {}
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._ask_on, name="late", daemon=True)
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._poll, name="late", daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()
         return self
 
     def __exit__(self, *failure: object) -> None:
-        self._over.set()
+        self._stopped.set()
         self._thread.join(self._period)
 
     def look(self) -> None:
-        """Ask once."""
+        """Poll both shapers once."""
         for way, one in self._running.items():
             late = of_metrics(samples(one.metrics()), 0, _UNKNOWN).late
             if late is not None:
                 self._late[way] = max(late, self._late.get(way, 0.0))
 
-    def worst(self, way: str, told: Evidence) -> Evidence:
-        """Put the worst of a direction in place of what it tells at the end."""
-        known = [late for late in (told.late, self._late.get(way)) if late is not None]
-        return replace(told, late=max(known, default=None))
+    def worst(self, way: str, evidence: Evidence) -> Evidence:
+        """Replace the last lateness in the evidence by the worst one of the direction."""
+        known = [late for late in (evidence.late, self._late.get(way)) if late is not None]
+        return replace(evidence, late=max(known, default=None))
 
-    def _ask_on(self) -> None:
-        while not self._over.wait(self._period):
+    def _poll(self) -> None:
+        while not self._stopped.wait(self._period):
             self.look()
 
 
 PROBE, TRAIN = 254, 255
-"""Kinds that no end of a tunnel knows: these datagrams never leave this process's own link."""
+"""Kinds of datagrams that only this module uses; no tunnel end accepts them."""
 EPOCH = 1
 
 
 class Probes:
-    """Writes and reads the probes of both directions.
+    """Write and read the probes of both directions.
 
     Attributes:
-        damaged: Numbers of those that arrived, but not as they were sent, by direction.
+        damaged: Numbers of the probes that arrived damaged, by direction.
     """
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
-        """Set up for probes of these sizes, UDP payload [bytes], by direction."""
+        """Store the sizes of the probes by direction, UDP payload [bytes]."""
         self._sizes = {way: {PROBE: size, TRAIN: SIZE} for way, size in sizes.items()}
         self.damaged: dict[str, set[int]] = {way: set() for way in sizes}
 
     def write(self, way: str, kind: int, number: int) -> bytes:
-        """Make a probe."""
+        """Encode a probe."""
         header = codec.encode_header(kind, Direction[way.upper()], EPOCH, number)
         return _filled(header, self._sizes[way][kind])
 
     def read(self, data: bytes) -> tuple[int, int, int]:
-        """Read kind, epoch and number, whichever bit was flipped; note whether any was.
+        """Decode kind, epoch and number even if bits were flipped; record the damage.
 
         Raises:
-            ValueError: If it is none of ours.
+            ValueError: If it is no probe.
         """
         header = data[:HEADER_SIZE]
-        whole = data == _filled(header, len(data))
-        if not whole:
-            places = range(0, len(data) - HEADER_SIZE + 1, HEADER_SIZE)
-            copies = Counter(data[place : place + HEADER_SIZE] for place in places)
+        intact = data == _filled(header, len(data))
+        if not intact:
+            offsets = range(0, len(data) - HEADER_SIZE + 1, HEADER_SIZE)
+            copies = Counter(data[offset : offset + HEADER_SIZE] for offset in offsets)
             if not copies:
                 raise ValueError("too short")
             header = copies.most_common(1)[0][0]
         found = codec.peek(header)
-        if not whole and found[0] == PROBE:
+        if not intact and found[0] == PROBE:
             self.damaged[Direction(header[1]).name.lower()].add(found[2])
         return found
 
@@ -158,9 +154,9 @@ def _filled(header: bytes, size: int) -> bytes:
 
 
 BEGIN = 1.0
-"""After the link came up the first probe leaves [s]."""
+"""Time from the start of the link to the first probe [s]."""
 TELL_PERIOD = 1.3
-"""The link's processes tell their counts once a second [s]."""
+"""Wait before reading the counts [s]; the link's processes update them once a second."""
 _PAUSE = 0.3
 _QUIET_MIN, _QUIET_MAX = 0.5, 5.0
 
@@ -169,7 +165,12 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What is asked of one direction, and how it is found out."""
+    """Plan for verifying one direction.
+
+    Attributes:
+        plan: Schedule of the probes and the expected measurements.
+        trains: Trains of datagrams that measure the rate; None without them.
+    """
 
     plan: Plan
     trains: Trains | None
@@ -177,7 +178,12 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Bank:
-    """One end of the link: its socket, and where its direction's shaper runs."""
+    """One end of the link.
+
+    Attributes:
+        own: Socket that sends and receives probes.
+        place: Addresses of the shaper of its direction.
+    """
 
     own: socket.socket
     place: Place
@@ -193,29 +199,29 @@ def verify(
     meddle: Callable[[Mapping[str, Shaping]], None] | None = None,
     routes: Mapping[str, tuple[str, int]] | None = None,
 ) -> Said:
-    """Find out whether the link of an experiment is what it is asked to be.
+    """Measure whether the link of an experiment matches its profile.
 
     Args:
-        experiment: Says what is asked.
-        title: Names it.
+        experiment: The experiment.
+        title: Its name, for the report.
         shaper: "relay" or "netem".
-        seconds: How long to probe [s]; None for as long as it takes.
-        tell: Hears what is going on.
-        applied: Profile in force in place of what is asked; here begin faults for tests.
-        meddle: Is shown the link's processes before the first probe.
-        routes: Where to send instead of where the link says, by direction.
+        seconds: Time to send probes [s]; None for as long as needed.
+        tell: Receives progress as text.
+        applied: Profile to apply instead of the requested one; tests inject faults with it.
+        meddle: Gets the link's processes before the first probe; tests inject faults with it.
+        routes: Addresses to send to instead of the link's own, by direction; for tests.
 
     Raises:
-        BadInputError: If the shaper cannot be what is asked.
+        BadInputError: If the shaper cannot realise the profile.
     """
     refuse_impossible(experiment, shaper)
-    tell("plans the probes")
+    tell("planning the probes")
     asked = plan(experiment, seconds, shaper)
     profile = applied or Profile(uplink=experiment.uplink, downlink=experiment.downlink)
-    text = document.write(profile.model_dump(mode="json", exclude_defaults=True))
+    text = write(profile.model_dump(mode="json", exclude_defaults=True))
     with banks(shaper) as ends:
         places = {way: bank.place for way, bank in ends.items()}
-        tell("starts the link")
+        tell("starting the link")
         with shaping(places, dump(experiment), text, shaper) as running:
             if meddle:
                 meddle(running)
@@ -232,24 +238,24 @@ def verify(
 
 
 def _notes(experiment: ResolvedExperiment, asked: Mapping[str, Asked], shaper: str) -> list[str]:
-    """Say what is not judged, or more loosely."""
-    said = [note for way, one in asked.items() for note in notes(way, one.plan, one.trains)]
+    """Collect the notes on what is judged loosely or not at all."""
+    found = [note for way, one in asked.items() for note in notes(way, one.plan, one.trains)]
     if shaper == "netem":
         for way in asked:
             profile = link_profile(getattr(experiment, way))
-            said += on_correlation(way, profile.correlation if has_jitter(profile) else 0.0)
-    return said
+            found += on_correlation(way, profile.correlation if has_jitter(profile) else 0.0)
+    return found
 
 
 def plan(
     experiment: ResolvedExperiment, seconds: float | None, shaper: str = "relay"
 ) -> dict[str, Asked]:
-    """Choose the probes of both directions, each as large as what flies there.
+    """Plan the probes of both directions, as large as the tunnel's own datagrams.
 
     Args:
-        experiment: Says what is asked.
-        seconds: How long to probe [s]; None for as long as it takes.
-        shaper: "relay"; or "netem", which is judged by what it makes of a profile.
+        experiment: The experiment.
+        seconds: Time to send probes [s]; None for as long as needed.
+        shaper: "relay", or "netem", which is judged by its approximation of the profile.
     """
     kinds = {"uplink": Kind.TELEMETRY, "downlink": Kind.COMMAND}
     plans: dict[str, Plan] = {}
@@ -272,7 +278,7 @@ def _has_rate(one: Plan) -> bool:
 
 @contextlib.contextmanager
 def banks(shaper: str) -> Iterator[dict[str, Bank]]:
-    """Open both ends of a link: on the loopback for the relay, in two namespaces for netem."""
+    """Open both ends of a link: on loopback for the relay, in two namespaces for netem."""
     if shaper == "netem":
         with banks_of_namespaces() as ends:
             yield ends
@@ -282,11 +288,11 @@ def banks(shaper: str) -> Iterator[dict[str, Bank]]:
         for one in owns:
             one.bind((LOOPBACK, 0))
         listens = [(LOOPBACK, port) for port in free_ports(2)]
-        tells = [(LOOPBACK, port) for port in free_ports(2, socket.SOCK_STREAM)]
+        metrics = [(LOOPBACK, port) for port in free_ports(2, socket.SOCK_STREAM)]
         peers = [one.getsockname() for one in reversed(owns)]
         yield {
-            way: Bank(own, Place(peer, listen, told))
-            for way, own, peer, listen, told in zip(WAYS, owns, peers, listens, tells, strict=True)
+            way: Bank(own, Place(peer, listen, at))
+            for way, own, peer, listen, at in zip(WAYS, owns, peers, listens, metrics, strict=True)
         }
     finally:
         for one in owns:
@@ -303,11 +309,11 @@ def probe(
     """Send all probes and judge them.
 
     Args:
-        asked: By direction.
-        ends: Likewise: who sends.
-        running: Likewise: who shapes.
-        tell: Hears how far it is.
-        routes: Where to send instead of where the link says.
+        asked: Plans by direction.
+        ends: Sending ends by direction.
+        running: Shapers by direction.
+        tell: Receives progress as text.
+        routes: Addresses to send to instead of the link's own, by direction.
     """
     probes = Probes({way: one.plan.schedule.size for way, one in asked.items()})
     shores = [
@@ -322,18 +328,18 @@ def probe(
     begin_ns = max(time.monotonic_ns() + 50_000_000, origin_ns + round(BEGIN * 1e9))
     volleys = [_volley(asked[way].plan) for way in WAYS]
     longest = max(asked[way].plan.duration for way in WAYS)
-    said, quiet = _told(tell, f"sends probes for {longest:.0f} s"), _quiet(asked)
+    progress, quiet = _progress(tell, f"sending probes for {longest:.0f} s"), _quiet(asked)
     relays = {way: one for way, one in running.items() if not one.place.inside}
     with LateWatch(relays) as late:
-        logs = sound(shores, volleys, probes.read, begin_ns=begin_ns, quiet=quiet, tell=said)
+        logs = sound(shores, volleys, probes.read, begin_ns=begin_ns, quiet=quiet, tell=progress)
         time.sleep(TELL_PERIOD)
     evidence = {
         way: late.worst(way, _read_back(running[way], len(log.sent_ns)))
         for way, log in zip(WAYS, logs, strict=True)
     }
-    drawn_out = _send_trains(asked, shores, probes, tell)
+    durations = _send_trains(asked, shores, probes, tell)
     findings = {}
-    for way, log, drawn in zip(WAYS, logs, drawn_out, strict=True):
+    for way, log, drawn in zip(WAYS, logs, durations, strict=True):
         sent = np.array([stamp_ns - origin_ns for stamp_ns in log.sent_ns]) * 1e-9
         one = asked[way].plan
         expects = as_sent(one.expects, one.profile, sent, one.schedule.size)
@@ -348,7 +354,7 @@ def probe(
 def _send_trains(
     asked: Mapping[str, Asked], shores: list[Shore], probes: Probes, tell: Tell
 ) -> list[list[float]]:
-    """Measure the rates, where there are any; say how far trains were drawn out [s]."""
+    """Send trains where a rate is to be measured; return their received durations [s]."""
     trains = [asked[way].trains for way in WAYS]
     if not any(one and one.count for one in trains):
         return [[], []]
@@ -357,9 +363,9 @@ def _send_trains(
         for one in trains
     ]
     begin_ns = time.monotonic_ns() + round(_PAUSE * 1e9)
-    said = _told(tell, "sends trains")
+    progress = _progress(tell, "sending trains")
     quiet = _quiet(asked)
-    logs = sound(shores, volleys, probes.read, begin_ns=begin_ns, quiet=quiet, tell=said)
+    logs = sound(shores, volleys, probes.read, begin_ns=begin_ns, quiet=quiet, tell=progress)
     return [
         spans(one.count, one.length, log.arrivals) if one else []
         for one, log in zip(trains, logs, strict=True)
@@ -367,13 +373,13 @@ def _send_trains(
 
 
 def _read_back(one: Shaping, sent: int) -> Evidence:
-    """Ask a shaper what it does."""
+    """Read back what a shaper does and has counted."""
     state = one.state()
     in_force = Profile.model_validate_json(_json(state.profile))
     applied = link_profile(getattr(in_force, state.direction))
     known = Evidence(shaper=state.shaper, why=state.reason, layers=1, applied=applied)
-    told = of_metrics(samples(one.metrics()), sent, known)
-    found = with_near(told, look(one.place.peer[0], one.place.inside))
+    counted = of_metrics(samples(one.metrics()), sent, known)
+    found = with_near(counted, look(one.place.peer[0], one.place.inside))
     if state.shaper != "netem":
         return found
     return replace(found, applied=found.applied and netem_makes(found.applied))
@@ -387,7 +393,7 @@ def _json(values: object) -> str:
 
 def _route(one: Shaping) -> tuple[str, int]:
     route = one.route()
-    assert route is not None, "waited for"
+    assert route is not None, "shaping() waits for it"
     return route
 
 
@@ -397,33 +403,33 @@ def _volley(one: Plan) -> Volley:
 
 
 def _quiet(asked: Mapping[str, Asked]) -> float:
-    """Say for how long nothing may come before the last probe is given up [s]."""
+    """Return the silence after which missing probes count as lost [s]."""
     expects = [one.plan.expects for one in asked.values()]
     longest = max(one.mean.expected + 15.0 * one.deviation.expected for one in expects)
     return min(_QUIET_MAX, _QUIET_MIN + longest)
 
 
-def _told(tell: Tell, what: str = "sends probes") -> Callable[[float], None]:
+def _progress(tell: Tell, what: str) -> Callable[[float], None]:
     return lambda share: tell(f"{what}: {share:.0%}")
 
 
 DEVICE = "tunnel"
 PORT, METRICS_PORT = 7400, 9102
 HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}
-"""Addresses of the ends, by the direction that they send."""
+"""Addresses of the ends, by the direction in which they send."""
 _CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
 
 
 @contextlib.contextmanager
 def banks_of_namespaces() -> Iterator[dict[str, Bank]]:
-    """Make the namespaces, and open a socket in each.
+    """Create two namespaces and open a socket in each.
 
     Raises:
-        MissingPrerequisiteError: If this user may not, or ip is missing.
+        MissingPrerequisiteError: If this user is not root, or ip is missing.
     """
     if os.geteuid() != 0:
         raise MissingPrerequisiteError(
-            "netem is verified between two network namespaces, which takes root; run this as root,"
+            "netem is verified between two network namespaces, which needs root; run this as root,"
             " or verify the relay (--shaper relay)"
         )
     names = {way: f"cloudrc-{way}-{os.getpid()}" for way in WAYS}
@@ -454,7 +460,7 @@ def _place(way: str, name: str) -> Place:
 
 
 def _join(names: dict[str, str]) -> None:
-    """Make both namespaces and the cable."""
+    """Create both namespaces and join them with a veth pair."""
     near, far = (names[way] for way in WAYS)
     for name in (near, far):
         _ip("netns", "add", name)
@@ -485,10 +491,10 @@ def _run(*words: str) -> str:
 
 @contextlib.contextmanager
 def _inside(name: str) -> Iterator[None]:
-    """Be in a namespace with this thread; sockets that are opened there stay there."""
-    library = ctypes.CDLL(None, use_errno=True)  # os.setns is Python 3.12's
-    with open("/proc/thread-self/ns/net") as home, open(f"/run/netns/{name}") as there:
-        if library.setns(there.fileno(), _CLONE_NEWNET):
+    """Move this thread into a namespace; sockets opened there stay there."""
+    library = ctypes.CDLL(None, use_errno=True)  # os.setns exists from Python 3.12 only
+    with open("/proc/thread-self/ns/net") as home, open(f"/run/netns/{name}") as target:
+        if library.setns(target.fileno(), _CLONE_NEWNET):
             raise MissingPrerequisiteError(
                 f"cannot enter the namespace {name}: {os.strerror(ctypes.get_errno())}; use "
                 "--shaper relay"

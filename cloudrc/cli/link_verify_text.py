@@ -1,7 +1,4 @@
-"""The verdict on a link for people and for programs: a table on a terminal, or JSON.
-
-What is said beside the table of a verdict: how it was probed, and what was not judged.
-"""
+"""Report the verdict on a link: a table with notes for people, a document for programs."""
 
 from __future__ import annotations
 
@@ -34,21 +31,21 @@ HEADINGS = ("", "asked", "applied", "measured", "allowed", "verdict")
 _SCALES = {"s": (1e3, "ms"), "1": (1e2, "%"), "bit/s": (1e-3, "kbit/s")}
 DIGITS = 2
 NOT_JUDGED = "NOT JUDGED"
-"""In a note: something that was asked for is not known to be so."""
+"""Mark in a note: the profile asks for something that was not verified."""
 
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What was found out about a link.
+    """Result of verifying a link.
 
     Attributes:
-        title: What was asked for.
-        shaper: Who shapes it, in words.
-        findings: By direction.
-        probes: What was sent, in words, by direction.
-        notes: What else there is to know.
-        causes: Why it is not believed.
-        more: What helps if it is undecided.
+        title: Name of the profile, experiment or release.
+        shaper: Description of the shaper.
+        findings: Measurements and verdicts, by direction.
+        probes: Description of the probes, by direction.
+        notes: What was judged loosely or not at all.
+        causes: Why the link is not believed.
+        more: Advice if the verdict is undecided.
     """
 
     title: str
@@ -57,11 +54,11 @@ class Said:
     probes: Mapping[str, str]
     notes: Sequence[str]
     causes: Sequence[Cause]
-    more: str = "too few probes to say; give --seconds more"
+    more: str = "too few probes; give more --seconds"
 
     @property
     def verdict(self) -> str:
-        """Believed, not believed, or undecided."""
+        """Overall verdict: "believed", "not believed" or "undecided"."""
         ways = [[row.verdict for row in deciding(one.rows)] for one in self.findings.values()]
         if any("off" in verdicts for verdicts in ways):
             return "not believed"
@@ -69,7 +66,7 @@ class Said:
 
 
 def deciding(rows: Sequence[Row]) -> list[Row]:
-    """Rows that a verdict rests on: a rate too high to be measured does not hold it up."""
+    """Select the rows that count for the verdict; a rate too high to measure does not."""
     return [
         row
         for row in rows
@@ -78,7 +75,7 @@ def deciding(rows: Sequence[Row]) -> list[Row]:
 
 
 def as_text(said: Said) -> str:
-    """Lay out a table per direction, the causes, and the verdict in the last line."""
+    """Format a table per direction, the causes, and the verdict in the last line."""
     rows: list[tuple[str, ...]] = []
     for way, found in said.findings.items():
         rows.append((way, *HEADINGS[1:]))
@@ -106,10 +103,10 @@ def _last_line(said: Said) -> str:
     verdict = said.verdict
     colours = {"believed": "green", "not believed": "red", "undecided": "yellow"}
     partly = any(NOT_JUDGED in note for note in said.notes)
-    but = f", but for what is {NOT_JUDGED} (above)" if partly else ""
+    exception = f", except what is {NOT_JUDGED} (above)" if partly else ""
     words = {
-        "believed": f"BELIEVED: the link is what was asked for{but}",
-        "not believed": "NOT BELIEVED: the link is not what was asked for",
+        "believed": f"BELIEVED: the link matches its profile{exception}",
+        "not believed": "NOT BELIEVED: the link does not match its profile",
         "undecided": f"UNDECIDED: {said.more}",
     }
     return paint(words[verdict], colours[verdict])
@@ -147,7 +144,7 @@ def _range(low: float, high: float) -> str:
 
 
 def as_document(said: Said) -> dict[str, Any]:
-    """Write it for programs; numbers in SI, shares in [0, 1]; what is unknown is left out."""
+    """Convert to plain values: SI units, shares in [0, 1]; unknown values are left out."""
     return {
         "schemaVersion": 1,
         "verdict": said.verdict,
@@ -192,13 +189,13 @@ def _evidence(found: Findings) -> dict[str, Any]:
 
 
 def shaper_in_words(findings: Mapping[str, Findings]) -> str:
-    """Say who shapes both directions."""
+    """Name the shapers of both directions."""
     names = sorted({one.evidence.shaper for one in findings.values()})
     return f"shaped by {' and '.join(names)}"
 
 
 def describe(plan: Plan, trains: Trains | None) -> str:
-    """Say what is sent through a direction."""
+    """Describe the probes of a direction."""
     schedule = plan.schedule
     text = f"{schedule.count} probes of {schedule.size} bytes, {1 / schedule.period:.0f} per second"
     if trains and trains.count:
@@ -207,11 +204,11 @@ def describe(plan: Plan, trains: Trains | None) -> str:
 
 
 def notes(way: str, plan: Plan, trains: Trains | None) -> Iterator[str]:
-    """Say what is judged more loosely than usual, or not at all."""
+    """Note what is judged more loosely than usual, or not at all."""
     if not plan.enough:
         seconds = plan.needs * plan.schedule.period
         yield (
-            f"{way}: its delays scatter so that {seconds:.0f} s of probes are needed (default: "
+            f"{way}: its delays vary so much that {seconds:.0f} s of probes are needed (default: "
             f"at most {LONGEST:.0f}); give --seconds {seconds:.0f}"
         )
     if has_jitter(plan.profile):
@@ -220,48 +217,51 @@ def notes(way: str, plan: Plan, trains: Trains | None) -> Iterator[str]:
         if expects.share and expects.variation is None and expects.middle is None:
             yield from on_deviation(way, expects.deviation.expected)
     if trains and not trains.judges:
-        yield f"{way}: rate {NOT_JUDGED}: it is too high to be told from none"
+        yield f"{way}: rate {NOT_JUDGED}: too high to be distinguished from no limit"
 
 
 def on_jitter(way: str, share: float) -> Iterator[str]:
-    """Say by which share [1] jitter may be off, unless it is the usual tenth."""
+    """Note the share [1] by which jitter may be off, unless it is the usual 10 %."""
     usual = JITTER_SHARES[0]
     if not share:
-        yield f"{way}: jitter {NOT_JUDGED}: too little of its delays' scatter is jitter"
+        yield f"{way}: jitter {NOT_JUDGED}: jitter is too small a part of the delay variation"
     elif share > usual:
-        yield f"{way}: jitter judged within {share:.0%} only: its tail hides {usual:.0%}"
+        yield (
+            f"{way}: jitter judged within {share:.0%} only: the tail of its distribution hides "
+            f"{usual:.0%}"
+        )
 
 
 def on_correlation(way: str, asked: float) -> Iterator[str]:
-    """Say that netem makes nothing of a correlation [1], unless none was asked for."""
+    """Note that netem does not realise a correlation, if `asked` [1] is not zero."""
     if asked:
-        yield f"{way}: correlation {asked:g} {NOT_JUDGED}: netem realises next to none of it"
+        yield f"{way}: correlation {asked:g} {NOT_JUDGED}: netem realises almost none of it"
 
 
 def on_patience(way: str, name: str, needs: float) -> Iterator[str]:
-    """Say that a quantity takes more datagrams than are kept.
+    """Note that a quantity needs more datagrams than are kept.
 
     Args:
         way: The direction.
-        name: Of the row.
-        needs: Datagrams [1]; infinite if it cannot be told from what the ends add.
+        name: Name of the row.
+        needs: Number of datagrams [1]; infinite if delays of the ends hide the quantity.
     """
-    why = "what the ends may add hides it, however many datagrams there are"
+    why = "delays inside the ends may hide it, for any number of datagrams"
     if isfinite(needs):
-        why = f"takes {needs:.0f} datagrams, {needs * PERIOD:.0f} s of a flight"
+        why = f"needs {needs:.0f} datagrams, {needs * PERIOD:.0f} s of a flight"
     yield f"{way}: {NAMES.get(name, name)} {NOT_JUDGED}: {why}"
 
 
 def on_deviation(way: str, asked: float) -> Iterator[str]:
-    """Say that a standard deviation which alone judges the jitter is too small for a tenth.
+    """Note that the jitter is judged by a standard deviation too small for the usual 10 %.
 
     Args:
         way: The direction.
-        asked: That deviation [s].
+        asked: Requested standard deviation [s].
     """
     if 0.0 < asked < 2.0 * DEVIATION_FLOOR:
         yield (
             f"{way}: standard deviation, and so its jitter, judged within "
-            f"{DEVIATION_FLOOR * 1e3:g} ms only: below {2e3 * DEVIATION_FLOOR:g} ms machines make "
-            "as much"
+            f"{DEVIATION_FLOOR * 1e3:g} ms only: below {2e3 * DEVIATION_FLOOR:g} ms the machine "
+            "itself adds as much"
         )

@@ -1,4 +1,4 @@
-"""`cloudrc mission`: missions and the operator's hand, on a run here or a release in a cluster."""
+"""Run `cloudrc mission`: fly and steer missions, in a local run or a release in a cluster."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 where:
-  a run that flies here ('cloudrc run --mode local'): found by itself, that of
-  ./runs/latest first, or by --run, its folder, or by --api
-  a release in a cluster: with --context, -n or --release, if none flies here,
-  and always as 'kubectl cloudrc mission'
+  a run on this machine ('cloudrc run --mode local'): found automatically (first
+  ./runs/latest), or named by --run DIR or --api URL
+  a release in a cluster: if --context, -n or --release is given, or if no run
+  flies on this machine; always with 'kubectl cloudrc mission'
 
 examples:
   cloudrc mission run pipes
@@ -29,14 +29,15 @@ examples:
   cloudrc mission run my.yaml --queue --context kind-cloudrc -n demo
   cloudrc mission logs --follow
 
-A mission is a file with 'waypoints', such as those that 'cloudrc list missions'
-names. 'run' and 'fly' end with its verdict: 0 done, 1 failed, 6 not real time.
-'estop' stops the rotors at once, whatever flies, and lets the robot fall; that
-and a landing, whatever its cause, are left by 'acknowledge'. An API that is
-called over a network asks for a token: --token-file, CLOUDRC_TOKEN_FILE, or for
-a release of the chart its Secret, read with your own rights in the cluster. A
-run that is found here is sent none."""
+A mission is a file with 'waypoints'; 'cloudrc list missions' names those that
+ship. The exit code of 'run' and 'fly' is the verdict: 0 done, 1 failed, 6 not
+real time. 'estop' stops the rotors at once, with or without a mission, and the
+robot falls. After an emergency stop or a landing, 'acknowledge' allows the next
+mission. An API in a network asks for a token: give --token-file or
+CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your rights
+in the cluster. A run that is found on this machine needs no token."""
 
+DEBUG = "show the traceback of an error"
 NO_API = "no run with an API flies there; name another folder, or --api URL"
 
 
@@ -52,7 +53,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
             formatter_class=parser.formatter_class,
             allow_abbrev=False,
         )
-        verb.add_argument("--debug", action="store_true", default=argparse.SUPPRESS)
+        verb.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=DEBUG)
         verb.add_argument(
             "--api", metavar="URL", help="http://HOST:PORT or unix:PATH of a run or release"
         )
@@ -62,36 +63,37 @@ def arguments(parser: argparse.ArgumentParser) -> None:
             place_arguments(verb)
         return verb
 
-    run = add("run", "fly a mission and follow it to its verdict")
-    run.add_argument("mission", metavar="FILE", help="a mission's file, or one that ships")
+    run = add("run", "fly a mission and show its progress until the verdict")
+    run.add_argument("mission", metavar="FILE", help="mission file, or name of a shipped mission")
     timeout_argument(run)
-    run.add_argument("--name", default="", help="for people (default: the file's name)")
-    for name in ("list", "status"):
-        line = {"list": "all missions", "status": "how things are, or how one mission is"}[name]
-        shown = add(name, line)
-        output_argument(shown)
-    shown.add_argument("id", nargs="?", metavar="ID", help="of a mission (in a cluster: of a Job)")
-    cancel = add("cancel", "end a mission; the robot holds")
-    cancel.add_argument("id", nargs="?", metavar="ID", help="default: the one under way")
-    logs = add("logs", "what has happened")
-    logs.add_argument("id", nargs="?", metavar="ID", help="default: to all missions")
-    logs.add_argument("-f", "--follow", action="store_true", help="and what happens from now on")
-    goto = add("goto", "fly to a point, or hold a held mission there")
+    run.add_argument("--name", default="", help="name shown to people (default: the file's name)")
+    output_argument(add("list", "list all missions"))
+    status = add("status", "show the robot's state, or the state of a mission")
+    output_argument(status)
+    status.add_argument("id", nargs="?", metavar="ID", help="mission (in a cluster: name of a Job)")
+    cancel = add("cancel", "cancel a mission; the robot holds its position")
+    cancel.add_argument("id", nargs="?", metavar="ID", help="mission (default: the current one)")
+    logs = add("logs", "show the events of missions")
+    logs.add_argument("id", nargs="?", metavar="ID", help="mission (default: all)")
+    logs.add_argument("-f", "--follow", action="store_true", help="keep printing new events")
+    goto = add("goto", "fly to a point; a held mission then holds there")
     for axis in "XYZ":
         goto.add_argument(axis.lower(), type=_metres, metavar=axis, help="[m], world frame")
-    add("hold", "stop the robot where it is, 0.35 m up at least")
-    add("resume", "go on with the mission that is held")
-    add("estop", "stop the rotors at once: the robot falls, and its mission has failed")
-    add("acknowledge", "release a robot that was stopped or has landed; arms nothing")
-    fly = add("fly", "what a mission's Job runs: post, follow, end with the verdict")
-    fly.add_argument("--mission", required=True, metavar="FILE", help="the mission")
-    fly.add_argument("--key", default="", help="posting twice under one key flies once")
+    add("hold", "hold the robot where it is, at least 0.35 m above the ground")
+    add("resume", "resume the held mission")
+    add("estop", "stop the rotors at once: the robot falls and its mission fails")
+    add("acknowledge", "allow flights again after a stop or a landing; does not start the rotors")
+    fly = add("fly", "fly a mission inside a Job: post it, follow it, exit with the verdict")
+    fly.add_argument("--mission", required=True, metavar="FILE", help="mission file")
+    fly.add_argument("--key", default="", help="a mission posted twice under one key flies once")
     for verb in (run, fly):
-        verb.add_argument("--queue", action="store_true", help="wait for the one under way")
+        verb.add_argument(
+            "--queue", action="store_true", help="wait for the current mission to end"
+        )
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Do what the verb says."""
+    """Run the chosen verb."""
     from cloudrc.cli import mission_cluster, mission_local
     from cloudrc.cli.client import Api
 
@@ -102,7 +104,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.api:
         return of_api(options, Api(options.api, reader(token_file(options))))
     if (url := find_here(options, url_of, NO_API)) is not None:
-        return of_api(options, Api(url))  # it asks for no token, and so gets none
+        return of_api(options, Api(url))  # a local run asks for no token, so send none
     if verb in mission_cluster.VERBS:
         in_cluster: Callable[[argparse.Namespace], int] = mission_cluster.VERBS[verb]
         return in_cluster(options)
@@ -111,8 +113,8 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _metres(text: str) -> float:
-    """Read a coordinate, as argparse calls it; how far away it may be is the API's to say."""
+    """Parse a coordinate [m] for argparse; the API checks its range."""
     try:
         return float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is no number of metres") from None
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of metres") from None

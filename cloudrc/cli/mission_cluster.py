@@ -1,8 +1,7 @@
-"""Verbs of `cloudrc mission` that speak with Kubernetes: missions are Jobs there.
+"""Run the verbs of `cloudrc mission` in a cluster, where a mission is a Kubernetes Job.
 
-Checks a mission before a Job is made of it: a mission's file comes in, its limit goes out.
-
-The API checks the same by the same code, but only once the Job's pod runs.
+A mission is checked before its Job is created. The API checks it again with the same code, but only
+once the Job's pod runs.
 """
 
 from __future__ import annotations
@@ -32,20 +31,20 @@ if TYPE_CHECKING:
 
 
 UNKNOWN_LIMIT = 600.0
-"""Of a mission that does not say its own, on a release whose experiment may not be read [s]."""
+"""Time limit of a mission if neither it nor the release's experiment gives one [s]."""
 LISTED = 20
-"""Problems that are named; a mission in wrong units is wrong everywhere."""
+"""Largest number of problems to print: a mission in wrong units has one per waypoint."""
 
 
 def parse(name: str, mission: Mapping[str, Any]) -> MissionRequest:
-    """Check what can be checked without knowing where it is to be flown.
+    """Check a mission without its experiment.
 
     Args:
-        name: Of the file, for messages.
-        mission: As it is posted.
+        name: Name of the file, for messages.
+        mission: Body of the request to the API.
 
     Raises:
-        BadInputError: With everything that is wrong.
+        BadInputError: Lists all problems.
     """
     from pydantic import ValidationError
 
@@ -56,7 +55,7 @@ def parse(name: str, mission: Mapping[str, Any]) -> MissionRequest:
         request = MissionRequest.model_validate_json(json.dumps(mission))
     except ValidationError as error:
         _refuse(name, from_pydantic(error, MissionRequest))
-        raise  # there was nothing to say
+        raise  # if no problem was listed
     if not request.waypoints:
         _refuse(name, [Problem(("waypoints",), "", "none given; give at least one")])
     return request
@@ -66,15 +65,15 @@ def check_on(release: Release, name: str, request: MissionRequest) -> float:
     """Check a mission against the experiment of a release.
 
     Args:
-        release: That is to fly it.
-        name: Of the file, for messages.
+        release: The release.
+        name: Name of the file, for messages.
         request: The mission.
 
     Returns:
-        Its limit of time, or the experiment's where it does not say its own [s].
+        Time limit of the mission, else that of the experiment [s].
 
     Raises:
-        BadInputError: With everything that is wrong.
+        BadInputError: Lists all problems.
     """
     from cloudrc.config.mission_check import check_mission
     from cloudrc.config.schema import Mission
@@ -89,7 +88,7 @@ def check_on(release: Release, name: str, request: MissionRequest) -> float:
 
 
 def _experiment(release: Release) -> Experiment | None:
-    """Read a release's experiment; None if this user, or this version, cannot."""
+    """Read a release's experiment; None if this user or this version cannot read it."""
     from pydantic import ValidationError
 
     from cloudrc.cluster.client import FILE, experiment_text
@@ -119,7 +118,7 @@ def _refuse(name: str, problems: Sequence[Problem]) -> None:
 
 @contextmanager
 def api(options: argparse.Namespace) -> Iterator[Api]:
-    """Open the way to a release's API for as long as the block lasts."""
+    """Forward a port to a release's API while the block runs."""
     release, path = _place(options), token_file(options)
     from cloudrc.cluster.pods import api_url, operator_token
 
@@ -140,15 +139,15 @@ def _run(options: argparse.Namespace) -> int:
 
     require_release(release)
     limit = check_on(release, options.mission, request)
-    # An install that was not waited for is a matter of seconds: the link is up last.
+    # After 'helm install' without --wait this takes some seconds: the link starts last.
     wait_ready(release, timeout=options.timeout, tell=say)
     job = run_job(release, mission, limit=limit, queue=options.queue)
     print(f"Job {job.name} in namespace '{release.namespace}'", flush=True)
     try:
         ended = follow(release, job.name, say, timeout=patience(limit, options.queue))
     except KeyboardInterrupt:
-        end = f"cloudrc mission cancel {job.name} {' '.join(release.cloudrc_flags)}"
-        print(f"Job {job.name} flies on; end it: {end}", file=sys.stderr)
+        command = f"cloudrc mission cancel {job.name} {' '.join(release.cloudrc_flags)}"
+        print(f"Job {job.name} is still running; cancel it: {command}", file=sys.stderr)
         raise
     if ended.exit_code is None:
         say(ended.message)
@@ -171,10 +170,10 @@ def _list(options: argparse.Namespace) -> int:
 
 def _status(options: argparse.Namespace) -> int:
     if options.id is None:
-        from cloudrc.cli.mission_local import VERBS as OF_API
+        from cloudrc.cli.mission_local import VERBS as API_VERBS
 
-        with api(options) as of_release:
-            return OF_API["status"](options, of_release)
+        with api(options) as forwarded:
+            return API_VERBS["status"](options, forwarded)
     release = _place(options)
     from cloudrc.cluster.jobs import read_job
 
@@ -187,10 +186,10 @@ def _status(options: argparse.Namespace) -> int:
 
 def _cancel(options: argparse.Namespace) -> int:
     if options.id is None:
-        from cloudrc.cli.mission_local import VERBS as OF_API
+        from cloudrc.cli.mission_local import VERBS as API_VERBS
 
-        with api(options) as of_release:
-            return OF_API["cancel"](options, of_release)
+        with api(options) as forwarded:
+            return API_VERBS["cancel"](options, forwarded)
     release = _place(options)
     from cloudrc.cluster.jobs import cancel
 

@@ -1,8 +1,7 @@
-"""Verbs of `cloudrc mission` that speak with teleop's API, wherever it is.
+"""Run the verbs of `cloudrc mission` through teleop's API.
 
-A mission followed to its end: the API's events become lines, its verdict an exit code.
-
-The API may go away for a while, since the cloud pod may be replaced in flight.
+A mission that is followed prints a line per event and ends with its verdict as exit code. The API
+may be away for a while: the cloud pod may be replaced in flight.
 """
 
 from __future__ import annotations
@@ -21,23 +20,23 @@ from cloudrc.cli.pool import end_orderly
 from cloudrc.errors import BadInputError, CloudrcError
 
 PERIOD = 0.5
-"""Between two looks at a mission [s]."""
+"""Pause between two polls of a mission [s]."""
 PATIENCE = 180.0
-"""How long the API may be away: a pod on another node has to load its image [s]."""
+"""Longest absence of the API [s]: a pod on another node first loads its image."""
 TERMINATION_LOG = Path("/dev/termination-log")
-"""In a pod: what `kubectl describe` shows of a container that has ended."""
+"""File in a pod whose text `kubectl describe` shows once a container has ended."""
 
 _Answer = TypeVar("_Answer")
 
 
 class WaitedTooLongError(CloudrcError):
-    """The API was away for too long."""
+    """Report that the API was away for too long."""
 
     exit_code = 4
 
 
 class Follower:
-    """Follows one mission, through restarts of the API."""
+    """Follow one mission, through restarts of the API."""
 
     def __init__(
         self,
@@ -45,58 +44,58 @@ class Follower:
         write: Callable[[str], None],
         patience: float | None = None,
     ) -> None:
-        """Begin to follow.
+        """Store the API; follow nothing yet.
 
         Args:
-            api: Of teleop.
-            write: Gets a line for everything that happens.
-            patience: How long the API may be away [s]; None for `PATIENCE`.
+            api: Teleop's API.
+            write: Receives a line for each event.
+            patience: Longest absence of the API [s]; None for `PATIENCE`.
         """
         self._api, self._write = api, write
         self._patience = PATIENCE if patience is None else patience
-        self._told = 0
+        self._last_event = 0
 
     def post(self, mission: Mapping[str, Any]) -> dict[str, Any]:
-        """Post a mission, as soon as the API is there; raises what `Api.post` raises."""
-        view = self._insist(lambda: self._api.post("/v1/missions", mission))
+        """Post a mission once the API answers; raises like `Api.post`."""
+        view = self._retry(lambda: self._api.post("/v1/missions", mission))
         self._write(f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}")
         return dict(view)
 
     def follow(self, mission_id: str) -> dict[str, Any]:
-        """Write what happens until the mission has ended.
+        """Write the events of a mission until it has ended.
 
         Returns:
-            Its verdict, as the API gives it.
+            The verdict in the form of the API.
         """
         while True:
-            view = self._insist(lambda: self._api.get(path_of(mission_id)))
+            view = self._retry(lambda: self._api.get(path_of(mission_id)))
             for event in view["events"]:
-                if event["id"] > self._told:
-                    self._told = event["id"]
+                if event["id"] > self._last_event:
+                    self._last_event = event["id"]
                     self._write(f"{event['time_s']:7.2f} s  {event['text']}")
             if view["verdict"] is not None:
                 return dict(view["verdict"])
             time.sleep(PERIOD)
 
-    def _insist(self, ask: Callable[[], _Answer]) -> _Answer:
-        """Ask until there is an answer, or patience ends."""
-        until, told = time.monotonic() + self._patience, False
+    def _retry(self, request: Callable[[], _Answer]) -> _Answer:
+        """Repeat a request until there is an answer, or patience ends."""
+        deadline, reported = time.monotonic() + self._patience, False
         while True:
             try:
-                return ask()
+                return request()
             except UnreachableError as error:
-                if time.monotonic() > until:
+                if time.monotonic() > deadline:
                     raise WaitedTooLongError(
-                        f"{error}; given up after {self._patience:g} s"
+                        f"{error}; gave up after {self._patience:g} s"
                     ) from None
-                if not told:
+                if not reported:
                     self._write(f"{error}; waiting")
-                    told = True
+                    reported = True
             time.sleep(PERIOD)
 
 
 def in_words(verdict: Mapping[str, Any]) -> str:
-    """Say a verdict in one line."""
+    """Describe a verdict in one line."""
     word = verdict["outcome"].upper()
     failures = [f"{failure['code']}: {failure['text']}" for failure in verdict["failures"]]
     if not failures:
@@ -105,50 +104,50 @@ def in_words(verdict: Mapping[str, Any]) -> str:
 
 
 def leave_message(text: str, path: Path = TERMINATION_LOG) -> None:
-    """Tell Kubernetes how it ended, if this is a pod."""
+    """Write the termination message for Kubernetes, if this is a pod."""
     try:
         if path.exists():
             path.write_text(text + "\n", encoding="utf-8")
     except OSError:
-        pass  # the log's last line says the same, and is the fallback
+        pass  # Kubernetes then falls back to the last line of the log, which says the same
 
 
 INTERRUPTED = 130
 
 
 def read_mission(name: str) -> dict[str, Any]:
-    """Read the file of a mission that ships, or any other; the API checks what is in it.
+    """Read a shipped mission or a mission file; the API checks its content.
 
     Raises:
-        BadInputError: If there is no such file, or it holds no mission.
+        BadInputError: If the file does not exist or holds no mission.
     """
     from cloudrc.config import shipped
 
     mission = dict(shipped.read("mission", name, Path()).tree)
     if mission.get("steps") is not None:
         raise BadInputError(
-            f"{name}: steps are for experiments; fly them by 'cloudrc run', or give waypoints"
+            f"{name}: steps are for experiments; fly them with 'cloudrc run', or give waypoints"
         )
     mission.pop("steps", None)
     return {"name": Path(name).stem, **mission}
 
 
 def fly(options: argparse.Namespace) -> int:
-    """Post a mission, follow it, end with its verdict; asked to stop, cancel it."""
+    """Post a mission and follow it to its verdict; cancel it on an interrupt."""
     if options.api is None:
-        raise BadInputError("fly needs --api; to fly by hand: cloudrc mission run FILE")
+        raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
     end_orderly()
     api = Api(options.api, reader(token_file(options)))
-    follower, found = Follower(api, say), ""
+    follower, mission_id = Follower(api, say), ""
     try:
         mission = read_mission(options.mission)
         order = {**mission, "key": options.key, "queue": options.queue}
-        found = follower.post(order)["id"]
-        verdict = follower.follow(found)
+        mission_id = follower.post(order)["id"]
+        verdict = follower.follow(mission_id)
     except KeyboardInterrupt:
-        if found:
+        if mission_id:
             with suppress(CloudrcError):
-                api.post(f"{path_of(found)}/cancel")
+                api.post(f"{path_of(mission_id)}/cancel")
         _end("INTERRUPTED: the Job was stopped, its mission is cancelled")
         return INTERRUPTED
     except CloudrcError as error:
@@ -167,9 +166,9 @@ def _run(options: argparse.Namespace, api: Api) -> int:
     try:
         verdict = follower.follow(mission_id)
     except KeyboardInterrupt:
-        goes_on = "waits or flies on" if options.queue else "flies on"
-        end = f"cloudrc mission cancel {mission_id}"
-        say(f"mission {mission_id} {goes_on}; end it: {end}", sys.stderr)
+        state = "is waiting or flying" if options.queue else "is still flying"
+        command = f"cloudrc mission cancel {mission_id}"
+        say(f"mission {mission_id} {state}; cancel it: {command}", sys.stderr)
         raise
     say(in_words(verdict))
     return int(verdict["exit_code"])
@@ -198,19 +197,19 @@ def _status(options: argparse.Namespace, api: Api) -> int:
         mission = api.get(path_of(options.id))
         if options.output != "table":
             return _print(mission, options.output)
-        _say(mission)
+        _print_state(mission)
         _print_history(mission)
         return 0
     state = api.get("/v1/state")
     if options.output != "table":
         return _print(state, options.output)
     if state["mission"]:
-        _say(state["mission"])
+        _print_state(state["mission"])
     else:
         print("no mission is under way")
     if state["queue"]:
         say(f"waiting: {', '.join(state['queue'])}")
-    _say_seen(state["seen"], state["cloud_age_s"])
+    _print_robot(state["seen"], state["cloud_age_s"])
     return 0
 
 
@@ -221,7 +220,7 @@ def _cancel(options: argparse.Namespace, api: Api) -> int:
         if mission is None:
             raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
         mission_id = mission["id"]
-    _say(api.post(f"{path_of(mission_id)}/cancel"))
+    _print_state(api.post(f"{path_of(mission_id)}/cancel"))
     return 0
 
 
@@ -242,23 +241,23 @@ def _logs(options: argparse.Namespace, api: Api) -> int:
 
 def _goto(options: argparse.Namespace, api: Api) -> int:
     body = {"position_m": [options.x, options.y, options.z]}
-    _say(api.post("/v1/goto", body))
+    _print_state(api.post("/v1/goto", body))
     return 0
 
 
 def _hold(options: argparse.Namespace, api: Api) -> int:
-    _say(api.post("/v1/hold"))
+    _print_state(api.post("/v1/hold"))
     return 0
 
 
 def _resume(options: argparse.Namespace, api: Api) -> int:
-    _say(api.post("/v1/resume"))
+    _print_state(api.post("/v1/resume"))
     return 0
 
 
 def _estop(options: argparse.Namespace, api: Api) -> int:
     mission = api.post("/v1/estop")["id"]
-    print("emergency stop: the robot is told to stop its rotors until it has", flush=True)
+    print("emergency stop: sent, and repeated until the rotors have stopped", flush=True)
     if mission:
         say(f"mission {mission} has failed")
     return 0
@@ -266,10 +265,12 @@ def _estop(options: argparse.Namespace, api: Api) -> int:
 
 def _acknowledge(options: argparse.Namespace, api: Api) -> int:
     api.post("/v1/acknowledge")
-    print("acknowledged: the next mission may fly; a landing low over the ground ends first")
     print(
-        "where it was stopped or has touched down, the robot takes off only once it has been "
-        "still, 0.5 m inside the fence"
+        "acknowledged: the next mission may fly; a landing close to the ground is completed first"
+    )
+    print(
+        "after a stop or a touchdown the robot takes off only once it is at rest, and at least "
+        "0.5 m inside the fence"
     )
     return 0
 
@@ -288,29 +289,29 @@ VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
 }
 
 
-def _say(mission: dict[str, Any]) -> None:
-    """Say in one line where a mission is."""
+def _print_state(mission: dict[str, Any]) -> None:
+    """Print the state of a mission in one line."""
     where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
     name = f" ({mission['name']})" if mission["name"] else ""
     verdict = f"; {in_words(mission['verdict'])}" if mission["verdict"] else ""
     say(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
 
 
-def _say_seen(seen: dict[str, Any] | None, cloud_age: float | None) -> None:
-    """Say where the robot is, how, since when, and what comes next; what is past is said so.
+def _print_robot(seen: dict[str, Any] | None, cloud_age: float | None) -> None:
+    """Print the robot's position, its state, the time since its last telemetry, the next step.
 
     Args:
         seen: The newest telemetry.
-        cloud_age: Since cloud was heard [s]; None if it never was.
+        cloud_age: Time since the last message from cloud [s]; None if there was none.
     """
     heard = "never" if cloud_age is None else f"{cloud_age:.1f} s ago"
     if seen is None:
-        print(f"the robot has not been seen yet; is the link up? cloud heard {heard}")
+        print(f"no telemetry from the robot yet; is the link up? cloud heard {heard}")
         return
     where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
     if seen["guard_for_s"] is None:
-        then = f"robot not heard for {seen['age_s']:.1f} s (guard {seen['guard']} then)"
-        say(f"{then}; cloud heard {heard}")
+        past = f"robot not heard for {seen['age_s']:.1f} s (guard {seen['guard']} then)"
+        say(f"{past}; cloud heard {heard}")
         say(f"last seen at ({where}) m: {seen['cause']}")
     else:
         rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"

@@ -1,15 +1,11 @@
-"""`cloudrc teleop`: the process that flies missions; its API is where they come from.
+"""Run `cloudrc teleop`: the process that flies missions, with its API and its journal.
 
-The emergency stop past teleop's loop: one datagram to cloud, repeated where it is not taken.
+An emergency stop bypasses teleop's loop, which may be waiting for its disk: a thread repeats one
+datagram until cloud accepts it.
 
-The API of `cloudrc teleop`: its flags come in, a server goes out, with tokens and audit log.
-
-Room for the journal to be shortened where it has filled its volume: a file that is given up.
-
-What a start takes out of the journal is taken out by writing the rest anew beside it, for which a
-full disk has no room; and to wait for the next start would be to wait for ever. So some room is
-kept by a file, which is deleted then and made again once the old journal is gone. Names beside the
-journal are its own, as that of its lock is; all this happens while the lock is held.
+A start removes old missions from the journal: it writes the others to a new file beside it. A full
+disk has no room for that, so a reserve file keeps some. It is deleted when the room is needed, and
+made again once the old journal is gone. All this happens while teleop holds the journal's lock.
 """
 
 from __future__ import annotations
@@ -42,68 +38,66 @@ if TYPE_CHECKING:
 
 
 REPEAT_PERIOD = 0.02
-"""Between two tries [s]."""
+"""Pause between two attempts to send an emergency stop [s]."""
 REPEAT_LIMIT = 2.0
-"""After the operator's word [s]: who has not had an answer by then asks again, and a cloud that
-stands still for so long has a robot that holds."""
+"""How long to repeat an emergency stop [s]. If cloud is blocked for that long, the robot holds."""
 
 
 class Alarm:
-    """Tells cloud to stop the rotors; may be called from any thread, and waits for nobody.
+    """Send an emergency stop to cloud, from any thread, without blocking.
 
-    A cloud that stands still lets eleven datagrams wait, and refuses what comes then. Teleop's loop
-    would say it again, but may itself be waiting for its disk: so a thread says it until cloud has
-    taken it, and goes.
+    The socket of a blocked cloud queues eleven datagrams and refuses more. Then a thread repeats
+    the stop until cloud accepts it.
     """
 
     def __init__(self, send: Callable[[], bool]) -> None:
-        """Begin.
+        """Store how to send.
 
         Args:
-            send: Sends it, if cloud takes it now; says whether it did. Must not block.
+            send: Sends the stop once; returns whether cloud accepted it. Must not block.
         """
         self._send = send
         self._lock = threading.Lock()
-        self._until = 0.0
-        self._repeats = False  # there is such a thread
+        self._deadline = 0.0
+        self._repeating = False  # whether the thread runs
 
     def __call__(self) -> None:
-        """Send it, now or as soon as cloud takes it."""
+        """Send the stop, now or as soon as cloud accepts it."""
         with self._lock:
             if self._send():
-                self._until = 0.0  # once is enough
+                self._deadline = 0.0  # ends the thread
                 return
-            self._until = time.monotonic() + REPEAT_LIMIT
-            if self._repeats:
+            self._deadline = time.monotonic() + REPEAT_LIMIT
+            if self._repeating:
                 return
             try:
                 threading.Thread(target=self._repeat, name="alarm", daemon=True).start()
-            except RuntimeError:  # there can be no more threads: it is left to teleop's loop
+            except RuntimeError:  # no more threads: teleop's loop repeats the stop
                 return
-            self._repeats = True
+            self._repeating = True
 
     def _repeat(self) -> None:
-        while self._repeats_after(REPEAT_PERIOD):
+        while self._try_again(REPEAT_PERIOD):
             pass
 
-    def _repeats_after(self, period: float) -> bool:
-        """Wait, then try again; say whether it has to be tried once more."""
+    def _try_again(self, period: float) -> bool:
+        """Wait, then send again; return whether another attempt is needed."""
         time.sleep(period)
-        with self._lock:  # whoever asks meanwhile finds a thread that goes on, or none
-            self._repeats = time.monotonic() < self._until and not self._send()
-            return self._repeats
+        with self._lock:  # `_repeating` is true only while this thread will try again
+            self._repeating = time.monotonic() < self._deadline and not self._send()
+            return self._repeating
 
 
 LOOPBACK = "127.0.0.1"
 COUNT_PERIOD_NS = 1_000_000_000
-"""Between two times that the API's counts become metrics [ns]."""
+"""Period at which the API's counts become metrics [ns]."""
 
 
 class ServedApi:
-    """An API that answers; until it is opened only that teleop is not ready yet.
+    """Serve the API; until `open` it answers that teleop is not ready.
 
     Attributes:
-        bridge: From its threads to teleop's loop.
+        bridge: Passes calls from the API's threads to teleop's loop.
     """
 
     def __init__(self, bridge: Bridge, server: ApiServer, audit: Audit) -> None:
@@ -112,17 +106,17 @@ class ServedApi:
         self._counted_ns = 0
 
     def open(self, service: MissionService, alarm: Callable[[], object]) -> None:
-        """Serve missions from now on.
+        """Start to serve missions.
 
         Args:
-            service: Of them.
-            alarm: Sends an emergency stop past the service; called from any thread.
+            service: The service that flies them.
+            alarm: Sends an emergency stop directly to cloud; called from any thread.
         """
         self.bridge.alarm, self._service = alarm, service
         self.bridge.open(service)
 
     def counted(self) -> list[Counted]:
-        """What was done with requests so far, once a second."""
+        """Return the counts of requests once a second, else an empty list."""
         import time
 
         from cloudrc.records import Counted
@@ -137,13 +131,13 @@ class ServedApi:
         return [Counted(now_ns, "teleop", f"api_{name}", n) for name, n in sorted(counts.items())]
 
     def stop(self) -> None:
-        """Answer what is asked, and end."""
+        """Finish the open requests and stop."""
         self._server.stop()
         self._audit.close()
 
 
 def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> ServedApi:
-    """Answer from now on, if only that teleop is not ready yet."""
+    """Start the API; it answers that teleop is not ready until it is opened."""
     import json
     from functools import partial
 
@@ -172,12 +166,12 @@ def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> Se
 
 
 def complain(text: str) -> None:
-    """Write a line into the process's log; from any thread."""
+    """Write a line to the log, from any thread."""
     say(f"cloudrc teleop: {text}", sys.stderr)
 
 
 def api_address(text: str) -> Address | Path:
-    """Read [HOST:]PORT, whose port may be 0, or unix:PATH."""
+    """Parse [HOST:]PORT, where PORT may be 0, or unix:PATH."""
     if text.startswith("unix:") and len(text) > len("unix:"):
         return Path(text.removeprefix("unix:"))
     host, colon, port = text.rpartition(":")
@@ -186,55 +180,57 @@ def api_address(text: str) -> Address | Path:
 
 
 RESERVE_SIZE = 2 << 20
-"""Of the file [bytes].
+"""Size of the reserve file [bytes].
 
-What a start leaves are the 100 missions that have ended last, and 17 that have not. The paper's, of
-seven waypoints, takes 3.8 kB, all of them 0.45 MB; here is room for 45 waypoints in each. The
-chart's volume has 64 MiB, of which the audit log may take 16.
+A start keeps at most the last 100 missions that have ended and 17 others. The paper's mission with
+seven waypoints takes 3.8 kB, 117 of them 0.45 MB; the reserve suffices for 45 waypoints in each.
+The chart's volume has 64 MiB, of which the audit log may take 16.
 """
 FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors that mean a full disk."""
 
 
 def room(folder: Path) -> int:
-    """How much a folder's volume has left for this user [bytes]."""
+    """Return the free space of a folder's volume for this user [bytes]."""
     volume = os.statvfs(folder)
     return volume.f_bavail * volume.f_frsize
 
 
 def shorten(journal: Journal, known: Sequence[Entry], disk: Disk | None = None) -> str:
-    """Leave in the journal what is known alone, also on a full disk; keep room for the next time.
+    """Reduce the journal to its known entries, also on a full disk, and renew the reserve.
 
-    What the disk refuses stops nobody: the journal is then as before.
+    If the disk refuses, teleop continues with the old journal.
 
     Args:
-        journal: Open.
-        known: Those of its entries that are to stay.
-        disk: Where it is; None for the machine's own.
+        journal: The open journal.
+        known: Entries to keep.
+        disk: Disk of the journal; None for the real one.
 
     Returns:
-        What is wrong and what to do about it; "" if nothing.
+        The problem and its remedy; "" without a problem.
     """
     reserve = Reserve(journal.path, disk)
     try:
         if len(known) < len(journal.entries):
             _rewrite(journal, known, reserve)
-    except OSError as error:  # the reserve stays away: there is more need of its room now
+    except OSError as error:  # do not renew the reserve: the journal needs its room now
         return (
             f"{journal.path}: cannot be shortened to the missions still known: {error.strerror}; "
-            "once it is full no mission can start: free or mend its volume, then restart teleop"
+            "once it is full no mission can start: free space or repair the volume, then restart "
+            "teleop"
         )
     try:
         reserve.make()
     except OSError as error:
         complain(
             f"{reserve.path}: {error.strerror}: without it a restart cannot shorten a journal that "
-            "has filled its volume; free or mend that"
+            "has filled its volume; free space or repair the volume"
         )
     return ""
 
 
 def _rewrite(journal: Journal, known: Sequence[Entry], reserve: Reserve) -> None:
-    """Write the journal anew, if need be in the room of the reserve."""
+    """Rewrite the journal; on a full disk delete the reserve first."""
     try:
         journal.rewrite(known)
     except OSError as error:
@@ -244,25 +240,25 @@ def _rewrite(journal: Journal, known: Sequence[Entry], reserve: Reserve) -> None
 
 
 class Reserve:
-    """A file beside the journal that holds nothing but room.
+    """Manage the reserve: a file beside the journal that only occupies space.
 
     Attributes:
-        path: Of it.
+        path: Path of the reserve.
     """
 
     def __init__(self, journal: Path, disk: Disk | None = None) -> None:
-        """Touch nothing yet.
+        """Store the path; touch no file.
 
         Args:
             journal: Path of the journal.
-            disk: Where it is; None for the machine's own.
+            disk: Disk of the journal; None for the real one.
         """
         from cloudrc.teleop.journal import Disk
 
         self.path, self._disk = journal.with_name(f"{journal.name}.reserve"), disk or Disk()
 
     def give_up(self) -> bool:
-        """Delete it; say whether there was one.
+        """Delete the reserve; return whether it existed.
 
         Raises:
             OSError: If the disk refuses.
@@ -270,23 +266,23 @@ class Reserve:
         if self._size() is None:
             return False
         self._disk.remove(self.path)
-        self._disk.sync_folder(self.path.parent)  # some disks give room back with that alone
+        self._disk.sync_folder(self.path.parent)  # some disks free the space only then
         return True
 
     def make(self) -> None:
-        """Make it, unless it is there and whole.
+        """Make the reserve, unless it exists in full size.
 
         Raises:
-            OSError: If the disk refuses, or has no more room than entries need; there is none then.
+            OSError: If the disk refuses or has too little space; there is no reserve then.
         """
         if self._size() == RESERVE_SIZE:
             return
-        self._disk.remove(self.path)  # one that a crash has left, or whatever a link leads to
+        self._disk.remove(self.path)  # the rest of a crash, or a symbolic link
         if room(self.path.parent) < 2 * RESERVE_SIZE:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         file = self._disk.open(self.path, new=True)
         try:
-            # Not zeros, nor a hole: a disk that compresses would keep no room for those.
+            # Random bytes: a file system that compresses would keep no space for zeros or holes.
             left = memoryview(os.urandom(RESERVE_SIZE))
             while left:
                 left = left[self._disk.write(file, bytes(left)) :]
@@ -299,7 +295,7 @@ class Reserve:
             self._disk.close(file)
 
     def _size(self) -> int | None:
-        """Its length [bytes]; None if there is none."""
+        """Return the size of the reserve [bytes]; None without one."""
         try:
             return self.path.lstat().st_size
         except OSError:
@@ -307,18 +303,20 @@ class Reserve:
 
 
 EPILOG = """\
-It talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
---start or --mission it ends once that is flown; else on SIGTERM, on Ctrl-C,
-and when the process that started it is gone; what flies then holds, and a
-successor with the same journal goes on. The API describes itself:
-/openapi.json. It asks for a token, except on a socket file, which only its
-owner can open. A token: openssl rand -hex 32 > DIR/operator; one in DIR/reader
-may look, not command."""
+teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
+--start or --mission it ends after that mission; otherwise on SIGTERM, on Ctrl-C
+and when its parent process has ended. A flying robot then holds; a new teleop
+with the same journal resumes the mission.
+
+/openapi.json describes the API. The API asks for a token, except on a socket
+file, which only its owner can open. To make a token:
+openssl rand -hex 32 > DIR/operator. The token in DIR/reader may only read."""
 LOCK_PERIOD = 0.2
-"""Between two tries to get the journal [s]."""
+"""Pause between two attempts to lock the journal [s]."""
 PAUSE_LIMIT_NS = 500_000_000
-"""For the robot to be seen to hold before teleop ends [ns]."""
+"""Longest wait for the robot to hold before teleop ends [ns]."""
 SALT_SIZE = 16
+"""Size of the random salt of mission numbers [bytes]."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -331,28 +329,36 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--api",
         type=api_address,
         metavar="WHERE",
-        help="serve the API here: [HOST:]PORT, HOST being 127.0.0.1 unless you say, port 0: any; "
-        "or unix:PATH, for you alone (default: not at all)",
+        help="serve the API here: [HOST:]PORT (default HOST: 127.0.0.1; PORT 0: any free port) or "
+        "unix:PATH, for your user only (default: no API)",
     )
     parser.add_argument(
-        "--tokens", type=Path, metavar="DIR", help="token files, 'operator' and 'reader'"
+        "--tokens",
+        type=Path,
+        metavar="DIR",
+        help="folder of the token files 'operator' and 'reader'",
     )
     parser.add_argument(
-        "--audit", type=Path, metavar="FILE", help="write here who commanded what (JSON lines)"
+        "--audit", type=Path, metavar="FILE", help="log all commands and their callers (JSON lines)"
     )
-    parser.add_argument("--api-file", type=Path, metavar="FILE", help="write the API's URL here")
     parser.add_argument(
-        "--journal", type=Path, metavar="FILE", help="keep missions here (default: nowhere)"
+        "--api-file", type=Path, metavar="FILE", help="write the API's URL to this file"
+    )
+    parser.add_argument(
+        "--journal",
+        type=Path,
+        metavar="FILE",
+        help="store missions in this file (default: not stored)",
     )
     first = parser.add_mutually_exclusive_group()
-    first.add_argument("--mission", metavar="FILE", help="fly this mission, then end")
+    first.add_argument("--mission", metavar="FILE", help="fly this mission, then exit")
     first.add_argument(
-        "--start", action="store_true", help="fly the experiment's mission, then end"
+        "--start", action="store_true", help="fly the experiment's mission, then exit"
     )
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Fly missions."""
+    """Run teleop until its mission has ended or it is told to stop."""
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.process import StopSignal
     from cloudrc.records import Counted
@@ -369,11 +375,11 @@ def execute(options: argparse.Namespace) -> int:
         if options.journal:
             journal = _open_journal(options.journal, stop, served.bridge if served else None)
             if journal is None:
-                return 0  # stopped while another one had it
+                return 0  # stopped while another teleop held the journal
         service = _open_service(experiment, journal)
-        ends = _start(options, experiment, service)
+        single_mission = _start(options, experiment, service)
         ending = _Ending(service, stop)
-        over = lambda: ending() or (ends and service.over)  # noqa: E731
+        over = lambda: ending() or (single_mission and service.over)  # noqa: E731
         if exporter is not None and journal is not None and journal.repaired:
             exporter.see([Counted(0, "teleop", "journal_repaired", 1)])
         _fly(options, service, served, exporter, over, journal.trouble if journal else "")
@@ -386,20 +392,22 @@ def execute(options: argparse.Namespace) -> int:
 
 
 class _Ending:
-    """Lets teleop end: what flies is paused first, and the robot is given the time to hold."""
+    """Decide when teleop may end: first pause the mission, then wait until the robot holds."""
 
     def __init__(self, service: MissionService, asked: Callable[[], bool]) -> None:
-        self._service, self._asked = service, asked
+        self._service, self._stop_asked = service, asked
         self._since_ns: int | None = None
 
     def __call__(self) -> bool:
         import time
 
-        if not self._asked():
+        if not self._stop_asked():
             return False
         if self._since_ns is None:
             self._service.pause(time.monotonic_ns())
-            self._since_ns = time.monotonic_ns()  # its disk may have taken long
+            self._since_ns = (
+                time.monotonic_ns()
+            )  # again: pausing writes to the disk, which may take long
         return self._service.settled or time.monotonic_ns() - self._since_ns > PAUSE_LIMIT_NS
 
 
@@ -426,12 +434,12 @@ def _fly(
         calls, stops = served.bridge.take, served.bridge.take_urgent
     feed.ready()
 
-    def tell(told: list[Any]) -> None:
-        feed.tell(record for record in told if isinstance(record, Fault))  # cloud tells events
+    def publish(records: list[Any]) -> None:
+        feed.tell(record for record in records if isinstance(record, Fault))  # cloud has events
         if exporter is not None:
-            exporter.see(told)
+            exporter.see(records)
 
-    def ask() -> bool:
+    def update_and_check() -> bool:
         if exporter is not None:
             exporter.ready(service.sight.seen is not None)
             if served is not None:
@@ -439,26 +447,33 @@ def _fly(
         return stop()
 
     if trouble:
-        tell([Fault(0, "journal", trouble)])
+        publish([Fault(0, "journal", trouble)])
     serve_teleop(
-        service, peer, wire.encode, wire.decode, calls=calls, stops=stops, tell=tell, stop=ask
+        service,
+        peer,
+        wire.encode,
+        wire.decode,
+        calls=calls,
+        stops=stops,
+        tell=publish,
+        stop=update_and_check,
     )
 
 
 def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge | None) -> Journal | None:
-    """Wait for the journal as long as another teleop holds it; None if told to stop."""
+    """Open the journal once no other teleop holds it; None if stopped before."""
     import time
 
     from cloudrc.teleop.journal import Journal, JournalLockedError
 
-    said = False
+    reported = False
     while not stop():
         try:
             journal = Journal(path)
         except JournalLockedError as error:
-            if not said:
+            if not reported:
                 print(f"cloudrc teleop: {error}", file=sys.stderr, flush=True)
-                said = True
+                reported = True
             if bridge is not None:
                 bridge.close(str(error))
             time.sleep(LOCK_PERIOD)
@@ -470,7 +485,7 @@ def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge | None) -
 
 
 def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> MissionService:
-    """Remember what the journal has; what is too old to be known is taken out of it."""
+    """Make the service from the journal, and remove missions that are too old from it."""
     import os
 
     from cloudrc.errors import BadInputError
@@ -483,8 +498,8 @@ def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> Mi
         service = MissionService(limit, journal.append, journal.entries, salt=salt)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise BadInputError(
-            f"--journal {journal.path}: it holds whole entries that this version cannot read: was "
-            "it written by another one? Move it away, or name another file"
+            f"--journal {journal.path}: this version cannot read its entries; was it written by "
+            "another version? Move it away, or name another file"
         ) from error
     known = [entry for entry in journal.entries if service.book.knows(entry)]
     if trouble := shorten(journal, known):
@@ -496,7 +511,7 @@ def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> Mi
 def _start(
     options: argparse.Namespace, experiment: ResolvedExperiment, service: MissionService
 ) -> bool:
-    """Start the mission that the flags ask for, if any; say whether there is one."""
+    """Start the mission of the command line, if any; return whether there is one."""
     import time
 
     from cloudrc import assembly
@@ -509,14 +524,14 @@ def _start(
         mission, name = _load(options.mission, experiment), Path(options.mission).stem
     plan = assembly.mission_plan(mission, criteria.time_limit_s, experiment.seed)
     if any(each.order.plan == plan for each in service.book.open()):
-        return True  # of the process before this one, which had the same flags: it goes on
+        return True  # the previous process started it with the same options: it resumes
     try:
         service.create(Order(plan, name, contact=criteria.contact), time.monotonic_ns())
     except ConflictError as error:
         if not options.api:
             raise
         print(f"cloudrc teleop: {error}", file=sys.stderr, flush=True)
-        return False  # whoever acknowledges a stop, or cancels what is in the way, needs the API
+        return False  # the operator can solve the conflict through the API
     return True
 
 

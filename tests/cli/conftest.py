@@ -1,4 +1,4 @@
-"""A disk model for the journal: limited space, refused operations and kills."""
+"""A disk for the journal with limited room, which can fail or kill the process."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ MIB = 1 << 20
 
 
 class KilledError(BaseException):
-    """Stands for the death of the process; nothing may catch it."""
+    """Stand for the end of the process: nothing catches it."""
 
 
 class Volume(Disk):
-    """A real folder with limited space, which refuses operations or kills the process.
+    """A real folder with limited room, which can fail or kill the process.
 
     Attributes:
-        room: Space for all files of the folder [bytes].
-        error: The errno of a full disk.
-        refused: The operation that fails, the ending of the file's name, and the errno.
+        room: Room for all files of the folder [bytes].
+        error: Error number when the room is used up.
+        refused: Operation that fails, for names with an ending, and the error number.
         steps: Number of operations so far.
         kill_at: Number of the operation before which the process is killed.
     """
@@ -57,7 +57,7 @@ class Volume(Disk):
         )  # at most half of it, as in the tests of the journal
 
     def sync(self, file: int) -> None:
-        self._step("sync")  # a crash of the machine is not modelled
+        self._step("sync")  # a crash of the machine is not tested here
 
     def replace(self, new: Path, path: Path) -> None:
         self._step("replace", path)

@@ -48,7 +48,7 @@ def test_the_emergency_stop_reaches_the_only_run_from_any_folder(
         assert main(["mission", "estop"]) == 0
         assert len(api.alarms) == 1
     said = capsys.readouterr()
-    assert said.out.startswith("emergency stop: the robot is told")
+    assert said.out.startswith("emergency stop: sent")
     assert said.err == f"cloudrc: using the run in {tmp_path / 'out'}\n"
 
 

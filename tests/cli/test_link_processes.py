@@ -1,4 +1,4 @@
-"""The link's processes of a test of itself: what is asked in vain, and what their end says."""
+"""Processes of `cloudrc link verify`: what they cannot do, and how they report an early end."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_an_early_end_has_the_exit_code_of_the_process(
     assert str(ended.value).endswith(says)
 
 
-def test_what_netem_cannot_be_is_bad_input_and_names_the_flag() -> None:
+def test_a_profile_that_netem_cannot_do_names_the_flag() -> None:
     with pytest.raises(BadInputError) as refused:
         refuse_impossible(load_profile("lossy"), "netem")
     assert str(refused.value) == (
@@ -56,11 +56,11 @@ def test_what_netem_cannot_be_is_bad_input_and_names_the_flag() -> None:
 
 
 @pytest.mark.parametrize(("name", "mode"), [("lossy", "relay"), ("paper-p3", "netem")])
-def test_what_a_shaper_can_be_is_not_refused(name: str, mode: str) -> None:
+def test_a_profile_that_the_shaper_can_do_is_accepted(name: str, mode: str) -> None:
     refuse_impossible(load_profile(name), mode)
 
 
-def test_a_links_process_is_told_whose_end_is_its_own(tmp_path: Path) -> None:
+def test_a_links_process_gets_the_id_of_its_parent(tmp_path: Path) -> None:
     place = Place(ANY, ANY, ANY, inside=("printenv", PARENT))
     one = link_processes._start(tmp_path, "uplink", place, "relay")
     one.process.wait()

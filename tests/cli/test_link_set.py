@@ -1,4 +1,4 @@
-"""`cloudrc link set`: what is asked for becomes a profile, takes force, and is read back."""
+"""`cloudrc link set`: settings become a profile, take effect, and are read back."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TIMED = {
 }
 
 
-def test_single_values_leave_all_else_as_it_is() -> None:
+def test_single_values_change_nothing_else() -> None:
     made = edit(Document(dict(TIMED)), None, ["uplink.loss=0.02", "link.uplink.delay_ms=60"])
     assert made.values == {**TIMED, "uplink": {"delay_ms": 60.0, "loss": 0.02}}
     assert made.cause == "uplink.loss=0.02, link.uplink.delay_ms=60"
@@ -43,7 +43,7 @@ def test_single_values_leave_all_else_as_it_is() -> None:
     assert made.notes == []
 
 
-def test_the_time_line_does_not_change_a_value_set_by_hand() -> None:
+def test_the_time_line_no_longer_changes_a_value_set_by_hand() -> None:
     made = edit(Document(dict(TIMED)), None, ["downlink.delay_ms=120"])
     assert made.values["downlink"]["delay_ms"] == 120.0
     assert made.values["downlink"]["changes"] == [
@@ -63,7 +63,7 @@ def test_a_delay_by_hand_ends_a_trace(tmp_path: Path) -> None:
     assert made.notes == ["the uplink no longer follows its trace"]
 
 
-def test_a_profile_takes_the_old_ones_place_and_begins_anew() -> None:
+def test_a_profile_replaces_the_old_one_and_starts_anew() -> None:
     made = edit(Document(dict(TIMED)), "satellite", ["uplink.delay_ms=280"])
     assert made.values["uplink"]["delay_ms"] == 280.0
     assert made.values["downlink"]["delay_ms"] == 300.0
@@ -83,16 +83,14 @@ def test_a_profile_takes_the_old_ones_place_and_begins_anew() -> None:
         ("nowhere", [], "nowhere"),
     ],
 )
-def test_what_makes_no_sense_is_refused(
-    profile: str | None, settings: list[str], words: str
-) -> None:
+def test_invalid_settings_are_refused(profile: str | None, settings: list[str], words: str) -> None:
     with pytest.raises(BadInputError) as refused:
         edit(Document(dict(TIMED)), profile, settings)
     assert words in str(refused.value)
 
 
 class Flight:
-    """A run here whose relay looks whenever the command waits."""
+    """A local run whose relay reads the change while the command waits."""
 
     def __init__(self, folder: Path) -> None:
         direction = DirectionProfile(0.045)
@@ -110,11 +108,11 @@ class Flight:
         self.control.swap()
 
     def delay(self, way: str) -> float:
-        """One way, of a packet that is sent now [s]."""
+        """Return the one-way delay of a packet sent now [s]."""
         return self.links[way].send(1, 3, 0, 172, 0)[0] * 1e-9
 
 
-def test_what_a_full_disk_does_not_take_is_told_once_it_has_room(
+def test_state_that_a_full_disk_refused_is_written_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flight = Flight(tmp_path / "run")
@@ -160,19 +158,19 @@ def test_a_run_here_is_found_changed_and_read_back(
     assert document["links"]["downlink"]["changes"] == 2
 
 
-def test_a_relay_that_does_not_answer_is_said(
+def test_a_relay_that_does_not_answer_is_an_error(
     flight: Flight, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_set, "LOCAL_PATIENCE", 0.0)
     monkeypatch.setattr(link_set, "sleep", lambda _: None)
     assert main(["link", "set", "downlink.delay_ms=120"]) == 4
     assert capsys.readouterr().err == (
-        "cloudrc: error: the uplink and downlink did not take the change over within 0 s; "
+        "cloudrc: error: the uplink and downlink did not apply the change within 0 s; "
         f"see {Path('runs/latest/relay.log')}\n"
     )
 
 
-def test_a_change_that_the_link_refuses_is_an_error(
+def test_a_refused_change_is_an_error_with_the_reason(
     flight: Flight, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = Path("runs/latest/link")
@@ -185,10 +183,10 @@ def test_a_change_that_the_link_refuses_is_an_error(
 
     monkeypatch.setattr(link_set, "sleep", refuse)
     assert main(["link", "set", "uplink.delay_ms=1"]) == 2
-    assert "the uplink is as it was: netem cannot do this" in capsys.readouterr().err
+    assert "the uplink is unchanged: netem cannot do this" in capsys.readouterr().err
 
 
-def test_without_a_flight_it_says_what_to_start(
+def test_a_named_run_that_does_not_fly_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -207,7 +205,7 @@ def test_without_a_flight_it_says_what_to_start(
         [],
     ],
 )
-def test_without_a_flight_what_is_wrong_comes_first(
+def test_without_a_flight_a_wrong_line_is_reported_first(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -215,7 +213,7 @@ def test_without_a_flight_what_is_wrong_comes_first(
     assert main(["link", "set", *words]) == 2
 
 
-def test_the_table_names_all_that_is_asked(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_names_all_settings(capsys: pytest.CaptureFixture[str]) -> None:
     own = {"corrupt": 0.1, "reorder": 0.05, "duplicate": 0.01, "correlation": 0.4,
            "keep_order": True, "blackouts": [{}]}  # fmt: skip
     state = LinkState("relay", "", "relay", "uplink", {"uplink": own}, "", 1)

@@ -1,4 +1,4 @@
-"""`cloudrc link`: what there is, a trace of a run or a log, a picture of a profile."""
+"""`cloudrc link`: its actions, traces of runs and logs, pictures of profiles."""
 
 from __future__ import annotations
 
@@ -54,7 +54,9 @@ def test_an_action_has_to_be_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert "an action is missing" in capsys.readouterr().err
 
 
-def test_a_run_has_both_ways(run: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_gives_a_trace_per_direction(
+    run: Path, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["link", "record", str(run), "-o", "trace.csv"]) == 0
     said = capsys.readouterr().out
     for way in ("uplink", "downlink"):
@@ -68,14 +70,14 @@ def test_a_run_has_both_ways(run: Path, here: Path, capsys: pytest.CaptureFixtur
         assert read_table(here / f"trace-{way}.csv")
 
 
-def test_one_way_of_a_recording_alone(run: Path, here: Path) -> None:
+def test_one_direction_of_a_recording(run: Path, here: Path) -> None:
     recording = str(run / "mission.mcap")
     assert main(["link", "record", recording, "-o", "t.csv", "--direction", "downlink"]) == 0
     assert [path.name for path in here.iterdir()] == ["t.csv"]
 
 
 def test_half_of_a_runs_round_trips(run: Path, here: Path) -> None:
-    """Newest wins prefers the quick ones: less than the 30 ms that the profile has one way."""
+    """Only fast datagrams are applied: below the 30 ms of the profile."""
     assert main(["link", "record", str(run), "-o", "t.csv", "--halve-rtt"]) == 0
     trace = read_trace(here / "t.csv")
     assert trace.losses is None
@@ -111,7 +113,7 @@ def test_a_ping_log(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
         ("a.json.gz", gzip.compress(b"{}", mtime=0), "choose --direction"),
     ],
 )
-def test_what_cannot_be_used_is_refused_in_one_line(
+def test_an_unusable_source_is_refused_in_one_line(
     name: str, data: bytes, says: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (here / name).write_bytes(data)
@@ -122,7 +124,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     assert not (here / "t.csv").exists()
 
 
-def test_a_compressed_file_is_not_unpacked_without_limit(
+def test_a_small_file_that_unpacks_to_a_huge_one_is_refused(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_record, "UNPACKED_MAX", 1 << 20)
@@ -138,7 +140,7 @@ def test_a_compressed_file_is_not_unpacked_without_limit(
     monkeypatch.setattr(gzip, "open", Counted)
     (here / "bomb.json.gz").write_bytes(gzip.compress(bytes(8 << 20)))
     assert main(["link", "record", "bomb.json.gz", "-o", "t.csv"]) == 2
-    said = "cannot be unpacked: it holds more than 1 MiB; give the file itself"
+    said = "cannot be unpacked: it holds more than 1 MiB; give the unpacked file"
     assert capsys.readouterr().err == f"cloudrc: error: bomb.json.gz: {said}\n"
     assert most == (1 << 20) + 1
 
@@ -182,7 +184,7 @@ def test_a_file_with_any_key_of_an_experiment_is_verified_as_one(key: str, here:
     assert find("./mine.yaml", []).uplink.delay_ms == 12.0
 
 
-def test_the_delay_that_a_relay_shows_is_that_of_its_trace(here: Path) -> None:
+def test_a_relay_exports_the_delay_of_its_trace(here: Path) -> None:
     (here / "t.csv").write_text("time_s,delay_ms\n0,40\n5,90\n")
     (here / "mine.yaml").write_text("link: {uplink: {trace: t.csv}, downlink: {delay_ms: 25}}\n")
     told: dict[str, float] = {}
@@ -192,7 +194,7 @@ def test_the_delay_that_a_relay_shows_is_that_of_its_trace(here: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
-def test_a_profile_is_drawn_and_put_into_numbers(
+def test_a_profile_is_drawn_and_its_statistics_printed(
     kind: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     line = ["link", "show", "handover", "--seconds", "12", "-o", f"a.{kind}"]
@@ -208,7 +210,7 @@ def test_a_profile_is_drawn_and_put_into_numbers(
     assert (here / f"a.{kind}").read_bytes() == first, "the same link gives the same picture"
 
 
-def test_rate_and_number_of_packets_are_as_asked(
+def test_rate_and_number_of_packets_can_be_set(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (here / "mine.yaml").write_text("uplink: {delay_ms: 70, jitter_ms: 25}\n")
@@ -221,7 +223,7 @@ def test_rate_and_number_of_packets_are_as_asked(
     assert overtaken == pytest.approx({50: 19.0, 200: 59.0}, abs=3.0)
 
 
-def test_a_trace_has_one_way(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_trace_has_one_direction(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = "\n".join(f"{n / 100},{40 + n % 7},{int(n % 10 == 0)}" for n in range(500))
     (here / "t.csv").write_text(f"time_s,delay_ms,loss\n{rows}\n")
     assert main(["link", "show", "t.csv"]) == 0

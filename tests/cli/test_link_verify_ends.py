@@ -1,4 +1,4 @@
-"""`cloudrc link verify --ends`: what `helm test` asks the pods of a release, over real HTTP."""
+"""`cloudrc link verify --ends`, which `helm test` runs, over real HTTP."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ APPLIED = DirectionProfile(0.045, loss=0.02, duplicate=0.01, rate=3e6)
 
 @dataclass
 class Release:
-    """The exporters of two pods; whatever is asked of them makes their counters go on."""
+    """The exporters of two pods; each poll lets their counters advance."""
 
     world: Exporter
     cloud: Exporter
@@ -38,7 +38,7 @@ class Release:
     looks: int = 0
 
     def hears(self, end: str, mean: str, *, trip: bool = False, stamp_ns: int = 5) -> None:
-        """Let an end come to a verdict on the direction that it hears."""
+        """Give an end a verdict on the direction that it receives."""
         exporter, uplink = (self.cloud, True) if end == "cloud" else (self.world, False)
         measured = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}[mean]
         name = "round_trip" if trip else "mean"
@@ -50,7 +50,7 @@ class Release:
         )
 
     def count(self, seconds: float) -> None:
-        """Time passes: both ends send, and their links see it."""
+        """Let time pass: both ends send, and their links count."""
         self.looks += 1
         total = self.looks * SENT_PER_LOOK
         for exporter in (self.world, self.cloud):
@@ -76,19 +76,19 @@ def release(monkeypatch: pytest.MonkeyPatch) -> Iterator[Release]:
         made = Release(world, cloud, {"uplink": up, "downlink": down}, pods)
         made.count(0.0)
         monkeypatch.setattr(link_verify_ends.time, "sleep", made.count)
-        monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 0.0)  # since no time passes
+        monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 0.0)  # as no time passes
         yield made
 
 
 @pytest.fixture
 def proxy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A proxy that nobody serves: whoever asks it gets no answer."""
+    """Name a proxy that does not answer."""
     for name in ("no_proxy", "NO_PROXY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
 
 
-def test_a_proxy_of_the_environment_is_not_asked(
+def test_a_proxy_of_the_environment_is_not_used(
     release: Release, proxy: None, tmp_path: Path
 ) -> None:
     release.hears("world", "ok")
@@ -113,13 +113,13 @@ def test_a_release_is_believed_once_both_ends_do(release: Release) -> None:
     assert said.verdict == "believed"
     assert said.shaper == "shaped by relay"
     mean, loss = said.findings["uplink"].rows
-    assert mean.applied == pytest.approx(0.0456, abs=1e-4), "with its time at the rate"
+    assert mean.applied == pytest.approx(0.0456, abs=1e-4), "including the transmission time"
     assert loss.applied == 0.02
     assert said.findings["uplink"].evidence.passed == said.findings["uplink"].evidence.sent
     assert as_text(said).splitlines()[-1].startswith("BELIEVED")
 
 
-def test_what_one_end_hears_is_named_for_its_direction(release: Release) -> None:
+def test_a_fault_names_its_direction(release: Release) -> None:
     release.hears("world", "off")
     release.hears("cloud", "ok")
     said = ask(release)
@@ -139,7 +139,7 @@ def test_counters_at_both_ends_show_a_bypass(release: Release) -> None:
     ("shaper", "leaves", "code"),
     [("relay", "eth0", "shaped_twice"), ("netem", "eth1", "wrong_interface")],
 )
-def test_what_the_links_find_on_the_way_is_named(
+def test_qdiscs_that_the_links_find_are_named(
     release: Release, shaper: str, leaves: str, code: str
 ) -> None:
     near = Near(leaves, {"eth0": [{"kind": "netem"}]})
@@ -151,7 +151,7 @@ def test_what_the_links_find_on_the_way_is_named(
 
 
 @pytest.mark.parametrize(("applied", "told_so"), [(0.090, True), (0.0452, False)])
-def test_a_misinformed_shaper_differs_from_a_wrong_one(
+def test_a_wrong_setting_differs_from_a_wrong_shaper(
     release: Release, applied: float, told_so: bool
 ) -> None:
     said = write_told(Told("relay", "", DirectionProfile(applied)))
@@ -164,7 +164,7 @@ def test_a_misinformed_shaper_differs_from_a_wrong_one(
     assert ("it was told so" in cause.text) is told_so
 
 
-def test_once_one_direction_fails_the_other_is_not_awaited(
+def test_once_one_direction_is_off_the_wait_is_short(
     release: Release, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_verify_ends, "OTHER_LIMIT", 0.0)
@@ -174,7 +174,7 @@ def test_once_one_direction_fails_the_other_is_not_awaited(
     assert release.looks <= 3, "once at the start, once it is off"
 
 
-def test_what_was_off_for_a_moment_does_not_cut_the_wait_short(
+def test_a_verdict_off_for_a_moment_does_not_end_the_wait(
     release: Release, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_verify_ends, "OTHER_LIMIT", 0.05)
@@ -182,18 +182,18 @@ def test_what_was_off_for_a_moment_does_not_cut_the_wait_short(
     release.hears("cloud", "open")
     began = time.monotonic()
 
-    def goes_on(seconds: float) -> None:
+    def recover(seconds: float) -> None:
         release.count(seconds)
         if release.looks > 2:
             release.hears("world", "ok", stamp_ns=6)
         if time.monotonic() - began > 0.2:
             release.hears("cloud", "ok", stamp_ns=6)
 
-    monkeypatch.setattr(link_verify_ends.time, "sleep", goes_on)
+    monkeypatch.setattr(link_verify_ends.time, "sleep", recover)
     assert ask(release).verdict == "believed"
 
 
-def test_a_link_that_does_not_tell_leaves_what_is_applied_open(release: Release) -> None:
+def test_a_link_without_status_leaves_applied_values_open(release: Release) -> None:
     release.links["uplink"].tells(lambda: "{}")
     release.hears("world", "ok")
     release.hears("cloud", "ok")
@@ -210,13 +210,13 @@ def test_without_commands_it_says_to_fly_first(release: Release) -> None:
     assert any("fly a mission first" in note for note in said.notes)
 
 
-def test_round_trips_are_told_as_such(release: Release) -> None:
+def test_a_verdict_by_round_trips_is_noted(release: Release) -> None:
     release.hears("world", "ok")
     release.hears("cloud", "ok", trip=True)
     assert "do not share a clock" in "".join(ask(release).notes)
 
 
-def test_what_the_ends_cannot_judge_is_said_and_no_blank_belief(release: Release) -> None:
+def test_what_the_ends_cannot_judge_is_noted(release: Release) -> None:
     release.hears("world", "ok")
     release.hears("cloud", "ok")
     for name, asked, measured in (
@@ -229,20 +229,20 @@ def test_what_the_ends_cannot_judge_is_said_and_no_blank_belief(release: Release
     text = as_text(said)
     assert said.verdict == "believed"
     assert "rate of 2000 kbit/s (applied: 3000 kbit/s) NOT JUDGED" in text
-    assert "0% was watched" in text
+    assert "0% of its time line was measured" in text
     assert "jitter, judged within 0.5 ms only" in text
     assert "within 25% only" in text
-    assert text.splitlines()[-1].endswith("but for what is NOT JUDGED (above)")
+    assert text.splitlines()[-1].endswith("except what is NOT JUDGED (above)")
 
 
 @pytest.mark.parametrize(
     ("asked", "applied", "code"),
     [(2e6, 3e6, "rate_ignored"), (2e6, None, "rate_ignored"), (5e6, 3e6, "slow")],
 )
-def test_a_shaper_that_tells_of_another_rate_is_not_believed(
+def test_a_shaper_that_reports_another_rate_is_not_believed(
     release: Release, asked: float, applied: float | None, code: str
 ) -> None:
-    """Its datagrams come alone, and are as long under way at any rate."""
+    """Single datagrams do not measure the rate."""
     said_so = write_told(Told("relay", "", DirectionProfile(0.045, rate=applied)))
     release.links["uplink"].tells(lambda: said_so)
     release.hears("world", "ok")
@@ -256,7 +256,7 @@ def test_a_shaper_that_tells_of_another_rate_is_not_believed(
     assert "NOT JUDGED" not in as_text(said)
 
 
-def test_what_is_undecided_says_how_long_it_takes(release: Release) -> None:
+def test_an_undecided_verdict_says_how_long_it_takes(release: Release) -> None:
     release.hears("world", "ok")
     release.hears("cloud", "open")
     release.cloud.see([LinkChecked(5, True, "datagrams", 8800, 3300, 0.0, 0.0, "told", 3300)])
@@ -268,9 +268,11 @@ def test_what_is_undecided_says_how_long_it_takes(release: Release) -> None:
 
 @pytest.mark.parametrize(
     ("needs", "why"),
-    [(115_000.0, "takes 115000 datagrams, 1150 s"), (math.inf, "the ends may add")],
+    [(115_000.0, "needs 115000 datagrams, 1150 s"), (math.inf, "for any number of datagrams")],
 )
-def test_an_undecidable_check_is_reported_at_once(release: Release, needs: float, why: str) -> None:
+def test_an_undecidable_quantity_is_noted_and_not_awaited(
+    release: Release, needs: float, why: str
+) -> None:
     release.hears("world", "ok")
     release.hears("cloud", "ok")
     for name, asked in (("round_trip", 0.09), ("round_trip_takes", needs), ("correlation", 0.9)):
@@ -278,12 +280,12 @@ def test_an_undecidable_check_is_reported_at_once(release: Release, needs: float
     said = ask(release)
     assert said.verdict == "believed"
     assert [one for one in said.notes if "round trip, mean NOT JUDGED: " in one and why in one]
-    assert "uplink: correlation 0.9 NOT JUDGED: netem realises next to none of it" in said.notes
-    assert "round trips are judged" not in as_text(said)
-    assert as_text(said).splitlines()[-1].endswith("but for what is NOT JUDGED (above)")
+    assert "uplink: correlation 0.9 NOT JUDGED: netem realises almost none of it" in said.notes
+    assert "judged by round trips" not in as_text(said)
+    assert as_text(said).splitlines()[-1].endswith("except what is NOT JUDGED (above)")
 
 
-def test_what_netem_applies_is_told_as_netem_makes_it(release: Release) -> None:
+def test_applied_values_of_netem_are_its_own_approximation(release: Release) -> None:
     applied = DirectionProfile(0.045, loss=0.2, duplicate=0.3)
     release.links["uplink"].tells(lambda: write_told(Told("netem", "", applied)))
     release.hears("world", "ok")
@@ -294,5 +296,5 @@ def test_what_netem_applies_is_told_as_netem_makes_it(release: Release) -> None:
 
 def test_ends_that_do_not_answer_are_a_timeout(release: Release) -> None:
     release.world.close()
-    with pytest.raises(TimedOutError, match="world could not be asked"):
+    with pytest.raises(TimedOutError, match="world did not answer"):
         ask(release, 0.0)

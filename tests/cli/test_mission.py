@@ -1,4 +1,4 @@
-"""`cloudrc mission` against the real API: what is printed, and what it ends with."""
+"""`cloudrc mission` against the real API: its output and exit codes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import mission_local
-from cloudrc.cli import mission_local as mission_follow
 from cloudrc.cli.client import Api, reader
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
@@ -35,8 +34,8 @@ def api() -> Iterator[Running]:
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(mission_follow, "PERIOD", 0.02)
-    monkeypatch.setattr(mission_follow, "PATIENCE", 0.5)
+    monkeypatch.setattr(mission_local, "PERIOD", 0.02)
+    monkeypatch.setattr(mission_local, "PATIENCE", 0.5)
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "two.yaml").write_text(FILE)
@@ -58,7 +57,7 @@ def mission(api: Running, monkeypatch: pytest.MonkeyPatch) -> Command:
 
 
 def pilot(api: Running, *points: tuple[float, float, float]) -> threading.Thread:
-    """Fly the robot from point to point, each once the one before is reached."""
+    """Move the robot from point to point, each once the mission has reached the previous one."""
 
     def fly() -> None:
         api.until(lambda: api.get("/v1/state")["mission"] is not None)
@@ -95,7 +94,7 @@ def test_fly_under_one_key_flies_once_and_leaves_its_verdict(
 ) -> None:
     log = folder / "termination-log"
     log.touch()
-    monkeypatch.setattr(mission_follow.leave_message, "__defaults__", (log,))
+    monkeypatch.setattr(mission_local.leave_message, "__defaults__", (log,))
     thread = pilot(api, A)
     end = threading.Thread(target=lambda: (thread.join(), api.post("/v1/missions/m1/cancel")))
     end.start()
@@ -113,12 +112,12 @@ def test_a_stopped_job_cancels_its_mission(
     def stopped(self: object, mission_id: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(mission_follow.Follower, "follow", stopped)
+    monkeypatch.setattr(mission_local.Follower, "follow", stopped)
     assert mission("fly", "--mission", "two.yaml") == 130
     assert api.state_of("m1") == "cancelled"
 
 
-def test_a_second_one_is_refused_with_5_and_names_the_first(
+def test_a_second_mission_is_refused_and_names_the_first(
     api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
 ) -> None:
     api.post("/v1/missions", {"waypoints": [{"position_m": B}]})
@@ -150,7 +149,9 @@ def test_an_api_that_is_not_there_ends_with_4_or_5(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("url", ["here", "unix:", "ftp://h:1", "http://me@h:1", "http://"])
-def test_an_api_without_a_usable_url_is_said(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_url_of_the_api_is_an_error(
+    url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["mission", "status", "--api", url]) == 2
     said = f"cloudrc: error: --api {url}: give http://HOST:PORT or unix:PATH\n"
     assert capsys.readouterr().err == said
@@ -169,7 +170,7 @@ def test_the_operators_verbs(
         points = ["0.5", "-1", "1.2"] if verb == "goto" else []
         assert mission(verb, *points) == 0
         assert f"mission m1 (far): {word}" in capsys.readouterr().out
-    assert mission("goto", "0.5", "0", "1") == 5  # it flies
+    assert mission("goto", "0.5", "0", "1") == 5  # the mission is flying
     assert mission("cancel") == 0
     assert mission("goto", "0", "0", "99") == 2
     assert "beyond the fence" in capsys.readouterr().err
@@ -212,7 +213,7 @@ def test_the_local_run_is_found_and_needs_no_token(
             assert main(["mission", "estop"]) == 0
         said = capsys.readouterr().out
         assert said.splitlines() == [
-            "emergency stop: the robot is told to stop its rotors until it has",
+            "emergency stop: sent, and repeated until the rotors have stopped",
             "mission m1 has failed",
         ]
 
@@ -233,9 +234,9 @@ def test_emergency_stop_and_acknowledgement(
     assert mission("acknowledge") == 0
     api.until(lambda: api.get("/v1/state")["seen"]["guard"] == "GROUND")
     assert capsys.readouterr().out.splitlines() == [
-        "acknowledged: the next mission may fly; a landing low over the ground ends first",
-        "where it was stopped or has touched down, the robot takes off only once it has been "
-        "still, 0.5 m inside the fence",
+        "acknowledged: the next mission may fly; a landing close to the ground is completed first",
+        "after a stop or a touchdown the robot takes off only once it is at rest, and at least "
+        "0.5 m inside the fence",
     ]
 
 
@@ -247,7 +248,7 @@ def test_the_token_file_comes_from_flag_or_environment(
 ) -> None:
     command = ["mission", "hold", "--api", api.url]
     assert main(command) == 5
-    assert "wants a token; name its file: --token-file FILE" in capsys.readouterr().err
+    assert "asks for a token; name its file: --token-file FILE" in capsys.readouterr().err
     (folder / "wrong").write_text("not-the-operators-token\n")
     monkeypatch.setenv("CLOUDRC_TOKEN_FILE", str(folder / "wrong"))
     assert main(command) == 5
@@ -265,7 +266,7 @@ def test_the_token_file_comes_from_flag_or_environment(
     assert "two words" not in error
 
 
-def test_without_run_and_cluster_both_ways_out_are_named(
+def test_without_run_and_cluster_both_remedies_are_named(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["mission", "status"]) == 3
@@ -281,7 +282,7 @@ def test_a_missing_verb_or_point_is_refused(capsys: pytest.CaptureFixture[str]) 
     assert main(["mission", "holt"]) == 2
     assert "hold" in capsys.readouterr().err
     assert main(["mission", "goto", "1", "2", "up"]) == 2
-    assert "'up' is no number of metres" in capsys.readouterr().err
+    assert "'up' is not a number of metres" in capsys.readouterr().err
 
 
 def test_events_can_be_followed(api: Running) -> None:

@@ -1,4 +1,4 @@
-"""`cloudrc mission run`, interrupted: what it says next ends that mission and no other."""
+"""`cloudrc mission run`, interrupted: the command that it prints cancels this mission only."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ def _interrupted(*arguments: object) -> None:
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(("flags", "word"), [([], "flies on"), (["--queue"], "waits or flies on")])
-def test_the_advice_ends_the_mission_that_was_ordered(
+@pytest.mark.parametrize(
+    ("flags", "word"), [([], "is still flying"), (["--queue"], "is waiting or flying")]
+)
+def test_the_printed_command_cancels_this_mission(
     flags: list[str],
     word: str,
     tmp_path: Path,
@@ -38,7 +40,7 @@ def test_the_advice_ends_the_mission_that_was_ordered(
         (advice,) = (
             line for line in capsys.readouterr().err.splitlines() if line.startswith("mission")
         )
-        assert advice == f"mission {mine} {word}; end it: cloudrc mission cancel {mine}"
+        assert advice == f"mission {mine} {word}; cancel it: cloudrc mission cancel {mine}"
         assert main([*advice.split("cloudrc ")[1].split(), "--api", api.url]) == 0
         missions = Api(api.url).get("/v1/missions")["missions"]
         states = {each["id"]: each["state"] for each in missions}

@@ -1,4 +1,4 @@
-"""`cloudrc mission status` while the robot or cloud is silent: what is past is said to be so."""
+"""`cloudrc mission status` while the robot or cloud is silent: old values are marked as old."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SEEN = {
 
 
 class Api:
-    """Says how things are."""
+    """An API with a fixed state."""
 
     state: dict[str, Any]
 
@@ -57,7 +57,7 @@ def test_a_robot_that_is_not_heard_has_no_present_state(
     ]
 
 
-def test_one_that_is_heard_has(
+def test_a_robot_that_is_heard_has_a_present_state(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen = {**SEEN, "age_s": 0.02, "guard_for_s": 4.5, "next_step": "the robot flies"}
@@ -69,11 +69,11 @@ def test_one_that_is_heard_has(
 
 
 @pytest.mark.parametrize(("age", "heard"), [(None, "never"), (0.1, "0.1 s ago")])
-def test_before_the_robot_is_seen_it_says_whether_cloud_is_heard(
+def test_before_the_first_telemetry_cloud_is_mentioned(
     age: float | None,
     heard: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     (line,) = status(monkeypatch, capsys, seen=None, cloud_age_s=age)
-    assert line == f"the robot has not been seen yet; is the link up? cloud heard {heard}"
+    assert line == f"no telemetry from the robot yet; is the link up? cloud heard {heard}"

@@ -1,4 +1,4 @@
-"""`cloudrc teleop`: what keeps it from starting is one sentence."""
+"""`cloudrc teleop`: each reason not to start is one sentence."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_without_fastapi_the_api_is_refused_and_the_extra_named(
 
 
 @pytest.mark.parametrize("entry", [{"a": 1}, {"mission": "m1"}, {"entry": "order", "id": 7}])
-def test_a_journal_of_another_format_is_refused_and_kept(
+def test_a_journal_of_another_format_is_refused_unchanged(
     entry: dict[str, Any], tmp_path: Path
 ) -> None:
     file = tmp_path / "journal"
@@ -42,7 +42,7 @@ def test_a_journal_of_another_format_is_refused_and_kept(
 
 
 @pytest.mark.process
-def test_what_it_cannot_have_is_named(tmp_path: Path) -> None:
+def test_a_missing_resource_is_named(tmp_path: Path) -> None:
     (tmp_path / "operator").write_text("a token of the operator".replace(" ", "-"))
     tokens = f"--tokens={tmp_path}"
     with socket.create_server(("127.0.0.1", 0)) as taken:

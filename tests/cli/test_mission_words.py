@@ -1,4 +1,4 @@
-"""`cloudrc mission`: words that come from elsewhere stay in their line, and steer no terminal."""
+"""`cloudrc mission`: foreign text stays in its line and cannot control the terminal."""
 
 from __future__ import annotations
 
@@ -11,11 +11,9 @@ import pytest
 import yaml
 
 from cloudrc.cli import client, mission_cluster, mission_local
-from cloudrc.cli import mission_local as mission_follow
 from cloudrc.cli.main import main
 from cloudrc.cli.output import harmless
 from cloudrc.cluster import jobs
-from cloudrc.cluster import jobs as follow
 from cloudrc.cluster.jobs import JobStatus
 from cloudrc.errors import BadInputError
 from cloudrc.teleop.store import SHOWN as EVENTS
@@ -30,19 +28,19 @@ SHOWN = r"far\x1b[2J\nm9  forged\r\x9b31m\x7f\u202e"
 def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
     monkeypatch.chdir(tmp_path)
     with running(unix=True) as one:
-        # Past the API, which refuses such a name: a journal may hold what another version took.
+        # Bypass the API, which refuses such a name: the journal of another version may hold it.
         made = one.bridge.submit(lambda service, now_ns: service.create(Order(PLAN, NAME), now_ns))
         made.result(10.0)
         yield one
 
 
-def test_what_can_be_shown_stays_as_it_is() -> None:
+def test_printable_text_stays_unchanged() -> None:
     assert harmless("Zur Tür, 3 µm - 門") == "Zur Tür, 3 µm - 門"
     assert harmless("\ud800\u2028\0") == r"\ud800\u2028\x00"
 
 
 @pytest.mark.parametrize("words", ["list", "status", "status m1", "cancel", "hold"])
-def test_a_missions_name_is_shown_and_does_nothing(
+def test_a_missions_name_is_shown_without_effect(
     words: str, api: Running, capsys: pytest.CaptureFixture[str]
 ) -> None:
     main(["mission", *words.split(), "--api", api.url])
@@ -53,7 +51,7 @@ def test_a_missions_name_is_shown_and_does_nothing(
 
 
 @pytest.mark.parametrize("form", ["json", "yaml"])
-def test_json_gives_names_unchanged_but_safe_for_a_terminal(
+def test_documents_hold_the_name_in_printable_form(
     form: str, api: Running, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["mission", "list", "--api", api.url, "-o", form]) == 0
@@ -64,7 +62,7 @@ def test_json_gives_names_unchanged_but_safe_for_a_terminal(
 
 
 class Hostile:
-    """An API that says what it likes."""
+    """An API that answers with hostile text."""
 
     def post(self, path: str, body: object = None) -> dict[str, object]:
         return {"id": NAME, "state": NAME, "waypoints": 1}
@@ -76,12 +74,12 @@ class Hostile:
         return {"events": [event], "verdict": verdict}
 
 
-def test_events_and_verdicts_are_shown_and_do_nothing(
+def test_events_and_verdicts_are_shown_without_effect(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = tmp_path / "termination-log"
     log.touch()
-    monkeypatch.setattr(mission_follow.leave_message, "__defaults__", (log,))
+    monkeypatch.setattr(mission_local.leave_message, "__defaults__", (log,))
     for module in (mission_local, client):
         monkeypatch.setattr(module, "Api", lambda *_: Hostile())
     assert main(["mission", "fly", "--mission", "pipes", "--api", "unix:there"]) == 1
@@ -93,13 +91,13 @@ def test_events_and_verdicts_are_shown_and_do_nothing(
         assert [c for c in said if not c.isprintable() and c != "\n"] == []
 
 
-def test_what_a_pod_has_said_is_shown_and_does_nothing(
+def test_text_of_a_pod_is_shown_without_effect(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     job = JobStatus("job-1", "uid", "failed", "now", 1, NAME)
     monkeypatch.setattr(mission_cluster, "_place", lambda options: None)
     monkeypatch.setattr(jobs, "list_jobs", lambda release: [job])
-    monkeypatch.setattr(follow, "logs", lambda release, name: [NAME])
+    monkeypatch.setattr(jobs, "logs", lambda release, name: [NAME])
     options = argparse.Namespace(id=None, output="table", follow=False)
     for verb, lines in (("list", 2), ("logs", 1)):
         assert mission_cluster.VERBS[verb](options) == 0
@@ -108,7 +106,7 @@ def test_what_a_pod_has_said_is_shown_and_does_nothing(
         assert SHOWN in said
 
 
-def test_what_the_api_refuses_it_says_in_words_that_do_nothing(api: Running) -> None:
+def test_a_refusal_of_the_api_is_shown_without_effect(api: Running) -> None:
     point = {"position_m": [99.0, 0.0, 1.0], NAME: 1}
     with pytest.raises(BadInputError) as refused:
         api.post_local("/v1/missions", {NAME: 2, "waypoints": [point]})
@@ -121,7 +119,7 @@ def test_what_the_api_refuses_it_says_in_words_that_do_nothing(api: Running) -> 
 @pytest.mark.parametrize(
     "given", ["\x1b[31m", "m1?x", "m 1", "..", "a/b", "tür", "\udcff", "%", "m1#"]
 )
-def test_an_id_that_is_none_is_no_mission(
+def test_an_invalid_id_is_no_mission(
     verb: str, given: str, api: Running, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["mission", verb, given, "--api", api.url]) == 5
@@ -132,7 +130,7 @@ def test_an_id_that_is_none_is_no_mission(
 
 
 @pytest.mark.parametrize("words", ["status m1", "logs m1"])
-def test_events_that_are_left_out_are_told_of(
+def test_left_out_events_are_counted(
     words: str, api: Running, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mission = api.flight.teleop.book.find("m1")

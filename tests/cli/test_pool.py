@@ -119,9 +119,9 @@ def test_a_fault_search_with_a_killed_worker_keeps_results(
     count = json.loads(out)["count"]
     assert 1 <= count < KILLED
     assert f"; {count} of 9 were flown" in error
-    assert f"go on with 'cloudrc faults fuzz --first {count + 1} --seeds {9 - count}'" in error
+    assert f"continue with 'cloudrc faults fuzz --first {count + 1} --seeds {9 - count}'" in error
     assert main(f"faults fuzz --first {KILLED} --seeds 2 --jobs 2".split()) == 6
-    assert "; not one schedule was flown" in capsys.readouterr().err
+    assert "; no schedule was flown" in capsys.readouterr().err
 
 
 def _kill(which: tuple[str, str, int]) -> None:
@@ -186,4 +186,4 @@ def test_a_store_that_is_not_a_folder_is_refused(
     monkeypatch.chdir(tmp_path)
     Path("a.json").touch()
     assert main("faults fuzz --seeds 1 --store a.json/found".split()) == 2
-    assert "no folder can be made there" in capsys.readouterr().err
+    assert "this folder cannot be made" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""tc kept running answers as a tc that is started anew, only sooner; here tc is a script."""
+"""A lasting tc process answers like a new tc process, but sooner; here tc is a script."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def programs(tmp_path: Path) -> Programs:
     return Programs({"PATH": f"{tmp_path}:/usr/bin:/bin", "HOME": str(tmp_path)})
 
 
-def asked(tmp_path: Path) -> list[str]:
+def commands_run(tmp_path: Path) -> list[str]:
     return [line for line in (tmp_path / "log").read_text().splitlines() if line[-2:] != "lo"]
 
 
@@ -50,11 +50,14 @@ def test_changes_and_listings_go_through_one_process(programs: Programs, tmp_pat
     for _ in range(3):
         assert programs((*CHANGE, "delay", "1us")) == (0, "", "")
         assert programs(SHOW) == (0, '[{"kind":"netem"}]', "")
-    assert asked(tmp_path) == ["qdisc change dev eth0 netem delay 1us", "qdisc show dev eth0"] * 3
+    assert (
+        commands_run(tmp_path)
+        == ["qdisc change dev eth0 netem delay 1us", "qdisc show dev eth0"] * 3
+    )
     programs.close()
 
 
-def test_an_error_is_told_with_tcs_words_and_is_not_the_end(programs: Programs) -> None:
+def test_an_error_of_tc_is_reported_and_the_session_goes_on(programs: Programs) -> None:
     for _ in range(2):
         code, _, error = programs((*CHANGE, "lacks"))
         assert code
@@ -64,23 +67,23 @@ def test_an_error_is_told_with_tcs_words_and_is_not_the_end(programs: Programs) 
     programs.close()
 
 
-def test_other_commands_are_processes_of_their_own(programs: Programs, tmp_path: Path) -> None:
+def test_other_commands_run_in_their_own_processes(programs: Programs, tmp_path: Path) -> None:
     assert programs(("tc", "qdisc", "add", "dev", "eth0", "root", "prio")).code == 0
     assert programs(("tc", "qdisc", "add", "lacks")).code == 2
     assert programs(("no-such-program",)).code == 127
-    assert asked(tmp_path)[0] == "qdisc add dev eth0 root prio"
+    assert commands_run(tmp_path)[0] == "qdisc add dev eth0 root prio"
 
 
-def test_one_that_died_is_replaced(programs: Programs) -> None:
+def test_a_tc_process_that_died_is_replaced(programs: Programs) -> None:
     assert programs(SHOW).code == 0
-    assert programs((*CHANGE, "dies")).code == 0  # asked again, in a process of its own
+    assert programs((*CHANGE, "dies")).code == 0  # repeated in its own process
     assert programs(SHOW).output == '[{"kind":"netem"}]'
     programs.close()
     programs.close()
 
 
-def test_a_tool_that_may_not_be_run_is_an_error_like_others(tmp_path: Path) -> None:
-    (tmp_path / "ip").mkdir()  # no program: EACCES for everybody
+def test_a_tool_without_permission_gives_an_error(tmp_path: Path) -> None:
+    (tmp_path / "ip").mkdir()  # a folder is no program: EACCES even for root
     code, _, error = Programs({"PATH": str(tmp_path)})(("ip", "route"))
     assert code
     assert "denied" in error

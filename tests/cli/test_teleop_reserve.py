@@ -1,4 +1,4 @@
-"""A journal that has filled its volume: a restart shortens it, in the room of its reserve."""
+"""A restart shortens a journal that has filled its volume, with the room of the reserve."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import pytest
 
 from cloudrc.assembly import build_plan
 from cloudrc.cli import teleop
-from cloudrc.cli import teleop as teleop_reserve
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
@@ -22,9 +21,9 @@ from cloudrc.teleop.store import KEPT, QUEUE_MAX, MissionBook, Order
 from tests.cli.conftest import MIB, KilledError, Volume
 
 RESERVE = MIB // 8
-"""In the place of the real one, so that a journal need not be long to take as much room."""
+"""Size of the reserve here [bytes]: small, so that a short journal needs as much room."""
 LEFT = KEPT + 1
-"""Missions: what a mission makes too old is forgotten as that is ordered, not as it ends."""
+"""Missions that a start keeps: a new mission removes the oldest one when it is ordered."""
 HOVER = load_experiment("hover")
 Printed = pytest.CaptureFixture[str]
 
@@ -43,17 +42,17 @@ def reserve(path: Path) -> Path:
 
 @pytest.fixture
 def volume(path: Path, monkeypatch: pytest.MonkeyPatch) -> Volume:
-    """On which teleop finds its journal, and whatever it puts beside that."""
+    """The disk of the journal and of the files beside it."""
     disk = Volume(path.parent)
-    monkeypatch.setattr(teleop_reserve, "RESERVE_SIZE", RESERVE)
-    monkeypatch.setattr(teleop_reserve, "room", lambda folder: max(disk.room - disk.used, 0))
+    monkeypatch.setattr(teleop, "RESERVE_SIZE", RESERVE)
+    monkeypatch.setattr(teleop, "room", lambda folder: max(disk.room - disk.used, 0))
     monkeypatch.setattr("cloudrc.teleop.journal.Disk", lambda: disk)
     return disk
 
 
 @cache
 def over(count: int) -> list[Entry]:
-    """Of so many missions that were cancelled before they began."""
+    """Return entries of missions that were cancelled before they began."""
     entries: list[Entry] = []
     book, order = MissionBook(entries.append, [], bytes(16)), Order(build_plan(HOVER))
     for _ in range(count):
@@ -62,14 +61,14 @@ def over(count: int) -> list[Entry]:
 
 
 def start(path: Path) -> str:
-    """Have teleop open its journal, and end; what it says is wrong."""
+    """Let teleop open its journal and end; return the trouble that it reports."""
     with Journal(path) as journal:
         teleop._open_service(HOVER, journal)
         return journal.trouble
 
 
 def fill(path: Path, volume: Volume, count: int = KEPT + 900) -> None:
-    """Have the journal take all the room there is."""
+    """Let the journal fill the volume."""
     volume.room = 64 * MIB
     with Journal(path) as journal:
         journal.rewrite(over(count))
@@ -85,11 +84,11 @@ def names(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT])
-def test_a_restart_shortens_a_journal_that_filled_its_volume(
+def test_a_restart_shortens_a_journal_on_a_full_volume(
     error: int, path: Path, reserve: Path, volume: Volume, capsys: Printed
 ) -> None:
     start(path)
-    for _ in range(2):  # as often as it happens
+    for _ in range(2):  # not only once
         fill(path, volume)
         volume.error = error
         assert start(path) == ""
@@ -102,18 +101,20 @@ def test_a_restart_shortens_a_journal_that_filled_its_volume(
     assert capsys.readouterr().err == ""
 
 
-def test_the_reserve_fits_beside_a_start_with_paper_missions() -> None:
-    """Its waypoints are reached, and its missions kept, by entries like these."""
+def test_the_reserve_has_room_for_all_missions_of_the_paper() -> None:
+    """Each mission writes entries like these."""
     entries: list[Entry] = []
     plan = build_plan(load_experiment("paper"))
     book = MissionBook(entries.append, [], bytes(16))
     mission = book.add(Order(plan, "paper", "k" * 36))
     for event in ("starting", "started", *["reached"] * len(plan.legs), "done"):
         book.note(mission, event, "waypoint 7 of 7 reached", world="0" * 32)
-    assert 4 * (KEPT + QUEUE_MAX + 1) * len(to_bytes(entries)) < teleop_reserve.RESERVE_SIZE
+    assert 4 * (KEPT + QUEUE_MAX + 1) * len(to_bytes(entries)) < teleop.RESERVE_SIZE
 
 
-def test_the_reserve_is_real_room_and_made_once(path: Path, reserve: Path, volume: Volume) -> None:
+def test_the_reserve_takes_real_space_and_is_made_once(
+    path: Path, reserve: Path, volume: Volume
+) -> None:
     start(path)
     before = reserve.stat()
     assert before.st_blocks * 512 >= RESERVE
@@ -122,7 +123,7 @@ def test_the_reserve_is_real_room_and_made_once(path: Path, reserve: Path, volum
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
 
-def test_a_partial_or_linked_reserve_is_made_again(
+def test_a_partial_reserve_or_a_symbolic_link_is_replaced(
     path: Path, reserve: Path, volume: Volume
 ) -> None:
     precious = path.parent.with_name("precious")
@@ -137,10 +138,10 @@ def test_a_partial_or_linked_reserve_is_made_again(
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_teleop_goes_on_and_warns_if_the_reserve_is_too_small(
+def test_without_room_teleop_reports_it_and_continues(
     there: bool, path: Path, reserve: Path, volume: Volume, capsys: Printed
 ) -> None:
-    """No reserve was made, or somebody else takes its room."""
+    """There is no reserve, or another program takes its room."""
     if there:
         start(path)
     fill(path, volume)
@@ -148,18 +149,19 @@ def test_teleop_goes_on_and_warns_if_the_reserve_is_too_small(
     trouble = start(path)
     assert trouble == (
         f"{path}: cannot be shortened to the missions still known: No space left on device; "
-        "once it is full no mission can start: free or mend its volume, then restart teleop"
+        "once it is full no mission can start: free space or repair the volume, then restart "
+        "teleop"
     )
     assert capsys.readouterr().err == f"cloudrc teleop: {trouble}\n"
     assert path.read_bytes() == entries
-    assert names(path) == {"", ".lock"}  # there is more need of the room for what happens now
-    volume.room = 64 * MIB  # somebody does as it says
+    assert names(path) == {"", ".lock"}  # the journal needs the room now
+    volume.room = 64 * MIB  # somebody frees space
     assert start(path) == ""
     assert missions(path) == LEFT
     assert reserve.stat().st_size == RESERVE
 
 
-def test_a_journal_that_cannot_be_shortened_is_reported(
+def test_a_journal_that_cannot_be_shortened_is_published(
     path: Path, volume: Volume, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, handlers: None
 ) -> None:
     fill(path, volume)
@@ -167,12 +169,12 @@ def test_a_journal_that_cannot_be_shortened_is_reported(
     monkeypatch.setattr(teleop, "_fly", lambda *words: told.extend(words))
     words = ["--socket", str(tmp_path), "--journal", str(path)]
     assert main(["teleop", "--config", str(FOLDERS["experiment"] / "hover.yaml"), *words]) == 0
-    assert "free or mend its volume" in told[-1]
+    assert "free space or repair the volume" in told[-1]
 
 
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO])
 @pytest.mark.parametrize("operation", ["open", "write", "sync", "remove"])
-def test_no_reserve_stops_nobody(
+def test_teleop_starts_without_a_reserve(
     operation: str, error: int, path: Path, reserve: Path, volume: Volume, capsys: Printed
 ) -> None:
     ending = ".reserve" if operation in ("open", "remove") else ""
@@ -186,14 +188,12 @@ def test_no_reserve_stops_nobody(
     assert not reserve.exists()
     assert capsys.readouterr().err == (
         f"cloudrc teleop: {reserve}: refused: without it a restart cannot shorten a journal that "
-        "has filled its volume; free or mend that\n"
+        "has filled its volume; free space or repair the volume\n"
     )
 
 
-def test_no_reserve_takes_the_room_that_entries_need(
-    path: Path, reserve: Path, volume: Volume
-) -> None:
-    for room in (RESERVE // 2, RESERVE, 2 * RESERVE - 1):  # entries need room, too
+def test_the_reserve_leaves_room_for_entries(path: Path, reserve: Path, volume: Volume) -> None:
+    for room in (RESERVE // 2, RESERVE, 2 * RESERVE - 1):  # entries need room as well
         volume.room = room
         start(path)
         assert not reserve.exists()
@@ -202,12 +202,12 @@ def test_no_reserve_takes_the_room_that_entries_need(
     assert reserve.stat().st_size == RESERVE
 
 
-def test_how_much_room_there_is(tmp_path: Path) -> None:
+def test_room_is_the_free_space_of_the_volume(tmp_path: Path) -> None:
     free = shutil.disk_usage(tmp_path).free
-    assert teleop_reserve.room(tmp_path) == pytest.approx(free, abs=free / 10)
+    assert teleop.room(tmp_path) == pytest.approx(free, abs=free / 10)
 
 
-def test_any_other_refusal_gives_no_reserve_up(path: Path, reserve: Path, volume: Volume) -> None:
+def test_another_error_keeps_the_reserve(path: Path, reserve: Path, volume: Volume) -> None:
     start(path)
     fill(path, volume)
     volume.room, volume.refused = 64 * MIB, ("replace", "", errno.EIO)
@@ -216,7 +216,7 @@ def test_any_other_refusal_gives_no_reserve_up(path: Path, reserve: Path, volume
 
 
 def kills(path: Path, volume: Volume) -> Iterator[int]:
-    """Teleop starts with a full volume and dies, once before its every operation."""
+    """Start teleop on a full volume and kill it, once before each of its operations."""
     at = 0
     while True:
         volume.room, volume.kill_at = 64 * MIB, -1
@@ -233,7 +233,7 @@ def kills(path: Path, volume: Volume) -> Iterator[int]:
         at += 1
 
 
-def test_after_a_kill_at_any_step_the_next_start_ends_with_both(
+def test_after_a_kill_at_any_step_a_start_repairs_both_files(
     path: Path, reserve: Path, volume: Volume
 ) -> None:
     count = 0

@@ -66,7 +66,7 @@ def test_a_refusal_by_both_needs_no_further_words(
     for pod in ("world-1", "cloud-1"):
         cluster.make("cannot", pod, "corrupt")
     assert set_link("downlink.corrupt=0.5") == 2
-    assert error(capsys).endswith("the uplink is as it was: netem cannot do that")
+    assert error(capsys).endswith("the uplink is unchanged: netem cannot do that")
     assert not cluster.kept()
 
 

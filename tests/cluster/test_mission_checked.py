@@ -164,7 +164,7 @@ def test_an_interrupted_run_says_that_the_job_continues(
     (job,) = made(running)
     name = job["metadata"]["name"]
     assert capsys.readouterr().err == (
-        f"Job {name} flies on; end it: "
+        f"Job {name} is still running; cancel it: "
         f"cloudrc mission cancel {name} --namespace=demo --release=cloudrc\n"
     )
 

@@ -202,7 +202,7 @@ def hand_behind_its_back(component: str, profile: dict[str, Any]) -> None:
     assert told["change"] == change["number"], told
 
 
-def test_helm_test_refuses_a_link_that_was_doubled_behind_its_back(
+def test_helm_test_refuses_a_link_whose_delay_was_doubled(
     flight: None, note: Callable[[str], None]
 ) -> None:
     """Cloud's pod alone is told: the other end goes on asking for what the release asks for."""
@@ -233,7 +233,7 @@ def operate(*words: str) -> str:
     return done.stdout
 
 
-def test_the_operator_holds_the_mission_moves_the_robot_and_lets_it_go_on(flight: None) -> None:
+def test_the_operator_holds_moves_and_resumes_a_mission(flight: None) -> None:
     assert "(long): held" in operate("hold")
     assert "(long): held" in operate("goto", *map(str, ASIDE))
 

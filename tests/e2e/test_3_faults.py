@@ -98,9 +98,7 @@ def lingering() -> Iterator[None]:
     wait_ready(place(), timeout=90.0)
 
 
-def test_an_old_cloud_that_lingers_beside_the_new_one_does_no_harm(
-    installed: None, lingering: None
-) -> None:
+def test_an_old_cloud_beside_the_new_one_does_no_harm(installed: None, lingering: None) -> None:
     fly_until("haunted", "waypoint 1 of 7 reached")
     old = delete("cloud")
     eventually(lambda: new_pod("cloud", old), "a new cloud pod")

@@ -65,7 +65,7 @@ def plain(installed: None) -> dict[str, float]:
 @pytest.mark.parametrize(
     ("name", "component"), [("constrained-drone", "world"), ("loaded-cloud", "cloud")]
 )
-def test_a_constrained_part_is_throttled_and_still_keeps_real_time(
+def test_a_constrained_part_is_throttled_yet_keeps_real_time(
     plain: dict[str, float],
     with_values: Callable[..., None],
     tmp_path: Path,

@@ -56,7 +56,7 @@ def test_an_image_that_is_not_loaded_is_named(refusal: Refusal) -> None:
     assert "make kind-load" in line
 
 
-def test_strict_netem_without_the_kernels_is_refused_with_both_ways_out(refusal: Refusal) -> None:
+def test_netem_without_kernel_support_is_refused_with_advice(refusal: Refusal) -> None:
     if has_netem():
         pytest.skip("this kernel has sch_netem")
     code, line = refusal("no-netem", "--set=link.mode=netem")

@@ -100,7 +100,7 @@ def test_what_falls_out_of_the_fence_by_the_operators_word_is_told_and_fails_not
     monkeypatch.setattr("cloudrc.faults.fuzz.fly", falling)
     page = tmp_path / "adversary.md"
     assert main(["faults", "fuzz", "--adversarial", "--seeds", "4", f"--document={page}"]) == 0
-    told = "2 stopped by the operator's word came to lie outside of it, at most by 0.40 m"
+    told = "2 came to rest outside of it after an emergency stop, at most by 0.40 m"
     assert told in page.read_text()
     command = f"cloudrc faults fuzz --adversarial --seeds 4 --document {page}"
     assert f"Written by `{command}`" in page.read_text()

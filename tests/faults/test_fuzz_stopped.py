@@ -87,7 +87,7 @@ def test_what_was_flown_until_it_is_told_to_stop_is_told(
     assert len(told["failures"]) == (at == BAD), "not shrunk, but told"
     assert page.read_text() == "of a longer one"
     rest = f"cloudrc faults fuzz --first {at + 1} --seeds {20 - at}"
-    assert f"stopped; {at} of 20 were flown; go on with '{rest}'" in error
+    assert f"stopped; {at} of 20 were flown; continue with '{rest}'" in error
 
 
 def test_a_terminal_that_is_closed_says_so_twice_and_a_second_wish_ends_it_at_once() -> None:
@@ -143,4 +143,4 @@ def test_several_processes_stop_together(fuzz: Fuzz, monkeypatch: pytest.MonkeyP
     told, error = fuzz(200, "--jobs", "2", "--clean", code=130)
     assert 1 <= told["count"] < 20
     rest = f"--clean --first {told['count'] + 1} --seeds {200 - told['count']}"
-    assert f"go on with 'cloudrc faults fuzz {rest}'" in error
+    assert f"continue with 'cloudrc faults fuzz {rest}'" in error

@@ -19,7 +19,7 @@ DAMAGING = DirectionProfile(0.02, 0.01, corrupt=0.1)
 
 @pytest.mark.parametrize("kind", [PROBE, TRAIN])
 @pytest.mark.parametrize("way", ["uplink", "downlink"])
-def test_whichever_bit_is_flipped_it_is_seen_and_the_probe_is_known(kind: int, way: str) -> None:
+def test_any_flipped_bit_is_seen_and_the_probe_identified(kind: int, way: str) -> None:
     probes = Probes({"uplink": 187, "downlink": 72})
     whole = probes.write(way, kind, 77)
     assert probes.read(whole) == (kind, 1, 77)
@@ -37,7 +37,7 @@ def test_what_is_too_short_is_no_probe() -> None:
         Probes({"uplink": 187, "downlink": 72}).read(b"\0\1")
 
 
-def test_a_link_that_damages_as_asked_is_believed_and_one_that_does_not_is_named() -> None:
+def test_only_the_requested_corruption_is_believed() -> None:
     asked = Asked.of(DAMAGING)
     rows = {row.name: row for row in probe(asked, DAMAGING).rows}
     assert {row.verdict for row in rows.values()} == {"ok"}

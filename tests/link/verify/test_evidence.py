@@ -28,7 +28,7 @@ PRIO: dict[str, Any] = {"kind": "prio", "handle": "7400:", "packets": 5000, "dro
 ROOM: dict[str, Any] = {"kind": "noqueue", "packets": 0}
 
 
-def test_a_netem_where_the_flow_leaves_shapes_it_and_has_counted_it() -> None:
+def test_netem_on_the_outgoing_interface_is_the_shaper() -> None:
     found = of_qdiscs({"eth0": [PRIO, NETEM], "lo": [ROOM]}, "eth0")
     assert (found.shaper, found.interface, found.layers) == ("netem", "eth0", 1)
     assert found.passed == 1000, "sent on and dropped"
@@ -71,13 +71,13 @@ def test_bursts_and_rates_are_read_from_tc() -> None:
     assert netem_profile({"rate": {"rate": 12.5e9}}, DirectionProfile()).rate is None, "for order"
 
 
-def test_the_jitter_of_a_measured_table_is_told_without_its_stretch() -> None:
+def test_jitter_of_a_table_is_reported_without_its_scale() -> None:
     told = DirectionProfile(0.04, 0.01, distribution="table", table=(-1.0, 0.0, 5.0))
     options = {"delay": {"delay": 0.04, "jitter": 0.02}}
     assert netem_profile(options, told).jitter == pytest.approx(0.01)
 
 
-def test_metrics_tell_of_lateness_and_of_qdiscs_that_were_put_back() -> None:
+def test_metrics_report_lateness_and_restored_qdiscs() -> None:
     text = (
         'cloudrc_link_release_error_seconds{percentile="99"} 0.0021\n'
         "cloudrc_link_restored_total 2\n"
@@ -87,7 +87,7 @@ def test_metrics_tell_of_lateness_and_of_qdiscs_that_were_put_back() -> None:
     assert (found.late, found.restored, found.passed, found.sent) == (0.0021, 2, 500, 600)
 
 
-def test_what_befell_a_link_before_the_probes_tells_nothing_of_them() -> None:
+def test_counts_from_before_the_probes_are_subtracted() -> None:
     before, after = (
         samples(
             f"cloudrc_cpu_periods_total {periods}\n"

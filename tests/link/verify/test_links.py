@@ -123,7 +123,7 @@ def test_a_relay_that_does_not_get_its_cpu_is_named() -> None:
 
 
 @pytest.mark.parametrize("fault", ["order_kept", "rate_ignored", "halved_delay", "no_loss"])
-def test_a_relay_that_does_not_get_its_cpu_hides_nothing_that_this_cannot_cause(fault: str) -> None:
+def test_cpu_starvation_hides_no_fault_that_it_cannot_cause(fault: str) -> None:
     """It adds delay, scatter and losses; it never makes a link quicker, or more orderly."""
     profile, real, _, evidence = FAULTS[fault]
     deaf = replace(evidence, shaper="relay", sent=2000, unread=99)
@@ -143,7 +143,7 @@ def test_a_qdisc_that_was_put_back_is_not_told_as_one_direction() -> None:
     assert [(cause.code, cause.way) for cause in find_causes(found)] == [("no_qdisc", "uplink")]
 
 
-def test_a_shaper_that_was_hardly_ever_stopped_hides_no_other_cause() -> None:
+def test_rare_throttling_hides_no_other_cause() -> None:
     evidence = told(applied=PAPER, throttled=0.02)
     found = {"uplink": probe(asked(PAPER), replace(PAPER, delay=0.090), 1, evidence=evidence)}
     assert [cause.code for cause in find_causes(found)] == ["doubled_delay"]

@@ -95,7 +95,7 @@ def patiently(link: Link) -> Said:
 
 
 @pytest.mark.smoke
-def test_a_true_link_is_believed_and_one_whose_qdisc_was_gone_is_not(
+def test_a_true_link_is_believed_but_not_without_its_qdisc(
     plan: dict[str, Asked],
 ) -> None:
     with up(plan) as link:
@@ -110,7 +110,7 @@ def test_a_true_link_is_believed_and_one_whose_qdisc_was_gone_is_not(
         assert [(cause.code, cause.way) for cause in broken.causes] == [("no_qdisc", "uplink")]
 
 
-def test_a_true_link_is_believed_whose_correlation_netem_does_not_realise() -> None:
+def test_a_correlation_that_netem_ignores_is_no_fault() -> None:
     settings = [f"link.{way}.correlation=0.9" for way in WAYS]
     plan = run.plan(find("ideal", [*SETTINGS, *settings]), SECONDS, "netem")
     with up(plan, PROFILE.replace("80}", "80, correlation: 0.9}")) as link:

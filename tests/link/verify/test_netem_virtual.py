@@ -141,8 +141,8 @@ def test_a_netem_that_is_off_is_not_believed(
         assert f"{row} off" in doubts(shaped(asked, replace(true, **real), seed))
 
 
-def test_a_correlation_that_netem_cannot_do_is_said_beside_the_verdict() -> None:
+def test_a_correlation_that_netem_ignores_is_noted() -> None:
     experiment = find("satellite", [])
     said = _notes(experiment, plan(experiment, 60.0, "netem"), "netem")
-    assert "uplink: correlation 0.9 NOT JUDGED: netem realises next to none of it" in said
+    assert "uplink: correlation 0.9 NOT JUDGED: netem realises almost none of it" in said
     assert not [one for one in _notes(experiment, plan(experiment, 60.0), "relay") if "corr" in one]

@@ -128,7 +128,7 @@ def test_the_chances_of_each_loss_are_those_of_the_model() -> None:
 
 @pytest.mark.parametrize("loss", [0.0, 0.001, 0.05, 0.3, BURSTS, replace(BURSTS, loss_bad=1.0)])
 @pytest.mark.parametrize("wrong", [-1.0, 1.0])
-def test_a_loss_that_is_off_by_its_margin_is_hardly_ever_believed(
+def test_a_loss_off_by_its_margin_is_almost_never_believed(
     loss: float | GilbertElliott, wrong: float
 ) -> None:
     margin = max(0.02, 0.25 * mean_loss(loss))

@@ -117,7 +117,7 @@ def test_a_new_profile_is_judged_by_from_then_on() -> None:
     assert newest(records)["mean"].asked == pytest.approx(0.120, abs=1e-3)
 
 
-def test_the_profile_is_followed_in_the_state_of_the_link_through_nonsense(tmp_path: Path) -> None:
+def test_the_state_file_is_followed_past_invalid_content(tmp_path: Path) -> None:
     seen = Event()
     check, slow = downlink(PAPER), DirectionProfile(0.070)
     follow = check.follow
@@ -144,7 +144,7 @@ def test_the_profile_is_followed_in_the_state_of_the_link_through_nonsense(tmp_p
     assert newest(records)["mean"].asked == pytest.approx(0.070)
 
 
-def test_a_state_of_the_link_that_would_hold_the_loop_is_not_loaded(tmp_path: Path) -> None:
+def test_a_state_file_that_would_block_the_loop_is_not_loaded(tmp_path: Path) -> None:
     check, path, loaded, done = downlink(PAPER), tmp_path / "link.json", list[object](), Event()
     check.follow = lambda *given: None  # type: ignore[method-assign]
     names = ("shaper", "reason", "mode", "direction", "since", "since_ns")
@@ -165,7 +165,7 @@ def test_a_state_of_the_link_that_would_hold_the_loop_is_not_loaded(tmp_path: Pa
     assert loaded == ["short"]
 
 
-def test_by_what_held_before_a_state_that_is_too_long_nothing_is_judged(tmp_path: Path) -> None:
+def test_nothing_is_judged_after_a_state_file_that_is_too_long(tmp_path: Path) -> None:
     check, path, done = downlink(PAPER), tmp_path / "link.json", Event()
     path.write_text("x" * (STATE_MAX + 1))
     check.begin((PAPER, PAPER), path, lambda values: (PAPER, PAPER))
@@ -196,7 +196,7 @@ def test_a_new_session_begins_anew() -> None:
     ("gap", "compared"),
     [(20_000, 24_000 - WINDOW), (10**6, 2000 - WINDOW), (10**18, 2000 - WINDOW)],
 )
-def test_what_lies_behind_a_gap_of_hours_is_compared_with_nothing(gap: int, compared: int) -> None:
+def test_datagrams_after_a_gap_of_hours_are_not_compared(gap: int, compared: int) -> None:
     """Of minutes, though, all that should have come; a hostile counter may jump by anything."""
     heard = [(n * PERIOD_NS, n + gap * (n >= 2000), 0.0705) for n in range(4000)]
     found = Twin(DirectionProfile(0.070), DRAWS).compare(1, heard)
@@ -207,7 +207,7 @@ def test_what_lies_behind_a_gap_of_hours_is_compared_with_nothing(gap: int, comp
     )
 
 
-def test_a_comparison_that_fails_is_told_once_and_the_next_is_made(
+def test_a_failed_comparison_is_logged_once_and_checks_go_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     followed, made = Event(), SimpleQueue[int]()

@@ -34,7 +34,7 @@ def asked(name: str, way: str) -> DirectionProfile:
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", names("profile"))
-def test_a_true_link_is_believed_within_half_a_minute_by_its_draws(name: str, way: str) -> None:
+def test_known_draws_prove_a_true_link_within_half_a_minute(name: str, way: str) -> None:
     profile, up = asked(name, way), way == "uplink"
     records, faults = checked(hearing(profile, up), arrivals(profile, 33.0, uplink=up))
     assert faults == []
@@ -42,7 +42,7 @@ def test_a_true_link_is_believed_within_half_a_minute_by_its_draws(name: str, wa
     assert believed(records)
 
 
-def test_what_statistics_cannot_decide_is_not_waited_for_and_says_how_much_it_takes() -> None:
+def test_an_undecidable_loss_is_skipped_with_its_sample_size() -> None:
     profile = asked("lossy", "downlink")
     records, faults = checked(downlink(profile), arrivals(profile, 60.0, seed=2))
     last = newest(records)
@@ -142,6 +142,6 @@ def test_a_trace_is_judged() -> None:
     assert not believed(records)
 
 
-def test_a_bottleneck_is_not_measured_by_datagrams_that_come_alone_which_is_told() -> None:
+def test_single_datagrams_do_not_measure_a_bottleneck() -> None:
     records, _ = checked(downlink(SATELLITE), arrivals(SATELLITE, 33.0))
     assert newest(records)["rate"].verdict == "told"

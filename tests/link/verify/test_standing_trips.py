@@ -147,7 +147,7 @@ OFF: dict[str, Callable[[DirectionProfile], DirectionProfile]] = {
 @pytest.mark.parametrize("seed", [3, 4, 5])
 @pytest.mark.parametrize("adds", [0.0, 4e-4])
 @pytest.mark.parametrize("fault", OFF)
-def test_round_trips_that_are_off_by_their_margin_are_not_believed(
+def test_round_trips_off_by_their_margin_are_not_believed(
     fault: str, adds: float, seed: int
 ) -> None:
     up, down = ways("5g")
@@ -159,9 +159,7 @@ def test_round_trips_that_are_off_by_their_margin_are_not_believed(
 
 
 @pytest.mark.parametrize(("late", "ever"), [(None, False), (1.5e-3, False), (1e-5, True)])
-def test_what_the_ends_hide_is_not_judged_and_keeps_no_verdict_open(
-    late: float | None, ever: bool
-) -> None:
+def test_errors_hidden_by_late_ends_are_not_judged(late: float | None, ever: bool) -> None:
     up, down = ways("paper-p1")
     records, faults = checked(cloud(up, down), flight(up, down, 100.0, late=late))
     last = newest(records)
@@ -179,7 +177,7 @@ def test_what_the_ends_hide_is_not_judged_and_keeps_no_verdict_open(
     assert json.loads(check.text())["verdict"] == "ok"
 
 
-def test_round_trips_that_are_far_off_are_told_though_they_cannot_be_proven() -> None:
+def test_round_trips_far_off_are_reported_without_proof() -> None:
     up, down = ways("paper-p1")
     real = replace(up, delay=up.delay + 0.010)
     _, faults = checked(cloud(up, down), flight(real, down, 60.0, late=None))
