@@ -33,7 +33,7 @@ def test_a_refusal_by_one_direction_rolls_the_other_back(
     cluster.make("cannot", "cloud-1", "corrupt")
     assert set_link("downlink.corrupt=0.5", "uplink.delay_ms=9") == 2
     assert error(capsys) == (
-        "cloudrc: error: the downlink is as it was: netem cannot do that; the uplink had the "
+        "cloudrc: error: the downlink is unchanged: netem cannot do that; the uplink had the "
         "change for a moment and has its old profile again"
     )
     assert not cluster.kept(), "it does not last either"
@@ -132,7 +132,7 @@ def test_a_silent_container_is_waited_for_and_rolled_back(
     cluster.make("deaf", "cloud-1")
     assert set_link("downlink.delay_ms=120") == 4
     assert error(capsys) == (
-        "cloudrc: error: the downlink did not take the change over within 5 s; see the logs of the "
+        "cloudrc: error: the downlink did not apply the change within 5 s; see the logs of the "
         "link containers; the uplink had the change for a moment and has its old profile again; "
         "the downlink (pod cloud-1) gets its old profile when it responds"
     )
