@@ -17,6 +17,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def nightly(*values: object) -> list[object]:
+    """Mark values of a parametrized test as `full`: make nightly tries them, make test does not."""
+    return [pytest.param(value, marks=pytest.mark.full) for value in values]
+
+
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Where REQUIRE_ALL is set, as in CI, a test that was skipped has failed."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")

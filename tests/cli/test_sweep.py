@@ -17,6 +17,7 @@ import pytest
 
 from cloudrc.cli import sweep
 from cloudrc.cli.main import main
+from tests.conftest import nightly
 
 SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
 """Overrides of `steps` for one second of flight."""
@@ -92,7 +93,7 @@ def _begin_sweep() -> subprocess.Popen[str]:
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, *nightly(signal.SIGINT, signal.SIGHUP)])
 def test_a_signal_ends_a_sweep_at_once(number: int, folder: Path) -> None:
     """A terminal sends SIGINT and SIGHUP to the whole process group, but SIGTERM goes to one."""
     process = _begin_sweep()

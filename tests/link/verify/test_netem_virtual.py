@@ -28,7 +28,7 @@ SHIPPED = [
     for way in WAYS
     if can(link_profile(getattr(load_profile(name), way)))
 ]
-QUICK = ("paper-p2", "satellite", "5g")
+QUICK = ("paper-p2", "5g")
 BURSTS = GilbertElliott(0.02, 0.2, 0.9, 0.02)
 LINKS = {
     "a correlation": DirectionProfile(0.080, 0.020, correlation=0.9),
