@@ -14,26 +14,26 @@ from hypothesis import given, seed, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard.limits import RANGE, growth
-from cloudrc.world.guard.state import JOLT
+from cloudrc.world.guard.limits import COMMAND_MAX, growth
+from cloudrc.world.guard.state import JOLT_MAX
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, sensed
 from tests.world.guard.test_rules import ANY, PLACES, SPECIAL, SPECIAL_BAD, SPEEDS, VECTORS
 
-TAKEN = st.tuples(*[st.floats(-RANGE, RANGE)] * 3)
+TAKEN = st.tuples(*[st.floats(-COMMAND_MAX, COMMAND_MAX)] * 3)
 """What is not refused, however strange."""
 CASES_AT_ONCE = 4
 CASE = st.tuples(
     st.one_of(SPEEDS, TAKEN),
     st.one_of(VECTORS, TAKEN, SPEEDS, SPEEDS),
-    st.one_of(ANY, st.floats(-RANGE, RANGE)),
+    st.one_of(ANY, st.floats(-COMMAND_MAX, COMMAND_MAX)),
     st.one_of(st.just(None), PLACES, PLACES, VECTORS),
     st.one_of(SPEEDS, VECTORS),
-    st.tuples(*[st.floats(-JOLT, JOLT)] * 3),
+    st.tuples(*[st.floats(-JOLT_MAX, JOLT_MAX)] * 3),
     st.integers(-2, 300),
     st.sampled_from([TICK, TICK, 300 * MS]),
 )
 CASES = st.lists(CASE, min_size=CASES_AT_ONCE, max_size=CASES_AT_ONCE)
-ASIDE = 0.04
+STEP_MAX = 0.04
 """The robot moves by less than this [m] in a tick."""
 
 
@@ -54,7 +54,7 @@ def check_case(first, then, yaw_rate, place, velocity, change, age_ms, after_ns)
     for _ in range(5 if age_ms < 0 else 1):  # five from the future: LAND
         guard.offer(command(then, after_ns - age_ms * MS, yaw_rate), after_ns)
     if place is not None:
-        position = tuple(at + ASIDE * d for at, d in zip(position, change, strict=True))
+        position = tuple(at + STEP_MAX * d for at, d in zip(position, change, strict=True))
     velocity = tuple(v + d if abs(v) < 1e3 else v for v, d in zip(velocity, change, strict=True))
     after = guard.tick(after_ns, sensed(position, velocity), DT)
     check_flown(guard, after, position)
@@ -92,7 +92,7 @@ def test_whatever_is_commanded_and_sensed_what_is_flown_is_inside_the_caps(cases
 def any_float(rng):
     """Of any bits, or of any size up to the range, or one of those that trouble arithmetic."""
     (value,) = struct.unpack("d", rng.randbytes(8))
-    small = rng.choice((-1.0, 1.0)) * RANGE * 10.0 ** rng.uniform(-320.0, 0.0)
+    small = rng.choice((-1.0, 1.0)) * COMMAND_MAX * 10.0 ** rng.uniform(-320.0, 0.0)
     return rng.choice((value, small, rng.choice(SPECIAL_BAD)))
 
 
@@ -105,9 +105,9 @@ def vector(rng, low=-8.0, high=8.0):
 
 def case_by_chance(rng):
     """As CASE has them, a hundred times faster, but smaller cases are not looked for."""
-    first = tuple(v if abs(v) <= RANGE else 0.0 for v in vector(rng))
+    first = tuple(v if abs(v) <= COMMAND_MAX else 0.0 for v in vector(rng))
     place = rng.choice((None, vector(rng, -4.0, 10.0), vector(rng, 0.0, 2.5)))
-    change = tuple(rng.uniform(-JOLT, JOLT) for _ in range(3))
+    change = tuple(rng.uniform(-JOLT_MAX, JOLT_MAX) for _ in range(3))
     after_ns = rng.choice((TICK, TICK, 300 * MS))
     age_ms = rng.randint(-2, 300)
     return first, vector(rng), any_float(rng), place, vector(rng), change, age_ms, after_ns
@@ -141,7 +141,9 @@ def test_a_million_commands_and_readings_stay_inside_the_caps(figure):
 
 
 @pytest.mark.parametrize("axis", range(4))
-@pytest.mark.parametrize("value", [v for v in (*SPECIAL, RANGE, -RANGE) if abs(v) <= RANGE])
+@pytest.mark.parametrize(
+    "value", [v for v in (*SPECIAL, COMMAND_MAX, -COMMAND_MAX) if abs(v) <= COMMAND_MAX]
+)
 def test_every_special_float_that_is_taken_is_flown_inside_the_caps(axis, value):
     values = [0.5, 0.5, 0.5, 0.5]
     values[axis] = value

@@ -8,7 +8,13 @@ import pytest
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.hold import TAKE_OFF_MARGIN
-from cloudrc.world.guard.limits import BOUNCE, CREEP, SLIDE, TUMBLE, fall_time
+from cloudrc.world.guard.limits import (
+    BOUNCE_TIME,
+    CREEP_SPEED,
+    SLIDE_TIME,
+    TUMBLE_DISTANCE,
+    fall_time,
+)
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.simulator import Simulator
 from tests.world.guard.conftest import LIMITS, UP, Flight, hostile
@@ -54,7 +60,7 @@ def beyond(simulator, seed):
     flight.fly(Random(seed).uniform(0.3, 5.0), hostile(seed))
     (x, y, z), (vx, vy, _) = flight.readings.position, flight.readings.velocity
     flight.guard.stop(flight.now_ns)
-    falls = fall_time(z - FLOOR_MARGIN) + SLIDE + BOUNCE
+    falls = fall_time(z - FLOOR_MARGIN) + SLIDE_TIME + BOUNCE_TIME
     speeds = (vx, -vx, vy, -vy)
     ways = [0.0] * 4
     for _ in range(30):
@@ -62,9 +68,9 @@ def beyond(simulator, seed):
         xn, yn, _ = flight.readings.position
         ways = list(map(max, ways, (xn - x, x - xn, yn - y, y - yn)))
     return [
-        way - speed * falls - TUMBLE
+        way - speed * falls - TUMBLE_DISTANCE
         for way, speed in zip(ways, speeds, strict=True)
-        if speed > CREEP
+        if speed > CREEP_SPEED
     ]
 
 

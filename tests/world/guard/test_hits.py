@@ -5,8 +5,15 @@ from math import cos, radians, sin
 import pytest
 
 from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState
-from cloudrc.world.guard.limits import GLIMPSE_NS
-from cloudrc.world.guard.state import JOLT, PULL, SPIN_MAX, TUMBLE_MAX, UPSET, Hits
+from cloudrc.world.guard.limits import RECHECK_NS
+from cloudrc.world.guard.state import (
+    JOLT_MAX,
+    JOLT_RATE_MAX,
+    OVERTURNED_COSINE,
+    SPIN_MAX,
+    TUMBLE_MAX,
+    Hits,
+)
 from cloudrc.world.readings import Readings
 from tests.world.guard.conftest import (
     DT,
@@ -50,7 +57,7 @@ def test_nothing_but_a_hit_turns_the_robot_so_fast(rate, cause):
 
 @pytest.mark.parametrize(("tilt_deg", "cause"), [(78.0, None), (79.0, OVER), (180.0, OVER)])
 def test_a_robot_on_its_side_has_turned_over(tilt_deg, cause):
-    assert cos(radians(78.5)) == pytest.approx(UPSET, abs=0.001)
+    assert cos(radians(78.5)) == pytest.approx(OVERTURNED_COSINE, abs=0.001)
     assert Hits().felt(0, felt(tilt_deg=tilt_deg)) == cause
 
 
@@ -58,7 +65,7 @@ def test_a_robot_on_its_side_has_turned_over(tilt_deg, cause):
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("after_ns", [TICK, 10 * MS])
 def test_nothing_but_a_hit_changes_the_speed_so_fast(axis, sign, after_ns):
-    most = JOLT + PULL * after_ns
+    most = JOLT_MAX + JOLT_RATE_MAX * after_ns
     for change, cause in ((most + 0.001, JOLTED), (most - 0.001, None)):
         hits, velocity = Hits(), [1.0, -2.0, 0.5]
         assert hits.felt(SECOND, felt(tuple(velocity))) is None
@@ -70,9 +77,9 @@ def test_nothing_but_a_hit_changes_the_speed_so_fast(axis, sign, after_ns):
 @pytest.mark.parametrize("axis", range(3))
 def test_at_the_limits_nothing_is_felt_yet(axis):
     hits, velocity = Hits(), [0.0, 0.0, 0.0]
-    velocity[axis] = JOLT + PULL * TICK
+    velocity[axis] = JOLT_MAX + JOLT_RATE_MAX * TICK
     at_limit = felt(rate=(TUMBLE_MAX, 0.0, SPIN_MAX))
-    at_limit = at_limit._replace(axes=(*at_limit.axes[:8], UPSET))
+    at_limit = at_limit._replace(axes=(*at_limit.axes[:8], OVERTURNED_COSINE))
     assert hits.felt(0, at_limit) is None
     assert hits.felt(TICK, at_limit._replace(velocity=tuple(velocity))) is None
 
@@ -153,4 +160,4 @@ def test_far_from_the_fence_a_hit_is_felt_within_twelve_milliseconds(flown_ticks
         guard.tick(now_ns, felt(rate=(0.0, 0.0, 9.0) if hit else ZERO), DT)
     changes = guard.take_changes()
     assert [change.state for change in changes] == [TRACK, ESTOP]
-    assert changes[1].stamp_ns - flown_ticks * TICK <= GLIMPSE_NS + TICK
+    assert changes[1].stamp_ns - flown_ticks * TICK <= RECHECK_NS + TICK

@@ -5,7 +5,7 @@ from math import nan
 import pytest
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard.hold import LAND_SPEED, STILL
+from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED
 from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import (
     HERE,
@@ -167,7 +167,7 @@ def test_a_robot_that_is_pressed_down_when_it_is_landed_touches_down():
 
 
 def test_what_moves_by_as_much_as_this_has_not_touched_down():
-    for speed in (STILL, -STILL):
+    for speed in (STILL_SPEED, -STILL_SPEED):
         down = run(landing(), 2 * SECOND, 4 * SECOND, (1.0, 2.0, 1.0), (0.0, 0.0, speed))
         assert None not in down
 

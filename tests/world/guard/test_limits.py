@@ -9,7 +9,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import GuardState
-from cloudrc.world.guard.limits import MARGIN, Limits
+from cloudrc.world.guard.limits import FENCE_MARGIN, Limits
 from tests.world.guard.conftest import LIMITS, MS, SECOND, TICK, armed, run, tracking
 
 NUMBERS = [field.name for field in fields(Limits) if not field.name.startswith("fence")]
@@ -69,7 +69,7 @@ def test_a_fence_without_room_is_refused(axis, high):
 
 
 def test_a_fence_as_thick_as_its_margins_has_no_room():
-    thin = FLOOR_MARGIN + MARGIN
+    thin = FLOOR_MARGIN + FENCE_MARGIN
     with pytest.raises(ValueError, match="leaves no room"):
         Limits((0.0, 0.0, 0.0), (5.0, 5.0, thin))
     Limits((0.0, 0.0, 0.0), (5.0, 5.0, thin + 0.01))
@@ -82,7 +82,7 @@ def test_a_fence_has_three_axes(low):
 
 
 def test_inside_the_fence_are_its_margins():
-    low, high = Limits((0.0, 10.0, 20.0), (5.0, 15.0, 25.0)).inside()
+    low, high = Limits((0.0, 10.0, 20.0), (5.0, 15.0, 25.0)).inner_corners()
     assert low == pytest.approx((0.2, 10.2, 20.35))
     assert high == pytest.approx((4.8, 14.8, 24.8))
 

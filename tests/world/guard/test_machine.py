@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from cloudrc.messages import GuardState
-from cloudrc.world.guard.limits import GLIMPSE_NS, Limits
-from cloudrc.world.guard.state import JOLT, Guard
+from cloudrc.world.guard.limits import RECHECK_NS, Limits
+from cloudrc.world.guard.state import JOLT_MAX, Guard
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, command, sensed
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -147,7 +147,7 @@ class GuardMachine(RuleBasedStateMachine):
         calm = sensed((1.0, 1.0, self.height), (0.0, 0.0, self.climb))
         flew = self.guard.tick(self.now_ns, calm, DT) is not None
         self.noted("time")
-        self.now_ns += GLIMPSE_NS + TICK  # until then the guard need not look
+        self.now_ns += RECHECK_NS + TICK  # until then the guard need not look
         spun = calm._replace(angular_velocity_body=(0.0, 0.0, 9.0))
         self.flown = self.guard.tick(self.now_ns, spun, DT)
         self.noted("hit")
@@ -164,7 +164,9 @@ class GuardMachine(RuleBasedStateMachine):
         for _ in range(round(seconds / DT)):
             standing = self.height < 0.2 or self.flown is None
             sinking = 0.0 if standing else self.flown[2]
-            self.climb += min(max(sinking - self.climb, -JOLT / 2), JOLT / 2)  # as no hit does
+            self.climb += min(
+                max(sinking - self.climb, -JOLT_MAX / 2), JOLT_MAX / 2
+            )  # as no hit does
             readings = sensed((1.0, 1.0, self.height), (0.0, 0.0, self.climb))
             self.flown = self.guard.tick(self.now_ns, readings, DT)
             self.noted("time")

@@ -8,7 +8,7 @@ import z3
 from cloudrc.messages import Command
 from cloudrc.world.guard import hold
 from cloudrc.world.guard import limits as rules
-from cloudrc.world.guard.limits import AGE_MAX_NS, RANGE
+from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
 from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import LIMITS, everywhere, root
 
@@ -30,7 +30,7 @@ def test_a_command_with_a_number_out_of_range_is_refused_whole():
 
     def check(run):
         numbers = [run.fresh(name) for name in ("vx", "vy", "vz", "yaw_rate")]
-        inside = z3.And([z3.fpAbs(number.term) <= RANGE for number in numbers])
+        inside = z3.And([z3.fpAbs(number.term) <= COMMAND_MAX for number in numbers])
         refused = Guard(LIMITS).offer(Command(0, 0, 0, tuple(numbers[:3]), numbers[3]), 0)
         assert refused in (None, "range")
         run.prove(z3.Not(inside) if refused else inside)
@@ -43,7 +43,7 @@ def test_within_answers_from_its_interval_whatever_comes_in():
     def check(run):
         value, low, high = (run.fresh(name) for name in ("value", "low", "high"))
         run.learn(z3.And(is_finite(low.term), is_finite(high.term), low.term <= high.term))
-        answer = rules.within(value, low, high)
+        answer = rules.clamp(value, low, high)
         run.prove(z3.And(answer.term >= low.term, answer.term <= high.term))
 
     assert everywhere(check) == 3
@@ -53,18 +53,18 @@ def test_within_changes_nothing_inside_its_interval():
     def check(run):
         value = run.fresh("value")
         run.learn(z3.And(value.term > -1.0, value.term < 1.0))
-        run.prove(z3.fpEQ(lift(run, rules.within(value, -1.0, 1.0)).term, value.term))
+        run.prove(z3.fpEQ(lift(run, rules.clamp(value, -1.0, 1.0)).term, value.term))
 
     everywhere(check)
 
 
-@pytest.mark.parametrize("caution", [rules.CAUTION, rules.REACTION])
+@pytest.mark.parametrize("caution", [rules.FENCE_REACTION, rules.REACTION])
 def test_an_approach_is_never_below_the_way_back_and_never_not_a_number(caution):
     def check(run):
         reach = run.fresh("reach")
-        answer = rules.approach(reach, caution)
+        answer = rules.approach_speed(reach, caution)
         term = answer.term if hasattr(answer, "term") else z3.FPVal(answer, z3.Float64())
-        run.prove(term >= -rules.COME_BACK_MAX)
+        run.prove(term >= -rules.RETURN_SPEED_MAX)
         # Outside or at the face never outwards; inside never back.
         run.prove(z3.Implies(reach.term <= 0.0, term <= 0.0))
         run.prove(z3.Implies(reach.term > 0.0, term >= 0.0))
@@ -79,10 +79,10 @@ def test_an_axis_at_the_fence_is_finite_and_no_faster_than_commanded(at_the_floo
     def check(run):
         v, up, down = (run.fresh(name) for name in ("v", "up", "down"))
         run.learn(is_finite(v.term))
-        run.learn(z3.And(up.term >= -rules.COME_BACK_MAX, down.term >= -rules.COME_BACK_MAX))
+        run.learn(z3.And(up.term >= -rules.RETURN_SPEED_MAX, down.term >= -rules.RETURN_SPEED_MAX))
         low = min(0.0, -down) if at_the_floor else -down
-        term = lift(run, rules.within(v, low, up)).term
-        bound = z3.fpMax(z3.fpAbs(v.term), z3.FPVal(rules.COME_BACK_MAX, z3.Float64()))
+        term = lift(run, rules.clamp(v, low, up)).term
+        bound = z3.fpMax(z3.fpAbs(v.term), z3.FPVal(rules.RETURN_SPEED_MAX, z3.Float64()))
         run.prove(z3.And(is_finite(term), z3.fpAbs(term) <= bound))
 
     assert everywhere(check) == (6 if at_the_floor else 3)
@@ -103,7 +103,7 @@ def test_what_grows_is_no_more_than_what_there_is():
 def test_the_rate_of_braking_is_inside_its_range_whatever_comes_in():
     def check(run):
         rate = lift(run, hold.brake_rate(run.fresh("speed"))).term
-        run.prove(z3.And(rate >= hold.GENTLEST, rate <= hold.HARDEST))
+        run.prove(z3.And(rate >= hold.BRAKE_MIN, rate <= hold.BRAKE_MAX))
 
     everywhere(check)
 

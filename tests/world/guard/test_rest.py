@@ -6,17 +6,17 @@ import pytest
 
 from cloudrc.messages import ZERO
 from cloudrc.world.guard.hold import (
-    DAMPING,
-    EASE,
-    GENTLEST,
-    HARDEST,
-    LEAST_SHARE,
-    PULL,
-    PULL_MAX,
-    STILL,
-    TRIM,
-    TRIM_MAX,
-    Rest,
+    BRAKE_MAX,
+    BRAKE_MIN,
+    BRAKE_SHARE_MIN,
+    BRAKE_TIME_CONSTANT,
+    DAMPING_GAIN,
+    HOLD_SPEED_MAX,
+    INTEGRAL_GAIN,
+    INTEGRAL_MAX,
+    POSITION_GAIN,
+    STILL_SPEED,
+    PositionHold,
     brake_start,
 )
 from cloudrc.world.guard.limits import BRAKE
@@ -29,7 +29,7 @@ ENOUGH = 1.0
 
 def at_rest(sink=0.0, speed_max=6.0, position=HERE):
     """Has dropped its anchor here."""
-    rest = Rest(LOW, HIGH, speed_max)
+    rest = PositionHold(LOW, HIGH, speed_max)
     reference = (0.0, 0.0, -sink)
     assert rest.follow(reference, sensed(position, reference), sink, ENOUGH) == reference
     assert not rest.brakes
@@ -44,7 +44,7 @@ def moved(offset, velocity=ZERO):
 
 
 def test_what_flies_does_not_brake():
-    assert Rest(LOW, HIGH, 6.0).brakes is False
+    assert PositionHold(LOW, HIGH, 6.0).brakes is False
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_what_flies_does_not_brake():
 def test_the_reference_begins_1_mps_ahead_of_the_robot_but_never_at_rest(axis, speed, begins):
     velocity = [0.0, 0.0, 0.0]
     velocity[axis] = speed
-    assert LEAST_SHARE == 0.2
+    assert BRAKE_SHARE_MIN == 0.2
     for reference in (velocity, [1.5 * v for v in velocity]):
         start = brake_start(tuple(reference), tuple(velocity))
         assert start[axis] == pytest.approx(begins)
@@ -68,16 +68,16 @@ def test_of_two_that_are_as_fast_the_reference_counts():
 @pytest.mark.parametrize(
     ("reference", "sink", "rate"),
     [
-        ((0.4, 0.0, 0.0), 0.0, 0.4 / EASE),
-        ((0.0, 0.4, 0.0), 0.0, 0.4 / EASE),
-        ((0.0, 0.0, 0.4), 0.0, 0.4 / EASE),
-        ((0.0, 0.0, 0.1), 0.5, 0.6 / EASE),
-        ((0.0, 0.0, 3.0), 0.0, HARDEST),
-        ((0.1, 0.0, 0.0), 0.0, GENTLEST),
+        ((0.4, 0.0, 0.0), 0.0, 0.4 / BRAKE_TIME_CONSTANT),
+        ((0.0, 0.4, 0.0), 0.0, 0.4 / BRAKE_TIME_CONSTANT),
+        ((0.0, 0.0, 0.4), 0.0, 0.4 / BRAKE_TIME_CONSTANT),
+        ((0.0, 0.0, 0.1), 0.5, 0.6 / BRAKE_TIME_CONSTANT),
+        ((0.0, 0.0, 3.0), 0.0, BRAKE_MAX),
+        ((0.1, 0.0, 0.0), 0.0, BRAKE_MIN),
     ],
 )
 def test_braking_goes_step_by_step_towards_rest(reference, sink, rate):
-    rest = Rest(LOW, HIGH, 6.0)
+    rest = PositionHold(LOW, HIGH, 6.0)
     rest.follow(reference, sensed(velocity=(5.0, 5.0, 5.0)), sink, DT)  # begins
     after = rest.follow(reference, sensed(velocity=(5.0, 5.0, 5.0)), sink, DT)
     way = hypot(*(a - b for a, b in zip(reference, after, strict=True)))
@@ -91,20 +91,20 @@ def test_braking_goes_step_by_step_towards_rest(reference, sink, rate):
 @pytest.mark.parametrize("sink", [0.0, 0.5])
 @pytest.mark.parametrize(("share", "still"), [(0.99, True), (1.01, False), (-1.01, False)])
 def test_the_robot_is_at_rest_when_it_is_slow_in_every_direction(axis, sink, share, still):
-    rest, velocity = Rest(LOW, HIGH, 6.0), [0.0, 0.0, -sink]
-    velocity[axis] += share * STILL
+    rest, velocity = PositionHold(LOW, HIGH, 6.0), [0.0, 0.0, -sink]
+    velocity[axis] += share * STILL_SPEED
     rest.follow((0.0, 0.0, -sink), sensed(velocity=tuple(velocity)), sink, ENOUGH)
     assert rest.brakes != still
 
 
 def test_at_the_limit_it_is_not_yet_at_rest():
-    rest = Rest(LOW, HIGH, 6.0)
-    rest.follow(ZERO, sensed(velocity=(STILL, 0.0, 0.0)), 0.0, ENOUGH)
+    rest = PositionHold(LOW, HIGH, 6.0)
+    rest.follow(ZERO, sensed(velocity=(STILL_SPEED, 0.0, 0.0)), 0.0, ENOUGH)
     assert rest.brakes
 
 
 def test_it_is_not_at_rest_before_its_reference_is():
-    rest = Rest(LOW, HIGH, 6.0)
+    rest = PositionHold(LOW, HIGH, 6.0)
     rest.follow((1.0, 0.0, 0.0), sensed(velocity=(3.0, 0.0, 0.0)), 0.0, DT)
     rest.follow((1.0, 0.0, 0.0), sensed(velocity=ZERO), 0.0, DT)
     assert rest.brakes
@@ -115,12 +115,12 @@ def test_it_is_not_at_rest_before_its_reference_is():
 
 def test_the_position_hold_pulls_back_and_damps():
     reference = at_rest().follow(ZERO, moved((0.1, -0.1, 0.05), (0.04, -0.02, 0.01)), 0.0, ENOUGH)
-    pull = (-0.1 * PULL, 0.1 * PULL, -0.05 * PULL)
-    damped = (0.04 * DAMPING, -0.02 * DAMPING, 0.01 * DAMPING)
+    pull = (-0.1 * POSITION_GAIN, 0.1 * POSITION_GAIN, -0.05 * POSITION_GAIN)
+    damped = (0.04 * DAMPING_GAIN, -0.02 * DAMPING_GAIN, 0.01 * DAMPING_GAIN)
     assert reference == pytest.approx(tuple(a - b for a, b in zip(pull, damped, strict=True)))
 
 
-@pytest.mark.parametrize(("speed_max", "allowed"), [(6.0, PULL_MAX), (0.3, 0.3)])
+@pytest.mark.parametrize(("speed_max", "allowed"), [(6.0, HOLD_SPEED_MAX), (0.3, 0.3)])
 def test_it_pulls_no_faster_than_it_may(speed_max, allowed):
     rest = at_rest(speed_max=speed_max)
     assert hypot(*rest.follow(ZERO, moved((3.0, -4.0, 0.5)), 0.0, ENOUGH)) == pytest.approx(allowed)
@@ -141,7 +141,7 @@ def trimmed(offset, seconds, sink=0.0):
 
 def test_it_leans_against_what_keeps_it_beside_its_anchor():
     beside = (0.03, -0.02, 0.01)
-    lean = tuple(-TRIM * each * 2.0 for each in beside)
+    lean = tuple(-INTEGRAL_GAIN * each * 2.0 for each in beside)
     assert trimmed(beside, 2.0) == pytest.approx(lean)
 
 
@@ -149,7 +149,7 @@ def test_it_leans_against_what_keeps_it_beside_its_anchor():
 def test_it_leans_no_farther_than_it_has_to(sign):
     """Or it would wind up against what it touches."""
     beside = (0.05 * sign, 0.05 * sign, 0.05 * sign)
-    assert trimmed(beside, 60.0) == pytest.approx((-TRIM_MAX * sign,) * 3)
+    assert trimmed(beside, 60.0) == pytest.approx((-INTEGRAL_MAX * sign,) * 3)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
@@ -175,7 +175,7 @@ def test_of_another_rest_it_knows_nothing():
 
 def test_going_down_it_holds_the_position_sideways_only():
     reference = at_rest(0.5).follow(ZERO, moved((0.1, 0.0, -1.0), (0.0, 0.1, -0.3)), 0.5, ENOUGH)
-    assert reference == pytest.approx((-0.1 * PULL, -0.1 * DAMPING, -0.5))
+    assert reference == pytest.approx((-0.1 * POSITION_GAIN, -0.1 * DAMPING_GAIN, -0.5))
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_going_down_it_holds_the_position_sideways_only():
 )
 def test_the_position_that_is_held_is_inside_the_margins(position, anchor):
     reference = at_rest(position=position).follow(ZERO, sensed(position), 0.0, ENOUGH)
-    wanted = tuple(PULL * (a - b) for a, b in zip(anchor, position, strict=True))
+    wanted = tuple(POSITION_GAIN * (a - b) for a, b in zip(anchor, position, strict=True))
     assert reference == pytest.approx(wanted)
 
 

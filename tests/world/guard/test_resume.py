@@ -115,7 +115,7 @@ def test_it_rises_slowly_for_as_long_as_it_takes_to_the_cap(speed_max, ramp_s):
 def test_coming_back_from_the_fence_is_as_slow_after_a_hold():
     """Whoever says so: the reference, the cloud, or the guard where the robot is in the margin."""
     guard = holding()
-    outside = (LIMITS.inside()[1][0] + 0.15, 1.0, 2.0)
+    outside = (LIMITS.inner_corners()[1][0] + 0.15, 1.0, 2.0)
     now_ns = feed(guard, 2 * SECOND, 10, ZERO, position=outside)
     guard.reference = ZERO
     guard.counts.clear()

@@ -6,8 +6,8 @@ from math import hypot, inf, nan, nextafter
 import pytest
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard.hold import HARDEST, PULL_MAX
-from cloudrc.world.guard.limits import CREEP, RANGE, Limits
+from cloudrc.world.guard.hold import BRAKE_MAX, HOLD_SPEED_MAX
+from cloudrc.world.guard.limits import COMMAND_MAX, CREEP_SPEED, Limits
 from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import (
     HERE,
@@ -26,7 +26,7 @@ from tests.world.guard.conftest import (
 from tests.world.guard.test_rules import SPECIAL
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-BEYOND = [value for value in (*SPECIAL, 1e308, -1e308) if abs(value) > RANGE]
+BEYOND = [value for value in (*SPECIAL, 1e308, -1e308) if abs(value) > COMMAND_MAX]
 
 
 # Arming
@@ -79,7 +79,7 @@ def test_what_the_fence_changes_is_within_the_acceleration_cap():
         before = after
     assert before[0] > 0.2
     assert before[1] > 0.3
-    assert hypot(*before) == pytest.approx(CREEP)
+    assert hypot(*before) == pytest.approx(CREEP_SPEED)
 
 
 def test_put_on_the_ground_nothing_is_armed_or_remembered():
@@ -95,7 +95,7 @@ def test_put_on_the_ground_nothing_is_armed_or_remembered():
 # What is taken of a command
 
 
-@pytest.mark.parametrize("bad", [*BEYOND, nan, inf, -inf, nextafter(RANGE, inf), -1000.1])
+@pytest.mark.parametrize("bad", [*BEYOND, nan, inf, -inf, nextafter(COMMAND_MAX, inf), -1000.1])
 @pytest.mark.parametrize("axis", range(4))
 def test_what_is_beyond_all_reason_is_refused_whole(bad, axis):
     guard = tracking((0.5, 0.0, 0.0))
@@ -124,7 +124,7 @@ def test_the_speed_is_capped_and_keeps_its_direction():
     assert guard.counts["limited_speed"] == 61
 
 
-@pytest.mark.parametrize("most", [RANGE, -RANGE])
+@pytest.mark.parametrize("most", [COMMAND_MAX, -COMMAND_MAX])
 def test_up_to_the_range_what_is_too_fast_is_shortened(most):
     guard = armed()
     assert guard.offer(command((most, most, most), yaw_rate=most), 0) is None
@@ -196,7 +196,7 @@ def test_hold_brakes_at_once_and_then_holds_where_the_robot_came_to_rest():
     assert not guard.brakes
     assert run(guard, 904 * MS, 906 * MS, (1.02, 2.0, 1.3))[0][0] < 0.0
     far = run(guard, 906 * MS, 2 * SECOND, (3.0, 2.0, 1.3))[-1]
-    assert far == pytest.approx((-PULL_MAX, 0.0, 0.0))
+    assert far == pytest.approx((-HOLD_SPEED_MAX, 0.0, 0.0))
 
 
 def test_a_robot_that_lags_its_reference_brakes_from_where_it_is():
@@ -212,7 +212,7 @@ def test_the_reference_brakes_no_harder_than_is_said():
     run(guard, 0, 252 * MS, velocity=(3.0, 0.0, 0.0))
     references = run(guard, 252 * MS, 1200 * MS, velocity=(3.0, 0.0, 0.0))
     steps = [a[0] - b[0] for a, b in pairwise(references)]
-    assert max(steps) <= HARDEST * 0.002 * (1 + 1e-9)
+    assert max(steps) <= BRAKE_MAX * 0.002 * (1 + 1e-9)
 
 
 def test_the_next_hold_is_another_place():

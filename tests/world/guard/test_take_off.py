@@ -7,7 +7,13 @@ import pytest
 
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Command, GuardState
-from cloudrc.world.guard.hold import HOP, HOP_SPEED, STILL, STILL_TICKS, TakeOff
+from cloudrc.world.guard.hold import (
+    GROUND_SPEED_MAX,
+    LIFT_OFF_HEIGHT,
+    STILL_SPEED,
+    STILL_TICKS,
+    TakeOff,
+)
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.robot import Robot
@@ -57,7 +63,14 @@ def taking_off(height=0.0, now_ns=0):
 
 
 @pytest.mark.parametrize(
-    ("height", "over"), [(0.0, False), (HOP - 1e-6, False), (HOP, True), (-HOP, True), (nan, True)]
+    ("height", "over"),
+    [
+        (0.0, False),
+        (LIFT_OFF_HEIGHT - 1e-6, False),
+        (LIFT_OFF_HEIGHT, True),
+        (-LIFT_OFF_HEIGHT, True),
+        (nan, True),
+    ],
 )
 def test_so_far_from_where_it_stood_the_take_off_is_over(height, over):
     take_off = TakeOff(*FENCE)
@@ -86,7 +99,9 @@ def test_a_robot_that_was_never_seen_to_stand_flies():
 
 
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize(("speed", "may"), [(0.99 * HOP_SPEED, True), (HOP_SPEED, False)])
+@pytest.mark.parametrize(
+    ("speed", "may"), [(0.99 * GROUND_SPEED_MAX, True), (GROUND_SPEED_MAX, False)]
+)
 def test_at_speed_the_rotors_do_not_stop(axis, speed, may):
     velocity = [0.0, 0.0, 0.0]
     velocity[axis] = speed
@@ -122,14 +137,14 @@ def test_stopped_it_may_take_off_once_it_has_been_at_rest():
 
 
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("speed", [STILL, nan])
+@pytest.mark.parametrize("speed", [STILL_SPEED, nan])
 def test_a_tick_in_motion_begins_the_rest_anew(axis, speed):
     take_off, velocity = stopped(), [0.0, 0.0, 0.0]
     velocity[axis] = speed
     lie(take_off, STILL_TICKS - 1)
     assert not lie(take_off, STILL_TICKS, velocity=tuple(velocity))
     assert not lie(take_off, STILL_TICKS - 1)
-    velocity[axis] = 0.99 * STILL
+    velocity[axis] = 0.99 * STILL_SPEED
     assert lie(take_off, 1, velocity=tuple(velocity))
 
 
@@ -150,8 +165,8 @@ def test_outside_the_fence_it_stays_where_it_lies(axis, face):
 
 
 def test_on_the_ground_a_hold_stops_the_rotors_and_the_mission_goes_on():
-    guard = taking_off(0.9 * HOP)
-    flown = run(guard, 250 * MS, 260 * MS, above(0.9 * HOP))
+    guard = taking_off(0.9 * LIFT_OFF_HEIGHT)
+    flown = run(guard, 250 * MS, 260 * MS, above(0.9 * LIFT_OFF_HEIGHT))
     assert flown[0] is not None
     assert set(flown[1:]) == {None}
     cause = "command age 0.252 s above 0.250 s"
@@ -217,11 +232,11 @@ def test_a_robot_that_is_fast_brakes_before_its_rotors_stop():
 
 @pytest.mark.promise("no-rotor-stop-in-the-air")
 def test_a_robot_that_has_left_the_ground_stays_up_and_climbs_clear_of_it():
-    guard = taking_off(1.1 * HOP)
-    flown = run(guard, 10 * MS, 3 * SECOND, above(1.1 * HOP))
+    guard = taking_off(1.1 * LIFT_OFF_HEIGHT)
+    flown = run(guard, 10 * MS, 3 * SECOND, above(1.1 * LIFT_OFF_HEIGHT))
     assert states(guard) == [HOLD]
     assert flown[-1][:2] == (0.0, 0.0)
-    assert flown[-1][2] == pytest.approx(0.8 * (FLOOR_MARGIN - STANDS[2] - 1.1 * HOP))
+    assert flown[-1][2] == pytest.approx(0.8 * (FLOOR_MARGIN - STANDS[2] - 1.1 * LIFT_OFF_HEIGHT))
 
 
 @pytest.mark.promise("no-rotor-stop-in-the-air")

@@ -37,7 +37,7 @@ def test_along_a_wall_a_robot_that_is_turned_aside_lies_before_it(axis, sign, he
     """It falls from its height with a share of its speed, and slides, and tumbles."""
     for distance in (0.4, 0.8, 1.2, 1.6):
         place = by_the_wall(axis, sign, distance, height)
-        speed = hypot(*rules.fenced(along(axis, 6.0), place, LOW, HIGH))
+        speed = hypot(*rules.limit_to_fence(along(axis, 6.0), place, LOW, HIGH))
         lies = aside(height) * speed * (sqrt(2 * height / 9.81) + 0.4) + 0.3
         assert lies == pytest.approx(distance) or (speed == 0.5 and lies > distance)
 
@@ -49,7 +49,7 @@ def test_towards_a_wall_a_robot_that_falls_lies_before_it(axis, sign, height):
         velocity = [0.0, 0.0, 0.0]
         velocity[axis] = 6.0 * sign
         place = by_the_wall(axis, sign, distance, height)
-        speed = hypot(*rules.fenced(tuple(velocity), place, LOW, HIGH))
+        speed = hypot(*rules.limit_to_fence(tuple(velocity), place, LOW, HIGH))
         stops = 0.6 * speed + speed * speed / 6 + 0.2
         lies = speed * (sqrt(2 * height / 9.81) + 0.4 + 0.2 + 0.3) + 0.3
         assert max(stops, lies) == pytest.approx(distance) or (speed <= 0.5 and lies > distance)
@@ -57,36 +57,36 @@ def test_towards_a_wall_a_robot_that_falls_lies_before_it(axis, sign, height):
 
 def test_away_from_a_wall_it_is_slowed_for_its_side_speed_alone():
     place = by_the_wall(1, -1, 1.0, 1.3)
-    away = rules.fenced((0.0, 6.0, 0.0), place, LOW, HIGH)
-    beside = rules.fenced((6.0, 0.0, 0.0), place, LOW, HIGH)
+    away = rules.limit_to_fence((0.0, 6.0, 0.0), place, LOW, HIGH)
+    beside = rules.limit_to_fence((6.0, 0.0, 0.0), place, LOW, HIGH)
     assert away[1] == pytest.approx(beside[0])
-    assert rules.fenced((0.0, -6.0, 0.0), place, LOW, HIGH)[1] > -0.5 * away[1]
+    assert rules.limit_to_fence((0.0, -6.0, 0.0), place, LOW, HIGH)[1] > -0.5 * away[1]
 
 
 @pytest.mark.parametrize(("axis", "sign"), WALLS)
 def test_along_a_wall_it_is_far_up_to_where_it_would_come_to_lie(axis, sign):
     height = 1.3
-    above = height + rules.GLIMPSE
-    reach = aside(above) * 3.0 * (sqrt(2 * above / 9.81) + 0.4) + 0.3 + rules.GLIMPSE
+    above = height + rules.RECHECK_DISTANCE
+    reach = aside(above) * 3.0 * (sqrt(2 * above / 9.81) + 0.4) + 0.3 + rules.RECHECK_DISTANCE
     for beyond, far in ((-1e-9, False), (1e-9, True)):
         place = by_the_wall(axis, sign, reach + beyond, height)
-        assert rules.is_far(along(axis, 3.0), place, LOW, HIGH) == far
+        assert rules.is_far_from_fence(along(axis, 3.0), place, LOW, HIGH) == far
 
 
 @pytest.mark.parametrize(("axis", "sign"), WALLS)
 def test_towards_a_wall_it_is_far_up_to_where_it_would_come_to_lie(axis, sign):
     height, velocity = 1.3, [0.0, 0.0, 0.0]
     velocity[axis] = 1.5 * sign
-    falls = sqrt(2 * (height + rules.GLIMPSE) / 9.81)
-    reach = 1.5 * (falls + 0.4 + 0.2 + 0.3) + 0.3 + rules.GLIMPSE
+    falls = sqrt(2 * (height + rules.RECHECK_DISTANCE) / 9.81)
+    reach = 1.5 * (falls + 0.4 + 0.2 + 0.3) + 0.3 + rules.RECHECK_DISTANCE
     for beyond, far in ((-1e-9, False), (1e-9, True)):
         place = by_the_wall(axis, sign, reach + beyond, height)
-        assert rules.is_far(tuple(velocity), place, LOW, HIGH) == far
+        assert rules.is_far_from_fence(tuple(velocity), place, LOW, HIGH) == far
 
 
 def test_the_higher_it_flies_the_slower_it_is_beside_a_wall():
     speeds = [
-        hypot(*rules.fenced((6.0, 0.0, 0.0), by_the_wall(1, -1, 1.5, 0.01 * k), LOW, HIGH))
+        hypot(*rules.limit_to_fence((6.0, 0.0, 0.0), by_the_wall(1, -1, 1.5, 0.01 * k), LOW, HIGH))
         for k in range(40, 230)
     ]
     assert speeds == sorted(speeds, reverse=True)
@@ -103,10 +103,10 @@ def test_from_the_floor_there_is_no_fall():
 
 
 def test_creeping_it_may_be_near_a_wall_and_yet_far():
-    near = (LOW[0] + rules.GLIMPSE + 0.01, -1.5, 1.3)
-    assert rules.is_far((0.0, rules.CREEP, 0.0), near, LOW, HIGH)
-    assert not rules.is_far((0.0, rules.CREEP + 1e-9, 0.0), near, LOW, HIGH)
-    assert rules.fenced((0.0, 6.0, 0.0), near, LOW, HIGH) == (0.0, rules.CREEP, 0.0)
+    near = (LOW[0] + rules.RECHECK_DISTANCE + 0.01, -1.5, 1.3)
+    assert rules.is_far_from_fence((0.0, rules.CREEP_SPEED, 0.0), near, LOW, HIGH)
+    assert not rules.is_far_from_fence((0.0, rules.CREEP_SPEED + 1e-9, 0.0), near, LOW, HIGH)
+    assert rules.limit_to_fence((0.0, 6.0, 0.0), near, LOW, HIGH) == (0.0, rules.CREEP_SPEED, 0.0)
 
 
 def test_the_papers_flight_is_not_slowed_by_its_walls():
@@ -117,14 +117,16 @@ def test_the_papers_flight_is_not_slowed_by_its_walls():
         ((0.08, 0.0, 0.0), (8.135, -6.42, 0.7)),
         ((2.0, -2.0, 0.0), (0.9, -4.6, 0.7)),
     ):
-        assert rules.fenced(velocity, position, LOW, HIGH) == velocity
+        assert rules.limit_to_fence(velocity, position, LOW, HIGH) == velocity
 
 
 def test_where_the_robot_is_slowed_along_a_wall_it_is_not_far():
     for speed in (0.4, 0.6, 0.9, 1.1, 2.0, 3.0, 4.4):
         for k in range(300):
             velocity, position = (0.0, speed, 0.0), (-3.0 + 0.01 * k, -3.0, 1.3)
-            if rules.is_far(velocity, position, LOW, HIGH):
-                assert rules.fenced(velocity, position, LOW, HIGH) == pytest.approx(velocity)
-    assert rules.is_far((0.0, 0.4, 0.0), (-3.0 + 0.46, -3.0, 1.3), LOW, HIGH)
-    assert rules.fenced((0.0, -4.4, 0.0), (-1.0, 0.0, 0.7), LOW, HIGH) == (0.0, -4.4, 0.0)
+            if rules.is_far_from_fence(velocity, position, LOW, HIGH):
+                assert rules.limit_to_fence(velocity, position, LOW, HIGH) == pytest.approx(
+                    velocity
+                )
+    assert rules.is_far_from_fence((0.0, 0.4, 0.0), (-3.0 + 0.46, -3.0, 1.3), LOW, HIGH)
+    assert rules.limit_to_fence((0.0, -4.4, 0.0), (-1.0, 0.0, 0.7), LOW, HIGH) == (0.0, -4.4, 0.0)
