@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import UPRIGHT, ZERO
-from cloudrc.world.low_level import ASKEW, TURNED_AWAY, LowLevel, allocate, attitude
+from cloudrc.world.low_level import NOSE_COSINE_MIN, YAW_SINE_MAX, LowLevel, allocate, attitude
 from cloudrc.world.readings import Readings
 
 WEIGHT = 10.3005  # 1.05 kg * 9.81 m/s^2
@@ -105,7 +105,7 @@ def test_attitude_is_the_matrix_formula(force, quaternion):
     y_d = np.cross(z_d, (1.0, 0.0, 0.0))
     y_d /= np.linalg.norm(y_d)
     error = np.column_stack([np.cross(y_d, z_d), y_d, z_d]).T @ rotation
-    assume(error[1, 1] > TURNED_AWAY and abs(rotation[1, 0]) < ASKEW)
+    assume(error[1, 1] > NOSE_COSINE_MIN and abs(rotation[1, 0]) < YAW_SINE_MAX)
     error = 0.5 * (error - error.T)
     thrust, *torque = attitude(force, turned((w, *q)))
     assert thrust == pytest.approx(np.dot(force, rotation[:, 2]), abs=1e-9)

@@ -6,17 +6,17 @@ import re
 
 import pytest
 
-from cloudrc.world.endpoint import QUIET_NS, Pace
+from cloudrc.world.endpoint import REPORT_AGAIN_NS, PaceMonitor
 
 SECOND_NS = 1_000_000_000
 
 
 def told(*slips: float, start_ns: int = 0) -> list[tuple[int, str]]:
     """What is said in the seconds of world's clock in which it slips by so much [s]."""
-    pace, slip_ns, said = Pace(), 0, list[tuple[int, str]]()
+    pace, slip_ns, said = PaceMonitor(), 0, list[tuple[int, str]]()
     for n, slip in enumerate(slips):
         slip_ns += round(slip * 1e9)
-        faults = pace.look(start_ns + (n + 1) * SECOND_NS, slip_ns)
+        faults = pace.check(start_ns + (n + 1) * SECOND_NS, slip_ns)
         assert {fault.code for fault in faults} <= {"late"}
         said += [(n, fault.text) for fault in faults]
     return said
@@ -49,7 +49,7 @@ def test_a_world_that_is_always_slow_says_it_once() -> None:
 
 
 def test_it_says_it_again_once_it_has_kept_up_for_10_s() -> None:
-    quiet = QUIET_NS // SECOND_NS
+    quiet = REPORT_AGAIN_NS // SECOND_NS
     soon, late = [0.0] * (quiet - 1), [0.0] * quiet
     assert [second for second, _ in told(0.0, 0.5, *soon, 0.5)] == [1]
     assert [second for second, _ in told(0.0, 0.5, *late, 0.7)] == [1, quiet + 2]

@@ -28,7 +28,7 @@ def test_it_flies_where_the_wanted_gl_is_missing(tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stderr.splitlines() == ["MUJOCO_GL=egl ignored: flying needs no GL"]
+    assert done.stderr.splitlines() == ["MUJOCO_GL=egl ignored: a flight needs no OpenGL"]
     assert not list(tmp_path.iterdir())
 
 

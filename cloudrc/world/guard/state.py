@@ -123,10 +123,8 @@ class Guard:
         self._speed_max = limits.speed_max * rules.ROUNDING_FACTOR
         self._low, self._high = limits.inner_corners()
         self._floor, half = self._low[2], 0.5 * limits.speed_max
-        self._position_hold, self._descent = (
-            PositionHold(self._low, self._high, half),
-            Descent(self._floor, half),
-        )
+        self._position_hold = PositionHold(self._low, self._high, half)
+        self._descent = Descent(self._floor, half)
         self._hits, self._take_off = Hits(), TakeOff(limits.fence_low, limits.fence_high)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
