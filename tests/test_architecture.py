@@ -136,7 +136,7 @@ def place_of(path: Path) -> str:
     return path.relative_to(PACKAGE).as_posix()
 
 
-def test_a_file_imports_only_what_its_part_may() -> None:
+def test_a_file_imports_only_allowed_modules() -> None:
     found = {place_of(path): violations(place_of(path), tree) for path, tree in TREES.items()}
     assert {place: breaches for place, breaches in found.items() if breaches} == {}
 
@@ -157,7 +157,7 @@ def test_a_file_imports_only_what_its_part_may() -> None:
         ("metrics/rtt.py", "print('x')"),
     ],
 )
-def test_a_breach_is_found(place: str, code: str) -> None:
+def test_a_forbidden_import_is_found(place: str, code: str) -> None:
     assert violations(place, ast.parse(code))
 
 
@@ -167,7 +167,7 @@ def foreign(trees: Iterable[ast.AST]) -> set[str]:
     return {ASKED_AS.get(name, name) for name in found - sys.stdlib_module_names - {"cloudrc"}}
 
 
-def test_what_is_imported_is_what_is_declared_and_nothing_else() -> None:
+def test_imported_and_declared_packages_are_the_same() -> None:
     """So a package of another's name cannot slip in (threat T23)."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [lines for name, lines in project["optional-dependencies"].items() if name != "dev"]
@@ -193,12 +193,12 @@ def test_no_function_is_longer_than_50_lines() -> None:
     assert {name: length for name, length in lengths.items() if length > 50} == {}
 
 
-def test_every_module_says_what_it_is() -> None:
+def test_every_module_has_a_docstring() -> None:
     silent = [place_of(p) for p, tree in TREES.items() if tree.body and not ast.get_docstring(tree)]
     assert silent == [], "a module opens with one sentence"
 
 
-def test_numpy_gives_no_global_chance() -> None:
+def test_numpy_s_global_random_state_is_not_used() -> None:
     """`numpy.random.default_rng(seed)` is an injected generator; everything else is global."""
     allowed = {"default_rng", "Generator", "Philox", "PCG64", "SeedSequence"}
     for path, tree in TREES.items():

@@ -103,5 +103,5 @@ def test_every_quantity_has_its_unit() -> None:
         ('class A:\n    """A."""\n    x: float', []),
     ],
 )
-def test_what_is_missing_is_found(code: str, missing: list[str]) -> None:
+def test_a_missing_unit_is_found(code: str, missing: list[str]) -> None:
     assert without_unit(code) == missing

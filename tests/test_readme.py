@@ -96,7 +96,7 @@ def test_another_flight_works(command: str, capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_recording_is_read_as_the_readme_says(folder: Path) -> None:
+def test_the_readme_s_way_to_read_a_recording_works(folder: Path) -> None:
     assert main("run hover --mode virtual --set mission.waypoints.0.dwell_s=1".split()) == 0
     done = execute(f"{sys.executable} read_recording.py", folder)
     assert done.returncode == 0, done.stderr
@@ -104,7 +104,7 @@ def test_the_recording_is_read_as_the_readme_says(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_predictor_does_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_readme_s_predictor_works(capsys: pytest.CaptureFixture[str]) -> None:
     """A share of 1 is `constant_velocity`; half of it predicts worse; neither is a fault."""
     errors = []
     for share in ("0.5", "1.0"):

@@ -96,12 +96,12 @@ def test_the_tip_touches_at_the_contact_pose() -> None:
     assert tip == pytest.approx((8.535, -6.422, 0.87))
 
 
-def test_nobody_is_near_in_an_empty_scene() -> None:
+def test_clearance_is_infinite_in_an_empty_scene() -> None:
     assert clearance(Scene("empty"), [(0, 0, 1), (1, 0, 1)], [LEVEL] * 2).tolist() == [math.inf] * 2
     assert clearance(PIPES, np.empty((0, 3)), np.empty((0, 4))).shape == (0,)
 
 
-def test_many_poses_are_the_same_as_each_alone() -> None:
+def test_a_batch_gives_the_same_as_single_poses() -> None:
     rng = np.random.default_rng(1)
     at = rng.uniform((-2, -8, 0), (9, 4, 2), (333, 3))
     facing = rng.normal(size=(333, 4))

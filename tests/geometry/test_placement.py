@@ -115,7 +115,7 @@ def in_pipe(points: Array, pipe: Pipe) -> tuple[Array, Array]:
 
 @settings(max_examples=50, deadline=None)
 @given(*[st.tuples(st.floats(-3, 9), st.floats(-8, 5), st.floats(0, 2))] * 2)
-def test_a_way_is_through_a_wall_if_some_of_it_is_within_and_some_without(
+def test_a_way_crosses_a_wall_if_it_changes_sides(
     start: Vector, end: Vector
 ) -> None:
     """Of ways that are cut into short pieces: a piece that changes sides does so in the wall."""
@@ -134,7 +134,7 @@ def test_a_way_is_through_a_wall_if_some_of_it_is_within_and_some_without(
         assert np.any(near & (np.abs(depth) < pipe.length / 2 + 0.02))
 
 
-def test_a_waypoint_behind_a_wall_is_refused_and_its_way_is_named() -> None:
+def test_a_waypoint_behind_a_wall_is_refused_with_its_way() -> None:
     inside, outside = Waypoint(position_m=(-1.0, 0.0, 0.7)), Waypoint(position_m=(0.5, 0.0, 0.7))
     (problem,) = check_mission(Mission(waypoints=(inside, outside)), PIPES)
     assert str(problem).startswith("waypoints.1.position_m: [0.5, 0, 0.7]: the straight way there")
@@ -142,7 +142,7 @@ def test_a_waypoint_behind_a_wall_is_refused_and_its_way_is_named() -> None:
     assert check_mission(Mission(waypoints=(outside, outside)), PIPES) == []
 
 
-def test_none_and_both_are_refused() -> None:
+def test_neither_waypoints_nor_steps_or_both_are_refused() -> None:
     assert "none given" in str(check_mission(Mission(), PIPES)[0])
     both = Mission(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps())
     assert "not both" in str(check_mission(both, Scene("empty"))[0])
@@ -162,7 +162,7 @@ def test_steps_that_can_end_in_a_wall_are_refused(steps: Steps, scene: str, reas
     assert reason in problem.reason
 
 
-def test_points_beyond_all_bounds_are_refused_without_an_overflow() -> None:
+def test_points_far_outside_are_refused_without_overflow() -> None:
     far = Mission(waypoints=(Waypoint(position_m=(1e300, 0.0, 1.0), yaw_deg=1e300),))
     *_, problem = check_mission(far, PIPES)
     assert "beyond the fence" in problem.reason

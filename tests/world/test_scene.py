@@ -121,7 +121,7 @@ def test_staves_are_tangent_to_the_pipe(pipes, name, expected):
     assert np.sum(directions, axis=0) == pytest.approx([0, 0, 0], abs=1e-9)
 
 
-def test_the_board_is_where_it_is_said_to_be(pipes):
+def test_the_board_is_where_the_numbers_say(pipes):
     x, y_min, y_max, z_min, z_max = facts("pipes")["board"]
     assert (x, y_min, y_max, z_min, z_max) == (8.535, -6.82, -6.02, 0.025, 1.225)
     geoms = [pipes.geom(number) for number in range(pipes.ngeom)]
@@ -202,7 +202,7 @@ def test_a_scene_that_cannot_be_flown_in_is_refused(tmp_path, scene, message):
     assert str(path) in str(error.value)
 
 
-def test_an_unknown_name_lists_those_that_there_are():
+def test_an_unknown_name_lists_the_available_ones():
     with pytest.raises(BadInputError, match=r"no robot named 'pelikan'; available: pelican"):
         compile_model("pelikan", "pipes")
     with pytest.raises(BadInputError, match=r"no scene named 'tubes'; available: empty, pipes"):

@@ -57,7 +57,7 @@ def test_thrust_grows_with_the_square_of_the_speed():
     )
 
 
-def test_drag_of_level_flight_by_hand():
+def test_drag_of_level_flight_equals_the_hand_calculation():
     # Four rotors at 500 rad/s: 8.06428e-5 * 2000 = .1612856 N s/m. At 2 m/s: -.3225712 N, and it
     # acts .05 m above the base: torque .05 * -.3225712 about y.
     readings = Readings.of((*ZERO, *UPRIGHT), (2.0, 0.0, 1.0, *ZERO))
@@ -125,7 +125,7 @@ def test_the_torque_allocated_is_the_torque_that_turns(scene_at, axis, sign):
     assert change[axis] == pytest.approx(sign * 0.02 * 0.0875 / inertia, rel=0.1)
 
 
-def test_hover_without_position_feedback_drifts_forward_by_26_mm_per_s(scene_at):
+def test_hover_without_position_feedback_drifts_26_mm_per_s(scene_at):
     # The arm's moment of .01 kg * .2 m * 9.81 m/s^2 tilts the robot by .0196 rad (k_R = 1), that is
     # .204 N forward. The integral takes .1 N of it; the rest drives it on at 4 v = .104 N.
     simulator = Simulator("pelican", scene_at(0, 0, 3, "empty"))

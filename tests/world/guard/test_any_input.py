@@ -85,7 +85,7 @@ def check_flown(guard, reference, position):
 @pytest.mark.promise("commands-within-caps")
 @given(CASES)
 @settings(max_examples=10_000 // CASES_AT_ONCE, deadline=None)
-def test_whatever_is_commanded_and_sensed_what_is_flown_is_inside_the_caps(cases):
+def test_any_input_is_flown_inside_the_caps(cases):
     check_cases(cases)
 
 
@@ -144,7 +144,7 @@ def test_a_million_commands_and_readings_stay_inside_the_caps(figure):
 @pytest.mark.parametrize(
     "value", [v for v in (*SPECIAL, COMMAND_MAX, -COMMAND_MAX) if abs(v) <= COMMAND_MAX]
 )
-def test_every_special_float_that_is_taken_is_flown_inside_the_caps(axis, value):
+def test_every_accepted_special_float_is_flown_in_the_caps(axis, value):
     values = [0.5, 0.5, 0.5, 0.5]
     values[axis] = value
     velocity, yaw_rate = tuple(values[:3]), values[3]

@@ -37,13 +37,13 @@ def check_stopped(simulator, seed, figure):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_stopped_at_any_instant_it_comes_to_lie_within_what_is_told(simulator, seed, figure):
+def test_a_stopped_robot_lies_within_the_documented_distance(simulator, seed, figure):
     check_stopped(simulator, seed, figure)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("seed", range(5, 400))
-def test_stopped_at_four_hundred_instants_likewise(simulator, seed, figure):
+def test_a_stopped_robot_lies_as_documented_in_400_falls(simulator, seed, figure):
     check_stopped(simulator, seed, figure)
 
 
@@ -84,12 +84,12 @@ def check_falls(simulator, seeds, figure, share_max, farthest_max):
     assert max(excess) <= farthest_max
 
 
-def test_after_a_fall_it_seldom_lies_farther_than_the_fence_counts_on(simulator, figure):
+def test_after_a_fall_it_seldom_lies_beyond_the_margin(simulator, figure):
     check_falls(simulator, range(40), figure, 0.10, 1.5)
 
 
 @pytest.mark.full
-def test_after_a_fall_it_seldom_lies_farther_in_two_thousand_falls(simulator, figure):
+def test_after_a_fall_it_seldom_lies_beyond_it_in_2000_falls(simulator, figure):
     check_falls(simulator, range(2000), figure, 0.05, 1.5)
 
 
@@ -121,13 +121,13 @@ def scrapes(simulator, seed, room):
 
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("seed", [48, 86, 90, 101])
-def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence(simulator, seed):
+def test_a_take_off_scrapes_less_far_than_to_the_fence(simulator, seed):
     """Those of 400 that get farthest: lying tilted, it is pushed along before it rises."""
     assert scrapes(simulator, seed, TAKE_OFF_MARGIN) > 0.02
 
 
 @pytest.mark.full
-def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence_in_four_hundred(
+def test_a_take_off_scrapes_less_far_in_400_take_offs(
     simulator, figure
 ):
     seeds = range(400)
@@ -139,7 +139,7 @@ def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence_in_four_hundre
 
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("nearer", [0.01, -0.01])
-def test_stopped_near_a_wall_it_takes_off_only_so_far_from_it(simulator, nearer):
+def test_near_a_wall_a_stopped_robot_does_not_take_off(simulator, nearer):
     flight = Flight(simulator)
     _, y, z = LIMITS.fence_low
     far = replace(LIMITS, fence_low=(-TAKE_OFF_MARGIN + nearer, y, z))

@@ -25,7 +25,7 @@ def is_finite(term):
     return z3.Not(z3.Or(z3.fpIsNaN(term), z3.fpIsInf(term)))
 
 
-def test_a_command_with_a_number_out_of_range_is_refused_whole():
+def test_a_command_with_one_value_out_of_range_is_rejected():
     """`Guard.offer` refuses all but what is within the range: NaN, infinities and 1e308, too."""
 
     def check(run):
@@ -39,7 +39,7 @@ def test_a_command_with_a_number_out_of_range_is_refused_whole():
     assert everywhere(check) == 5
 
 
-def test_within_answers_from_its_interval_whatever_comes_in():
+def test_clamp_of_any_value_is_in_its_interval():
     def check(run):
         value, low, high = (run.fresh(name) for name in ("value", "low", "high"))
         run.learn(z3.And(is_finite(low.term), is_finite(high.term), low.term <= high.term))
@@ -49,7 +49,7 @@ def test_within_answers_from_its_interval_whatever_comes_in():
     assert everywhere(check) == 3
 
 
-def test_within_changes_nothing_inside_its_interval():
+def test_clamp_keeps_a_value_inside_its_interval():
     def check(run):
         value = run.fresh("value")
         run.learn(z3.And(value.term > -1.0, value.term < 1.0))
@@ -59,7 +59,7 @@ def test_within_changes_nothing_inside_its_interval():
 
 
 @pytest.mark.parametrize("caution", [rules.FENCE_REACTION, rules.REACTION])
-def test_an_approach_is_never_below_the_way_back_and_never_not_a_number(caution):
+def test_approach_speed_is_a_number_and_has_its_lower_bound(caution):
     def check(run):
         reach = run.fresh("reach")
         answer = rules.approach_speed(reach, caution)
@@ -73,7 +73,7 @@ def test_an_approach_is_never_below_the_way_back_and_never_not_a_number(caution)
 
 
 @pytest.mark.parametrize("at_the_floor", [False, True])
-def test_an_axis_at_the_fence_is_finite_and_no_faster_than_commanded(at_the_floor):
+def test_one_axis_of_limit_to_fence_is_finite_and_bounded(at_the_floor):
     """One axis of `fenced`, any finite command; of `approach` only what is proven above is used."""
 
     def check(run):
@@ -88,7 +88,7 @@ def test_an_axis_at_the_fence_is_finite_and_no_faster_than_commanded(at_the_floo
     assert everywhere(check) == (6 if at_the_floor else 3)
 
 
-def test_what_grows_is_no_more_than_what_there_is():
+def test_growth_is_at_most_the_value_itself():
     """So what is held back keeps its sign, and is never faster than what was asked for."""
 
     def check(run):
@@ -100,7 +100,7 @@ def test_what_grows_is_no_more_than_what_there_is():
     assert everywhere(check) >= 6
 
 
-def test_the_rate_of_braking_is_inside_its_range_whatever_comes_in():
+def test_brake_rate_of_any_speed_is_in_its_range():
     def check(run):
         rate = lift(run, hold.brake_rate(run.fresh("speed"))).term
         run.prove(z3.And(rate >= hold.BRAKE_MIN, rate <= hold.BRAKE_MAX))
@@ -108,7 +108,7 @@ def test_the_rate_of_braking_is_inside_its_range_whatever_comes_in():
     everywhere(check)
 
 
-def test_a_fall_lasts_no_longer_than_one_from_the_largest_height_whatever_comes_in(monkeypatch):
+def test_fall_time_has_an_upper_bound(monkeypatch):
     top = 2.0 / rules.GRAVITY * rules.HEIGHT_MAX
     monkeypatch.setattr(rules, "sqrt", partial(root, top=top))
     longest = rules.fall_time(rules.HEIGHT_MAX)
@@ -130,7 +130,7 @@ def any_speed_and_reaction(run):
     return speed, reaction
 
 
-def test_a_way_to_rest_is_never_negative_and_always_a_number():
+def test_stopping_distance_is_a_number_and_never_negative():
     def check(run):
         way = rules.stopping_distance(*any_speed_and_reaction(run)).term
         run.prove(way >= 0.0)
@@ -138,7 +138,7 @@ def test_a_way_to_rest_is_never_negative_and_always_a_number():
     assert everywhere(check) == 1
 
 
-def test_from_above_seven_metres_a_second_no_way_to_rest_is_allowed():
+def test_above_7_mps_every_stopping_distance_is_too_long():
     """Up to the largest float: a way that overflows is infinite, and that is too long as well."""
 
     def check(run):

@@ -39,7 +39,7 @@ def test_ten_fresh_commands_within_half_a_second_end_a_hold():
 
 
 @pytest.mark.parametrize(("took_ns", "state"), [(500 * MS, TRACK), (500 * MS + 1, HOLD)])
-def test_half_a_second_is_half_a_second(took_ns, state):
+def test_more_than_half_a_second_does_not_end_a_hold(took_ns, state):
     guard = holding()
     for k in range(9):
         guard.offer(command(basis_ns=2 * SECOND + k * MS), 2 * SECOND + k * MS)
@@ -99,7 +99,7 @@ def test_after_a_hold_the_reference_rises_slowly():
 
 
 @pytest.mark.parametrize(("speed_max", "ramp_s"), [(6.0, 2.0), (4.5, 1.5), (1.5, 1.0)])
-def test_it_rises_slowly_for_as_long_as_it_takes_to_the_cap(speed_max, ramp_s):
+def test_after_a_hold_the_ramp_lasts_until_the_cap(speed_max, ramp_s):
     """What a cloud says first, that it rests or has been caught up with, ends nothing."""
     guard = holding(replace(LIMITS, speed_max=speed_max))
     feed(guard, 2 * SECOND, 10, ZERO)
@@ -112,7 +112,7 @@ def test_it_rises_slowly_for_as_long_as_it_takes_to_the_cap(speed_max, ramp_s):
         assert guard.reference[0] == pytest.approx(rate * 0.01)
 
 
-def test_coming_back_from_the_fence_is_as_slow_after_a_hold():
+def test_after_a_hold_the_return_to_the_fence_has_the_ramp():
     """Whoever says so: the reference, the cloud, or the guard where the robot is in the margin."""
     guard = holding()
     outside = (LIMITS.inner_corners()[1][0] + 0.15, 1.0, 2.0)
@@ -126,7 +126,7 @@ def test_coming_back_from_the_fence_is_as_slow_after_a_hold():
         assert after[0] < before[0]
 
 
-def test_a_robot_that_was_put_on_the_ground_knows_of_no_hold():
+def test_a_reset_to_the_ground_forgets_the_last_hold():
     guard = holding()
     now_ns = feed(guard, 2 * SECOND, 20)
     guard.put_on_ground(now_ns, "from spawn")
@@ -144,7 +144,7 @@ def test_slowing_down_is_as_fast_as_ever_after_a_hold():
     assert before - guard.reference[0] == pytest.approx(12.0 * 0.01)
 
 
-def test_a_link_that_comes_and_goes_does_not_chatter():
+def test_an_unstable_link_does_not_make_the_state_chatter():
     """Fresh just long enough to be believed, then silent: again and again for 20 s."""
     guard = tracking()
     now_ns = 0

@@ -21,23 +21,23 @@ PLACES = st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-0.2, 3))
 SPEEDS = st.tuples(*[st.floats(-8, 8)] * 3)
 
 
-def test_the_way_to_a_stop_is_that_of_the_stop_rule():
+def test_stopping_distance_is_that_of_the_stop_rule():
     assert rules.stopping_distance(6.0, 0.45) == pytest.approx(8.7)
 
 
 @pytest.mark.parametrize("reach", [TINY, 1e-9, 0.01, 0.5, 1.0, 7.0, 1000.0])
 @pytest.mark.parametrize("caution", [rules.FENCE_REACTION, rules.REACTION])
-def test_the_approach_is_the_solution_of_the_stop_rule(reach, caution):
+def test_approach_speed_solves_the_stop_rule(reach, caution):
     v = rules.approach_speed(reach, caution)
     assert v * (caution + v / 6) == pytest.approx(reach, rel=1e-12)
 
 
 @pytest.mark.parametrize(("reach", "back"), [(-0.1, -0.1), (-0.5, -0.5), (-3.0, -0.5), (0.0, 0.0)])
-def test_beyond_a_face_the_way_back_is_as_fast_as_it_is_long(reach, back):
+def test_beyond_a_face_the_return_speed_grows_with_distance(reach, back):
     assert rules.approach_speed(reach) == back
 
 
-def test_from_nowhere_nothing_is_approached():
+def test_approach_speed_of_nan_is_zero():
     assert rules.approach_speed(nan) == 0.0
 
 
@@ -48,12 +48,12 @@ def test_nearer_is_never_faster():
 
 
 @pytest.mark.parametrize("value", SPECIAL_BAD)
-def test_within_answers_from_the_interval(value):
+def test_clamp_stays_in_its_interval(value):
     assert -2.0 <= rules.clamp(value, -2.0, 3.0) <= 3.0
 
 
 @pytest.mark.parametrize("length_max", [0.5, 6.0])
-def test_shortened_is_short_and_points_the_same_way(length_max):
+def test_limit_length_limits_length_and_keeps_direction(length_max):
     for a in product(SPECIAL_BAD, repeat=3):
         b = rules.limit_length(a, length_max)
         if not all(map(isfinite, a)):
@@ -65,7 +65,7 @@ def test_shortened_is_short_and_points_the_same_way(length_max):
             assert b is a
 
 
-def test_what_is_just_as_long_as_allowed_is_not_shortened():
+def test_limit_length_keeps_a_vector_of_the_allowed_length():
     """Else it would count as limited; what is a hair longer must not be taken for no number."""
     allowed, longer = (1.0, 0.0, 0.0), (1.0, 2.0**-26, 0.0)
     assert rules.limit_length(allowed, 1.0) is allowed
@@ -73,7 +73,7 @@ def test_what_is_just_as_long_as_allowed_is_not_shortened():
 
 
 @pytest.mark.parametrize("step", [1e-9, 0.024, 3.0])
-def test_towards_goes_a_step_and_not_beyond(step):
+def test_step_towards_moves_by_at_most_a_step(step):
     assert rules.step_towards((0.0, 0.0, 0.0), (3.0, 0.0, 4.0), step)[2] == pytest.approx(
         0.8 * step
     )
@@ -88,7 +88,7 @@ HIGH = tuple(high - rules.FENCE_MARGIN for high in LIMITS.fence_high)
 
 @given(SPEEDS, PLACES)
 @settings(max_examples=1000, deadline=None)
-def test_towards_every_face_the_robot_can_stop(velocity, position):
+def test_limit_to_fence_lets_the_robot_stop_before_each_face(velocity, position):
     limited = rules.limit_to_fence(velocity, position, LOW, HIGH)
     for v, at, low, high in zip(
         limited, position, LIMITS.fence_low, LIMITS.fence_high, strict=True
@@ -99,7 +99,7 @@ def test_towards_every_face_the_robot_can_stop(velocity, position):
 
 @given(SPEEDS, PLACES, st.tuples(*[st.floats(-rules.RECHECK_DISTANCE, rules.RECHECK_DISTANCE)] * 3))
 @settings(max_examples=1000, deadline=None)
-def test_far_from_the_fence_it_changes_nothing_here_and_near_by(velocity, position, step):
+def test_far_from_the_fence_limit_to_fence_changes_nothing(velocity, position, step):
     if rules.is_far_from_fence(velocity, position, LOW, HIGH):
         near = tuple(at + d for at, d in zip(position, step, strict=True))
         assert rules.limit_to_fence(velocity, near, LOW, HIGH) == pytest.approx(velocity, abs=1e-12)
@@ -107,7 +107,7 @@ def test_far_from_the_fence_it_changes_nothing_here_and_near_by(velocity, positi
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
-def test_nowhere_is_not_far(axis, bad):
+def test_a_nan_position_is_not_far_from_the_fence(axis, bad):
     position = [1.0, 1.0, 1.0]
     assert rules.is_far_from_fence(ZERO, tuple(position), LOW, HIGH)
     position[axis] = bad
@@ -115,7 +115,7 @@ def test_nowhere_is_not_far(axis, bad):
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(a, s) for a in range(3) for s in (-1, 1)])
-def test_it_is_far_up_to_where_the_robot_has_to_slow_down(axis, sign):
+def test_far_from_the_fence_ends_where_the_robot_must_slow_down(axis, sign):
     position, velocity = [1.0, 1.0, 1.3], [0.0, 0.0, 0.0]
     velocity[axis] = 0.3 * sign
     caution = rules.REACTION if (axis, sign) == (2, -1) else rules.FENCE_REACTION
@@ -134,13 +134,13 @@ def test_beyond_the_margin_the_robot_comes_back(position, axis, sign):
     assert rules.limit_to_fence(ZERO, position, LOW, HIGH)[axis] * sign > 0.05
 
 
-def test_whoever_stands_on_the_floor_is_not_asked_to_take_off():
+def test_a_robot_on_the_floor_is_not_told_to_climb():
     assert rules.limit_to_fence(ZERO, (0.0, 0.0, 0.1), LOW, HIGH) == ZERO
     assert rules.limit_to_fence((0.0, 0.0, -1.0), (0.0, 0.0, 0.1), LOW, HIGH) == ZERO
     assert rules.limit_to_fence((0.0, 0.0, 0.9), (0.0, 0.0, 0.1), LOW, HIGH) == (0.0, 0.0, 0.9)
 
 
-def test_near_the_floor_the_robot_goes_no_faster_than_it_can_touch():
+def test_near_the_floor_the_sideways_speed_is_limited():
     assert rules.limit_to_fence((3.0, 4.0, 0.0), (0, -2, 0.2), LOW, HIGH)[:2] == pytest.approx(
         (0.6, 0.8)
     )
@@ -164,7 +164,7 @@ def test_in_land_the_floor_is_no_face():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("bad", SPECIAL_BAD)
-def test_whatever_is_sensed_the_fence_answers_with_a_speed(bad, axis):
+def test_limit_to_fence_of_any_reading_is_finite(bad, axis):
     position = [0.0, 0.0, 1.0]
     position[axis] = bad
     for velocity in ((6.0, 6.0, 6.0), (-6.0, -6.0, -6.0), ZERO):
@@ -173,7 +173,7 @@ def test_whatever_is_sensed_the_fence_answers_with_a_speed(bad, axis):
         )
 
 
-def test_the_reference_does_not_fall_faster_than_the_robot_can():
+def test_limit_sink_limits_how_fast_the_reference_sinks():
     kept = rules.limit_sink((1.0, 0.0, -3.0), (1.0, 0.0, 0.0), climb=-0.2, speed_max=6.0)
     assert kept == (1.0, 0.0, -0.2 - rules.SINK_LEAD_MAX)
     same = (1.0, 0.0, -0.6)
@@ -185,7 +185,7 @@ def test_the_reference_does_not_fall_faster_than_the_robot_can():
 
 
 @pytest.mark.parametrize("climb", SPECIAL_BAD)
-def test_whatever_is_sensed_the_reference_stays_below_the_cap(climb):
+def test_limit_sink_of_any_reading_stays_below_the_cap(climb):
     before = (0.0, 0.0, 5.9)
     kept = rules.limit_sink((5.9, 0.0, -1.0), before, climb, speed_max=6.0)
     assert hypot(*kept) <= 6.0 * (1 + 1e-15)
@@ -193,7 +193,7 @@ def test_whatever_is_sensed_the_reference_stays_below_the_cap(climb):
 
 @given(SPEEDS, VECTORS)
 @settings(max_examples=500, deadline=None)
-def test_braking_begins_with_no_more_than_what_was_flown(reference, velocity):
+def test_brake_start_is_no_faster_than_the_reference(reference, velocity):
     start = brake_start(reference, velocity)
     assert hypot(*start) <= hypot(*reference)
 
@@ -205,7 +205,7 @@ def test_braking_is_hard_first_and_gentle_in_the_end(speed, rate):
 
 @given(SPEEDS, SPEEDS, st.floats(1e-3, 0.1))
 @settings(max_examples=1000, deadline=None)
-def test_no_more_than_a_step_leads_away_from_rest(before, after, step):
+def test_limit_growth_speeds_up_by_at_most_a_step(before, after, step):
     kept = rules.limit_growth(before, after, step)
     grown = [rules.growth(a, b) for a, b in zip(before, kept, strict=True)]
     assert hypot(*grown) <= step * (1 + 1e-12) + 1e-15
@@ -216,7 +216,7 @@ def test_no_more_than_a_step_leads_away_from_rest(before, after, step):
         assert kept == pytest.approx(after, abs=1e-15)
 
 
-def test_slowing_down_is_never_held_back():
+def test_limit_growth_does_not_limit_slowing_down():
     braked = (1.0, -1.0, 0.0)
     assert rules.limit_growth((5.0, -5.0, 5.0), braked, 0.024) is braked
     a_step = (-0.25, 0.0, 0.0)
@@ -229,7 +229,7 @@ def test_slowing_down_is_never_held_back():
     ("before", "after", "grown"),
     [(1.0, 3.0, 2.0), (3.0, 1.0, 0.0), (-1.0, 3.0, 3.0), (1.0, -3.0, 3.0), (-1.0, -3.0, 2.0)],
 )
-def test_what_grows_leads_farther_from_rest(before, after, grown):
+def test_growth_is_the_speed_up_away_from_rest(before, after, grown):
     assert rules.growth(before, after) == grown
 
 

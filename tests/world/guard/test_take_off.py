@@ -72,7 +72,7 @@ def taking_off(height=0.0, now_ns=0):
         (nan, True),
     ],
 )
-def test_so_far_from_where_it_stood_the_take_off_is_over(height, over):
+def test_a_take_off_is_over_at_the_lift_off_height(height, over):
     take_off = TakeOff(*FENCE)
     take_off.look(sensed((0.0, 0.0, 0.0)), flies=False)
     take_off.look(sensed((9.0, 0.0, height)), flies=True)
@@ -80,7 +80,7 @@ def test_so_far_from_where_it_stood_the_take_off_is_over(height, over):
     assert take_off.may_end(sensed()) == (not over)
 
 
-def test_where_it_stands_is_where_it_stood_last():
+def test_the_last_place_on_the_ground_counts():
     take_off = TakeOff(*FENCE)
     for height in (3.0, 1.0, 0.5):
         take_off.look(sensed((0.0, 0.0, height)), flies=False)
@@ -88,7 +88,7 @@ def test_where_it_stands_is_where_it_stood_last():
     assert not take_off.over
 
 
-def test_a_robot_that_was_never_seen_to_stand_flies():
+def test_a_robot_never_seen_on_the_ground_flies():
     take_off = TakeOff(*FENCE)
     take_off.look(sensed(STANDS), flies=True)
     assert take_off.over
@@ -138,7 +138,7 @@ def test_stopped_it_may_take_off_once_it_has_been_at_rest():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("speed", [STILL_SPEED, nan])
-def test_a_tick_in_motion_begins_the_rest_anew(axis, speed):
+def test_a_tick_in_motion_restarts_the_count_of_still_ticks(axis, speed):
     take_off, velocity = stopped(), [0.0, 0.0, 0.0]
     velocity[axis] = speed
     lie(take_off, STILL_TICKS - 1)
@@ -150,7 +150,7 @@ def test_a_tick_in_motion_begins_the_rest_anew(axis, speed):
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("face", [0, 1])
-def test_outside_the_fence_it_stays_where_it_lies(axis, face):
+def test_outside_the_fence_a_take_off_is_not_allowed(axis, face):
     """And where it lies so near to a wall that it would scrape out of it."""
     position = list(STANDS)
     edge = FENCE[face][axis] - (0.5 if axis < 2 else 0.0) * (2 * face - 1)
@@ -164,7 +164,7 @@ def test_outside_the_fence_it_stays_where_it_lies(axis, face):
 # On the ground
 
 
-def test_on_the_ground_a_hold_stops_the_rotors_and_the_mission_goes_on():
+def test_a_hold_on_the_ground_stops_the_rotors_not_the_mission():
     guard = taking_off(0.9 * LIFT_OFF_HEIGHT)
     flown = run(guard, 250 * MS, 260 * MS, above(0.9 * LIFT_OFF_HEIGHT))
     assert flown[0] is not None
@@ -175,7 +175,7 @@ def test_on_the_ground_a_hold_stops_the_rotors_and_the_mission_goes_on():
     assert guard.reference == ZERO
 
 
-def test_a_broken_off_take_off_is_taken_up_again_by_a_fresh_command():
+def test_a_fresh_command_resumes_an_aborted_take_off():
     guard = taking_off()
     run(guard, 10 * MS, 2 * SECOND, STANDS)
     assert states(guard) == [HOLD, GROUND]
@@ -183,7 +183,7 @@ def test_a_broken_off_take_off_is_taken_up_again_by_a_fresh_command():
     assert states(guard) == [TRACK]
 
 
-def test_a_mission_that_ends_on_the_ground_leaves_the_robot_there():
+def test_a_mission_that_ends_on_the_ground_ends_in_ground():
     guard = taking_off()
     guard.end_mission(10 * MS)
     assert run(guard, 10 * MS, 20 * MS, STANDS) == [None] * 5
@@ -196,7 +196,7 @@ def test_a_mission_that_ends_on_the_ground_leaves_the_robot_there():
     assert guard.state is TRACK
 
 
-def test_on_the_ground_a_link_that_comes_and_goes_does_not_chatter():
+def test_on_the_ground_an_unstable_link_does_not_chatter():
     """Fresh for a tick, then silent: again and again for 20 s."""
     guard, now_ns = taking_off(), 10 * MS
     while now_ns < 20 * SECOND:
@@ -210,7 +210,7 @@ def test_on_the_ground_a_link_that_comes_and_goes_does_not_chatter():
         assert min(b - a for a, b in pairwise(stamps)) >= 1 * SECOND
 
 
-def test_after_a_spawn_nothing_has_to_settle():
+def test_after_a_spawn_the_settling_time_does_not_apply():
     guard = taking_off()
     guard.end_mission(20 * MS)
     guard.put_on_ground(30 * MS, "mission starts from spawn")
@@ -231,7 +231,7 @@ def test_a_robot_that_is_fast_brakes_before_its_rotors_stop():
 
 
 @pytest.mark.promise("no-rotor-stop-in-the-air")
-def test_a_robot_that_has_left_the_ground_stays_up_and_climbs_clear_of_it():
+def test_above_the_ground_a_hold_climbs_clear_of_it():
     guard = taking_off(1.1 * LIFT_OFF_HEIGHT)
     flown = run(guard, 10 * MS, 3 * SECOND, above(1.1 * LIFT_OFF_HEIGHT))
     assert states(guard) == [HOLD]
@@ -240,7 +240,7 @@ def test_a_robot_that_has_left_the_ground_stays_up_and_climbs_clear_of_it():
 
 
 @pytest.mark.promise("no-rotor-stop-in-the-air")
-def test_a_robot_that_has_flown_never_stops_its_rotors_where_it_once_stood():
+def test_after_flying_the_rotors_do_not_stop_where_it_stood():
     """It may have taken off from a roof, and be beside it."""
     guard = taking_off(1.0)
     run(guard, 10 * MS, 3 * SECOND, STANDS)
@@ -250,7 +250,7 @@ def test_a_robot_that_has_flown_never_stops_its_rotors_where_it_once_stood():
     assert states(guard) == [TRACK, HOLD]
 
 
-def test_the_next_take_off_is_another_one():
+def test_a_landed_robot_has_a_new_take_off():
     guard = taking_off(1.0)
     guard.stop(10 * MS)
     guard.acknowledge(1 * SECOND)
@@ -262,7 +262,7 @@ def test_the_next_take_off_is_another_one():
     assert states(guard) == [HOLD, GROUND]
 
 
-def test_acknowledged_started_and_led_within_one_tick_it_knows_where_it_stood():
+def test_a_take_off_within_one_tick_knows_its_ground():
     """Else it would take what scrapes along the ground for a robot that flies."""
     guard = standing()
     guard.stop(10 * MS)
@@ -305,7 +305,7 @@ def broken_off(simulator, ticks, velocity, ended):
 
 @pytest.mark.parametrize("ended", [False, True])
 @pytest.mark.parametrize("velocity", [(0.0, 0.0, 1.0), (1.5, 0.5, 2.0), (6.0, 0.0, 0.3)])
-def test_whenever_a_take_off_is_broken_off_the_robot_does_not_scrape(simulator, velocity, ended):
+def test_a_take_off_aborted_at_any_time_does_not_scrape(simulator, velocity, ended):
     ends = set()
     for ticks in (1, 5, 12, 16, 20, 28, 30, 35, 40, 50, 70, 100, 125, 200):
         guard, touched = broken_off(simulator, ticks, velocity, ended)

@@ -33,7 +33,7 @@ WALLS = [(axis, sign) for axis in (0, 1) for sign in (-1, 1)]
 
 @pytest.mark.parametrize("height", [0.5, 1.3, 2.2])
 @pytest.mark.parametrize(("axis", "sign"), WALLS)
-def test_along_a_wall_a_robot_that_is_turned_aside_lies_before_it(axis, sign, height):
+def test_along_a_wall_a_deflected_robot_stays_before_it(axis, sign, height):
     """It falls from its height with a share of its speed, and slides, and tumbles."""
     for distance in (0.4, 0.8, 1.2, 1.6):
         place = by_the_wall(axis, sign, distance, height)
@@ -44,7 +44,7 @@ def test_along_a_wall_a_robot_that_is_turned_aside_lies_before_it(axis, sign, he
 
 @pytest.mark.parametrize("height", [0.5, 1.3, 2.2])
 @pytest.mark.parametrize(("axis", "sign"), WALLS)
-def test_towards_a_wall_a_robot_that_falls_lies_before_it(axis, sign, height):
+def test_towards_a_wall_a_falling_robot_stays_before_it(axis, sign, height):
     for distance in (0.4, 0.8, 1.6, 2.4):
         velocity = [0.0, 0.0, 0.0]
         velocity[axis] = 6.0 * sign
@@ -55,7 +55,7 @@ def test_towards_a_wall_a_robot_that_falls_lies_before_it(axis, sign, height):
         assert max(stops, lies) == pytest.approx(distance) or (speed <= 0.5 and lies > distance)
 
 
-def test_away_from_a_wall_it_is_slowed_for_its_side_speed_alone():
+def test_away_from_a_wall_only_the_sideways_speed_counts():
     place = by_the_wall(1, -1, 1.0, 1.3)
     away = rules.limit_to_fence((0.0, 6.0, 0.0), place, LOW, HIGH)
     beside = rules.limit_to_fence((6.0, 0.0, 0.0), place, LOW, HIGH)
@@ -64,7 +64,7 @@ def test_away_from_a_wall_it_is_slowed_for_its_side_speed_alone():
 
 
 @pytest.mark.parametrize(("axis", "sign"), WALLS)
-def test_along_a_wall_it_is_far_up_to_where_it_would_come_to_lie(axis, sign):
+def test_along_a_wall_far_ends_at_the_throw_distance(axis, sign):
     height = 1.3
     above = height + rules.RECHECK_DISTANCE
     reach = aside(above) * 3.0 * (sqrt(2 * above / 9.81) + 0.4) + 0.3 + rules.RECHECK_DISTANCE
@@ -74,7 +74,7 @@ def test_along_a_wall_it_is_far_up_to_where_it_would_come_to_lie(axis, sign):
 
 
 @pytest.mark.parametrize(("axis", "sign"), WALLS)
-def test_towards_a_wall_it_is_far_up_to_where_it_would_come_to_lie(axis, sign):
+def test_towards_a_wall_far_ends_at_the_throw_distance(axis, sign):
     height, velocity = 1.3, [0.0, 0.0, 0.0]
     velocity[axis] = 1.5 * sign
     falls = sqrt(2 * (height + rules.RECHECK_DISTANCE) / 9.81)
@@ -94,7 +94,7 @@ def test_the_higher_it_flies_the_slower_it_is_beside_a_wall():
 
 
 @pytest.mark.parametrize("height", [nan, inf, 5.0, 1e9])
-def test_from_who_knows_how_high_the_fall_is_a_long_one(height):
+def test_a_fall_from_an_unknown_height_is_a_long_one(height):
     assert rules.fall_time(height) == sqrt(2.0 / 9.81 * 5.0)
 
 
@@ -102,7 +102,7 @@ def test_from_the_floor_there_is_no_fall():
     assert rules.fall_time(-0.35) == rules.fall_time(-2.0) == 0.0
 
 
-def test_creeping_it_may_be_near_a_wall_and_yet_far():
+def test_at_creep_speed_a_near_wall_does_not_count():
     near = (LOW[0] + rules.RECHECK_DISTANCE + 0.01, -1.5, 1.3)
     assert rules.is_far_from_fence((0.0, rules.CREEP_SPEED, 0.0), near, LOW, HIGH)
     assert not rules.is_far_from_fence((0.0, rules.CREEP_SPEED + 1e-9, 0.0), near, LOW, HIGH)
