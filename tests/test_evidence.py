@@ -1,4 +1,4 @@
-"""A number that a test misses fails it; a night's page shows the worst of each number."""
+"""A number beyond its limit fails its test; the nightly page shows the worst of each number."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_nightly_page_shows_all_kinds_of_results(
     ):
         assert main([*words.split(), "-o", "json"]) == 0
         (tmp_path / f"{name}.json").write_text(capsys.readouterr().out)
-    (tmp_path / "faults-real.json").touch()  # its command broke
+    (tmp_path / "faults-real.json").touch()  # its command failed
     (tmp_path / "tests.xml").write_text(
         '<testsuite tests="9" failures="1" errors="0" skipped="2"/>'
     )

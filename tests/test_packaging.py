@@ -1,4 +1,4 @@
-"""The package: what pyproject.toml and the wheel give to those who install it."""
+"""The package: dependencies, version, licence and the files of the wheel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clearance: hand-worked distances, the plant's published ones, and a brute force beside them."""
+"""Clearance equals hand-calculated, published and brute-force distances."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_clearance_on_the_axis_is_that_of_the_plant(
 
 
 def test_clearance_turns_with_the_robot() -> None:
-    """Along the pipe every pipe leaves .320.
+    """Check that the clearance along each pipe is .320.
 
     Source: docs/reference/plant.md, "Clearance on the axis".
     """
@@ -81,12 +81,12 @@ def test_clearance_turns_with_the_robot() -> None:
 
 
 def test_the_spawn_trap() -> None:
-    """Straight up from the spawn the rear rotor ends in the outside of pipe 1; x = .2 is clear."""
+    """Straight above the spawn the rear rotor is in the wall of pipe 1; x = .2 is clear."""
     heights = np.arange(0.1, 1.6, 0.01)
     at = np.stack([np.zeros_like(heights), np.zeros_like(heights), heights], axis=1)
     facing = np.tile(LEVEL, (len(at), 1))
     assert clearance(PIPES, at, facing).min() == pytest.approx(-0.019, abs=1e-3)
-    # The trap is 0.338 - (1 - 0.7) = 0.038 deep; the wall is as thick, half of it is deepest.
+    # The overlap is 0.338 - (1 - 0.7) = 0.038 deep, as thick as the wall; its middle is deepest.
     aside = at + np.array([0.2, 0, 0])
     assert clearance(PIPES, aside, facing).min() == pytest.approx(0.162, abs=2e-3)
 

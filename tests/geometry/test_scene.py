@@ -1,4 +1,4 @@
-"""Scenes: the numbers in an MJCF file are those of the plant, and bad ones are named."""
+"""The numbers in a scene file are those of the plant; bad ones are named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The low-level controller's equations, by numbers worked by hand."""
+"""The equations of the low-level controller give the hand-calculated numbers."""
 
 from math import cos, isfinite, radians, sin
 
@@ -114,7 +114,7 @@ def test_attitude_is_the_matrix_formula(force, quaternion):
 
 @pytest.mark.parametrize("yaw", [18.0, -18.0, 60.0, 90.0, 135.0, 180.0, -100.0])
 def test_after_a_hit_the_turned_robot_tilts_the_right_way(yaw):
-    """The torque, seen from the world, turns the thrust towards the force: e_z x z_d."""
+    """In the world frame the torque turns the thrust towards the force: e_z x z_d."""
     half = radians(yaw) / 2
     readings = turned((cos(half), 0.0, 0.0, sin(half)))
     _, roll, pitch, _ = attitude((3.0, 0.0, 4.0), readings)

@@ -1,4 +1,4 @@
-"""A world that falls behind real time says so, by how much, and not every second."""
+"""A world that is slower than real time is reported with its factor, but not every second."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SECOND_NS = 1_000_000_000
 
 
 def told(*slips: float, start_ns: int = 0) -> list[tuple[int, str]]:
-    """What is said in the seconds of world's clock in which it slips by so much [s]."""
+    """Return the reports of seconds in which world's clock slips by these times [s]."""
     pace, slip_ns, said = PaceMonitor(), 0, list[tuple[int, str]]()
     for n, slip in enumerate(slips):
         slip_ns += round(slip * 1e9)

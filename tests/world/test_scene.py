@@ -1,7 +1,4 @@
-"""Robot and scene have the masses, pipes, board and contact of docs/reference/plant.md.
-
-Bad files are refused.
-"""
+"""Robot and scene are those of docs/reference/plant.md; bad files are refused."""
 
 from math import pi, sin, tan
 from xml.etree import ElementTree
@@ -16,7 +13,7 @@ from cloudrc.world.simulator import Simulator
 
 ROBOTS = sorted(path.stem for path in (FOLDER / "robots").glob("*.xml"))
 SCENES = sorted(path.stem for path in (FOLDER / "scenes").glob("*.xml"))
-BASE = 1  # the only moving body, once the static ones are fused
+BASE = 1  # the only moving body after the static ones are fused
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +22,7 @@ def pipes():
 
 
 def facts(scene: str) -> dict[str, list[float]]:
-    """What readers without MuJoCo see."""
+    """Return the scene as readers without MuJoCo see it."""
     root = ElementTree.parse(FOLDER / "scenes" / f"{scene}.xml").getroot()
     return {n.get("name"): [float(x) for x in n.get("data").split()] for n in root.iter("numeric")}
 
@@ -132,7 +129,7 @@ def test_the_board_is_where_the_numbers_say(pipes):
 
 
 def touched_at(scene: str) -> set[str]:
-    """What the robot touches where it spawns, apart from the floor that it stands on."""
+    """Return the bodies that the robot touches at its spawn, without the floor."""
     simulator = Simulator("pelican", scene)
     simulator.step(STOPPED)
     return {touch.body for touch in simulator.take_contacts()}

@@ -1,4 +1,4 @@
-"""MuJoCo is imported in one place, without GL, or its absence is named."""
+"""MuJoCo is imported without OpenGL; if it is missing, the error says so."""
 
 import os
 import subprocess

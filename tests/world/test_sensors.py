@@ -1,4 +1,4 @@
-"""What the cloud is told: the truth, or the truth with seeded noise."""
+"""Odometry for cloud is the truth, or the truth plus seeded noise."""
 
 import numpy as np
 import pytest

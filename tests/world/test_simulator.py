@@ -1,4 +1,4 @@
-"""The physics: rotors and drag by their formulas, hover as predicted, replay bit-equal."""
+"""Rotors and drag follow their formulas, hover is as predicted, replay is equal bit by bit."""
 
 from math import exp
 
@@ -24,7 +24,7 @@ def fly(simulator, low_level, reference, duration):
 
 
 def steady(speeds, readings):
-    """What rotors do to the robot that turn as commanded."""
+    """Return the thrusts and drag of rotors that turn as commanded."""
     rotors = Rotors(0.002)
     rotors.speeds = speeds
     return rotors.step(speeds, readings)
@@ -161,7 +161,7 @@ def test_reset_gives_the_same_flight_again():
 
 @pytest.mark.parametrize("before", [0.2, 1.5])
 def test_the_tape_replays_to_the_same_bits_through_contact(scene_at, before):
-    # It begins before the board is touched, or while the tip presses on it.
+    # The tape starts before the tip touches the board, or while it presses on it.
     simulator, low_level = Simulator("pelican", scene_at(8.0, -6.42, 0.9)), LowLevel()
     fly(simulator, low_level, (0.2, 0.0, 0.0), before)
     assert (simulator.tip_force() > 0.0) == (before > 1.0)
@@ -172,6 +172,6 @@ def test_the_tape_replays_to_the_same_bits_through_contact(scene_at, before):
     assert replay(simulator.model, start, simulator.tape).tobytes() == (
         simulator.state().physics.tobytes()
     )
-    # The drag on the tape matters: without it the flight ends elsewhere.
+    # The drag on the tape matters: without it the end state differs.
     still = [(*controls[:4], *(0.0,) * 6) for controls in simulator.tape]
     assert replay(simulator.model, start, still).tobytes() != simulator.state().physics.tobytes()

@@ -1,4 +1,4 @@
-"""Contacts: what begins to be touched is told once, with the velocities just before."""
+"""A new contact is reported once, with the velocities just before it."""
 
 import pytest
 
@@ -11,7 +11,7 @@ STEP = 0.002
 
 
 def fly(simulator, low_level, reference, duration):
-    """Follow a velocity [m/s] for a duration [s]; returns the contacts on the way."""
+    """Follow a velocity [m/s] for a duration [s]; return the contacts."""
     for _ in range(round(duration / STEP)):
         simulator.step(low_level.update(simulator.readings, reference))
     return simulator.take_contacts()
@@ -29,7 +29,7 @@ def test_the_tip_touches_the_board_once_and_feels_it(at_the_board):
     simulator, low_level = at_the_board
     (touch,) = fly(simulator, low_level, (0.2, 0.0, 0.0), 2.0)
     assert (touch.body, touch.tip) == ("board", True)
-    # Level it would be 8.135; nose down by 2 deg, the tip leads by another 6 mm.
+    # A level robot would be at 8.135; nose down by 2 deg, the tip is 6 mm farther ahead.
     assert touch.position[0] == pytest.approx(8.132, abs=0.005)
     assert 0.05 < touch.velocity[0] < 0.25
     assert touch.tip_velocity[0] == pytest.approx(touch.velocity[0], abs=0.03)
@@ -54,7 +54,7 @@ def test_a_contact_is_new_after_0_1_s_without_one(at_the_board):
 
 
 def test_the_velocity_of_the_tip_includes_the_rotation(scene_at):
-    # Two rotors only: it tumbles over its nose, and the tip comes down faster than the base.
+    # With two rotors it tips over its nose, and the tip falls faster than the base.
     simulator = Simulator("pelican", scene_at(0, 0, 0.6, "empty"))
     touches = []
     while not touches:

@@ -1,4 +1,4 @@
-"""Why the guard is in its state: what telemetry tells of it, beside the words of each change."""
+"""The cause that telemetry gives for the guard's state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The guard: a landing that the operator acknowledges before the robot stands."""
+"""A landing that the operator acknowledges before touch-down."""
 
 from dataclasses import replace
 from math import nan
@@ -22,10 +22,8 @@ SINKS = (0.0, 0.0, -LAND_SPEED)
 @pytest.mark.parametrize(
     ("position", "velocity"), [(NEAR, SINKS), (HERE, (0.0, 0.0, -LAND_SPEED / 2)), (HERE, ZERO)]
 )
-def test_a_landing_acknowledged_too_low_goes_on_to_touch_down(
-    position, velocity
-):
-    """Held there it would scrape along, or climb back into what stands beside it."""
+def test_a_landing_acknowledged_too_low_goes_on_to_touch_down(position, velocity):
+    """A HOLD there would scrape along the ground or climb into an obstacle."""
     guard = landing()
     run(guard, 2 * SECOND, 3 * SECOND, position, SINKS)
     guard.acknowledge(3 * SECOND)
@@ -65,7 +63,7 @@ def test_an_acknowledgement_does_not_count_for_the_next_landing():
 
 
 def test_a_slow_landing_can_be_acknowledged_in_the_air():
-    """At most 0.3 m/s: it sinks at 0.15 m/s."""
+    """With a cap of 0.3 m/s the robot sinks at 0.15 m/s."""
     guard = landing(Limits(fence.LOW, fence.HIGH, speed_max=0.3))
     assert run(guard, 2 * SECOND, 3 * SECOND, velocity=(0.0, 0.0, -0.15))[-1] == (0.0, 0.0, -0.15)
     guard.acknowledge(3 * SECOND)
@@ -75,7 +73,7 @@ def test_a_slow_landing_can_be_acknowledged_in_the_air():
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
 def test_a_landing_near_the_fence_touches_down(share):
-    """The pull takes some of the descent's speed: both together are no faster than the creep."""
+    """Descent and return from the margin together are no faster than CREEP_SPEED."""
     x, y, _ = fence.HIGH
     guard, place = landing(), (x - share, y - share, 0.1)
     stood = run(guard, 2 * SECOND, 4 * SECOND, place)

@@ -1,4 +1,4 @@
-"""What becomes of a robot whose rotors have stopped: where it comes to lie, and takes off again."""
+"""Where a robot with stopped rotors comes to lie, and how it takes off again."""
 
 from dataclasses import replace
 from random import Random
@@ -26,7 +26,7 @@ def simulator():
 
 
 def check_stopped(simulator, seed, figure):
-    """docs/safety.md tells people how far to stay away: more than it has ever gone."""
+    """docs/safety.md names a distance that no fall has reached."""
     flight = Flight(simulator)
     flight.fly(1.0, UP)
     flight.fly(Random(seed).uniform(1.0, 12.0), hostile(seed))
@@ -47,13 +47,13 @@ def test_a_stopped_robot_lies_as_documented_in_400_falls(simulator, seed, figure
     check_stopped(simulator, seed, figure)
 
 
-# What the fence counts on where a hit stops the rotors: `hit_speed` in guard_rules.py.
+# The distance that `hit_speed_max` assumes for a hit.
 
 
 def beyond(simulator, seed):
-    """How far a robot that is stopped lies beyond what the fence counts on, towards each side [m].
+    """Return by how much a stopped robot exceeds the assumed distance, towards each side [m].
 
-    Only sides that it flies towards faster than it may creep anywhere.
+    Only sides count that it flies towards faster than CREEP_SPEED.
     """
     flight = Flight(simulator)
     flight.fly(1.0, UP)
@@ -93,11 +93,11 @@ def test_after_a_fall_it_seldom_lies_beyond_it_in_2000_falls(simulator, figure):
     check_falls(simulator, range(2000), figure, 0.05, 1.5)
 
 
-# Where it lies tilted near a wall it scrapes along the floor before it rises.
+# A tilted robot scrapes along the floor before it rises.
 
 
 def scrapes(simulator, seed, room):
-    """How near it comes to a wall so far away when it takes off from where it came to lie [m]."""
+    """Return its smallest distance to a wall when it takes off from where it fell [m]."""
     rng, flight = Random(seed), Flight(simulator)
     flight.fly(1.0, UP)
     flight.fly(rng.uniform(0.3, 5.0), hostile(seed))
@@ -122,14 +122,12 @@ def scrapes(simulator, seed, room):
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("seed", [48, 86, 90, 101])
 def test_a_take_off_scrapes_less_far_than_to_the_fence(simulator, seed):
-    """Those of 400 that get farthest: lying tilted, it is pushed along before it rises."""
+    """Check the seeds with the longest ways, of 400."""
     assert scrapes(simulator, seed, TAKE_OFF_MARGIN) > 0.02
 
 
 @pytest.mark.full
-def test_a_take_off_scrapes_less_far_in_400_take_offs(
-    simulator, figure
-):
+def test_a_take_off_scrapes_less_far_in_400_take_offs(simulator, figure):
     seeds = range(400)
     nearest = min(scrapes(simulator, seed, TAKE_OFF_MARGIN) for seed in seeds)
     name = "taken off 0.5 m from the fence: nearest to it"

@@ -1,4 +1,4 @@
-"""The guard with a robot under it: it brakes, holds, lands, stops, and meets a hostile cloud."""
+"""The guard with a simulated robot: it brakes, holds, lands, stops, and resists hostile clouds."""
 
 from dataclasses import replace
 from math import dist, hypot, nan
@@ -18,7 +18,7 @@ def simulator():
 
 @pytest.fixture
 def flight(simulator):
-    """At 1.5 m, at rest."""
+    """Return a flight at a height of 1.5 m, at rest."""
     flight = Flight(simulator)
     flight.fly(1.5, UP)
     return flight.fly(2.0, (0.0, 0.0, 0.0))
@@ -111,7 +111,7 @@ def test_a_robot_stopped_outside_the_fence_does_not_take_off(simulator):
     assert flight.fly(3.0, UP).guard.state is GuardState.GROUND
 
 
-# A cloud that does its worst. The robot is at most 6 m/s fast, and its base stays in the box.
+# Hostile clouds: the robot flies at most at 6 m/s, and its base stays inside the fence.
 
 FACES = [(9.0, 0.0, 0.0), (-9.0, 0.0, 0.0), (0.0, 9.0, 0.0), (0.0, -9.0, 0.0), (0.0, 0.0, 9.0)]
 

@@ -1,4 +1,4 @@
-"""A robot flown into something: its rotors stop, and nobody but an operator goes on."""
+"""After a hit the rotors stop, and only the operator releases the robot."""
 
 from math import cos, radians, sin
 
@@ -34,7 +34,7 @@ SPUN, JOLTED, OVER = Cause.SPUN, Cause.JOLTED, Cause.OVERTURNED
 
 
 def felt(velocity=ZERO, rate=ZERO, tilt_deg=0.0, position=HERE):
-    """What the sensors say of a robot that is tilted about x."""
+    """Return the readings of a robot that is tilted about x."""
     half = radians(tilt_deg) / 2
     return Readings.of((*position, cos(half), sin(half), 0.0, 0.0), (*velocity, *rate))
 
@@ -113,7 +113,7 @@ def test_a_hit_is_detected_within_10_ms_of_a_steady_command():
 
 
 def test_between_two_checks_the_readings_are_not_used():
-    """The usual tick is the fast one."""
+    """The usual tick is fast."""
     guard = tracking((0.5, 0.0, 0.0))
     run(guard, 0, 200 * MS)
     guard.offer(command((0.5, 0.0, 0.0), 200 * MS), 200 * MS)
@@ -123,7 +123,7 @@ def test_between_two_checks_the_readings_are_not_used():
 
 
 def test_a_robot_on_the_ground_detects_no_hit():
-    """On the ground, stopped, or landed, nothing is felt; the next flight begins anew."""
+    """On the ground, stopped or landed, no hit is detected; a new flight compares nothing."""
     guard = armed()
     upside_down = felt((3.0, 0.0, 0.0), (9.0, 9.0, 9.0), 180.0)
     assert guard.tick(0, upside_down, DT) is None
@@ -152,7 +152,7 @@ def test_readings_without_tilt_are_upright():
 
 @pytest.mark.parametrize("flown_ticks", range(50, 57))
 def test_far_from_the_fence_a_hit_is_detected_within_12_ms(flown_ticks):
-    """The guard looks again every 10 ms, and at what lasts as a hit does."""
+    """The guard checks every 10 ms, and a hit lasts longer."""
     guard = armed()
     for now_ns in range(0, (flown_ticks + 7) * TICK, TICK):
         hit = now_ns >= flown_ticks * TICK

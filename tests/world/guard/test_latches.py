@@ -1,4 +1,4 @@
-"""The guard: when it lands, and by whose word that and an emergency stop end."""
+"""When the guard lands, and how a landing or an emergency stop ends."""
 
 from math import nan
 
@@ -39,7 +39,7 @@ def test_a_minute_of_hold_in_a_mission_ends_in_land():
 
 
 def test_repeated_starts_do_not_delay_the_landing():
-    """Nobody has to hear its commands for that."""
+    """No command need arrive for that."""
     guard = holding()
     for second in range(3, 61):
         guard.start_mission(second * SECOND)
@@ -48,9 +48,9 @@ def test_repeated_starts_do_not_delay_the_landing():
 
 
 def test_a_mission_on_the_ground_waits_a_minute_for_its_cloud():
-    """Nobody expects it to take off any more; it needs no touch-down for that."""
+    """Then the state is LAND, without a touch-down."""
     guard = armed()
-    guard.offer(command(basis_ns=-300 * MS), SECOND)  # stale: nobody is there
+    guard.offer(command(basis_ns=-300 * MS), SECOND)  # a stale command does not count
     assert run(guard, 0, 60 * SECOND + TICK)[-1] is None
     assert (guard.state, guard.armed) == (GROUND, True)
     assert run(guard, 60 * SECOND + TICK, 60 * SECOND + 2 * TICK) == [None]
@@ -63,7 +63,7 @@ def test_a_mission_on_the_ground_waits_a_minute_for_its_cloud():
 
 
 def test_with_fresh_commands_it_waits_until_it_may_take_off():
-    """Slipping along after a stop, it may not."""
+    """A robot that slides after a stop may not take off."""
     guard = Guard(LIMITS)
     guard.stop(0)
     guard.acknowledge(0)
@@ -75,7 +75,7 @@ def test_with_fresh_commands_it_waits_until_it_may_take_off():
 
 
 def test_a_hold_that_sinks_to_its_point_does_not_land():
-    """As slowly as a descent, and standing still, as if on something."""
+    """It moves like a descent and stands still as if on an obstacle."""
     guard = holding()
     down = run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 2.2))
     assert down[-1] == (0.0, 0.0, -LAND_SPEED)
@@ -88,7 +88,7 @@ def test_hold_between_missions_has_no_limit():
     for minute in range(1, 10):
         run(guard, minute * 60 * SECOND, minute * 60 * SECOND + 10 * MS)
     assert guard.state is HOLD
-    guard.start_mission(600 * SECOND)  # and the minute counts from the next start
+    guard.start_mission(600 * SECOND)  # the minute counts from the next start
     run(guard, 659 * SECOND, 659 * SECOND + 2 * MS)
     assert guard.state is HOLD
     run(guard, 661 * SECOND, 661 * SECOND + 2 * MS)
@@ -157,7 +157,7 @@ def test_after_touch_down_it_may_slide_off_an_obstacle():
     assert guard.state is TRACK
 
 
-def test_a_landing_of_a_robot_that_is_pressed_down_ends():
+def test_land_from_a_fast_descent_touches_down():
     guard = tracking((0.0, 0.0, -2.0))
     assert run(guard, 0, 100 * MS, (1.0, 2.0, 1.0))[-1][2] == pytest.approx(-LAND_SPEED)
     for _ in range(5):

@@ -1,4 +1,4 @@
-"""The limits of the guard: none can be switched off, in the file or in code."""
+"""No limit of the guard can be switched off, neither in the file nor in code."""
 
 from dataclasses import FrozenInstanceError, fields
 from math import inf, nan
@@ -42,7 +42,7 @@ def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
 
 @pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (10, 10), (11, 11)])
 def test_on_the_ground_it_waits_for_a_mission_for_10_s_at_least(hold_s, waited_s):
-    """A hold may be too short for a first command to come."""
+    """The longest hold may be too short for a first command to arrive."""
     guard = armed(limits(hold_max_ns=round(hold_s * SECOND)))
     run(guard, 0, waited_s * SECOND + TICK)
     assert guard.state is GuardState.GROUND

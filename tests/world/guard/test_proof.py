@@ -1,4 +1,4 @@
-"""The guard's comparisons and clamps, proven for all 64-bit floats, NaN and infinities included."""
+"""Proofs of the guard's arithmetic for all 64-bit floats, NaN and infinity included."""
 
 from functools import partial
 
@@ -13,7 +13,7 @@ from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import LIMITS, everywhere, root
 
 LATEST = AGE_MAX_NS * 1e-9 + rules.REACTION
-"""After which the robot brakes [s], at the largest age of a command that may be flown."""
+"""Time until the robot brakes [s] with the largest command age."""
 
 
 @pytest.fixture(autouse=True)
@@ -26,7 +26,7 @@ def is_finite(term):
 
 
 def test_a_command_with_one_value_out_of_range_is_rejected():
-    """`Guard.offer` refuses all but what is within the range: NaN, infinities and 1e308, too."""
+    """Prove that `Guard.offer` rejects every value beyond COMMAND_MAX, NaN included."""
 
     def check(run):
         numbers = [run.fresh(name) for name in ("vx", "vy", "vz", "yaw_rate")]
@@ -35,7 +35,7 @@ def test_a_command_with_one_value_out_of_range_is_rejected():
         assert refused in (None, "range")
         run.prove(z3.Not(inside) if refused else inside)
 
-    # All in range, or one of the four is the first that is not.
+    # Five paths: all values are in range, or the first bad one is one of the four.
     assert everywhere(check) == 5
 
 
@@ -65,7 +65,7 @@ def test_approach_speed_is_a_number_and_has_its_lower_bound(caution):
         answer = rules.approach_speed(reach, caution)
         term = answer.term if hasattr(answer, "term") else z3.FPVal(answer, z3.Float64())
         run.prove(term >= -rules.RETURN_SPEED_MAX)
-        # Outside or at the face never outwards; inside never back.
+        # At the face or outside never outwards; inside never back.
         run.prove(z3.Implies(reach.term <= 0.0, term <= 0.0))
         run.prove(z3.Implies(reach.term > 0.0, term >= 0.0))
 
@@ -74,7 +74,7 @@ def test_approach_speed_is_a_number_and_has_its_lower_bound(caution):
 
 @pytest.mark.parametrize("at_the_floor", [False, True])
 def test_one_axis_of_limit_to_fence_is_finite_and_bounded(at_the_floor):
-    """One axis of `fenced`, any finite command; of `approach` only what is proven above is used."""
+    """Prove it for any finite command, with the proven bounds of `approach_speed`."""
 
     def check(run):
         v, up, down = (run.fresh(name) for name in ("v", "up", "down"))
@@ -89,7 +89,7 @@ def test_one_axis_of_limit_to_fence_is_finite_and_bounded(at_the_floor):
 
 
 def test_growth_is_at_most_the_value_itself():
-    """So what is held back keeps its sign, and is never faster than what was asked for."""
+    """Then a limited reference keeps its sign and is never faster than the wanted one."""
 
     def check(run):
         before, after = run.fresh("before"), run.fresh("after")
@@ -118,12 +118,12 @@ def test_fall_time_has_an_upper_bound(monkeypatch):
         time = lift(run, rules.fall_time(run.fresh("height"))).term
         run.prove(z3.And(time >= 0.0, time <= longest))
 
-    # From the largest height; from none; from between.
+    # Three paths: the largest height, none, and between.
     assert everywhere(check) == 3
 
 
 def any_speed_and_reaction(run):
-    """What `Limits` asks of: a speed >= 0, and what it may take to react, both finite."""
+    """Return the arguments that `Limits` uses: a finite speed >= 0 and a reaction time."""
     speed, reaction = run.fresh("speed"), run.fresh("reaction")
     run.learn(z3.And(speed.term >= 0.0, is_finite(speed.term)))
     run.learn(z3.And(reaction.term >= rules.REACTION, reaction.term <= LATEST))
@@ -139,7 +139,7 @@ def test_stopping_distance_is_a_number_and_never_negative():
 
 
 def test_above_7_mps_every_stopping_distance_is_too_long():
-    """Up to the largest float: a way that overflows is infinite, and that is too long as well."""
+    """A distance that overflows is infinite, which is too long as well."""
 
     def check(run):
         speed, reaction = any_speed_and_reaction(run)
@@ -150,7 +150,7 @@ def test_above_7_mps_every_stopping_distance_is_too_long():
 
 
 def lift(run, value):
-    """A number as a symbol."""
+    """Turn a number into a symbol."""
     if isinstance(value, float | int):
         symbol = run.fresh("constant")
         run.learn(z3.fpEQ(symbol.term, z3.FPVal(value, z3.Float64())))

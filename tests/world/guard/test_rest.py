@@ -1,4 +1,4 @@
-"""How the guard comes to rest and stays there, number by number."""
+"""Braking and position hold, with numbers."""
 
 from math import hypot
 
@@ -24,11 +24,11 @@ from tests.world.guard.conftest import DT, HERE, sensed
 
 LOW, HIGH = (-2.8, -8.3, 0.0), (9.0, 5.3, 2.3)
 ENOUGH = 1.0
-"""As a tick it is long enough to reach any reference [s]."""
+"""A tick that is long enough to reach any reference [s]."""
 
 
 def at_rest(sink=0.0, speed_max=6.0, position=HERE):
-    """Has dropped its anchor here."""
+    """Return a position hold with its hold point at `position`."""
     rest = PositionHold(LOW, HIGH, speed_max)
     reference = (0.0, 0.0, -sink)
     assert rest.follow(reference, sensed(position, reference), sink, ENOUGH) == reference
@@ -110,7 +110,7 @@ def test_it_is_not_at_rest_before_its_reference_is():
     assert rest.brakes
 
 
-# Staying
+# Holding
 
 
 def test_the_position_hold_pulls_back_and_damps():
@@ -132,7 +132,7 @@ def test_the_position_hold_accelerates_no_more_than_brake():
 
 
 def trimmed(offset, seconds, sink=0.0):
-    """What it asks for on its anchor [m/s], after so long [s] beside it, every 0.1 s."""
+    """Return the reference at the hold point [m/s] after some seconds at an offset from it [m]."""
     rest = at_rest(sink)
     for _ in range(round(seconds / 0.1)):
         rest.follow(ZERO, moved(offset), sink, 0.1)
@@ -147,14 +147,14 @@ def test_the_integral_works_against_a_steady_distance():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_integral_is_limited(sign):
-    """Or it would wind up against what it touches."""
+    """Otherwise it would wind up against an obstacle."""
     beside = (0.05 * sign, 0.05 * sign, 0.05 * sign)
     assert trimmed(beside, 60.0) == pytest.approx((-INTEGRAL_MAX * sign,) * 3)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
 def test_far_from_the_hold_point_it_does_not_integrate(order):
-    """Or it would fly past its anchor."""
+    """Otherwise it would overshoot the hold point."""
     near, far = (0.06, 0.0, 0.0799), (0.06, 0.0, 0.0801)
     assert trimmed(tuple(near[axis] for axis in order), 1.0) != ZERO
     assert trimmed(tuple(far[axis] for axis in order), 1.0) == ZERO

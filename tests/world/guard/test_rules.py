@@ -1,4 +1,4 @@
-"""The guard's arithmetic: with any floats, the special ones first, it stays inside its bounds."""
+"""The guard's arithmetic stays within its bounds for any float, special ones included."""
 
 from itertools import product
 from math import hypot, inf, isfinite, nan, nextafter, sqrt
@@ -66,10 +66,10 @@ def test_limit_length_limits_length_and_keeps_direction(length_max):
 
 
 def test_limit_length_keeps_a_vector_of_the_allowed_length():
-    """Else it would count as limited; what is a hair longer must not be taken for no number."""
+    """Otherwise it would count as limited. A slightly longer vector is not taken for NaN."""
     allowed, longer = (1.0, 0.0, 0.0), (1.0, 2.0**-26, 0.0)
     assert rules.limit_length(allowed, 1.0) is allowed
-    assert rules.limit_length(longer, 1.0) == longer  # its length is 1.0 again, once rounded
+    assert rules.limit_length(longer, 1.0) == longer  # rounding makes its length 1.0 again
 
 
 @pytest.mark.parametrize("step", [1e-9, 0.024, 3.0])
@@ -180,7 +180,7 @@ def test_limit_sink_limits_how_fast_the_reference_sinks():
     assert rules.limit_sink(same, (1.0, 0.0, 0.0), climb=-0.2, speed_max=6.0) is same
     same = (1.0, 0.0, -0.2 - rules.SINK_LEAD_MAX)
     assert rules.limit_sink(same, (1.0, 0.0, 0.0), climb=-0.2, speed_max=6.0) is same
-    # Nor does it rise again while the robot still climbs.
+    # And it does not rise again while the robot still climbs.
     assert rules.limit_sink((0.0, 0.0, -1.0), (0.0, 0.0, 0.5), climb=3.0, speed_max=6.0)[2] == 0.5
 
 
@@ -234,7 +234,7 @@ def test_growth_is_the_speed_up_away_from_rest(before, after, grown):
 
 
 def test_the_cap_holds_to_the_last_bit():
-    """Speeds whose square rounds down."""
+    """Use speeds whose square is rounded down."""
     for k in range(2000):
         v = nextafter(6.0, 0.0) / sqrt(1 + k * k * 1e-6)
         w = rules.limit_length((v, v * k * 1e-3, 0.0), 6.0 * rules.ROUNDING_FACTOR)

@@ -1,4 +1,4 @@
-"""The guard: who arms it, what it takes of a command, and when it falls into HOLD."""
+"""How the guard is armed, limits commands, and enters HOLD."""
 
 from itertools import pairwise
 from math import hypot, inf, nan, nextafter
@@ -43,7 +43,7 @@ def test_fresh_commands_alone_never_arm():
     guard = Guard(LIMITS)
     assert guard.offer(command(), 0) is None
     assert guard.state is GROUND
-    assert run(guard, 0, 10 * MS) == [None] * 5  # the rotors stand still
+    assert run(guard, 0, 10 * MS) == [None] * 5  # the rotors are stopped
 
 
 def test_a_started_mission_waits_for_its_first_command():
@@ -69,7 +69,7 @@ def test_a_second_start_within_a_mission_forgets_nothing():
 
 
 def test_the_fence_changes_the_reference_within_the_cap():
-    """Beyond a margin it comes back in one axis while another axis speeds up."""
+    """Beyond the margin it returns in one axis while another axis speeds up."""
     guard = tracking((0.0, 6.0, 0.0))
     before = ZERO
     for k in range(40):
@@ -92,7 +92,7 @@ def test_put_on_the_ground_nothing_is_armed_or_remembered():
     assert guard.state is GROUND
 
 
-# What is taken of a command
+# Limits of a command
 
 
 @pytest.mark.parametrize("bad", [*BEYOND, nan, inf, -inf, nextafter(COMMAND_MAX, inf), -1000.1])
@@ -154,7 +154,7 @@ def test_one_command_is_slowed_more_and_more_near_the_fence():
     assert guard.reference == (0.0, 2.0, 0.0)
     assert guard.counts == {}
     flown = []
-    for k, y in enumerate((3.0, 4.0, 4.5, 5.0, 5.4)):  # not faster than a robot gets there
+    for k, y in enumerate((3.0, 4.0, 4.5, 5.0, 5.4)):  # no faster than a robot can move
         start_ns = (300 + 40 * k) * MS
         flown.append(run(guard, start_ns, start_ns + 2 * MS, (1.0, y, 1.3))[0][1])
     assert flown[0] == 2.0
@@ -188,7 +188,7 @@ def test_hold_brakes_at_once_and_then_holds_the_position():
     guard = tracking((1.5, 0.0, 0.0))
     run(guard, 0, 252 * MS, velocity=(1.5, 0.0, 0.0))
     first, *rest = run(guard, 252 * MS, 900 * MS, velocity=(1.5, 0.0, 0.0))
-    assert hypot(*first) < 1.0  # the reference starts ahead of the robot, which follows late
+    assert hypot(*first) < 1.0  # below the speed of the robot, which follows late
     assert rest[-1] == ZERO
     assert guard.brakes
     run(guard, 900 * MS, 902 * MS, velocity=(0.75, 0.0, 0.0))

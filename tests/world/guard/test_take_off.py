@@ -1,4 +1,4 @@
-"""A take-off that is broken off: on the ground the rotors stop, above it the robot climbs clear."""
+"""An aborted take-off: on the ground the rotors stop, above it the robot climbs clear."""
 
 from itertools import pairwise
 from math import hypot, nan
@@ -43,14 +43,14 @@ def above(height):
 
 
 def standing(now_ns=0):
-    """On the ground, rotors stopped; its mission has started."""
+    """Return a guard in GROUND that has seen its place; a mission has started."""
     guard = armed(now_ns=now_ns)
     assert run(guard, now_ns, now_ns + TICK, STANDS) == [None]
     return guard
 
 
 def taking_off(height=0.0, now_ns=0):
-    """In TRACK since an instant, and so high since the tick after."""
+    """Return a guard in TRACK whose robot has this height since the next tick."""
     guard = standing(now_ns)
     guard.offer(command((0.0, 0.0, 1.0), now_ns), now_ns)
     run(guard, now_ns + TICK, now_ns + 10 * MS, above(height))
@@ -59,7 +59,7 @@ def taking_off(height=0.0, now_ns=0):
     return guard
 
 
-# What the robot knows of its take-off
+# Detection of a take-off
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def stopped():
 
 
 def lie(take_off, ticks, position=STANDS, velocity=ZERO):
-    """Let it lie there for so many ticks; say whether it may take off then."""
+    """Let the robot lie for some ticks; tell whether it may take off then."""
     for _ in range(ticks):
         take_off.look(sensed(position, velocity), flies=False)
     return take_off.allowed
@@ -129,7 +129,7 @@ def test_stopped_it_may_take_off_once_it_has_been_at_rest():
     assert not lie(take_off, STILL_TICKS - 1)
     take_off.forget()  # acknowledged
     assert lie(take_off, 1)
-    assert not lie(take_off, 1, velocity=(1.0, 0.0, 0.0))  # it slides off what it lay on
+    assert not lie(take_off, 1, velocity=(1.0, 0.0, 0.0))  # it slides off an obstacle
     assert lie(take_off, STILL_TICKS)
     take_off.look(sensed(STANDS), flies=True)
     take_off.forget()
@@ -151,7 +151,7 @@ def test_a_tick_in_motion_restarts_the_count_of_still_ticks(axis, speed):
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("face", [0, 1])
 def test_outside_the_fence_a_take_off_is_not_allowed(axis, face):
-    """And where it lies so near to a wall that it would scrape out of it."""
+    """Nor so near a wall that it would scrape out of the fence."""
     position = list(STANDS)
     edge = FENCE[face][axis] - (0.5 if axis < 2 else 0.0) * (2 * face - 1)
     position[axis] = edge
@@ -197,7 +197,7 @@ def test_a_mission_that_ends_on_the_ground_ends_in_ground():
 
 
 def test_on_the_ground_an_unstable_link_does_not_chatter():
-    """Fresh for a tick, then silent: again and again for 20 s."""
+    """Fresh commands for a tick, then silence, repeatedly for 20 s."""
     guard, now_ns = taking_off(), 10 * MS
     while now_ns < 20 * SECOND:
         guard.offer(command((0.0, 0.0, 1.0), now_ns - 249 * MS), now_ns)
@@ -241,7 +241,7 @@ def test_above_the_ground_a_hold_climbs_clear_of_it():
 
 @pytest.mark.promise("no-rotor-stop-in-the-air")
 def test_after_flying_the_rotors_do_not_stop_where_it_stood():
-    """It may have taken off from a roof, and be beside it."""
+    """It may have taken off from a roof and be beside it now."""
     guard = taking_off(1.0)
     run(guard, 10 * MS, 3 * SECOND, STANDS)
     assert states(guard) == [HOLD]
@@ -250,7 +250,7 @@ def test_after_flying_the_rotors_do_not_stop_where_it_stood():
     assert states(guard) == [TRACK, HOLD]
 
 
-def test_a_landed_robot_has_a_new_take_off():
+def test_after_a_stop_the_next_take_off_is_a_new_one():
     guard = taking_off(1.0)
     guard.stop(10 * MS)
     guard.acknowledge(1 * SECOND)
@@ -263,7 +263,7 @@ def test_a_landed_robot_has_a_new_take_off():
 
 
 def test_a_take_off_within_one_tick_knows_its_ground():
-    """Else it would take what scrapes along the ground for a robot that flies."""
+    """Otherwise a robot that scrapes along the ground would count as flying."""
     guard = standing()
     guard.stop(10 * MS)
     run(guard, 10 * MS, 1 * SECOND, STANDS)
@@ -275,7 +275,7 @@ def test_a_take_off_within_one_tick_knows_its_ground():
     assert states(guard) == [HOLD, GROUND]
 
 
-# With a robot under it
+# With a simulated robot
 
 
 @pytest.fixture(scope="module")
@@ -284,7 +284,7 @@ def simulator():
 
 
 def broken_off(simulator, ticks, velocity, ended):
-    """Fly a command for so many ticks, then leave the robot alone for 6 s."""
+    """Fly a command for some ticks, then send nothing for 6 s."""
     guard = Guard(LIMITS)
     robot = Robot(simulator, LowLevel(), guard)
     robot.put_on_ground(0, "test")

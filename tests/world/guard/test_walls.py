@@ -1,4 +1,4 @@
-"""Beside a wall: no faster than a robot may fall there after a hit."""
+"""The speed near a wall lets a robot that is hit fall inside the fence."""
 
 from math import hypot, inf, nan, sqrt
 
@@ -10,21 +10,21 @@ from tests.world.guard.test_rules import HIGH, LOW
 
 
 def by_the_wall(axis, sign, distance, height):
-    """Mid between the other walls, at a `distance` [m] from one of them."""
+    """Return a position at a `distance` [m] from one wall, in the middle of the other axis."""
     position = [3.1, -1.5, height]
     position[axis] = (LIMITS.fence_high if sign > 0 else LIMITS.fence_low)[axis] - sign * distance
     return tuple(position)
 
 
 def along(axis, speed):
-    """A velocity [m/s] along the wall that is across an axis."""
+    """Return a velocity [m/s] along the wall that is perpendicular to an axis."""
     velocity = [0.0, 0.0, 0.0]
     velocity[1 - axis] = speed
     return tuple(velocity)
 
 
 def aside(height):
-    """What share of its speed a hit at this height [m] may turn towards a wall."""
+    """Return the share of the speed that a hit at this height [m] may turn towards a wall."""
     return 0.44 + 0.6 * min(max(height - 0.9, 0.0), 1.0)
 
 
@@ -34,7 +34,7 @@ WALLS = [(axis, sign) for axis in (0, 1) for sign in (-1, 1)]
 @pytest.mark.parametrize("height", [0.5, 1.3, 2.2])
 @pytest.mark.parametrize(("axis", "sign"), WALLS)
 def test_along_a_wall_a_deflected_robot_stays_before_it(axis, sign, height):
-    """It falls from its height with a share of its speed, and slides, and tumbles."""
+    """It falls from its height with a share of its speed, slides and tumbles."""
     for distance in (0.4, 0.8, 1.2, 1.6):
         place = by_the_wall(axis, sign, distance, height)
         speed = hypot(*rules.limit_to_fence(along(axis, 6.0), place, LOW, HIGH))
@@ -110,7 +110,7 @@ def test_at_creep_speed_a_near_wall_does_not_count():
 
 
 def test_the_papers_flight_is_not_slowed_by_its_walls():
-    """It asks for 4.83 m/s 2.07 m from the wall beside pipe 1, and presses on the board."""
+    """The paper's flight asks for 4.83 m/s at 2.07 m from the wall, and presses on the board."""
     for velocity, position in (
         ((-0.05, -4.83, -0.06), (-0.93, 3.4, 0.74)),
         ((0.59, 0.0, 0.0), (7.5, -6.42, 0.7)),
