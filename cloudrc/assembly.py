@@ -1,6 +1,7 @@
-"""From an experiment to the parts that fly it: the one place where configuration becomes SI.
+"""Build world, cloud and link from an experiment, and convert its values to SI units.
 
-Drivers know endpoints by contract only, world and cloud never meet: here they are put together.
+Drivers know the contract of an endpoint only, and world and cloud do not import each other. This
+module puts them together.
 """
 
 from __future__ import annotations
@@ -30,16 +31,16 @@ if TYPE_CHECKING:
 
 MS_TO_NS = 1_000_000
 CRUISE_SPEED = 1.0
-"""That a leg is expected to be flown at, at least, if the guard allows it [m/s]."""
+"""Expected speed of a leg, if the guard allows it [m/s]."""
 SETTLE_TIME = 4.0
-"""Expected for a leg's beginning and end [s]."""
+"""Expected extra time for the beginning and the end of a leg [s]."""
 LEG_PATIENCE = 3.0
-"""A leg fails after this multiple of its expected time [1].
+"""Time limit of a leg as a multiple of its expected time [1].
 Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
-"""Number on board of the mission of a cloud that flies no other."""
+"""Mission number of a cloud that flies only one mission."""
 FENCE_SPAN = dist(fence.LOW, fence.HIGH)
-"""The longest way that there is [m]."""
+"""Longest straight way inside the fence [m]."""
 
 
 def build_world(
@@ -47,12 +48,12 @@ def build_world(
     identity: WorldIdentity,
     clock: Callable[[], int] = lambda: 0,
 ) -> WorldEndpoint:
-    """Put the robot into its scene and give it its end of the tunnel; needs MuJoCo.
+    """Build world's end: the robot in its scene and its end of the tunnel; needs MuJoCo.
 
     Args:
-        experiment: What to fly.
-        identity: Who this end is.
-        clock: Its monotonic clock [ns]; read last, since a scene takes a while to compile.
+        experiment: The experiment.
+        identity: The identity of this end.
+        clock: Its monotonic clock [ns]; read last, because a scene takes a while to compile.
     """
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.guard.limits import Limits
@@ -93,13 +94,13 @@ def build_cloud(
     clock: Callable[[], int] = lambda: 0,
     teleop: Operator | None = None,
 ) -> CloudEndpoint:
-    """Join plug-ins and teleoperation, give them cloud's end of the tunnel, start the mission.
+    """Build cloud's end: plug-ins, teleoperation and its end of the tunnel.
 
     Args:
-        experiment: What to fly.
-        identity: Who this end is.
+        experiment: The experiment.
+        identity: The identity of this end.
         clock: Its monotonic clock [ns].
-        teleop: Where setpoints come from; None for a machine within, which starts the mission.
+        teleop: The source of setpoints; None for an internal one, which starts the mission at once.
     """
     cloud = experiment.cloud
     loop = ControlLoop(
@@ -116,7 +117,7 @@ def build_cloud(
 
 
 def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:
-    """Make both directions of the emulated network: uplink, downlink."""
+    """Build both directions of the emulated network: uplink, downlink."""
     return (
         LinkDirection(link_profile(experiment.uplink), experiment.seed, uplink=True),
         LinkDirection(link_profile(experiment.downlink), experiment.seed, uplink=False),
@@ -139,29 +140,29 @@ def mission_plan(
     """Turn a mission into legs.
 
     Args:
-        mission: Checked.
-        time_limit: Of the whole mission [s].
-        seed: Of random steps.
-        speed_max: That the guard allows [m/s].
+        mission: A checked mission.
+        time_limit: Time limit of the whole mission [s].
+        seed: Seed of random steps.
+        speed_max: Largest speed that the guard allows [m/s].
     """
     if mission.steps is not None:
         legs = _step_legs(mission.steps, seed)
     else:
-        befores = (None, *mission.waypoints)
-        ways = zip(befores, mission.waypoints, strict=False)  # none leaves the last one
-        legs = tuple(_leg(before, waypoint, speed_max) for before, waypoint in ways)
+        starts = (None, *mission.waypoints)
+        ways = zip(starts, mission.waypoints, strict=False)  # no leg starts at the last waypoint
+        legs = tuple(_leg(start, waypoint, speed_max) for start, waypoint in ways)
     return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
 
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
-    """Convert one direction of the link to SI, its trace read in.
+    """Convert one direction of a link profile to SI units; read its trace and table.
 
     Args:
-        direction: As in a profile's file.
-        file_max: Longest trace or table that is read [bytes].
+        direction: One direction, as in the profile's file.
+        file_max: Largest trace or table that is read [bytes].
 
     Raises:
-        BadInputError: If one cannot be read.
+        BadInputError: If a trace or table cannot be read.
     """
     file = direction.trace
     return DirectionProfile(
@@ -189,11 +190,11 @@ def _table(direction: schema.Direction, file_max: int) -> tuple[float, ...]:
     return read_table(Path(direction.table), file_max)
 
 
-def _leg(before: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: float) -> Leg:
+def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: float) -> Leg:
     limit = waypoint.time_limit_s
     if limit is None:
-        # The first leg's beginning is not known: as far as the fence is wide.
-        way = FENCE_SPAN if before is None else dist(before.position_m, waypoint.position_m)
+        # The start of the first leg is unknown: assume the longest way.
+        way = FENCE_SPAN if start is None else dist(start.position_m, waypoint.position_m)
         expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
         limit = round(LEG_PATIENCE * expected, 1)
     yaw = radians(waypoint.yaw_deg)
@@ -201,7 +202,7 @@ def _leg(before: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: f
 
 
 def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:
-    """Seeded setpoints, each for one period wherever the robot is by then."""
+    """Make random setpoints, each for one period, wherever the robot is."""
     rng = np.random.Generator(np.random.PCG64([seed, _stream("steps")]))
     offsets = rng.uniform(-1.0, 1.0, (steps.count, 3)) * steps.range_m + steps.centre_m
     limit = 10 * steps.period_s
@@ -238,5 +239,5 @@ def _scaled(value: float | None, factor: float) -> float | None:
 
 
 def _stream(name: str) -> int:
-    """A number for each use of chance, so that none shifts another."""
+    """Return the number of a random stream, so that no stream shifts another."""
     return int.from_bytes(name.encode(), "little")

@@ -1,7 +1,7 @@
-"""The contract of both ends: a state machine that bytes and instants go into and come out of.
+"""The contract of both ends of the tunnel: state machines without I/O.
 
-An endpoint owns no socket, no clock and no thread. A driver calls it, and is the only one that
-knows whether time is virtual or real:
+An endpoint has no socket, no clock and no thread. A driver calls it; only the driver knows whether
+time is virtual or real:
 
     for data in arrived:
         endpoint.receive_datagram(data, now_ns)
@@ -10,8 +10,8 @@ knows whether time is virtual or real:
     send(endpoint.take_datagrams())
     keep(endpoint.take_records())
 
-Rules for drivers: `now_ns` never falls. All datagrams that are drained in one wake carry the same
-`now_ns`, which lets an endpoint tell what waited in the socket while its process stood still.
+Rules for drivers: `now_ns` never falls. All datagrams that are read in one wake get the same
+`now_ns`, so that an endpoint knows which ones waited in the socket while its process was stalled.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from cloudrc.records import Record
 
 
 class Endpoint(Protocol):
-    """One end of the tunnel, sans I/O. Times are integer nanoseconds of its own clock."""
+    """One end of the tunnel. Times are integer nanoseconds on its own clock."""
 
     @property
     def sealed(self) -> bool:
-        """Whether its datagrams are sealed; one whose are not must not come near a socket."""
+        """Whether its datagrams are authenticated; if not, they must never reach a socket."""
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Take in one datagram; one that is not valid is counted and dropped, never raised."""
+        """Handle one datagram; an invalid one is counted and dropped and raises nothing."""
 
     def next_deadline_ns(self) -> int:
-        """Say when `handle_deadline` wants to be called next [ns]."""
+        """Return when to call `handle_deadline` next [ns]."""
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Do what is due at `now_ns` [ns]; being late is allowed and does no harm."""
+        """Do what is due at `now_ns` [ns]; a late call is allowed."""
 
     def take_datagrams(self) -> list[bytes]:
-        """Hand over the datagrams to send, oldest first; they are then forgotten."""
+        """Return the datagrams to send since the last call, oldest first."""
 
     def take_records(self) -> list[Record]:
-        """Hand over the records since the last call, oldest first; they are then forgotten."""
+        """Return the records since the last call, oldest first."""

@@ -1,62 +1,63 @@
-"""Errors that a user can mend: one line that says what, where and what to do next.
+"""Errors that a user can fix: one line that says what is wrong, where, and what to do next.
 
-And what foreign code or files say, made fit to be told: as long as they like, in any characters.
+Foreign code and files may contain texts of any length and characters; two functions here turn them
+into one printable line.
 """
 
 from __future__ import annotations
 
 TEXT_MAX = 2000
-"""Of foreign words so many characters are told."""
+"""Longest part of a foreign text that is shown [characters]."""
 
 
 class CloudrcError(Exception):
-    """Something the user can mend; `exit_code` is what the command ends with."""
+    """An error that the user can fix; the command exits with `exit_code`."""
 
     exit_code = 1
 
 
 class BadInputError(CloudrcError):
-    """A file, key, flag or value that cannot be used."""
+    """A file, key, option or value is not usable."""
 
     exit_code = 2
 
 
 class MissingPrerequisiteError(CloudrcError):
-    """A package, program or permission that is not there."""
+    """A package, program or permission is missing."""
 
     exit_code = 3
 
 
 class InvalidRunError(CloudrcError):
-    """The run was not what was asked for: not in real time, or a process died."""
+    """The run is invalid: it was not in real time, or a process died."""
 
     exit_code = 6
 
 
 class TimedOutError(CloudrcError):
-    """Something did not happen in the time that it had."""
+    """A timeout expired."""
 
     exit_code = 4
 
 
 class InterruptedRunError(CloudrcError):
-    """A person ended the run before there was anything to report."""
+    """The user interrupted the run before there was anything to report."""
 
     exit_code = 130
 
 
 def in_one_line(text: str) -> str:
-    """Cut foreign words to a line that can be told anywhere: half a surrogate cannot be written."""
+    """Turn a foreign text into one line that can be printed; lone surrogates are escaped."""
     line = " ".join(text[:TEXT_MAX].split())
     return line.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def in_words(error: BaseException) -> str:
-    """Say in one line what an exception is and says, whoever wrote it."""
+    """Describe an exception in one line: its type and its message."""
     name = type(error).__name__
     try:
         return in_one_line(f"{name}: {error}")
     except KeyboardInterrupt:
         raise
-    except BaseException:  # its words are foreign code, too
+    except BaseException:  # the exception's __str__ is foreign code, too
         return in_one_line(name)

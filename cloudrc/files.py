@@ -1,4 +1,4 @@
-"""Files where somebody else writes, too: read whole and never waited for, written in one step."""
+"""Read and write files that other processes write, too: without waiting, and in one step."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from pathlib import Path
 from typing import IO
 
 SIZE_MAX = 1 << 20
-"""Longest that is read [bytes]: what a ConfigMap holds."""
+"""Largest file that is read by default [bytes]: the size limit of a ConfigMap."""
 
 
 class TooLongError(ValueError):
-    """A file that is longer than who reads it takes."""
+    """A file is larger than the reader's limit."""
 
 
 def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | None:
-    """Tell versions of a file apart by one system call; None while there is none.
+    """Identify the version of a file with one system call; None if it does not exist.
 
     Args:
         path: The file.
-        follow: Whether a link stands for what it leads to.
+        follow: Whether to follow a symbolic link.
     """
     try:
         status = os.stat(path, follow_symlinks=follow)
@@ -33,20 +33,20 @@ def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | 
 
 
 def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
-    """Read a file that somebody else has written, without waiting for anybody.
+    """Read a whole file that another process has written, without waiting.
 
     Args:
         path: The file.
-        size_max: Longest that is read [bytes].
+        size_max: Largest allowed size [bytes].
 
     Raises:
-        OSError: If it cannot be read.
-        ValueError: If it is no file, as a pipe is none.
-        TooLongError: If it is longer than that.
+        OSError: If the file cannot be read.
+        ValueError: If it is not a regular file, for example a pipe.
+        TooLongError: If it is larger than `size_max`.
     """
     with BufferedReader(open_file(path)) as file:
         status = os.fstat(file.fileno())
-        # As much memory is asked for at once: no more than there is to read, and room to grow.
+        # read() allocates its argument at once: ask for the size of the file plus room to grow.
         long = status.st_size > size_max
         data = b"" if long else file.read(min(size_max, status.st_size + SIZE_MAX) + 1)
     if long or len(data) > size_max:
@@ -55,11 +55,11 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
 
 
 def open_file(path: Path) -> FileIO:
-    """Open a file that somebody else has written, without waiting for anybody; it has no buffer.
+    """Open a file that another process has written, without a buffer and without waiting.
 
     Raises:
-        OSError: If it cannot be opened.
-        ValueError: If it is no file, as a pipe is none.
+        OSError: If the file cannot be opened.
+        ValueError: If it is not a regular file, for example a pipe.
     """
     file = FileIO(path, opener=_at_once)
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -70,17 +70,17 @@ def open_file(path: Path) -> FileIO:
 
 @contextmanager
 def draft(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
-    """Make a file that gets its name when it is whole; what had that name till then is replaced.
+    """Write a file under a temporary name and rename it to `path` once it is complete.
 
-    The folder may be somebody else's: a link that lies there is replaced, too, and not followed,
-    and no name of a draft can be known before.
+    Others may write to the folder, too. Therefore a symbolic link at `path` is replaced and not
+    followed, and the temporary name cannot be guessed.
 
     Args:
-        path: The file.
-        mode: Of the new one from its beginning, less what the process masks.
+        path: The file; an existing one is replaced.
+        mode: Permissions of the new file from its creation, minus the umask.
 
     Raises:
-        OSError: If it cannot be written; then what was there before is as it was.
+        OSError: If the file cannot be written; an existing one then stays unchanged.
     """
     new = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
     alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
@@ -95,7 +95,7 @@ def draft(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
 
 
 def put(path: Path, data: bytes) -> None:
-    """Write a whole file by a `draft`."""
+    """Write a whole file through `draft`."""
     with draft(path) as file:
         file.write(data)
 

@@ -1,11 +1,10 @@
-"""The messages of the loop: what the two ends tell each other and what they record.
+"""The messages between world, cloud and teleoperation.
 
-Named tuples in SI units: they cannot be changed, and one is made in a quarter of the time that a
-frozen dataclass takes, which counts where a dozen are made in every 10 ms of flight. Every stamp
-is an integer number of nanoseconds on the monotonic clock of the end that is named beside it; two
-stamps may be subtracted only if they are of one clock. Frames: REP-103 (x forward, y left, z up);
-unmarked vectors are in the world frame, the others end in ``_body``. Quaternions are ``wxyz``, as
-in MuJoCo.
+They are named tuples in SI units: immutable, and four times as fast to make as a frozen dataclass,
+which matters for a dozen of them in every 10 ms. Every stamp is an integer number of nanoseconds on
+the monotonic clock of the named end; only stamps of the same clock may be subtracted.
+Frames: REP-103 (x forward, y left, z up). A vector is in the world frame unless its name ends in
+``_body``. Quaternions are ``wxyz``, as in MuJoCo.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ Quaternion: TypeAlias = tuple[float, float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 NEVER_NS = -1
-"""The stamp of something that has not happened yet."""
+"""The stamp of an event that has not happened [ns]."""
 
 
 class GuardState(IntEnum):
-    """What the guard on board lets the robot do."""
+    """State of the guard."""
 
     GROUND = 0
     """Rotors stopped; only an operator's start of a mission leads out."""
@@ -33,18 +32,18 @@ class GuardState(IntEnum):
     HOLD = 2
     """No fresh command: brake, then hold the position with onboard sensing alone."""
     LAND = 3
-    """Slow descent, rotors stopped once it has touched down; latched until acknowledged."""
+    """Slow descent; the rotors stop at touch-down; latched until acknowledged."""
     ESTOP = 4
     """Rotors stopped at once; latched until acknowledged."""
 
 
 class Cause(IntEnum):
-    """Why the guard is in its state: a number on the wire, `words` for whoever reads."""
+    """Why the guard is in its state: a number on the wire, and `words` for people."""
 
     words: str
 
     def __new__(cls, number: int, words: str) -> Cause:
-        """Make a member of its number; the words come along."""
+        """Make a member from its number and its words."""
         cause = int.__new__(cls, number)
         cause._value_, cause.words = number, words
         return cause
@@ -74,33 +73,33 @@ class Start(IntEnum):
     SPAWN = 0
     """The world is reset to its spawn under a new epoch."""
     HERE = 1
-    """The robot goes on from where it is."""
+    """The robot starts from where it is."""
 
 
 class Request(IntEnum):
-    """What the operator asks of the robot itself."""
+    """A request of the operator to the robot."""
 
     START = 0
     """Begin the mission: arm."""
     END = 1
     """The mission is over: hold locally until the next one starts."""
     ESTOP = 2
-    """Stop the rotors at once, whatever the robot does; latched until acknowledged."""
+    """Stop the rotors at once, in any state; latched until acknowledged."""
     ACKNOWLEDGE = 3
-    """The operator has seen why the robot lands or was stopped, and releases it; arms nothing."""
+    """Release a landing or stop whose cause the operator has seen; arms nothing."""
     PROGRESS = 4
-    """Keep in mind how far the mission is, for a cloud that forgets: no number, no effect else."""
+    """Keep the mission's progress on board, for a cloud that restarts; has no number."""
 
 
 class Odometry(NamedTuple):
-    """Pose and twist of the robot's base at one instant.
+    """Pose and twist of the robot's base at one time.
 
     Attributes:
-        stamp_ns: Instant of the measurement [ns], world's clock.
-        position: Of the base [m], world frame, shape (3,).
-        orientation_wxyz: Of the base, unit quaternion, body to world, shape (4,).
-        velocity: Of the base [m/s], world frame, shape (3,).
-        angular_velocity_body: Of the base [rad/s], body frame, shape (3,).
+        stamp_ns: Time of the measurement [ns], world's clock.
+        position: Position of the base [m], world frame, shape (3,).
+        orientation_wxyz: Orientation of the base, unit quaternion, body to world, shape (4,).
+        velocity: Velocity of the base [m/s], world frame, shape (3,).
+        angular_velocity_body: Angular velocity of the base [rad/s], body frame, shape (3,).
     """
 
     stamp_ns: int
@@ -111,23 +110,23 @@ class Odometry(NamedTuple):
 
 
 class Telemetry(NamedTuple):
-    """What world sends to cloud at 100 Hz.
+    """Message from world to cloud, at 100 Hz.
 
     Attributes:
-        stamp_ns: That of the odometry [ns], world's clock.
-        odometry: Measured pose and twist, with sensor noise if there is any.
+        stamp_ns: Stamp of the odometry [ns], world's clock.
+        odometry: Measured pose and twist, with sensor noise if configured.
         tip_force: Force on the touch sensor at the arm's tip [N].
-        echo_stamp_ns: Stamp of the newest command applied [ns], cloud's clock; NEVER_NS if none.
+        echo_stamp_ns: Stamp of the newest applied command [ns], cloud's clock; NEVER_NS if none.
         echo_hold_ns: How long world has held that command [ns].
-        slip_ns: By how much world's clock lags its machine's monotonic clock [ns].
-        mission: Number of the last mission request that world has acted on; 0 if none.
+        slip_ns: Lag of world's clock behind its machine's monotonic clock [ns].
+        mission: Number of the last operator request that world carried out; 0 if none.
         guard: State of the guard.
-        pipe_contacts: How often the robot has begun to touch a pipe in this mission.
-        touch_speed: Of the tip when it first touched the board in this mission [m/s]; NaN if it has
-            not yet.
-        mission_id: The mission started last, as OperatorRequest named it; 0 if none.
-        reached: How many of its waypoints world has been told are reached, or `MISSION_OVER`.
-        cause: Why the guard is in its state; of one that has touched down in LAND, why it landed.
+        pipe_contacts: Number of contacts with pipes in this mission.
+        touch_speed: Speed of the tip at its first contact with the board in this mission [m/s]; NaN
+            before that.
+        mission_id: Mission that was started last, as in `OperatorRequest`; 0 if none.
+        reached: Number of its waypoints reached, as far as world knows, or `MISSION_OVER`.
+        cause: Why the guard is in its state; after touch-down in LAND, why it landed.
     """
 
     stamp_ns: int
@@ -146,10 +145,10 @@ class Telemetry(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What cloud sends to world at 100 Hz.
+    """Message from cloud to world, at 100 Hz.
 
     Attributes:
-        stamp_ns: When it was computed [ns], cloud's clock.
+        stamp_ns: Time of the computation [ns], cloud's clock.
         basis_stamp_ns: Stamp of the odometry it was computed from [ns], world's clock.
         basis_hold_ns: How long cloud had held that odometry [ns].
         velocity: Wanted velocity [m/s], world frame, shape (3,).
@@ -164,22 +163,22 @@ class Command(NamedTuple):
 
 
 MISSION_OVER = 0xFFFF
-"""In place of a number of waypoints reached: more than any mission has."""
+"""Value of `reached` for a mission that has ended; no mission has so many waypoints."""
 
 
 class OperatorRequest(NamedTuple):
-    """What the operator asks of the robot itself; repeated until telemetry shows its number.
+    """A request of the operator to the robot, repeated until telemetry shows its number.
 
     Attributes:
-        number: Rises with every request of an operator, above what the robot has acted on.
-        request: What is asked.
-        start: Where the mission starts from; only read with Request.START.
-        mission_id: Names the mission, below 2^63.
-        reached: How many of its waypoints are reached; `MISSION_OVER` if it has ended before that.
-        basis_stamp_ns: When the newest odometry was measured that cloud has had as it passed this
-            on [ns, world's clock]; before any, `NEVER_NS`.
-        epoch: Session in which the robot was seen when teleop said it; 0 if that was in none. For
-            cloud alone: it is not told to the robot.
+        number: Number of the request; it rises, and is above what the robot has carried out.
+        request: Kind of the request.
+        start: Where the mission starts from; used with `Request.START` only.
+        mission_id: Number of the mission, below 2^63.
+        reached: Number of its waypoints reached; `MISSION_OVER` if it ended early.
+        basis_stamp_ns: Stamp of cloud's newest odometry when it forwarded the request [ns], world's
+            clock; `NEVER_NS` before the first.
+        epoch: Session that teleop saw when it made the request; 0 for none. Cloud uses it and does
+            not send it to the robot.
     """
 
     number: int
@@ -192,13 +191,13 @@ class OperatorRequest(NamedTuple):
 
 
 class Setpoint(NamedTuple):
-    """What the controller tracks: teleop to controller.
+    """Setpoint that teleop gives to the controller.
 
     Attributes:
-        position: [m], world frame, shape (3,).
-        yaw: [rad].
-        waypoint: Index of the mission's waypoint that it belongs to; -1 if it belongs to none.
-        epoch: Session in which the robot was seen that it is meant for; 0 if that was in none.
+        position: Wanted position [m], world frame, shape (3,).
+        yaw: Wanted heading [rad].
+        waypoint: Index of its waypoint in the mission; -1 for none.
+        epoch: Session that it is meant for, as teleop saw it; 0 for none.
     """
 
     position: Vector

@@ -1,10 +1,11 @@
-"""Finds plug-ins: a kind and a configuration name go in, what its `build` makes comes out.
+"""Find plug-ins by kind and configuration name, and build them.
 
-A plug-in is one file with a function `build(**parameters)`; the file's name is its configuration
-name. (A metric has no `build`: see `cloudrc.metrics`.) Three places are searched: the kind's
-package here, where files that start with an underscore are no plug-ins; installed packages that
-name one in the entry-point group `cloudrc.<kind>`; and, for a name that is a path or ends in `.py`,
-that file.
+A plug-in is one file with a function `build(**parameters)`. Its file name is its configuration
+name. A metric has no `build`; see `cloudrc.metrics`. Three places are searched:
+
+1. the package of the kind in cloudrc, except for files that start with an underscore;
+2. installed packages with an entry point in the group `cloudrc.<kind>`;
+3. a file, if the name is a path or ends in `.py`.
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ PACKAGES = {
     "controllers": "cloudrc.cloud.controllers",
     "metrics": "",
 }
-"""Kind of plug-in -> the package whose files are plug-ins of it; metrics ship as rows of tables."""
+"""Kind of plug-in -> package of the shipped ones. Shipped metrics are rows of tables instead."""
 
 
 def names(kind: str) -> list[str]:
-    """List the configuration names of a kind, sorted; nothing but its package is imported."""
+    """List the configuration names of a kind, sorted; no plug-in is imported."""
     return sorted({*_shipped(kind), *_installed(kind)})
 
 
 def describe(kind: str, name: str) -> str:
-    """Give the first line of a plug-in's docstring, or why it cannot be loaded."""
+    """Return the first line of a plug-in's docstring, or why it cannot be loaded."""
     try:
         target = find(kind, name)
     except CloudrcError as error:
@@ -47,7 +48,7 @@ def describe(kind: str, name: str) -> str:
 
 
 def signature(kind: str, name: str) -> inspect.Signature:
-    """Give the parameters of a plug-in's `build`, their annotations evaluated."""
+    """Return the parameters of a plug-in's `build`, with evaluated annotations."""
     build = _build(kind, name)
     try:
         return inspect.signature(build, eval_str=True)
@@ -63,15 +64,15 @@ def load(kind: str, name: str, **parameters: Any) -> Any:
     Args:
         kind: One of `PACKAGES`.
         name: Configuration name, or the path of a file.
-        **parameters: For its `build`; names and types are those of its signature.
+        **parameters: Arguments of its `build`.
 
     Raises:
-        BadInputError: If there is no such plug-in, or its `build` refuses the parameters.
+        BadInputError: If the plug-in does not exist, or its `build` fails.
     """
     build = _build(kind, name)
     try:
         return build(**parameters)
-    except Exception as error:  # a stranger's code: whatever it raises, the user reads one line
+    except Exception as error:  # foreign code may raise anything; the user gets one line
         raise BadInputError(f"{_one(kind)} {name!r} cannot be built: {_reason(error)}") from error
 
 
@@ -83,7 +84,7 @@ def find(kind: str, name: str) -> Any:
         name: Configuration name, or the path of a file.
 
     Returns:
-        Its module; for an entry point, what that names.
+        Its module, or the object of its entry point.
     """
     try:
         if is_path(name):
@@ -103,18 +104,18 @@ def find(kind: str, name: str) -> Any:
 
 
 def is_path(name: str) -> bool:
-    """Say whether a configuration name means a file outside the package."""
+    """Tell whether a configuration name is the path of a file."""
     return name.endswith(".py") or "/" in name or "\\" in name
 
 
 def unknown(what: str, name: str, available: list[str]) -> str:
-    """Word the refusal of a name: what there is, and what may have been meant."""
+    """Return the error text for an unknown name, with the known and the nearest names."""
     there = ", ".join(available) or "none"
     return f"no {what} named {name!r}; available: {there}{meant(name, available)}"
 
 
 def meant(name: str, available: list[str]) -> str:
-    """Say which name may have been meant, to be put behind a refusal; "" if none is near."""
+    """Return the end of an error text that suggests the nearest name; "" if none is near."""
     near = difflib.get_close_matches(name, available, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
@@ -149,13 +150,13 @@ def _installed(kind: str) -> dict[str, EntryPoint]:
 def _load_file(kind: str, path: Path) -> ModuleType:
     if not path.is_file():
         raise BadInputError(f"{_one(kind)} {str(path)!r}: there is no such file")
-    # The path is in the name: two files of one name are two plug-ins.
+    # The module name has the whole path, because two files may have the same name.
     module_name = f"cloudrc_plugin:{path.resolve()}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     if spec is None or spec.loader is None:
         raise BadInputError(f"{_one(kind)} {str(path)!r} is not a Python file; name it *.py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module  # dataclasses look their module up there
+    sys.modules[module_name] = module  # dataclasses look up their module there
     spec.loader.exec_module(module)
     return module
 

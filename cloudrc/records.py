@@ -1,10 +1,7 @@
-"""The records of a run: what world, cloud and the drivers note down while they fly.
+"""The records of a run, which world, cloud and the drivers make during a flight.
 
-Every record is a named tuple whose first field is `stamp_ns`, on the clock of the end that
-made it. `record/` turns them into MCAP topics, columns and a hash; `metrics/` turns them into
-numbers. The loop only makes them and hands them over.
-
-The records of the link itself: that it was changed, and what its standing check finds out.
+A record is a named tuple whose first field is `stamp_ns`, on the clock of the end that made it.
+`record/` turns records into MCAP topics, columns and a hash; `metrics/` turns them into numbers.
 """
 
 from __future__ import annotations
@@ -15,23 +12,23 @@ from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
 
 
 class LinkChanged(NamedTuple):
-    """Driver, in real time only: what shapes what this end sends is new. Topic /link.
+    """Driver, in real time only: the link conditions of this end's direction. Topic /link.
 
-    World tells of the uplink, cloud of the downlink. Noted when the link is first seen, when it
-    has changed, and again when a session or a mission begins.
+    World records the uplink, cloud the downlink: at the start, after every change, and again when
+    a session or a mission begins. The requested values are those at the start of the time line.
 
     Attributes:
-        stamp_ns: When this end noted it [ns], own clock.
+        stamp_ns: When this end recorded it [ns], own clock.
         uplink: True for the uplink, False for the downlink.
         shaper: "relay" or "netem".
-        cause: Why it changed, in words; "" if it is as it came up.
-        age: How long it had been in force by then [s].
-        time_line: How long its time line had been running by then [s]; NaN: as the one before.
-        delay: Asked for, one way [s]; this and the following at the beginning of the time line.
-        jitter: Asked for, as in the profile [s].
-        loss: Asked for, in the long run, in [0, 1].
-        rate: Asked for [bit/s]; NaN without a bottleneck.
-        conditions: All that is asked for, as in a profile's file, as JSON.
+        cause: Why the link changed, in words; "" at the start.
+        age: Time for which these conditions have been in force [s].
+        time_line: Time for which the time line has run [s]; NaN if it continues the last one.
+        delay: Requested one-way delay [s].
+        jitter: Requested jitter, as in the profile [s].
+        loss: Requested long-run loss, in [0, 1].
+        rate: Requested rate [bit/s]; NaN without a bottleneck.
+        conditions: All requested values, as in a profile's file, as JSON.
     """
 
     stamp_ns: int
@@ -48,26 +45,26 @@ class LinkChanged(NamedTuple):
 
 
 class LinkChecked(NamedTuple):
-    """Driver, in real time only: one number of the link, judged in flight. Topic /link_check.
+    """Driver, in real time only: one measured quantity of the link, judged. Topic /link_check.
 
-    Cloud judges the uplink, world the downlink, by the tunnel's own datagrams of up to 250 s.
+    Cloud judges the uplink, world the downlink, from the tunnel's own datagrams of up to 250 s.
 
     Attributes:
-        stamp_ns: [ns], own clock.
+        stamp_ns: Time of the check [ns], own clock.
         uplink: True for the uplink, False for the downlink.
         quantity: "mean", "deviation", "variation", "middle", "round_trip", "loss", "reordered" or
-            "duplicated". And what is only told: "datagrams" (needed, there), "time_line" (share
-            of it that was watched and as asked), "rate" (not measured by datagrams that come
-            alone), "jitter_share" (usual, and by which share the jitter may be off here),
-            "correlation" (asked of netem, which realises none), and "mean_takes" and the like (so
-            many datagrams as there never are would decide it).
-        asked: What a true link shows: delays [s], shares in [0, 1].
-        measured: Likewise.
-        low: Least that is believed, likewise.
-        high: Most that is believed, likewise.
-        verdict: "ok", "off", or "open" where there were too few datagrams to say, or the ends
-            woke so late that the link cannot be told from them; "told" judges nothing.
-        datagrams: That this rests on.
+            "duplicated". These are for information only: "datagrams" (needed, received);
+            "time_line" (share of it that was observed and as requested); "rate" (single datagrams
+            cannot measure it); "jitter_share" (usual and present tolerance of the jitter);
+            "correlation" (requested of netem, which has none); and "mean_takes" and the like
+            (number of datagrams, never reached, that would decide the quantity).
+        asked: Expected value: delays [s], shares in [0, 1].
+        measured: Measured value, likewise.
+        low: Lowest accepted value, likewise.
+        high: Highest accepted value, likewise.
+        verdict: "ok" or "off"; "open" if there were too few datagrams, or if the ends woke too late
+            to judge the link; "told" for information only.
+        datagrams: Number of datagrams behind the measurement.
     """
 
     stamp_ns: int
@@ -82,18 +79,18 @@ class LinkChecked(NamedTuple):
 
 
 REAL_TIME_FACTOR_MIN = 0.95
-"""Below it a run that was to be in real time is invalid [1].
+"""Lowest real-time factor of a valid run in real time [1].
 Source: docs/reference/control.md, "Real-time factor"."""
 
 
 class TelemetrySent(NamedTuple):
-    """World: telemetry left. Topics /odometry and /telemetry.
+    """World: telemetry was sent. Topics /odometry and /telemetry.
 
     Attributes:
-        stamp_ns: [ns], world's clock.
-        epoch: Session it belongs to.
-        counter: Its counter in the header.
-        telemetry: As sent.
+        stamp_ns: Time of sending [ns], world's clock.
+        epoch: Session of the datagram.
+        counter: Counter in its header.
+        telemetry: The message, as sent.
     """
 
     stamp_ns: int
@@ -106,7 +103,7 @@ class GroundTruth(NamedTuple):
     """World: the true state, at every odometry. Topics /ground_truth and /reference.
 
     Attributes:
-        stamp_ns: [ns], world's clock.
+        stamp_ns: Time of the state [ns], world's clock.
         odometry: True pose and twist.
         tip_force: Force on the touch sensor [N].
         reference: Velocity that the guard lets the low-level controller follow [m/s], shape (3,).
@@ -121,16 +118,16 @@ class GroundTruth(NamedTuple):
 class Arrival(NamedTuple):
     """Either end: a telemetry or command datagram arrived, late ones included.
 
-    Those that were repeated are noted up to as many as were sent; of more only the count is.
+    Repeated datagrams are recorded until they are as many as the sent ones, then only counted.
     Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
 
     Attributes:
-        stamp_ns: When it arrived [ns], receiver's clock.
+        stamp_ns: Time of arrival [ns], receiver's clock.
         uplink: True for telemetry at cloud, False for commands at world.
-        epoch: From its header.
-        counter: From its header.
-        delay: One way [s]; NaN if the two ends cannot prove that they share a clock.
-        used: True if it became the newest, False if it was late, stale, repeated or refused.
+        epoch: Epoch in its header.
+        counter: Counter in its header.
+        delay: One-way delay [s]; NaN if the two ends cannot prove that they share a clock.
+        used: True if it became the newest; False if it was late, stale, repeated or rejected.
     """
 
     stamp_ns: int
@@ -146,10 +143,10 @@ class CommandApplied(NamedTuple):
 
     Attributes:
         stamp_ns: When the low-level controller first saw it [ns], world's clock.
-        epoch: From its header.
-        counter: From its header; with the epoch it names the `Control` record it came from.
+        epoch: Epoch in its header.
+        counter: Counter in its header; epoch and counter identify its `Control` record.
         basis_stamp_ns: Stamp of the odometry that it was computed from [ns], world's clock.
-        velocity: As commanded, before the caps [m/s], shape (3,).
+        velocity: Commanded velocity, before the caps [m/s], shape (3,).
     """
 
     stamp_ns: int
@@ -163,7 +160,7 @@ class GuardChange(NamedTuple):
     """World: the guard changed its state. Topic /guard.
 
     Attributes:
-        stamp_ns: [ns], world's clock.
+        stamp_ns: Time of the change [ns], world's clock.
         state: The new state.
         cause: Why, in words: "mission started", "command age 0.252 s above 0.250 s".
     """
@@ -177,11 +174,11 @@ class Contact(NamedTuple):
     """World: the robot began to touch something. Topic /contact.
 
     Attributes:
-        stamp_ns: [ns], world's clock.
+        stamp_ns: Time of the contact [ns], world's clock.
         body: Name of the scene's body: pipe_1, board, floor.
-        position: Of the base [m], shape (3,).
-        velocity: Of the base just before [m/s], shape (3,).
-        tip_velocity: Of the arm's tip just before [m/s], shape (3,).
+        position: Position of the base just before [m], world frame, shape (3,).
+        velocity: Velocity of the base just before [m/s], world frame, shape (3,).
+        tip_velocity: Velocity of the arm's tip just before [m/s], world frame, shape (3,).
         tip: True if the arm's tip touched, False for any other part.
     """
 
@@ -197,9 +194,9 @@ class SessionOpened(NamedTuple):
     """Either end: a session began under a new epoch. Topic /session.
 
     Attributes:
-        stamp_ns: [ns], own clock.
+        stamp_ns: Time of the start [ns], own clock.
         end: "world" or "cloud".
-        epoch: Its number.
+        epoch: The new epoch.
         cause: Why, in words: "cloud said hello", "mission starts from spawn".
     """
 
@@ -215,24 +212,25 @@ class Control(NamedTuple):
     Topics /estimated_odometry, /setpoint_position, /cmd_vel, /delay_estimate and /pid.
 
     Attributes:
-        stamp_ns: [ns], cloud's clock: that of the command.
+        stamp_ns: Stamp of the command [ns], cloud's clock.
         epoch: Session of the command.
-        counter: Of the command, in its header.
+        counter: Counter in the command's header.
         basis_stamp_ns: Stamp of the odometry used [ns], world's clock.
-        horizon: By how much it was moved ahead [s]: the delay estimate, clamped.
-        rtt: Last round trip, hold excluded [s]; NaN before the first echo.
-        loop_delay: Last `now - echo_stamp`, hold included: the paper's tau_n [s]; NaN likewise.
+        horizon: Prediction horizon [s]: the delay estimate, clamped.
+        rtt: Last round trip without the hold [s]; NaN before the first echo.
+        loop_delay: Last `now - echo_stamp` with the hold, the paper's tau_n [s]; NaN before the
+            first echo.
         measured: Position in the odometry used [m], shape (3,).
-        position: Predicted [m], shape (3,), for `basis_stamp_ns + horizon`.
-        orientation_wxyz: Predicted, unit quaternion, shape (4,).
-        velocity: Predicted [m/s], shape (3,).
-        setpoint: [m], shape (3,).
-        waypoint: Index of the waypoint flown to; -1 if none.
-        command: Velocity commanded [m/s], shape (3,).
-        yaw_rate: Commanded [rad/s].
-        proportional: Term of the controller per axis [m/s], shape (3,).
-        integral: Likewise.
-        derivative: Likewise.
+        position: Predicted position for `basis_stamp_ns + horizon` [m], shape (3,).
+        orientation_wxyz: Predicted orientation, unit quaternion, shape (4,).
+        velocity: Predicted velocity [m/s], shape (3,).
+        setpoint: Position of the setpoint [m], shape (3,).
+        waypoint: Index of the current waypoint; -1 if none.
+        command: Commanded velocity [m/s], shape (3,).
+        yaw_rate: Commanded yaw rate [rad/s].
+        proportional: Proportional term of the controller per axis [m/s], shape (3,).
+        integral: Integral term [m/s], shape (3,).
+        derivative: Derivative term [m/s], shape (3,).
     """
 
     stamp_ns: int
@@ -256,10 +254,10 @@ class Control(NamedTuple):
 
 
 class MissionEvent(NamedTuple):
-    """Cloud: the mission moved on. Topic /mission.
+    """Cloud: an event of the mission. Topic /mission.
 
     Attributes:
-        stamp_ns: [ns], cloud's clock.
+        stamp_ns: Time of the event [ns], cloud's clock.
         event: "started", "reached", "held", "resumed", "goto"; at the end its outcome: "done",
             "cancelled", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped",
             "emergency_stopped", "taken_over", "end_lost".
@@ -274,13 +272,14 @@ class MissionEvent(NamedTuple):
 
 
 class Fault(NamedTuple):
-    """Either end: something went wrong that did not stop the flight. Topic /fault.
+    """Either end: a problem that did not stop the flight. Topic /fault.
 
     Attributes:
-        stamp_ns: [ns], own clock.
+        stamp_ns: Time of the problem [ns], own clock.
         code: One word: "estimator_failed", "predictor_failed", "controller_failed", "recorder",
-            "link_check", "wall_clock", "late": cloud in its periods, world behind real time.
-        text: What, where, what to do.
+            "link_check", "wall_clock", or "late" (cloud missed its periods, or world is slower than
+            real time).
+        text: What is wrong, where, and what to do.
     """
 
     stamp_ns: int
@@ -289,14 +288,14 @@ class Fault(NamedTuple):
 
 
 class Counted(NamedTuple):
-    """Either end: how often something has happened so far; once a second. Topic /count.
+    """Either end: the value of a counter, once a second. Topic /count.
 
     Attributes:
-        stamp_ns: [ns], own clock.
+        stamp_ns: Time of the reading [ns], own clock.
         end: "world", "cloud" or "link".
         name: "received", "sent", "malformed", "late", "stale", "repeated", "old_epoch",
             "range", "recorder_dropped"...
-        total: Since the start.
+        total: Value since the start.
     """
 
     stamp_ns: int
@@ -306,14 +305,14 @@ class Counted(NamedTuple):
 
 
 class Lateness(NamedTuple):
-    """Driver, in real time only: how late a wake was. Topic /lateness.
+    """Driver, in real time only: how late a deadline was handled. Topic /lateness.
 
     Attributes:
-        stamp_ns: [ns], own clock, when the deadline was handled.
+        stamp_ns: When the deadline was handled [ns], own clock.
         end: "world" or "cloud".
-        lateness: Now minus the deadline [s].
-        busy: How long handling it took [s].
-        slip_ns: World's clock behind the machine's [ns]; 0 for cloud.
+        lateness: Time from the deadline to its handling [s].
+        busy: Duration of the handling [s].
+        slip_ns: Lag of world's clock behind the machine's clock [ns]; 0 for cloud.
     """
 
     stamp_ns: int

@@ -1,4 +1,4 @@
-"""The import rules, read from the syntax tree: who may know whom, and who may touch the world."""
+"""The import rules of the package and the sizes of its files and functions."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 ALWAYS = {"errors", "messages", "records", "__version__"}
 
-# What runs in real time beside the drivers: the shapers of the link and the API of teleop.
+# Parts that run in real time besides the drivers: link shapers and teleop's API.
 SHAPERS = ("link/relay", "link/lateness", "link/verify/probe", "link/verify/monitor")
 API = ("teleop/api", "teleop/auth", "teleop/bridge", "teleop/server")
 
-# Faults with real processes and sockets, and a wall clock that is made to jump.
+# Faults with real processes and sockets, and with a wall clock that jumps.
 REAL = ("faults/real/", "faults/cluster/", "faults/walls")
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it.
 RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/",),
-    # The simulator packs forces straight into MuJoCo's buffers: nothing else is as fast.
+    # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
     # The relay reads the kernel's stamp of every datagram, and reads and sends them in batches.
     "struct": ("tunnel/codec", "record/", "world/simulator", "link/relay_io"),
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "faults/schedule"),
@@ -84,7 +84,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("random", "secrets", "uuid"), ("drivers/", "cluster/", "cli/")),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
 }
-# Package that is imported -> the one by which pyproject.toml asks for it.
+# Imported package -> its name in pyproject.toml.
 ASKED_AS = {
     "yaml": "pyyaml",
     **dict.fromkeys(("pydantic_core", "annotated_types"), "pydantic"),
@@ -99,7 +99,7 @@ def part_of(path: Path) -> str:
 
 
 def imports(tree: ast.AST) -> Iterator[str]:
-    """Full dotted names of everything imported, wherever in the file."""
+    """Return the full dotted names of all imports, anywhere in the file."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -109,7 +109,7 @@ def imports(tree: ast.AST) -> Iterator[str]:
 
 
 def violations(place: str, tree: ast.AST) -> list[str]:
-    """What a file at `place` (a path below cloudrc/) imports or calls that it may not."""
+    """Return the forbidden imports and calls of a file at `place`, a path below cloudrc/."""
     part = place.split("/")[0].removesuffix(".py")
     allowed = MAY_IMPORT[part] | ALWAYS | {part}
     found = []
@@ -136,7 +136,7 @@ def place_of(path: Path) -> str:
     return path.relative_to(PACKAGE).as_posix()
 
 
-def test_a_file_imports_only_what_its_part_may() -> None:
+def test_a_file_imports_only_allowed_modules() -> None:
     found = {place_of(path): violations(place_of(path), tree) for path, tree in TREES.items()}
     assert {place: breaches for place, breaches in found.items() if breaches} == {}
 
@@ -157,18 +157,18 @@ def test_a_file_imports_only_what_its_part_may() -> None:
         ("metrics/rtt.py", "print('x')"),
     ],
 )
-def test_a_breach_is_found(place: str, code: str) -> None:
+def test_a_forbidden_import_is_found(place: str, code: str) -> None:
     assert violations(place, ast.parse(code))
 
 
 def foreign(trees: Iterable[ast.AST]) -> set[str]:
-    """What from outside is imported, as pyproject.toml asks for it."""
+    """Return the imported external packages by their names in pyproject.toml."""
     found = {name.partition(".")[0] for tree in trees for name in imports(tree)}
     return {ASKED_AS.get(name, name) for name in found - sys.stdlib_module_names - {"cloudrc"}}
 
 
-def test_what_is_imported_is_what_is_declared_and_nothing_else() -> None:
-    """So a package of another's name cannot slip in (threat T23)."""
+def test_imported_and_declared_packages_are_the_same() -> None:
+    """Check that no package of a similar name is installed by mistake."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [lines for name, lines in project["optional-dependencies"].items() if name != "dev"]
     lines = sum(extras, project["dependencies"])
@@ -193,13 +193,13 @@ def test_no_function_is_longer_than_50_lines() -> None:
     assert {name: length for name, length in lengths.items() if length > 50} == {}
 
 
-def test_every_module_says_what_it_is() -> None:
+def test_every_module_has_a_docstring() -> None:
     silent = [place_of(p) for p, tree in TREES.items() if tree.body and not ast.get_docstring(tree)]
     assert silent == [], "a module opens with one sentence"
 
 
-def test_numpy_gives_no_global_chance() -> None:
-    """`numpy.random.default_rng(seed)` is an injected generator; everything else is global."""
+def test_numpy_s_global_random_state_is_not_used() -> None:
+    """Allow `numpy.random.default_rng(seed)` only; everything else is global state."""
     allowed = {"default_rng", "Generator", "Philox", "PCG64", "SeedSequence"}
     for path, tree in TREES.items():
         for node in ast.walk(tree):

@@ -1,8 +1,8 @@
-"""Every float, vector and array in a public docstring has its unit: read from the syntax tree.
+"""Every float, vector and array in a public docstring has its unit.
 
-A unit stands in brackets: [s], [m/s], [1] for what has none. "Likewise" is that of the line above.
-A share "in [0, 1]", a unit vector and a unit quaternion have none either; whatever takes numbers of
-any unit says so.
+A unit is in brackets: [s], [m/s]; [1] means no unit. "Likewise" means the unit of the line above.
+A share "in [0, 1]", a unit vector and a unit quaternion have no unit. A function for numbers of any
+unit says "any unit".
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ENTRY = re.compile(r"^    (\w+): ", re.MULTILINE)
 RECORDS = {"dataclass", "NamedTuple"}
 QUANTITIES = {"float", "Vector", "Quaternion", "Array"}
 
-# Function or class -> why its floats have no unit that could be named.
+# Function or class -> why its floats have no fixed unit.
 EXCEPTIONS = {
     "Number": "its `unit` is a field of its own",
 }
@@ -34,20 +34,20 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def is_quantity(annotation: ast.expr | None) -> bool:
-    """A float, vector or array, or one that may be absent."""
+    """Tell whether an annotation is a float, vector or array, or None besides."""
     return annotation is not None and (
         ast.unparse(annotation).removesuffix(" | None") in QUANTITIES
     )
 
 
 def is_record(node: ast.ClassDef) -> bool:
-    """A class whose attributes are its fields."""
+    """Tell whether the attributes of a class are its fields."""
     marks = [ast.unparse(mark) for mark in (*node.decorator_list, *node.bases)]
     return any(mark.partition("(")[0] in RECORDS for mark in marks)
 
 
 def public(tree: ast.Module) -> Iterator[Function | ast.ClassDef]:
-    """Functions, classes and their methods, of which a reader reads the docstring."""
+    """Yield the public classes with their methods, and all functions."""
     for node in tree.body:
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
             yield node
@@ -57,7 +57,7 @@ def public(tree: ast.Module) -> Iterator[Function | ast.ClassDef]:
 
 
 def quantities(node: Function | ast.ClassDef) -> list[str]:
-    """Names of the arguments, or of the attributes of a record, that have a unit."""
+    """Return the names of the arguments or fields that need a unit."""
     if isinstance(node, ast.ClassDef):
         fields = [field for field in node.body if isinstance(field, ast.AnnAssign)]
         named = [(ast.unparse(field.target), field.annotation) for field in fields]
@@ -67,7 +67,7 @@ def quantities(node: Function | ast.ClassDef) -> list[str]:
 
 
 def without_unit(source: str) -> list[str]:
-    """Which of them are not given a unit: "function: argument"."""
+    """Return the quantities without a unit, as "function: argument"."""
     found = []
     for node in public(ast.parse(source)):
         said = ast.get_docstring(node)
@@ -76,7 +76,7 @@ def without_unit(source: str) -> list[str]:
         sentences, *pieces = ENTRY.split(said)
         entries = dict(zip(pieces[::2], pieces[1::2], strict=True))
         for name in quantities(node):
-            # What is not listed is told in the sentence: "after `seconds` [s]".
+            # A quantity without an entry has its unit in the sentence: "after `seconds` [s]".
             told = re.search(rf"\b{name.replace('_', '[_ ]')}\b", sentences)
             if not UNIT.search(entries.get(name, sentences if told else "")):
                 found.append(f"{node.name}: {name}")
@@ -103,5 +103,5 @@ def test_every_quantity_has_its_unit() -> None:
         ('class A:\n    """A."""\n    x: float', []),
     ],
 )
-def test_what_is_missing_is_found(code: str, missing: list[str]) -> None:
+def test_a_missing_unit_is_found(code: str, missing: list[str]) -> None:
     assert without_unit(code) == missing

@@ -1,4 +1,4 @@
-"""A number that a test misses fails it; a night's page shows the worst of each number."""
+"""A number beyond its limit fails its test; the nightly page shows the worst of each number."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tools import evidence
         (0, "==", 0),
     ],
 )
-def test_a_number_that_is_as_asked_passes(
+def test_a_number_within_its_limit_passes(
     figure: Callable[..., None], measured: float, relation: str, asked: float
 ) -> None:
     figure("number", measured, relation, asked)
@@ -35,14 +35,14 @@ def test_a_number_that_is_as_asked_passes(
         (None, "<=", 1.0, "number: nan s, asked <= 1 s"),
     ],
 )
-def test_a_number_that_was_missed_fails_its_test(
+def test_a_number_beyond_its_limit_fails_its_test(
     figure: Callable[..., None], measured: float | None, relation: str, asked: float, said: str
 ) -> None:
     with pytest.raises(AssertionError, match=said):
         figure("number", measured, relation, asked, "s")
 
 
-def test_a_night_s_page_shows_the_worst_of_each_number(
+def test_the_nightly_page_shows_the_worst_of_each_number(
     figure: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CLOUDRC_EVIDENCE", str(tmp_path))
@@ -62,7 +62,7 @@ def test_a_night_s_page_shows_the_worst_of_each_number(
     ]
 
 
-def test_a_night_s_page_shows_faults_searches_tests_and_mutants(
+def test_the_nightly_page_shows_all_kinds_of_results(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, words in (
@@ -71,7 +71,7 @@ def test_a_night_s_page_shows_faults_searches_tests_and_mutants(
     ):
         assert main([*words.split(), "-o", "json"]) == 0
         (tmp_path / f"{name}.json").write_text(capsys.readouterr().out)
-    (tmp_path / "faults-real.json").touch()  # its command broke
+    (tmp_path / "faults-real.json").touch()  # its command failed
     (tmp_path / "tests.xml").write_text(
         '<testsuite tests="9" failures="1" errors="0" skipped="2"/>'
     )

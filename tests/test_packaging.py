@@ -1,4 +1,4 @@
-"""The package: what pyproject.toml and the wheel give to those who install it."""
+"""The package: dependencies, version, licence and the files of the wheel."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 SHIPPED = {".py", ".yaml", ".xml", ".typed", ".csv", ".html", ".css", ".js", ".mplstyle"}
 
 
-def test_the_base_is_what_a_pod_needs_and_no_more() -> None:
+def test_base_dependencies_are_those_of_a_pod() -> None:
     names = {re.split(r"[<>=\[; ]", line)[0] for line in PROJECT["dependencies"]}
     assert names == {"numpy", "pyyaml", "pydantic", "cryptography", "prometheus-client"}
 
 
-def test_the_extras_are_those_of_the_issue() -> None:
+def test_the_extras_are_the_documented_ones() -> None:
     extras = {"world", "report", "record", "kube", "api", "dev", "all"}
     assert set(PROJECT["optional-dependencies"]) == extras
 
 
-def test_everything_says_the_same_version() -> None:
+def test_all_files_name_the_same_version() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"\nversion: {cloudrc.__version__}\n" in citation
     assert PROJECT["dynamic"] == ["version"]
 
 
-def test_the_licence_is_whole() -> None:
+def test_the_licence_is_complete() -> None:
     text = (ROOT / "LICENSE").read_text()
     assert "Apache License" in text
     assert "END OF TERMS AND CONDITIONS" in text

@@ -32,7 +32,7 @@ COMMANDS = [line for line in LINES if line and line != SETUP]
 
 
 def is_slow(command: str) -> bool:
-    """Real time, or many flights."""
+    """Tell whether a command runs in real time or flies many times."""
     return command.startswith("make") or "--mode local" in command or "--seeds" in command
 
 
@@ -47,7 +47,7 @@ def execute(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     if words[0] == "cloudrc":
         words = [sys.executable, "-m", *words]
     where = ROOT if words[0] == "make" else folder
-    # A make inside make says which folder it enters and leaves.
+    # A make inside make prints the folder that it enters and leaves.
     plain = {key: value for key, value in os.environ.items() if not key.startswith("MAKE")}
     environment = {**plain, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
     return subprocess.run(words, cwd=where, capture_output=True, text=True, env=environment)
@@ -55,7 +55,7 @@ def execute(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A working folder with the files that the pages tell one to write."""
+    """Make a working folder with the files that the pages describe."""
     path = tmp_path_factory.mktemp("readme")
     for name, body in FILES.items():
         (path / name).write_text(body)
@@ -83,7 +83,7 @@ def test_a_slow_command_works(command: str, folder: Path) -> None:
 
 @pytest.fixture
 def numbers_only(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fly here and without figures: quick."""
+    """Fly in this process and without figures, which is fast."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
 
@@ -100,7 +100,7 @@ def test_another_flight_works(command: str, capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_recording_is_read_as_the_readme_says(folder: Path) -> None:
+def test_the_readme_s_way_to_read_a_recording_works(folder: Path) -> None:
     assert main("run hover --mode virtual --set mission.waypoints.0.dwell_s=1".split()) == 0
     done = execute(f"{sys.executable} read_recording.py", folder)
     assert done.returncode == 0, done.stderr
@@ -108,8 +108,8 @@ def test_the_recording_is_read_as_the_readme_says(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_predictor_does_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
-    """A share of 1 is `constant_velocity`; half of it predicts worse; neither is a fault."""
+def test_the_readme_s_predictor_works(capsys: pytest.CaptureFixture[str]) -> None:
+    """Check that a share of 1 is `constant_velocity`, and that a share of 0.5 predicts worse."""
     errors = []
     for share in ("0.5", "1.0"):
         line = "run steps --mode virtual -o json --set mission.steps.count=3"

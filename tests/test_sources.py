@@ -1,4 +1,4 @@
-"""What code cites as its source can be opened: a page of this repository, or a public document."""
+"""Every cited source is a page of this repository or a public document."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PUBLIC = re.compile(
 
 
 def entries(text: str, suffix: str) -> Iterator[str]:
-    """The sources that docstrings and comments of a file name, each on one line."""
+    """Yield the sources in the docstrings and comments of a file, each on one line."""
     if "Source:" not in text:
         return
     comments = re.findall(
@@ -38,7 +38,7 @@ def entries(text: str, suffix: str) -> Iterator[str]:
 
 
 def unresolved(entry: str) -> list[str]:
-    """Parts of an entry that lead a reader nowhere."""
+    """Return the parts of an entry that cannot be resolved."""
     found, pages = VAGUE.findall(entry), PAGE.findall(entry)
     for name, quoted in pages:
         headings = re.findall('"([^"]+)"', quoted)

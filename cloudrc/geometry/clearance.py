@@ -1,7 +1,7 @@
-"""How near the robot is to the pipes: poses go in, distances to the nearest wall come out.
+"""Compute the distance between the robot and the walls of the pipes.
 
-A pipe is taken as the ideal hollow cylinder with flat ends, not as the staves that the physics
-collides with: those deviate by up to 3.2 mm.
+A pipe is an ideal hollow cylinder with flat ends. The staves of the physics deviate from it by up
+to 3.2 mm.
 
 Source: docs/reference/plant.md, "Staves".
 """
@@ -14,22 +14,21 @@ from numpy.typing import ArrayLike, NDArray
 from cloudrc.geometry.robot import Array, Points, key_points, place
 from cloudrc.geometry.scene import Pipe, Scene
 
-_CHUNK = 100  # poses at a time: 100 x 225 points stay in the processor's cache
+_CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 
 
 def distance_to_pipe(pipe: Pipe, points: Array) -> Array:
-    """Measure the signed distance of points to a pipe's material.
+    """Compute the signed distance of points to a pipe's wall.
 
-    Around the axis a hollow cylinder is a rectangle in the plane of s, along the axis, and r,
-    away from it; the distance is the one to that rectangle.
+    In the plane of s (along the axis) and r (away from it) the wall is a rectangle. The result is
+    the distance to that rectangle.
 
     Args:
         pipe: The hollow cylinder.
-        points: [m], world frame, shape (..., 3).
+        points: Points [m], world frame, shape (..., 3).
 
     Returns:
-        Distance [m], shape (...): positive outside of the material, in the bore too; negative in
-        the wall.
+        Distance [m], shape (...): negative inside the wall, positive outside and in the bore.
     """
     relative = points - np.asarray(pipe.centre)
     s = relative @ np.asarray(pipe.axis)
@@ -50,16 +49,16 @@ def clearance_per_pipe(
     orientations_wxyz: ArrayLike,
     points: Points | None = None,
 ) -> Array:
-    """Measure how far the robot is from each pipe.
+    """Compute the robot's distance from the wall of each pipe.
 
     Args:
-        scene: Where it flies.
-        positions: Of the base [m], world frame, shape (n, 3).
-        orientations_wxyz: Of the base, unit quaternions, body to world, shape (n, 4).
-        points: What of the robot counts; default: `key_points()`.
+        scene: The scene.
+        positions: Positions of the base [m], world frame, shape (n, 3).
+        orientations_wxyz: Orientations of the base, unit quaternions, body to world, shape (n, 4).
+        points: The robot's points; default: `key_points()`.
 
     Returns:
-        Distance of the robot's nearest point to the material [m], shape (n, number of pipes).
+        Distance of the nearest point [m], negative in a wall, shape (n, number of pipes).
     """
     points = points or key_points()
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
@@ -75,15 +74,15 @@ def clearance_per_pipe(
 
 
 def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) -> Array:
-    """Measure how far the robot is from the nearest pipe.
+    """Compute the robot's distance from the wall of the nearest pipe.
 
     Args:
-        scene: Where it flies.
-        positions: Of the base [m], world frame, shape (n, 3).
-        orientations_wxyz: Of the base, unit quaternions, body to world, shape (n, 4).
+        scene: The scene.
+        positions: Positions of the base [m], world frame, shape (n, 3).
+        orientations_wxyz: Orientations of the base, unit quaternions, body to world, shape (n, 4).
 
     Returns:
-        [m], shape (n,): negative where a point is in a wall, infinite in a scene without pipes.
+        Distance [m], negative in a wall, infinite in a scene without pipes, shape (n,).
     """
     nearest: Array = clearance_per_pipe(scene, positions, orientations_wxyz).min(
         axis=1, initial=np.inf
@@ -92,14 +91,14 @@ def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) 
 
 
 def pipe_index(scene: Scene, positions: ArrayLike) -> NDArray[np.int64]:
-    """Say in which pipe's bore the base is.
+    """Find the pipe whose bore contains the base.
 
     Args:
-        scene: Where it flies.
-        positions: Of the base [m], world frame, shape (n, 3).
+        scene: The scene.
+        positions: Positions of the base [m], world frame, shape (n, 3).
 
     Returns:
-        Index of the pipe, the first of several; -1 where the base is in none; shape (n,).
+        Index of the first such pipe, or -1, shape (n,).
     """
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     result = np.full(len(at), -1, dtype=np.int64)
@@ -113,13 +112,13 @@ def pipe_index(scene: Scene, positions: ArrayLike) -> NDArray[np.int64]:
 
 
 def inside_pipe(scene: Scene, positions: ArrayLike) -> NDArray[np.bool_]:
-    """Say whether the base is in a bore: |s| <= half the length, r < the inner radius.
+    """Tell whether the base is in a bore: |s| <= half the length, r < the inner radius.
 
     Args:
-        scene: Where it flies.
-        positions: Of the base [m], world frame, shape (n, 3).
+        scene: The scene.
+        positions: Positions of the base [m], world frame, shape (n, 3).
 
     Returns:
-        True where it is; shape (n,).
+        True where the base is in a bore, shape (n,).
     """
     return pipe_index(scene, positions) >= 0

@@ -9,17 +9,17 @@ HIGH: Vector = (9.2, 5.5, 2.5)
 """Corners of the box, base position [m], world frame.
 Source: docs/reference/plant.md, "Fence of the guard"."""
 FLOOR_MARGIN = 0.35
-"""Lower than this above the fence's floor no position is held [m]: parts of a tilted robot would
-touch the ground, or scrape along it."""
+"""Least height of a hold point above the fence's floor [m]. Below it a tilted robot would touch the
+ground or scrape along it."""
 
 
 def inside(position: Vector) -> bool:
-    """Say whether a base at `position` [m], world frame, shape (3,), is inside the fence."""
+    """Tell whether a base at `position` [m], world frame, shape (3,), is inside the fence."""
     return all(low <= value <= high for low, value, high in zip(LOW, position, HIGH, strict=True))
 
 
 def clamp(position: Vector) -> Vector:
-    """Give the point inside the fence nearest to `position` [m], world frame, shape (3,)."""
+    """Return the point inside the fence nearest to `position` [m], world frame, shape (3,)."""
     x, y, z = (
         min(max(value, low), high) for low, value, high in zip(LOW, position, HIGH, strict=True)
     )

@@ -1,4 +1,4 @@
-"""Where the robot may be asked to go: positions go in, what they would overlap comes out."""
+"""Check whether the robot may fly to a position: the fence, the pipes, and the way there."""
 
 from __future__ import annotations
 
@@ -11,31 +11,30 @@ from cloudrc.geometry.robot import Array, hull_points
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 
-_SEARCH = 1.5  # [m] how far away a legal point is looked for
+_SEARCH = 1.5  # [m] largest distance of a suggested legal point
 
 
 def outside_fence(positions: Array) -> NDArray[np.bool_]:
-    """Say which positions of the base [m], world frame, shape (n, 3), are beyond the fence."""
+    """Tell which positions of the base [m], world frame, shape (n, 3), are outside the fence."""
     outside: NDArray[np.bool_] = np.any((positions < fence.LOW) | (positions > fence.HIGH), axis=1)
     return outside
 
 
 def overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
-    """Say which pipe's wall the base's box or the arm would overlap.
+    """Find the pipe whose wall the base's box or the arm would overlap.
 
-    The rotors do not count: they have no say in where the base can be asked to go, only in how
-    near the flight comes, which the metrics judge.
+    The rotors do not count here; the metrics judge how near they come to a wall.
 
     Args:
-        scene: Where the robot is; its board does not count.
-        positions: Of the base [m], world frame, shape (n, 3).
+        scene: The scene; its board does not count.
+        positions: Positions of the base [m], world frame, shape (n, 3).
         yaws: Headings of the level robot [rad], shape (n,).
 
     Returns:
-        Index of the pipe; -1 where there is none; shape (n,).
+        Index of the pipe with the deepest overlap, or -1, shape (n,).
     """
     result = np.full(len(positions), -1, dtype=np.int64)
-    # Points far beyond the fence would only overflow.
+    # Points far outside the fence would overflow.
     near = np.flatnonzero(np.all(np.abs(positions) < 1e3, axis=1))
     if len(near) == 0 or not scene.pipes:
         return result
@@ -47,17 +46,18 @@ def overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.i
 
 
 def crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
-    """Say through which pipe's wall a straight way of the base's middle leads.
+    """Find the pipe whose wall a straight way of the base's centre crosses.
 
-    Where robot and wall only graze each other is not said: how straight it flies nobody knows yet.
+    A way that only grazes a wall does not count, because the flight may deviate from the straight
+    way.
 
     Args:
-        scene: Where the robot is; its board does not count.
-        starts: Of the ways [m], world frame, not far beyond the fence, shape (n, 3).
-        ends: Likewise.
+        scene: The scene; its board does not count.
+        starts: Starts of the ways [m], world frame, not far outside the fence, shape (n, 3).
+        ends: Ends of the ways [m], world frame, likewise, shape (n, 3).
 
     Returns:
-        Index of the pipe, the last one if there are several; -1 where there is none; shape (n,).
+        Index of the last such pipe, or -1, shape (n,).
     """
     result = np.full(len(starts), -1, dtype=np.int64)
     for index, pipe in enumerate(scene.pipes):
@@ -65,10 +65,10 @@ def crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
         from_centre, along = starts - np.asarray(pipe.centre), ends - starts
         depth, deeper = from_centre @ axis, along @ axis
         away, farther = from_centre - depth[:, None] * axis, along - deeper[:, None] * axis
-        # Where it meets the middle of the wall: |away + t farther| = radius.
+        # The way meets the middle of the wall where |away + t farther| = radius.
         a, b = np.sum(farther**2, axis=1), 2 * np.sum(away * farther, axis=1)
         c = np.sum(away**2, axis=1) - ((pipe.inner + pipe.outer) / 2) ** 2
-        with np.errstate(invalid="ignore", divide="ignore"):  # never, or along the axis
+        with np.errstate(invalid="ignore", divide="ignore"):  # no such t, or parallel to the axis
             root = np.sqrt(b**2 - 4 * a * c)
             for t in ((-b - root) / (2 * a), (-b + root) / (2 * a)):
                 meets = (t >= 0) & (t <= 1) & (np.abs(depth + t * deeper) <= pipe.length / 2)
@@ -77,18 +77,19 @@ def crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
 
 
 def nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | None:
-    """Look for a legal point near by, along the axes and towards and away from the pipes' axes.
+    """Find a legal point near a position.
 
-    Points are whole centimetres, so that what is printed is what was checked.
+    The search goes along the axes, and towards and away from the axes of the pipes. Candidates are
+    whole centimetres, so that the printed point is the checked one.
 
     Args:
-        scene: Where the robot is.
-        position: Of the base [m], world frame, shape (3,).
+        scene: The scene.
+        position: Position of the base [m], world frame, shape (3,).
         yaw: Heading [rad].
 
     Returns:
-        A point inside the fence at which nothing overlaps [m], shape (3,); None if there is none
-        within 1.5 m.
+        A point inside the fence without an overlap [m], shape (3,); None if there is none within
+        1.5 m.
     """
     start = np.array(fence.clamp(position))
     directions = [*np.eye(3), *-np.eye(3)]

@@ -1,4 +1,4 @@
-"""The robot as points in its body frame, and where they are when it is somewhere.
+"""Represent the robot by points in its body frame, and move them to its pose.
 
 Source: docs/reference/plant.md, "Robot", "Key points for clearance".
 """
@@ -15,20 +15,20 @@ Array = NDArray[np.float64]
 BASE_HALF = (0.05, 0.05, 0.10)
 """Half sizes of the base's box [m], body frame."""
 ARM_LENGTH, ARM_HEIGHT, ARM_RADIUS = 0.40, 0.17, 0.01
-"""The arm lies along +x of the body, from its z axis to the tip [m]."""
+"""The arm along +x of the body: length from the z axis to the tip, height, radius [m]."""
 ROTOR_ARM, ROTOR_HEIGHT, ROTOR_RADIUS, ROTOR_HALF_THICKNESS = 0.21, 0.05, 0.128, 0.0025
-"""Distance of a rotor's centre from the body's z axis, its height and size [m]."""
+"""The rotors: distance of a centre from the body's z axis, height, radius, half thickness [m]."""
 ROD_RADIUS, ROD_BOTTOM, ROD_TOP = 0.05, 0.06, 0.18
-"""The top rod: radius, heights of its ends [m]."""
+"""The top rod: radius, heights of both ends [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Spheres that stand for the robot.
+    """Spheres that represent the robot.
 
     Attributes:
         positions: Centres [m], body frame, shape (k, 3).
-        radii: [m], shape (k,).
+        radii: Radii [m], shape (k,).
     """
 
     positions: Array
@@ -36,7 +36,7 @@ class Points:
 
 
 def key_points() -> Points:
-    """Give the 225 points that clearance is measured at: rotors, arm, base box, top rod."""
+    """Return the 225 points for the clearance: rotors, arm, base box, top rod."""
     rotors = [
         _ring(x, y, height, ROTOR_RADIUS, 24)
         for x, y in ((ROTOR_ARM, 0), (0, ROTOR_ARM), (-ROTOR_ARM, 0), (0, -ROTOR_ARM))
@@ -47,7 +47,7 @@ def key_points() -> Points:
 
 
 def hull_points() -> Points:
-    """Give points of the base's box and the arm so dense that no pipe wall slips between them.
+    """Return points of the base's box and the arm, dense enough to find every overlap with a wall.
 
     Neighbours are 0.02 m apart in the box and 0.01 m on the arm; a wall is 0.038 m thick.
     """
@@ -55,12 +55,12 @@ def hull_points() -> Points:
 
 
 def place(points: Points, positions: Array, orientations_wxyz: Array) -> Array:
-    """Move the robot's points to where it is.
+    """Transform the robot's points to the world frame.
 
     Args:
-        points: In the body frame.
-        positions: Of the base [m], world frame, shape (n, 3).
-        orientations_wxyz: Of the base, unit quaternions, body to world, shape (n, 4).
+        points: Points in the body frame.
+        positions: Positions of the base [m], world frame, shape (n, 3).
+        orientations_wxyz: Orientations of the base, unit quaternions, body to world, shape (n, 4).
 
     Returns:
         Centres [m], world frame, shape (n, k, 3).

@@ -1,7 +1,7 @@
-"""The scene in numbers: a scene's MJCF file goes in, its pipes, board and floor come out.
+"""Read the pipes, the board and the floor of a scene from its MJCF file.
 
-The bodies are MuJoCo's; their ideal shapes stand in the same file as numbers that no physics
-engine is needed to read: `<custom><numeric name="pipe_1" data="..."/>`, in metres, world frame.
+The file describes the bodies for MuJoCo. It repeats their ideal shapes as numbers, for readers
+without a physics engine: `<custom><numeric name="pipe_1" data="..."/>`, in metres, world frame.
 
 | name | data |
 |---|---|
@@ -28,12 +28,12 @@ class Pipe:
     """A hollow cylinder with flat ends.
 
     Attributes:
-        name: As the body is called.
+        name: Name of the body.
         centre: Midpoint of the axis [m], world frame, shape (3,).
-        axis: Unit vector along it, world frame, shape (3,).
-        length: From end to end [m].
-        inner: Radius of the bore [m].
-        outer: Radius of the outside [m].
+        axis: Unit vector along the axis, world frame, shape (3,).
+        length: Length [m].
+        inner: Inner radius [m].
+        outer: Outer radius [m].
     """
 
     name: str
@@ -49,9 +49,9 @@ class Board:
     """A wall to touch; its front face looks along -x.
 
     Attributes:
-        x: Of the front face [m], world frame.
-        y: From, to [m].
-        z: From, to [m].
+        x: Position of the front face [m], world frame.
+        y: Extent from, to [m].
+        z: Extent from, to [m].
     """
 
     x: float
@@ -61,13 +61,13 @@ class Board:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What a robot can run into.
+    """The obstacles of a scene.
 
     Attributes:
         name: File name without .xml.
-        pipes: In the order of the file.
-        board: None if there is none.
-        floor: Its height z [m].
+        pipes: The pipes, in the order of the file.
+        board: The board, if any.
+        floor: Height z of the floor [m].
     """
 
     name: str
@@ -80,13 +80,17 @@ def load_scene(name: str) -> Scene:
     """Read a shipped scene by its file name without .xml.
 
     Raises:
-        BadInputError: If there is no such file, or its numbers are not what the table above says.
+        BadInputError: If the file does not exist, or its numbers do not fit the table above.
     """
     return read_scene(SCENES / f"{name}.xml")
 
 
 def read_scene(path: Path) -> Scene:
-    """Read the scene in an MJCF file; raises as `load_scene`."""
+    """Read the scene in an MJCF file.
+
+    Raises:
+        BadInputError: As `load_scene`.
+    """
     try:
         root = ElementTree.parse(path).getroot()
     except OSError as error:
@@ -112,7 +116,8 @@ def _pipe(path: Path, name: str, data: list[float]) -> Pipe:
     norm = math.hypot(ax, ay, az)
     if norm == 0 or length <= 0 or not 0 < inner < outer:
         raise BadInputError(
-            f"scene {path.name}: {name}: needs an axis, a length and 0 < inner < outer radius"
+            f"scene {path.name}: {name}: needs an axis that is not zero, a length above 0 and "
+            "0 < inner < outer radius"
         )
     return Pipe(name, (cx, cy, cz), (ax / norm, ay / norm, az / norm), length, inner, outer)
 

@@ -1,7 +1,7 @@
-"""The robot's end of the loop: commands come in through the tunnel, telemetry goes out.
+"""The robot's end of the loop: physics, sensors, guard and low-level controller.
 
     tunnel > guard > low_level > rotor speeds > simulator > readings > sensors > tunnel
 
-`readings` is the seam between physics and onboard part. MuJoCo is imported in `scene` only; robots
-and scenes are MJCF files in `robots/` and `scenes/`, found by their name.
+`readings` is the interface between physics and onboard part. Only `scene` imports MuJoCo. Robots
+and scenes are MJCF files in `robots/` and `scenes/`; their file name is their configuration name.
 """

@@ -1,19 +1,8 @@
-"""World's end of the tunnel: commands come in, the robot flies, telemetry leaves.
+"""World's end of the tunnel: it receives commands, flies the robot and sends telemetry.
 
-Time only moves in `_advance`: before anything that comes in has an effect, the ticks before it are
-run, so the result does not depend on when a driver wakes up. World alone hands out epochs: a cloud
-that gets authority gets a new one, and so does a mission that starts from the spawn.
-
-What the robot has touched in a mission: contacts come in, what the verdict needs goes out.
-
-What the operator asks of the robot: requests come in, the guard is told, progress is kept.
-
-Whether simulated time keeps up with the machine's: looks of world's clock in, a fault out.
-
-What is slow is the robot, not its network, so a run like that is invalid: who watches it is told
-while it flies, and the metric goes on telling.
-
-Who world's end is, what it must not forget, and what it may accept.
+Time advances in `_advance` only. The ticks before a datagram's arrival run before the datagram has
+any effect, so that the result does not depend on when the driver wakes up. World alone hands out
+epochs: a cloud that takes control gets a new one, and a mission that starts from the spawn, too.
 """
 
 from __future__ import annotations
@@ -57,12 +46,12 @@ from cloudrc.world.robot import CATCH_UP_NS, Robot, SimulationClock
 from cloudrc.world.sensors import Sensors
 
 
-class Touches:
-    """Of one mission.
+class MissionContacts:
+    """What the robot has touched in one mission.
 
     Attributes:
-        pipes: How often the robot has begun to touch a pipe.
-        speed: Of the tip when it first touched the board [m/s]; NaN if it has not yet.
+        pipes: Number of contacts with pipes.
+        speed: Speed of the tip at its first contact with the board [m/s]; NaN before that.
     """
 
     def __init__(self) -> None:
@@ -70,7 +59,7 @@ class Touches:
         self.speed = nan
 
     def note(self, touch: Touch) -> None:
-        """Take note of a contact that has begun."""
+        """Count a contact that has begun."""
         if touch.body.startswith("pipe"):
             self.pipes += 1
         elif touch.body == "board" and touch.tip and isnan(self.speed):
@@ -78,33 +67,33 @@ class Touches:
 
 
 START_AGE_MAX_NS = 1_000_000_000
-"""What cloud saw when it passed a start on may be so old [ns], or as old as a command may be."""
+"""Largest age of the basis of a start request [ns], unless a command may be older."""
 
 
 class Orders:
-    """The operator's requests, obeyed by rising number.
+    """Carries out the operator's requests in the order of their numbers.
 
     Attributes:
-        number: Of the newest that was acted on in this session.
-        mission_id: The mission started last, through every session.
-        reached: How many of its waypoints are known to be reached; it only ever rises.
-        touches: What the robot has touched in it.
+        number: Number of the newest request that was carried out in this session.
+        mission_id: The mission that was started last, in any session.
+        reached: Number of its waypoints known to be reached; it never falls.
+        touches: What the robot has touched in this mission.
     """
 
     def __init__(
         self, guard: Guard, counts: defaultdict[str, int], command_age_max_ns: int
     ) -> None:
-        """Begin with nothing asked.
+        """Start without any request.
 
         Args:
-            guard: Is told.
-            counts: Takes up "start_refused".
-            command_age_max_ns: Of a command's basis [ns].
+            guard: The guard that carries the requests out.
+            counts: Counters of the endpoint; "start_refused" is counted here.
+            command_age_max_ns: Largest age of a command's basis [ns].
         """
         self._guard, self._counts = guard, counts
         self._age_max_ns = max(START_AGE_MAX_NS, command_age_max_ns)
         self.number = self.mission_id = self.reached = 0
-        self.touches = Touches()
+        self.touches = MissionContacts()
 
     def obey(
         self,
@@ -114,20 +103,20 @@ class Orders:
         waited: bool,
         has_epoch: Callable[[], bool],
     ) -> bool:
-        """Do as is asked, but for a start, which the caller begins.
+        """Carry out a request; the caller itself begins a mission.
 
         Args:
-            request: In the operator's name.
+            request: The operator's request.
             now_ns: World's clock [ns].
-            waited: Whether it may have waited in the socket through a stall.
-            has_epoch: Whether there is an epoch for a start from the spawn.
+            waited: Whether the request may have waited in the socket during a stall.
+            has_epoch: Tells whether there is an epoch for a start from the spawn.
 
         Returns:
-            Whether a mission is to be started.
+            Whether the caller must begin a mission.
 
         Raises:
-            DecodeError: "stale" or "future" for a start that was not said just now: somebody may
-                have held it back, and the mission may be over.
+            DecodeError: "stale" or "future" for a start that is not recent. Somebody may have
+                delayed it, and the mission may be over.
         """
         if request.request is Request.PROGRESS:
             self._keep_progress(request)
@@ -136,8 +125,8 @@ class Orders:
             return False
         starts = request.request is Request.START
         if starts:
-            self._refuse_unless_new(now_ns - request.basis_stamp_ns, waited)
-            # Not acted on, so not confirmed either: the operator has to acknowledge first.
+            self._refuse_old(now_ns - request.basis_stamp_ns, waited)
+            # Not carried out, so not confirmed either: the operator must acknowledge first.
             if self._guard.latched or (request.start is Start.SPAWN and not has_epoch()):
                 self._counts["start_refused"] += 1
                 return False
@@ -153,69 +142,73 @@ class Orders:
             self._guard.acknowledge(now_ns)
         return starts
 
-    def _refuse_unless_new(self, age_ns: int, waited: bool) -> None:
+    def _refuse_old(self, age_ns: int, waited: bool) -> None:
         if waited or age_ns > self._age_max_ns:
             raise DecodeError("stale")
         if age_ns < 0:
             raise DecodeError("future")
 
     def _begin_mission(self, request: OperatorRequest) -> None:
-        """From the spawn nothing is reached yet, and nothing touched."""
+        """Forget waypoints and contacts if the mission is new or starts from the spawn."""
         if request.mission_id != self.mission_id or request.start is Start.SPAWN:
             self.mission_id, self.reached = request.mission_id, 0
-            self.touches = Touches()
+            self.touches = MissionContacts()
 
     def _keep_progress(self, request: OperatorRequest) -> None:
-        """The onboard witness of how far a mission is."""
+        """Keep the mission's progress on board, for a cloud that restarts."""
         if request.mission_id == self.mission_id:
             self.reached = max(self.reached, request.reached)
 
 
-QUIET_NS = 10_000_000_000
-"""It is told again once it has kept up for so long [ns]."""
+REPORT_AGAIN_NS = 10_000_000_000
+"""Time of keeping up with real time after which a new delay is reported again [ns]."""
 
 
-class Pace:
-    """Compares each look with the one before; the first, after a process's start, tells nothing."""
+class PaceMonitor:
+    """Compares world's clock with the machine's and reports a world slower than real time.
+
+    The first call after a start has nothing to compare with. Such a run is invalid, because not the
+    network is slow but the robot.
+    """
 
     def __init__(self) -> None:
-        self._looked_ns = self._slip_ns = NEVER_NS
+        self._checked_ns = self._slip_ns = NEVER_NS
         self._slow_ns = NEVER_NS
 
-    def look(self, now_ns: int, slip_ns: int) -> list[Fault]:
-        """Say so if world has fallen behind since the look before, about a second ago.
+    def check(self, now_ns: int, slip_ns: int) -> list[Fault]:
+        """Return a fault if world fell behind since the last call, about a second ago.
 
         Args:
             now_ns: World's clock [ns].
-            slip_ns: By how much it lags the machine's [ns].
+            slip_ns: Lag of world's clock behind the machine's clock [ns].
         """
-        passed_ns, slipped_ns = now_ns - self._looked_ns, slip_ns - self._slip_ns
-        is_first = self._looked_ns == NEVER_NS
-        self._looked_ns, self._slip_ns = now_ns, slip_ns
+        passed_ns, slipped_ns = now_ns - self._checked_ns, slip_ns - self._slip_ns
+        is_first = self._checked_ns == NEVER_NS
+        self._checked_ns, self._slip_ns = now_ns, slip_ns
         factor = passed_ns / (passed_ns + slipped_ns)
         if is_first or factor >= REAL_TIME_FACTOR_MIN:
             return []
-        is_news = self._slow_ns == NEVER_NS or now_ns - self._slow_ns > QUIET_NS
+        is_news = self._slow_ns == NEVER_NS or now_ns - self._slow_ns > REPORT_AGAIN_NS
         self._slow_ns = now_ns
         text = (
             f"real-time factor {factor:.2f} over {(passed_ns + slipped_ns) * 1e-9:.1f} s: "
-            "simulated time falls behind; give world more processor time"
+            "simulated time is too slow; give world more processor time"
         )
         return [Fault(now_ns, "late", text)] if is_news else []
 
 
 @dataclass(frozen=True, slots=True)
 class WorldIdentity:
-    """What world's end is given at its start.
+    """The identity of world's end, fixed at its start.
 
     Attributes:
         clock_id: 16 bytes that name this machine's monotonic clock.
         nonce: 16 bytes that name this process; never the same twice.
-        last_epoch: The last epoch handed out before this process began.
-        ring: The pre-shared keys; None for an end that never leaves its process.
-        suite: Cipher that this machine is fast at.
-        next_epoch: Gives epochs that are persisted before they are used, or None as long as the
-            disk has none; None to count on from `last_epoch`.
+        last_epoch: Last epoch that was handed out before this process started.
+        ring: The pre-shared keys; None for an end whose datagrams stay in its process.
+        suite: The cipher that is fastest on this machine.
+        next_epoch: Returns the next epoch once it is on disk, or None while the disk refuses it.
+            Without this function, epochs continue from `last_epoch`.
     """
 
     clock_id: bytes
@@ -229,9 +222,9 @@ class WorldIdentity:
 ODOMETRY_PERIOD_NS = 10_000_000
 """Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""
 COUNT_PERIOD_NS = TEND_PERIOD_NS = 1_000_000_000
-TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # an enum's member is slow to look up
-COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
-_new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
+TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # looking up a member of an enum is slow
+COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # used in every period
+_new = tuple.__new__  # makes a named tuple in half the time of its own constructor
 
 
 class WorldEndpoint:
@@ -247,18 +240,18 @@ class WorldEndpoint:
         command_age_max_ns: int,
         start_ns: int = 0,
     ) -> None:
-        """Begin with the robot on the ground at its spawn.
+        """Start with the robot on the ground at its spawn.
 
         Args:
-            robot: At its spawn, its guard in GROUND.
-            sensors: What odometry sees.
-            identity: Who this end is.
-            newest_wins: Policy for late commands.
-            command_age_max_ns: What may have waited longer in the socket is stale [ns].
+            robot: The robot, its guard in GROUND.
+            sensors: The sensors that give odometry its noise.
+            identity: The identity of this end.
+            newest_wins: Whether late commands are dropped.
+            command_age_max_ns: Datagrams that may have waited longer in the socket are stale [ns].
             start_ns: The monotonic clock now [ns].
         """
         self.robot, self._sensors, self._identity = robot, sensors, identity
-        self._clock, self._pace = SimulationClock(start_ns), Pace()
+        self._clock, self._pace = SimulationClock(start_ns), PaceMonitor()
         self._session = make_session(Direction.UPLINK, identity.ring, start_ns)
         self._door = Door(self._session, identity, age_max_ns=command_age_max_ns)
         self._channel = Channel(newest_wins)
@@ -278,7 +271,7 @@ class WorldEndpoint:
 
     @property
     def slip_ns(self) -> int:
-        """By how much world's clock lags the monotonic one [ns]."""
+        """Lag of world's clock behind the monotonic clock [ns]."""
         return self._clock.slip_ns
 
     @property
@@ -287,28 +280,28 @@ class WorldEndpoint:
         return self._session.sealed
 
     def next_deadline_ns(self) -> int:
-        """When the next odometry is due [ns], monotonic clock."""
+        """Return when the next odometry is due [ns], monotonic clock."""
         return self._odometry_ns + self._clock.slip_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Run every tick up to and including `now_ns`; odometry leaves on its way."""
+        """Run every tick up to and including `now_ns`; telemetry is sent on the way."""
         self._advance(self._follow(now_ns) + 1)
-        if now_ns >= self._tend_ns:  # by the machine's clock: world's may lag
+        if now_ns >= self._tend_ns:  # on the machine's clock, because world's may lag
             self._tend_ns = now_ns + TEND_PERIOD_NS
-            self._greet(self._session.tend(now_ns))
+            self._queue(self._session.tend(now_ns))
 
     def take_datagrams(self) -> list[bytes]:
-        """Hand over the datagrams to send."""
+        """Return the datagrams to send."""
         datagrams, self._datagrams = self._datagrams, []
         return datagrams
 
     def take_records(self) -> list[Record]:
-        """Hand over the records since the last call."""
+        """Return the records since the last call."""
         records, self._records = self._records, []
         return records
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Take in one datagram; what is not valid is counted and dropped."""
+        """Handle one datagram; an invalid one is counted and dropped."""
         world_ns = self._follow(now_ns)
         try:
             kind, _, epoch, counter, body = self._session.open(data)
@@ -328,7 +321,10 @@ class WorldEndpoint:
                 self._records += self._complaints.about(str(error), data, world_ns)
 
     def _follow(self, now_ns: int) -> int:
-        """World time at a wake; remembers a wake after a stall, whose datagrams have waited."""
+        """Return world's time at a wake, and remember a wake after a stall.
+
+        The datagrams that a wake after a stall finds may have waited in the socket.
+        """
         world_ns = now_ns - self._clock.slip_ns
         behind_ns = world_ns - self._clock.tick_ns
         if behind_ns > self._command_age_max_ns:
@@ -337,7 +333,7 @@ class WorldEndpoint:
         return self._clock.follow(now_ns) if behind_ns > CATCH_UP_NS else world_ns
 
     def _advance(self, until_ns: int) -> None:
-        """Run all ticks before `until_ns` [world's clock]."""
+        """Run all ticks before `until_ns` [ns], world's clock."""
         clock, tick_ns = self._clock, self._clock.tick_ns
         if tick_ns < until_ns and self._waiting is not None:
             self._apply(tick_ns)
@@ -349,18 +345,18 @@ class WorldEndpoint:
             tick_ns = clock.tick_ns = self.robot.run(tick_ns, stop_ns)
 
     def _apply(self, now_ns: int) -> None:
-        """The waiting command reaches the low-level controller with this tick."""
+        """Note that the waiting command takes effect with this tick."""
         assert self._waiting is not None
         epoch, counter, command = self._waiting
         self._waiting = None
-        if self.robot.guard.state is not TRACK:  # ended or stopped in the same wake
+        if self.robot.guard.state is not TRACK:  # the mission ended or stopped in the same wake
             return
         echo_ns, basis_ns, _, velocity, _ = command
         self._echo_stamp_ns, self._applied_ns = echo_ns, now_ns
         self._records.append(_new(CommandApplied, (now_ns, epoch, counter, basis_ns, velocity)))
 
     def _send_telemetry(self, now_ns: int) -> None:
-        """Measure, tell cloud, and note down the truth."""
+        """Measure, send telemetry, and record the ground truth."""
         simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
         orders = self._orders
         tip_force = simulator.tip_force()
@@ -398,11 +394,11 @@ class WorldEndpoint:
             self._counts["held_seconds"] += guard.armed and guard.state is HOLD
             for name, count in sorted((self._counts | guard.counts).items()):
                 records.append(Counted(now_ns, "world", name, count))
-            records += self._pace.look(now_ns, self._clock.slip_ns)
+            records += self._pace.check(now_ns, self._clock.slip_ns)
         self._odometry_ns += ODOMETRY_PERIOD_NS
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:
-        """Answer as the door says; what waited through a stall is too old to decide by."""
+        """Answer a hello; one that waited during a stall is stale."""
         if now_ns == self._stalled_wake_ns:
             raise DecodeError("stale")
         answer = self._door.knock(hello, counter, now_ns)
@@ -413,17 +409,17 @@ class WorldEndpoint:
             self._clock_is_shared = self._door.shares_clock
             self._orders.number = 0
             self._begin_epoch("cloud said hello")
-        self._greet(answer.datagrams)
+        self._queue(answer.datagrams)
 
     def _has_epoch(self) -> bool:
-        """Say whether an epoch can begin; if not, the user is told."""
+        """Tell whether an epoch can begin; if not, record a fault."""
         ready = self._door.ready
         if not ready:
             self._records += self._complaints.say("epochs", NO_EPOCH, self._clock.tick_ns)
         return ready
 
     def _begin_epoch(self, cause: str) -> None:
-        """Everything that belongs to the old epoch is forgotten."""
+        """Forget everything that belongs to the old epoch."""
         self._channel.reset()
         self.robot.guard.forget_commands()
         self._waiting = None
@@ -433,20 +429,20 @@ class WorldEndpoint:
         self._records.append(SessionOpened(now_ns, "world", epoch, cause))
 
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
-        """Do as the operator asks; a mission from the spawn begins an epoch of its own."""
+        """Carry out an operator request; a mission from the spawn begins a new epoch."""
         tick_ns, waited = self._clock.tick_ns, now_ns == self._stalled_wake_ns
         if not self._orders.obey(request, tick_ns, waited=waited, has_epoch=self._has_epoch):
             return
         if request.start is Start.SPAWN:
             self.robot.put_on_ground(tick_ns, "mission starts from spawn")
-            self._greet([self._door.move_on(now_ns)])
+            self._queue([self._door.move_on(now_ns)])
             self._begin_epoch("mission starts from spawn")
         self.robot.guard.start_mission(tick_ns)
 
     def _receive_command(
         self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
     ) -> None:
-        """Whatever arrives for this epoch is noted; the newest is offered to the guard."""
+        """Record a command of this epoch; give the newest one to the guard."""
         command, guard = codec.decode_command(body), self.robot.guard
         outcome = self._channel.take(counter)
         if outcome != REPEATED:
@@ -467,6 +463,6 @@ class WorldEndpoint:
         self._datagrams.append(self._session.seal(kind, body))
         self._counts["sent"] += 1
 
-    def _greet(self, datagrams: list[bytes]) -> None:
+    def _queue(self, datagrams: list[bytes]) -> None:
         self._datagrams += datagrams
         self._counts["sent"] += len(datagrams)

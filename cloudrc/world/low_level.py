@@ -1,11 +1,11 @@
-"""The onboard low-level controller: readings and a wanted velocity in, rotor speeds out, at 500 Hz.
+"""The onboard low-level controller, which makes the robot follow a velocity at 500 Hz.
 
-A velocity PID gives the force that the robot needs; geometric attitude control turns the thrust
-axis towards it; the allocation splits thrust and torque over four rotors. Plain floats: it runs at
-every physics step.
+A velocity PID gives the force that the robot needs. Geometric attitude control turns the thrust
+axis towards that force. The allocation splits thrust and torque over four rotors. It uses plain
+floats, because it runs in every physics step.
 Source: docs/reference/plant.md, "Low-level controller".
-Deviation: the published code takes dt = 10 ms while it is called every 2 ms; here dt is the true
-one and the gains are those that the published code then has in effect.
+Deviation: the published code assumes dt = 10 ms but runs every 2 ms; here dt is the true step, and
+the gains are converted so that the effect is the same.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ TILT_RATE_GAIN, YAW_RATE_GAIN = 0.22, 0.01
 """k_w: torque per angular velocity about x and y, about z [N m s].
 Source: docs/reference/plant.md, "Low-level controller"."""
 THRUST_MAX = THRUST_COEFFICIENT * SPEED_MAX**2
-"""Of one rotor [N]."""
+"""Largest thrust of one rotor [N]."""
 TINY = 1e-9
 
 Effort: TypeAlias = tuple[float, float, float, float]
@@ -40,9 +40,9 @@ _WEIGHT = MASS * GRAVITY
 _HALF_TILT_GAIN, _HALF_YAW_GAIN = 0.5 * TILT_GAIN, 0.5 * YAW_GAIN
 _TWO_ARMS, _FOUR_RATIOS = 2.0 * ARM, 4.0 * TORQUE_RATIO
 
-TURNED_AWAY, ASKEW = 0.5, 0.3
-"""Cosine of the error about the nose below which, and sine of the yaw error beyond which the axes
-of the published error do not fit any more [1]."""
+NOSE_COSINE_MIN, YAW_SINE_MAX = 0.5, 0.3
+"""Limits beyond which the published attitude error uses wrong axes: smallest cosine of the error
+about the nose, and largest sine of the yaw error [1]."""
 
 
 class LowLevel:
@@ -57,18 +57,18 @@ class LowLevel:
         integral_limit_z: float = 0.40,
         dt: float = 0.002,
     ) -> None:
-        """Set the velocity loop up.
+        """Set the gains and limits of the velocity loop.
 
         Args:
             gain_p: Force per velocity error [N s/m], shape (3,).
             gain_i: Force per integrated velocity error [N/m], shape (3,).
             gain_d: Force per rate of the velocity error [N s^2/m], shape (3,).
             integral_limit_xy: Limit of the integrated velocity error in x and y [m].
-            integral_limit_z: Likewise in z [m].
+            integral_limit_z: Limit of the integrated velocity error in z [m].
             dt: Time between two updates [s].
         """
         dx, dy, dz = gain_d
-        # Of the error, its integral and its change in a tick: one tuple is fast to unpack.
+        # Gains of the error, its integral and its change per tick; one tuple unpacks fastest.
         self._gains = (*gain_p, *gain_i, dx / dt, dy / dt, dz / dt)
         self._limits = (integral_limit_xy, integral_limit_z, dt)
         self.reset()
@@ -79,7 +79,7 @@ class LowLevel:
         self._error: Vector | None = None
 
     def update(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
-        """Compute the rotor speeds that make the robot follow a velocity; once every `dt`.
+        """Compute the rotor speeds that make the robot follow a velocity; call it every `dt`.
 
         Args:
             readings: State of the base.
@@ -92,10 +92,10 @@ class LowLevel:
         return allocate(attitude(force, readings))
 
     def brake(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
-        """As `update`, while the robot comes to rest: the integral, which would wind up, stays.
+        """Compute the rotor speeds as `update` does, with the integral frozen while braking.
 
-        Deviation: the published controller integrates always; after a braking its integral pushes
-        the robot back for a second.
+        Deviation: the published controller always integrates. Its integral winds up while the robot
+        brakes, and pushes the robot back for a second afterwards.
 
         Args:
             readings: State of the base.
@@ -107,25 +107,25 @@ class LowLevel:
         return speeds
 
     def force(self, velocity: Vector, reference: Vector) -> Vector:
-        """Compute the force that the robot needs, and move the integral on by one `dt`.
+        """Compute the force that the robot needs, and advance the integral by `dt`.
 
         e = v - v_ref;  F = -(Kp e + Ki int(e dt) + Kd de/dt) + (0, 0, m g), int(e dt) clamped.
         Source: docs/reference/plant.md, "Low-level controller".
 
         Args:
-            velocity: [m/s], world frame, shape (3,).
-            reference: [m/s], world frame, shape (3,).
+            velocity: Velocity of the base [m/s], world frame, shape (3,).
+            reference: Wanted velocity [m/s], world frame, shape (3,).
 
         Returns:
-            [N], world frame, shape (3,).
+            Force [N], world frame, shape (3,).
         """
         px, py, pz, ix, iy, iz, dx, dy, dz = self._gains
         limit_xy, limit_z, dt = self._limits
         vx, vy, vz = velocity
         rx, ry, rz = reference
-        # Of opposite sign to the equation's, which saves turning every term.
+        # The opposite sign of the equation saves a negation per term.
         ex, ey, ez = error = (rx - vx, ry - vy, rz - vz)
-        # The first error after a reset has no predecessor: its rate counts as 0.
+        # After a reset there is no last error: the rate is 0.
         last_x, last_y, last_z = self._error or error
         self._error = error
 
@@ -150,14 +150,14 @@ def attitude(force: Vector, readings: Readings) -> Effort:
 
     z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
     e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R e_R + k_w w); thrust = F . (R z).
-    Worked out in the body frame, where the vectors wanted are the rows of Q.
+    The code works in the body frame, where the wanted axes are the rows of Q.
     Source: docs/reference/plant.md, "Low-level controller", with yaw and yaw rate reference 0.
-    Deviation: where a hit has turned the robot by more than 17 degrees, the tilt is corrected about
-    the axes that it has now: e_R steers it half the yaw error aside, and beyond 90 degrees the
-    wrong way.
+    Deviation: if a hit has turned the robot by more than 17 degrees, the tilt is corrected about
+    the body's present axes. There e_R would steer aside by half the yaw error, and beyond 90
+    degrees the wrong way.
 
     Args:
-        force: Wanted [N], world frame, shape (3,).
+        force: Wanted force [N], world frame, shape (3,).
         readings: State of the base.
 
     Returns:
@@ -167,7 +167,7 @@ def attitude(force: Vector, readings: Readings) -> Effort:
     _, _, _, (p, q, r), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = readings
     thrust = fx * zx + fy * zy + fz * zz
 
-    # A force that vanishes or points along the nose leaves an axis undefined: no torque from it.
+    # A zero force, or one along the nose, leaves an axis undefined and causes no torque there.
     across = fy * fy + fz * fz
     scale = 1.0 / (sqrt(fx * fx + across) or TINY)
     z0 = scale * (fx * xx + fy * xy + fz * xz)
@@ -178,7 +178,7 @@ def attitude(force: Vector, readings: Readings) -> Effort:
     y1 = scale * (fz * yy - fy * yz)
     y2 = scale * (fz * zy - fy * zz)
 
-    if y1 < TURNED_AWAY or xy > ASKEW or xy < -ASKEW:
+    if y1 < NOSE_COSINE_MIN or xy > YAW_SINE_MAX or xy < -YAW_SINE_MAX:
         roll, pitch = -z1 - z1, z0 + z0
     else:
         roll, pitch = y2 - z1, z0 + y1 * z0 - y0 * z1
@@ -210,12 +210,12 @@ def allocate(effort: Effort) -> RotorSpeeds:
     front, back = with_yaw - pitch, with_yaw + pitch
     left, right = against_yaw + roll, against_yaw - roll
     if thrust <= THRUST_MAX and front >= 0.0 and left >= 0.0 and back >= 0.0 and right >= 0.0:
-        # None pulls and they sum to the thrust, so none is above the limit either.
+        # None is negative and their sum is the thrust, so none exceeds the limit.
         k = THRUST_COEFFICIENT
         return sqrt(front / k), sqrt(left / k), sqrt(back / k), sqrt(right / k)
     return _speed(front), _speed(left), _speed(back), _speed(right)
 
 
 def _speed(thrust: float) -> float:
-    """Return the rotor speed [rad/s] for a thrust [N] beyond its limits: it cannot pull."""
+    """Return the rotor speed [rad/s] for a thrust [N], limited to [0, THRUST_MAX]."""
     return sqrt(min(max(thrust, 0.0), THRUST_MAX) / THRUST_COEFFICIENT)

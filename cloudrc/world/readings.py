@@ -1,7 +1,7 @@
-"""The seam between physics and what flies on board: readings come out, rotor speeds go in.
+"""The interface between physics and onboard part: sensor readings and rotor speeds.
 
 Nothing else passes between `simulator` and `low_level`, `guard` or `sensors`, so that the two sides
-can live in different processes. This module needs no MuJoCo.
+can run in different processes. This module needs no MuJoCo.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ _new = tuple.__new__
 
 
 class Readings(NamedTuple):
-    """The true state of the robot's base, as ideal onboard sensors see it.
+    """The true state of the robot's base, as ideal onboard sensors measure it.
 
     Attributes:
-        position: Of the base's origin [m], world frame, shape (3,).
-        orientation_wxyz: Body to world, unit quaternion, shape (4,).
-        velocity: Of the base's origin [m/s], world frame, shape (3,).
-        angular_velocity_body: [rad/s], body frame, shape (3,).
-        axes: The body's x, y and z axis in the world frame, one after the other, shape (9,): the
-            orientation once more, because drag and low-level controller need it at every step.
+        position: Position of the base's origin [m], world frame, shape (3,).
+        orientation_wxyz: Orientation, body to world, unit quaternion, shape (4,).
+        velocity: Velocity of the base's origin [m/s], world frame, shape (3,).
+        angular_velocity_body: Angular velocity [rad/s], body frame, shape (3,).
+        axes: The body's x, y and z axes in the world frame, shape (9,). They repeat the orientation
+            because drag and low-level controller need them in every step.
     """
 
     position: Vector
@@ -37,7 +37,7 @@ class Readings(NamedTuple):
 
     @classmethod
     def of(cls, pose: Iterable[float], twist: Iterable[float]) -> Readings:
-        """Make readings of what MuJoCo knows of a free joint.
+        """Make readings from the state of a free joint in MuJoCo.
 
         The axes are the columns of the rotation matrix of the unit quaternion (w, x, y, z).
 
@@ -62,19 +62,19 @@ class Readings(NamedTuple):
             yz - wx,
             1.0 - xx - yy,
         )
-        # Made at every physics step: the class's own constructor takes twice the time.
+        # One per physics step: the class's own constructor takes twice the time.
         return _new(cls, ((px, py, pz), (w, x, y, z), (vx, vy, vz), (p, q, r), axes))
 
 
 class Touch(NamedTuple):
-    """The robot has begun to touch something of the scene.
+    """The beginning of a contact between robot and scene.
 
     Attributes:
         body: Name of the scene's body: pipe_1, board, floor.
         tip: True if the arm's tip touched, False for any other part.
-        position: Of the base just before [m], world frame, shape (3,).
-        velocity: Of the base just before [m/s], world frame, shape (3,).
-        tip_velocity: Of the arm's tip just before [m/s], world frame, shape (3,).
+        position: Position of the base just before [m], world frame, shape (3,).
+        velocity: Velocity of the base just before [m/s], world frame, shape (3,).
+        tip_velocity: Velocity of the arm's tip just before [m/s], world frame, shape (3,).
     """
 
     body: str

@@ -1,13 +1,11 @@
-"""The robot in its surroundings: physics and the onboard part, joined by one narrow interface.
+"""The robot in its scene, and the simulation clock.
 
-Sensor readings go from the simulator to the onboard part (guard and low-level controller), four
-rotor speeds go back, once per tick. Nothing else passes between the two.
+In every tick the simulator gives sensor readings to the onboard part (guard and low-level
+controller) and gets four rotor speeds back. Nothing else passes between the two.
 
-World's clock: simulation time that follows the machine's monotonic clock and can fall behind.
-
-Monotonic instants come in; world time goes out. After a stall the simulation catches up at most
-50 ms per wake; the rest is slip, and world's clock lags by it from then on. So the guard never
-skips a tick, and a stalled machine gives a slow world, not a jumping one.
+World's clock follows the machine's monotonic clock and may fall behind. After a stall the
+simulation catches up by at most 50 ms per wake; the rest is slip, and world's clock lags by it from
+then on. The guard therefore never skips a tick: a stalled machine makes world slow but never jump.
 """
 
 from __future__ import annotations
@@ -19,16 +17,16 @@ from cloudrc.world.rotors import STOPPED
 from cloudrc.world.simulator import Simulator
 
 STEP_NS = 2_000_000
-"""One tick of physics, low-level controller and guard [ns].
+"""Duration of a tick of physics, low-level controller and guard [ns].
 Source: docs/reference/plant.md, "Physics step"."""
 STEP = STEP_NS * 1e-9
-"""The same [s]."""
+"""Duration of a tick [s]."""
 CATCH_UP_NS = 50_000_000
-"""The most that is caught up in one wake [ns]."""
+"""Longest simulated time that a wake catches up [ns]."""
 
 
 class SimulationClock:
-    """Counts ticks; `tick_ns` is the next one to be run."""
+    """World's clock; `tick_ns` is the next tick to run [ns], `slip_ns` its total lag [ns]."""
 
     def __init__(self, start_ns: int) -> None:
         """Start at `start_ns` of the machine's monotonic clock [ns]."""
@@ -36,13 +34,13 @@ class SimulationClock:
         self.slip_ns = 0
 
     def follow(self, now_ns: int) -> int:
-        """Convert a monotonic instant to world time, slipping if too much was missed.
+        """Convert a monotonic time to world time; slip if more than 50 ms were missed.
 
         Args:
             now_ns: The machine's monotonic clock [ns].
 
         Returns:
-            World time [ns]; at most 50 ms after the next tick.
+            World time [ns], at most 50 ms after the next tick.
         """
         excess = now_ns - self.slip_ns - self.tick_ns - CATCH_UP_NS
         if excess > 0:
@@ -50,7 +48,7 @@ class SimulationClock:
         return now_ns - self.slip_ns
 
 
-TRACK = GuardState.TRACK  # an enum's member is slow to look up
+TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 
 
 class Robot:
@@ -62,16 +60,16 @@ class Robot:
         self._low_level = low_level
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Put the robot back to its spawn, rotors stopped, nothing remembered."""
+        """Reset the robot to its spawn, with its rotors stopped."""
         self.simulator.reset()
         self._low_level.reset()
         self.guard.put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run all ticks from `tick_ns` on that are before `until_ns`.
+        """Run all ticks from `tick_ns` to before `until_ns`, world's clock.
 
         Returns:
-            The first tick that has not been run [ns, world's clock].
+            The next tick to run [ns].
         """
         simulator, guard, low_level = self.simulator, self.guard, self._low_level
         ticks = range(tick_ns, until_ns, STEP_NS)

@@ -1,8 +1,8 @@
-"""The rotors between command and force: commanded speeds in, thrusts and a drag wrench out.
+"""The rotors: they turn commanded speeds into thrusts and a drag wrench.
 
-Plain floats; this runs at every physics step. Order of the rotors everywhere: front (+x), left
-(+y), back, right. Front and back give a positive reaction torque about z for their thrust, left and
-right a negative one.
+It uses plain floats, because it runs in every physics step. The order of the rotors is always front
+(+x), left (+y), back, right. Front and back give a positive reaction torque about z, left and right
+a negative one.
 Source: docs/reference/plant.md, "Robot".
 """
 
@@ -14,17 +14,17 @@ from typing import TypeAlias
 from cloudrc.world.readings import Readings, RotorSpeeds
 
 THRUST_COEFFICIENT = 9.9865e-6
-"""kf: thrust over speed squared [N s^2]."""
+"""kf: thrust per speed squared [N s^2]."""
 TORQUE_RATIO = 0.016
-"""km: reaction torque about the rotor's axis over thrust [m]."""
+"""km: reaction torque about the rotor's axis per thrust [m]."""
 SPEED_MAX = 1838.0
-"""[rad/s]"""
+"""Largest rotor speed [rad/s]."""
 TIME_CONSTANT_UP = 0.0125
-"""Of a rotor that speeds up [s]."""
+"""Time constant of a rotor that speeds up [s]."""
 TIME_CONSTANT_DOWN = 0.025
-"""Of a rotor that slows down [s]."""
+"""Time constant of a rotor that slows down [s]."""
 DRAG_COEFFICIENT = 8.06428e-5
-"""Drag over speed and velocity across the axis [N s^2/m]."""
+"""Drag per rotor speed and per velocity across the axis [N s^2/m]."""
 ARM = 0.21
 """Distance of a rotor's axis from the base's z axis [m]."""
 HEIGHT = 0.05
@@ -36,8 +36,8 @@ _DRAG_ARM = DRAG_COEFFICIENT * ARM
 _ARM_SQUARED = ARM * ARM
 
 Controls: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
-"""What goes to MuJoCo: four thrusts [N]; the drag as a wrench at the base's origin, as a free joint
-wants it, force in the world frame [N], torque in the body frame [N m]."""
+"""Input to MuJoCo: four thrusts [N], and the drag as a wrench at the base's origin. As a free joint
+requires, its force is in the world frame [N] and its torque in the body frame [N m]."""
 
 
 class Rotors:
@@ -48,25 +48,25 @@ class Rotors:
     """
 
     def __init__(self, dt: float) -> None:
-        """Start with rotors that stand still, for steps of `dt` [s]."""
+        """Start with stopped rotors, for steps of `dt` [s]."""
         self._up = 1.0 - exp(-dt / TIME_CONSTANT_UP)
         self._down = 1.0 - exp(-dt / TIME_CONSTANT_DOWN)
         self.speeds = STOPPED
 
     def step(self, commands: RotorSpeeds, readings: Readings) -> Controls:
-        """Move the speeds on by `dt`, and say what they do to the robot then.
+        """Advance the rotor speeds by `dt` and return their thrusts and drag.
 
-        Lag: w(t + dt) = w + (command - w) (1 - exp(-dt/T)), T = 12.5 ms up, 25 ms down; exact for a
-        command that is constant over a step. Thrust: kf w^2.
-        Drag: at each rotor F = -w c v, v being the part of the hub's velocity across the rotor's
-        axis. With body velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h) that part is
+        Lag: w(t + dt) = w + (command - w) (1 - exp(-dt/T)), T = 12.5 ms up, 25 ms down. This is
+        exact for a command that is constant over a step. Thrust: kf w^2.
+        Drag: at each rotor F = -w c v; v is the hub's velocity across the rotor's axis. With body
+        velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h), v is
         (u + q h - r y, v + r x - p h). Summed over x = (l, 0, -l, 0), y = (0, l, 0, -l):
         torque = sum of r x F = (-h Fy, h Fx, sum of x Fy - y Fx).
         Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
 
         Args:
-            commands: [rad/s], shape (4,).
-            readings: State of the base, for the drag; the air stands still.
+            commands: Commanded speeds [rad/s], shape (4,).
+            readings: State of the base, for the drag; there is no wind.
         """
         up, down, k = self._up, self._down, THRUST_COEFFICIENT
         front, left, back, right = self.speeds

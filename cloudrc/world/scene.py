@@ -1,6 +1,6 @@
-"""Robot and scene become one MuJoCo model: two names in, a compiled model out.
+"""Compile a robot and a scene into one MuJoCo model.
 
-The only module that imports MuJoCo's package; the rest of `world` takes it from here.
+No other module of `world` imports the package `mujoco`; they take it from here.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 ROBOT_PREFIX = "robot/"
-"""Of the names of everything that belongs to the robot in a compiled model."""
+"""Prefix of all names that belong to the robot in a compiled model."""
 ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
 """Names of a robot's actuators, in the order of every tuple of four."""
 TIMESTEP = 0.002
@@ -25,17 +25,19 @@ _NO_GL = {"", "disable", "disabled", "off", "false", "0"}
 
 
 def import_mujoco() -> Any:
-    """Import MuJoCo without any GL: nothing that flies needs one.
+    """Import MuJoCo without OpenGL, which a flight does not need.
 
-    With MUJOCO_GL=egl and no libEGL `import mujoco` itself dies. So the variable reads `disable`
-    during the import and is put back afterwards, for a child process that may want to render.
+    With MUJOCO_GL=egl and no libEGL, `import mujoco` fails. Therefore the variable is `disable`
+    during the import. It is restored afterwards, for a child process that renders.
 
     Raises:
         MissingPrerequisiteError: If the package is not installed.
     """
     wanted = os.environ.get("MUJOCO_GL")
     if "mujoco" not in sys.modules and (wanted or "").lower() not in _NO_GL:
-        logging.getLogger(__name__).warning("MUJOCO_GL=%s ignored: flying needs no GL", wanted)
+        logging.getLogger(__name__).warning(
+            "MUJOCO_GL=%s ignored: a flight needs no OpenGL", wanted
+        )
     os.environ["MUJOCO_GL"] = "disable"
     try:
         import mujoco
@@ -52,7 +54,7 @@ def import_mujoco() -> Any:
 
 
 mujoco = import_mujoco()
-# Else MuJoCo writes its warnings to MUJOCO_LOG.TXT in the working directory.
+# Otherwise MuJoCo writes its warnings to MUJOCO_LOG.TXT in the working directory.
 mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
 
@@ -64,7 +66,7 @@ def model_path(kind: str, name: str) -> Path:
         name: A shipped file's name without .xml, or the path of an .xml file.
 
     Raises:
-        BadInputError: If there is none; the message lists those that ship.
+        BadInputError: If the file does not exist; the message lists the shipped ones.
     """
     path = Path(name) if name.endswith(".xml") else FOLDER / kind / f"{name}.xml"
     if not path.is_file():
@@ -74,17 +76,17 @@ def model_path(kind: str, name: str) -> Path:
 
 
 def compile_model(robot: str, scene: str) -> Any:
-    """Put the robot at the scene's frame `spawn` and compile both.
+    """Attach the robot to the scene's frame `spawn` and compile both.
 
-    Static bodies are fused, which halves the time of a step; a contact finds the name of the
-    scene's body again as the part of its geom's name before the slash.
+    Static bodies are fused, which halves the time of a step. Their names are lost by that, so each
+    geom of the scene gets the name BODY/NUMBER, from which a contact finds its body.
 
     Args:
         robot: Name or path of the robot's file.
         scene: Name or path of the scene's file.
 
     Returns:
-        An `MjModel`. The robot's names begin with `robot/`.
+        An `MjModel`; the robot's names begin with `robot/`.
 
     Raises:
         BadInputError: If a file is missing, cannot be read or does not compile.
@@ -108,7 +110,7 @@ def compile_model(robot: str, scene: str) -> Any:
 
 
 def _check(model: Any, robot_path: Path, scene_path: Path) -> None:
-    """Refuse what the loop cannot fly, naming what is missing."""
+    """Check that robot and scene have what the loop needs."""
     actuators = [model.actuator(number).name for number in range(model.nu)]
     if actuators != [f"{ROBOT_PREFIX}{rotor}" for rotor in ROTORS]:
         raise BadInputError(f"{robot_path}: needs the actuators {', '.join(ROTORS)}, in this order")

@@ -1,6 +1,6 @@
-"""The sensors of the loop: true odometry in, odometry with seeded noise out, at 100 Hz.
+"""Sensors that add seeded noise to odometry, at 100 Hz.
 
-Only what goes to the cloud is noisy; the onboard controller sees the true state.
+Only the odometry for cloud is noisy; the onboard controller uses the true state.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ class Sensors:
         """Set the noise.
 
         Args:
-            position_noise: Standard deviation per axis [m]; 0 draws nothing.
-            velocity_noise: Standard deviation per axis [m/s]; 0 draws nothing.
-            rng: Where the noise is drawn from.
+            position_noise: Standard deviation per axis [m]; 0 for no noise.
+            velocity_noise: Standard deviation per axis [m/s]; 0 for no noise.
+            rng: The generator of the noise.
         """
         self._position_noise, self._velocity_noise = position_noise, velocity_noise
         self._rng = rng
         self._exact = position_noise == velocity_noise == 0.0
 
     def measure(self, truth: Odometry) -> Odometry:
-        """Make the odometry that goes to the cloud out of the true one; the same if noise-free."""
+        """Return the odometry for cloud: the true one plus noise."""
         if self._exact:
             return truth
         return truth._replace(

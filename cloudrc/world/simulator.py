@@ -1,13 +1,11 @@
-"""The physics of the loop: commanded rotor speeds in, readings and contacts out.
+"""The physics: it turns commanded rotor speeds into readings and contacts.
 
-Rotors (lag, thrust, drag) are computed here in plain floats, the rest is one `mj_step`. MuJoCo's
-arrays are read and written by `struct` through memory views: to write four elements takes a quarter
-of the time of a numpy slice assignment, and to read them is a little faster than `tolist`.
+The rotors (lag, thrust, drag) are computed in plain floats; `mj_step` does the rest. `struct`
+reads and writes MuJoCo's arrays through memory views: writing four elements takes a quarter of the
+time of a numpy slice assignment, and reading is a little faster than `tolist`.
 
-The benchmark's yardstick: a tape of the very same controls in, the same end state out, in C.
-
-How fast `replay` runs is how fast raw `mj_step` can be; that both end in the same bits shows that
-the comparison is fair.
+`replay` is for the benchmark: it plays the recorded controls of a flight in C. Its speed is that of
+raw `mj_step`, and its end state equals the simulator's bit by bit, so the comparison is fair.
 """
 
 from __future__ import annotations
@@ -25,22 +23,23 @@ from cloudrc.world.rotors import STOPPED, Controls, Rotors
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
 
 TOUCH_GAP = 0.1
-"""Something counts as newly touched after this long without contact [s]."""
-LOOK_STEPS = 5
-"""While their number stays the same, contacts are looked at this often: it costs a whole step."""
+"""Time without contact after which a contact is a new one [s]."""
+CONTACT_CHECK_STEPS = 5
+"""Number of steps between two checks of the contacts while their number is constant. A check takes
+as long as a step."""
 
 _mj_step = mujoco.mj_step
 _pack_ctrl = Struct("4d").pack_into
 _pack_applied = Struct("6d").pack_into
 _unpack_pose, _unpack_twist = Struct("7d").unpack_from, Struct("6d").unpack_from
-_readings_of = Readings.of  # a class's method is bound anew every time that it is looked up
+_readings_of = Readings.of  # looking up a class method binds it anew each time
 
 
 class State(NamedTuple):
-    """All that decides how the physics goes on; `replay` starts from it.
+    """The whole state of the physics; `replay` starts from it.
 
     Attributes:
-        physics: Of `mjSTATE_FULLPHYSICS`: time [s], positions, velocities, shape (n,).
+        physics: The state `mjSTATE_FULLPHYSICS`: time [s], positions, velocities, shape (n,).
         warmstart: Accelerations that the contact solver starts from, shape (nv,).
     """
 
@@ -55,16 +54,15 @@ class Simulator:
         model: The compiled `MjModel`.
         dt: Duration of a step [s].
         readings: State of the base after the last step.
-        touches: What the robot began to touch since the last `take_contacts`.
-        tape: If set to a list, every step since the last reset appends what it gave to MuJoCo;
-            `replay` plays it again.
+        touches: Contacts that began since the last `take_contacts`.
+        tape: If set to a list, every step since the last reset appends its controls, for `replay`.
     """
 
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
         """Compile `robot` in `scene` (names or paths) and put it at its spawn.
 
         Raises:
-            BadInputError: If there is no such file, or the loop cannot fly what is in it.
+            BadInputError: If a file is missing or does not suit the loop.
         """
         self.model = model = compile_model(robot, scene)
         self.dt: float = model.opt.timestep
@@ -80,13 +78,13 @@ class Simulator:
         self._tip_offset: Vector = tuple(model.site_pos[self._tip].tolist())
         self._tip_radius = float(model.site_size[self._tip, 0])
         names = [model.geom(number).name for number in range(model.ngeom)]
-        # The robot's geoms have the empty name: of a touching pair the other one counts.
+        # The robot's geoms get an empty name: in a contact the other geom names the body.
         self._bodies = ["" if n.startswith(ROBOT_PREFIX) else n.split("/")[0] for n in names]
         self._gap_steps = round(TOUCH_GAP / self.dt)
         self.reset()
 
     def reset(self) -> None:
-        """Put the robot back to its spawn, at rest, rotors stopped."""
+        """Reset the robot to its spawn, at rest, with its rotors stopped."""
         mujoco.mj_resetData(self.model, self._data)
         mujoco.mj_forward(self.model, self._data)
         self._rotors.speeds = STOPPED
@@ -94,14 +92,14 @@ class Simulator:
         if self.tape is not None:
             self.tape.clear()
         self.touches: list[Touch] = []
-        # It stands on the floor: to touch that is news only after it has been in the air.
+        # The robot stands on the floor: a contact with it is new only after a flight.
         self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
         self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
 
     def step(self, rotor_speeds: RotorSpeeds) -> None:
-        """Go on by `dt` with these commanded rotor speeds [rad/s], shape (4,).
+        """Advance by `dt` with these commanded rotor speeds [rad/s], shape (4,).
 
-        Thrust kf w^2 and drag are those of the speeds at the end of the step, the drag with the
+        Thrust kf w^2 and drag use the rotor speeds at the end of the step. The drag uses the
         velocity at its beginning.
         """
         before, data = self.readings, self._data
@@ -117,14 +115,14 @@ class Simulator:
         self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
         contacts = data.ncon
         if contacts or self._contacts:
-            self._look_at_contacts(contacts, before)
+            self._check_contacts(contacts, before)
 
     def tip_force(self) -> float:
-        """Return the normal force on the arm's tip [N], as of the beginning of the last step."""
+        """Return the normal force on the arm's tip at the beginning of the last step [N]."""
         return self._sensors[self._tip_sensor]
 
     def take_contacts(self) -> list[Touch]:
-        """Hand over what the robot began to touch since the last call, oldest first."""
+        """Return the contacts that began since the last call, oldest first."""
         touches, self.touches = self.touches, []
         return touches
 
@@ -135,14 +133,14 @@ class Simulator:
         mujoco.mj_getState(self.model, self._data, physics, spec)
         return State(physics, self._data.qacc_warmstart.copy())
 
-    def _look_at_contacts(self, contacts: int, before: Readings) -> None:
-        """Note them if their number has changed, else every few steps."""
-        if contacts and (contacts != self._contacts or self._steps % LOOK_STEPS == 0):
+    def _check_contacts(self, contacts: int, before: Readings) -> None:
+        """Note the contacts if their number has changed, else every few steps."""
+        if contacts and (contacts != self._contacts or self._steps % CONTACT_CHECK_STEPS == 0):
             self._note_contacts(before)
         self._contacts = contacts
 
     def _note_contacts(self, before: Readings) -> None:
-        """Note which contacts are new. MuJoCo found them in the state `before` the step."""
+        """Note the new contacts, which MuJoCo found in the state `before` the step."""
         contact = self._data.contact
         tip = self._data.site_xpos[self._tip].tolist()
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
@@ -171,12 +169,12 @@ def _velocity_at(readings: Readings, offset: Vector) -> Vector:
 
 
 def replay(model: Any, start: State, tape: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Play a `Simulator.tape` again with `mujoco.rollout`, one thread.
+    """Replay a `Simulator.tape` with `mujoco.rollout`, in one thread.
 
     Args:
         model: `Simulator.model`.
-        start: `Simulator.state()` when the tape began.
-        tape: Thrusts [N] and applied wrench [N], [N m] of every step; no reset in between.
+        start: `Simulator.state()` at the beginning of the tape.
+        tape: Thrusts [N] and applied wrench [N], [N m] of every step, without a reset in between.
 
     Returns:
         The physics of `Simulator.state()` at the end, shape (n,).

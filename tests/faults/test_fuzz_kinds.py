@@ -183,8 +183,10 @@ def test_a_few_impossible_numbers_do_not_land_it_many_do_until_it_is_acknowledge
 def test_huge_numbers_that_pass_the_guard_are_found(monkeypatch: Patch) -> None:
     huge = Event("values_huge", 8.0, 4.0, 4.0)
     assert _flown(huge) == set()
-    monkeypatch.setattr("cloudrc.world.guard.state.RANGE", 1e308)
-    monkeypatch.setattr("cloudrc.world.guard.state.rules.towards", lambda start, end, step: end)
+    monkeypatch.setattr("cloudrc.world.guard.state.COMMAND_MAX", 1e308)
+    monkeypatch.setattr(
+        "cloudrc.world.guard.state.rules.step_towards", lambda start, end, step: end
+    )
     assert "cap" in _flown(huge)
 
 

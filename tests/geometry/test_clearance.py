@@ -1,4 +1,4 @@
-"""Clearance: hand-worked distances, the plant's published ones, and a brute force beside them."""
+"""Clearance equals hand-calculated, published and brute-force distances."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_clearance_on_the_axis_is_that_of_the_plant(
 
 
 def test_clearance_turns_with_the_robot() -> None:
-    """Along the pipe every pipe leaves .320.
+    """Check that the clearance along each pipe is .320.
 
     Source: docs/reference/plant.md, "Clearance on the axis".
     """
@@ -81,12 +81,12 @@ def test_clearance_turns_with_the_robot() -> None:
 
 
 def test_the_spawn_trap() -> None:
-    """Straight up from the spawn the rear rotor ends in the outside of pipe 1; x = .2 is clear."""
+    """Straight above the spawn the rear rotor is in the wall of pipe 1; x = .2 is clear."""
     heights = np.arange(0.1, 1.6, 0.01)
     at = np.stack([np.zeros_like(heights), np.zeros_like(heights), heights], axis=1)
     facing = np.tile(LEVEL, (len(at), 1))
     assert clearance(PIPES, at, facing).min() == pytest.approx(-0.019, abs=1e-3)
-    # The trap is 0.338 - (1 - 0.7) = 0.038 deep; the wall is as thick, half of it is deepest.
+    # The overlap is 0.338 - (1 - 0.7) = 0.038 deep, as thick as the wall; its middle is deepest.
     aside = at + np.array([0.2, 0, 0])
     assert clearance(PIPES, aside, facing).min() == pytest.approx(0.162, abs=2e-3)
 
@@ -96,12 +96,12 @@ def test_the_tip_touches_at_the_contact_pose() -> None:
     assert tip == pytest.approx((8.535, -6.422, 0.87))
 
 
-def test_nobody_is_near_in_an_empty_scene() -> None:
+def test_clearance_is_infinite_in_an_empty_scene() -> None:
     assert clearance(Scene("empty"), [(0, 0, 1), (1, 0, 1)], [LEVEL] * 2).tolist() == [math.inf] * 2
     assert clearance(PIPES, np.empty((0, 3)), np.empty((0, 4))).shape == (0,)
 
 
-def test_many_poses_are_the_same_as_each_alone() -> None:
+def test_a_batch_gives_the_same_as_single_poses() -> None:
     rng = np.random.default_rng(1)
     at = rng.uniform((-2, -8, 0), (9, 4, 2), (333, 3))
     facing = rng.normal(size=(333, 4))

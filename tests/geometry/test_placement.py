@@ -1,4 +1,4 @@
-"""Where the base may be asked to go: overlaps with walls, and legal points near by."""
+"""Positions that overlap a wall, ways that cross one, and legal points nearby."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def hit(position: Vector, yaw: float = 0.0) -> int:
         ((-0.76, 0.0, 0.8), 0, 0),
         # Beyond that the tip is outside and the arm goes through the wall.
         ((-0.60, 0.0, 0.8), 0, 0),
-        # Turned along the pipe the arm is out of the way.
+        # Turned along the pipe, the arm is clear.
         ((-0.76, 0.0, 0.8), math.pi / 2, -1),
         # The bottom of the base's box: z - .10 against the bore's z - .662.
         ((-1.0, 0.0, 0.25), math.pi / 2, -1),
         ((-1.0, 0.0, 0.23), math.pi / 2, 0),
-        # The wall inside of the box: all its corners are outside of the material.
+        # The wall is inside the box, and all corners of the box are outside the wall.
         ((-1.0, 0.0, 0.119), math.pi / 2, 0),
-        # At (0, 0) only the rotors are in the way: they do not count.
+        # At (0, 0) only the rotors overlap; they do not count.
         ((0.0, 0.0, 0.8), 0, -1),
         # Behind the board.
         ((8.235, -6.422, 0.7), 0, -1),
@@ -107,7 +107,7 @@ def test_a_straight_way_through_a_wall_is_found(start: Vector, end: Vector, pipe
 
 
 def in_pipe(points: Array, pipe: Pipe) -> tuple[Array, Array]:
-    """Depth along its axis from its centre, and distance from the axis [m], shapes (n,)."""
+    """Return the depth along the axis and the distance from it [m], shapes (n,)."""
     relative = points - np.array(pipe.centre)
     depth = relative @ np.array(pipe.axis)
     return depth, np.linalg.norm(relative - depth[:, None] * np.array(pipe.axis), axis=1)
@@ -115,10 +115,8 @@ def in_pipe(points: Array, pipe: Pipe) -> tuple[Array, Array]:
 
 @settings(max_examples=50, deadline=None)
 @given(*[st.tuples(st.floats(-3, 9), st.floats(-8, 5), st.floats(0, 2))] * 2)
-def test_a_way_is_through_a_wall_if_some_of_it_is_within_and_some_without(
-    start: Vector, end: Vector
-) -> None:
-    """Of ways that are cut into short pieces: a piece that changes sides does so in the wall."""
+def test_a_way_crosses_a_wall_if_it_changes_sides(start: Vector, end: Vector) -> None:
+    """Cut the way into short pieces: a piece that changes sides crosses the wall."""
     points = np.linspace(start, end, 2_000)
     (found,) = crossed_pipe(PIPES, np.array([start]), np.array([end])).tolist()
     for pipe in PIPES.pipes:
@@ -134,7 +132,7 @@ def test_a_way_is_through_a_wall_if_some_of_it_is_within_and_some_without(
         assert np.any(near & (np.abs(depth) < pipe.length / 2 + 0.02))
 
 
-def test_a_waypoint_behind_a_wall_is_refused_and_its_way_is_named() -> None:
+def test_a_waypoint_behind_a_wall_is_refused_with_its_way() -> None:
     inside, outside = Waypoint(position_m=(-1.0, 0.0, 0.7)), Waypoint(position_m=(0.5, 0.0, 0.7))
     (problem,) = check_mission(Mission(waypoints=(inside, outside)), PIPES)
     assert str(problem).startswith("waypoints.1.position_m: [0.5, 0, 0.7]: the straight way there")
@@ -142,7 +140,7 @@ def test_a_waypoint_behind_a_wall_is_refused_and_its_way_is_named() -> None:
     assert check_mission(Mission(waypoints=(outside, outside)), PIPES) == []
 
 
-def test_none_and_both_are_refused() -> None:
+def test_neither_waypoints_nor_steps_or_both_are_refused() -> None:
     assert "none given" in str(check_mission(Mission(), PIPES)[0])
     both = Mission(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps())
     assert "not both" in str(check_mission(both, Scene("empty"))[0])
@@ -162,7 +160,7 @@ def test_steps_that_can_end_in_a_wall_are_refused(steps: Steps, scene: str, reas
     assert reason in problem.reason
 
 
-def test_points_beyond_all_bounds_are_refused_without_an_overflow() -> None:
+def test_points_far_outside_are_refused_without_overflow() -> None:
     far = Mission(waypoints=(Waypoint(position_m=(1e300, 0.0, 1.0), yaw_deg=1e300),))
     *_, problem = check_mission(far, PIPES)
     assert "beyond the fence" in problem.reason

@@ -1,4 +1,4 @@
-"""Scenes: the numbers in an MJCF file are those of the plant, and bad ones are named."""
+"""The numbers in a scene file are those of the plant; bad ones are named."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_pipes_are_those_of_the_plant() -> None:
     assert scene.floor == 0
 
 
-def test_empty_has_nothing() -> None:
+def test_the_empty_scene_has_no_obstacles() -> None:
     assert load_scene("empty") == Scene("empty")
 
 
@@ -45,7 +45,7 @@ def scene_file(folder: Path, body: str) -> Path:
     return path
 
 
-def test_axis_is_made_a_unit_vector_and_other_numbers_are_left_alone(tmp_path: Path) -> None:
+def test_only_the_axis_is_normalised(tmp_path: Path) -> None:
     scene = read_scene(
         scene_file(
             tmp_path,
@@ -73,7 +73,7 @@ def test_bad_numbers_are_named(tmp_path: Path, body: str, reason: str) -> None:
         read_scene(scene_file(tmp_path, body))
 
 
-def test_a_scene_that_is_not_there() -> None:
+def test_a_missing_scene_is_refused() -> None:
     with pytest.raises(BadInputError, match="No such file"):
         load_scene("nowhere")
 

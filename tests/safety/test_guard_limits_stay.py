@@ -32,7 +32,7 @@ def bounds(guard: Guard) -> dict[str, Any]:
     """Copy a guard's limits and the values that it derived from them."""
     parts = (
         (guard, ("_limits", "_speed_max", "_high", "_floor")),
-        (guard._rest, ("_low", "_high", "_pull_max")),
+        (guard._position_hold, ("_low", "_high", "_speed_max")),
         (guard._descent, ("_floor", "speed")),
         (guard._take_off, ("_low", "_high")),
     )

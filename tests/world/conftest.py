@@ -1,4 +1,4 @@
-"""Scenes with another spawn, so that a test can begin in the air or beside the board."""
+"""Scenes with another spawn, so that a test can start in the air or beside the board."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +12,7 @@ SPAWN = 'name="spawn" pos="0 0 .1"'
 
 @pytest.fixture
 def scene_at(tmp_path: Path) -> Callable[..., str]:
-    """Write a shipped scene with the spawn at (x, y, z) [m]; returns its path."""
+    """Return a function that writes a shipped scene with its spawn at (x, y, z) [m]."""
 
     def write(x: float, y: float, z: float, scene: str = "pipes") -> str:
         text = (FOLDER / "scenes" / f"{scene}.xml").read_text()

@@ -1,4 +1,4 @@
-"""The low-level controller's equations, by numbers worked by hand."""
+"""The equations of the low-level controller give the hand-calculated numbers."""
 
 from math import cos, isfinite, radians, sin
 
@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import UPRIGHT, ZERO
-from cloudrc.world.low_level import ASKEW, TURNED_AWAY, LowLevel, allocate, attitude
+from cloudrc.world.low_level import NOSE_COSINE_MIN, YAW_SINE_MAX, LowLevel, allocate, attitude
 from cloudrc.world.readings import Readings
 
 WEIGHT = 10.3005  # 1.05 kg * 9.81 m/s^2
@@ -22,7 +22,7 @@ def turned(orientation, rate=ZERO):
 AT_REST = turned(UPRIGHT)
 
 
-def test_at_rest_the_force_is_the_weight_that_the_controller_believes_in():
+def test_at_rest_the_force_is_the_weight_of_the_assumed_mass():
     assert LowLevel().force(ZERO, ZERO) == pytest.approx((0, 0, WEIGHT))
 
 
@@ -31,13 +31,13 @@ def test_hover_is_508_rad_per_s_on_every_rotor():
     assert LowLevel().update(AT_REST, ZERO) == pytest.approx((507.80,) * 4, abs=0.005)
 
 
-def test_proportional_and_integral_force_against_the_velocity_error():
+def test_proportional_and_integral_force_oppose_the_error():
     # e = v - v_ref = (.1, -.1, .1): P = 4, 4, 10 times; the integral after 2 ms is .0002.
     force = LowLevel().force((0.1, 0.1, 0.3), (0.0, 0.2, 0.2))
     assert force == pytest.approx((-0.4002, 0.4002, WEIGHT - 1.0005))
 
 
-def test_derivative_is_that_of_the_error_reference_included():
+def test_the_derivative_is_that_of_the_error():
     # A reference that jumps by .1 m/s within 2 ms: .3 * .1 / .002 = 15 N, .5 * .1 / .002 = 25 N.
     low_level = LowLevel(gain_p=ZERO, gain_i=ZERO)
     low_level.force(ZERO, ZERO)
@@ -105,7 +105,7 @@ def test_attitude_is_the_matrix_formula(force, quaternion):
     y_d = np.cross(z_d, (1.0, 0.0, 0.0))
     y_d /= np.linalg.norm(y_d)
     error = np.column_stack([np.cross(y_d, z_d), y_d, z_d]).T @ rotation
-    assume(error[1, 1] > TURNED_AWAY and abs(rotation[1, 0]) < ASKEW)
+    assume(error[1, 1] > NOSE_COSINE_MIN and abs(rotation[1, 0]) < YAW_SINE_MAX)
     error = 0.5 * (error - error.T)
     thrust, *torque = attitude(force, turned((w, *q)))
     assert thrust == pytest.approx(np.dot(force, rotation[:, 2]), abs=1e-9)
@@ -113,8 +113,8 @@ def test_attitude_is_the_matrix_formula(force, quaternion):
 
 
 @pytest.mark.parametrize("yaw", [18.0, -18.0, 60.0, 90.0, 135.0, 180.0, -100.0])
-def test_a_robot_that_was_turned_by_a_hit_still_tilts_the_right_way(yaw):
-    """The torque, seen from the world, turns the thrust towards the force: e_z x z_d."""
+def test_after_a_hit_the_turned_robot_tilts_the_right_way(yaw):
+    """In the world frame the torque turns the thrust towards the force: e_z x z_d."""
     half = radians(yaw) / 2
     readings = turned((cos(half), 0.0, 0.0, sin(half)))
     _, roll, pitch, _ = attitude((3.0, 0.0, 4.0), readings)
@@ -122,7 +122,7 @@ def test_a_robot_that_was_turned_by_a_hit_still_tilts_the_right_way(yaw):
     assert turn[:2] == pytest.approx([0.0, 0.6], abs=1e-9)
 
 
-def test_while_the_robot_brakes_the_integral_stands_still():
+def test_while_braking_the_integral_is_frozen():
     law = LowLevel()
     moving = AT_REST._replace(velocity=(1.0, 0.0, 0.0))
     for _ in range(50):

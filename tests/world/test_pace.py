@@ -1,4 +1,4 @@
-"""A world that falls behind real time says so, by how much, and not every second."""
+"""A world that is slower than real time is reported with its factor, but not every second."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import re
 
 import pytest
 
-from cloudrc.world.endpoint import QUIET_NS, Pace
+from cloudrc.world.endpoint import REPORT_AGAIN_NS, PaceMonitor
 
 SECOND_NS = 1_000_000_000
 
 
 def told(*slips: float, start_ns: int = 0) -> list[tuple[int, str]]:
-    """What is said in the seconds of world's clock in which it slips by so much [s]."""
-    pace, slip_ns, said = Pace(), 0, list[tuple[int, str]]()
+    """Return the reports of seconds in which world's clock slips by these times [s]."""
+    pace, slip_ns, said = PaceMonitor(), 0, list[tuple[int, str]]()
     for n, slip in enumerate(slips):
         slip_ns += round(slip * 1e9)
-        faults = pace.look(start_ns + (n + 1) * SECOND_NS, slip_ns)
+        faults = pace.check(start_ns + (n + 1) * SECOND_NS, slip_ns)
         assert {fault.code for fault in faults} <= {"late"}
         said += [(n, fault.text) for fault in faults]
     return said
@@ -32,7 +32,7 @@ def told(*slips: float, start_ns: int = 0) -> list[tuple[int, str]]:
     ],
 )
 @pytest.mark.parametrize("start_ns", [0, 10**15])
-def test_a_slow_second_is_told_with_its_factor(slip: float, words: str, start_ns: int) -> None:
+def test_a_slow_second_is_reported_with_its_factor(slip: float, words: str, start_ns: int) -> None:
     ((second, text),) = told(0.0, 0.0, slip, 0.0, start_ns=start_ns)
     assert second == 2
     assert text.startswith(words)
@@ -40,21 +40,21 @@ def test_a_slow_second_is_told_with_its_factor(slip: float, words: str, start_ns
     assert "\n" not in text
 
 
-def test_what_keeps_up_says_nothing_nor_does_a_process_that_starts() -> None:
+def test_real_time_and_the_first_call_report_nothing() -> None:
     assert told(3.0, 0.0, 0.05, 0.052, 0.0) == []
 
 
-def test_a_world_that_is_always_slow_says_it_once() -> None:
+def test_a_world_that_is_always_slow_is_reported_once() -> None:
     assert [second for second, _ in told(0.0, *[0.5] * 100)] == [1]
 
 
-def test_it_says_it_again_once_it_has_kept_up_for_10_s() -> None:
-    quiet = QUIET_NS // SECOND_NS
+def test_a_new_delay_after_10_s_of_real_time_is_reported() -> None:
+    quiet = REPORT_AGAIN_NS // SECOND_NS
     soon, late = [0.0] * (quiet - 1), [0.0] * quiet
     assert [second for second, _ in told(0.0, 0.5, *soon, 0.5)] == [1]
     assert [second for second, _ in told(0.0, 0.5, *late, 0.7)] == [1, quiet + 2]
 
 
-def test_the_second_time_it_is_the_factor_of_that_second() -> None:
+def test_the_second_report_has_the_factor_of_its_second() -> None:
     texts = [text for _, text in told(0.0, 0.5, *[0.0] * 10, 1.0)]
     assert [re.findall(r"\d\.\d\d", text) for text in texts] == [["0.67"], ["0.50"]]

@@ -1,7 +1,4 @@
-"""Robot and scene have the masses, pipes, board and contact of docs/reference/plant.md.
-
-Bad files are refused.
-"""
+"""Robot and scene are those of docs/reference/plant.md; bad files are refused."""
 
 from math import pi, sin, tan
 from xml.etree import ElementTree
@@ -16,7 +13,7 @@ from cloudrc.world.simulator import Simulator
 
 ROBOTS = sorted(path.stem for path in (FOLDER / "robots").glob("*.xml"))
 SCENES = sorted(path.stem for path in (FOLDER / "scenes").glob("*.xml"))
-BASE = 1  # the only moving body, once the static ones are fused
+BASE = 1  # the only moving body after the static ones are fused
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +22,7 @@ def pipes():
 
 
 def facts(scene: str) -> dict[str, list[float]]:
-    """What readers without MuJoCo see."""
+    """Return the scene as readers without MuJoCo see it."""
     root = ElementTree.parse(FOLDER / "scenes" / f"{scene}.xml").getroot()
     return {n.get("name"): [float(x) for x in n.get("data").split()] for n in root.iter("numeric")}
 
@@ -121,7 +118,7 @@ def test_staves_are_tangent_to_the_pipe(pipes, name, expected):
     assert np.sum(directions, axis=0) == pytest.approx([0, 0, 0], abs=1e-9)
 
 
-def test_the_board_is_where_it_is_said_to_be(pipes):
+def test_the_board_is_where_the_numbers_say(pipes):
     x, y_min, y_max, z_min, z_max = facts("pipes")["board"]
     assert (x, y_min, y_max, z_min, z_max) == (8.535, -6.82, -6.02, 0.025, 1.225)
     geoms = [pipes.geom(number) for number in range(pipes.ngeom)]
@@ -132,7 +129,7 @@ def test_the_board_is_where_it_is_said_to_be(pipes):
 
 
 def touched_at(scene: str) -> set[str]:
-    """What the robot touches where it spawns, apart from the floor that it stands on."""
+    """Return the bodies that the robot touches at its spawn, without the floor."""
     simulator = Simulator("pelican", scene)
     simulator.step(STOPPED)
     return {touch.body for touch in simulator.take_contacts()}
@@ -202,7 +199,7 @@ def test_a_scene_that_cannot_be_flown_in_is_refused(tmp_path, scene, message):
     assert str(path) in str(error.value)
 
 
-def test_an_unknown_name_lists_those_that_there_are():
+def test_an_unknown_name_lists_the_available_ones():
     with pytest.raises(BadInputError, match=r"no robot named 'pelikan'; available: pelican"):
         compile_model("pelikan", "pipes")
     with pytest.raises(BadInputError, match=r"no scene named 'tubes'; available: empty, pipes"):

@@ -1,4 +1,4 @@
-"""MuJoCo is imported in one place, without GL, or its absence is named."""
+"""MuJoCo is imported without OpenGL; if it is missing, the error says so."""
 
 import os
 import subprocess
@@ -18,7 +18,7 @@ assert simulator.readings.position[2] > 0.1
 """
 
 
-def test_it_flies_where_the_wanted_gl_is_missing(tmp_path):
+def test_it_flies_without_the_requested_gl(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", FLIGHT],
         env={**os.environ, "MUJOCO_GL": "egl", "PYTHONPATH": os.pathsep.join(sys.path)},
@@ -28,12 +28,12 @@ def test_it_flies_where_the_wanted_gl_is_missing(tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stderr.splitlines() == ["MUJOCO_GL=egl ignored: flying needs no GL"]
+    assert done.stderr.splitlines() == ["MUJOCO_GL=egl ignored: a flight needs no OpenGL"]
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("wanted", [None, "disable", "egl"])
-def test_the_variable_is_put_back_and_nothing_said_twice(monkeypatch, caplog, wanted):
+def test_the_variable_is_restored_and_nothing_logged_again(monkeypatch, caplog, wanted):
     if wanted is None:
         monkeypatch.delenv("MUJOCO_GL", raising=False)
     else:

@@ -1,4 +1,4 @@
-"""What the cloud is told: the truth, or the truth with seeded noise."""
+"""Odometry for cloud is the truth, or the truth plus seeded noise."""
 
 import numpy as np
 import pytest
@@ -9,14 +9,14 @@ from cloudrc.world.sensors import Sensors
 TRUTH = Odometry(5, (1.0, 2.0, 3.0), (0.6, 0.0, 0.8, 0.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0))
 
 
-def test_without_noise_odometry_is_the_truth_and_nothing_is_drawn():
+def test_without_noise_odometry_is_true_and_rng_is_unused():
     rng = np.random.default_rng(1)
     assert Sensors(0.0, 0.0, rng).measure(TRUTH) == TRUTH
     assert rng.random() == np.random.default_rng(1).random()
 
 
 @pytest.mark.parametrize(("position", "velocity"), [(0.005, 0.0), (0.0, 0.02), (0.005, 0.02)])
-def test_noise_has_the_deviation_asked_for_per_axis(position, velocity):
+def test_noise_has_the_configured_deviation_per_axis(position, velocity):
     sensors = Sensors(position, velocity, np.random.default_rng(1))
     samples = [sensors.measure(TRUTH) for _ in range(2000)]
     places = np.array([s.position for s in samples]) - TRUTH.position
@@ -35,7 +35,7 @@ def test_attitude_and_rates_stay_true_and_numbers_plain():
     assert {type(x) for x in (*odometry.position, *odometry.velocity)} == {float}
 
 
-def test_the_seed_decides():
+def test_the_seed_decides_the_noise():
     def first(seed: int) -> Odometry:
         return Sensors(0.1, 0.1, np.random.default_rng(seed)).measure(TRUTH)
 

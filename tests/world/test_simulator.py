@@ -1,4 +1,4 @@
-"""The physics: rotors and drag by their formulas, hover as predicted, replay bit-equal."""
+"""Rotors and drag follow their formulas, hover is as predicted, replay is equal bit by bit."""
 
 from math import exp
 
@@ -24,7 +24,7 @@ def fly(simulator, low_level, reference, duration):
 
 
 def steady(speeds, readings):
-    """What rotors do to the robot that turn as commanded."""
+    """Return the thrusts and drag of rotors that turn as commanded."""
     rotors = Rotors(0.002)
     rotors.speeds = speeds
     return rotors.step(speeds, readings)
@@ -57,7 +57,7 @@ def test_thrust_grows_with_the_square_of_the_speed():
     )
 
 
-def test_drag_of_level_flight_by_hand():
+def test_drag_of_level_flight_equals_the_hand_calculation():
     # Four rotors at 500 rad/s: 8.06428e-5 * 2000 = .1612856 N s/m. At 2 m/s: -.3225712 N, and it
     # acts .05 m above the base: torque .05 * -.3225712 about y.
     readings = Readings.of((*ZERO, *UPRIGHT), (2.0, 0.0, 1.0, *ZERO))
@@ -125,7 +125,7 @@ def test_the_torque_allocated_is_the_torque_that_turns(scene_at, axis, sign):
     assert change[axis] == pytest.approx(sign * 0.02 * 0.0875 / inertia, rel=0.1)
 
 
-def test_hover_without_position_feedback_drifts_forward_by_26_mm_per_s(scene_at):
+def test_hover_without_position_feedback_drifts_26_mm_per_s(scene_at):
     # The arm's moment of .01 kg * .2 m * 9.81 m/s^2 tilts the robot by .0196 rad (k_R = 1), that is
     # .204 N forward. The integral takes .1 N of it; the rest drives it on at 4 v = .104 N.
     simulator = Simulator("pelican", scene_at(0, 0, 3, "empty"))
@@ -161,7 +161,7 @@ def test_reset_gives_the_same_flight_again():
 
 @pytest.mark.parametrize("before", [0.2, 1.5])
 def test_the_tape_replays_to_the_same_bits_through_contact(scene_at, before):
-    # It begins before the board is touched, or while the tip presses on it.
+    # The tape starts before the tip touches the board, or while it presses on it.
     simulator, low_level = Simulator("pelican", scene_at(8.0, -6.42, 0.9)), LowLevel()
     fly(simulator, low_level, (0.2, 0.0, 0.0), before)
     assert (simulator.tip_force() > 0.0) == (before > 1.0)
@@ -172,6 +172,6 @@ def test_the_tape_replays_to_the_same_bits_through_contact(scene_at, before):
     assert replay(simulator.model, start, simulator.tape).tobytes() == (
         simulator.state().physics.tobytes()
     )
-    # The drag on the tape matters: without it the flight ends elsewhere.
+    # The drag on the tape matters: without it the end state differs.
     still = [(*controls[:4], *(0.0,) * 6) for controls in simulator.tape]
     assert replay(simulator.model, start, still).tobytes() != simulator.state().physics.tobytes()

@@ -1,4 +1,4 @@
-"""Contacts: what begins to be touched is told once, with the velocities just before."""
+"""A new contact is reported once, with the velocities just before it."""
 
 import pytest
 
@@ -11,7 +11,7 @@ STEP = 0.002
 
 
 def fly(simulator, low_level, reference, duration):
-    """Follow a velocity [m/s] for a duration [s]; returns the contacts on the way."""
+    """Follow a velocity [m/s] for a duration [s]; return the contacts."""
     for _ in range(round(duration / STEP)):
         simulator.step(low_level.update(simulator.readings, reference))
     return simulator.take_contacts()
@@ -29,7 +29,7 @@ def test_the_tip_touches_the_board_once_and_feels_it(at_the_board):
     simulator, low_level = at_the_board
     (touch,) = fly(simulator, low_level, (0.2, 0.0, 0.0), 2.0)
     assert (touch.body, touch.tip) == ("board", True)
-    # Level it would be 8.135; nose down by 2 deg, the tip leads by another 6 mm.
+    # A level robot would be at 8.135; nose down by 2 deg, the tip is 6 mm farther ahead.
     assert touch.position[0] == pytest.approx(8.132, abs=0.005)
     assert 0.05 < touch.velocity[0] < 0.25
     assert touch.tip_velocity[0] == pytest.approx(touch.velocity[0], abs=0.03)
@@ -44,7 +44,7 @@ def test_the_steady_force_is_what_statics_says(at_the_board):
     assert simulator.readings.velocity == pytest.approx(ZERO, abs=0.002)
 
 
-def test_a_second_touch_is_told_after_a_tenth_of_a_second_without(at_the_board):
+def test_a_contact_is_new_after_0_1_s_without_one(at_the_board):
     simulator, low_level = at_the_board
     assert len(fly(simulator, low_level, (0.2, 0.0, 0.0), 1.0)) == 1
     assert fly(simulator, low_level, (-0.2, 0.0, 0.0), 1.0) == []
@@ -53,8 +53,8 @@ def test_a_second_touch_is_told_after_a_tenth_of_a_second_without(at_the_board):
     assert (again.body, again.tip) == ("board", True)
 
 
-def test_the_velocity_of_the_tip_counts_the_rotation(scene_at):
-    # Two rotors only: it tumbles over its nose, and the tip comes down faster than the base.
+def test_the_velocity_of_the_tip_includes_the_rotation(scene_at):
+    # With two rotors it tips over its nose, and the tip falls faster than the base.
     simulator = Simulator("pelican", scene_at(0, 0, 0.6, "empty"))
     touches = []
     while not touches:
@@ -73,13 +73,13 @@ def test_the_velocity_of_the_tip_counts_the_rotation(scene_at):
         ((5.66, -6.42, 0.7), (0.0, 0.5, 0.0), "pipe_3", False),
     ],
 )
-def test_a_pipe_that_is_touched_is_named(scene_at, spawn, reference, body, tip):
+def test_a_contact_names_the_touched_pipe(scene_at, spawn, reference, body, tip):
     simulator = Simulator("pelican", scene_at(*spawn))
     touch = fly(simulator, LowLevel(), reference, 2.0)[0]
     assert (touch.body, touch.tip) == (body, tip)
 
 
-def test_the_floor_is_news_only_after_a_flight():
+def test_the_floor_is_a_new_contact_only_after_a_flight():
     simulator, low_level = Simulator("pelican", "empty"), LowLevel()
     for _ in range(200):
         simulator.step(STOPPED)

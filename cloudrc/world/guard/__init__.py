@@ -1,1 +1,1 @@
-"""The guard on board: states and rules that hold whatever the cloud sends."""
+"""The onboard guard, which keeps the robot safe whatever the cloud sends."""

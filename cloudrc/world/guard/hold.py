@@ -1,8 +1,7 @@
-"""How the guard comes to rest, lands and takes off: readings in, a velocity reference out.
+"""Brake, hold a position, land and take off with the onboard sensors alone.
 
-Position and velocity of the sensors on board are all that is used. Braking starts hard and ends
-gently, because the low-level controller follows late and swings back; the promise that the stop
-rule builds on, BRAKE after REACTION, is kept with room to spare.
+Braking starts hard and ends gently, because the low-level controller follows late and overshoots.
+It is always harder than the stop rule assumes: BRAKE after REACTION.
 """
 
 from __future__ import annotations
@@ -11,245 +10,249 @@ from math import hypot, nan
 from operator import le
 
 from cloudrc.messages import ZERO, Cause, Vector
-from cloudrc.world.guard.limits import BRAKE, shortened, towards, within
+from cloudrc.world.guard.limits import BRAKE, clamp, limit_length, step_towards
 from cloudrc.world.readings import Readings
 
-HARDEST, GENTLEST = 5.5, 1.0
-"""Range of what is flown in place of the 3 m/s^2 that are promised [m/s^2]."""
-EASE = 0.25
-"""In the end the reference falls exponentially, with this time constant [s]."""
-LEAD, LEAST_SHARE = 1.0, 0.2
-"""By so much [m/s] the reference begins ahead of the robot, but not below this share of it."""
-STILL = 0.1
-"""Slower than this the robot counts as come to rest [m/s]."""
+BRAKE_MAX, BRAKE_MIN = 5.5, 1.0
+"""Largest and smallest deceleration of the reference [m/s^2]; the stop rule assumes 3 m/s^2."""
+BRAKE_TIME_CONSTANT = 0.25
+"""Time constant of the exponential end of braking [s]."""
+BRAKE_LEAD, BRAKE_SHARE_MIN = 1.0, 0.2
+"""Braking starts with a reference below the robot's speed by BRAKE_LEAD [m/s], but not below
+BRAKE_SHARE_MIN of that speed [1]."""
+STILL_SPEED = 0.1
+"""Speed below which the robot is at rest [m/s]."""
 LAND_SPEED = 0.5
 """Speed of the descent [m/s]. Source: docs/reference/plant.md, "Landing"."""
 STILL_SHARE = 0.2
-"""A descent slower than this share of its speed stands, where that is below STILL: with a low cap
-every descent is slower than STILL, and would count as touched down in the air."""
+"""A descent slower than this share of its planned speed has stopped [1]. It matters with a low
+speed cap, where every descent is slower than STILL_SPEED and would count as touched down."""
 TOUCH_DOWN_NS = 400_000_000
-"""A descent that has stood still for so long has touched down [ns]."""
+"""Time without motion after which a descent has touched down [ns]."""
 STILL_TICKS = 200
-"""So many at rest, 0.4 s: what is thrown up stands still for less than that."""
-PULL = 0.8
-"""Of the position hold: velocity per distance [1/s]."""
-DAMPING = 1.6
-"""Of the position hold: velocity taken back per velocity [1]."""
-PULL_MAX = 0.5
-"""Of the position hold [m/s]."""
-TRIM, TRIM_MAX, TRIM_REACH = 0.2, 0.05, 0.1
-"""Likewise: velocity added per distance and time [1/s^2], at most so much per axis [m/s], and only
-this near [m]: farther off the robot is on its way. What is lopsided needs more than the low-level
-controller's integral gives: without this it would stand 30 mm nearer to a pipe than it stopped."""
+"""Number of ticks at rest after which the robot lies still, 0.4 s. At the top of a throw it rests
+for less than that."""
+POSITION_GAIN = 0.8
+"""Position hold: velocity per distance [1/s]."""
+DAMPING_GAIN = 1.6
+"""Position hold: velocity subtracted per velocity of the robot [1]."""
+HOLD_SPEED_MAX = 0.5
+"""Position hold: largest speed [m/s]."""
+INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1
+"""Position hold: integral gain [1/s^2], largest integral term per axis [m/s], and largest distance
+from the hold point at which it integrates [m]. The arm makes the robot lopsided, and the low-level
+controller's own integral is too small: without this the robot would stand 30 mm off its point."""
 TAKE_OFF_MARGIN = 0.5
-"""So far from the walls [m] a robot that was stopped has to lie to take off: tilted, it scrapes
-along the floor before it rises, by 0.35 m at most: `pytest -m "" -k scrapes tests/world`."""
-HOP, HOP_SPEED = 0.02, 0.2
-"""A robot that has not been this far [m] above or below where it stood stands there still, if it is
-slower than this [m/s]: it drops from no higher, and hits nothing at speed."""
+"""Distance from the walls that a stopped robot needs to take off [m]. A tilted robot scrapes along
+the floor before it rises, by 0.35 m at most: `pytest -m "" -k scrapes tests/world`."""
+LIFT_OFF_HEIGHT, GROUND_SPEED_MAX = 0.02, 0.2
+"""Change of height after which the robot has left the ground [m]. Below it, and below
+GROUND_SPEED_MAX [m/s], its rotors may stop: it drops from no higher and hits nothing at speed."""
 
 
-class Rest:
-    """Brakes, holds the position where the robot came to rest, or goes down from there.
+class PositionHold:
+    """Brakes, holds the point where the robot came to rest, or descends from there.
 
     Attributes:
-        brakes: Whether the robot is coming to rest, and has no position to hold yet.
+        brakes: Whether the robot still brakes and has no hold point yet.
     """
 
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
-        """Begin without a position.
+        """Start without a hold point.
 
         Args:
-            low: Corner of where a position may be held [m], world frame, shape (3,).
-            high: The opposite corner [m], shape (3,).
-            speed_max: Of the position hold, if it is below PULL_MAX [m/s].
+            low: Lower corner of the box for hold points [m], world frame, shape (3,).
+            high: Upper corner [m], shape (3,).
+            speed_max: Largest speed of the position hold, if below HOLD_SPEED_MAX [m/s].
         """
         self._low, self._high = low, high
-        self._pull_max = min(PULL_MAX, speed_max)
-        self._anchor: Vector | None = None
-        self._trim = ZERO
+        self._speed_max = min(HOLD_SPEED_MAX, speed_max)
+        self._hold_point: Vector | None = None
+        self._integral = ZERO
         self.brakes = False
 
     def forget(self) -> None:
-        """The robot moves on; the next rest is another one."""
-        self._anchor, self.brakes = None, False
+        """Forget the hold point: the robot moves on."""
+        self._hold_point, self.brakes = None, False
 
     def follow(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
-        """Go on with braking, with holding the position, and with going down.
+        """Return the next reference for braking, holding or descending.
 
         Args:
-            reference: As followed so far [m/s], world frame, shape (3,).
-            readings: Of the sensors on board.
-            sink: How fast to go down [m/s], 0 to stay.
+            reference: Reference of the last tick [m/s], world frame, shape (3,).
+            readings: Readings of the onboard sensors.
+            sink: Speed of the descent [m/s]; 0 holds the height.
             dt: Time since the last call [s].
         """
-        if self._anchor is None:
+        if self._hold_point is None:
             return self._brake(reference, readings, sink, dt)
-        (ax, ay, az), (x, y, z), (vx, vy, vz) = self._anchor, readings.position, readings.velocity
-        dx, dy, dz = ax - x, ay - y, 0.0 if sink else az - z
-        tx, ty, tz = self._trim
-        if hypot(dx, dy, dz) < TRIM_REACH:
-            self._trim = self._trimmed((dx, dy, dz), dt)
-        up = 0.0 if sink else PULL * dz - DAMPING * vz + tz
-        back = (PULL * dx - DAMPING * vx + tx, PULL * dy - DAMPING * vy + ty, up)
-        x, y, z = shortened(back, self._pull_max)
-        return towards(reference, (x, y, z - sink), BRAKE * dt)
+        (hx, hy, hz), (x, y, z) = self._hold_point, readings.position
+        vx, vy, vz = readings.velocity
+        dx, dy, dz = hx - x, hy - y, 0.0 if sink else hz - z
+        ix, iy, iz = self._integral
+        if hypot(dx, dy, dz) < INTEGRAL_RANGE:
+            self._integral = self._integrate((dx, dy, dz), dt)
+        back_x = POSITION_GAIN * dx - DAMPING_GAIN * vx + ix
+        back_y = POSITION_GAIN * dy - DAMPING_GAIN * vy + iy
+        back_z = 0.0 if sink else POSITION_GAIN * dz - DAMPING_GAIN * vz + iz
+        x, y, z = limit_length((back_x, back_y, back_z), self._speed_max)
+        return step_towards(reference, (x, y, z - sink), BRAKE * dt)
 
-    def _trimmed(self, distance: Vector, dt: float) -> Vector:
-        """Move the trim [m/s] on by `dt` [s] at this `distance` [m] from the anchor, shape (3,)."""
-        (tx, ty, tz), (dx, dy, dz), gain = self._trim, distance, TRIM * dt
+    def _integrate(self, distance: Vector, dt: float) -> Vector:
+        """Integrate the `distance` [m] from the hold point, shape (3,), over `dt` [s]."""
+        (ix, iy, iz), (dx, dy, dz), gain = self._integral, distance, INTEGRAL_GAIN * dt
         return (
-            within(tx + gain * dx, -TRIM_MAX, TRIM_MAX),
-            within(ty + gain * dy, -TRIM_MAX, TRIM_MAX),
-            within(tz + gain * dz, -TRIM_MAX, TRIM_MAX),
+            clamp(ix + gain * dx, -INTEGRAL_MAX, INTEGRAL_MAX),
+            clamp(iy + gain * dy, -INTEGRAL_MAX, INTEGRAL_MAX),
+            clamp(iz + gain * dz, -INTEGRAL_MAX, INTEGRAL_MAX),
         )
 
     def _brake(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
-        """Slow down; at rest, drop anchor."""
+        """Slow the reference down; once the robot is at rest, set the hold point."""
         if not self.brakes:
             reference, self.brakes = brake_start(reference, readings.velocity), True
         x, y, z = reference
         rest = (0.0, 0.0, -sink)
-        reference = towards(reference, rest, brake_rate(hypot(x, y, z + sink)) * dt)
+        reference = step_towards(reference, rest, brake_rate(hypot(x, y, z + sink)) * dt)
         vx, vy, vz = readings.velocity
-        if reference is rest and hypot(vx, vy, vz + sink) < STILL:
-            x, y, z = map(within, readings.position, self._low, self._high)
-            self._anchor, self._trim, self.brakes = (x, y, z), ZERO, False
+        if reference is rest and hypot(vx, vy, vz + sink) < STILL_SPEED:
+            x, y, z = map(clamp, readings.position, self._low, self._high)
+            self._hold_point, self._integral, self.brakes = (x, y, z), ZERO, False
         return reference
 
 
 def brake_start(reference: Vector, velocity: Vector) -> Vector:
-    """Say where the reference begins to brake: ahead of the robot, which follows it late.
+    """Return the reference at the start of braking, below the robot's speed.
 
-    A robot that is slower than its reference would else go on speeding up for a while.
+    The robot follows late. One that is slower than its reference would still speed up for a while.
 
     Args:
-        reference: So far, finite [m/s], shape (3,).
-        velocity: Of the robot [m/s], world frame, shape (3,).
+        reference: Finite reference of the last tick [m/s], shape (3,).
+        velocity: Velocity of the robot [m/s], world frame, shape (3,).
     """
     start = velocity if hypot(*velocity) < hypot(*reference) else reference
     speed = hypot(*start)
     if speed == 0.0:
         return start
-    share = max(LEAST_SHARE, 1.0 - LEAD / speed)
+    share = max(BRAKE_SHARE_MIN, 1.0 - BRAKE_LEAD / speed)
     x, y, z = start
     return (share * x, share * y, share * z)
 
 
 def brake_rate(speed: float) -> float:
-    """Say how fast the reference falls at a `speed` [m/s]: hard first, gently in the end."""
-    return min(HARDEST, max(GENTLEST, speed / EASE))
+    """Return the deceleration of a reference of this `speed` [m/s]: hard first, gentle at last."""
+    return min(BRAKE_MAX, max(BRAKE_MIN, speed / BRAKE_TIME_CONSTANT))
 
 
 class Descent:
-    """Tells a robot that has touched down from one that sinks, and may still stop in the air.
+    """Detects touch-down, and whether a descent may still stop in the air.
 
-    What stands, or has not the room to come to rest in, would scrape along the ground, or into a
-    pipe beside it: it goes on down, though it is acknowledged, and its rotors stop.
+    A robot that stands, or that is too low to stop in the air, would scrape along the ground or
+    into a pipe. It descends to touch-down although the operator has acknowledged.
 
     Attributes:
-        speed: Downwards [m/s].
-        acknowledged: Whether the operator has seen it land.
+        speed: Speed of the descent [m/s].
+        acknowledged: Whether the operator has acknowledged this landing.
     """
 
     def __init__(self, floor: float, speed_max: float) -> None:
-        """Begin where nothing lands.
+        """Start without a landing.
 
         Args:
-            floor: Lowest height at which a position is held [m].
-            speed_max: Of the descent, if it is below LAND_SPEED [m/s].
+            floor: Lowest height of a hold point [m].
+            speed_max: Speed of the descent, if below LAND_SPEED [m/s].
         """
         self._floor, self.speed = floor, min(LAND_SPEED, speed_max)
-        self._still = min(STILL, STILL_SHARE * self.speed)
+        self._still_speed = min(STILL_SPEED, STILL_SHARE * self.speed)
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """A descent begins at `now_ns` [ns], of which the operator does not know."""
+        """Begin a descent at `now_ns` [ns], not yet acknowledged."""
         self._moved_ns, self.acknowledged = now_ns, False
 
     def may_stop(self, readings: Readings) -> bool:
-        """Say whether the operator has called it off while it sinks freely, and high enough."""
+        """Tell whether the operator acknowledged while the robot sinks freely and high enough."""
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
 
     def is_over(self, now_ns: int, reference: Vector, readings: Readings) -> bool:
-        """Note whether the robot moves; say whether it stands on something.
+        """Take in the motion of this tick; tell whether the robot has touched down.
 
         Args:
             now_ns: World's clock [ns].
-            reference: As followed so far [m/s], world frame, shape (3,).
-            readings: Of the sensors on board.
+            reference: Reference of the last tick [m/s], world frame, shape (3,).
+            readings: Readings of the onboard sensors.
         """
-        if reference[2] > -0.5 * self.speed or abs(readings.velocity[2]) >= self._still:
+        if reference[2] > -0.5 * self.speed or abs(readings.velocity[2]) >= self._still_speed:
             self._moved_ns = now_ns
         return now_ns - self._moved_ns >= TOUCH_DOWN_NS
 
 
 class TakeOff:
-    """Tells a robot that has not left the ground yet from one that flies.
+    """Detects when the robot has left the ground, and whether it may take off.
 
-    Held in the air so near to the ground it would scrape along. One whose rotors were stopped may
-    still be falling, or lie outside the fence, when it is acknowledged: it takes off while it is
-    at rest, and that inside, by TAKE_OFF_MARGIN.
+    Before that, a HOLD would scrape along the ground, so the rotors stop instead. A robot whose
+    rotors were stopped in the air may still be falling, or lie outside the fence, when it is
+    acknowledged. It may take off once it is at rest inside the fence, by TAKE_OFF_MARGIN.
 
     Attributes:
         over: Whether the robot has left the ground.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
-        """Begin on the ground.
+        """Start on the ground.
 
         Args:
-            low: Corner of the fence [m], shape (3,).
-            high: The opposite one [m], shape (3,).
+            low: Lower corner of the fence [m], shape (3,).
+            high: Upper corner [m], shape (3,).
         """
         (ax, ay, az), (bx, by, bz) = low, high
         self._low = (ax + TAKE_OFF_MARGIN, ay + TAKE_OFF_MARGIN, az)
         self._high = (bx - TAKE_OFF_MARGIN, by - TAKE_OFF_MARGIN, bz)
         self.over = self._stopped = False
-        self._still, self._height = 0, nan
+        self._still_ticks, self._height = 0, nan
 
     @property
     def allowed(self) -> bool:
-        """Whether it may leave the ground."""
-        return not self._stopped or self._still >= STILL_TICKS
+        """Whether the robot may leave the ground."""
+        return not self._stopped or self._still_ticks >= STILL_TICKS
 
     @property
     def condition(self) -> Cause:
-        """How it is acknowledged: whether something has yet to come before a take-off."""
+        """The cause of GROUND after an acknowledgement: whether the robot must be still first."""
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
-        """The robot stands, or will; the next take-off is another one.
+        """Forget the last take-off: the robot stands, or falls to the ground.
 
         Args:
-            stopped: Whether its rotors were stopped elsewhere than on the ground, perhaps.
+            stopped: Whether the rotors may have been stopped in the air or on an obstacle.
         """
         self.over = False
         if stopped:
-            self._stopped, self._still, self._height = True, 0, nan
+            self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Note where the robot stands, or see whether it has left.
+        """Take in where the robot stands, or whether it has left the ground.
 
         Args:
-            readings: Of the sensors on board.
-            flies: Whether its rotors turn.
+            readings: Readings of the onboard sensors.
+            flies: Whether the rotors turn.
         """
         height = readings.position[2]
         if flies:
-            self.over, self._stopped = not abs(height - self._height) < HOP, False
+            self.over, self._stopped = not abs(height - self._height) < LIFT_OFF_HEIGHT, False
         else:
             self._height = height
             if self._stopped:
-                self._count_rest(readings)
+                self._count_still_ticks(readings)
 
-    def _count_rest(self, readings: Readings) -> None:
+    def _count_still_ticks(self, readings: Readings) -> None:
         low, position, high = self._low, readings.position, self._high
         inside = all(map(le, low, position)) and all(map(le, position, high))
-        at_rest = inside and hypot(*readings.velocity) < STILL
-        self._still = self._still + 1 if at_rest else 0
+        at_rest = inside and hypot(*readings.velocity) < STILL_SPEED
+        self._still_ticks = self._still_ticks + 1 if at_rest else 0
 
     def may_end(self, readings: Readings) -> bool:
-        """Say whether the rotors may stop here."""
-        return not self.over and hypot(*readings.velocity) < HOP_SPEED
+        """Tell whether the robot is still on the ground and slow enough to stop its rotors."""
+        return not self.over and hypot(*readings.velocity) < GROUND_SPEED_MAX

@@ -1,12 +1,9 @@
-"""What the guard allows: set on world's side only, checked once, never zero and never infinite.
+"""The limits of the guard, and the arithmetic that keeps a velocity reference within them.
 
-A limit that is switched off is the fault that nobody sees, so there is no value that does it.
-
-The guard's arithmetic: pure functions on floats, of which each answers to any numbers at all.
-
-Whatever comes in, NaN and infinities included, a finite answer inside its bound goes out. So every
-comparison is written so that NaN fails it. `tests/world/guard/test_proof.py` proves the scalar
-ones for all 64-bit floats.
+World alone sets the limits. Each is finite and above 0: no value switches a limit off.
+The functions are pure. For any input, NaN and infinity included, they return a finite result within
+its bound; therefore every comparison is written so that NaN fails it.
+`tests/world/guard/test_proof.py` proves this for the scalar functions and all 64-bit floats.
 """
 
 from __future__ import annotations
@@ -18,161 +15,170 @@ from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Vector
 
 BRAKE = 3.0
-"""Deceleration that the robot is sure to reach [m/s^2].
+"""Deceleration that the robot always reaches [m/s^2].
 Source: docs/reference/plant.md, "Stop rule"."""
 REACTION = 0.2
-"""Time until it does [s]. Source: docs/reference/plant.md, "Stop rule"."""
+"""Time until the robot decelerates at BRAKE [s]. Source: docs/reference/plant.md, "Stop rule"."""
 STOPPING_DISTANCE = 8.7
 """Distance within which the robot stops from the speed cap [m].
 Source: docs/reference/plant.md, "Speed cap"."""
-SIXTH = 1.0 / (2.0 * BRAKE)
-CAUTION, MARGIN = 0.6, 0.2
-"""At the fence v has to keep CAUTION v + v^2/6 <= distance - MARGIN [s], [m]. At the floor with
-FLOOR_MARGIN instead, and there REACTION is enough, since the robot climbs readily.
-Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With these a hostile cloud
-gets the robot 0.3 m beyond the fence, because the low-level controller follows late."""
+STOP_COEFFICIENT = 1.0 / (2.0 * BRAKE)
+"""Braking distance over speed squared [s^2/m]."""
+FENCE_REACTION, FENCE_MARGIN = 0.6, 0.2
+"""Towards a wall or the ceiling of the fence, the speed v keeps
+FENCE_REACTION v + v^2/6 <= distance - FENCE_MARGIN [s], [m]. Towards the floor, REACTION and
+FLOOR_MARGIN replace them, because the robot climbs readily.
+Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With those, a hostile cloud
+moves the robot 0.3 m beyond the fence, because the low-level controller follows late."""
 FAR = 1e6
-"""Farther than this [m] a face limits nothing."""
-GLIMPSE, GLIMPSE_NS = 0.25, 10_000_000
-"""The robot moves by less than this [m] in so long [ns]: it is never faster than 25 m/s."""
-COME_BACK, COME_BACK_MAX = 1.0, 0.5
-"""Beyond the margin the robot has to fly back: velocity per distance [1/s], at most [m/s]."""
-ASIDE = 0.44
-"""What the robot hits turns it aside: so much of its speed [1] may become speed towards a wall. Off
-the board's edge at 2.7 m/s it goes on across at 1.2."""
-TOP, OFF_TOP = 0.55, 0.6
-"""From so high above the margin of the floor [m] it may roll off the top of a pipe: its fall, too,
-becomes speed towards a wall. So much more of its own is counted per height [1/m], up to 1 m."""
-SLIDE, TUMBLE = 0.4, 0.3
-"""A hit stops the rotors: the robot falls, goes on along the floor for so long [s], and then lies
-so much [m] farther. Few get beyond that: `pytest -m "" -k after_a_fall tests/world`."""
-BOUNCE = 0.2
-"""What goes straight on meets the floor spinning, and may leave it faster than it came, at 2.6 m/s
-after 1.9: it goes on for so much longer [s]."""
-LATE = 0.3
-"""The robot follows a braking reference so late [s]."""
-CREEP = 0.5
-"""No faster than this [m/s], the robot may fly anywhere: it hits nothing hard."""
+"""Distance beyond which a face of the fence limits nothing [m]."""
+RECHECK_DISTANCE, RECHECK_NS = 0.25, 10_000_000
+"""The robot moves by less than RECHECK_DISTANCE [m] within RECHECK_NS [ns], since it is never
+faster than 25 m/s. So far from the fence the guard checks only once per RECHECK_NS."""
+RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
+"""Return to the fence from beyond its margin: velocity per distance [1/s], largest speed [m/s]."""
+DEFLECTION = 0.44
+"""Share of the speed [1] that an obstacle may turn towards a wall. Example: a robot that hits the
+edge of the board at 2.7 m/s leaves it sideways at 1.2 m/s."""
+ROLL_OFF_HEIGHT, ROLL_OFF_GAIN = 0.55, 0.6
+"""Above ROLL_OFF_HEIGHT [m] over the floor's margin the robot may roll off the top of a pipe, and
+its fall becomes speed towards a wall, too. For that, DEFLECTION grows by ROLL_OFF_GAIN per height
+[1/m], over at most 1 m."""
+SLIDE_TIME, TUMBLE_DISTANCE = 0.4, 0.3
+"""After a hit the rotors stop and the robot falls. It then slides along the floor for SLIDE_TIME
+[s] and tumbles on by TUMBLE_DISTANCE [m]. Few falls end farther away:
+`pytest -m "" -k after_a_fall tests/world`."""
+BOUNCE_TIME = 0.2
+"""Extra slide after a fall straight ahead [s]: the robot reaches the floor spinning and may leave
+it faster than it came, for example at 2.6 m/s after 1.9 m/s."""
+FOLLOW_DELAY = 0.3
+"""Delay with which the robot follows a braking reference [s]."""
+CREEP_SPEED = 0.5
+"""Speed up to which a hit is harmless, so that the robot may fly anywhere [m/s]."""
 HEIGHT_MAX, GRAVITY = 5.0, 9.81
-"""A fall from higher than this [m] counts as one from there. [m/s^2]"""
-LOW, LOW_SPEED = 0.25, 1.0
-"""Lower than this [m] the robot flies sideways no faster than this [m/s]."""
-SINK_LAG = 0.5
-"""The reference goes down ahead of the robot by at most this [m/s]: asked for more than gravity
-gives, the low-level controller would turn the robot over, and then brake nothing."""
-JUST_BELOW = 1.0 - 2.0**-45
-"""Times this, a cap is not exceeded by what is rounded on the way to the reference."""
+"""Greatest height of a fall that counts [m]; gravity [m/s^2]."""
+LOW_HEIGHT, LOW_SPEED = 0.25, 1.0
+"""Below LOW_HEIGHT [m] the robot flies sideways at most at LOW_SPEED [m/s]."""
+SINK_LEAD_MAX = 0.5
+"""Largest speed by which the reference may sink faster than the robot [m/s]. If it sank faster than
+a free fall, the low-level controller would turn the robot over and could not brake."""
+ROUNDING_FACTOR = 1.0 - 2.0**-45
+"""Factor on the speed cap that leaves room for rounding errors [1]."""
 
 
 def stopping_distance(speed: float, reaction: float) -> float:
-    """Give the way [m] from a `speed` [m/s] to rest: `reaction` [s], then braking at BRAKE."""
-    return speed * (reaction + speed * SIXTH)
+    """Return the distance [m] from `speed` [m/s] to rest: `reaction` [s], then braking at BRAKE."""
+    return speed * (reaction + speed * STOP_COEFFICIENT)
 
 
-def within(value: float, low: float, high: float) -> float:
-    """Give `value`, or the end nearest to it of what lies between `low` and `high`.
+def clamp(value: float, low: float, high: float) -> float:
+    """Limit `value` to the interval from `low` to `high`; all three in any unit.
 
-    `low` if it is not a number; all three are in one unit, [m], [m/s] or [rad/s].
+    NaN becomes `low`.
     """
     if value >= high:
         return high
     return value if value > low else low
 
 
-def approach(reach: float, caution: float = CAUTION) -> float:
-    """Say how fast the robot may be told to fly towards a face of the fence.
+def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
+    """Return the largest reference speed towards a face of the fence [m/s].
 
-    The largest v with t v + v^2/6 <= d is 2 d / (t + sqrt(t^2 + 2 d/3)): solved so that no
-    difference cancels. Beyond the face v is negative: the robot has to come back.
+    The largest v with t v + v^2/6 <= d is 2 d / (t + sqrt(t^2 + 2 d/3)). In this form no difference
+    cancels. Beyond the face v is negative, so that the robot returns.
 
     Args:
-        reach: Distance to the face [m], margin taken off.
-        caution: t of the formula [s].
+        distance: Distance to the face minus the margin, d of the formula [m].
+        reaction: t of the formula [s].
     """
-    if reach > FAR:
+    if distance > FAR:
         return inf
-    if reach > 0.0:
-        return 2.0 * reach / (caution + sqrt(caution * caution + 4.0 * SIXTH * reach))
-    return max(COME_BACK * reach, -COME_BACK_MAX) if reach < 0.0 else 0.0
+    if distance > 0.0:
+        return (
+            2.0
+            * distance
+            / (reaction + sqrt(reaction * reaction + 4.0 * STOP_COEFFICIENT * distance))
+        )
+    return max(RETURN_GAIN * distance, -RETURN_SPEED_MAX) if distance < 0.0 else 0.0
 
 
-def is_far(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
-    """Say whether `fenced` leaves a velocity as it is, here and up to GLIMPSE from here.
+def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
+    """Tell whether `limit_to_fence` keeps a velocity within RECHECK_DISTANCE of a position.
 
     Args:
-        velocity: [m/s], world frame, shape (3,).
-        position: Of the base [m], world frame, shape (3,).
-        low: Corner of the fence [m], margins taken off, shape (3,).
-        high: The opposite corner [m], shape (3,).
+        velocity: Reference [m/s], world frame, shape (3,).
+        position: Position of the base [m], world frame, shape (3,).
+        low: Lower corner of the fence, margins taken off [m], shape (3,).
+        high: Upper corner, margins taken off [m], shape (3,).
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     speed = sqrt(vx * vx + vy * vy + vz * vz)
-    if speed > CREEP:
-        aside, straight = thrown(speed, z + GLIMPSE - az)
-        spare = MARGIN - TUMBLE - GLIMPSE
+    if speed > CREEP_SPEED:
+        aside, straight = throw_distance(speed, z + RECHECK_DISTANCE - az)
+        spare = FENCE_MARGIN - TUMBLE_DISTANCE - RECHECK_DISTANCE
         dx = max(aside, abs(vx) * straight) - spare
         dy = max(aside, abs(vy) * straight) - spare
         if not (ax + dx <= x <= bx - dx and ay + dy <= y <= by - dy):
             return False
     if vx > 0.0:
-        bx -= vx * (CAUTION + vx * SIXTH)
+        bx -= vx * (FENCE_REACTION + vx * STOP_COEFFICIENT)
     else:
-        ax -= vx * (CAUTION - vx * SIXTH)
+        ax -= vx * (FENCE_REACTION - vx * STOP_COEFFICIENT)
     if vy > 0.0:
-        by -= vy * (CAUTION + vy * SIXTH)
+        by -= vy * (FENCE_REACTION + vy * STOP_COEFFICIENT)
     else:
-        ay -= vy * (CAUTION - vy * SIXTH)
+        ay -= vy * (FENCE_REACTION - vy * STOP_COEFFICIENT)
     if vz > 0.0:
-        bz -= vz * (CAUTION + vz * SIXTH)
+        bz -= vz * (FENCE_REACTION + vz * STOP_COEFFICIENT)
     else:
-        az -= vz * (REACTION - vz * SIXTH)
+        az -= vz * (REACTION - vz * STOP_COEFFICIENT)
     return (
-        ax + GLIMPSE <= x <= bx - GLIMPSE
-        and ay + GLIMPSE <= y <= by - GLIMPSE
-        and az + GLIMPSE <= z <= bz - GLIMPSE
+        ax + RECHECK_DISTANCE <= x <= bx - RECHECK_DISTANCE
+        and ay + RECHECK_DISTANCE <= y <= by - RECHECK_DISTANCE
+        and az + RECHECK_DISTANCE <= z <= bz - RECHECK_DISTANCE
     )
 
 
-def fenced(velocity: Vector, position: Vector, low: Vector, high: Vector) -> Vector:
-    """Slow a reference, axis by axis, until the robot can stop before the faces of the fence.
+def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> Vector:
+    """Slow a reference, axis by axis, so that the robot can stop before the faces of the fence.
 
-    Near the floor it is slowed sideways, too: a rotor that touches at speed turns the robot over.
-    And near the walls in every direction: should it hit something there, it has to come to lie
-    before them, though nothing steers it any more.
+    Near the floor the reference is also slowed sideways, because a rotor that touches the floor at
+    speed turns the robot over. Near the walls it is slowed in every direction: after a hit nothing
+    steers the robot any more, and it must still come to lie inside the fence.
 
     Args:
-        velocity: Finite [m/s], world frame, shape (3,).
-        position: Of the base [m], world frame, shape (3,).
-        low: Corner of the fence [m], margins taken off, shape (3,).
-        high: The opposite corner [m], shape (3,).
+        velocity: Finite reference [m/s], world frame, shape (3,).
+        position: Position of the base [m], world frame, shape (3,).
+        low: Lower corner of the fence, margins taken off [m], shape (3,).
+        high: Upper corner, margins taken off [m], shape (3,).
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
-    if not z >= az - FLOOR_MARGIN + LOW:
-        vx, vy, _ = shortened((vx, vy, 0.0), LOW_SPEED)
+    if not z >= az - FLOOR_MARGIN + LOW_HEIGHT:
+        vx, vy, _ = limit_length((vx, vy, 0.0), LOW_SPEED)
     inside = (
-        within(vx, -approach(x - ax), approach(bx - x)),
-        within(vy, -approach(y - ay), approach(by - y)),
-        # Whoever stands on the floor is not asked to take off.
-        within(vz, min(0.0, -approach(z - az, REACTION)), approach(bz - z)),
+        clamp(vx, -approach_speed(x - ax), approach_speed(bx - x)),
+        clamp(vy, -approach_speed(y - ay), approach_speed(by - y)),
+        # A robot that stands on the floor is not told to climb.
+        clamp(vz, min(0.0, -approach_speed(z - az, REACTION)), approach_speed(bz - z)),
     )
-    return shortened(inside, max(hit_speed(inside, position, low, high), CREEP))
+    return limit_length(inside, max(hit_speed_max(inside, position, low, high), CREEP_SPEED))
 
 
-def hit_speed(velocity: Vector, position: Vector, low: Vector, high: Vector) -> float:
-    """Say how fast [m/s] the robot may fly this way to come to lie before the walls after a hit.
+def hit_speed_max(velocity: Vector, position: Vector, low: Vector, high: Vector) -> float:
+    """Return the largest speed in this direction from which a robot that is hit stays inside [m/s].
 
     Args:
-        velocity: Finite [m/s], world frame, shape (3,).
-        position: Of the base [m], world frame, shape (3,).
-        low: Corner of the fence [m], margins taken off, shape (3,).
-        high: The opposite corner [m], shape (3,).
+        velocity: Finite reference [m/s], world frame, shape (3,).
+        position: Position of the base [m], world frame, shape (3,).
+        low: Lower corner of the fence, margins taken off [m], shape (3,).
+        high: Upper corner, margins taken off [m], shape (3,).
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, _) = velocity, position, low, high
     speed = sqrt(vx * vx + vy * vy + vz * vz)
-    if speed <= CREEP:
-        return CREEP
-    aside, straight = thrown(speed, z - az)
-    spare = MARGIN - TUMBLE
+    if speed <= CREEP_SPEED:
+        return CREEP_SPEED
+    aside, straight = throw_distance(speed, z - az)
+    spare = FENCE_MARGIN - TUMBLE_DISTANCE
     share = min(
         (x - ax + spare) / max(aside, -vx * straight),
         (bx - x + spare) / max(aside, vx * straight),
@@ -182,25 +188,25 @@ def hit_speed(velocity: Vector, position: Vector, low: Vector, high: Vector) -> 
     return speed * share
 
 
-def thrown(speed: float, height: float) -> tuple[float, float]:
-    """Say how far a hit may throw the robot before it lies: TUMBLE comes to that.
+def throw_distance(speed: float, height: float) -> tuple[float, float]:
+    """Return how far a robot moves after a hit, without TUMBLE_DISTANCE.
 
     Args:
-        speed: At the hit [m/s].
-        height: Above the margin of the floor [m].
+        speed: Speed at the hit [m/s].
+        height: Height above the floor's margin [m].
 
     Returns:
-        How far to any side [m], and for how long it goes straight on [s].
+        The distance to any side [m], and the time for which it moves straight ahead [s].
     """
-    fall = fall_time(height) + SLIDE
-    share = ASIDE + OFF_TOP * within(height - TOP, 0.0, 1.0)
-    return share * speed * fall, fall + BOUNCE + LATE
+    fall = fall_time(height) + SLIDE_TIME
+    share = DEFLECTION + ROLL_OFF_GAIN * clamp(height - ROLL_OFF_HEIGHT, 0.0, 1.0)
+    return share * speed * fall, fall + BOUNCE_TIME + FOLLOW_DELAY
 
 
 def fall_time(height: float) -> float:
-    """Say how long the robot falls [s] from a `height` above the margin of the floor [m].
+    """Return the time of a fall [s] from a `height` above the floor's margin [m].
 
-    In LAND, where the floor is no face, from HEIGHT_MAX.
+    In LAND the fence has no floor, the height is infinite, and HEIGHT_MAX counts.
     """
     height += FLOOR_MARGIN
     if not height < HEIGHT_MAX:
@@ -208,15 +214,15 @@ def fall_time(height: float) -> float:
     return sqrt(2.0 / GRAVITY * max(height, 0.0))
 
 
-def shortened(a: Vector, length_max: float) -> Vector:
-    """Give `a` [m/s] if it is at most `length_max` [m/s] long, else its direction with that length.
+def limit_length(a: Vector, length_max: float) -> Vector:
+    """Shorten `a` [m/s] to at most `length_max` [m/s] and keep its direction.
 
-    Zero if a component is not a number, or infinite.
+    The result is zero if a component is NaN or infinite.
     """
     x, y, z = a
     largest = max(abs(x), abs(y), abs(z))
     if largest > length_max:
-        # Scaled down first: the square of a huge but finite number overflows to infinity.
+        # Scale down first: the square of a huge but finite number overflows to infinity.
         scale = length_max / largest
         x, y, z = x * scale, y * scale, z * scale
     square = x * x + y * y + z * z
@@ -228,8 +234,8 @@ def shortened(a: Vector, length_max: float) -> Vector:
     return (x * scale, y * scale, z * scale)
 
 
-def towards(start: Vector, end: Vector, step: float) -> Vector:
-    """Give the point from `start` to `end` at most `step` away from `start`, all in [m/s]."""
+def step_towards(start: Vector, end: Vector, step: float) -> Vector:
+    """Move from `start` towards `end` by at most `step`, all in [m/s]."""
     (ax, ay, az), (bx, by, bz) = start, end
     x, y, z = bx - ax, by - ay, bz - az
     square = x * x + y * y + z * z
@@ -239,16 +245,16 @@ def towards(start: Vector, end: Vector, step: float) -> Vector:
     return (ax + share * x, ay + share * y, az + share * z)
 
 
-def held_back(before: Vector, after: Vector, step: float) -> Vector:
-    """Give `after`, but no more than `step` of what leads away from rest, all in [m/s].
+def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
+    """Limit how much a velocity speeds up from `before` to `after`; slowing down is not limited.
 
-    Where the fence has the robot come back in one axis while another speeds up, each axis alone may
-    be within the cap and their sum beyond it. Slowing down is never held back.
+    The fence may turn one axis back while another axis speeds up. Then each axis may be within the
+    cap and their sum beyond it.
 
     Args:
         before: Finite [m/s], shape (3,).
         after: Finite [m/s], shape (3,).
-        step: Longest way from `before` that speeds up [m/s].
+        step: Largest speed-up [m/s].
     """
     (ax, ay, az), (bx, by, bz) = before, after
     x, y, z = growth(ax, bx), growth(ay, by), growth(az, bz)
@@ -264,51 +270,51 @@ def held_back(before: Vector, after: Vector, step: float) -> Vector:
 
 
 def growth(before: float, after: float) -> float:
-    """Say by how much `after` is farther from rest than `before` on the same side, in [m/s]."""
+    """Return how much faster `after` is than `before` in the direction of `after`, in [m/s]."""
     if after < 0.0:
         before, after = -before, -after
     return max(after - max(before, 0.0), 0.0)
 
 
-def upright(reference: Vector, before: Vector, climb: float, speed_max: float) -> Vector:
-    """Keep the reference from going down so far ahead of the robot that it would turn over.
+def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float) -> Vector:
+    """Limit how fast the reference sinks, so that the robot does not turn over.
 
     Args:
-        reference: Wanted [m/s], world frame, shape (3,).
-        before: What it was a tick ago [m/s], at most `speed_max` long, shape (3,).
+        reference: Wanted reference [m/s], world frame, shape (3,).
+        before: Reference of the last tick [m/s], at most `speed_max` long, shape (3,).
         climb: Vertical velocity of the robot [m/s].
-        speed_max: Of the result [m/s].
+        speed_max: Largest speed of the result [m/s].
     """
     x, y, z = reference
-    lowest = min(before[2], climb - SINK_LAG)
-    return shortened((x, y, lowest), speed_max) if z < lowest else reference
+    lowest = min(before[2], climb - SINK_LEAD_MAX)
+    return limit_length((x, y, lowest), speed_max) if z < lowest else reference
 
 
 AGE_MAX_NS = 10_000_000_000
-"""Commands that are older are never flown [ns], whatever an experiment says."""
-GROUND_MIN_NS = 10_000_000_000
-"""A robot on the ground waits for a mission's first command for so long at least [ns]: it comes a
-round trip behind the start, 0.6 s by `satellite`, or some, if one end has not heard the other."""
+"""Largest command age that an experiment may allow [ns]."""
+GROUND_WAIT_MIN_NS = 10_000_000_000
+"""Shortest time that a robot on the ground waits for a mission's first command [ns]. The command
+comes at least one round trip after the start: 0.6 s with the profile `satellite`."""
 RAMP_MIN = 1.0
-"""Out of HOLD the reference is led slowly for so long at least [s]."""
-RANGE = 1000.0
-"""Largest number of a command that is shortened to a cap, not refused [m/s, rad/s]: no controller
-asks a robot for more. One that does has a bug, and its direction is as wrong as its length.
+"""Shortest time for which the reference grows slowly after a HOLD [s]."""
+COMMAND_MAX = 1000.0
+"""Largest value in a command that is shortened to a cap and not rejected [m/s, rad/s]. A larger one
+comes from a bug, and its direction is as wrong as its length.
 Source: docs/reference/faults.md, "F23"."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What the guard allows.
+    """The limits of the guard.
 
     Attributes:
-        fence_low: Corner of the box that the base may not leave [m], world frame, shape (3,).
-        fence_high: The opposite corner [m], shape (3,).
-        command_age_max_ns: Age of the basis beyond which a command is not flown [ns].
+        fence_low: Lower corner of the box that the base may not leave [m], world frame, shape (3,).
+        fence_high: Upper corner [m], shape (3,).
+        command_age_max_ns: Largest age of the basis of a command that is flown [ns].
         speed_max: Largest speed [m/s].
         acceleration_max: Largest change of the reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
-        hold_max_ns: HOLD for so long in a mission ends in LAND [ns]; see `alone_max_ns`.
+        hold_max_ns: Longest HOLD in a mission; then LAND [ns]. See `alone_max_ns`.
     """
 
     fence_low: Vector
@@ -320,53 +326,53 @@ class Limits:
     hold_max_ns: int = 60_000_000_000
 
     def __post_init__(self) -> None:
-        """Refuse what would switch a limit off.
+        """Check the limits.
 
         Raises:
-            ValueError: If a limit is not finite, not above 0 or, for the speed and the age, beyond
-                what can be stopped in time; the message names it.
+            ValueError: If a limit is not finite or not above 0, if the robot cannot stop in time
+                from that speed with that age, or if the fence leaves no room.
         """
         for name in self.__slots__[2:]:
             value = getattr(self, name)
             if not (isfinite(value) and value > 0):
-                raise ValueError(f"guard: {name} is {value}; it has to be finite and above 0")
+                raise ValueError(f"guard: {name} is {value}; it must be finite and above 0")
         if self.command_age_max_ns > AGE_MAX_NS:
             raise ValueError(f"guard: command_age_max_ns is {self.command_age_max_ns}, above 10 s")
         way = stopping_distance(self.speed_max, self.command_age_max_ns * 1e-9 + REACTION)
         if way > STOPPING_DISTANCE + 1e-4:
             raise ValueError(
-                f"guard: speed_max is {self.speed_max:g} m/s, from which stopping takes {way:.2f} m"
-                f" with commands that old; at most {STOPPING_DISTANCE:g} m are allowed"
+                f"guard: speed_max is {self.speed_max:g} m/s; with this command age the robot needs"
+                f" {way:.2f} m to stop, and at most {STOPPING_DISTANCE:g} m are allowed"
             )
         for low, high in zip(self.fence_low, self.fence_high, strict=True):
-            if not (isfinite(low) and isfinite(high) and high - low > FLOOR_MARGIN + MARGIN):
+            if not (isfinite(low) and isfinite(high) and high - low > FLOOR_MARGIN + FENCE_MARGIN):
                 raise ValueError(f"guard: a fence from {low:g} to {high:g} m leaves no room")
 
     @property
     def ramp_ns(self) -> int:
-        """How long the reference grows by no more than BRAKE after a HOLD [ns]: to the cap.
+        """Time for which the reference grows at most at BRAKE after a HOLD [ns].
 
-        By time alone: the first commands after a silence rest, and a ramp that ended where the
-        reference has caught up with them would be none.
+        It is long enough to reach the speed cap. The ramp ends by time only: the first commands
+        after a silence may be zero, and the reference reaches those at once.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
 
     def alone_max_ns(self, flies: bool) -> int:
-        """How long a robot in a mission waits for its cloud before LAND [ns]."""
-        return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_MIN_NS)
+        """Return how long a robot in a mission waits for its cloud before LAND [ns]."""
+        return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_WAIT_MIN_NS)
 
-    def too_old(self, beyond_ns: int) -> str:
-        """Say by how much the newest command is too old, so many nanoseconds beyond the limit."""
+    def age_text(self, beyond_ns: int) -> str:
+        """Describe the age of a command that is `beyond_ns` too old [ns]."""
         age, limit = self.command_age_max_ns + beyond_ns, self.command_age_max_ns
         return f"command age {age * 1e-9:.3f} s above {limit * 1e-9:.3f} s"
 
-    def left_alone(self, flies: bool) -> str:
-        """Say for how long it has waited."""
+    def wait_text(self, flies: bool) -> str:
+        """Describe how long the robot waited for its cloud."""
         return f"held for {self.alone_max_ns(flies) * 1e-9:g} s without the cloud"
 
-    def inside(self) -> tuple[Vector, Vector]:
-        """Give the fence's corners with the margins taken off [m], shape (3,) each."""
+    def inner_corners(self) -> tuple[Vector, Vector]:
+        """Return the corners of the fence, margins taken off [m], shape (3,) each."""
         (ax, ay, az), (bx, by, bz) = self.fence_low, self.fence_high
-        low = (ax + MARGIN, ay + MARGIN, az + FLOOR_MARGIN)
-        return low, (bx - MARGIN, by - MARGIN, bz - MARGIN)
+        low = (ax + FENCE_MARGIN, ay + FENCE_MARGIN, az + FLOOR_MARGIN)
+        return low, (bx - FENCE_MARGIN, by - FENCE_MARGIN, bz - FENCE_MARGIN)

@@ -1,7 +1,7 @@
-"""The guard: between the tunnel and the low-level controller, it decides what may be flown.
+"""The guard: the state machine that decides which commands the robot flies.
 
-Commands and operator requests come in; a velocity reference comes out, every 2 ms. It trusts its
-own clock and its own sensors only, and assumes that the cloud may say anything.
+It stands between the tunnel and the low-level controller and gives a velocity reference every 2 ms.
+It uses only its own clock and the onboard sensors, and it assumes that the cloud is hostile.
 
                  fresh command of a         command too old, mission over,
                   started mission                   new session
@@ -13,22 +13,21 @@ own clock and its own sensors only, and assumes that the cloud may say anything.
           |                          |   5 impossible commands within 1 s   |
           +------------------------ LAND <----------------------------------+
 
-ESTOP is reached from everywhere by the operator's word, and by a hit: what has flown into something
-at speed, or turned over, is thrown about by its rotors. It is left for GROUND by the
-acknowledgement. LAND acknowledged in the air becomes HOLD; on something or low above it, GROUND, at
-touch-down. Both end the mission: only a start arms again. HOLD before the robot has left the ground
-is GROUND: its rotors stop, the mission goes on, for 60 s without the cloud as in HOLD.
+A command is fresh while its *basis*, the odometry that it was computed from, is at most
+`command_age_max` old.
 
-A command is fresh while its *basis*, the odometry it was computed from, is at most
-`command_age_max` old. HOLD after a mission's end lasts as long as the operator likes: there a robot
-waits for the next one. HOLD within a mission does not: who should end it may be gone.
+- ESTOP: entered from every state by the operator's request or after a hit. With its rotors on, a
+  robot that was hit would fly off in any direction; without them it falls within a known distance.
+  An acknowledgement leads to GROUND.
+- LAND: an acknowledgement in the air leads to HOLD; low above the ground or on an obstacle it leads
+  to GROUND at touch-down. LAND and ESTOP end the mission: only a start arms again.
+- HOLD before the robot has left the ground becomes GROUND. The rotors stop and the mission
+  continues, for 60 s without the cloud, as in HOLD.
+- HOLD after the end of a mission has no time limit: the robot waits for the next mission. HOLD
+  within a mission has one, because the operator may be gone.
 
-How the guard feels a hit: readings in, out comes what tells that the robot has met something.
-
-The guard knows neither pipes nor board. A robot that has been flown into one at speed needs up to a
-second to get its attitude back, and meanwhile its rotors push it wherever they point, faster and
-faster; without them it falls, and lies within a stretch that can be told before. None of this
-happens to a robot that touches nothing, whatever it is commanded: the limits are beyond that.
+A robot that touches nothing is never taken for one that was hit: the limits of the hit detector are
+beyond the effect of any command.
 """
 
 from __future__ import annotations
@@ -39,47 +38,48 @@ from math import inf
 from cloudrc.messages import NEVER_NS, ZERO, Cause, Command, GuardState, Vector
 from cloudrc.records import GuardChange
 from cloudrc.world.guard import limits as rules
-from cloudrc.world.guard.hold import Descent, Rest, TakeOff
-from cloudrc.world.guard.limits import RANGE, Limits
+from cloudrc.world.guard.hold import Descent, PositionHold, TakeOff
+from cloudrc.world.guard.limits import COMMAND_MAX, Limits
 from cloudrc.world.readings import Readings
 
-UPSET = 0.2
-"""Cosine of the tilt; the worst commands get to 0.4 without a hit [1]."""
+OVERTURNED_COSINE = 0.2
+"""Cosine of the tilt below which the robot has turned over [1]. Without a hit, the worst commands
+reach 0.4."""
 SPIN_MAX = 3.0
-"""Yaw rate [rad/s]; no command asks for it."""
+"""Largest yaw rate without a hit [rad/s]; no command asks for more."""
 TUMBLE_MAX = 7.0
-"""Rate of roll and pitch [rad/s]; the worst commands get to 5.4 without a hit."""
-JOLT, PULL = 0.8, 40.0e-9
-"""How much a component of the velocity changes at once [m/s]: a hasty touch of the board takes off
-0.5. The rotors add this in time [m/s per ns]."""
+"""Largest rate of roll and pitch without a hit [rad/s]; the worst commands reach 5.4."""
+JOLT_MAX, JOLT_RATE_MAX = 0.8, 40.0e-9
+"""Largest change per axis of the velocity without a hit: JOLT at once [m/s], plus PULL for what the
+rotors add in time [m/s per ns]. A fast touch of the board changes it by 0.5 m/s."""
 
 
 class Hits:
-    """Compares what is sensed now with what was sensed last."""
+    """Detects hits from changes of the readings."""
 
     def __init__(self) -> None:
-        """Begin with nothing to compare with."""
+        """Start without a previous reading."""
         self.forget()
 
     def forget(self) -> None:
-        """What comes next is another flight."""
+        """Forget the last reading: a new flight begins."""
         self._velocity, self._seen_ns = ZERO, NEVER_NS
 
     def felt(self, now_ns: int, readings: Readings) -> Cause | None:
-        """Say what has befallen the robot since the last call; None if nothing has.
+        """Return the kind of hit since the last call; None if there was none.
 
         Args:
             now_ns: World's clock [ns].
-            readings: Of the sensors on board.
+            readings: Readings of the onboard sensors.
         """
         _, _, (vx, vy, vz), (p, q, r), axes = readings
         (ux, uy, uz), seen_ns = self._velocity, self._seen_ns
         self._velocity, self._seen_ns = readings.velocity, now_ns
-        if axes[8] < UPSET:
+        if axes[8] < OVERTURNED_COSINE:
             return Cause.OVERTURNED
         if abs(r) > SPIN_MAX or p * p + q * q > TUMBLE_MAX * TUMBLE_MAX:
             return Cause.SPUN
-        most = JOLT + PULL * (now_ns - seen_ns)
+        most = JOLT_MAX + JOLT_RATE_MAX * (now_ns - seen_ns)
         if seen_ns != NEVER_NS and (
             abs(vx - ux) > most or abs(vy - uy) > most or abs(vz - uz) > most
         ):
@@ -87,43 +87,44 @@ class Hits:
         return None
 
 
-GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # an enum's member is slow to look up
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # looking up a member of an enum is slow
 
 RESUME_COMMANDS = 10
 RESUME_NS = 500_000_000
-"""RESUME_COMMANDS fresh commands within this time end a HOLD [ns].
+"""Time within which RESUME_COMMANDS fresh commands end a HOLD [ns].
 Source: docs/reference/plant.md, "Leaving HOLD"."""
 SETTLE_NS = 1_000_000_000
-"""Least time from one HOLD to the next, and from one TRACK to the next [ns].
+"""Shortest time from one HOLD to the next, and from one TRACK to the next [ns].
 Source: docs/reference/plant.md, "Settling time"; docs/reference/faults.md, "F5"."""
 INVALID_COMMANDS = 5
 IMPOSSIBLE = f"{INVALID_COMMANDS} impossible commands within 1 s"
 INVALID_NS = 1_000_000_000
-"""INVALID_COMMANDS impossible commands within this time end in LAND [ns].
+"""Time within which INVALID_COMMANDS impossible commands lead to LAND [ns].
 Source: docs/reference/faults.md, "F23"."""
 
 
 class Guard:
-    """A state machine on world's clock; starts in GROUND, where no command is flown.
+    """The state machine of the guard, on world's clock; it starts in GROUND.
 
     Attributes:
-        state: Where it is.
-        cause: Why; of one that has touched down in LAND, why it landed.
-        armed: Whether a mission is on: from the operator's start to its end, LAND or ESTOP.
-        reference: What the low-level controller was last told to follow [m/s], shape (3,).
-        yaw_rate: Capped [rad/s]; the published low-level controller holds yaw at 0 regardless.
-        changes: Of the state, since the last `take_changes`.
-        counts: How often a limit changed what was commanded: "limited_speed", "limited_yaw_rate"
-            (commands), "limited_fence" (ticks).
+        state: Current state.
+        cause: Why the guard is in this state; after touch-down in LAND, why it landed.
+        armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
+        reference: Last velocity reference for the low-level controller [m/s], shape (3,).
+        yaw_rate: Capped yaw rate [rad/s]; the published low-level controller ignores it.
+        changes: Changes of the state since the last `take_changes`.
+        counts: How often a limit changed a command: "limited_speed" and "limited_yaw_rate" count
+            commands, "limited_fence" counts ticks.
     """
 
     def __init__(self, limits: Limits) -> None:
-        """Begin on the ground."""
+        """Start on the ground."""
         self._limits = limits
-        self._speed_max = limits.speed_max * rules.JUST_BELOW
-        self._low, self._high = limits.inside()
+        self._speed_max = limits.speed_max * rules.ROUNDING_FACTOR
+        self._low, self._high = limits.inner_corners()
         self._floor, half = self._low[2], 0.5 * limits.speed_max
-        self._rest, self._descent = Rest(self._low, self._high, half), Descent(self._floor, half)
+        self._position_hold = PositionHold(self._low, self._high, half)
+        self._descent = Descent(self._floor, half)
         self._hits, self._take_off = Hits(), TakeOff(limits.fence_low, limits.fence_high)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
@@ -138,76 +139,81 @@ class Guard:
 
     @property
     def brakes(self) -> bool:
-        """Whether the robot is coming to rest, and has no position to hold yet."""
-        return self._rest.brakes
+        """Whether the robot still brakes and has no hold point yet."""
+        return self._position_hold.brakes
 
     @property
     def latched(self) -> bool:
-        """Whether nothing goes on without the operator's acknowledgement."""
+        """Whether only the operator's acknowledgement leads out of this state."""
         return self.state is LAND or self.state is ESTOP
 
     def take_changes(self) -> list[GuardChange]:
-        """Hand over the changes of state since the last call."""
+        """Return the changes of the state since the last call."""
         changes, self.changes = self.changes, []
         return changes
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """The robot stands at its spawn: rotors off, nothing is remembered."""
+        """Reset to GROUND: the robot stands at its spawn with its rotors off."""
         self.forget_commands()
         self._tracked_ns = self._held_ns = -SETTLE_NS
         self._enter(GROUND, now_ns, Cause.SPAWN, cause)
 
     def start_mission(self, now_ns: int) -> None:
-        """The operator starts a mission: from here on fresh commands are flown.
+        """Arm for a mission that the operator starts; from now on fresh commands are flown.
 
-        Not while the operator has to acknowledge first why the robot landed or was stopped.
+        A latched guard ignores this: the operator must acknowledge first.
         """
         if self.latched:
             return
         if not self.armed:
-            self.forget_commands()  # only what is computed for this mission counts
+            self.forget_commands()  # only commands of this mission count
             self._alone_ns = now_ns
         self.armed = True
 
     def end_mission(self, now_ns: int) -> None:
-        """The mission is over: hold here until the operator starts the next one."""
+        """End the mission: hold here until the operator starts the next one."""
         self.armed = False
         if self.state is TRACK:
             self._enter(HOLD, now_ns, Cause.ENDED)
 
     def stop(self, now_ns: int) -> None:
-        """Stop the rotors at once, whatever the robot does."""
+        """Stop the rotors at once, in any state."""
         if self.state is not ESTOP:
             self._enter(ESTOP, now_ns, Cause.STOPPED)
 
     def acknowledge(self, now_ns: int) -> None:
-        """The operator knows why the robot lands or was stopped; no mission is on."""
+        """Release a landing or stop that the operator has acknowledged; this arms nothing."""
         if self.latched and not self._flies:
             self._enter(GROUND, now_ns, self._take_off.condition)
         elif self.state is LAND:
             self._descent.acknowledged = True
 
     def forget_commands(self) -> None:
-        """A new session or mission begins: what came before is no longer fresh."""
+        """Forget earlier commands: a new session or mission begins."""
         self._track_until_ns = self._steady_until_ns = NEVER_NS
         self._fresh_ns.clear()
         self._invalid_ns.clear()
         self._wanted, self.yaw_rate = ZERO, 0.0
 
     def offer(self, command: Command, now_ns: int) -> str | None:
-        """Take a command that the tunnel lets through.
+        """Accept or reject a command that arrived through the tunnel.
 
         Args:
-            command: Any numbers at all.
+            command: A command with any numbers.
             now_ns: World's clock [ns].
 
         Returns:
-            None if it may be flown, else why it is refused: "range", of NaN, too; "future", if it
-            names odometry that has yet to be measured; "stale".
+            None if it is accepted, else the reason: "range" for a value that is too large or NaN;
+            "future" for a basis that is not yet measured; "stale" for a basis that is too old.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
-        if not (abs(x) <= RANGE and abs(y) <= RANGE and abs(z) <= RANGE and abs(yaw_rate) <= RANGE):
+        if not (
+            abs(x) <= COMMAND_MAX
+            and abs(y) <= COMMAND_MAX
+            and abs(z) <= COMMAND_MAX
+            and abs(yaw_rate) <= COMMAND_MAX
+        ):
             self._note_invalid(now_ns)
             return "range"
         limits = self._limits
@@ -219,8 +225,8 @@ class Guard:
             return "stale"
         if self.armed:
             fresh_until_ns = command.basis_stamp_ns + limits.command_age_max_ns
-            self._wanted = rules.shortened(velocity, self._speed_max)
-            self.yaw_rate = rules.within(yaw_rate, -limits.yaw_rate_max, limits.yaw_rate_max)
+            self._wanted = rules.limit_length(velocity, self._speed_max)
+            self.yaw_rate = rules.clamp(yaw_rate, -limits.yaw_rate_max, limits.yaw_rate_max)
             if self._wanted is not velocity:
                 self.counts["limited_speed"] += 1
             if self.yaw_rate != yaw_rate:
@@ -236,22 +242,22 @@ class Guard:
         return None
 
     def _leave_hold(self, now_ns: int, fresh_until_ns: int) -> None:
-        """One more fresh command has come: fly again once the link has proven itself."""
+        """Count a fresh command; after enough of them in a short time, fly again."""
         self._fresh_ns.append(now_ns)
         took_ns = now_ns - self._fresh_ns[0]
         enough = len(self._fresh_ns) == RESUME_COMMANDS and took_ns <= RESUME_NS
         if enough and self._settled(now_ns, fresh_until_ns):
-            told = f"{RESUME_COMMANDS} fresh commands within {took_ns * 1e-9:.3f} s"
-            self._enter(TRACK, now_ns, Cause.COMMANDS, told)
+            text = f"{RESUME_COMMANDS} fresh commands within {took_ns * 1e-9:.3f} s"
+            self._enter(TRACK, now_ns, Cause.COMMANDS, text)
             self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Whether TRACK may be, and it and the next HOLD keep their distance from the last ones."""
+        """Tell whether TRACK may begin: a take-off is allowed and SETTLE_NS has passed."""
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS
 
     def _note_invalid(self, now_ns: int) -> None:
-        """An honest cloud never says that: one that goes on saying it is not flown any more."""
+        """Count an impossible command, which no honest cloud sends; after some of them, land."""
         self._invalid_ns.append(now_ns)
         if len(self._invalid_ns) < INVALID_COMMANDS or now_ns - self._invalid_ns[0] > INVALID_NS:
             return
@@ -259,17 +265,17 @@ class Guard:
             self._enter(LAND, now_ns, Cause.IMPOSSIBLE, IMPOSSIBLE)
 
     def tick(self, now_ns: int, readings: Readings, dt: float) -> Vector | None:
-        """Say what the low-level controller shall follow now.
+        """Advance by one tick and return the reference for the low-level controller.
 
         Args:
             now_ns: World's clock [ns].
-            readings: Of the sensors on board.
+            readings: Readings of the onboard sensors.
             dt: Time since the last tick [s].
 
         Returns:
-            Velocity reference [m/s], shape (3,); None while the rotors stand still.
+            Velocity reference [m/s], shape (3,); None while the rotors are stopped.
         """
-        # The usual case: the same command as in the last tick, and far from the fence.
+        # The usual case: the same command as in the last tick, far from the fence.
         if now_ns <= self._steady_until_ns and self.reference is self._wanted:
             return self.reference
         if self._flies and (hit := self._hits.felt(now_ns, readings)):
@@ -278,43 +284,45 @@ class Guard:
             self._take_off.look(readings, self._flies)
         if now_ns <= self._track_until_ns:
             change_max = self._limits.acceleration_max * dt
-            reference = rules.towards(self.reference, self._wanted, change_max)
+            reference = rules.step_towards(self.reference, self._wanted, change_max)
         else:
             self._look_after_itself(now_ns, readings)
             if not self._flies:
                 return None
             sink = self._descent.speed if self.state is LAND else 0.0
-            reference = self._rest.follow(self.reference, readings, sink, dt)
+            reference = self._position_hold.follow(self.reference, readings, sink, dt)
         self._follow(reference, now_ns, readings, dt)
         return self.reference
 
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
-        """Take a reference as far as the robot stays upright, and inside the fence."""
+        """Set the reference, limited so that the robot stays upright and inside the fence."""
         climb, position = readings.velocity[2], readings.position
-        if reference[2] < climb - rules.SINK_LAG:
-            reference = rules.upright(reference, self.reference, climb, self._speed_max)
-        if rules.is_far(reference, position, self._low, self._high):
-            self._steady_until_ns = min(self._track_until_ns, now_ns + rules.GLIMPSE_NS)
+        if reference[2] < climb - rules.SINK_LEAD_MAX:
+            reference = rules.limit_sink(reference, self.reference, climb, self._speed_max)
+        if rules.is_far_from_fence(reference, position, self._low, self._high):
+            self._steady_until_ns = min(self._track_until_ns, now_ns + rules.RECHECK_NS)
         else:
             self._steady_until_ns = NEVER_NS
-            inside = rules.fenced(reference, position, self._low, self._high)
+            inside = rules.limit_to_fence(reference, position, self._low, self._high)
             if inside != reference:
                 self.counts["limited_fence"] += 1
-                inside = rules.held_back(self.reference, inside, self._limits.acceleration_max * dt)
-                reference = rules.shortened(inside, self._speed_max)
+                inside = rules.limit_growth(
+                    self.reference, inside, self._limits.acceleration_max * dt
+                )
+                reference = rules.limit_length(inside, self._speed_max)
         if now_ns < self._ramp_until_ns:
-            reference = rules.held_back(self.reference, reference, rules.BRAKE * dt)
+            reference = rules.limit_growth(self.reference, reference, rules.BRAKE * dt)
         self.reference = reference
 
     def _look_after_itself(self, now_ns: int, readings: Readings) -> None:
-        """Change the state where no fresh command leads."""
+        """Change the state while there is no fresh command."""
         state, limits = self.state, self._limits
         if state is TRACK and self._track_until_ns == NEVER_NS:
             self._enter(HOLD, now_ns, Cause.SESSION)
         elif state is TRACK:
-            self._enter(HOLD, now_ns, Cause.SILENCE, limits.too_old(now_ns - self._track_until_ns))
+            self._enter(HOLD, now_ns, Cause.SILENCE, limits.age_text(now_ns - self._track_until_ns))
         elif self.armed and now_ns - self._alone_ns > limits.alone_max_ns(self._flies):
-            self._enter(LAND, now_ns, Cause.ALONE, limits.left_alone(self._flies))
+            self._enter(LAND, now_ns, Cause.ALONE, limits.wait_text(self._flies))
             self._flies = state is HOLD  # not in GROUND
         elif state is LAND and self._flies:
             if self._descent.may_stop(readings):
@@ -323,15 +331,15 @@ class Guard:
                 state = GROUND if self._descent.acknowledged else LAND
                 self._enter(state, now_ns, Cause.DOWN)
                 self._flies, self.reference = False, ZERO
-                self._take_off.forget(stopped=True)  # on a pipe, perhaps, from which it slides off
+                self._take_off.forget(stopped=True)  # it may stand on a pipe and slide off
         if self.state is HOLD and self._take_off.may_end(readings):
             self._enter(GROUND, now_ns, Cause.NOT_OFF)
 
-    def _enter(self, state: GuardState, now_ns: int, cause: Cause, told: str = "") -> None:
-        """Change the state; every change is noted with its cause, in words of its own if `told`."""
+    def _enter(self, state: GuardState, now_ns: int, cause: Cause, text: str = "") -> None:
+        """Change the state and note the change; `text` replaces the words of the cause."""
         self.cause = self.cause if cause is Cause.DOWN and state is LAND else cause
-        if self.state is not HOLD or state is not LAND:  # goes down where it has held
-            self._rest.forget()
+        if self.state is not HOLD or state is not LAND:  # LAND descends from the hold point
+            self._position_hold.forget()
         self.state, self._flies = state, state is not GROUND and state is not ESTOP
         self._track_until_ns = self._steady_until_ns = self._ramp_until_ns = NEVER_NS
         self._low = (*self._low[:2], -inf if state is LAND else self._floor)
@@ -347,4 +355,4 @@ class Guard:
                 self.reference = ZERO
                 self._hits.forget()
                 self._take_off.forget(stopped=state is ESTOP)
-        self.changes.append(GuardChange(now_ns, state, told or cause.words))
+        self.changes.append(GuardChange(now_ns, state, text or cause.words))

@@ -1,14 +1,10 @@
-"""A robot in free air under the guard, and clouds that command it.
+"""Helpers for tests of the guard: a guard alone, a flying robot with hostile clouds, and proofs.
 
-A guard without a robot: commands, readings and time as a test writes them.
-
-Runs plain Python on all 64-bit floats at once: branches are explored, z3 answers.
-
-A `Symbol` stands for any float. Where the code under test compares, the run forks: each run takes
-one way, and what was found true on it is its path. Comparisons, sums, products and negation are
-those of IEEE 754, bit for bit, and so is division by a power of two. Other divisions and square
-roots take z3 minutes; they are replaced by what correct rounding promises of them, which is enough
-for bounds.
+A proof runs plain Python for all 64-bit floats at once, with z3. A `Symbol` stands for any float.
+At each comparison the run forks; a run takes one branch, and the conditions that hold on it are its
+path. Comparisons, sums, products, negation and division by a power of two are those of IEEE 754,
+bit by bit. Other divisions and square roots would take z3 minutes. They are replaced by bounds that
+correct rounding guarantees.
 """
 
 from __future__ import annotations
@@ -37,31 +33,31 @@ LIMITS = Limits(fence.LOW, fence.HIGH)
 
 
 def command(velocity: Vector = (1.0, 0.0, 0.0), basis_ns: int = 0, yaw_rate: float = 0.0):
-    """A command that was computed from odometry of `basis_ns`."""
+    """Return a command that was computed from odometry of `basis_ns`."""
     return Command(0, basis_ns, 0, velocity, yaw_rate)
 
 
 def sensed(position: Vector = HERE, velocity: Vector = ZERO) -> Readings:
-    """What the sensors of an upright robot say."""
+    """Return the readings of an upright robot."""
     return Readings.of((*position, *UPRIGHT), (*velocity, *ZERO))
 
 
 def armed(limits: Limits = LIMITS, now_ns: int = 0) -> Guard:
-    """On the ground, its mission started."""
+    """Return a guard in GROUND with a started mission."""
     guard = Guard(limits)
     guard.start_mission(now_ns)
     return guard
 
 
 def tracking(velocity: Vector = (1.0, 0.0, 0.0), limits: Limits = LIMITS) -> Guard:
-    """Flying since 0 ns by a command with a basis of 0 ns."""
+    """Return a guard in TRACK since 0 ns, by a command with a basis of 0 ns."""
     guard = armed(limits)
     assert guard.offer(command(velocity), 0) is None
     return guard
 
 
 def run(guard, start_ns, end_ns, position=HERE, velocity=ZERO):
-    """Tick through a time with the sensors standing still; returns the references."""
+    """Tick with constant readings; return the references."""
     return [
         guard.tick(now_ns, sensed(position, velocity), DT)
         for now_ns in range(start_ns, end_ns, TICK)
@@ -69,7 +65,7 @@ def run(guard, start_ns, end_ns, position=HERE, velocity=ZERO):
 
 
 def feed(guard, start_ns, count, velocity=(1.0, 0.0, 0.0), every_ns=10 * MS, position=HERE):
-    """Offer fresh commands and tick; returns the instant after the last one."""
+    """Give fresh commands and tick; return the time after the last one."""
     now_ns = start_ns
     for _ in range(count):
         guard.offer(command(velocity, basis_ns=now_ns), now_ns)
@@ -79,7 +75,7 @@ def feed(guard, start_ns, count, velocity=(1.0, 0.0, 0.0), every_ns=10 * MS, pos
 
 
 def holding(limits: Limits = LIMITS):
-    """In HOLD since 252 ms, at rest since; a mission is on."""
+    """Return a guard in HOLD in a mission, at rest, at 2 s."""
     guard = tracking(limits=limits)
     run(guard, 0, 2000 * MS)
     assert guard.state is GuardState.HOLD
@@ -87,7 +83,7 @@ def holding(limits: Limits = LIMITS):
 
 
 def landing(limits: Limits = LIMITS):
-    """In LAND because of impossible commands; at 2 s."""
+    """Return a guard in LAND after impossible commands, at 2 s."""
     guard = holding(limits)
     for _ in range(5):
         guard.offer(command((float("nan"), 0.0, 0.0)), 2000 * MS)
@@ -96,7 +92,7 @@ def landing(limits: Limits = LIMITS):
 
 
 def states(guard):
-    """The states entered since the last call."""
+    """Return the states entered since the last call."""
     return [change.state for change in guard.take_changes()]
 
 
@@ -124,7 +120,7 @@ class Flight:
         return hypot(*self.readings.velocity)
 
     def fly(self, seconds, policy=None):
-        """Go on; a policy gives the command, None is silence."""
+        """Fly on; the policy gives the commands, None means silence."""
         for _ in range(round(seconds * SECOND / PERIOD_NS)):
             if policy is not None:
                 velocity = policy(self) if callable(policy) else policy
@@ -138,7 +134,7 @@ class Flight:
 
 
 def hostile(seed):
-    """Jumps between extremes, at random instants."""
+    """Make a policy that jumps between extreme velocities at random times."""
     rng, until_ns, velocity = Random(seed), 0, UP
 
     def policy(flight):
@@ -156,7 +152,7 @@ LARGEST = sys.float_info.max
 
 
 class Symbol:
-    """Any float that fulfils the path so far."""
+    """Any float that satisfies the path of its run."""
 
     def __init__(self, run: Run, term: z3.FPRef) -> None:
         self.run, self.term = run, term
@@ -190,9 +186,9 @@ class Symbol:
     __rmul__ = __mul__
 
     def __truediv__(self, other):
-        """Of n >= 0 by d > 0: a float >= 0, not NaN; finite if n is finite and d at least 0.1.
+        """Divide n >= 0 by d >= 0.1, both finite: the quotient is any finite float >= 0.
 
-        By a power of two it is the multiplication by its inverse, of any n.
+        Division by a power of two is exact, for any n.
         """
         if isinstance(other, float) and frexp(other)[0] == 0.5:
             return self * (1.0 / other)
@@ -217,7 +213,7 @@ class Symbol:
 
 
 class Run:
-    """One way through the code."""
+    """One path through the code."""
 
     def __init__(self, decisions: list[bool]) -> None:
         self.decisions, self.taken = decisions, 0
@@ -225,16 +221,16 @@ class Run:
         self.names = 0
 
     def fresh(self, name: str) -> Symbol:
-        """A float of which nothing is known."""
+        """Return a symbol for any float at all."""
         self.names += 1
         return Symbol(self, z3.FP(f"{name}_{self.names}", DOUBLE))
 
     def learn(self, fact: z3.BoolRef) -> None:
-        """From here on it is so."""
+        """Add a condition to the path."""
         self.path.append(fact)
 
     def take(self, condition: z3.BoolRef) -> bool:
-        """Which way this run goes; the other one is for another run."""
+        """Choose the branch of this run; another run takes the other branch."""
         if self.taken == len(self.decisions):
             self.decisions.append(True)
         decision = self.decisions[self.taken]
@@ -243,23 +239,23 @@ class Run:
         return decision
 
     def prove(self, claim: z3.BoolRef) -> None:
-        """Fail with a counterexample, if there is one on this path."""
+        """Fail if there is a counterexample on this path."""
         solver = z3.Solver()
         solver.add(*self.path, z3.Not(claim))
         answer = solver.check()
         assert answer == z3.unsat, f"{answer}: {solver.model() if answer == z3.sat else claim}"
 
     def is_possible(self) -> bool:
-        """Whether any float goes this way."""
+        """Tell whether any float takes this path."""
         solver = z3.Solver()
         solver.add(*self.path)
         return solver.check() != z3.unsat
 
 
 def root(x: Symbol | float, top: float = LARGEST) -> Symbol | float:
-    """Of x >= 0, finite: a float >= 0, finite; up to `top` no more than the root of `top`.
+    """Return the square root of a finite x >= 0: a finite float >= 0.
 
-    Rounding keeps what is in order in order: correctly rounded, a root never falls as x grows.
+    For x up to `top` it is at most the root of `top`: a correctly rounded root is monotonic.
     """
     if isinstance(x, float):
         return sqrt(x)
@@ -271,7 +267,7 @@ def root(x: Symbol | float, top: float = LARGEST) -> Symbol | float:
 
 
 def everywhere(check: Callable[[Run], None]) -> int:
-    """Run `check` on every path; returns how many are possible."""
+    """Run `check` on every path; return the number of possible paths."""
     decisions: list[bool] = []
     paths = 0
     while True:

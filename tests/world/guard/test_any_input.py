@@ -1,7 +1,7 @@
-"""The whole guard, with any commands and any readings: what it lets through is inside its bounds.
+"""For any commands and readings, the guard's reference stays within its bounds.
 
-Each case is a flight of its own: what the sensors say at first may be anything, but from there on
-it changes no faster than without a hit, which would stop the rotors.
+Each case is one flight. The first reading may be anything; the next one differs from it by no more
+than without a hit, because a hit would stop the rotors.
 """
 
 import random
@@ -14,53 +14,53 @@ from hypothesis import given, seed, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard.limits import RANGE, growth
-from cloudrc.world.guard.state import JOLT
+from cloudrc.world.guard.limits import COMMAND_MAX, growth
+from cloudrc.world.guard.state import JOLT_MAX
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, sensed
 from tests.world.guard.test_rules import ANY, PLACES, SPECIAL, SPECIAL_BAD, SPEEDS, VECTORS
 
-TAKEN = st.tuples(*[st.floats(-RANGE, RANGE)] * 3)
-"""What is not refused, however strange."""
+TAKEN = st.tuples(*[st.floats(-COMMAND_MAX, COMMAND_MAX)] * 3)
+"""Values that a command may have without being rejected."""
 CASES_AT_ONCE = 4
 CASE = st.tuples(
     st.one_of(SPEEDS, TAKEN),
     st.one_of(VECTORS, TAKEN, SPEEDS, SPEEDS),
-    st.one_of(ANY, st.floats(-RANGE, RANGE)),
+    st.one_of(ANY, st.floats(-COMMAND_MAX, COMMAND_MAX)),
     st.one_of(st.just(None), PLACES, PLACES, VECTORS),
     st.one_of(SPEEDS, VECTORS),
-    st.tuples(*[st.floats(-JOLT, JOLT)] * 3),
+    st.tuples(*[st.floats(-JOLT_MAX, JOLT_MAX)] * 3),
     st.integers(-2, 300),
     st.sampled_from([TICK, TICK, 300 * MS]),
 )
 CASES = st.lists(CASE, min_size=CASES_AT_ONCE, max_size=CASES_AT_ONCE)
-ASIDE = 0.04
-"""The robot moves by less than this [m] in a tick."""
+STEP_MAX = 0.04
+"""The robot moves by less than this in a tick [m]."""
 
 
 def check_cases(cases):
-    """Whatever is commanded and sensed, what is flown is finite, in the caps, and can stop."""
+    """Check cases; return how often each state was reached."""
     seen = Counter(check_case(*case) for case in cases)
     assert seen.total() == len(cases)
     return seen
 
 
 def check_case(first, then, yaw_rate, place, velocity, change, age_ms, after_ns):
-    """One command is flown, then comes another, or silence; gives the state that this ends in."""
+    """Fly one command, then another one or silence; return the last state."""
     guard = armed()
     position = (1.0, 1.0, 1.0) if place is None else place
     guard.offer(command(first), 0)
     check_flown(guard, guard.tick(0, sensed(position, velocity), 1.0), position)
     before, limited = guard.reference, guard.counts["limited_fence"]
-    for _ in range(5 if age_ms < 0 else 1):  # five from the future: LAND
+    for _ in range(5 if age_ms < 0 else 1):  # five commands from the future lead to LAND
         guard.offer(command(then, after_ns - age_ms * MS, yaw_rate), after_ns)
     if place is not None:
-        position = tuple(at + ASIDE * d for at, d in zip(position, change, strict=True))
+        position = tuple(at + STEP_MAX * d for at, d in zip(position, change, strict=True))
     velocity = tuple(v + d if abs(v) < 1e3 else v for v, d in zip(velocity, change, strict=True))
     after = guard.tick(after_ns, sensed(position, velocity), DT)
     check_flown(guard, after, position)
     if place is None and guard.state is GuardState.TRACK:
-        # No nearer to the fence: nothing grows beyond the cap; only where the fence wants the robot
-        # slower that way does it change by more.
+        # Far from the fence nothing grows beyond the cap. Only near it, where the robot must be
+        # slower, the reference may change by more.
         step_max = 12.0 * DT * (1 + 1e-9)
         grown = hypot(*(growth(a, b) for a, b in zip(before, after, strict=True)))
         step = hypot(*(b - a for a, b in zip(before, after, strict=True)))
@@ -70,10 +70,10 @@ def check_case(first, then, yaw_rate, place, velocity, change, age_ms, after_ns)
 
 
 def check_flown(guard, reference, position):
-    """Inside the caps, and slow enough to stop before the fence."""
+    """Check that a reference is within the caps and lets the robot stop before the fence."""
     assert abs(guard.yaw_rate) <= LIMITS.yaw_rate_max
     assert reference is not None
-    assert hypot(*reference) <= LIMITS.speed_max  # so no component is infinite or not a number
+    assert hypot(*reference) <= LIMITS.speed_max  # therefore no component is infinite or NaN
     for v, at, low, high in zip(
         reference, position, LIMITS.fence_low, LIMITS.fence_high, strict=True
     ):
@@ -85,29 +85,29 @@ def check_flown(guard, reference, position):
 @pytest.mark.promise("commands-within-caps")
 @given(CASES)
 @settings(max_examples=10_000 // CASES_AT_ONCE, deadline=None)
-def test_whatever_is_commanded_and_sensed_what_is_flown_is_inside_the_caps(cases):
+def test_any_input_is_flown_inside_the_caps(cases):
     check_cases(cases)
 
 
 def any_float(rng):
-    """Of any bits, or of any size up to the range, or one of those that trouble arithmetic."""
+    """Draw a float of any bits, of any size up to COMMAND_MAX, or a special one."""
     (value,) = struct.unpack("d", rng.randbytes(8))
-    small = rng.choice((-1.0, 1.0)) * RANGE * 10.0 ** rng.uniform(-320.0, 0.0)
+    small = rng.choice((-1.0, 1.0)) * COMMAND_MAX * 10.0 ** rng.uniform(-320.0, 0.0)
     return rng.choice((value, small, rng.choice(SPECIAL_BAD)))
 
 
 def vector(rng, low=-8.0, high=8.0):
-    """Mostly a speed [m/s] or place [m] between two bounds, else three numbers of any kind."""
+    """Draw a velocity [m/s] or position [m] between two bounds, or three numbers of any kind."""
     if rng.random() < 0.7:
         return tuple(rng.uniform(low, high) for _ in range(3))
     return tuple(any_float(rng) for _ in range(3))
 
 
 def case_by_chance(rng):
-    """As CASE has them, a hundred times faster, but smaller cases are not looked for."""
-    first = tuple(v if abs(v) <= RANGE else 0.0 for v in vector(rng))
+    """Draw cases like CASE a hundred times faster, without shrinking."""
+    first = tuple(v if abs(v) <= COMMAND_MAX else 0.0 for v in vector(rng))
     place = rng.choice((None, vector(rng, -4.0, 10.0), vector(rng, 0.0, 2.5)))
-    change = tuple(rng.uniform(-JOLT, JOLT) for _ in range(3))
+    change = tuple(rng.uniform(-JOLT_MAX, JOLT_MAX) for _ in range(3))
     after_ns = rng.choice((TICK, TICK, 300 * MS))
     age_ms = rng.randint(-2, 300)
     return first, vector(rng), any_float(rng), place, vector(rng), change, age_ms, after_ns
@@ -115,7 +115,7 @@ def case_by_chance(rng):
 
 @pytest.mark.full
 def test_a_million_cases_of_hypothesis_stay_inside_the_caps(figure):
-    parts, seen = 25, Counter()  # it remembers all that it has tried in a part
+    parts, seen = 25, Counter()  # hypothesis remembers all examples of a part
     for part in range(parts):
 
         @seed(part)
@@ -141,8 +141,10 @@ def test_a_million_commands_and_readings_stay_inside_the_caps(figure):
 
 
 @pytest.mark.parametrize("axis", range(4))
-@pytest.mark.parametrize("value", [v for v in (*SPECIAL, RANGE, -RANGE) if abs(v) <= RANGE])
-def test_every_special_float_that_is_taken_is_flown_inside_the_caps(axis, value):
+@pytest.mark.parametrize(
+    "value", [v for v in (*SPECIAL, COMMAND_MAX, -COMMAND_MAX) if abs(v) <= COMMAND_MAX]
+)
+def test_every_accepted_special_float_is_flown_in_the_caps(axis, value):
     values = [0.5, 0.5, 0.5, 0.5]
     values[axis] = value
     velocity, yaw_rate = tuple(values[:3]), values[3]

@@ -1,4 +1,4 @@
-"""Why the guard is in its state: what telemetry tells of it, beside the words of each change."""
+"""The cause that telemetry gives for the guard's state."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def told(guard: Guard) -> tuple[GuardState, Cause]:
     return guard.state, guard.cause
 
 
-def test_a_mission_from_its_first_command_to_its_end():
+def test_causes_of_a_mission_from_command_to_end():
     guard = armed()
     assert told(guard) == (GROUND, Cause.SPAWN)
     guard.offer(command(), 0)
@@ -38,7 +38,7 @@ def test_a_mission_from_its_first_command_to_its_end():
     assert told(guard) == (HOLD, Cause.ENDED)
 
 
-def test_silence_and_what_ends_it():
+def test_causes_of_silence_and_its_end():
     guard = holding()
     assert told(guard) == (HOLD, Cause.SILENCE)
     now_ns = feed(guard, 2 * SECOND, 20)
@@ -48,7 +48,7 @@ def test_silence_and_what_ends_it():
     assert told(guard) == (HOLD, Cause.SESSION)
 
 
-def test_of_one_that_has_landed_it_is_why_it_landed():
+def test_after_touch_down_the_cause_is_that_of_the_landing():
     guard = landing()
     run(guard, 2 * SECOND, 3 * SECOND, LOW, (0.0, 0.0, -0.5))
     assert None in run(guard, 3 * SECOND, 5 * SECOND, LOW)
@@ -57,7 +57,7 @@ def test_of_one_that_has_landed_it_is_why_it_landed():
     assert guard.cause in (Cause.ALONE, Cause.IMPOSSIBLE)
 
 
-def test_a_landing_that_was_acknowledged_low_ends_in_what_has_happened():
+def test_a_landing_acknowledged_low_has_its_causes():
     guard = landing()
     run(guard, 2 * SECOND, 3 * SECOND, LOW, (0.0, 0.0, -0.5))
     guard.acknowledge(3 * SECOND)
@@ -65,7 +65,7 @@ def test_a_landing_that_was_acknowledged_low_ends_in_what_has_happened():
     assert told(guard) == (GROUND, Cause.DOWN)
 
 
-def test_impossible_commands_and_a_minute_alone():
+def test_causes_of_impossible_commands_and_long_silence():
     guard = tracking()
     for _ in range(5):
         guard.offer(command((nan, 0.0, 0.0)), 0)
@@ -75,7 +75,7 @@ def test_impossible_commands_and_a_minute_alone():
     assert told(guard) == (LAND, Cause.ALONE)
 
 
-def test_a_stop_and_how_it_is_left():
+def test_causes_of_a_stop_and_its_release():
     guard = tracking()
     guard.stop(SECOND)
     assert told(guard) == (ESTOP, Cause.STOPPED)
@@ -87,7 +87,7 @@ def test_a_stop_and_how_it_is_left():
     assert told(guard) == (GROUND, Cause.ACKNOWLEDGED)
 
 
-def test_carried_back_to_where_missions_start():
+def test_cause_of_a_reset_to_the_spawn():
     guard = tracking()
     guard.put_on_ground(SECOND, "mission starts from spawn")
     assert told(guard) == (GROUND, Cause.SPAWN)

@@ -1,4 +1,4 @@
-"""The guard: a landing that the operator acknowledges before the robot stands."""
+"""A landing that the operator acknowledges before touch-down."""
 
 from dataclasses import replace
 from math import nan
@@ -22,10 +22,8 @@ SINKS = (0.0, 0.0, -LAND_SPEED)
 @pytest.mark.parametrize(
     ("position", "velocity"), [(NEAR, SINKS), (HERE, (0.0, 0.0, -LAND_SPEED / 2)), (HERE, ZERO)]
 )
-def test_a_landing_that_is_acknowledged_low_or_on_something_goes_on_to_touch_down(
-    position, velocity
-):
-    """Held there it would scrape along, or climb back into what stands beside it."""
+def test_a_landing_acknowledged_too_low_goes_on_to_touch_down(position, velocity):
+    """A HOLD there would scrape along the ground or climb into an obstacle."""
     guard = landing()
     run(guard, 2 * SECOND, 3 * SECOND, position, SINKS)
     guard.acknowledge(3 * SECOND)
@@ -41,7 +39,7 @@ def test_a_landing_that_is_acknowledged_low_or_on_something_goes_on_to_touch_dow
     assert guard.state is TRACK
 
 
-def test_a_landing_that_is_acknowledged_while_it_still_climbs_holds_once_it_sinks():
+def test_a_landing_acknowledged_in_a_climb_holds_once_it_sinks():
     guard, now_ns = landing(), 2 * SECOND
     guard.acknowledge(now_ns)
     for climb in (0.5, 0.0, -0.25):
@@ -64,8 +62,8 @@ def test_an_acknowledgement_does_not_count_for_the_next_landing():
     assert guard.state is LAND
 
 
-def test_a_slow_robot_lands_slowly_and_its_landing_can_be_called_off():
-    """At most 0.3 m/s: it sinks at 0.15 m/s."""
+def test_a_slow_landing_can_be_acknowledged_in_the_air():
+    """With a cap of 0.3 m/s the robot sinks at 0.15 m/s."""
     guard = landing(Limits(fence.LOW, fence.HIGH, speed_max=0.3))
     assert run(guard, 2 * SECOND, 3 * SECOND, velocity=(0.0, 0.0, -0.15))[-1] == (0.0, 0.0, -0.15)
     guard.acknowledge(3 * SECOND)
@@ -74,8 +72,8 @@ def test_a_slow_robot_lands_slowly_and_its_landing_can_be_called_off():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
-def test_a_robot_that_lands_near_the_fence_touches_down_though_it_is_pulled_inwards(share):
-    """The pull takes some of the descent's speed: both together are no faster than the creep."""
+def test_a_landing_near_the_fence_touches_down(share):
+    """Descent and return from the margin together are no faster than CREEP_SPEED."""
     x, y, _ = fence.HIGH
     guard, place = landing(), (x - share, y - share, 0.1)
     stood = run(guard, 2 * SECOND, 4 * SECOND, place)
@@ -84,14 +82,14 @@ def test_a_robot_that_lands_near_the_fence_touches_down_though_it_is_pulled_inwa
 
 
 @pytest.mark.parametrize("speed_max", [0.01, 0.05, 0.19, 0.2, 0.25, 6.0])
-def test_a_robot_that_sinks_slowly_by_its_cap_has_not_touched_down(speed_max):
+def test_slow_sinking_under_a_low_cap_is_no_touch_down(speed_max):
     guard = landing(replace(LIMITS, speed_max=speed_max))
     sinks = (0.0, 0.0, -0.5 * min(LAND_SPEED, 0.5 * speed_max))
     assert None not in run(guard, 2 * SECOND, 5 * SECOND, velocity=sinks)
     assert None in run(guard, 5 * SECOND, 6 * SECOND)
 
 
-def test_with_the_lowest_cap_it_lands_on_the_floor_and_falls_onto_nothing():
+def test_with_the_lowest_cap_it_lands_on_the_floor():
     flight = Flight(Simulator("pelican", "empty"), replace(LIMITS, speed_max=0.1))
     flight.fly(6.0, (0.0, 0.0, 0.1))
     height = flight.readings.position[2]

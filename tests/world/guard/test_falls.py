@@ -1,4 +1,4 @@
-"""What becomes of a robot whose rotors have stopped: where it comes to lie, and takes off again."""
+"""Where a robot with stopped rotors comes to lie, and how it takes off again."""
 
 from dataclasses import replace
 from random import Random
@@ -8,7 +8,13 @@ import pytest
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.hold import TAKE_OFF_MARGIN
-from cloudrc.world.guard.limits import BOUNCE, CREEP, SLIDE, TUMBLE, fall_time
+from cloudrc.world.guard.limits import (
+    BOUNCE_TIME,
+    CREEP_SPEED,
+    SLIDE_TIME,
+    TUMBLE_DISTANCE,
+    fall_time,
+)
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.simulator import Simulator
 from tests.world.guard.conftest import LIMITS, UP, Flight, hostile
@@ -20,7 +26,7 @@ def simulator():
 
 
 def check_stopped(simulator, seed, figure):
-    """docs/safety.md tells people how far to stay away: more than it has ever gone."""
+    """docs/safety.md names a distance that no fall has reached."""
     flight = Flight(simulator)
     flight.fly(1.0, UP)
     flight.fly(Random(seed).uniform(1.0, 12.0), hostile(seed))
@@ -31,30 +37,30 @@ def check_stopped(simulator, seed, figure):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_stopped_at_any_instant_it_comes_to_lie_within_what_is_told(simulator, seed, figure):
+def test_a_stopped_robot_lies_within_the_documented_distance(simulator, seed, figure):
     check_stopped(simulator, seed, figure)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("seed", range(5, 400))
-def test_stopped_at_four_hundred_instants_likewise(simulator, seed, figure):
+def test_a_stopped_robot_lies_as_documented_in_400_falls(simulator, seed, figure):
     check_stopped(simulator, seed, figure)
 
 
-# What the fence counts on where a hit stops the rotors: `hit_speed` in guard_rules.py.
+# The distance that `hit_speed_max` assumes for a hit.
 
 
 def beyond(simulator, seed):
-    """How far a robot that is stopped lies beyond what the fence counts on, towards each side [m].
+    """Return by how much a stopped robot exceeds the assumed distance, towards each side [m].
 
-    Only sides that it flies towards faster than it may creep anywhere.
+    Only sides count that it flies towards faster than CREEP_SPEED.
     """
     flight = Flight(simulator)
     flight.fly(1.0, UP)
     flight.fly(Random(seed).uniform(0.3, 5.0), hostile(seed))
     (x, y, z), (vx, vy, _) = flight.readings.position, flight.readings.velocity
     flight.guard.stop(flight.now_ns)
-    falls = fall_time(z - FLOOR_MARGIN) + SLIDE + BOUNCE
+    falls = fall_time(z - FLOOR_MARGIN) + SLIDE_TIME + BOUNCE_TIME
     speeds = (vx, -vx, vy, -vy)
     ways = [0.0] * 4
     for _ in range(30):
@@ -62,9 +68,9 @@ def beyond(simulator, seed):
         xn, yn, _ = flight.readings.position
         ways = list(map(max, ways, (xn - x, x - xn, yn - y, y - yn)))
     return [
-        way - speed * falls - TUMBLE
+        way - speed * falls - TUMBLE_DISTANCE
         for way, speed in zip(ways, speeds, strict=True)
-        if speed > CREEP
+        if speed > CREEP_SPEED
     ]
 
 
@@ -78,20 +84,20 @@ def check_falls(simulator, seeds, figure, share_max, farthest_max):
     assert max(excess) <= farthest_max
 
 
-def test_after_a_fall_it_seldom_lies_farther_than_the_fence_counts_on(simulator, figure):
+def test_after_a_fall_it_seldom_lies_beyond_the_margin(simulator, figure):
     check_falls(simulator, range(40), figure, 0.10, 1.5)
 
 
 @pytest.mark.full
-def test_after_a_fall_it_seldom_lies_farther_in_two_thousand_falls(simulator, figure):
+def test_after_a_fall_it_seldom_lies_beyond_it_in_2000_falls(simulator, figure):
     check_falls(simulator, range(2000), figure, 0.05, 1.5)
 
 
-# Where it lies tilted near a wall it scrapes along the floor before it rises.
+# A tilted robot scrapes along the floor before it rises.
 
 
 def scrapes(simulator, seed, room):
-    """How near it comes to a wall so far away when it takes off from where it came to lie [m]."""
+    """Return its smallest distance to a wall when it takes off from where it fell [m]."""
     rng, flight = Random(seed), Flight(simulator)
     flight.fly(1.0, UP)
     flight.fly(rng.uniform(0.3, 5.0), hostile(seed))
@@ -115,15 +121,13 @@ def scrapes(simulator, seed, room):
 
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("seed", [48, 86, 90, 101])
-def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence(simulator, seed):
-    """Those of 400 that get farthest: lying tilted, it is pushed along before it rises."""
+def test_a_take_off_scrapes_less_far_than_to_the_fence(simulator, seed):
+    """Check the seeds with the longest ways, of 400."""
     assert scrapes(simulator, seed, TAKE_OFF_MARGIN) > 0.02
 
 
 @pytest.mark.full
-def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence_in_four_hundred(
-    simulator, figure
-):
+def test_a_take_off_scrapes_less_far_in_400_take_offs(simulator, figure):
     seeds = range(400)
     nearest = min(scrapes(simulator, seed, TAKE_OFF_MARGIN) for seed in seeds)
     name = "taken off 0.5 m from the fence: nearest to it"
@@ -133,7 +137,7 @@ def test_where_it_may_take_off_it_scrapes_not_as_far_as_the_fence_in_four_hundre
 
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("nearer", [0.01, -0.01])
-def test_stopped_near_a_wall_it_takes_off_only_so_far_from_it(simulator, nearer):
+def test_near_a_wall_a_stopped_robot_does_not_take_off(simulator, nearer):
     flight = Flight(simulator)
     _, y, z = LIMITS.fence_low
     far = replace(LIMITS, fence_low=(-TAKE_OFF_MARGIN + nearer, y, z))

@@ -1,4 +1,4 @@
-"""The guard with a robot under it: it brakes, holds, lands, stops, and meets a hostile cloud."""
+"""The guard with a simulated robot: it brakes, holds, lands, stops, and resists hostile clouds."""
 
 from dataclasses import replace
 from math import dist, hypot, nan
@@ -18,7 +18,7 @@ def simulator():
 
 @pytest.fixture
 def flight(simulator):
-    """At 1.5 m, at rest."""
+    """Return a flight at a height of 1.5 m, at rest."""
     flight = Flight(simulator)
     flight.fly(1.5, UP)
     return flight.fly(2.0, (0.0, 0.0, 0.0))
@@ -27,7 +27,7 @@ def flight(simulator):
 @pytest.mark.parametrize(
     "velocity", [(1.5, 0.0, 0.0), (-1.5, 0.0, 0.0), (0.0, 1.5, 0.0), (0.0, -1.0, 0.3)]
 )
-def test_a_robot_that_is_left_alone_stops_and_stays(flight, velocity):
+def test_without_commands_the_robot_stops_and_stays(flight, velocity):
     flight.fly(1.2, velocity)
     flight.fly(0.26)
     assert flight.guard.state is GuardState.HOLD
@@ -39,7 +39,7 @@ def test_a_robot_that_is_left_alone_stops_and_stays(flight, velocity):
         assert dist(flight.readings.position, still) < 0.10
 
 
-def test_a_minute_later_it_goes_down_slowly_and_stops_its_rotors(flight):
+def test_after_a_minute_it_lands_and_stops_its_rotors(flight):
     flight.fly(60.5)
     assert flight.guard.state is GuardState.LAND
     start = flight.readings.position
@@ -73,7 +73,7 @@ def test_an_emergency_stop_lets_it_fall(flight):
     assert flight.readings.position[2] < 0.3
 
 
-def test_after_an_acknowledged_stop_it_takes_off_again_from_where_it_is(flight):
+def test_after_an_acknowledged_stop_it_takes_off_again(flight):
     flight.fly(1.5, (0.0, 0.0, -0.8))
     flight.guard.stop(flight.now_ns)
     flight.fly(2.0)
@@ -85,7 +85,7 @@ def test_after_an_acknowledged_stop_it_takes_off_again_from_where_it_is(flight):
 
 
 @pytest.mark.promise("stays-inside-the-fence")
-def test_acknowledged_in_its_fall_it_does_not_take_off_before_it_lies(flight):
+def test_acknowledged_in_its_fall_it_waits_until_it_lies(flight):
     flight.guard.stop(flight.now_ns)
     flight.fly(0.1)
     flight.guard.acknowledge(flight.now_ns)
@@ -101,7 +101,7 @@ def test_acknowledged_in_its_fall_it_does_not_take_off_before_it_lies(flight):
 
 
 @pytest.mark.promise("stays-inside-the-fence")
-def test_where_it_was_stopped_outside_the_fence_it_does_not_take_off(simulator):
+def test_a_robot_stopped_outside_the_fence_does_not_take_off(simulator):
     flight = Flight(simulator)
     _, y, z = LIMITS.fence_low
     flight.guard = flight.robot.guard = Guard(replace(LIMITS, fence_low=(0.1, y, z)))
@@ -111,14 +111,14 @@ def test_where_it_was_stopped_outside_the_fence_it_does_not_take_off(simulator):
     assert flight.fly(3.0, UP).guard.state is GuardState.GROUND
 
 
-# A cloud that does its worst. The robot is at most 6 m/s fast, and its base stays in the box.
+# Hostile clouds: the robot flies at most at 6 m/s, and its base stays inside the fence.
 
 FACES = [(9.0, 0.0, 0.0), (-9.0, 0.0, 0.0), (0.0, 9.0, 0.0), (0.0, -9.0, 0.0), (0.0, 0.0, 9.0)]
 
 
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("velocity", [*FACES, (0.0, 0.0, -9.0), (5.0, -5.0, 5.0), (-5.0,) * 3])
-def test_full_speed_at_a_face_ends_before_it(flight, velocity):
+def test_full_speed_at_a_face_stops_before_it(flight, velocity):
     flight.fly(8.0, velocity)
     assert flight.room > 0.1
     assert flight.readings.position[2] > 0.25
@@ -141,5 +141,5 @@ def test_a_hostile_cloud_does_not_get_it_out_of_the_fence(simulator, seed):
 
 @pytest.mark.full
 @pytest.mark.parametrize("seed", range(3, 203))
-def test_two_hundred_hostile_clouds_do_not_get_it_out_of_the_fence(simulator, seed):
+def test_200_hostile_clouds_do_not_get_it_out_of_the_fence(simulator, seed):
     check_hostile(simulator, seed)

@@ -1,12 +1,19 @@
-"""A robot flown into something: its rotors stop, and nobody but an operator goes on."""
+"""After a hit the rotors stop, and only the operator releases the robot."""
 
 from math import cos, radians, sin
 
 import pytest
 
 from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState
-from cloudrc.world.guard.limits import GLIMPSE_NS
-from cloudrc.world.guard.state import JOLT, PULL, SPIN_MAX, TUMBLE_MAX, UPSET, Hits
+from cloudrc.world.guard.limits import RECHECK_NS
+from cloudrc.world.guard.state import (
+    JOLT_MAX,
+    JOLT_RATE_MAX,
+    OVERTURNED_COSINE,
+    SPIN_MAX,
+    TUMBLE_MAX,
+    Hits,
+)
 from cloudrc.world.readings import Readings
 from tests.world.guard.conftest import (
     DT,
@@ -27,7 +34,7 @@ SPUN, JOLTED, OVER = Cause.SPUN, Cause.JOLTED, Cause.OVERTURNED
 
 
 def felt(velocity=ZERO, rate=ZERO, tilt_deg=0.0, position=HERE):
-    """What the sensors say of a robot that is tilted about x."""
+    """Return the readings of a robot that is tilted about x."""
     half = radians(tilt_deg) / 2
     return Readings.of((*position, cos(half), sin(half), 0.0, 0.0), (*velocity, *rate))
 
@@ -44,21 +51,21 @@ RATES = [
 
 
 @pytest.mark.parametrize(("rate", "cause"), RATES)
-def test_nothing_but_a_hit_turns_the_robot_so_fast(rate, cause):
+def test_a_high_rate_is_a_hit(rate, cause):
     assert Hits().felt(0, felt(rate=rate)) == cause
 
 
 @pytest.mark.parametrize(("tilt_deg", "cause"), [(78.0, None), (79.0, OVER), (180.0, OVER)])
 def test_a_robot_on_its_side_has_turned_over(tilt_deg, cause):
-    assert cos(radians(78.5)) == pytest.approx(UPSET, abs=0.001)
+    assert cos(radians(78.5)) == pytest.approx(OVERTURNED_COSINE, abs=0.001)
     assert Hits().felt(0, felt(tilt_deg=tilt_deg)) == cause
 
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("after_ns", [TICK, 10 * MS])
-def test_nothing_but_a_hit_changes_the_speed_so_fast(axis, sign, after_ns):
-    most = JOLT + PULL * after_ns
+def test_a_sudden_change_of_velocity_is_a_hit(axis, sign, after_ns):
+    most = JOLT_MAX + JOLT_RATE_MAX * after_ns
     for change, cause in ((most + 0.001, JOLTED), (most - 0.001, None)):
         hits, velocity = Hits(), [1.0, -2.0, 0.5]
         assert hits.felt(SECOND, felt(tuple(velocity))) is None
@@ -68,16 +75,16 @@ def test_nothing_but_a_hit_changes_the_speed_so_fast(axis, sign, after_ns):
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_at_the_limits_nothing_is_felt_yet(axis):
+def test_values_at_the_limits_are_no_hit(axis):
     hits, velocity = Hits(), [0.0, 0.0, 0.0]
-    velocity[axis] = JOLT + PULL * TICK
+    velocity[axis] = JOLT_MAX + JOLT_RATE_MAX * TICK
     at_limit = felt(rate=(TUMBLE_MAX, 0.0, SPIN_MAX))
-    at_limit = at_limit._replace(axes=(*at_limit.axes[:8], UPSET))
+    at_limit = at_limit._replace(axes=(*at_limit.axes[:8], OVERTURNED_COSINE))
     assert hits.felt(0, at_limit) is None
     assert hits.felt(TICK, at_limit._replace(velocity=tuple(velocity))) is None
 
 
-def test_there_is_nothing_to_compare_the_first_reading_with():
+def test_the_first_reading_is_no_hit():
     hits = Hits()
     assert hits.felt(0, felt((5.0, 0.0, 0.0))) is None
     hits.forget()
@@ -97,7 +104,7 @@ def test_after_a_hit_the_rotors_stop_and_the_mission_is_over(make):
     assert guard.state is GROUND
 
 
-def test_a_hit_is_felt_within_10_ms_while_one_command_is_flown():
+def test_a_hit_is_detected_within_10_ms_of_a_steady_command():
     guard = tracking((0.5, 0.0, 0.0))
     run(guard, 0, 200 * MS)
     assert guard.reference == (0.5, 0.0, 0.0)
@@ -105,8 +112,8 @@ def test_a_hit_is_felt_within_10_ms_while_one_command_is_flown():
     assert ticks[-1] is None
 
 
-def test_in_between_nothing_is_looked_at():
-    """The usual tick is the fast one."""
+def test_between_two_checks_the_readings_are_not_used():
+    """The usual tick is fast."""
     guard = tracking((0.5, 0.0, 0.0))
     run(guard, 0, 200 * MS)
     guard.offer(command((0.5, 0.0, 0.0), 200 * MS), 200 * MS)
@@ -115,8 +122,8 @@ def test_in_between_nothing_is_looked_at():
         assert guard.tick(now_ns, None, DT) == (0.5, 0.0, 0.0)
 
 
-def test_the_robot_may_lie_and_be_put_down_as_it_likes():
-    """On the ground, stopped, or landed, nothing is felt; the next flight begins anew."""
+def test_a_robot_on_the_ground_detects_no_hit():
+    """On the ground, stopped or landed, no hit is detected; a new flight compares nothing."""
     guard = armed()
     upside_down = felt((3.0, 0.0, 0.0), (9.0, 9.0, 9.0), 180.0)
     assert guard.tick(0, upside_down, DT) is None
@@ -131,7 +138,7 @@ def test_the_robot_may_lie_and_be_put_down_as_it_likes():
     assert guard.state is TRACK
 
 
-def test_what_lies_still_after_a_landing_is_not_stopped_again():
+def test_a_robot_that_has_landed_detects_no_hit():
     guard = landing()
     run(guard, 2 * SECOND, 5 * SECOND, (1.0, 2.0, 0.1))
     assert guard.take_changes()[-1].cause == "touched down, rotors stopped"
@@ -139,13 +146,13 @@ def test_what_lies_still_after_a_landing_is_not_stopped_again():
     assert guard.state is LAND
 
 
-def test_an_upright_robot_is_upright():
+def test_readings_without_tilt_are_upright():
     assert felt() == Readings.of((*HERE, *UPRIGHT), (*ZERO, *ZERO))
 
 
 @pytest.mark.parametrize("flown_ticks", range(50, 57))
-def test_far_from_the_fence_a_hit_is_felt_within_twelve_milliseconds(flown_ticks):
-    """The guard looks again every 10 ms, and at what lasts as a hit does."""
+def test_far_from_the_fence_a_hit_is_detected_within_12_ms(flown_ticks):
+    """The guard checks every 10 ms, and a hit lasts longer."""
     guard = armed()
     for now_ns in range(0, (flown_ticks + 7) * TICK, TICK):
         hit = now_ns >= flown_ticks * TICK
@@ -153,4 +160,4 @@ def test_far_from_the_fence_a_hit_is_felt_within_twelve_milliseconds(flown_ticks
         guard.tick(now_ns, felt(rate=(0.0, 0.0, 9.0) if hit else ZERO), DT)
     changes = guard.take_changes()
     assert [change.state for change in changes] == [TRACK, ESTOP]
-    assert changes[1].stamp_ns - flown_ticks * TICK <= GLIMPSE_NS + TICK
+    assert changes[1].stamp_ns - flown_ticks * TICK <= RECHECK_NS + TICK

@@ -1,11 +1,11 @@
-"""The guard: when it lands, and by whose word that and an emergency stop end."""
+"""When the guard lands, and how a landing or an emergency stop ends."""
 
 from math import nan
 
 import pytest
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard.hold import LAND_SPEED, STILL
+from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED
 from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import (
     HERE,
@@ -38,8 +38,8 @@ def test_a_minute_of_hold_in_a_mission_ends_in_land():
     assert not guard.armed
 
 
-def test_a_mission_that_is_started_again_and_again_lands_all_the_same():
-    """Nobody has to hear its commands for that."""
+def test_repeated_starts_do_not_delay_the_landing():
+    """No command need arrive for that."""
     guard = holding()
     for second in range(3, 61):
         guard.start_mission(second * SECOND)
@@ -47,10 +47,10 @@ def test_a_mission_that_is_started_again_and_again_lands_all_the_same():
     assert guard.state is LAND
 
 
-def test_a_minute_on_the_ground_of_a_mission_without_the_cloud_is_waited_no_longer():
-    """Nobody expects it to take off any more; it needs no touch-down for that."""
+def test_a_mission_on_the_ground_waits_a_minute_for_its_cloud():
+    """Then the state is LAND, without a touch-down."""
     guard = armed()
-    guard.offer(command(basis_ns=-300 * MS), SECOND)  # stale: nobody is there
+    guard.offer(command(basis_ns=-300 * MS), SECOND)  # a stale command does not count
     assert run(guard, 0, 60 * SECOND + TICK)[-1] is None
     assert (guard.state, guard.armed) == (GROUND, True)
     assert run(guard, 60 * SECOND + TICK, 60 * SECOND + 2 * TICK) == [None]
@@ -62,8 +62,8 @@ def test_a_minute_on_the_ground_of_a_mission_without_the_cloud_is_waited_no_long
     assert guard.state is GROUND
 
 
-def test_one_that_hears_its_cloud_waits_on_the_ground_until_it_may_take_off():
-    """Slipping along after a stop, it may not."""
+def test_with_fresh_commands_it_waits_until_it_may_take_off():
+    """A robot that slides after a stop may not take off."""
     guard = Guard(LIMITS)
     guard.stop(0)
     guard.acknowledge(0)
@@ -74,8 +74,8 @@ def test_one_that_hears_its_cloud_waits_on_the_ground_until_it_may_take_off():
     assert (guard.state, guard.armed) == (GROUND, True)
 
 
-def test_a_hold_that_goes_down_to_its_place_does_not_land():
-    """As slowly as a descent, and standing still, as if on something."""
+def test_a_hold_that_sinks_to_its_point_does_not_land():
+    """It moves like a descent and stands still as if on an obstacle."""
     guard = holding()
     down = run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 2.2))
     assert down[-1] == (0.0, 0.0, -LAND_SPEED)
@@ -88,7 +88,7 @@ def test_hold_between_missions_has_no_limit():
     for minute in range(1, 10):
         run(guard, minute * 60 * SECOND, minute * 60 * SECOND + 10 * MS)
     assert guard.state is HOLD
-    guard.start_mission(600 * SECOND)  # and the minute counts from the next start
+    guard.start_mission(600 * SECOND)  # the minute counts from the next start
     run(guard, 659 * SECOND, 659 * SECOND + 2 * MS)
     assert guard.state is HOLD
     run(guard, 661 * SECOND, 661 * SECOND + 2 * MS)
@@ -121,7 +121,7 @@ def test_impossible_commands_now_and_then_only_count():
     assert guard.state is LAND
 
 
-def test_impossible_commands_lift_or_land_nothing_that_is_not_on_a_mission():
+def test_without_a_mission_impossible_commands_do_nothing():
     on_ground, at_rest = armed(), tracking()
     at_rest.end_mission(0)
     for guard, state in ((on_ground, GROUND), (at_rest, HOLD)):
@@ -130,7 +130,7 @@ def test_impossible_commands_lift_or_land_nothing_that_is_not_on_a_mission():
         assert guard.state is state
 
 
-def test_land_goes_down_slowly_and_stops_the_rotors_once_it_stands():
+def test_land_sinks_slowly_and_stops_the_rotors_when_it_stands():
     guard = landing()
     down = run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 0.6), (0.0, 0.0, -0.5))
     assert down[-1] == pytest.approx((0.0, 0.0, -LAND_SPEED), abs=0.7)
@@ -143,7 +143,7 @@ def test_land_goes_down_slowly_and_stops_the_rotors_once_it_stands():
     assert guard.take_changes()[-1] == (4398 * MS, LAND, "touched down, rotors stopped")
 
 
-def test_what_it_has_landed_on_it_may_slide_off():
+def test_after_touch_down_it_may_slide_off_an_obstacle():
     guard = landing()
     run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 0.6), (0.0, 0.0, -0.5))
     run(guard, 4 * SECOND, 5 * SECOND, (1.0, 2.0, 0.5))
@@ -157,7 +157,7 @@ def test_what_it_has_landed_on_it_may_slide_off():
     assert guard.state is TRACK
 
 
-def test_a_robot_that_is_pressed_down_when_it_is_landed_touches_down():
+def test_land_from_a_fast_descent_touches_down():
     guard = tracking((0.0, 0.0, -2.0))
     assert run(guard, 0, 100 * MS, (1.0, 2.0, 1.0))[-1][2] == pytest.approx(-LAND_SPEED)
     for _ in range(5):
@@ -166,8 +166,8 @@ def test_a_robot_that_is_pressed_down_when_it_is_landed_touches_down():
     assert 400 * MS <= stood.index(None) * TICK < 1 * SECOND
 
 
-def test_what_moves_by_as_much_as_this_has_not_touched_down():
-    for speed in (STILL, -STILL):
+def test_a_robot_at_the_still_speed_has_not_touched_down():
+    for speed in (STILL_SPEED, -STILL_SPEED):
         down = run(landing(), 2 * SECOND, 4 * SECOND, (1.0, 2.0, 1.0), (0.0, 0.0, speed))
         assert None not in down
 
@@ -178,7 +178,7 @@ def test_a_robot_that_does_not_sink_yet_has_not_touched_down():
     assert stood.index(None) * TICK == 482 * MS
 
 
-def test_a_descent_that_stands_still_for_a_moment_has_not_touched_down():
+def test_a_short_stop_of_a_descent_is_no_touch_down():
     guard = landing()
     run(guard, 2 * SECOND, 4 * SECOND, velocity=(0.0, 0.0, -0.5))
     for k in range(10):
@@ -187,14 +187,14 @@ def test_a_descent_that_stands_still_for_a_moment_has_not_touched_down():
         assert None not in run(guard, start_ns + 390 * MS, start_ns + 400 * MS, HERE, (0, 0, -0.3))
 
 
-def test_land_holds_the_place_that_hold_had_found():
+def test_land_keeps_the_hold_point():
     guard = holding()
     run(guard, 2 * SECOND, 60_256 * MS)
     aside = run(guard, 60_256 * MS, 62 * SECOND, (1.2, 2.0, 1.0), (0.0, 0.0, -0.5))[-1]
     assert aside == pytest.approx((-0.16, 0.0, -LAND_SPEED))
 
 
-def test_land_out_of_flight_goes_down_where_the_robot_is():
+def test_land_from_track_descends_where_the_robot_is():
     guard, elsewhere = holding(), (3.0, 2.0, 1.0)
     now_ns = feed(guard, 2 * SECOND, 20, ZERO, position=elsewhere)
     assert guard.state is TRACK
@@ -210,7 +210,7 @@ def test_land_out_of_flight_goes_down_where_the_robot_is():
 
 @pytest.mark.promise("only-the-operator-arms")
 @pytest.mark.parametrize("make", [landing, lambda: stopped(tracking())])
-def test_nothing_but_the_acknowledgement_leads_out_of_a_latch(make):
+def test_only_an_acknowledgement_leads_out_of_a_latch(make):
     guard = make()
     state = guard.state
     assert guard.latched
@@ -261,7 +261,7 @@ def test_an_acknowledged_stop_is_on_the_ground_and_arms_nothing():
         ((9e9, 2.0, 0.1), ZERO, ", takes off once it has been still, 0.5 m inside the fence"),
     ],
 )
-def test_an_acknowledgement_says_what_a_take_off_still_waits_for(position, velocity, condition):
+def test_an_acknowledgement_names_the_condition_of_a_take_off(position, velocity, condition):
     guard = stopped(tracking())
     run(guard, 1 * SECOND, 2 * SECOND, position, velocity)
     guard.acknowledge(2 * SECOND)
@@ -287,7 +287,7 @@ def test_a_landing_that_is_acknowledged_on_the_ground_is_over():
 
 
 @pytest.mark.parametrize("make", [lambda: Guard(LIMITS), armed, tracking, holding])
-def test_there_is_nothing_to_acknowledge_elsewhere(make):
+def test_in_other_states_an_acknowledgement_does_nothing(make):
     guard = make()
     state, armed_before = guard.state, guard.armed
     guard.take_changes()

@@ -1,4 +1,4 @@
-"""The limits of the guard: none can be switched off, in the file or in code."""
+"""No limit of the guard can be switched off, neither in the file nor in code."""
 
 from dataclasses import FrozenInstanceError, fields
 from math import inf, nan
@@ -9,7 +9,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import GuardState
-from cloudrc.world.guard.limits import MARGIN, Limits
+from cloudrc.world.guard.limits import FENCE_MARGIN, Limits
 from tests.world.guard.conftest import LIMITS, MS, SECOND, TICK, armed, run, tracking
 
 NUMBERS = [field.name for field in fields(Limits) if not field.name.startswith("fence")]
@@ -21,7 +21,7 @@ def limits(**values):
 
 @pytest.mark.parametrize("name", NUMBERS)
 @pytest.mark.parametrize("value", [0, 0.0, -1, inf, -inf, nan])
-def test_a_limit_that_limits_nothing_is_refused(name, value):
+def test_a_limit_cannot_be_switched_off(name, value):
     with pytest.raises(ValueError, match=f"guard: {name} is"):
         limits(**{name: value})
 
@@ -33,7 +33,7 @@ def test_a_command_may_not_be_older_than_ten_seconds():
 
 
 @pytest.mark.parametrize(("age_ms", "fastest"), [(250, 6.0), (400, 5.645805), (800, 4.823043)])
-def test_a_speed_that_cannot_be_stopped_from_in_time_is_refused(age_ms, fastest):
+def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
     # v (T + 0.2) + v^2 / 6 = 8.7 m, solved by hand.
     limits(command_age_max_ns=age_ms * 1_000_000, speed_max=fastest)
     with pytest.raises(ValueError, match="speed_max"):
@@ -41,8 +41,8 @@ def test_a_speed_that_cannot_be_stopped_from_in_time_is_refused(age_ms, fastest)
 
 
 @pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (10, 10), (11, 11)])
-def test_on_the_ground_a_mission_is_waited_for_ten_seconds_at_least(hold_s, waited_s):
-    """A hold may be too short for a first command to come."""
+def test_on_the_ground_it_waits_for_a_mission_for_10_s_at_least(hold_s, waited_s):
+    """The longest hold may be too short for a first command to arrive."""
     guard = armed(limits(hold_max_ns=round(hold_s * SECOND)))
     run(guard, 0, waited_s * SECOND + TICK)
     assert guard.state is GuardState.GROUND
@@ -52,7 +52,7 @@ def test_on_the_ground_a_mission_is_waited_for_ten_seconds_at_least(hold_s, wait
 
 
 @pytest.mark.parametrize("hold_s", [2, 10, 11])
-def test_in_flight_a_hold_lasts_no_longer_than_it_may(hold_s):
+def test_in_flight_a_hold_lasts_no_longer_than_its_limit(hold_s):
     guard = tracking(limits=limits(hold_max_ns=hold_s * SECOND))
     run(guard, 0, 12 * SECOND)
     land = (hold_s * SECOND + 254 * MS, GuardState.LAND, f"held for {hold_s} s without the cloud")
@@ -69,7 +69,7 @@ def test_a_fence_without_room_is_refused(axis, high):
 
 
 def test_a_fence_as_thick_as_its_margins_has_no_room():
-    thin = FLOOR_MARGIN + MARGIN
+    thin = FLOOR_MARGIN + FENCE_MARGIN
     with pytest.raises(ValueError, match="leaves no room"):
         Limits((0.0, 0.0, 0.0), (5.0, 5.0, thin))
     Limits((0.0, 0.0, 0.0), (5.0, 5.0, thin + 0.01))
@@ -81,8 +81,8 @@ def test_a_fence_has_three_axes(low):
         Limits(low, (5.0, 5.0, 5.0))
 
 
-def test_inside_the_fence_are_its_margins():
-    low, high = Limits((0.0, 10.0, 20.0), (5.0, 15.0, 25.0)).inside()
+def test_the_inner_corners_have_the_margins_taken_off():
+    low, high = Limits((0.0, 10.0, 20.0), (5.0, 15.0, 25.0)).inner_corners()
     assert low == pytest.approx((0.2, 10.2, 20.35))
     assert high == pytest.approx((4.8, 14.8, 24.8))
 

@@ -1,4 +1,4 @@
-"""The guard in any order of events: its promises hold after each of them."""
+"""The guard keeps its promises after every event, in any order of events."""
 
 from math import hypot, nan
 
@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from cloudrc.messages import GuardState
-from cloudrc.world.guard.limits import GLIMPSE_NS, Limits
-from cloudrc.world.guard.state import JOLT, Guard
+from cloudrc.world.guard.limits import RECHECK_NS, Limits
+from cloudrc.world.guard.state import JOLT_MAX, Guard
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, command, sensed
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -16,7 +16,7 @@ AGE_MAX_NS = LIMITS.command_age_max_ns
 SECONDS = st.sampled_from([0.002, 0.01, 0.1, 0.3, 1.2, 6.0])
 VELOCITIES = st.tuples(*[st.sampled_from([-1e3, -2.0, 0.0, 0.5, 9.0])] * 3)
 
-# Who may lead where, and by what.
+# Allowed changes of the state (from, to) for each event.
 ALLOWED = {
     "start": set(),
     "end": {(TRACK, HOLD)},
@@ -48,14 +48,14 @@ class GuardMachine(RuleBasedStateMachine):
         self.height = 1.0
         self.climb = 0.0
         self.flown = None
-        self.started = False  # by the operator, and not ended since
-        self.acknowledged = False  # the landing
+        self.started = False  # whether a mission is active
+        self.acknowledged = False  # whether the operator acknowledged the landing
         self.newest_basis_ns = None
         self.stamps = []
         self.state = GROUND
 
     def noted(self, event):
-        """Every change has its cause in words, and was allowed to this event."""
+        """Check that this event allows each change, and that each change has a cause."""
         for change in self.guard.take_changes():
             assert (self.state, change.state) in ALLOWED[event], event
             assert change.cause
@@ -147,7 +147,7 @@ class GuardMachine(RuleBasedStateMachine):
         calm = sensed((1.0, 1.0, self.height), (0.0, 0.0, self.climb))
         flew = self.guard.tick(self.now_ns, calm, DT) is not None
         self.noted("time")
-        self.now_ns += GLIMPSE_NS + TICK  # until then the guard need not look
+        self.now_ns += RECHECK_NS + TICK  # the guard checks at the latest then
         spun = calm._replace(angular_velocity_body=(0.0, 0.0, 9.0))
         self.flown = self.guard.tick(self.now_ns, spun, DT)
         self.noted("hit")
@@ -164,7 +164,9 @@ class GuardMachine(RuleBasedStateMachine):
         for _ in range(round(seconds / DT)):
             standing = self.height < 0.2 or self.flown is None
             sinking = 0.0 if standing else self.flown[2]
-            self.climb += min(max(sinking - self.climb, -JOLT / 2), JOLT / 2)  # as no hit does
+            self.climb += min(
+                max(sinking - self.climb, -JOLT_MAX / 2), JOLT_MAX / 2
+            )  # less than a hit
             readings = sensed((1.0, 1.0, self.height), (0.0, 0.0, self.climb))
             self.flown = self.guard.tick(self.now_ns, readings, DT)
             self.noted("time")

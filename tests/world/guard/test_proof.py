@@ -1,4 +1,4 @@
-"""The guard's comparisons and clamps, proven for all 64-bit floats, NaN and infinities included."""
+"""Proofs of the guard's arithmetic for all 64-bit floats, NaN and infinity included."""
 
 from functools import partial
 
@@ -8,12 +8,12 @@ import z3
 from cloudrc.messages import Command
 from cloudrc.world.guard import hold
 from cloudrc.world.guard import limits as rules
-from cloudrc.world.guard.limits import AGE_MAX_NS, RANGE
+from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
 from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import LIMITS, everywhere, root
 
 LATEST = AGE_MAX_NS * 1e-9 + rules.REACTION
-"""After which the robot brakes [s], at the largest age of a command that may be flown."""
+"""Time until the robot brakes [s] with the largest command age."""
 
 
 @pytest.fixture(autouse=True)
@@ -25,47 +25,47 @@ def is_finite(term):
     return z3.Not(z3.Or(z3.fpIsNaN(term), z3.fpIsInf(term)))
 
 
-def test_a_command_with_a_number_out_of_range_is_refused_whole():
-    """`Guard.offer` refuses all but what is within the range: NaN, infinities and 1e308, too."""
+def test_a_command_with_one_value_out_of_range_is_rejected():
+    """Prove that `Guard.offer` rejects every value beyond COMMAND_MAX, NaN included."""
 
     def check(run):
         numbers = [run.fresh(name) for name in ("vx", "vy", "vz", "yaw_rate")]
-        inside = z3.And([z3.fpAbs(number.term) <= RANGE for number in numbers])
+        inside = z3.And([z3.fpAbs(number.term) <= COMMAND_MAX for number in numbers])
         refused = Guard(LIMITS).offer(Command(0, 0, 0, tuple(numbers[:3]), numbers[3]), 0)
         assert refused in (None, "range")
         run.prove(z3.Not(inside) if refused else inside)
 
-    # All in range, or one of the four is the first that is not.
+    # Five paths: all values are in range, or the first bad one is one of the four.
     assert everywhere(check) == 5
 
 
-def test_within_answers_from_its_interval_whatever_comes_in():
+def test_clamp_of_any_value_is_in_its_interval():
     def check(run):
         value, low, high = (run.fresh(name) for name in ("value", "low", "high"))
         run.learn(z3.And(is_finite(low.term), is_finite(high.term), low.term <= high.term))
-        answer = rules.within(value, low, high)
+        answer = rules.clamp(value, low, high)
         run.prove(z3.And(answer.term >= low.term, answer.term <= high.term))
 
     assert everywhere(check) == 3
 
 
-def test_within_changes_nothing_inside_its_interval():
+def test_clamp_keeps_a_value_inside_its_interval():
     def check(run):
         value = run.fresh("value")
         run.learn(z3.And(value.term > -1.0, value.term < 1.0))
-        run.prove(z3.fpEQ(lift(run, rules.within(value, -1.0, 1.0)).term, value.term))
+        run.prove(z3.fpEQ(lift(run, rules.clamp(value, -1.0, 1.0)).term, value.term))
 
     everywhere(check)
 
 
-@pytest.mark.parametrize("caution", [rules.CAUTION, rules.REACTION])
-def test_an_approach_is_never_below_the_way_back_and_never_not_a_number(caution):
+@pytest.mark.parametrize("caution", [rules.FENCE_REACTION, rules.REACTION])
+def test_approach_speed_is_a_number_and_has_its_lower_bound(caution):
     def check(run):
         reach = run.fresh("reach")
-        answer = rules.approach(reach, caution)
+        answer = rules.approach_speed(reach, caution)
         term = answer.term if hasattr(answer, "term") else z3.FPVal(answer, z3.Float64())
-        run.prove(term >= -rules.COME_BACK_MAX)
-        # Outside or at the face never outwards; inside never back.
+        run.prove(term >= -rules.RETURN_SPEED_MAX)
+        # At the face or outside never outwards; inside never back.
         run.prove(z3.Implies(reach.term <= 0.0, term <= 0.0))
         run.prove(z3.Implies(reach.term > 0.0, term >= 0.0))
 
@@ -73,23 +73,23 @@ def test_an_approach_is_never_below_the_way_back_and_never_not_a_number(caution)
 
 
 @pytest.mark.parametrize("at_the_floor", [False, True])
-def test_an_axis_at_the_fence_is_finite_and_no_faster_than_commanded(at_the_floor):
-    """One axis of `fenced`, any finite command; of `approach` only what is proven above is used."""
+def test_one_axis_of_limit_to_fence_is_finite_and_bounded(at_the_floor):
+    """Prove it for any finite command, with the proven bounds of `approach_speed`."""
 
     def check(run):
         v, up, down = (run.fresh(name) for name in ("v", "up", "down"))
         run.learn(is_finite(v.term))
-        run.learn(z3.And(up.term >= -rules.COME_BACK_MAX, down.term >= -rules.COME_BACK_MAX))
+        run.learn(z3.And(up.term >= -rules.RETURN_SPEED_MAX, down.term >= -rules.RETURN_SPEED_MAX))
         low = min(0.0, -down) if at_the_floor else -down
-        term = lift(run, rules.within(v, low, up)).term
-        bound = z3.fpMax(z3.fpAbs(v.term), z3.FPVal(rules.COME_BACK_MAX, z3.Float64()))
+        term = lift(run, rules.clamp(v, low, up)).term
+        bound = z3.fpMax(z3.fpAbs(v.term), z3.FPVal(rules.RETURN_SPEED_MAX, z3.Float64()))
         run.prove(z3.And(is_finite(term), z3.fpAbs(term) <= bound))
 
     assert everywhere(check) == (6 if at_the_floor else 3)
 
 
-def test_what_grows_is_no_more_than_what_there_is():
-    """So what is held back keeps its sign, and is never faster than what was asked for."""
+def test_growth_is_at_most_the_value_itself():
+    """Then a limited reference keeps its sign and is never faster than the wanted one."""
 
     def check(run):
         before, after = run.fresh("before"), run.fresh("after")
@@ -100,15 +100,15 @@ def test_what_grows_is_no_more_than_what_there_is():
     assert everywhere(check) >= 6
 
 
-def test_the_rate_of_braking_is_inside_its_range_whatever_comes_in():
+def test_brake_rate_of_any_speed_is_in_its_range():
     def check(run):
         rate = lift(run, hold.brake_rate(run.fresh("speed"))).term
-        run.prove(z3.And(rate >= hold.GENTLEST, rate <= hold.HARDEST))
+        run.prove(z3.And(rate >= hold.BRAKE_MIN, rate <= hold.BRAKE_MAX))
 
     everywhere(check)
 
 
-def test_a_fall_lasts_no_longer_than_one_from_the_largest_height_whatever_comes_in(monkeypatch):
+def test_fall_time_has_an_upper_bound(monkeypatch):
     top = 2.0 / rules.GRAVITY * rules.HEIGHT_MAX
     monkeypatch.setattr(rules, "sqrt", partial(root, top=top))
     longest = rules.fall_time(rules.HEIGHT_MAX)
@@ -118,19 +118,19 @@ def test_a_fall_lasts_no_longer_than_one_from_the_largest_height_whatever_comes_
         time = lift(run, rules.fall_time(run.fresh("height"))).term
         run.prove(z3.And(time >= 0.0, time <= longest))
 
-    # From the largest height; from none; from between.
+    # Three paths: the largest height, none, and between.
     assert everywhere(check) == 3
 
 
 def any_speed_and_reaction(run):
-    """What `Limits` asks of: a speed >= 0, and what it may take to react, both finite."""
+    """Return the arguments that `Limits` uses: a finite speed >= 0 and a reaction time."""
     speed, reaction = run.fresh("speed"), run.fresh("reaction")
     run.learn(z3.And(speed.term >= 0.0, is_finite(speed.term)))
     run.learn(z3.And(reaction.term >= rules.REACTION, reaction.term <= LATEST))
     return speed, reaction
 
 
-def test_a_way_to_rest_is_never_negative_and_always_a_number():
+def test_stopping_distance_is_a_number_and_never_negative():
     def check(run):
         way = rules.stopping_distance(*any_speed_and_reaction(run)).term
         run.prove(way >= 0.0)
@@ -138,8 +138,8 @@ def test_a_way_to_rest_is_never_negative_and_always_a_number():
     assert everywhere(check) == 1
 
 
-def test_from_above_seven_metres_a_second_no_way_to_rest_is_allowed():
-    """Up to the largest float: a way that overflows is infinite, and that is too long as well."""
+def test_above_7_mps_every_stopping_distance_is_too_long():
+    """A distance that overflows is infinite, which is too long as well."""
 
     def check(run):
         speed, reaction = any_speed_and_reaction(run)
@@ -150,7 +150,7 @@ def test_from_above_seven_metres_a_second_no_way_to_rest_is_allowed():
 
 
 def lift(run, value):
-    """A number as a symbol."""
+    """Turn a number into a symbol."""
     if isinstance(value, float | int):
         symbol = run.fresh("constant")
         run.learn(z3.fpEQ(symbol.term, z3.FPVal(value, z3.Float64())))

@@ -1,4 +1,4 @@
-"""How the guard comes to rest and stays there, number by number."""
+"""Braking and position hold, with numbers."""
 
 from math import hypot
 
@@ -6,17 +6,17 @@ import pytest
 
 from cloudrc.messages import ZERO
 from cloudrc.world.guard.hold import (
-    DAMPING,
-    EASE,
-    GENTLEST,
-    HARDEST,
-    LEAST_SHARE,
-    PULL,
-    PULL_MAX,
-    STILL,
-    TRIM,
-    TRIM_MAX,
-    Rest,
+    BRAKE_MAX,
+    BRAKE_MIN,
+    BRAKE_SHARE_MIN,
+    BRAKE_TIME_CONSTANT,
+    DAMPING_GAIN,
+    HOLD_SPEED_MAX,
+    INTEGRAL_GAIN,
+    INTEGRAL_MAX,
+    POSITION_GAIN,
+    STILL_SPEED,
+    PositionHold,
     brake_start,
 )
 from cloudrc.world.guard.limits import BRAKE
@@ -24,12 +24,12 @@ from tests.world.guard.conftest import DT, HERE, sensed
 
 LOW, HIGH = (-2.8, -8.3, 0.0), (9.0, 5.3, 2.3)
 ENOUGH = 1.0
-"""As a tick it is long enough to reach any reference [s]."""
+"""A tick that is long enough to reach any reference [s]."""
 
 
 def at_rest(sink=0.0, speed_max=6.0, position=HERE):
-    """Has dropped its anchor here."""
-    rest = Rest(LOW, HIGH, speed_max)
+    """Return a position hold with its hold point at `position`."""
+    rest = PositionHold(LOW, HIGH, speed_max)
     reference = (0.0, 0.0, -sink)
     assert rest.follow(reference, sensed(position, reference), sink, ENOUGH) == reference
     assert not rest.brakes
@@ -43,41 +43,41 @@ def moved(offset, velocity=ZERO):
 # Braking
 
 
-def test_what_flies_does_not_brake():
-    assert Rest(LOW, HIGH, 6.0).brakes is False
+def test_a_new_position_hold_does_not_brake():
+    assert PositionHold(LOW, HIGH, 6.0).brakes is False
 
 
 @pytest.mark.parametrize(
     ("speed", "begins"), [(4.0, 3.0), (2.0, 1.0), (1.25, 0.25), (0.5, 0.1), (0.0, 0.0)]
 )
 @pytest.mark.parametrize("axis", range(3))
-def test_the_reference_begins_1_mps_ahead_of_the_robot_but_never_at_rest(axis, speed, begins):
+def test_braking_starts_1_mps_below_the_speed_but_above_0(axis, speed, begins):
     velocity = [0.0, 0.0, 0.0]
     velocity[axis] = speed
-    assert LEAST_SHARE == 0.2
+    assert BRAKE_SHARE_MIN == 0.2
     for reference in (velocity, [1.5 * v for v in velocity]):
         start = brake_start(tuple(reference), tuple(velocity))
         assert start[axis] == pytest.approx(begins)
         assert hypot(*start) == pytest.approx(begins)
 
 
-def test_of_two_that_are_as_fast_the_reference_counts():
+def test_braking_starts_from_the_reference_if_both_are_as_fast():
     assert brake_start((0.0, 2.0, 0.0), (2.0, 0.0, 0.0)) == (0.0, 1.0, 0.0)
 
 
 @pytest.mark.parametrize(
     ("reference", "sink", "rate"),
     [
-        ((0.4, 0.0, 0.0), 0.0, 0.4 / EASE),
-        ((0.0, 0.4, 0.0), 0.0, 0.4 / EASE),
-        ((0.0, 0.0, 0.4), 0.0, 0.4 / EASE),
-        ((0.0, 0.0, 0.1), 0.5, 0.6 / EASE),
-        ((0.0, 0.0, 3.0), 0.0, HARDEST),
-        ((0.1, 0.0, 0.0), 0.0, GENTLEST),
+        ((0.4, 0.0, 0.0), 0.0, 0.4 / BRAKE_TIME_CONSTANT),
+        ((0.0, 0.4, 0.0), 0.0, 0.4 / BRAKE_TIME_CONSTANT),
+        ((0.0, 0.0, 0.4), 0.0, 0.4 / BRAKE_TIME_CONSTANT),
+        ((0.0, 0.0, 0.1), 0.5, 0.6 / BRAKE_TIME_CONSTANT),
+        ((0.0, 0.0, 3.0), 0.0, BRAKE_MAX),
+        ((0.1, 0.0, 0.0), 0.0, BRAKE_MIN),
     ],
 )
 def test_braking_goes_step_by_step_towards_rest(reference, sink, rate):
-    rest = Rest(LOW, HIGH, 6.0)
+    rest = PositionHold(LOW, HIGH, 6.0)
     rest.follow(reference, sensed(velocity=(5.0, 5.0, 5.0)), sink, DT)  # begins
     after = rest.follow(reference, sensed(velocity=(5.0, 5.0, 5.0)), sink, DT)
     way = hypot(*(a - b for a, b in zip(reference, after, strict=True)))
@@ -90,81 +90,81 @@ def test_braking_goes_step_by_step_towards_rest(reference, sink, rate):
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sink", [0.0, 0.5])
 @pytest.mark.parametrize(("share", "still"), [(0.99, True), (1.01, False), (-1.01, False)])
-def test_the_robot_is_at_rest_when_it_is_slow_in_every_direction(axis, sink, share, still):
-    rest, velocity = Rest(LOW, HIGH, 6.0), [0.0, 0.0, -sink]
-    velocity[axis] += share * STILL
+def test_at_rest_the_robot_is_slow_in_every_direction(axis, sink, share, still):
+    rest, velocity = PositionHold(LOW, HIGH, 6.0), [0.0, 0.0, -sink]
+    velocity[axis] += share * STILL_SPEED
     rest.follow((0.0, 0.0, -sink), sensed(velocity=tuple(velocity)), sink, ENOUGH)
     assert rest.brakes != still
 
 
 def test_at_the_limit_it_is_not_yet_at_rest():
-    rest = Rest(LOW, HIGH, 6.0)
-    rest.follow(ZERO, sensed(velocity=(STILL, 0.0, 0.0)), 0.0, ENOUGH)
+    rest = PositionHold(LOW, HIGH, 6.0)
+    rest.follow(ZERO, sensed(velocity=(STILL_SPEED, 0.0, 0.0)), 0.0, ENOUGH)
     assert rest.brakes
 
 
 def test_it_is_not_at_rest_before_its_reference_is():
-    rest = Rest(LOW, HIGH, 6.0)
+    rest = PositionHold(LOW, HIGH, 6.0)
     rest.follow((1.0, 0.0, 0.0), sensed(velocity=(3.0, 0.0, 0.0)), 0.0, DT)
     rest.follow((1.0, 0.0, 0.0), sensed(velocity=ZERO), 0.0, DT)
     assert rest.brakes
 
 
-# Staying
+# Holding
 
 
 def test_the_position_hold_pulls_back_and_damps():
     reference = at_rest().follow(ZERO, moved((0.1, -0.1, 0.05), (0.04, -0.02, 0.01)), 0.0, ENOUGH)
-    pull = (-0.1 * PULL, 0.1 * PULL, -0.05 * PULL)
-    damped = (0.04 * DAMPING, -0.02 * DAMPING, 0.01 * DAMPING)
+    pull = (-0.1 * POSITION_GAIN, 0.1 * POSITION_GAIN, -0.05 * POSITION_GAIN)
+    damped = (0.04 * DAMPING_GAIN, -0.02 * DAMPING_GAIN, 0.01 * DAMPING_GAIN)
     assert reference == pytest.approx(tuple(a - b for a, b in zip(pull, damped, strict=True)))
 
 
-@pytest.mark.parametrize(("speed_max", "allowed"), [(6.0, PULL_MAX), (0.3, 0.3)])
-def test_it_pulls_no_faster_than_it_may(speed_max, allowed):
+@pytest.mark.parametrize(("speed_max", "allowed"), [(6.0, HOLD_SPEED_MAX), (0.3, 0.3)])
+def test_the_position_hold_is_no_faster_than_its_limit(speed_max, allowed):
     rest = at_rest(speed_max=speed_max)
     assert hypot(*rest.follow(ZERO, moved((3.0, -4.0, 0.5)), 0.0, ENOUGH)) == pytest.approx(allowed)
 
 
-def test_it_pulls_no_harder_than_the_robot_brakes():
+def test_the_position_hold_accelerates_no_more_than_brake():
     reference = at_rest().follow(ZERO, moved((3.0, 0.0, 0.0)), 0.0, DT)
     assert reference == pytest.approx((-BRAKE * DT, 0.0, 0.0))
 
 
 def trimmed(offset, seconds, sink=0.0):
-    """What it asks for on its anchor [m/s], after so long [s] beside it, every 0.1 s."""
+    """Return the reference at the hold point [m/s] after some seconds at an offset from it [m]."""
     rest = at_rest(sink)
     for _ in range(round(seconds / 0.1)):
         rest.follow(ZERO, moved(offset), sink, 0.1)
     return rest.follow(ZERO, moved(ZERO), sink, ENOUGH)
 
 
-def test_it_leans_against_what_keeps_it_beside_its_anchor():
+def test_the_integral_works_against_a_steady_distance():
     beside = (0.03, -0.02, 0.01)
-    lean = tuple(-TRIM * each * 2.0 for each in beside)
+    lean = tuple(-INTEGRAL_GAIN * each * 2.0 for each in beside)
     assert trimmed(beside, 2.0) == pytest.approx(lean)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_it_leans_no_farther_than_it_has_to(sign):
-    """Or it would wind up against what it touches."""
+def test_the_integral_is_limited(sign):
+    """Otherwise it would wind up against an obstacle."""
     beside = (0.05 * sign, 0.05 * sign, 0.05 * sign)
-    assert trimmed(beside, 60.0) == pytest.approx((-TRIM_MAX * sign,) * 3)
+    assert trimmed(beside, 60.0) == pytest.approx((-INTEGRAL_MAX * sign,) * 3)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
-def test_on_its_way_back_it_does_not_lean(order):
-    """Or it would fly past its anchor."""
+def test_far_from_the_hold_point_it_does_not_integrate(order):
+    """Otherwise it would overshoot the hold point."""
     near, far = (0.06, 0.0, 0.0799), (0.06, 0.0, 0.0801)
     assert trimmed(tuple(near[axis] for axis in order), 1.0) != ZERO
     assert trimmed(tuple(far[axis] for axis in order), 1.0) == ZERO
 
 
-def test_going_down_it_leans_sideways_only():
+def test_in_a_descent_it_integrates_sideways_only():
     assert trimmed((0.03, -0.02, 0.5), 2.0, 0.5) == pytest.approx((-0.012, 0.008, -0.5))
 
 
-def test_of_another_rest_it_knows_nothing():
+def test_a_new_hold_point_starts_with_a_zero_integral():
     rest = at_rest()
     for _ in range(20):
         rest.follow(ZERO, moved((0.03, 0.0, 0.0)), 0.0, 0.1)
@@ -173,22 +173,22 @@ def test_of_another_rest_it_knows_nothing():
     assert rest.follow(ZERO, moved(ZERO), 0.0, ENOUGH) == ZERO
 
 
-def test_going_down_it_holds_the_position_sideways_only():
+def test_in_a_descent_it_holds_the_position_sideways_only():
     reference = at_rest(0.5).follow(ZERO, moved((0.1, 0.0, -1.0), (0.0, 0.1, -0.3)), 0.5, ENOUGH)
-    assert reference == pytest.approx((-0.1 * PULL, -0.1 * DAMPING, -0.5))
+    assert reference == pytest.approx((-0.1 * POSITION_GAIN, -0.1 * DAMPING_GAIN, -0.5))
 
 
 @pytest.mark.parametrize(
     ("position", "anchor"),
     [((9.1, 0.0, 1.0), (9.0, 0.0, 1.0)), ((0.0, -8.4, 2.4), (0.0, -8.3, 2.3))],
 )
-def test_the_position_that_is_held_is_inside_the_margins(position, anchor):
+def test_the_hold_point_is_inside_the_margins(position, anchor):
     reference = at_rest(position=position).follow(ZERO, sensed(position), 0.0, ENOUGH)
-    wanted = tuple(PULL * (a - b) for a, b in zip(anchor, position, strict=True))
+    wanted = tuple(POSITION_GAIN * (a - b) for a, b in zip(anchor, position, strict=True))
     assert reference == pytest.approx(wanted)
 
 
-def test_once_forgotten_the_position_is_another_one():
+def test_after_forget_it_sets_a_new_hold_point():
     rest = at_rest()
     rest.forget()
     rest.follow(ZERO, moved((1.0, 0.0, 0.0)), 0.0, ENOUGH)

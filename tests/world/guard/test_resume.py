@@ -1,4 +1,4 @@
-"""The guard: how it leaves HOLD, and that it does not chatter."""
+"""How the guard leaves HOLD without chattering between states."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -39,7 +39,7 @@ def test_ten_fresh_commands_within_half_a_second_end_a_hold():
 
 
 @pytest.mark.parametrize(("took_ns", "state"), [(500 * MS, TRACK), (500 * MS + 1, HOLD)])
-def test_half_a_second_is_half_a_second(took_ns, state):
+def test_a_hold_ends_only_within_half_a_second(took_ns, state):
     guard = holding()
     for k in range(9):
         guard.offer(command(basis_ns=2 * SECOND + k * MS), 2 * SECOND + k * MS)
@@ -48,7 +48,7 @@ def test_half_a_second_is_half_a_second(took_ns, state):
 
 
 def until_track(guard, start_ns):
-    """When a stream of fresh commands that begins at an instant ends the HOLD [ns], if it does."""
+    """Return when a stream of fresh commands from `start_ns` on ends the HOLD [ns], or None."""
     for now_ns in range(start_ns, start_ns + 3 * SECOND, 10 * MS):
         guard.offer(command(basis_ns=now_ns), now_ns)
         if guard.state is TRACK:
@@ -57,7 +57,7 @@ def until_track(guard, start_ns):
 
 
 def test_from_one_hold_to_the_next_it_takes_a_second():
-    """Resumed at 750 ms, with commands that stay fresh for 250 ms."""
+    """Return a guard that resumed at 750 ms, with commands that stay fresh for 250 ms."""
     start_ns = 10 * SECOND
     guard = armed(now_ns=start_ns)
     feed(guard, start_ns, 300)
@@ -99,8 +99,8 @@ def test_after_a_hold_the_reference_rises_slowly():
 
 
 @pytest.mark.parametrize(("speed_max", "ramp_s"), [(6.0, 2.0), (4.5, 1.5), (1.5, 1.0)])
-def test_it_rises_slowly_for_as_long_as_it_takes_to_the_cap(speed_max, ramp_s):
-    """What a cloud says first, that it rests or has been caught up with, ends nothing."""
+def test_after_a_hold_the_ramp_lasts_until_the_cap(speed_max, ramp_s):
+    """A first command of zero, or one that the reference reaches, does not end the ramp."""
     guard = holding(replace(LIMITS, speed_max=speed_max))
     feed(guard, 2 * SECOND, 10, ZERO)
     assert guard.state is TRACK
@@ -112,10 +112,10 @@ def test_it_rises_slowly_for_as_long_as_it_takes_to_the_cap(speed_max, ramp_s):
         assert guard.reference[0] == pytest.approx(rate * 0.01)
 
 
-def test_coming_back_from_the_fence_is_as_slow_after_a_hold():
-    """Whoever says so: the reference, the cloud, or the guard where the robot is in the margin."""
+def test_after_a_hold_the_return_to_the_fence_has_the_ramp():
+    """The ramp limits every change of the reference, also that of the fence."""
     guard = holding()
-    outside = (LIMITS.inside()[1][0] + 0.15, 1.0, 2.0)
+    outside = (LIMITS.inner_corners()[1][0] + 0.15, 1.0, 2.0)
     now_ns = feed(guard, 2 * SECOND, 10, ZERO, position=outside)
     guard.reference = ZERO
     guard.counts.clear()
@@ -126,7 +126,7 @@ def test_coming_back_from_the_fence_is_as_slow_after_a_hold():
         assert after[0] < before[0]
 
 
-def test_a_robot_that_was_put_on_the_ground_knows_of_no_hold():
+def test_a_reset_to_the_ground_forgets_the_last_hold():
     guard = holding()
     now_ns = feed(guard, 2 * SECOND, 20)
     guard.put_on_ground(now_ns, "from spawn")
@@ -144,12 +144,12 @@ def test_slowing_down_is_as_fast_as_ever_after_a_hold():
     assert before - guard.reference[0] == pytest.approx(12.0 * 0.01)
 
 
-def test_a_link_that_comes_and_goes_does_not_chatter():
-    """Fresh just long enough to be believed, then silent: again and again for 20 s."""
+def test_an_unstable_link_does_not_make_the_state_chatter():
+    """Fresh commands just long enough to resume, then silence, repeatedly for 20 s."""
     guard = tracking()
     now_ns = 0
     while now_ns < 20 * SECOND:
-        # The basis is as old as it may be: each burst is worth one tick of TRACK.
+        # The basis has the largest allowed age: each burst gives one tick of TRACK.
         for _ in range(12):
             guard.offer(command(basis_ns=now_ns - 249 * MS), now_ns)
             run(guard, now_ns, now_ns + 10 * MS)

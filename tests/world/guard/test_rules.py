@@ -1,4 +1,4 @@
-"""The guard's arithmetic: with any floats, the special ones first, it stays inside its bounds."""
+"""The guard's arithmetic stays within its bounds for any float, special ones included."""
 
 from itertools import product
 from math import hypot, inf, isfinite, nan, nextafter, sqrt
@@ -21,41 +21,41 @@ PLACES = st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-0.2, 3))
 SPEEDS = st.tuples(*[st.floats(-8, 8)] * 3)
 
 
-def test_the_way_to_a_stop_is_that_of_the_stop_rule():
+def test_stopping_distance_is_that_of_the_stop_rule():
     assert rules.stopping_distance(6.0, 0.45) == pytest.approx(8.7)
 
 
 @pytest.mark.parametrize("reach", [TINY, 1e-9, 0.01, 0.5, 1.0, 7.0, 1000.0])
-@pytest.mark.parametrize("caution", [rules.CAUTION, rules.REACTION])
-def test_the_approach_is_the_solution_of_the_stop_rule(reach, caution):
-    v = rules.approach(reach, caution)
+@pytest.mark.parametrize("caution", [rules.FENCE_REACTION, rules.REACTION])
+def test_approach_speed_solves_the_stop_rule(reach, caution):
+    v = rules.approach_speed(reach, caution)
     assert v * (caution + v / 6) == pytest.approx(reach, rel=1e-12)
 
 
 @pytest.mark.parametrize(("reach", "back"), [(-0.1, -0.1), (-0.5, -0.5), (-3.0, -0.5), (0.0, 0.0)])
-def test_beyond_a_face_the_way_back_is_as_fast_as_it_is_long(reach, back):
-    assert rules.approach(reach) == back
+def test_beyond_a_face_the_return_speed_grows_with_distance(reach, back):
+    assert rules.approach_speed(reach) == back
 
 
-def test_from_nowhere_nothing_is_approached():
-    assert rules.approach(nan) == 0.0
+def test_approach_speed_of_nan_is_zero():
+    assert rules.approach_speed(nan) == 0.0
 
 
 def test_nearer_is_never_faster():
-    speeds = [rules.approach(k * 0.001 - 2.0) for k in range(12_000)]
+    speeds = [rules.approach_speed(k * 0.001 - 2.0) for k in range(12_000)]
     assert speeds == sorted(speeds)
-    assert speeds[0] == -rules.COME_BACK_MAX
+    assert speeds[0] == -rules.RETURN_SPEED_MAX
 
 
 @pytest.mark.parametrize("value", SPECIAL_BAD)
-def test_within_answers_from_the_interval(value):
-    assert -2.0 <= rules.within(value, -2.0, 3.0) <= 3.0
+def test_clamp_stays_in_its_interval(value):
+    assert -2.0 <= rules.clamp(value, -2.0, 3.0) <= 3.0
 
 
 @pytest.mark.parametrize("length_max", [0.5, 6.0])
-def test_shortened_is_short_and_points_the_same_way(length_max):
+def test_limit_length_limits_length_and_keeps_direction(length_max):
     for a in product(SPECIAL_BAD, repeat=3):
-        b = rules.shortened(a, length_max)
+        b = rules.limit_length(a, length_max)
         if not all(map(isfinite, a)):
             assert b == ZERO
             continue
@@ -65,61 +65,65 @@ def test_shortened_is_short_and_points_the_same_way(length_max):
             assert b is a
 
 
-def test_what_is_just_as_long_as_allowed_is_not_shortened():
-    """Else it would count as limited; what is a hair longer must not be taken for no number."""
+def test_limit_length_keeps_a_vector_of_the_allowed_length():
+    """Otherwise it would count as limited. A slightly longer vector is not taken for NaN."""
     allowed, longer = (1.0, 0.0, 0.0), (1.0, 2.0**-26, 0.0)
-    assert rules.shortened(allowed, 1.0) is allowed
-    assert rules.shortened(longer, 1.0) == longer  # its length is 1.0 again, once rounded
+    assert rules.limit_length(allowed, 1.0) is allowed
+    assert rules.limit_length(longer, 1.0) == longer  # rounding makes its length 1.0 again
 
 
 @pytest.mark.parametrize("step", [1e-9, 0.024, 3.0])
-def test_towards_goes_a_step_and_not_beyond(step):
-    assert rules.towards((0.0, 0.0, 0.0), (3.0, 0.0, 4.0), step)[2] == pytest.approx(0.8 * step)
+def test_step_towards_moves_by_at_most_a_step(step):
+    assert rules.step_towards((0.0, 0.0, 0.0), (3.0, 0.0, 4.0), step)[2] == pytest.approx(
+        0.8 * step
+    )
     for share in (0.5, 1.0):
         end = (share * step, 0.0, 0.0)
-        assert rules.towards(ZERO, end, step) is end
+        assert rules.step_towards(ZERO, end, step) is end
 
 
 LOW = tuple(low + margin for low, margin in zip(LIMITS.fence_low, (0.2, 0.2, 0.35), strict=True))
-HIGH = tuple(high - rules.MARGIN for high in LIMITS.fence_high)
+HIGH = tuple(high - rules.FENCE_MARGIN for high in LIMITS.fence_high)
 
 
 @given(SPEEDS, PLACES)
 @settings(max_examples=1000, deadline=None)
-def test_towards_every_face_the_robot_can_stop(velocity, position):
-    fenced = rules.fenced(velocity, position, LOW, HIGH)
-    for v, at, low, high in zip(fenced, position, LIMITS.fence_low, LIMITS.fence_high, strict=True):
+def test_limit_to_fence_lets_the_robot_stop_before_each_face(velocity, position):
+    limited = rules.limit_to_fence(velocity, position, LOW, HIGH)
+    for v, at, low, high in zip(
+        limited, position, LIMITS.fence_low, LIMITS.fence_high, strict=True
+    ):
         room = high - at if v > 0 else at - low
         assert v == 0.0 or 0.2 * abs(v) + v * v / 6 <= room - 0.1 + 1e-12 or room > 5
 
 
-@given(SPEEDS, PLACES, st.tuples(*[st.floats(-rules.GLIMPSE, rules.GLIMPSE)] * 3))
+@given(SPEEDS, PLACES, st.tuples(*[st.floats(-rules.RECHECK_DISTANCE, rules.RECHECK_DISTANCE)] * 3))
 @settings(max_examples=1000, deadline=None)
-def test_far_from_the_fence_it_changes_nothing_here_and_near_by(velocity, position, step):
-    if rules.is_far(velocity, position, LOW, HIGH):
+def test_far_from_the_fence_limit_to_fence_changes_nothing(velocity, position, step):
+    if rules.is_far_from_fence(velocity, position, LOW, HIGH):
         near = tuple(at + d for at, d in zip(position, step, strict=True))
-        assert rules.fenced(velocity, near, LOW, HIGH) == pytest.approx(velocity, abs=1e-12)
+        assert rules.limit_to_fence(velocity, near, LOW, HIGH) == pytest.approx(velocity, abs=1e-12)
 
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
-def test_nowhere_is_not_far(axis, bad):
+def test_a_nan_position_is_not_far_from_the_fence(axis, bad):
     position = [1.0, 1.0, 1.0]
-    assert rules.is_far(ZERO, tuple(position), LOW, HIGH)
+    assert rules.is_far_from_fence(ZERO, tuple(position), LOW, HIGH)
     position[axis] = bad
-    assert not rules.is_far(ZERO, tuple(position), LOW, HIGH)
+    assert not rules.is_far_from_fence(ZERO, tuple(position), LOW, HIGH)
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(a, s) for a in range(3) for s in (-1, 1)])
-def test_it_is_far_up_to_where_the_robot_has_to_slow_down(axis, sign):
+def test_far_from_the_fence_ends_where_the_robot_must_slow_down(axis, sign):
     position, velocity = [1.0, 1.0, 1.3], [0.0, 0.0, 0.0]
     velocity[axis] = 0.3 * sign
-    caution = rules.REACTION if (axis, sign) == (2, -1) else rules.CAUTION
-    reach = 0.3 * (caution + 0.3 / 6) + rules.GLIMPSE
+    caution = rules.REACTION if (axis, sign) == (2, -1) else rules.FENCE_REACTION
+    reach = 0.3 * (caution + 0.3 / 6) + rules.RECHECK_DISTANCE
     edge = HIGH[axis] - reach if sign > 0 else LOW[axis] + reach
     for beyond, far in ((-1e-9, True), (1e-9, False)):
         position[axis] = edge + sign * beyond
-        assert rules.is_far(tuple(velocity), tuple(position), LOW, HIGH) == far
+        assert rules.is_far_from_fence(tuple(velocity), tuple(position), LOW, HIGH) == far
 
 
 @pytest.mark.parametrize(
@@ -127,65 +131,69 @@ def test_it_is_far_up_to_where_the_robot_has_to_slow_down(axis, sign):
     [((9.1, 0, 1), 0, -1), ((-2.9, 0, 1), 0, 1), ((0, 5.4, 1), 1, -1), ((0, 0, 2.45), 2, -1)],
 )
 def test_beyond_the_margin_the_robot_comes_back(position, axis, sign):
-    assert rules.fenced(ZERO, position, LOW, HIGH)[axis] * sign > 0.05
+    assert rules.limit_to_fence(ZERO, position, LOW, HIGH)[axis] * sign > 0.05
 
 
-def test_whoever_stands_on_the_floor_is_not_asked_to_take_off():
-    assert rules.fenced(ZERO, (0.0, 0.0, 0.1), LOW, HIGH) == ZERO
-    assert rules.fenced((0.0, 0.0, -1.0), (0.0, 0.0, 0.1), LOW, HIGH) == ZERO
-    assert rules.fenced((0.0, 0.0, 0.9), (0.0, 0.0, 0.1), LOW, HIGH) == (0.0, 0.0, 0.9)
+def test_a_robot_on_the_floor_is_not_told_to_climb():
+    assert rules.limit_to_fence(ZERO, (0.0, 0.0, 0.1), LOW, HIGH) == ZERO
+    assert rules.limit_to_fence((0.0, 0.0, -1.0), (0.0, 0.0, 0.1), LOW, HIGH) == ZERO
+    assert rules.limit_to_fence((0.0, 0.0, 0.9), (0.0, 0.0, 0.1), LOW, HIGH) == (0.0, 0.0, 0.9)
 
 
-def test_near_the_floor_the_robot_goes_no_faster_than_it_can_touch():
-    assert rules.fenced((3.0, 4.0, 0.0), (0, -2, 0.2), LOW, HIGH)[:2] == pytest.approx((0.6, 0.8))
-    assert rules.fenced((3.0, 4.0, 0.0), (0, -2, 0.25), LOW, HIGH)[:2] == (3.0, 4.0)
+def test_near_the_floor_the_sideways_speed_is_limited():
+    assert rules.limit_to_fence((3.0, 4.0, 0.0), (0, -2, 0.2), LOW, HIGH)[:2] == pytest.approx(
+        (0.6, 0.8)
+    )
+    assert rules.limit_to_fence((3.0, 4.0, 0.0), (0, -2, 0.25), LOW, HIGH)[:2] == (3.0, 4.0)
 
 
 def test_the_floor_is_approached_as_the_stop_rule_says():
-    v = -rules.fenced((0.0, 0.0, -9.0), (0, 0, 1.35), LOW, HIGH)[2]
+    v = -rules.limit_to_fence((0.0, 0.0, -9.0), (0, 0, 1.35), LOW, HIGH)[2]
     assert 0.2 * v + v * v / 6 == pytest.approx(1.0)
 
 
 def test_a_face_that_is_far_limits_nothing():
-    assert rules.approach(1e6) == pytest.approx(2447.7, abs=0.1)
-    assert rules.approach(1e6 + 1) == inf
+    assert rules.approach_speed(1e6) == pytest.approx(2447.7, abs=0.1)
+    assert rules.approach_speed(1e6 + 1) == inf
 
 
 def test_in_land_the_floor_is_no_face():
     low = (LOW[0], LOW[1], -inf)
-    assert rules.fenced((0.0, 0.0, -0.5), (0.0, 0.0, 0.1), low, HIGH) == (0.0, 0.0, -0.5)
+    assert rules.limit_to_fence((0.0, 0.0, -0.5), (0.0, 0.0, 0.1), low, HIGH) == (0.0, 0.0, -0.5)
 
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("bad", SPECIAL_BAD)
-def test_whatever_is_sensed_the_fence_answers_with_a_speed(bad, axis):
+def test_limit_to_fence_of_any_reading_is_finite(bad, axis):
     position = [0.0, 0.0, 1.0]
     position[axis] = bad
     for velocity in ((6.0, 6.0, 6.0), (-6.0, -6.0, -6.0), ZERO):
-        assert all(abs(v) <= 6.0 for v in rules.fenced(velocity, tuple(position), LOW, HIGH))
+        assert all(
+            abs(v) <= 6.0 for v in rules.limit_to_fence(velocity, tuple(position), LOW, HIGH)
+        )
 
 
-def test_the_reference_does_not_fall_faster_than_the_robot_can():
-    kept = rules.upright((1.0, 0.0, -3.0), (1.0, 0.0, 0.0), climb=-0.2, speed_max=6.0)
-    assert kept == (1.0, 0.0, -0.2 - rules.SINK_LAG)
+def test_limit_sink_limits_how_fast_the_reference_sinks():
+    kept = rules.limit_sink((1.0, 0.0, -3.0), (1.0, 0.0, 0.0), climb=-0.2, speed_max=6.0)
+    assert kept == (1.0, 0.0, -0.2 - rules.SINK_LEAD_MAX)
     same = (1.0, 0.0, -0.6)
-    assert rules.upright(same, (1.0, 0.0, 0.0), climb=-0.2, speed_max=6.0) is same
-    same = (1.0, 0.0, -0.2 - rules.SINK_LAG)
-    assert rules.upright(same, (1.0, 0.0, 0.0), climb=-0.2, speed_max=6.0) is same
-    # Nor does it rise again while the robot still climbs.
-    assert rules.upright((0.0, 0.0, -1.0), (0.0, 0.0, 0.5), climb=3.0, speed_max=6.0)[2] == 0.5
+    assert rules.limit_sink(same, (1.0, 0.0, 0.0), climb=-0.2, speed_max=6.0) is same
+    same = (1.0, 0.0, -0.2 - rules.SINK_LEAD_MAX)
+    assert rules.limit_sink(same, (1.0, 0.0, 0.0), climb=-0.2, speed_max=6.0) is same
+    # And it does not rise again while the robot still climbs.
+    assert rules.limit_sink((0.0, 0.0, -1.0), (0.0, 0.0, 0.5), climb=3.0, speed_max=6.0)[2] == 0.5
 
 
 @pytest.mark.parametrize("climb", SPECIAL_BAD)
-def test_whatever_is_sensed_the_reference_stays_below_the_cap(climb):
+def test_limit_sink_of_any_reading_stays_below_the_cap(climb):
     before = (0.0, 0.0, 5.9)
-    kept = rules.upright((5.9, 0.0, -1.0), before, climb, speed_max=6.0)
+    kept = rules.limit_sink((5.9, 0.0, -1.0), before, climb, speed_max=6.0)
     assert hypot(*kept) <= 6.0 * (1 + 1e-15)
 
 
 @given(SPEEDS, VECTORS)
 @settings(max_examples=500, deadline=None)
-def test_braking_begins_with_no_more_than_what_was_flown(reference, velocity):
+def test_brake_start_is_no_faster_than_the_reference(reference, velocity):
     start = brake_start(reference, velocity)
     assert hypot(*start) <= hypot(*reference)
 
@@ -197,8 +205,8 @@ def test_braking_is_hard_first_and_gentle_in_the_end(speed, rate):
 
 @given(SPEEDS, SPEEDS, st.floats(1e-3, 0.1))
 @settings(max_examples=1000, deadline=None)
-def test_no_more_than_a_step_leads_away_from_rest(before, after, step):
-    kept = rules.held_back(before, after, step)
+def test_limit_growth_speeds_up_by_at_most_a_step(before, after, step):
+    kept = rules.limit_growth(before, after, step)
     grown = [rules.growth(a, b) for a, b in zip(before, kept, strict=True)]
     assert hypot(*grown) <= step * (1 + 1e-12) + 1e-15
     for wanted, got in zip(after, kept, strict=True):
@@ -208,26 +216,26 @@ def test_no_more_than_a_step_leads_away_from_rest(before, after, step):
         assert kept == pytest.approx(after, abs=1e-15)
 
 
-def test_slowing_down_is_never_held_back():
+def test_limit_growth_does_not_limit_slowing_down():
     braked = (1.0, -1.0, 0.0)
-    assert rules.held_back((5.0, -5.0, 5.0), braked, 0.024) is braked
+    assert rules.limit_growth((5.0, -5.0, 5.0), braked, 0.024) is braked
     a_step = (-0.25, 0.0, 0.0)
-    assert rules.held_back(ZERO, a_step, 0.25) is a_step
-    assert rules.held_back((3.0, 0.0, 0.0), (1.0, 1.0, 0.0), 0.5) == (1.0, 0.5, 0.0)
-    assert rules.held_back((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.25) == (-0.25, 0.0, 0.0)
+    assert rules.limit_growth(ZERO, a_step, 0.25) is a_step
+    assert rules.limit_growth((3.0, 0.0, 0.0), (1.0, 1.0, 0.0), 0.5) == (1.0, 0.5, 0.0)
+    assert rules.limit_growth((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.25) == (-0.25, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
     ("before", "after", "grown"),
     [(1.0, 3.0, 2.0), (3.0, 1.0, 0.0), (-1.0, 3.0, 3.0), (1.0, -3.0, 3.0), (-1.0, -3.0, 2.0)],
 )
-def test_what_grows_leads_farther_from_rest(before, after, grown):
+def test_growth_is_the_speed_up_away_from_rest(before, after, grown):
     assert rules.growth(before, after) == grown
 
 
 def test_the_cap_holds_to_the_last_bit():
-    """Speeds whose square rounds down."""
+    """Use speeds whose square is rounded down."""
     for k in range(2000):
         v = nextafter(6.0, 0.0) / sqrt(1 + k * k * 1e-6)
-        w = rules.shortened((v, v * k * 1e-3, 0.0), 6.0 * rules.JUST_BELOW)
+        w = rules.limit_length((v, v * k * 1e-3, 0.0), 6.0 * rules.ROUNDING_FACTOR)
         assert hypot(*w) <= 6.0

@@ -1,4 +1,4 @@
-"""The guard: who arms it, what it takes of a command, and when it falls into HOLD."""
+"""How the guard is armed, limits commands, and enters HOLD."""
 
 from itertools import pairwise
 from math import hypot, inf, nan, nextafter
@@ -6,8 +6,8 @@ from math import hypot, inf, nan, nextafter
 import pytest
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard.hold import HARDEST, PULL_MAX
-from cloudrc.world.guard.limits import CREEP, RANGE, Limits
+from cloudrc.world.guard.hold import BRAKE_MAX, HOLD_SPEED_MAX
+from cloudrc.world.guard.limits import COMMAND_MAX, CREEP_SPEED, Limits
 from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import (
     HERE,
@@ -26,7 +26,7 @@ from tests.world.guard.conftest import (
 from tests.world.guard.test_rules import SPECIAL
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-BEYOND = [value for value in (*SPECIAL, 1e308, -1e308) if abs(value) > RANGE]
+BEYOND = [value for value in (*SPECIAL, 1e308, -1e308) if abs(value) > COMMAND_MAX]
 
 
 # Arming
@@ -43,10 +43,10 @@ def test_fresh_commands_alone_never_arm():
     guard = Guard(LIMITS)
     assert guard.offer(command(), 0) is None
     assert guard.state is GROUND
-    assert run(guard, 0, 10 * MS) == [None] * 5  # the rotors stand still
+    assert run(guard, 0, 10 * MS) == [None] * 5  # the rotors are stopped
 
 
-def test_a_started_mission_waits_on_the_ground_for_its_first_command():
+def test_a_started_mission_waits_for_its_first_command():
     guard = armed()
     assert run(guard, 0, 10 * MS) == [None] * 5
     guard.offer(command(basis_ns=10 * MS), 10 * MS)
@@ -54,7 +54,7 @@ def test_a_started_mission_waits_on_the_ground_for_its_first_command():
     assert [change.cause for change in guard.take_changes()] == ["fresh command"]
 
 
-def test_what_came_before_the_start_of_a_mission_is_not_flown():
+def test_commands_from_before_the_start_are_not_flown():
     guard = Guard(LIMITS)
     guard.offer(command(), 0)
     guard.start_mission(1 * MS)
@@ -68,8 +68,8 @@ def test_a_second_start_within_a_mission_forgets_nothing():
     assert guard.state is TRACK
 
 
-def test_what_the_fence_changes_is_within_the_acceleration_cap():
-    """Beyond a margin it comes back in one axis while another axis speeds up."""
+def test_the_fence_changes_the_reference_within_the_cap():
+    """Beyond the margin it returns in one axis while another axis speeds up."""
     guard = tracking((0.0, 6.0, 0.0))
     before = ZERO
     for k in range(40):
@@ -79,7 +79,7 @@ def test_what_the_fence_changes_is_within_the_acceleration_cap():
         before = after
     assert before[0] > 0.2
     assert before[1] > 0.3
-    assert hypot(*before) == pytest.approx(CREEP)
+    assert hypot(*before) == pytest.approx(CREEP_SPEED)
 
 
 def test_put_on_the_ground_nothing_is_armed_or_remembered():
@@ -92,12 +92,12 @@ def test_put_on_the_ground_nothing_is_armed_or_remembered():
     assert guard.state is GROUND
 
 
-# What is taken of a command
+# Limits of a command
 
 
-@pytest.mark.parametrize("bad", [*BEYOND, nan, inf, -inf, nextafter(RANGE, inf), -1000.1])
+@pytest.mark.parametrize("bad", [*BEYOND, nan, inf, -inf, nextafter(COMMAND_MAX, inf), -1000.1])
 @pytest.mark.parametrize("axis", range(4))
-def test_what_is_beyond_all_reason_is_refused_whole(bad, axis):
+def test_a_command_with_an_absurd_value_is_rejected(bad, axis):
     guard = tracking((0.5, 0.0, 0.0))
     before = run(guard, 0, 100 * MS)[-1]
     values = [1.0, 1.0, 1.0, 0.1]
@@ -124,8 +124,8 @@ def test_the_speed_is_capped_and_keeps_its_direction():
     assert guard.counts["limited_speed"] == 61
 
 
-@pytest.mark.parametrize("most", [RANGE, -RANGE])
-def test_up_to_the_range_what_is_too_fast_is_shortened(most):
+@pytest.mark.parametrize("most", [COMMAND_MAX, -COMMAND_MAX])
+def test_a_too_fast_command_in_range_is_shortened(most):
     guard = armed()
     assert guard.offer(command((most, most, most), yaw_rate=most), 0) is None
     assert guard.counts == {"limited_speed": 1, "limited_yaw_rate": 1}
@@ -142,19 +142,19 @@ def test_the_yaw_rate_is_capped(asked, allowed):
     assert guard.yaw_rate == 0.0
 
 
-def test_the_reference_follows_no_faster_than_the_acceleration_cap():
+def test_the_reference_changes_within_the_acceleration_cap():
     references = run(tracking((3.0, 4.0, 0.0)), 0, 200 * MS, position=(1.0, -3.0, 1.3))
     assert references[0] == pytest.approx((12 * 0.002 * 0.6, 12 * 0.002 * 0.8, 0.0))
     assert references[-1] == pytest.approx((1.44, 1.92, 0.0))  # 12 m/s^2 for 0.2 s
 
 
-def test_one_command_is_slowed_all_the_more_the_nearer_the_fence_is():
+def test_one_command_is_slowed_more_and_more_near_the_fence():
     guard = tracking((0.0, 2.0, 0.0))
     feed(guard, 0, 30, (0.0, 2.0, 0.0), position=(1.0, 0.0, 1.3))
     assert guard.reference == (0.0, 2.0, 0.0)
     assert guard.counts == {}
     flown = []
-    for k, y in enumerate((3.0, 4.0, 4.5, 5.0, 5.4)):  # not faster than a robot gets there
+    for k, y in enumerate((3.0, 4.0, 4.5, 5.0, 5.4)):  # no faster than a robot can move
         start_ns = (300 + 40 * k) * MS
         flown.append(run(guard, start_ns, start_ns + 2 * MS, (1.0, y, 1.3))[0][1])
     assert flown[0] == 2.0
@@ -184,11 +184,11 @@ def test_a_new_session_holds_at_once_and_says_why():
     assert guard.take_changes()[-1][1:] == (HOLD, "new session")
 
 
-def test_hold_brakes_at_once_and_then_holds_where_the_robot_came_to_rest():
+def test_hold_brakes_at_once_and_then_holds_the_position():
     guard = tracking((1.5, 0.0, 0.0))
     run(guard, 0, 252 * MS, velocity=(1.5, 0.0, 0.0))
     first, *rest = run(guard, 252 * MS, 900 * MS, velocity=(1.5, 0.0, 0.0))
-    assert hypot(*first) < 1.0  # the reference starts ahead of the robot, which follows late
+    assert hypot(*first) < 1.0  # below the speed of the robot, which follows late
     assert rest[-1] == ZERO
     assert guard.brakes
     run(guard, 900 * MS, 902 * MS, velocity=(0.75, 0.0, 0.0))
@@ -196,7 +196,7 @@ def test_hold_brakes_at_once_and_then_holds_where_the_robot_came_to_rest():
     assert not guard.brakes
     assert run(guard, 904 * MS, 906 * MS, (1.02, 2.0, 1.3))[0][0] < 0.0
     far = run(guard, 906 * MS, 2 * SECOND, (3.0, 2.0, 1.3))[-1]
-    assert far == pytest.approx((-PULL_MAX, 0.0, 0.0))
+    assert far == pytest.approx((-HOLD_SPEED_MAX, 0.0, 0.0))
 
 
 def test_a_robot_that_lags_its_reference_brakes_from_where_it_is():
@@ -207,15 +207,15 @@ def test_a_robot_that_lags_its_reference_brakes_from_where_it_is():
     assert hypot(*guard.reference) <= 0.2
 
 
-def test_the_reference_brakes_no_harder_than_is_said():
+def test_the_reference_brakes_no_harder_than_its_limit():
     guard = tracking((3.0, 0.0, 0.0))
     run(guard, 0, 252 * MS, velocity=(3.0, 0.0, 0.0))
     references = run(guard, 252 * MS, 1200 * MS, velocity=(3.0, 0.0, 0.0))
     steps = [a[0] - b[0] for a, b in pairwise(references)]
-    assert max(steps) <= HARDEST * 0.002 * (1 + 1e-9)
+    assert max(steps) <= BRAKE_MAX * 0.002 * (1 + 1e-9)
 
 
-def test_the_next_hold_is_another_place():
+def test_the_next_hold_has_a_new_hold_point():
     guard = holding()
     now_ns = feed(guard, 2 * SECOND, 20, (0.0, 0.0, 0.0))
     assert guard.state is TRACK
@@ -236,7 +236,7 @@ def test_position_hold_is_damped():
     assert run(guard, 2 * SECOND, 3 * SECOND, HERE, (0.0, 0.2, 0.0))[-1][1] < -0.2
 
 
-def test_the_end_of_a_mission_holds_whatever_the_cloud_says():
+def test_after_the_end_of_a_mission_it_holds_despite_commands():
     guard = tracking()
     guard.end_mission(10 * MS)
     assert guard.take_changes()[-1] == (10 * MS, HOLD, "mission ended")

@@ -1,4 +1,4 @@
-"""A take-off that is broken off: on the ground the rotors stop, above it the robot climbs clear."""
+"""An aborted take-off: on the ground the rotors stop, above it the robot climbs clear."""
 
 from itertools import pairwise
 from math import hypot, nan
@@ -7,7 +7,13 @@ import pytest
 
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Command, GuardState
-from cloudrc.world.guard.hold import HOP, HOP_SPEED, STILL, STILL_TICKS, TakeOff
+from cloudrc.world.guard.hold import (
+    GROUND_SPEED_MAX,
+    LIFT_OFF_HEIGHT,
+    STILL_SPEED,
+    STILL_TICKS,
+    TakeOff,
+)
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.robot import Robot
@@ -37,14 +43,14 @@ def above(height):
 
 
 def standing(now_ns=0):
-    """On the ground, rotors stopped; its mission has started."""
+    """Return a guard in GROUND that has seen its place; a mission has started."""
     guard = armed(now_ns=now_ns)
     assert run(guard, now_ns, now_ns + TICK, STANDS) == [None]
     return guard
 
 
 def taking_off(height=0.0, now_ns=0):
-    """In TRACK since an instant, and so high since the tick after."""
+    """Return a guard in TRACK whose robot has this height since the next tick."""
     guard = standing(now_ns)
     guard.offer(command((0.0, 0.0, 1.0), now_ns), now_ns)
     run(guard, now_ns + TICK, now_ns + 10 * MS, above(height))
@@ -53,13 +59,20 @@ def taking_off(height=0.0, now_ns=0):
     return guard
 
 
-# What the robot knows of its take-off
+# Detection of a take-off
 
 
 @pytest.mark.parametrize(
-    ("height", "over"), [(0.0, False), (HOP - 1e-6, False), (HOP, True), (-HOP, True), (nan, True)]
+    ("height", "over"),
+    [
+        (0.0, False),
+        (LIFT_OFF_HEIGHT - 1e-6, False),
+        (LIFT_OFF_HEIGHT, True),
+        (-LIFT_OFF_HEIGHT, True),
+        (nan, True),
+    ],
 )
-def test_so_far_from_where_it_stood_the_take_off_is_over(height, over):
+def test_a_take_off_is_over_at_the_lift_off_height(height, over):
     take_off = TakeOff(*FENCE)
     take_off.look(sensed((0.0, 0.0, 0.0)), flies=False)
     take_off.look(sensed((9.0, 0.0, height)), flies=True)
@@ -67,7 +80,7 @@ def test_so_far_from_where_it_stood_the_take_off_is_over(height, over):
     assert take_off.may_end(sensed()) == (not over)
 
 
-def test_where_it_stands_is_where_it_stood_last():
+def test_the_last_place_on_the_ground_counts():
     take_off = TakeOff(*FENCE)
     for height in (3.0, 1.0, 0.5):
         take_off.look(sensed((0.0, 0.0, height)), flies=False)
@@ -75,7 +88,7 @@ def test_where_it_stands_is_where_it_stood_last():
     assert not take_off.over
 
 
-def test_a_robot_that_was_never_seen_to_stand_flies():
+def test_a_robot_never_seen_on_the_ground_flies():
     take_off = TakeOff(*FENCE)
     take_off.look(sensed(STANDS), flies=True)
     assert take_off.over
@@ -86,7 +99,9 @@ def test_a_robot_that_was_never_seen_to_stand_flies():
 
 
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize(("speed", "may"), [(0.99 * HOP_SPEED, True), (HOP_SPEED, False)])
+@pytest.mark.parametrize(
+    ("speed", "may"), [(0.99 * GROUND_SPEED_MAX, True), (GROUND_SPEED_MAX, False)]
+)
 def test_at_speed_the_rotors_do_not_stop(axis, speed, may):
     velocity = [0.0, 0.0, 0.0]
     velocity[axis] = speed
@@ -103,7 +118,7 @@ def stopped():
 
 
 def lie(take_off, ticks, position=STANDS, velocity=ZERO):
-    """Let it lie there for so many ticks; say whether it may take off then."""
+    """Let the robot lie for some ticks; tell whether it may take off then."""
     for _ in range(ticks):
         take_off.look(sensed(position, velocity), flies=False)
     return take_off.allowed
@@ -114,7 +129,7 @@ def test_stopped_it_may_take_off_once_it_has_been_at_rest():
     assert not lie(take_off, STILL_TICKS - 1)
     take_off.forget()  # acknowledged
     assert lie(take_off, 1)
-    assert not lie(take_off, 1, velocity=(1.0, 0.0, 0.0))  # it slides off what it lay on
+    assert not lie(take_off, 1, velocity=(1.0, 0.0, 0.0))  # it slides off an obstacle
     assert lie(take_off, STILL_TICKS)
     take_off.look(sensed(STANDS), flies=True)
     take_off.forget()
@@ -122,21 +137,21 @@ def test_stopped_it_may_take_off_once_it_has_been_at_rest():
 
 
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("speed", [STILL, nan])
-def test_a_tick_in_motion_begins_the_rest_anew(axis, speed):
+@pytest.mark.parametrize("speed", [STILL_SPEED, nan])
+def test_a_tick_in_motion_restarts_the_count_of_still_ticks(axis, speed):
     take_off, velocity = stopped(), [0.0, 0.0, 0.0]
     velocity[axis] = speed
     lie(take_off, STILL_TICKS - 1)
     assert not lie(take_off, STILL_TICKS, velocity=tuple(velocity))
     assert not lie(take_off, STILL_TICKS - 1)
-    velocity[axis] = 0.99 * STILL
+    velocity[axis] = 0.99 * STILL_SPEED
     assert lie(take_off, 1, velocity=tuple(velocity))
 
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("face", [0, 1])
-def test_outside_the_fence_it_stays_where_it_lies(axis, face):
-    """And where it lies so near to a wall that it would scrape out of it."""
+def test_outside_the_fence_a_take_off_is_not_allowed(axis, face):
+    """Nor so near a wall that it would scrape out of the fence."""
     position = list(STANDS)
     edge = FENCE[face][axis] - (0.5 if axis < 2 else 0.0) * (2 * face - 1)
     position[axis] = edge
@@ -149,9 +164,9 @@ def test_outside_the_fence_it_stays_where_it_lies(axis, face):
 # On the ground
 
 
-def test_on_the_ground_a_hold_stops_the_rotors_and_the_mission_goes_on():
-    guard = taking_off(0.9 * HOP)
-    flown = run(guard, 250 * MS, 260 * MS, above(0.9 * HOP))
+def test_a_hold_on_the_ground_stops_the_rotors_not_the_mission():
+    guard = taking_off(0.9 * LIFT_OFF_HEIGHT)
+    flown = run(guard, 250 * MS, 260 * MS, above(0.9 * LIFT_OFF_HEIGHT))
     assert flown[0] is not None
     assert set(flown[1:]) == {None}
     cause = "command age 0.252 s above 0.250 s"
@@ -160,7 +175,7 @@ def test_on_the_ground_a_hold_stops_the_rotors_and_the_mission_goes_on():
     assert guard.reference == ZERO
 
 
-def test_a_broken_off_take_off_is_taken_up_again_by_a_fresh_command():
+def test_a_fresh_command_resumes_an_aborted_take_off():
     guard = taking_off()
     run(guard, 10 * MS, 2 * SECOND, STANDS)
     assert states(guard) == [HOLD, GROUND]
@@ -168,7 +183,7 @@ def test_a_broken_off_take_off_is_taken_up_again_by_a_fresh_command():
     assert states(guard) == [TRACK]
 
 
-def test_a_mission_that_ends_on_the_ground_leaves_the_robot_there():
+def test_a_mission_that_ends_on_the_ground_ends_in_ground():
     guard = taking_off()
     guard.end_mission(10 * MS)
     assert run(guard, 10 * MS, 20 * MS, STANDS) == [None] * 5
@@ -181,8 +196,8 @@ def test_a_mission_that_ends_on_the_ground_leaves_the_robot_there():
     assert guard.state is TRACK
 
 
-def test_on_the_ground_a_link_that_comes_and_goes_does_not_chatter():
-    """Fresh for a tick, then silent: again and again for 20 s."""
+def test_on_the_ground_an_unstable_link_does_not_chatter():
+    """Fresh commands for a tick, then silence, repeatedly for 20 s."""
     guard, now_ns = taking_off(), 10 * MS
     while now_ns < 20 * SECOND:
         guard.offer(command((0.0, 0.0, 1.0), now_ns - 249 * MS), now_ns)
@@ -195,7 +210,7 @@ def test_on_the_ground_a_link_that_comes_and_goes_does_not_chatter():
         assert min(b - a for a, b in pairwise(stamps)) >= 1 * SECOND
 
 
-def test_after_a_spawn_nothing_has_to_settle():
+def test_after_a_spawn_the_settling_time_does_not_apply():
     guard = taking_off()
     guard.end_mission(20 * MS)
     guard.put_on_ground(30 * MS, "mission starts from spawn")
@@ -216,17 +231,17 @@ def test_a_robot_that_is_fast_brakes_before_its_rotors_stop():
 
 
 @pytest.mark.promise("no-rotor-stop-in-the-air")
-def test_a_robot_that_has_left_the_ground_stays_up_and_climbs_clear_of_it():
-    guard = taking_off(1.1 * HOP)
-    flown = run(guard, 10 * MS, 3 * SECOND, above(1.1 * HOP))
+def test_above_the_ground_a_hold_climbs_clear_of_it():
+    guard = taking_off(1.1 * LIFT_OFF_HEIGHT)
+    flown = run(guard, 10 * MS, 3 * SECOND, above(1.1 * LIFT_OFF_HEIGHT))
     assert states(guard) == [HOLD]
     assert flown[-1][:2] == (0.0, 0.0)
-    assert flown[-1][2] == pytest.approx(0.8 * (FLOOR_MARGIN - STANDS[2] - 1.1 * HOP))
+    assert flown[-1][2] == pytest.approx(0.8 * (FLOOR_MARGIN - STANDS[2] - 1.1 * LIFT_OFF_HEIGHT))
 
 
 @pytest.mark.promise("no-rotor-stop-in-the-air")
-def test_a_robot_that_has_flown_never_stops_its_rotors_where_it_once_stood():
-    """It may have taken off from a roof, and be beside it."""
+def test_after_flying_the_rotors_do_not_stop_where_it_stood():
+    """It may have taken off from a roof and be beside it now."""
     guard = taking_off(1.0)
     run(guard, 10 * MS, 3 * SECOND, STANDS)
     assert states(guard) == [HOLD]
@@ -235,7 +250,7 @@ def test_a_robot_that_has_flown_never_stops_its_rotors_where_it_once_stood():
     assert states(guard) == [TRACK, HOLD]
 
 
-def test_the_next_take_off_is_another_one():
+def test_after_a_stop_the_next_take_off_is_a_new_one():
     guard = taking_off(1.0)
     guard.stop(10 * MS)
     guard.acknowledge(1 * SECOND)
@@ -247,8 +262,8 @@ def test_the_next_take_off_is_another_one():
     assert states(guard) == [HOLD, GROUND]
 
 
-def test_acknowledged_started_and_led_within_one_tick_it_knows_where_it_stood():
-    """Else it would take what scrapes along the ground for a robot that flies."""
+def test_a_take_off_within_one_tick_knows_its_ground():
+    """Otherwise a robot that scrapes along the ground would count as flying."""
     guard = standing()
     guard.stop(10 * MS)
     run(guard, 10 * MS, 1 * SECOND, STANDS)
@@ -260,7 +275,7 @@ def test_acknowledged_started_and_led_within_one_tick_it_knows_where_it_stood():
     assert states(guard) == [HOLD, GROUND]
 
 
-# With a robot under it
+# With a simulated robot
 
 
 @pytest.fixture(scope="module")
@@ -269,7 +284,7 @@ def simulator():
 
 
 def broken_off(simulator, ticks, velocity, ended):
-    """Fly a command for so many ticks, then leave the robot alone for 6 s."""
+    """Fly a command for some ticks, then send nothing for 6 s."""
     guard = Guard(LIMITS)
     robot = Robot(simulator, LowLevel(), guard)
     robot.put_on_ground(0, "test")
@@ -290,7 +305,7 @@ def broken_off(simulator, ticks, velocity, ended):
 
 @pytest.mark.parametrize("ended", [False, True])
 @pytest.mark.parametrize("velocity", [(0.0, 0.0, 1.0), (1.5, 0.5, 2.0), (6.0, 0.0, 0.3)])
-def test_whenever_a_take_off_is_broken_off_the_robot_does_not_scrape(simulator, velocity, ended):
+def test_a_take_off_aborted_at_any_time_does_not_scrape(simulator, velocity, ended):
     ends = set()
     for ticks in (1, 5, 12, 16, 20, 28, 30, 35, 40, 50, 70, 100, 125, 200):
         guard, touched = broken_off(simulator, ticks, velocity, ended)
