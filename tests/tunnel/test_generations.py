@@ -116,9 +116,9 @@ def test_a_forged_generation_opens_nothing_and_keeps_little():
     world, cloud = pair()
     for byte in range(1, 256):
         assert refuses(world, forged(cloud, byte))
-    assert len(world._openers._tried) <= AHEAD_MAX
+    assert len(world._openers._derived) <= AHEAD_MAX
     world.tend(1)
-    assert world._openers._tried == {}
+    assert world._openers._derived == {}
 
 
 def forged(cloud, byte):

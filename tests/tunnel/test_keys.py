@@ -97,25 +97,26 @@ HEX = SECRET.hex()
     [
         (
             "",
-            "^its lines are 'current', and perhaps 'previous', 'overlap_s' and 'previous_until_s'$",
+            "^expected the line 'current' and optionally 'previous', 'overlap_s' and "
+            "'previous_until_s', each once$",
         ),
-        ("# only a comment", "its lines are"),
-        (f"previous {HEX}", "its lines are"),
-        (f"current {HEX}\nnext {HEX}", "its lines are"),
-        (f"current {HEX}\ncurrent {HEX}", "its lines are"),
+        ("# only a comment", "expected the line"),
+        (f"previous {HEX}", "expected the line"),
+        (f"current {HEX}\nnext {HEX}", "expected the line"),
+        (f"current {HEX}\ncurrent {HEX}", "expected the line"),
         (HEX, "neither 32 bytes nor lines"),
         (f"current {HEX} {HEX}", "neither 32 bytes nor lines"),
         (f"current {HEX[:-2]}", "64 hexadecimal digits"),
         (f"current {HEX[:-1]}x", "64 hexadecimal digits"),
         (f"current {HEX}\nprevious x", "64 hexadecimal digits"),
         *(
-            (f"current {HEX}\noverlap_s {wrong}", "overlap_s is above 0")
+            (f"current {HEX}\noverlap_s {wrong}", "overlap_s must be above 0")
             for wrong in ("0", "-1", "nan", "inf", "86401", "soon")
         ),
         *(
             (
                 f"current {HEX}\nprevious_until_s {wrong}",
-                "^previous_until_s is seconds since 1970, before the year 10000$",
+                "^previous_until_s must be seconds since 1970, before the year 10000$",
             )
             for wrong in ("-1", "nan", "inf", "253402300800", "soon")
         ),
@@ -224,19 +225,19 @@ def test_a_clock_that_is_set_back_gives_no_more_than_the_overlap():
         (
             ROTATED,
             0.0,
-            "refused: by this machine's clock (1970-01-01T00:00:00+00:00) the key file is not made "
-            "yet; set the clock",
+            "refused: this machine's clock (1970-01-01T00:00:00+00:00) is behind the time when "
+            "the key file was written; set the clock",
         ),
         (
             KeySet(B, A),
             MADE,
-            "accepted for 300 s from every start on, for the key file does not say until when; "
+            "accepted for 300 s after every start, because the key file has no expiry time; "
             "drop it: cloudrc key retire FILE",
         ),
     ],
 )
 def test_what_is_doubtful_about_the_previous_key_is_told(keys, wall, said):
-    assert keys.caution(wall) == f"key {A.name}, the one before, is {said}"
+    assert keys.caution(wall) == f"the previous key {A.name} is {said}"
 
 
 @pytest.mark.parametrize("keys", [KeySet(B), ROTATED])

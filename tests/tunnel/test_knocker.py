@@ -158,10 +158,10 @@ def test_somebody_elses_refusal_does_not_count(knocker):
 
 def test_the_first_world_is_nobodys_successor(knocker):
     accepted(knocker, 3, accept(), 0)
-    assert not knocker._left
+    assert not knocker._old_worlds
 
 
 def test_what_is_remembered_of_worlds_is_bounded(knocker):
     for number in range(3 * LEFT_MAX):
         accepted(knocker, 1, accept(world=b"%016d" % number), 0)
-    assert len(knocker._left) == LEFT_MAX
+    assert len(knocker._old_worlds) == LEFT_MAX

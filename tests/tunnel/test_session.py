@@ -30,7 +30,7 @@ def a_session(sends=Direction.DOWNLINK, secret=bytes(32)):
 def state(session):
     """All that a datagram could change; ciphers by where they are."""
     known = {} if session._openers is None else vars(session._openers)
-    known = {name: value for name, value in known.items() if name not in ("_tried", "_far_tries")}
+    known = {name: value for name, value in known.items() if name not in ("_derived", "_far_tries")}
     return {name: repr(value) for name, value in (vars(session) | known).items()}
 
 
@@ -161,7 +161,7 @@ def test_no_nonce_is_used_twice_in_an_epoch():
 
 
 def test_an_end_cannot_begin_without_greetings():
-    with pytest.raises(AssertionError, match=r"^greetings come first$"):
+    with pytest.raises(AssertionError, match=r"^the handshake comes first$"):
         a_session().begin(1)
 
 
