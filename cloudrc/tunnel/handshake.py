@@ -281,7 +281,7 @@ LEFT_MAX = 64
 """Number of earlier world processes that cloud remembers."""
 
 
-class Knocker:
+class ClientHandshake:
     """Cloud's side: make hellos and decide which answers are valid."""
 
     def __init__(self, nonce: bytes, clock: bytes, suite: int) -> None:
@@ -300,12 +300,12 @@ class Knocker:
         self._world = b""  # nonce of the world process with the session
         self._old_worlds: deque[bytes] = deque(maxlen=LEFT_MAX)
 
-    def hello(self) -> bytes:
+    def make_hello(self) -> bytes:
         """Make the body of a periodic hello."""
         self._replies = REPLIES_MAX
         return self._hello()
 
-    def challenged(self, cookie: bytes) -> bytes | None:
+    def answer_challenge(self, cookie: bytes) -> bytes | None:
         """Handle a challenge and make the body of the hello that answers it.
 
         A repeated cookie is ignored: the next hello has it if it is the newest, and an older one
@@ -323,7 +323,7 @@ class Knocker:
             del self._cookies[next(iter(self._cookies))]
         return self._hello()
 
-    def refused(self, busy: Busy) -> bool:
+    def receive_busy(self, busy: Busy) -> bool:
         """Handle a refusal.
 
         Returns:
@@ -335,7 +335,9 @@ class Knocker:
             self._change_nonce()
         return not busy.used
 
-    def accepted(self, epoch: int, accept: Accept, current: int, *, asks: bool) -> Agreement | None:
+    def receive_accept(
+        self, epoch: int, accept: Accept, current: int, *, asks: bool
+    ) -> Agreement | None:
         """Handle an acceptance.
 
         Cloud accepts another world process only while it asks for a session, because a late

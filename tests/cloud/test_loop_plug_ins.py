@@ -87,7 +87,7 @@ def test_a_plug_in_that_fails_is_replaced_counted_and_reported_once(kind, bad):
     (fault,) = a_loop.take_faults()
     assert fault.code == f"{kind}_failed"
     assert "\n" not in fault.text
-    assert f"mend cloud.{kind}" in fault.text
+    assert f"fix cloud.{kind}" in fault.text
 
 
 ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
@@ -167,7 +167,7 @@ def test_plug_ins_that_fail_as_they_begin_anew_are_told_with_the_next_telemetry(
     faults = {fault.code: (fault.stamp_ns, fault.text) for fault in a_loop.take_faults()}
     assert set(faults) == {"estimator_failed", "predictor_failed", "controller_failed"}
     assert {stamp_ns for stamp_ns, _ in faults.values()} == {1090 * MS}
-    assert "it is asked on as it is" in faults["controller_failed"][1]
+    assert "cloud goes on using it" in faults["controller_failed"][1]
 
 
 def test_ctrl_c_in_a_plug_in_is_the_persons():
@@ -192,4 +192,4 @@ def test_what_a_plug_in_says_is_cut_to_a_line_that_can_be_written():
     (fault,) = a_loop.take_faults()
     assert "ValueError: no caf\\udce9 xxx" in fault.text
     assert len(fault.text.encode()) < 2200
-    assert fault.text.endswith("mend cloud.controller or choose another")
+    assert fault.text.endswith("fix cloud.controller or choose another")

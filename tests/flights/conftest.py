@@ -45,7 +45,7 @@ from cloudrc.report.document import Run
 from cloudrc.report.write import Assessment, assess
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
-from cloudrc.tunnel.handshake import Knocker
+from cloudrc.tunnel.handshake import ClientHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import AES_256_GCM, Session, make_session
 from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
@@ -132,11 +132,11 @@ class BareCloud:
 
     def __init__(self, nonce: bytes, keys: KeyRing | None) -> None:
         self.session: Session = make_session(Direction.DOWNLINK, keys)
-        self.knocker = Knocker(nonce.ljust(16), CLOCK, AES_256_GCM)
+        self.handshake = ClientHandshake(nonce.ljust(16), CLOCK, AES_256_GCM)
         self.heard: list[str] = []
 
     def hello(self) -> bytes:
-        return self.session.greet(Kind.HELLO, self.knocker.hello())
+        return self.session.greet(Kind.HELLO, self.handshake.make_hello())
 
     def command(self, now_ns: int = 0) -> bytes:
         body = codec.encode_command(Command(now_ns, now_ns, 0, ZERO, 0.0))
@@ -157,13 +157,13 @@ class BareCloud:
             return None
         self.heard.append(Kind(kind).name)
         if kind == Kind.CHALLENGE:
-            hello = self.knocker.challenged(codec.decode_challenge(body))
+            hello = self.handshake.answer_challenge(codec.decode_challenge(body))
             return hello and self.session.greet(Kind.HELLO, hello)
         if kind == Kind.BUSY:
-            self.knocker.refused(codec.decode_busy(body))
+            self.handshake.receive_busy(codec.decode_busy(body))
         if kind == Kind.ACCEPT:
             accept = codec.decode_accept(body)
-            agreement = self.knocker.accepted(epoch, accept, self.session.epoch, asks=True)
+            agreement = self.handshake.receive_accept(epoch, accept, self.session.epoch, asks=True)
             if agreement is not None:
                 self.session.begin(epoch, agreement)
         return None
@@ -446,14 +446,17 @@ class Talk:
         identity = WorldIdentity(SHARED_CLOCK, nonce.ljust(16), last_epoch, ring)
         self.world = assembly.build_world(HOVER, identity)
         self.key, self.now_ns, self.records = key, 0, []
-        self.clouds: dict[bytes, tuple[Session, Knocker]] = {}
+        self.clouds: dict[bytes, tuple[Session, ClientHandshake]] = {}
         self.session = self.cloud(b"cloud")[0]
 
-    def cloud(self, nonce: bytes) -> tuple[Session, Knocker]:
+    def cloud(self, nonce: bytes) -> tuple[Session, ClientHandshake]:
         """The cloud process of this name; from here on the one that speaks."""
         if nonce not in self.clouds:
             session = Session(Direction.DOWNLINK, KeyRing(KeySet(self.key)))
-            self.clouds[nonce] = session, Knocker(nonce.ljust(16), SHARED_CLOCK, AES_256_GCM)
+            self.clouds[nonce] = (
+                session,
+                ClientHandshake(nonce.ljust(16), SHARED_CLOCK, AES_256_GCM),
+            )
         self.session = self.clouds[nonce][0]
         return self.clouds[nonce]
 
@@ -479,18 +482,20 @@ class Talk:
 
     def hello(self, nonce: bytes) -> int:
         """Greet as this cloud, up to world's answer; the epoch that it got, 0 if none."""
-        session, knocker = self.cloud(nonce)
-        self.send(session.greet(Kind.HELLO, knocker.hello()))
+        session, handshake = self.cloud(nonce)
+        self.send(session.greet(Kind.HELLO, handshake.make_hello()))
         answers = self.hear(Kind.CHALLENGE, Kind.ACCEPT)
         for kind, _, body in answers:
             if kind == Kind.CHALLENGE:
                 self.send(
-                    session.greet(Kind.HELLO, knocker.challenged(codec.decode_challenge(body)))
+                    session.greet(
+                        Kind.HELLO, handshake.answer_challenge(codec.decode_challenge(body))
+                    )
                 )
                 answers = self.hear(Kind.ACCEPT)
         for _, epoch, body in answers:
             accept = codec.decode_accept(body)
-            agreement = knocker.accepted(epoch, accept, session.epoch, asks=True)
+            agreement = handshake.receive_accept(epoch, accept, session.epoch, asks=True)
             if agreement is not None:
                 session.begin(epoch, agreement)
             return epoch

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from cloudrc.messages import Command
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Busy, Direction, Hello, Kind
-from cloudrc.tunnel.handshake import Door, Knocker
+from cloudrc.tunnel.handshake import ClientHandshake, Door
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, REKEY_NS, Session, pair
 
@@ -164,13 +164,13 @@ def test_a_cookie_can_be_made_from_the_description_alone():
 
 
 def test_the_second_name_of_a_cloud_is_made_of_the_first():
-    knocker = Knocker(b"n" * 16, bytes(16), 1)
-    knocker.refused(Busy(b"n" * 16, used=True))
+    handshake = ClientHandshake(b"n" * 16, bytes(16), 1)
+    handshake.receive_busy(Busy(b"n" * 16, used=True))
     second = hashlib.sha256(b"n" * 16 + b" 1").digest()[:16]
-    assert codec.decode_hello(knocker.hello()).nonce == second
-    knocker.refused(Busy(second, used=True))
+    assert codec.decode_hello(handshake.make_hello()).nonce == second
+    handshake.receive_busy(Busy(second, used=True))
     third = hashlib.sha256(b"n" * 16 + b" 2").digest()[:16]
-    assert codec.decode_hello(knocker.hello()).nonce == third
+    assert codec.decode_hello(handshake.make_hello()).nonce == third
 
 
 FROZEN = {

@@ -1,15 +1,15 @@
 """Cloud's missed periods: when they are told, and when again."""
 
-from cloudrc.cloud.endpoint import Lateness
+from cloudrc.cloud.endpoint import MissedPeriods
 
 MS, S = 1_000_000, 1_000_000_000
 
 
 def told(missed: list[tuple[float, int]]) -> list[float]:
     """When it says something [s], of periods missed at instants [s]."""
-    lateness = Lateness()
+    missed = MissedPeriods()
     return [
-        fault.stamp_ns / S for at, count in missed for fault in lateness.miss(count, round(at * S))
+        fault.stamp_ns / S for at, count in missed for fault in missed.miss(count, round(at * S))
     ]
 
 
@@ -45,6 +45,8 @@ def test_half_of_the_periods_missed_is_told_within_two_seconds():
 
 
 def test_it_says_how_many_were_missed():
-    lateness = Lateness()
-    lateness.miss(40, 5 * S)
-    assert lateness.miss(30, 5 * S + 100 * MS)[0].text.startswith("cloud has let 70 periods of")
+    missed = MissedPeriods()
+    missed.miss(40, 5 * S)
+    assert missed.miss(30, 5 * S + 100 * MS)[0].text.startswith(
+        "cloud sent no command in 70 periods of"
+    )

@@ -1,0 +1,167 @@
+"""Cloud's side of the greetings: what its hellos say, and which answers count."""
+
+import pytest
+
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.codec import Accept, Busy, Hello
+from cloudrc.tunnel.handshake import COOKIES_MAX, LEFT_MAX, NO_COOKIE, REPLIES_MAX, ClientHandshake
+from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, Agreement
+
+NONCE, CLOCK, WORLD = b"n" * 16, b"c" * 16, b"w" * 16
+
+
+@pytest.fixture
+def handshake():
+    return ClientHandshake(NONCE, CLOCK, CHACHA20_POLY1305)
+
+
+def test_a_hello_says_who_asks(handshake):
+    hello = codec.decode_hello(handshake.make_hello())
+    assert hello == Hello(NONCE, CLOCK, NO_COOKIE, CHACHA20_POLY1305)
+
+
+def test_a_challenge_is_answered_with_its_cookie_and_later_hellos_have_it_too(handshake):
+    handshake.make_hello()
+    answer = handshake.answer_challenge(b"1" * 16)
+    assert answer is not None
+    assert codec.decode_hello(answer).cookie == b"1" * 16
+    assert codec.decode_hello(handshake.make_hello()).cookie == b"1" * 16
+
+
+def test_challenges_cannot_make_cloud_talk(handshake):
+    assert handshake.answer_challenge(b"0" * 16) is None  # it has not asked
+    handshake.make_hello()
+    assert handshake.answer_challenge(b"1" * 16)
+    assert handshake.answer_challenge(b"1" * 16) is None
+    answers = [handshake.answer_challenge(b"%016d" % n) for n in range(50)]
+    assert sum(answer is not None for answer in answers) == REPLIES_MAX - 1
+
+
+def test_old_challenges_that_are_repeated_take_no_ones_turn(handshake):
+    old = [b"old %d" % n for n in range(REPLIES_MAX)]
+    handshake.make_hello()
+    assert all(handshake.answer_challenge(cookie) for cookie in old)
+    handshake.make_hello()
+    assert [handshake.answer_challenge(cookie) for cookie in 100 * old] == 300 * [None]
+    answer = handshake.answer_challenge(b"1" * 16)
+    assert codec.decode_hello(answer).cookie == b"1" * 16
+    assert [handshake.answer_challenge(cookie) for cookie in old] == REPLIES_MAX * [None]
+    assert codec.decode_hello(handshake.make_hello()).cookie == b"1" * 16
+
+
+def test_a_cookie_that_found_no_turn_left_is_taken_at_the_next(handshake):
+    handshake.make_hello()
+    for number in range(REPLIES_MAX):
+        handshake.answer_challenge(b"old %d" % number)
+    assert handshake.answer_challenge(b"1" * 16) is None
+    handshake.make_hello()
+    assert handshake.answer_challenge(b"1" * 16)
+
+
+def test_what_is_remembered_of_cookies_is_bounded(handshake):
+    for number in range(COOKIES_MAX + 1):
+        handshake.make_hello()
+        handshake.answer_challenge(b"%016d" % number)
+    assert len(handshake._cookies) == COOKIES_MAX
+    assert handshake.answer_challenge(b"%016d" % 1) is None
+    assert handshake.answer_challenge(b"%016d" % 0)
+
+
+def accept(nonce=NONCE, world=WORLD, suite=AES_256_GCM):
+    return Accept(nonce, world, CLOCK, suite)
+
+
+def accepted(handshake, epoch, answer, current, *, asks=True):
+    return handshake.receive_accept(epoch, answer, current, asks=asks)
+
+
+def test_an_acceptance_gives_what_both_agree_on(handshake):
+    agreement = accepted(handshake, 3, accept(suite=CHACHA20_POLY1305), 0)
+    assert agreement == Agreement(NONCE, WORLD, CHACHA20_POLY1305)
+
+
+@pytest.mark.parametrize(("epoch", "counts"), [(2, False), (3, False), (4, True)])
+def test_of_one_world_only_a_newer_epoch_counts(handshake, epoch, counts):
+    accepted(handshake, 3, accept(), 0)
+    assert (accepted(handshake, epoch, accept(), 3) is not None) == counts
+
+
+@pytest.mark.parametrize(("ahead", "counts"), [(2**31 - 1, True), (2**31, False)])
+def test_half_of_all_epochs_are_newer(handshake, ahead, counts):
+    accepted(handshake, 1, accept(), 0)
+    assert (accepted(handshake, 1 + ahead, accept(), 1) is not None) == counts
+
+
+def test_another_process_of_world_may_begin_again_from_one(handshake):
+    accepted(handshake, 3, accept(), 0)
+    assert accepted(handshake, 1, accept(world=b"v" * 16), 3)
+
+
+@pytest.mark.promise("old-datagrams-do-nothing")
+def test_a_world_that_is_gone_does_not_come_back(handshake):
+    accepted(handshake, 3, accept(), 0)
+    accepted(handshake, 4, accept(world=b"v" * 16), 3)
+    assert accepted(handshake, 9, accept(), 4) is None
+    name = codec.decode_hello(handshake.make_hello()).nonce
+    assert accepted(handshake, 5, accept(name, b"v" * 16), 4)
+
+
+def test_what_a_world_that_is_gone_said_late_does_not_take_the_place_of_the_one_that_is_heard(
+    handshake,
+):
+    accepted(handshake, 3, accept(), 0)
+    assert accepted(handshake, 1, accept(world=b"v" * 16), 3, asks=False) is None
+    assert accepted(handshake, 4, accept(), 3, asks=False)
+
+
+def test_a_world_that_was_taken_for_gone_is_asked_under_another_name(handshake):
+    """What the one before had said came late, and was taken while nobody was heard."""
+    accepted(handshake, 3, accept(world=b"v" * 16), 0)
+    accepted(handshake, 9, accept(), 3)
+    assert accepted(handshake, 3, accept(world=b"v" * 16), 9) is None  # alive, and answers
+    name = codec.decode_hello(handshake.make_hello()).nonce
+    assert name != NONCE
+    assert accepted(handshake, 9, accept(), 9) is None  # the late word, once more
+    assert accepted(handshake, 4, accept(name, b"v" * 16), 9)
+    assert codec.decode_hello(handshake.make_hello()).nonce == name
+
+
+def test_after_the_last_epoch_of_all_the_first_is_newer(handshake):
+    accepted(handshake, 2**32 - 1, accept(), 0)
+    assert accepted(handshake, 2**32 - 2, accept(), 2**32 - 1) is None
+    assert accepted(handshake, 1, accept(), 2**32 - 1)
+
+
+def test_an_acceptance_of_somebody_else_does_not_count(handshake):
+    assert accepted(handshake, 3, accept(nonce=b"m" * 16), 0) is None
+
+
+def test_a_refusal_by_anothers_authority_is_told_and_asked_again_as_before(handshake):
+    assert handshake.receive_busy(Busy(NONCE, used=False))
+    assert codec.decode_hello(handshake.make_hello()).nonce == NONCE
+
+
+def test_a_used_name_is_replaced_once(handshake):
+    assert not handshake.receive_busy(Busy(NONCE, used=True))
+    second = codec.decode_hello(handshake.make_hello()).nonce
+    assert second != NONCE
+    assert not handshake.receive_busy(Busy(NONCE, used=True))  # an answer to a hello before that
+    assert codec.decode_hello(handshake.make_hello()).nonce == second
+    handshake.receive_busy(Busy(second, used=True))
+    assert codec.decode_hello(handshake.make_hello()).nonce not in (NONCE, second)
+    assert accepted(handshake, 1, accept(), 0) is None
+
+
+def test_somebody_elses_refusal_does_not_count(handshake):
+    assert not handshake.receive_busy(Busy(b"m" * 16, used=False))
+
+
+def test_the_first_world_is_nobodys_successor(handshake):
+    accepted(handshake, 3, accept(), 0)
+    assert not handshake._old_worlds
+
+
+def test_what_is_remembered_of_worlds_is_bounded(handshake):
+    for number in range(3 * LEFT_MAX):
+        accepted(handshake, 1, accept(world=b"%016d" % number), 0)
+    assert len(handshake._old_worlds) == LEFT_MAX
