@@ -65,7 +65,7 @@ def test_the_shipped_plugins_are_found():
 
 
 @every_plugin
-def test_build_needs_no_parameter_annotates_all_and_makes_its_kind(module, kind):
+def test_build_has_defaults_annotations_and_the_right_kind(module, kind):
     signature = inspect.signature(module.build, eval_str=True)
     for parameter in signature.parameters.values():
         assert parameter.annotation is not parameter.empty, parameter
@@ -75,7 +75,7 @@ def test_build_needs_no_parameter_annotates_all_and_makes_its_kind(module, kind)
 
 
 @every_plugin
-def test_the_docstrings_say_what_it_is_where_it_comes_from_and_what_parameters_mean(module, kind):
+def test_docstrings_have_a_source_and_explain_all_parameters(module, kind):
     assert "Source:" in module.__doc__
     assert inspect.getdoc(type(module.build()))
     for name in inspect.signature(module.build).parameters:

@@ -90,7 +90,7 @@ def test_a_run_replayed_after_both_restarts_is_not_accepted(first, last_epoch, s
     assert run.cloud.teleop.outcome is None or run.cloud.teleop.outcome.success
 
 
-def test_the_same_run_replayed_while_it_lasts_is_all_repeated():
+def test_a_run_replayed_during_the_run_is_all_repeated():
     run = Captured(b"world 1", b"cloud 1")
     run.go(4 * SECOND_NS)
     captured = {way: list(heard) for way, heard in run.heard.items()}
@@ -110,7 +110,7 @@ def test_the_same_run_replayed_while_it_lasts_is_all_repeated():
     assert run.world._session.epoch == epoch
 
 
-def test_a_flood_of_what_is_repeated_is_counted_and_not_recorded_one_by_one():
+def test_a_flood_of_repeats_is_counted_but_not_recorded():
     run = Captured(b"world 1", b"cloud 1")
     run.go(2 * SECOND_NS)
     heard = {way: [d for d in data if peek(d)[0] in FLOWING] for way, data in run.heard.items()}
@@ -175,7 +175,7 @@ def greetings(run: Captured, kind: Kind, *, to_world: bool) -> list[bytes]:
 
 @pytest.mark.parametrize("rate_hz", [18, 25, 100, 500])
 @pytest.mark.parametrize("which", ["old hello", "fresh hello", "hellos", "challenges", "all"])
-def test_so_does_one_while_captured_greetings_are_repeated(first, which, rate_hz):
+def test_repeated_greetings_do_not_delay_a_restarted_cloud(first, which, rate_hz):
     """Greetings carry the tag of a key that outlives them; they must lock nobody out."""
     run = Captured(b"world 2", b"cloud 2", 4096)
     run.world._door._next_epoch = iter(range(1, 9)).__next__

@@ -85,7 +85,7 @@ def check_kill_mid_pipe(figure, k):
 
 @pytest.mark.promise("brakes-without-commands")
 @pytest.mark.parametrize("k", DAILY)
-def test_when_its_cloud_is_killed_the_robot_stops_and_a_new_one_flies_on(k, figure):
+def test_a_new_cloud_flies_on_after_a_kill(k, figure):
     check_kill_mid_pipe(figure, k)
 
 

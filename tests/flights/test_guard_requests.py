@@ -77,7 +77,7 @@ def test_a_start_that_was_held_back_on_the_way_starts_nothing(
 
 
 @pytest.mark.parametrize("request_", [Request.END, Request.ESTOP])
-def test_what_stops_the_robot_does_so_however_late_it_comes(talk, request_):
+def test_a_late_stop_still_stops_the_robot(talk, request_):
     captured = talk.asked(2, request_, Start.HERE)
     talk.wait(talk.now_ns + 200_000 * MS)
     talk.send(captured)
@@ -94,7 +94,7 @@ def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
     assert talk.world._orders.number == 1
 
 
-def test_a_command_that_waits_as_the_robot_is_stopped_is_not_told_to_be_flown(talk):
+def test_a_command_waiting_during_a_stop_is_not_echoed(talk):
     applied = len(talk.take(CommandApplied))
     talk.send(talk.command())
     talk.request(2, Request.ESTOP, Start.HERE)
@@ -102,7 +102,7 @@ def test_a_command_that_waits_as_the_robot_is_stopped_is_not_told_to_be_flown(ta
     assert len(talk.take(CommandApplied)) == applied
 
 
-def test_its_keys_are_looked_after_by_the_machines_clock(talk):
+def test_world_rekeys_by_the_machines_clock(talk):
     """World's own lags behind it by what it could not make up for."""
     talk.wait(talk.now_ns + 100 * MS)
     before_ns = talk.now_ns
@@ -116,7 +116,7 @@ def test_the_end_of_a_mission_is_confirmed_even_while_latched(talk):
     assert ask(talk, 3, Request.END) == (GuardState.ESTOP, 3)
 
 
-def test_in_hold_commands_are_heard_but_neither_flown_nor_echoed(talk):
+def test_in_hold_commands_are_neither_flown_nor_echoed(talk):
     talk.wait(talk.now_ns + 2_000 * MS)
     applied = len(talk.take(CommandApplied))
     echo_ns = talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns
@@ -127,7 +127,7 @@ def test_in_hold_commands_are_heard_but_neither_flown_nor_echoed(talk):
     assert talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns > echo_ns
 
 
-def test_what_was_limited_is_counted(talk):
+def test_limited_commands_are_counted(talk):
     for _ in range(10):
         talk.send(talk.command((0.0, 0.0, 9.0)))
         talk.wait(talk.now_ns + 10 * MS)
@@ -143,7 +143,7 @@ def test_only_a_hold_within_a_mission_is_counted_as_held(talk):
     assert talk.counts()["held_seconds"] == held
 
 
-def test_what_the_robot_has_touched_is_told_until_another_mission_starts(talk):
+def test_contacts_are_reported_until_the_next_mission_starts(talk):
     """Cloud may die right after the touch: its successor has to learn of it."""
     ask(talk, 2, Request.END)
     talk.world._orders.touches.pipes = 1
@@ -157,7 +157,7 @@ def test_what_the_robot_has_touched_is_told_until_another_mission_starts(talk):
     assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == 0
 
 
-def test_what_the_cloud_before_has_said_does_not_count_for_the_next_one(talk):
+def test_requests_of_an_earlier_cloud_do_not_count(talk):
     """Nine fresh commands of one and a single one of another are no proof of a link."""
     fly(talk, 100)
     ask(talk, 2, Request.END)

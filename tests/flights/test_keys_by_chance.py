@@ -150,7 +150,7 @@ class Two:
 
 
 @pytest.mark.parametrize("first", [0, pytest.param(1_000, marks=pytest.mark.full)])
-def test_once_it_is_calm_both_ends_hear_each_other(first: int) -> None:
+def test_after_the_rotations_both_ends_hear_each_other(first: int) -> None:
     seeds, judged = range(first, 4 * first or 40), 0
     for seed in seeds:
         two = Two(seed)

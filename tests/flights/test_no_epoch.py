@@ -33,7 +33,7 @@ def told(talk):
     return [fault.text for fault in talk.take(Fault)]
 
 
-def test_another_cloud_gets_a_session_as_soon_as_there_is_an_epoch(talk, disk):
+def test_a_cloud_gets_a_session_as_soon_as_an_epoch_exists(talk, disk):
     for _ in range(3):
         talk.wait(talk.now_ns + 1_100 * MS)  # the one before has fallen silent
         assert talk.hello(b"two") == 0
@@ -44,7 +44,7 @@ def test_another_cloud_gets_a_session_as_soon_as_there_is_an_epoch(talk, disk):
     assert talk.hello(b"two") == 2
 
 
-def test_the_one_that_flies_goes_on_and_a_start_from_the_spawn_waits_for_an_epoch(talk, disk):
+def test_only_a_start_from_the_spawn_waits_for_an_epoch(talk, disk):
     for number in (2, 3):
         talk.request(number, Request.START, Start.SPAWN, mission_id=7)
         telemetry = fly(talk)
@@ -58,7 +58,7 @@ def test_the_one_that_flies_goes_on_and_a_start_from_the_spawn_waits_for_an_epoc
     assert talk.world._orders.mission_id == 7
 
 
-def test_what_needs_no_epoch_is_obeyed(talk):
+def test_requests_that_need_no_epoch_are_obeyed(talk):
     talk.request(2, Request.END, Start.SPAWN)
     talk.request(3, Request.START, Start.HERE)
     talk.request(4, Request.ESTOP, Start.SPAWN)

@@ -48,7 +48,7 @@ def test_a_setpoint_for_another_session_is_not_flown(ends: Ends) -> None:
         assert ends.cloud._setpoint == mine
 
 
-def test_nothing_starts_in_a_session_before_the_robot_is_seen_in_it(ends: Ends) -> None:
+def test_nothing_starts_before_the_first_telemetry(ends: Ends) -> None:
     start, end = (OperatorRequest(99, request) for request in (Request.START, Request.END))
     assert say(ends, start) == [Kind.OPERATOR]
     ends.cloud._loop.reset()  # as a new session does
@@ -56,7 +56,7 @@ def test_nothing_starts_in_a_session_before_the_robot_is_seen_in_it(ends: Ends) 
     assert say(ends, end) == [Kind.OPERATOR]
 
 
-def test_a_start_that_was_said_in_another_session_is_not_passed_on(ends: Ends) -> None:
+def test_a_start_for_another_session_is_not_passed_on(ends: Ends) -> None:
     """Teleop lags, as behind a slow disk; meanwhile somebody else may have moved the robot."""
     epoch = ends.cloud._session.epoch
     for start in Start:
@@ -67,7 +67,7 @@ def test_a_start_that_was_said_in_another_session_is_not_passed_on(ends: Ends) -
     assert ends.cloud._counts["words_dropped"] == 2 * len(Start)
 
 
-def test_when_the_numbers_are_used_up_nothing_breaks_and_the_next_session_has_them_all_again(
+def test_used_up_numbers_last_until_the_next_session(
     ends: Ends,
 ) -> None:
     """Somebody with the keys has asked for something under the highest number of all."""
@@ -85,7 +85,7 @@ def test_when_the_numbers_are_used_up_nothing_breaks_and_the_next_session_has_th
 
 
 @pytest.mark.parametrize("request_", [each for each in Request if each is not Request.START])
-def test_what_arms_nothing_is_passed_on_whenever_it_was_said(ends: Ends, request_: Request) -> None:
+def test_requests_that_arm_nothing_are_always_passed_on(ends: Ends, request_: Request) -> None:
     epoch = ends.cloud._session.epoch
     said = OperatorRequest(99, request_, epoch=epoch - 1)
     assert say(ends, said, said._replace(epoch=epoch)) == [Kind.OPERATOR] * 2
@@ -117,7 +117,7 @@ class Lagging:
         return outputs
 
 
-def test_a_teleop_that_lags_starts_its_mission_in_the_session_that_it_has_seen() -> None:
+def test_a_slow_teleop_starts_missions_in_the_session_it_saw() -> None:
     """Its first order is on the way while cloud restarts; it arrives in the next session."""
     ends = join(HOVER)
     teleop = ends.cloud.teleop = Lagging(ends.cloud.teleop)
@@ -136,7 +136,7 @@ def test_a_teleop_that_lags_starts_its_mission_in_the_session_that_it_has_seen()
     assert changes[-1].state is GuardState.TRACK
 
 
-def test_after_a_stall_cloud_looks_after_its_keys_once_not_for_each_second_of_it(
+def test_after_a_stall_cloud_maintains_its_keys_once(
     ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Looks are a second apart: an end that hears its peer with another key counts them."""

@@ -94,5 +94,5 @@ def test_nothing_on_the_control_path_reads_a_wall_clock() -> None:
 @pytest.mark.parametrize(
     "code", ["time.time()", "from time import time_ns", "datetime.now()", "datetime.date.today()"]
 )
-def test_a_wall_clock_is_found(code: str) -> None:
+def test_the_check_finds_a_wall_clock(code: str) -> None:
     assert wall_clocks(ast.parse(code))

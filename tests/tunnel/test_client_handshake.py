@@ -15,12 +15,12 @@ def handshake():
     return ClientHandshake(NONCE, CLOCK, CHACHA20_POLY1305)
 
 
-def test_a_hello_says_who_asks(handshake):
+def test_a_hello_has_nonce_clock_cookie_and_suite(handshake):
     hello = codec.decode_hello(handshake.make_hello())
     assert hello == Hello(NONCE, CLOCK, NO_COOKIE, CHACHA20_POLY1305)
 
 
-def test_a_challenge_is_answered_with_its_cookie_and_later_hellos_have_it_too(handshake):
+def test_answers_and_later_hellos_have_the_cookie(handshake):
     handshake.make_hello()
     answer = handshake.answer_challenge(b"1" * 16)
     assert answer is not None
@@ -28,7 +28,7 @@ def test_a_challenge_is_answered_with_its_cookie_and_later_hellos_have_it_too(ha
     assert codec.decode_hello(handshake.make_hello()).cookie == b"1" * 16
 
 
-def test_challenges_cannot_make_cloud_talk(handshake):
+def test_repeated_challenges_get_a_limited_number_of_answers(handshake):
     assert handshake.answer_challenge(b"0" * 16) is None  # it has not asked
     handshake.make_hello()
     assert handshake.answer_challenge(b"1" * 16)
@@ -37,7 +37,7 @@ def test_challenges_cannot_make_cloud_talk(handshake):
     assert sum(answer is not None for answer in answers) == REPLIES_MAX - 1
 
 
-def test_old_challenges_that_are_repeated_take_no_ones_turn(handshake):
+def test_repeated_old_challenges_use_up_no_answers(handshake):
     old = [b"old %d" % n for n in range(REPLIES_MAX)]
     handshake.make_hello()
     assert all(handshake.answer_challenge(cookie) for cookie in old)
@@ -49,7 +49,7 @@ def test_old_challenges_that_are_repeated_take_no_ones_turn(handshake):
     assert codec.decode_hello(handshake.make_hello()).cookie == b"1" * 16
 
 
-def test_a_cookie_that_found_no_turn_left_is_taken_at_the_next(handshake):
+def test_a_cookie_beyond_the_limit_is_answered_next_time(handshake):
     handshake.make_hello()
     for number in range(REPLIES_MAX):
         handshake.answer_challenge(b"old %d" % number)
@@ -58,7 +58,7 @@ def test_a_cookie_that_found_no_turn_left_is_taken_at_the_next(handshake):
     assert handshake.answer_challenge(b"1" * 16)
 
 
-def test_what_is_remembered_of_cookies_is_bounded(handshake):
+def test_the_memory_of_cookies_is_bounded(handshake):
     for number in range(COOKIES_MAX + 1):
         handshake.make_hello()
         handshake.answer_challenge(b"%016d" % number)
@@ -75,7 +75,7 @@ def accepted(handshake, epoch, answer, current, *, asks=True):
     return handshake.receive_accept(epoch, answer, current, asks=asks)
 
 
-def test_an_acceptance_gives_what_both_agree_on(handshake):
+def test_an_acceptance_gives_the_agreement(handshake):
     agreement = accepted(handshake, 3, accept(suite=CHACHA20_POLY1305), 0)
     assert agreement == Agreement(NONCE, WORLD, CHACHA20_POLY1305)
 
@@ -92,13 +92,13 @@ def test_half_of_all_epochs_are_newer(handshake, ahead, counts):
     assert (accepted(handshake, 1 + ahead, accept(), 1) is not None) == counts
 
 
-def test_another_process_of_world_may_begin_again_from_one(handshake):
+def test_a_new_world_process_may_begin_with_epoch_1(handshake):
     accepted(handshake, 3, accept(), 0)
     assert accepted(handshake, 1, accept(world=b"v" * 16), 3)
 
 
 @pytest.mark.promise("old-datagrams-do-nothing")
-def test_a_world_that_is_gone_does_not_come_back(handshake):
+def test_a_dead_world_does_not_come_back(handshake):
     accepted(handshake, 3, accept(), 0)
     accepted(handshake, 4, accept(world=b"v" * 16), 3)
     assert accepted(handshake, 9, accept(), 4) is None
@@ -106,7 +106,7 @@ def test_a_world_that_is_gone_does_not_come_back(handshake):
     assert accepted(handshake, 5, accept(name, b"v" * 16), 4)
 
 
-def test_what_a_world_that_is_gone_said_late_does_not_take_the_place_of_the_one_that_is_heard(
+def test_a_late_acceptance_of_a_dead_world_is_ignored(
     handshake,
 ):
     accepted(handshake, 3, accept(), 0)
@@ -114,7 +114,7 @@ def test_what_a_world_that_is_gone_said_late_does_not_take_the_place_of_the_one_
     assert accepted(handshake, 4, accept(), 3, asks=False)
 
 
-def test_a_world_that_was_taken_for_gone_is_asked_under_another_name(handshake):
+def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(handshake):
     """What the one before had said came late, and was taken while nobody was heard."""
     accepted(handshake, 3, accept(world=b"v" * 16), 0)
     accepted(handshake, 9, accept(), 3)
@@ -126,22 +126,22 @@ def test_a_world_that_was_taken_for_gone_is_asked_under_another_name(handshake):
     assert codec.decode_hello(handshake.make_hello()).nonce == name
 
 
-def test_after_the_last_epoch_of_all_the_first_is_newer(handshake):
+def test_the_first_epoch_is_newer_than_the_last(handshake):
     accepted(handshake, 2**32 - 1, accept(), 0)
     assert accepted(handshake, 2**32 - 2, accept(), 2**32 - 1) is None
     assert accepted(handshake, 1, accept(), 2**32 - 1)
 
 
-def test_an_acceptance_of_somebody_else_does_not_count(handshake):
+def test_an_acceptance_for_another_nonce_is_ignored(handshake):
     assert accepted(handshake, 3, accept(nonce=b"m" * 16), 0) is None
 
 
-def test_a_refusal_by_anothers_authority_is_told_and_asked_again_as_before(handshake):
+def test_after_a_refusal_cloud_asks_again_with_the_same_nonce(handshake):
     assert handshake.receive_busy(Busy(NONCE, used=False))
     assert codec.decode_hello(handshake.make_hello()).nonce == NONCE
 
 
-def test_a_used_name_is_replaced_once(handshake):
+def test_a_used_nonce_is_replaced_once(handshake):
     assert not handshake.receive_busy(Busy(NONCE, used=True))
     second = codec.decode_hello(handshake.make_hello()).nonce
     assert second != NONCE
@@ -152,16 +152,16 @@ def test_a_used_name_is_replaced_once(handshake):
     assert accepted(handshake, 1, accept(), 0) is None
 
 
-def test_somebody_elses_refusal_does_not_count(handshake):
+def test_a_refusal_for_another_nonce_is_ignored(handshake):
     assert not handshake.receive_busy(Busy(b"m" * 16, used=False))
 
 
-def test_the_first_world_is_nobodys_successor(handshake):
+def test_the_first_world_makes_no_old_world(handshake):
     accepted(handshake, 3, accept(), 0)
     assert not handshake._old_worlds
 
 
-def test_what_is_remembered_of_worlds_is_bounded(handshake):
+def test_the_memory_of_old_worlds_is_bounded(handshake):
     for number in range(3 * LEFT_MAX):
         accepted(handshake, 1, accept(world=b"%016d" % number), 0)
     assert len(handshake._old_worlds) == LEFT_MAX

@@ -73,7 +73,7 @@ def test_a_key_derives_by_hkdf_with_version_and_use():
     assert Key(SECRET).derive(b"salt", b"use") == derived(SECRET, b"salt", label)
 
 
-def test_a_keys_name_is_made_of_nothing_but_what_is_derived():
+def test_the_name_of_a_key_is_derived_from_it():
     assert Key(SECRET).name == derived(SECRET, b"", b"cloudrc 5 name")[:4].hex()
 
 
@@ -163,7 +163,7 @@ def test_a_cookie_can_be_made_from_the_description_alone():
     assert answer[16:-16] == cookie + bytes(33)
 
 
-def test_the_second_name_of_a_cloud_is_made_of_the_first():
+def test_a_clouds_next_nonce_is_derived_from_the_first():
     handshake = ClientHandshake(b"n" * 16, bytes(16), 1)
     handshake.receive_busy(Busy(b"n" * 16, used=True))
     second = hashlib.sha256(b"n" * 16 + b" 1").digest()[:16]
