@@ -6,7 +6,7 @@ from cloudrc.cloud.estimators import DelaySample, ewma, running_mean, running_me
 
 
 def loop_delay(seconds):
-    """A sample whose other delays would give another answer if they were used."""
+    """Make a sample whose other delays would give another result if they were used."""
     return DelaySample(loop_delay=seconds, rtt=seconds - 0.006, applied_minus_stamp=-777.0)
 
 
@@ -78,7 +78,7 @@ def test_split_adds_the_age_and_cancels_the_clock_offset(offset):
     uplink, downlink = 0.030, 0.050
     estimator.update(DelaySample(9.0, 9.0, applied_minus_stamp=downlink - offset))
     assert estimator.horizon(uplink + offset) == pytest.approx(0.080, abs=1e-9)
-    # A slow packet is known to be slow at once; nothing is averaged.
+    # The age of a slow packet counts at once, without averaging.
     assert estimator.horizon(0.090 + offset) == pytest.approx(0.140, abs=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""The control loop: what telemetry says about delays, and when the reference is frozen."""
+"""The control loop: delays from telemetry, and when the loop freezes."""
 
 import pytest
 
@@ -27,7 +27,7 @@ def test_a_command_names_its_basis_and_how_long_it_was_held():
 
 
 def test_a_repeated_echo_is_no_sample():
-    """While the downlink is silent one command is echoed over and over, older each time."""
+    """While the downlink is silent, world echoes the same command with a growing age."""
     a_loop = loop()
     a_loop.observe(telemetry(100, echo_ms=1000), 1090 * MS)
     for k in range(1, 2000):

@@ -1,4 +1,4 @@
-"""What plug-ins may do to the control loop: raise and return anything, without an end to it."""
+"""Plug-ins may raise and return anything: the control loop goes on."""
 
 from collections import Counter
 from math import inf, nan
@@ -39,7 +39,7 @@ class Closing(Estimator, Predictor, Controller):
 
 
 class Speechless(Estimator, Predictor, Controller):
-    """Raises what cannot be said."""
+    """Raises an exception without a text."""
 
     class Error(Exception):
         def __str__(self):

@@ -1,4 +1,4 @@
-"""The alarm: an emergency stop that cloud sees through alone, until the robot is seen to stand."""
+"""The alarm: cloud repeats an emergency stop until the guard is in ESTOP."""
 
 from cloudrc.cloud.operator import REPEAT_NS, Alarm
 from cloudrc.messages import GuardState, OperatorRequest, Request
@@ -31,7 +31,7 @@ def test_an_alarm_gets_a_new_number_if_its_own_is_taken():
     """World acts on rising numbers only."""
     alarm = sounding()
     alarm.due(3, 0)
-    alarm.see(TRACK, 4)  # a start of teleop's own counting
+    alarm.see(TRACK, 4)  # a start with a number of teleop
     assert alarm.due(4, REPEAT_NS).number == 5
 
 

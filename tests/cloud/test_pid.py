@@ -103,7 +103,7 @@ def test_saturation_causes_no_overshoot_by_windup(limit):
         output = controller.update(at(x(position)), Setpoint(x(10.0)), DT)
         position += output.velocity[0] * DT
         highest = max(highest, position)
-    # Wound up over the 9 s at the limit, the integral would hold 9 m/s there: metres too far.
+    # Without anti-windup the integral would reach 9 m/s in 9 s: an overshoot of metres.
     assert highest < 10.3
     assert position == pytest.approx(10.0, abs=0.01)
 

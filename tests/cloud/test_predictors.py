@@ -28,7 +28,7 @@ def command(velocity):
 
 
 def accelerate(predictor, velocities, period_ns=10_000_000):
-    """Let it observe these x velocities; return the last sample."""
+    """Let the predictor observe these x velocities; return the last sample."""
     for k, velocity in enumerate(velocities):
         sample = SAMPLE._replace(stamp_ns=k * period_ns, velocity=(velocity, 0.0, 0.0))
         predictor.observe(sample)

@@ -1,4 +1,4 @@
-"""Both ends around nothing, no robot and no loop: for a million short lives of the session.
+"""Provide both endpoints, alone or in flights, and the silences and kills of the tests.
 
 Fly an experiment in virtual time, without files, and judge it.
 
@@ -57,7 +57,7 @@ KEY = Key(b"k" * 32)
 
 
 def bare_robot() -> SimpleNamespace:
-    """A robot that flies whatever the session lets through."""
+    """A robot that flies every accepted command."""
     guard = SimpleNamespace(
         state=GuardState.TRACK,
         cause=Cause.COMMAND,
@@ -84,7 +84,7 @@ def bare_robot() -> SimpleNamespace:
 def bare_world(
     nonce: bytes = b"w", last_epoch: int = 0, ring: KeyRing | None = None, start_ns: int = 0
 ) -> WorldEndpoint:
-    """World's end, sealed if it gets keys."""
+    """Make world's end, sealed if it gets keys."""
     identity = WorldIdentity(CLOCK, nonce.ljust(16), last_epoch, ring)
     return WorldEndpoint(
         bare_robot(),
@@ -97,7 +97,7 @@ def bare_world(
 
 
 class NoLoop:
-    """Stands for cloud's loop: it knows when the robot was seen, and computes nothing."""
+    """Stand-in for cloud's loop that only notes the newest telemetry."""
 
     def __init__(self) -> None:
         self.faults: list[Fault] = []
@@ -112,7 +112,7 @@ class NoLoop:
 
 
 def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
-    """Cloud's end; what is put into its `teleop.outputs` it sends."""
+    """Make cloud's end; it sends the messages in its `teleop.outputs`."""
     teleop = SimpleNamespace(
         outputs=[], outcome=None, settled=True,
         see=lambda seen, now_ns: None, handle_deadline=lambda now_ns: None,
@@ -128,7 +128,7 @@ def ring() -> KeyRing:
 
 
 class BareCloud:
-    """A cloud process that greets and commands when it is told to."""
+    """A cloud process that sends hellos and commands on request."""
 
     def __init__(self, nonce: bytes, keys: KeyRing | None) -> None:
         self.session: Session = make_session(Direction.DOWNLINK, keys)
@@ -170,7 +170,7 @@ class BareCloud:
 
 
 class Bare:
-    """One world and some clouds, joined by a link that loses and delays nothing."""
+    """One world and some clouds, connected by a link without loss and delay."""
 
     def __init__(self, keys: KeyRing) -> None:
         self.keys, self.now_ns = keys, 0
@@ -224,7 +224,7 @@ LIMIT_NS = 150_000_000_000
 
 
 class Ends(NamedTuple):
-    """Both ends and what joins them."""
+    """Both endpoints and their link."""
 
     world: WorldEndpoint
     cloud: CloudEndpoint
@@ -232,7 +232,7 @@ class Ends(NamedTuple):
 
 
 def join(experiment: ResolvedExperiment, *, offset_ns: int = 0) -> Ends:
-    """Put an experiment together; with an offset the two clocks are not shared."""
+    """Assemble an experiment; with an offset the two ends have different clocks."""
     world_clock = b"another clock..." if offset_ns else SHARED_CLOCK
     world = assembly.build_world(experiment, WorldIdentity(world_clock, b"world".ljust(16)))
     cloud = assembly.build_cloud(
@@ -243,7 +243,7 @@ def join(experiment: ResolvedExperiment, *, offset_ns: int = 0) -> Ends:
 
 
 def records(experiment: ResolvedExperiment, **options: int) -> tuple[list[Record], list[Record]]:
-    """Fly; the records of world and of cloud."""
+    """Fly and return the records of world and of cloud."""
     _, cloud, run = join(experiment, **options)
     of_world: list[Record] = []
     of_cloud: list[Record] = []
@@ -257,7 +257,7 @@ def records(experiment: ResolvedExperiment, **options: int) -> tuple[list[Record
 
 
 def fly(name: str, *settings: str) -> Assessment:
-    """Fly; numbers and verdict."""
+    """Fly and return numbers and verdict."""
     experiment = load_experiment(name, settings)
     return assess(
         Recording.from_records(*records(experiment)), experiment, Run("virtual", "virtual")
@@ -265,12 +265,12 @@ def fly(name: str, *settings: str) -> Assessment:
 
 
 def numbers(assessment: Assessment) -> dict[str, float]:
-    """The numbers alone, in their units."""
+    """Return only the values of the numbers."""
     return {name: number.value for name, number in assessment.numbers.items()}
 
 
 def digest(experiment: ResolvedExperiment) -> str:
-    """SHA-256 of all records of a flight."""
+    """Compute the SHA-256 of all records of a flight."""
     digest = RecordHash()
     for each in records(experiment):
         digest.update(each)
@@ -282,12 +282,12 @@ PATIENCE = (
     "criteria.time_limit_s=200",
     *(f"mission.waypoints.{k}.time_limit_s=200" for k in range(7)),
 )
-"""So that no limit of time ends a mission that waits for its link."""
+"""Time limit that a mission waiting for its link does not reach."""
 SLOW = ("cloud.controller.speed_max=1.5",)
 
 
 class Instant(NamedTuple):
-    """The robot after one tick."""
+    """State of the robot after one tick."""
 
     stamp_ns: int
     state: GuardState
@@ -386,7 +386,7 @@ def _watch(robot, trace: list[Instant], begin_ns: int) -> None:
 
 COUNT = 200
 DAILY = range(COUNT)[13::40]
-"""Indices of those in the pipes that are not left to the night."""
+"""Indices of the instants in the pipes that are tested in every run."""
 REST = [k for k in range(COUNT) if k not in DAILY]
 LAST_S = 27.0
 """Uncapped the board is touched 1 s later; at 1.5 m/s 4.9 s later, 2.2 s after pipe 3's mouth."""
@@ -401,7 +401,7 @@ there is nothing left to resume."""
 
 
 class MidPipe(NamedTuple):
-    """An instant [s] at which the undisturbed robot's base is in the pipe of this index."""
+    """Return an instant [s] at which the undisturbed robot is in the pipe of this index."""
 
     start_s: float
     pipe: int
@@ -409,7 +409,7 @@ class MidPipe(NamedTuple):
 
 @cache
 def undisturbed(*settings: str) -> Flight:
-    """The flight without any silence or kill."""
+    """Fly without any silence or kill."""
     return fly("paper", *PATIENCE, *settings).flight
 
 
@@ -439,7 +439,7 @@ HOVER = load_experiment("hover", ["link.profile=ideal"])
 
 
 class Talk:
-    """A sealed world; the cloud is what the test says."""
+    """A sealed world with clouds that the test controls."""
 
     def __init__(self, last_epoch: int = 0, nonce: bytes = b"world", key: Key = KEY) -> None:
         ring = KeyRing(KeySet(KEY))

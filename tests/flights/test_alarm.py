@@ -1,4 +1,4 @@
-"""Both ends: an emergency stop past teleop reaches the robot, whatever the session and link do."""
+"""An emergency stop without teleop reaches the robot in any session and over a bad link."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ S = 1_000_000_000
 
 
 def fly(ends: Ends, until_ns: int) -> list[GuardState]:
-    """Go on; the states of the guard."""
+    """Continue the flight and return the states of the guard."""
     changes: list[GuardState] = []
     ends.run.fly(
         lambda: False,

@@ -1,4 +1,4 @@
-"""Both ends by their contract: sessions, bad datagrams, restarts, stalls; no link between them."""
+"""The contract of both endpoints without a link: sessions, bad datagrams, restarts, stalls."""
 
 from itertools import pairwise
 
@@ -42,7 +42,7 @@ def test_without_a_session_world_is_silent():
 def test_every_cloud_process_gets_a_new_epoch():
     talk, epochs = Talk(last_epoch=41), []
     for nonce in (b"one", b"one", b"two", b"two", b"three"):
-        talk.wait(talk.now_ns + 1_100 * MS)  # the one before has fallen silent
+        talk.wait(talk.now_ns + 1_100 * MS)  # the previous cloud is silent by now
         epochs.append(talk.hello(nonce))
     assert epochs == [42, 42, 43, 43, 44]
 
@@ -124,7 +124,7 @@ def test_absurd_and_stale_commands_are_refused_and_counted(talk):
 
 def test_after_a_stall_waiting_commands_are_stale(talk):
     data = talk.command()
-    talk.now_ns = 5_000 * MS  # the process stood still; the datagram lay in the socket
+    talk.now_ns = 5_000 * MS  # the process stalled while the datagram was in the socket
     talk.send(data)
     assert talk.world.slip_ns > 4_000 * MS
     assert talk.counts()["stale"] == 1
@@ -168,7 +168,7 @@ def test_one_mission_can_follow_another_from_here():
 
 
 def fly_with_restart(restart):
-    """Hover; at 2 s one end is replaced by a new process; returns records of both ends."""
+    """Hover, replace one end by a new process at 2 s, and return the records of both ends."""
     ends = join(load_experiment("hover", ["mission.waypoints.0.dwell_s=8"]))
     of_world, of_cloud = [], []
 

@@ -1,4 +1,4 @@
-"""A silent link anywhere in the paper's mission: hold, touch nothing, go on, finish."""
+"""A silent link anywhere in the paper's mission: the robot holds, then finishes the mission."""
 
 import pytest
 
@@ -25,7 +25,7 @@ from tests.flights.conftest import (
 
 LONG = ("guard.hold_max_s=100",)
 FEW = (13, 133)
-"""Those of the instants in the pipes that are not left to the night, uncapped."""
+"""Instants in the pipes that are tested in every run without the cap."""
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def check_minute(figure, start_s, calm_within, *settings, where="anywhere"):
         figure(text, measured, "<=", asked, unit)
     assert silence.outcome == "done"
     assert silence.touched == []
-    # Of the newest command that was applied: not before the limit, and within a tick after it.
+    # The age of the newest applied command is at the limit or up to a tick above.
     assert 0.250 < silence.basis_age <= 0.252 + 1e-9
     assert silence.held_after <= 0.252
     assert silence.calm_after <= calm_within
@@ -176,7 +176,7 @@ def fly_records(*settings, until_s=None):
 
 
 def test_a_silent_downlink_freezes_until_the_echo_is_back():
-    """With an integral and `commanded_velocity`, which would both drift off."""
+    """It uses an integral and `commanded_velocity`, which would both drift."""
     _, _, of_cloud = fly_records(
         *PATIENCE,
         "cloud.predictor=commanded_velocity",
@@ -205,7 +205,7 @@ def test_a_lost_downlink_lands_the_robot_and_ends_the_run():
 
 
 def test_a_robot_does_not_take_off_after_its_mission_is_over():
-    """The start was the last that it heard; no word of the mission's end gets through."""
+    """The robot receives the start but not the end of the mission."""
     ends, of_world, _ = fly_records(
         "link.downlink.blackouts=[{start_s: 0.29, duration_s: 100}]", until_s=110
     )
@@ -216,7 +216,7 @@ def test_a_robot_does_not_take_off_after_its_mission_is_over():
 
 
 def test_a_short_hold_limit_still_waits_for_a_first_command():
-    """It comes a round trip behind the start."""
+    """The first command comes a round trip after the start."""
     _, of_world, _ = fly_records("link.profile=satellite", "guard.hold_max_s=0.1", until_s=4)
     changes = [r.state for r in of_world if isinstance(r, GuardChange)]
     assert changes == [GuardState.GROUND, GuardState.TRACK]

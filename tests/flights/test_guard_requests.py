@@ -1,4 +1,4 @@
-"""What the operator says reaches the guard on board, and only what it acts on is confirmed."""
+"""Operator requests reach the guard, which confirms only those that it acts on."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from tests.flights.conftest import MS, talking
 
 @pytest.fixture
 def talk():
-    """Flying; the request to start was number 1."""
+    """Fly; the request to start had number 1."""
     talk = talking()
     fly(talk, 10)
     return talk
@@ -63,7 +63,7 @@ def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
 def test_a_start_that_was_held_back_on_the_way_starts_nothing(
     talk, start, held_back, ahead, outcome
 ):
-    """Its mission may be over by then, and given up; nobody expects the robot to take off."""
+    """Its mission may be over by then, so nobody expects the robot to take off."""
     talk.request(2, Request.END, Start.HERE)
     talk.now_ns += ahead
     captured = talk.asked(3, Request.START, start)
@@ -71,7 +71,7 @@ def test_a_start_that_was_held_back_on_the_way_starts_nothing(
     talk.send(captured)
     assert talk.world._counts[outcome] == (outcome != "")
     assert talk.world.robot.guard.armed == (outcome == "")
-    if outcome:  # said anew, it is obeyed
+    if outcome:  # repeated, it is obeyed
         talk.send(talk.asked(4, Request.START, start))
         assert talk.world.robot.guard.armed
 
@@ -86,7 +86,7 @@ def test_a_late_stop_still_stops_the_robot(talk, request_):
 
 
 def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
-    """World's clock stood still meanwhile: the age of what it was based on says nothing."""
+    """World's clock stood still in the meantime, so the age of its basis is meaningless."""
     captured = talk.asked(2, Request.START, Start.SPAWN)
     talk.now_ns += 60_000 * MS
     talk.send(captured)
@@ -103,7 +103,7 @@ def test_a_command_waiting_during_a_stop_is_not_echoed(talk):
 
 
 def test_world_rekeys_by_the_machines_clock(talk):
-    """World's own lags behind it by what it could not make up for."""
+    """World's simulated clock lags behind the machine's clock by the slip."""
     talk.wait(talk.now_ns + 100 * MS)
     before_ns = talk.now_ns
     talk.world.handle_deadline(before_ns + 60_000 * MS)
@@ -144,7 +144,7 @@ def test_only_a_hold_within_a_mission_is_counted_as_held(talk):
 
 
 def test_contacts_are_reported_until_the_next_mission_starts(talk):
-    """Cloud may die right after the touch: its successor has to learn of it."""
+    """Cloud may die right after the touch; the next cloud must learn of it."""
     ask(talk, 2, Request.END)
     talk.world._orders.touches.pipes = 1
     talk.wait(talk.now_ns + 300 * MS)
@@ -158,7 +158,7 @@ def test_contacts_are_reported_until_the_next_mission_starts(talk):
 
 
 def test_requests_of_an_earlier_cloud_do_not_count(talk):
-    """Nine fresh commands of one and a single one of another are no proof of a link."""
+    """Nine fresh commands of one cloud and one of another do not prove a link."""
     fly(talk, 100)
     ask(talk, 2, Request.END)
     talk.request(3, Request.START, Start.HERE)

@@ -1,4 +1,4 @@
-"""A disk that hangs has no epochs: what needs a new one is refused, and all else goes on."""
+"""Without an epoch from the disk, only requests that need a new epoch are refused."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from tests.flights.conftest import MS, talking
 
 @pytest.fixture
 def disk() -> list[int]:
-    """The epochs that it has."""
+    """The epochs that the disk has."""
     return []
 
 
@@ -35,7 +35,7 @@ def told(talk):
 
 def test_a_cloud_gets_a_session_as_soon_as_an_epoch_exists(talk, disk):
     for _ in range(3):
-        talk.wait(talk.now_ns + 1_100 * MS)  # the one before has fallen silent
+        talk.wait(talk.now_ns + 1_100 * MS)  # the previous cloud is silent by now
         assert talk.hello(b"two") == 0
     assert told(talk) == [NO_EPOCH]
     assert talk.world._session.epoch == 1

@@ -1,4 +1,4 @@
-"""The paper's mission and what it has to reach, in virtual time; fewer seeds than `-m full`."""
+"""The paper's mission and its required numbers, in virtual time; `-m full` flies more seeds."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The whole loop in virtual time: the robot keeps its mission's progress; a stuck leg fails."""
+"""Flights in virtual time: the robot stores its mission's progress, and a stuck leg fails."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_the_robot_stores_every_waypoint_reached() -> None:
 
 
 class Operated(Talk):
-    """A world that is asked for things."""
+    """A world that gets requests."""
 
     def ask(self, request: Request, number: int = 0, **what: int) -> Telemetry:
         what |= {"basis_stamp_ns": self.world_ns}
@@ -63,12 +63,12 @@ def test_progress_rises_and_belongs_to_the_mission_started_last(talk: Operated) 
     assert progress(ask(Request.PROGRESS, mission_id=ID, reached=1)) == (ID, 2)
     assert progress(ask(Request.PROGRESS, mission_id=ID + 1, reached=9)) == (ID, 2)
     assert progress(ask(Request.END, 2)) == (ID, 2)
-    assert progress(ask(Request.START, 3, mission_id=ID)) == (ID, 2)  # the same one goes on
+    assert progress(ask(Request.START, 3, mission_id=ID)) == (ID, 2)  # the same mission continues
     assert progress(ask(Request.START, 4, mission_id=ID + 1)) == (ID + 1, 0)
 
 
 def test_from_the_spawn_a_mission_begins_anew(talk: Operated) -> None:
-    """Its first half may be known on board alone, and the robot does not stand where that ended."""
+    """The old progress must not count, because the mission restarts at the spawn."""
     talk.ask(Request.START, 1, mission_id=ID)
     talk.ask(Request.PROGRESS, mission_id=ID, reached=2)
     again = OperatorRequest(2, Request.START, Start.SPAWN, ID)
@@ -98,7 +98,7 @@ def test_an_alarm_gets_a_number_that_world_acts_on() -> None:
 
 
 def test_a_leg_that_takes_three_times_too_long_fails() -> None:
-    """Its tolerance is finer than the sensor's noise: it can be flown to, and never be reached."""
+    """Its tolerance is below the sensor's noise, so the waypoint is never reached."""
     experiment = load_experiment(
         "hover",
         [

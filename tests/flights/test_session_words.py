@@ -1,4 +1,4 @@
-"""Cloud's end: what teleop has said for one session does not lead the robot in the next."""
+"""Cloud does not use setpoints and starts that teleop made for another session."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ELSEWHERE = (5.0, 5.0, 1.0)
 
 @pytest.fixture
 def ends() -> Ends:
-    """In flight."""
+    """Provide ends in flight."""
     ends = join(HOVER)
     ends.run.fly(lambda: False, 4 * S, lambda world, cloud: None)
     ends.cloud.take_datagrams()
@@ -31,7 +31,7 @@ def ends() -> Ends:
 
 
 def say(ends: Ends, *words: Setpoint | OperatorRequest) -> list[int]:
-    """Kinds of what cloud sends at once."""
+    """Return the kinds of the datagrams that cloud sends at once."""
     ends.cloud.teleop.outputs.extend(words)
     ends.cloud._take_from_teleop()
     return [peek(data)[0] for data in ends.cloud.take_datagrams()]
@@ -57,7 +57,7 @@ def test_nothing_starts_before_the_first_telemetry(ends: Ends) -> None:
 
 
 def test_a_start_for_another_session_is_not_passed_on(ends: Ends) -> None:
-    """Teleop lags, as behind a slow disk; meanwhile somebody else may have moved the robot."""
+    """Teleop is slow; in the meantime another cloud may have moved the robot."""
     epoch = ends.cloud._session.epoch
     for start in Start:
         said = OperatorRequest(99, Request.START, start)
@@ -70,7 +70,7 @@ def test_a_start_for_another_session_is_not_passed_on(ends: Ends) -> None:
 def test_used_up_numbers_last_until_the_next_session(
     ends: Ends,
 ) -> None:
-    """Somebody with the keys has asked for something under the highest number of all."""
+    """A sender with the keys has used the highest number of all."""
     cloud, run = ends.cloud, ends.run
     said = OperatorRequest(NUMBER_MAX, Request.END)
     assert say(ends, said) == [Kind.OPERATOR]
@@ -92,7 +92,7 @@ def test_requests_that_arm_nothing_are_always_passed_on(ends: Ends, request_: Re
 
 
 class Lagging:
-    """A teleop of its own process; what it says comes late, as from behind a slow disk."""
+    """A teleop in its own process whose messages are late."""
 
     outcome, settled = None, True
 
@@ -100,7 +100,7 @@ class Lagging:
         self._teleop = teleop
         self._late: list[tuple[int, Output | Fault]] = []
         self.outputs: list[Output | Fault] = []
-        self.epochs: dict[int, int] = {}  # each one seen, and when first [ns]
+        self.epochs: dict[int, int] = {}  # epochs seen, and when first [ns]
 
     def see(self, seen: Seen, now_ns: int) -> None:
         self.epochs.setdefault(seen.epoch, now_ns)
@@ -118,7 +118,7 @@ class Lagging:
 
 
 def test_a_slow_teleop_starts_missions_in_the_session_it_saw() -> None:
-    """Its first order is on the way while cloud restarts; it arrives in the next session."""
+    """Its first start is under way while cloud restarts, and arrives in the next session."""
     ends = join(HOVER)
     teleop = ends.cloud.teleop = Lagging(ends.cloud.teleop)
     changes: list[GuardChange] = []
@@ -139,7 +139,7 @@ def test_a_slow_teleop_starts_missions_in_the_session_it_saw() -> None:
 def test_after_a_stall_cloud_maintains_its_keys_once(
     ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Looks are a second apart: an end that hears its peer with another key counts them."""
+    """Checks must be a second apart, because an end counts those that find another key."""
     looks: list[int] = []
     monkeypatch.setattr(ends.cloud._session, "tend", lambda now_ns: looks.append(now_ns) or [])
     woken_ns = ends.run.now_ns + 60 * S

@@ -1,4 +1,4 @@
-"""Two clouds, one robot: who has authority, and that what is applied never goes back."""
+"""Two clouds and one robot: which cloud has authority, and that no command is reverted."""
 
 from itertools import product
 
@@ -105,7 +105,7 @@ def test_a_captured_hello_of_a_dead_cloud_opens_nothing():
     bare.wait(1100)  # b is silent, and the cookie is still valid
     for data in captured:
         bare.send(data)
-    bare.wait(5000)  # and now it is not
+    bare.wait(5000)  # and now it is no longer valid
     for data in captured:
         bare.send(data)
     assert bare.world._session.epoch == 2
@@ -130,25 +130,25 @@ ACTIONS = {
 
 
 def act(bare: Bare, name: str) -> None:
-    """What a cloud does: command if it has a session, and ask for one in any case."""
+    """Let a cloud command if it has a session, and ask for one in any case."""
     cloud = bare.cloud(name)
     if cloud.session.epoch:
         bare.send(cloud.command(bare.now_ns))
-        cloud.held = cloud.command(bare.now_ns)  # one that the link holds back until the replay
+        cloud.held = cloud.command(bare.now_ns)  # the link delays it until the replay
         bare.sent.append(cloud.held)
     if cloud.session.epoch != bare.world._session.epoch or not cloud.session.epoch:
         bare.send(cloud.hello())
 
 
 def spawn(bare: Bare) -> None:
-    """Whoever has the session starts a mission from the spawn."""
+    """Let the cloud with the session start a mission from the spawn."""
     for cloud in bare.clouds.values():
         if cloud.session.epoch == bare.world._session.epoch != 0:
             bare.send(cloud.start(bare.world._orders.number + 1))
 
 
 def check(names: tuple[str, ...]) -> None:
-    """Play one interleaving: what is applied rises, and an epoch belongs to one cloud."""
+    """Play one interleaving: applied counters rise, and an epoch belongs to one cloud."""
     bare, applied, owner = Bare(ring()), [], {}
     for name in names:
         ACTIONS[name](bare)

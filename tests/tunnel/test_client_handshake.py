@@ -1,4 +1,4 @@
-"""Cloud's side of the greetings: what its hellos say, and which answers count."""
+"""Cloud's side of the handshake: its hellos, and which answers it accepts."""
 
 import pytest
 
@@ -115,13 +115,13 @@ def test_a_late_acceptance_of_a_dead_world_is_ignored(
 
 
 def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(handshake):
-    """What the one before had said came late, and was taken while nobody was heard."""
+    """Cloud has accepted a late datagram of a dead world while it heard nobody."""
     accepted(handshake, 3, accept(world=b"v" * 16), 0)
     accepted(handshake, 9, accept(), 3)
     assert accepted(handshake, 3, accept(world=b"v" * 16), 9) is None  # alive, and answers
     name = codec.decode_hello(handshake.make_hello()).nonce
     assert name != NONCE
-    assert accepted(handshake, 9, accept(), 9) is None  # the late word, once more
+    assert accepted(handshake, 9, accept(), 9) is None  # the late datagram again
     assert accepted(handshake, 4, accept(name, b"v" * 16), 9)
     assert codec.decode_hello(handshake.make_hello()).nonce == name
 

@@ -1,4 +1,4 @@
-"""The wire: what goes in comes out again, and nothing else gets in."""
+"""The codec: every message survives a round trip, and everything else is refused."""
 
 import struct
 
@@ -52,7 +52,7 @@ requests = st.builds(
     st.integers(0, 2**63 - 1),
     st.integers(0, 2**16 - 1),
     st.integers(-1, 2**63 - 1),
-    epoch=st.just(0),  # is for cloud alone
+    epoch=st.just(0),  # not in the datagram's body
 )
 
 

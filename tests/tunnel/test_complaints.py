@@ -1,4 +1,4 @@
-"""What keeps two ends from talking is said once, in words, and only while they do not talk."""
+"""Why two ends have no session is logged once, and only while they have none."""
 
 import pytest
 

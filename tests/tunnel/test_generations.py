@@ -1,4 +1,4 @@
-"""Generations of keys: how far a peer may have moved on, and what a byte of them stands for."""
+"""Generations of keys: how far ahead a peer may be, and which generations a byte stands for."""
 
 import pytest
 
@@ -16,11 +16,11 @@ from cloudrc.tunnel.session import (
 )
 
 BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
-GENERATION = 6  # where it stands in the header
+GENERATION = 6  # offset in the header
 
 
 def after(rekeys, *, silence_ns=0):
-    """Both ends of a session; cloud has moved on, and world has heard nothing for so long [ns]."""
+    """Make a session in which cloud has rekeyed and world has heard nothing for `silence_ns`."""
     world, cloud = pair()
     world.tend(0)
     world.tend(silence_ns)
@@ -53,7 +53,7 @@ def test_a_silent_peer_may_be_many_generations_ahead(rekeys, silence_ns, refused
 
 @pytest.mark.parametrize("rekeys", [128, 255, 256, 300, 700])
 def test_after_any_sleep_an_end_hears_its_peer_in_seconds(rekeys):
-    """Its own clock stood still meanwhile; the peer's did not."""
+    """Its clock stood still in the meantime; the peer's did not."""
     world, cloud = after(rekeys, silence_ns=SILENCE_NS)
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[4] == BODY
     cloud.tend((rekeys + 1) * REKEY_NS)
@@ -92,7 +92,7 @@ def test_a_peer_that_has_just_been_heard_is_not_far_ahead():
 
 @pytest.mark.parametrize(("rekeys", "refused"), [(FAR_MAX, False), (FAR_MAX + 1, True)])
 def test_the_step_ahead_counts_from_the_last_generation_heard(rekeys, refused):
-    """And not from the first generation, from which a month's session is as far away."""
+    """It does not count from the first generation, which is far away after a month."""
     world, cloud = after(AHEAD_MAX)
     world.open(cloud.seal(Kind.COMMAND, BODY))
     world.tend(1)

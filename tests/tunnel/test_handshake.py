@@ -1,4 +1,4 @@
-"""World's side of the greetings: cookies, names, and who has authority."""
+"""World's side of the handshake: cookies, nonces, and which cloud has authority."""
 
 from types import SimpleNamespace
 
@@ -164,13 +164,13 @@ def test_the_first_acceptance_decides_the_key_of_the_session():
 
 
 def test_a_repeated_acceptance_has_the_key_of_its_epoch():
-    """World moved on, its acceptance was lost, and the key is no more that of the first hello."""
+    """World began a new epoch under another key, and its acceptance was lost."""
     step = Doorstep()
     step.knock(cookie=step.cookie())
     keys = KeySet(new := Key(b"n" * 32))
     step.world.ring.replace(keys, step.now_ns)
     step.now_ns += round(keys.overlap * 1e9) + SECOND_NS
-    step.world.tend(step.now_ns)  # seals with the new one from here on
+    step.world.tend(step.now_ns)  # seals with the new key from here on
     step.world.accepted = (new, KEY)
     for epoch, epoch_key in ((1, KEY), (2, new)):
         for hello_key in (new, KEY):
@@ -189,7 +189,7 @@ def test_a_repeated_acceptance_has_the_key_of_its_epoch():
     ids=["never heard", "heard before the third", "always heard"],
 )
 def test_a_cloud_without_the_key_of_its_epoch_gets_a_new_one(heard, repeated, opened):
-    """World moved on under the old key, which cloud had no more when the acceptance came."""
+    """World began an epoch under the old key, which cloud dropped before the acceptance came."""
     step = Doorstep()
     step.world.ring.replace(KeySet(new := Key(b"n" * 32)), step.now_ns)
     step.world.tend(step.now_ns)
@@ -245,7 +245,7 @@ def test_a_repeat_does_not_count_as_a_sign_of_life(step):
 
 
 def test_a_silent_incumbent_that_asks_gets_a_new_epoch(step):
-    """What it seals cannot be opened here, for whatever reason: nothing is lost with the epoch."""
+    """World cannot open its datagrams for some reason, so a new epoch loses nothing."""
     step.knock(cookie=step.cookie())
     for counter in range(2 * REPEATS_MAX):
         step.now_ns += SECOND_NS // 5
@@ -275,7 +275,7 @@ def test_a_new_epoch_of_a_session_keeps_its_cloud(step):
     step.door.admit(Kind.OPERATOR, 0, step.now_ns)
     kind, epoch, _ = codec.peek(step.door.move_on(step.now_ns))[0], step.world.epoch, None
     assert (kind, epoch) == (Kind.ACCEPT, 2)
-    step.door.admit(Kind.OPERATOR, 0, step.now_ns)  # counters begin again
+    step.door.admit(Kind.OPERATOR, 0, step.now_ns)  # counters restart
 
 
 def test_epochs_rise_from_the_last_one():

@@ -1,4 +1,4 @@
-"""How many hellos world answers, and that nobody can use up another one's answers."""
+"""How many hellos world answers, and that no sender can use up the answers of another."""
 
 import pytest
 

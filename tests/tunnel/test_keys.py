@@ -209,7 +209,7 @@ def test_without_an_expiry_the_overlap_counts_from_each_start(wall):
 
 @pytest.mark.promise("old-keys-expire")
 def test_a_wrong_clock_cannot_extend_the_overlap():
-    """It is asked at the start alone: whatever it says then, the process counts by itself."""
+    """The wall clock is read only at the start; then the process uses its monotonic clock."""
     for wall in range(round(MADE) - 400, round(MADE) + 400, 7):
         assert ROTATED.left(float(wall)) <= 300.0
 
@@ -247,7 +247,7 @@ def test_a_valid_previous_key_gives_no_warning(keys):
 
 @pytest.mark.promise("old-keys-expire")
 def test_a_new_file_cannot_extend_the_previous_keys_time():
-    ring = KeyRing(ROTATED, now_ns=0, wall=MADE + 300.0)  # it is over
+    ring = KeyRing(ROTATED, now_ns=0, wall=MADE + 300.0)  # it has expired
     ring.replace(KeySet(B, A, 600.0), 10 * SECOND_NS)
     assert ring.accepted(10 * SECOND_NS) == (B,)
     ring = KeyRing(KeySet(B, A, 20.0))

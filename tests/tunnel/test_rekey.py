@@ -12,7 +12,7 @@ from cloudrc.tunnel.session import KEPT, REKEY_NS, Agreement, Session, pair
 BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
 SECOND_NS = 1_000_000_000
 OLD, NEW, WRONG = Key(b"o" * 32), Key(b"n" * 32), Key(b"w" * 32)
-GENERATION = 6  # where it stands in the header
+GENERATION = 6  # offset in the header
 
 
 class Ends:
@@ -98,7 +98,7 @@ def test_a_rekey_follows_a_number_of_datagrams(monkeypatch, sent, moved):
     for _ in range(8):
         cloud.seal(Kind.COMMAND, BODY)
     cloud.tend(2)
-    assert generation(cloud.seal(Kind.COMMAND, BODY)) == 1  # the count begins anew
+    assert generation(cloud.seal(Kind.COMMAND, BODY)) == 1  # the count restarts
 
 
 def test_late_datagrams_of_the_generation_before_are_opened():
@@ -130,7 +130,7 @@ def test_a_rotation_loses_no_datagram(order, apart):
     ends.pass_time(50)
     ends.rotate(order[0])
     announced = ends.pass_time(apart)
-    assert announced <= apart  # the other end cannot open what says that there is a new key
+    assert announced <= apart  # the other end cannot open an announcement
     ends.rotate(order[1])
     assert ends.pass_time(2) <= 1
     assert ends.world._key == ends.cloud._key == NEW
@@ -154,7 +154,7 @@ def test_an_announced_generation_is_used_for_nothing_else():
     world.ring.replace(KeySet(NEW), 0)
     announced = [world.tend(second * SECOND_NS) for second in (1, 2)]
     assert [(generation(d), codec.peek(d)[2]) for (d,) in announced] == [(1, 0), (1, 1)]
-    (again,) = world.tend(REKEY_NS)  # the old key moves on, beyond what was announced
+    (again,) = world.tend(REKEY_NS)  # the old key gets the generation after the announced one
     assert generation(world.seal(Kind.ALIVE, b"")) == 2
     assert generation(again) == 3
     assert world.next_counter(Kind.ALIVE) == 4
@@ -218,7 +218,7 @@ def test_greetings_with_either_valid_key_are_accepted():
 
 
 def test_an_end_that_had_a_wrong_key_goes_on_with_the_right_one():
-    """Its peer has used that one all the time, and was heard while the wrong one was there."""
+    """Its peer has used the right key all the time, and was heard in the meantime."""
     ends = Ends(overlap=2.0)
     ends.rotate("cloud")
     ends.pass_time(3)
@@ -252,7 +252,7 @@ def test_with_equal_key_files_both_ends_hear_each_other_again():
         for _ in range(chance.randint(1, 6)):
             ends.rotate(chance.choice(("world", "cloud")), chance.choice((OLD, NEW, WRONG)))
             if chance.random() < 0.5:
-                ends.hear_each_other()  # before either has looked at its file
+                ends.hear_each_other()  # before either has read its file
             ends.pass_time(chance.choice((0, 0, 1, 2, 3, 7)), deliver=chance.random() < 0.8)
         last = chance.choice((OLD, NEW, Key(b"l" * 32)))
         for end in chance.sample(("world", "cloud"), 2):

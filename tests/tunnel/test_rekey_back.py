@@ -1,4 +1,4 @@
-"""Key files that differ and have one key in common: the ends come together on that one."""
+"""Key files that differ but have one key in common: both ends change to that key."""
 
 import pytest
 
@@ -12,7 +12,7 @@ HELLO = bytes(codec.BODY_SIZES[Kind.HELLO])
 
 
 def rotated():
-    """Both ends use the new key, and accept the one before for five minutes."""
+    """Make ends that use the new key and accept the old one for five minutes."""
     ends = Ends()
     for end in ("world", "cloud"):
         ends.rotate(end)
@@ -22,14 +22,14 @@ def rotated():
 
 
 def go_back(ends):
-    """Cloud alone seals with the old key again, and has been heard with it once."""
+    """Let only cloud return to the old key; world has heard it once with that key."""
     ends.rotate("cloud", OLD)
     ends.cloud._move_on(OLD)
     ends.world.open(ends.cloud.seal(Kind.ALIVE, b""))
 
 
 def look(ends, *, heard):
-    """World looks, a second later, after it has heard this."""
+    """Let world receive this and check its keys a second later."""
     ends.world.open(heard)
     ends.now_ns += SECOND_NS
     return ends.world.tend(ends.now_ns)
@@ -37,7 +37,7 @@ def look(ends, *, heard):
 
 @pytest.mark.parametrize("first", ["world", "cloud"])
 def test_one_end_that_is_rolled_back_is_followed(first):
-    """It knows the new key for two seconds more, the other one the old key for minutes."""
+    """One end accepts the new key for 2 s more; the other accepts the old key for minutes."""
     ends = rotated()
     ends.rings[first].replace(KeySet(OLD, NEW, 2.0), ends.now_ns)
     ends.pass_time(3 + LOOKS)

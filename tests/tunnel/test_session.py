@@ -1,4 +1,4 @@
-"""Sessions: whose datagrams are opened, and that nothing changes before a tag is right."""
+"""Sessions: which datagrams are opened, and that nothing changes before a tag is verified."""
 
 import pytest
 from hypothesis import given, settings
@@ -28,7 +28,7 @@ def a_session(sends=Direction.DOWNLINK, secret=bytes(32)):
 
 
 def state(session):
-    """All that a datagram could change; ciphers by where they are."""
+    """Return all state that a datagram could change; ciphers by their addresses."""
     known = {} if session._openers is None else vars(session._openers)
     known = {name: value for name, value in known.items() if name not in ("_derived", "_far_tries")}
     return {name: repr(value) for name, value in (vars(session) | known).items()}
@@ -68,7 +68,7 @@ def test_no_sealed_end_opens_an_unsealed_datagram():
 def test_a_malformed_datagram_costs_no_cryptography(monkeypatch):
     world, cloud = pair()
     data = cloud.seal(Kind.COMMAND, BODY)
-    longest = codec.DATAGRAM_MAX + 1  # what an end reads of a longer one
+    longest = codec.DATAGRAM_MAX + 1  # size that an end reads of a longer one
     other = bytes([data[0] ^ 1]) + data[1:]
 
     def tried(*given):
@@ -217,7 +217,7 @@ def test_a_greeting_with_another_key_is_refused():
 
 
 def datagrams(count):
-    """Sealed datagrams of every kind, both directions, and greetings; with who opens them."""
+    """Make datagrams of every kind in both directions, each with the end that opens it."""
     world, cloud = pair()
     made = []
     for number in range(count):
@@ -232,7 +232,7 @@ def datagrams(count):
 
 
 def flip_every_bit(made):
-    """How many of all copies with one bit flipped were opened."""
+    """Flip each bit of each datagram; return how many copies were opened, and their number."""
     accepted = flips = 0
     for data, opener in made:
         opener.open(data)

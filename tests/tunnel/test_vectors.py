@@ -52,7 +52,7 @@ HKDF_VECTORS = [
 
 
 def derived(key, salt, info, length=32):
-    """HKDF-SHA256 by hand: extract, expand."""
+    """Compute HKDF-SHA256 by hand: extract, expand."""
     inner = hmac.digest(salt or bytes(32), key, hashlib.sha256)
     block, out = b"", b""
     for number in range(1, -(-length // 32) + 1):
@@ -124,7 +124,7 @@ def test_chacha20_poly1305_is_that_of_rfc_8439():
 
 
 def by_hand(suite, direction, epoch, generation, kind, counter, body):
-    """A sealed datagram as docs/wire.md describes it."""
+    """Make a sealed datagram as docs/wire.md describes it."""
     use = b"cloudrc 5 session %d %d %d %d" % (suite, direction, epoch, generation)
     key = derived(SECRET, b"cloud".ljust(16) + b"world".ljust(16), use)
     header = struct.pack("<BBIBBQ", 5, direction, epoch, generation % 256, kind, counter)
@@ -193,7 +193,7 @@ FROZEN = {
 
 @pytest.mark.parametrize(("suite", "kind"), FROZEN)
 def test_the_wire_stays_as_it_is(suite, kind):
-    """A change here is another version of the wire: raise codec.VERSION with it."""
+    """If this changes, the wire format changes: raise codec.VERSION, too."""
     world, cloud = pair(7, SECRET, suite)
     end = world if kind == Kind.TELEMETRY else cloud
     body = bytes(n % 251 for n in range(codec.BODY_SIZES[kind]))
