@@ -1,12 +1,13 @@
-"""Cloud: telemetry of the robot comes in, velocity commands for it go out.
+"""The remote controller in the cloud: turn the robot's telemetry into velocity commands.
 
-The signal flows through three plug-ins and is steered by the operator:
+The signal passes through three plug-ins; the operator gives the setpoint:
 
-    telemetry > estimators (how long is the loop?) > predictors (where will the robot be by then?)
-              > controllers (how to get to the setpoint?) > command
+    telemetry > estimators (how long is the loop delay?)
+              > predictors (where will the robot be by then?)
+              > controllers (which velocity leads to the setpoint?) > command
                                                 ^
               operator > teleop (missions) ---- setpoint
 
-A file in `estimators`, `predictors` or `controllers` is a plug-in under its own name; a name that
+A file in `estimators`, `predictors` or `controllers` is a plug-in under its own name. A name that
 begins with an underscore is a helper of the others.
 """

@@ -1,13 +1,9 @@
-"""Cloud's end of the tunnel: telemetry comes in, a command leaves every 10 ms.
+"""Run cloud's end of the tunnel: receive telemetry and send a command every 10 ms.
 
-It asks for a session with hellos, and takes the epoch that world hands out; while it has nothing
-to command it says that it is alive, for its authority lasts as long as it is heard. Teleoperation
-is joined to it by messages only: what is seen goes there, setpoints and operator requests come
-back.
-
-Who cloud's end is, and which keys it has.
-
-Cloud's periods that pass without a command: counts in, a fault out where they are many.
+Cloud asks for a session with hellos and uses the epoch that world assigns. While it has nothing to
+command it sends ALIVE datagrams, because world gives the session to another cloud if it hears
+nothing. Cloud and teleop exchange messages only: teleop gets the robot's status and returns
+setpoints and operator requests.
 """
 
 from __future__ import annotations
@@ -17,27 +13,27 @@ from dataclasses import dataclass
 from math import nan
 
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.cloud.operator import Alarm, is_meant_for, seen_in
+from cloudrc.cloud.operator import Alarm, is_for_session, make_seen
 from cloudrc.cloud.operator import Operator as Operator
 from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
-from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE, Complaints, Knocker
+from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE, ClientHandshake, Complaints
 from cloudrc.tunnel.keys import KeyRing
 from cloudrc.tunnel.session import AES_256_GCM, NO_EPOCH, make_session
 
 
 @dataclass(frozen=True, slots=True)
 class CloudIdentity:
-    """What cloud's end is given at its start.
+    """Identity and keys of cloud's end.
 
     Attributes:
-        clock_id: 16 bytes that name this machine's monotonic clock.
-        nonce: 16 bytes that name this process; never the same twice.
-        ring: The pre-shared keys; None for an end that never leaves its process.
-        suite: Cipher that this machine is fast at.
+        clock_id: 16 bytes that identify this machine's monotonic clock.
+        nonce: 16 bytes that identify this process; new at every start.
+        ring: The pre-shared keys; None if both ends are in one process.
+        suite: Cipher that is fast on this machine.
     """
 
     clock_id: bytes
@@ -47,38 +43,38 @@ class CloudIdentity:
 
 
 MISSED_MAX = 50
-"""So many at a time are a fault worth telling; a few happen on any machine [periods]."""
+"""Number of missed periods at a time that makes a fault; a few happen on any machine [periods]."""
 FORGIVEN_NS = 200_000_000
-"""After so long one is forgiven: 5 % of all periods may be missed for ever [ns]."""
+"""Time after which one missed period no longer counts [ns]: 5 % of all periods may be missed."""
 
 
-class Lateness:
-    """Tells when cloud falls behind, and again once all that it has missed is forgiven."""
+class MissedPeriods:
+    """Report when cloud misses many periods, and again after all of them are forgiven."""
 
     def __init__(self) -> None:
-        self._missed, self._told = 0, False
-        self._forgiven_ns = NEVER_NS  # when all will be
+        self._missed, self._reported = 0, False
+        self._forgiven_ns = NEVER_NS  # when all missed periods will be forgiven
 
     def miss(self, count: int, now_ns: int) -> list[Fault]:
         """Count missed periods.
 
         Args:
-            count: How many, of 10 ms.
+            count: Number of missed periods of 10 ms.
             now_ns: Cloud's monotonic clock [ns].
 
         Returns:
-            What there is to tell: a fault or nothing.
+            A fault to report, or nothing.
         """
         full_ns = now_ns + MISSED_MAX * FORGIVEN_NS
         if self._forgiven_ns <= now_ns:
-            self._missed, self._told, self._forgiven_ns = 0, False, now_ns
+            self._missed, self._reported, self._forgiven_ns = 0, False, now_ns
         self._missed += count
         self._forgiven_ns = min(self._forgiven_ns + count * FORGIVEN_NS, full_ns)
-        if self._told or self._forgiven_ns < full_ns:
+        if self._reported or self._forgiven_ns < full_ns:
             return []
-        self._told = True
+        self._reported = True
         text = (
-            f"cloud has let {self._missed} periods of 10 ms pass without a command: "
+            f"cloud sent no command in {self._missed} periods of 10 ms: "
             "a plug-in is slow or the machine is busy"
         )
         return [Fault(now_ns, "late", text)]
@@ -87,21 +83,28 @@ class Lateness:
 PERIOD_NS = 10_000_000
 """Time between two commands [ns]. Source: docs/reference/plant.md, "Commands"."""
 HELLO_PERIOD_NS = 100_000_000
+"""Least time between two periodic hellos [ns]."""
 GIVE_UP_NS = 5_000_000_000
-"""A robot that has not been told in so long that its mission is over will not be told."""
+"""Longest time for which cloud tries to tell the robot that its mission is over [ns]."""
 SILENCE_NS = 500_000_000
-"""Without telemetry for so long, cloud says hello again: world may have restarted."""
+"""Time without telemetry after which cloud says hello again [ns]; world may have restarted."""
 ALIVE_PERIOD_NS = 100_000_000
-"""A cloud that has nothing to command says so often that it is there."""
+"""Time between two ALIVE datagrams while there is no command [ns]."""
 PATIENCE_NS = 5_000_000_000
-"""So long without a session is worth telling [ns]."""
+"""Time without a session after which cloud reports a fault [ns]."""
 COUNT_PERIOD_NS = 1_000_000_000
+"""Time between two records of the counts [ns]."""
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
-_new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
+_new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class CloudEndpoint:
-    """The remote controller's end of the tunnel; an `Endpoint`."""
+    """The remote controller's end of the tunnel; an `Endpoint`.
+
+    Attributes:
+        teleop: Teleop as cloud sees it.
+        guard: State of the guard in the newest telemetry.
+    """
 
     def __init__(
         self,
@@ -116,26 +119,26 @@ class CloudEndpoint:
 
         Args:
             loop: Estimator, predictor and controller.
-            teleop: Where setpoints come from.
-            identity: Who this end is.
-            newest_wins: Policy for late telemetry.
+            teleop: Source of setpoints and operator requests.
+            identity: Identity and keys of this end.
+            newest_wins: Whether late telemetry is dropped.
             start_ns: Cloud's monotonic clock now [ns].
         """
         self._loop = loop
         self.teleop = teleop
         self._identity = identity
         self._session = make_session(Direction.DOWNLINK, identity.ring, start_ns)
-        self._knocker = Knocker(identity.nonce, identity.clock_id, identity.suite)
+        self._handshake = ClientHandshake(identity.nonce, identity.clock_id, identity.suite)
         self._complaints = Complaints()
         self._channel = Channel(newest_wins)
         self._hellos = 0
         self._clock_is_shared = False
         self._setpoint: Setpoint | None = None
-        self._world = ""  # names the process that has accepted the session
-        self.guard = GuardState.GROUND  # as telemetry last told
-        self._delays = (nan, nan, nan)  # horizon, round trip and loop of the last command [s]
-        self._alarm, self._lateness = Alarm(), Lateness()
-        self._asked = 0  # the highest number of an operator's request
+        self._world = ""  # identifies the world process of the session
+        self.guard = GuardState.GROUND
+        self._delays = (nan, nan, nan)  # horizon, round trip and loop delay of the last command [s]
+        self._alarm, self._missed_periods = Alarm(), MissedPeriods()
+        self._asked = 0  # highest number of an operator request in this session
         self._tick_ns = start_ns
         self._hello_ns = start_ns
         self._alive_ns = start_ns
@@ -149,9 +152,9 @@ class CloudEndpoint:
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended and the robot is seen to hold, or cannot be told to."""
-        told = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
-        return told and self.teleop.outcome is not None
+        """Whether the mission has ended and the robot holds, or does not answer."""
+        done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
+        return done and self.teleop.outcome is not None
 
     @property
     def sealed(self) -> bool:
@@ -159,7 +162,7 @@ class CloudEndpoint:
         return self._session.sealed
 
     def next_deadline_ns(self) -> int:
-        """When the next command is due [ns]."""
+        """Return when the next command is due [ns]."""
         return self._tick_ns
 
     def take_datagrams(self) -> list[bytes]:
@@ -173,15 +176,15 @@ class CloudEndpoint:
         return records
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Send what is due; periods that were missed are skipped, not made up for."""
+        """Send what is due at `now_ns` [ns]; missed periods are skipped."""
         if now_ns < self._tick_ns:
             return
         missed = (now_ns - self._tick_ns) // PERIOD_NS
         if missed:
             self._counts["missed_periods"] += missed
-            self._records += self._lateness.miss(missed, now_ns)
+            self._records += self._missed_periods.miss(missed, now_ns)
         self._tick_ns += (missed + 1) * PERIOD_NS
-        if self._asks(now_ns):
+        if self._wants_session(now_ns):
             self._say_hello_if_due(now_ns)
             if now_ns - self._heard_ns > PATIENCE_NS:
                 self._records += self._complaints.say("no_session", SILENCE, now_ns)
@@ -199,12 +202,12 @@ class CloudEndpoint:
             self._alive_ns = now_ns + ALIVE_PERIOD_NS
             self._send(Kind.ALIVE, b"")
         if now_ns >= self._count_ns:
-            self._note_counts(now_ns)
+            self._record_counts(now_ns)
         if self._loop.faults:
             self._records += self._loop.take_faults()
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Take in one datagram; what is not valid is counted and dropped."""
+        """Handle one datagram; an invalid one is counted and dropped."""
         try:
             kind, _, epoch, counter, body = self._session.open(data)
             if kind == TELEMETRY:
@@ -212,11 +215,12 @@ class CloudEndpoint:
             elif kind == Kind.ACCEPT:
                 self._receive_accept(epoch, codec.decode_accept(body), now_ns)
             elif kind == Kind.CHALLENGE:
-                hello = self._knocker.challenged(codec.decode_challenge(body))
-                if hello is not None and self._asks(now_ns):
+                hello = self._handshake.answer_challenge(codec.decode_challenge(body))
+                if hello is not None and self._wants_session(now_ns):
                     self._greet(hello)
             elif kind == Kind.BUSY:
-                if self._knocker.refused(codec.decode_busy(body)) and self._asks(now_ns):
+                is_ours = self._handshake.receive_busy(codec.decode_busy(body))
+                if is_ours and self._wants_session(now_ns):
                     self._counts["busy"] += 1
                     self._records += self._complaints.say("busy", BUSY_TEXT, now_ns)
             elif kind != Kind.ALIVE:
@@ -227,22 +231,22 @@ class CloudEndpoint:
     def _refuse(self, outcome: str, data: bytes, now_ns: int) -> None:
         self._counts[outcome] += 1
         if outcome == "old_epoch" and codec.peek(data)[1] > self._session.epoch:
-            self._say_hello_if_due(now_ns)  # world may have moved on, its accept lost
-        elif self._asks(now_ns):
+            self._say_hello_if_due(now_ns)  # world's acceptance of a new epoch may be lost
+        elif self._wants_session(now_ns):
             self._records += self._complaints.about(outcome, data, now_ns)
 
     def _say_hello_if_due(self, now_ns: int) -> None:
         if now_ns < self._hello_ns:
             return
         self._hello_ns = now_ns + HELLO_PERIOD_NS
-        self._greet(self._knocker.hello())
+        self._greet(self._handshake.make_hello())
 
-    def _asks(self, now_ns: int) -> bool:
-        """Whether cloud wants a session: it has none, or does not hear world in it."""
+    def _wants_session(self, now_ns: int) -> bool:
+        """Whether cloud asks for a session: it has none, or does not hear world."""
         return self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
 
     def _greet(self, hello: bytes) -> None:
-        """Send a hello; while two keys are valid, with each in turn."""
+        """Send a hello; while two keys are valid, use them in turn."""
         keys = self._session.accepted
         key = keys[self._hellos % len(keys)]
         self._hellos += 1
@@ -250,9 +254,10 @@ class CloudEndpoint:
         self._counts["sent"] += 1
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
-        """Take the epoch that world hands out to this very process, if it is a new one."""
-        asks = self._asks(now_ns)
-        agreement = self._knocker.accepted(epoch, accept, self._session.epoch, asks=asks)
+        """Begin the epoch that world assigns to this process, if it is new."""
+        asks = self._wants_session(now_ns)
+        current = self._session.epoch
+        agreement = self._handshake.receive_accept(epoch, accept, current, asks=asks)
         if agreement is None:
             self._counts["accept_ignored"] += 1
             return
@@ -260,8 +265,8 @@ class CloudEndpoint:
         self._complaints.forget()
         self._channel.reset()
         self._loop.reset()
-        self._setpoint = None  # meant for where the robot was; teleop says it again
-        self._asked = 0  # what was asked in the session before counts no more
+        self._setpoint = None  # the robot may have moved; teleop sends a new one
+        self._asked = 0  # numbers of the previous session no longer count
         self._alarm.begin_again()
         self._world = accept.world_nonce.hex()
         self._clock_is_shared = accept.clock == self._identity.clock_id
@@ -270,9 +275,9 @@ class CloudEndpoint:
         self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
     def _receive_telemetry(self, epoch: int, counter: int, body: bytes, now_ns: int) -> None:
-        """Whatever arrives for this epoch is noted; loop and teleop get the newest."""
+        """Record telemetry of this epoch; pass it to loop and teleop if it is to be used."""
         outcome = self._channel.take(counter)
-        if outcome != REPEATED:  # those anybody can send
+        if outcome != REPEATED:  # anybody can send repeats
             self._heard_ns = now_ns
         self._counts[outcome] += 1
         used = outcome == USED
@@ -288,13 +293,13 @@ class CloudEndpoint:
             self._alarm.see(telemetry.guard, telemetry.mission)
             self._loop.observe(telemetry, now_ns)
             self._asked = max(self._asked, telemetry.mission)
-            self.teleop.see(seen_in(telemetry, epoch, self._world, self._delays), now_ns)
+            self.teleop.see(make_seen(telemetry, epoch, self._world, self._delays), now_ns)
             if self.teleop.outputs:
                 self._take_from_teleop()
 
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():
-            if not is_meant_for(self._session.epoch, message):
+            if not is_for_session(self._session.epoch, message):
                 self._counts["words_dropped"] += 1
             elif isinstance(message, Setpoint):
                 self._setpoint = message
@@ -306,11 +311,12 @@ class CloudEndpoint:
                     self._loop.start_mission()
 
     def _relay(self, request: OperatorRequest) -> None:
-        """Pass a request on; one without a number is an alarm, before which nothing starts.
+        """Relay a request to world, or drop it; teleop repeats a dropped request.
 
-        Nor before the robot is seen; and nothing without a session. Teleop repeats what is dropped.
+        An emergency stop without a number is an alarm. Cloud relays nothing without a session,
+        and no start before telemetry has arrived or while an alarm is active.
         """
-        if request.number > codec.NUMBER_MAX:  # somebody with the keys has used them up
+        if request.number > codec.NUMBER_MAX:  # somebody with the keys has used up the numbers
             self._counts["words_dropped"] += 1
             return
         may_start = self._loop.ready and not self._alarm.sounds
@@ -318,8 +324,8 @@ class CloudEndpoint:
             self._alarm.sound()
         elif self._session.epoch and (may_start or request.request is not Request.START):
             self._asked = max(self._asked, request.number)
-            known = request._replace(basis_stamp_ns=self._loop.basis_stamp_ns)
-            self._send(Kind.OPERATOR, codec.encode_operator(known))
+            stamped = request._replace(basis_stamp_ns=self._loop.basis_stamp_ns)
+            self._send(Kind.OPERATOR, codec.encode_operator(stamped))
 
     def _send_command(self, setpoint: Setpoint, now_ns: int) -> None:
         elapsed_ns = now_ns - self._commanded_ns if self._commanded_ns >= 0 else PERIOD_NS
@@ -330,7 +336,7 @@ class CloudEndpoint:
         self._records.append(control)
         self._delays = (control.horizon, control.rtt, control.loop_delay)
 
-    def _note_counts(self, now_ns: int) -> None:
+    def _record_counts(self, now_ns: int) -> None:
         self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
         self._datagrams += self._session.tend(now_ns)
         for name, count in sorted((self._counts | self._loop.counts).items()):

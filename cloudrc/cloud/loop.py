@@ -1,17 +1,15 @@
-"""The control loop: the newest telemetry becomes a command, through estimator, predictor, PID.
+"""Compute each command from the newest telemetry with estimator, predictor and controller.
 
-A plug-in may be wrong: it raises, or returns something that is not finite, or no numbers at all.
-Then the loop does the careful thing (looks ahead by the last good horizon, uses the last sample,
-commands zero), counts it, and says once what happened; it never stops.
+A plug-in may raise, or return values that are not finite or not numbers. The loop then uses a safe
+value (the last good horizon, the last sample, zero velocity), counts the failure and reports the
+first one. It never stops.
 
-While no echo shows that commands are flown, the reference is frozen: the command is to stand still
-and the controller is not asked, so that no integral winds up and no predictor believes in motion
-that was commanded and never flown. Commands go on, since only they can end the silence.
+While no echo shows that the robot flies the commands, the loop freezes: it commands zero velocity
+and does not call the controller. So no integral winds up, and no predictor assumes motion that the
+robot did not fly. The loop goes on sending commands, because only a new echo ends the silence.
 
-What telemetry tells about the delays: echoes become samples, samples become a horizon.
-
-All ages are measured on cloud's own clock; world's stamps are only ever compared with each other,
-so no clock synchronisation is needed.
+The loop measures all ages on cloud's own clock and compares world's stamps only with each other,
+so it needs no clock synchronisation.
 """
 
 from __future__ import annotations
@@ -32,16 +30,16 @@ HORIZON_MAX = 1.0
 
 
 class DelayMeter:
-    """Feeds a delay estimator and asks it how far to look ahead.
+    """Feed a delay estimator with echoes and get the horizon from it.
 
     Attributes:
-        rtt: Last round trip, hold excluded [s]; NaN before the first.
-        loop_delay: Last `now - echo_stamp`, hold included [s]; NaN likewise.
-        newest_echo_ns: Stamp of the newest command that is seen to be flown [ns], cloud's clock.
+        rtt: Last round trip without the hold [s]; NaN before the first.
+        loop_delay: Last `now - echo_stamp`, which includes the hold [s]; NaN before the first.
+        newest_echo_ns: Stamp of the newest command that an echo shows as flown [ns], cloud's clock.
     """
 
     def __init__(self, estimator: Estimator, counts: Counter[str]) -> None:
-        """Ask `estimator`; what is clamped is counted in `counts`."""
+        """Use `estimator`, and count clamped horizons in `counts`."""
         self._estimator, self._counts = estimator, counts
         self.newest_echo_ns = NEVER_NS
         self._stamp_ns = 0
@@ -49,10 +47,14 @@ class DelayMeter:
         self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Take in telemetry that became the newest, at its arrival.
+        """Process new telemetry at its arrival.
 
-        A repeated echo is no sample: while the downlink is silent the same command is echoed over
-        and over, and its growing age would poison the estimate.
+        A repeated echo is no sample. While the downlink is silent, world echoes the same command
+        again and again, and its growing age would corrupt the estimate.
+
+        Args:
+            telemetry: The newest telemetry.
+            now_ns: Cloud's clock [ns].
         """
         self._stamp_ns = telemetry.stamp_ns
         if telemetry.echo_stamp_ns <= self.newest_echo_ns:
@@ -66,7 +68,7 @@ class DelayMeter:
         self._estimator.update(DelaySample(self.loop_delay, self.rtt, applied_minus_stamp))
 
     def horizon(self, now_ns: int) -> float:
-        """How far to look ahead from the newest odometry for a command that leaves now.
+        """Return how far to predict from the newest odometry for a command that leaves now.
 
         Args:
             now_ns: Cloud's clock [ns].
@@ -75,7 +77,7 @@ class DelayMeter:
             Horizon [s], in [0, 1].
 
         Raises:
-            ValueError: If the estimator gives something that is not finite.
+            ValueError: If the estimator's horizon is not finite.
         """
         horizon = float(self._estimator.horizon((now_ns - self._stamp_ns) * 1e-9))
         if 0.0 <= horizon <= HORIZON_MAX:
@@ -87,14 +89,19 @@ class DelayMeter:
 
 
 FREEZE_NS = 400_000_000
-"""An echo that is silent for longer than the horizon and this freezes the reference [ns].
+"""Time without a new echo, in addition to the horizon, after which the loop freezes [ns].
 Source: docs/reference/plant.md, "Frozen reference"."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
-_new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
+_new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class ControlLoop:
-    """Estimator, predictor and controller of one session."""
+    """Run estimator, predictor and controller of one session.
+
+    Attributes:
+        faults: Faults since the last `take_faults`.
+        counts: How often each failure happened.
+    """
 
     def __init__(
         self,
@@ -102,9 +109,9 @@ class ControlLoop:
         predictor: Predictor,
         controller: Controller,
     ) -> None:
-        """Join three plug-ins; the estimator is built anew for every session.
+        """Connect three plug-ins; every session gets a new estimator.
 
-        Before anything flies a plug-in that fails may end this: whatever it raises gets out.
+        Exceptions of the plug-ins are not caught here, because nothing flies yet.
         """
         self._build_estimator = build_estimator
         self._predictor = predictor
@@ -118,12 +125,12 @@ class ControlLoop:
         self._begin(estimator)
 
     def reset(self) -> None:
-        """A new session begins: nothing measured in the old one counts."""
+        """Forget all measurements at the start of a session."""
         try:
             estimator = self._build_estimator()
         except BaseException as error:
             self._note("estimator", error, NEVER_NS)
-            estimator = Estimator()  # which knows nothing: the horizon stays 0
+            estimator = Estimator()  # it has no estimate, so the horizon stays 0
         self._reset("predictor", self._predictor.reset)
         self._reset("controller", self._controller.reset)
         self._begin(estimator)
@@ -133,31 +140,31 @@ class ControlLoop:
         self._basis: Odometry | None = None
         self._basis_arrival_ns = 0
         self._horizon = 0.0
-        self._trusted_ns = NEVER_NS
+        self._echoed_ns = NEVER_NS
 
     def start_mission(self) -> None:
-        """A mission begins within the session: the controller starts anew."""
+        """Reset the controller at the start of a mission within the session."""
         self._reset("controller", self._controller.reset)
-        self._trusted_ns = NEVER_NS
+        self._echoed_ns = NEVER_NS
 
     def _reset(self, kind: str, reset: Callable[[], None]) -> None:
         try:
             reset()
         except BaseException as error:
-            self._note(kind, error, NEVER_NS, "it is asked on as it is")
+            self._note(kind, error, NEVER_NS, "cloud goes on using it")
 
     @property
     def basis_stamp_ns(self) -> int:
-        """When the newest odometry was measured [ns, world's clock]; `NEVER_NS` before any."""
+        """Stamp of the newest odometry [ns], world's clock; `NEVER_NS` before the first."""
         return NEVER_NS if self._basis is None else self._basis.stamp_ns
 
     @property
     def ready(self) -> bool:
-        """Whether there is telemetry to compute a command from."""
+        """Whether telemetry has arrived in this session."""
         return self._basis is not None
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Take in telemetry that became the newest, at its arrival [ns, cloud's clock]."""
+        """Process new telemetry at its arrival `now_ns` [ns], cloud's clock."""
         self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
         if self._undated:
             self.faults += [fault._replace(stamp_ns=now_ns) for fault in self._undated]
@@ -177,17 +184,17 @@ class ControlLoop:
         """Compute the command that is due now.
 
         Args:
-            setpoint: Where to be.
+            setpoint: The setpoint.
             now_ns: Cloud's clock [ns].
             dt: Time since the last command [s], > 0.
-            epoch: Of the session, for the record.
-            counter: That the command will carry, for the record.
+            epoch: Epoch of the session, for the record.
+            counter: Counter of the command, for the record.
         """
         basis = self._basis
-        assert basis is not None, "ask `ready` first"
-        horizon = self._look_ahead(now_ns)
+        assert basis is not None, "check `ready` first"
+        horizon = self._choose_horizon(now_ns)
         estimate = self._predict(basis, horizon, now_ns)
-        if self._is_unheard(now_ns, horizon):
+        if self._is_echo_silent(now_ns, horizon):
             self.counts["frozen"] += 1
             output = STAND_STILL
         else:
@@ -199,7 +206,7 @@ class ControlLoop:
             self._predictor.commanded(command)
         except BaseException as error:
             self._note("predictor", error, now_ns)
-        known = (
+        fields = (
             now_ns,
             epoch,
             counter,
@@ -219,22 +226,22 @@ class ControlLoop:
             output.integral,
             output.derivative,
         )
-        return command, _new(Control, known)
+        return command, _new(Control, fields)
 
     def take_faults(self) -> list[Fault]:
-        """Hand over what went wrong for the first time since the last call."""
+        """Return the faults since the last call."""
         faults, self.faults = self.faults, []
         return faults
 
-    def _look_ahead(self, now_ns: int) -> float:
+    def _choose_horizon(self, now_ns: int) -> float:
         try:
             self._horizon = self._delays.horizon(now_ns)
         except BaseException as error:
             self._note("estimator", error, now_ns)
         return self._horizon
 
-    # A sum is finite only if all its terms are. That it can overflow is no loss: numbers of that
-    # size cannot be flown either.
+    # A sum is finite only if all its terms are finite. It may overflow, but a robot cannot fly
+    # numbers of that size anyway.
 
     def _predict(self, basis: Odometry, horizon: float, now_ns: int) -> Odometry:
         try:
@@ -264,19 +271,19 @@ class ControlLoop:
             self._note("controller", error, now_ns)
             return STAND_STILL
 
-    def _is_unheard(self, now_ns: int, horizon: float) -> bool:
-        """Whether the echo has been silent for too long; before the first it has time, too."""
-        if self._trusted_ns < self._delays.newest_echo_ns:
-            self._trusted_ns = self._delays.newest_echo_ns
-        elif self._trusted_ns == NEVER_NS:
-            self._trusted_ns = now_ns
-        return now_ns - self._trusted_ns > horizon * 1e9 + FREEZE_NS
+    def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
+        """Whether no new echo has come for too long; the first one has as much time."""
+        if self._echoed_ns < self._delays.newest_echo_ns:
+            self._echoed_ns = self._delays.newest_echo_ns
+        elif self._echoed_ns == NEVER_NS:
+            self._echoed_ns = now_ns
+        return now_ns - self._echoed_ns > horizon * 1e9 + FREEZE_NS
 
     def _note(self, kind: str, error: BaseException, now_ns: int, instead: str = "") -> None:
-        """Count what a plug-in did wrong; report it the first time.
+        """Count a failure of a plug-in and report the first one.
 
-        It is foreign code: anything may come out of it, but a person's Ctrl-C is not its own.
-        What is noted at NEVER_NS is dated by the next telemetry.
+        A plug-in may raise anything; only a user's Ctrl-C is raised again. A failure at NEVER_NS
+        gets its stamp from the next telemetry.
         """
         if isinstance(error, KeyboardInterrupt):
             raise error
@@ -288,18 +295,19 @@ class ControlLoop:
 
 
 _INSTEAD = {
-    "estimator": "the last good horizon is used",
-    "predictor": "the last sample is used unpredicted",
-    "controller": "the command is zero velocity",
+    "estimator": "cloud uses the last good horizon",
+    "predictor": "cloud uses the last sample without a prediction",
+    "controller": "cloud commands zero velocity",
 }
+"""What cloud does instead of using the plug-in, by its kind."""
 
 
 def _explain(kind: str, error: BaseException, instead: str) -> str:
     what = f"the {kind} failed ({in_words(error)}); {instead or _INSTEAD[kind]}"
-    return f"{what}; mend cloud.{kind} or choose another"
+    return f"{what}; fix cloud.{kind} or choose another"
 
 
 def _triple(numbers: Vector) -> Vector:
-    """Have it of numbers, whatever a plug-in has made of it; what is a triple stays as it is."""
+    """Convert what a plug-in returned to three floats."""
     x, y, z = numbers
     return float(x), float(y), float(z)

@@ -1,7 +1,4 @@
-"""What cloud's end knows of teleoperation: messages go to it and come from it, nothing else.
-
-One of them it has to see through by itself: the alarm.
-"""
+"""Connect cloud's end to teleop by messages, and repeat an emergency stop without teleop's help."""
 
 from __future__ import annotations
 
@@ -15,64 +12,64 @@ from cloudrc.tunnel.session import NO_EPOCH
 
 REPEAT_NS = 100_000_000
 """Time between two copies of the alarm [ns]."""
-_new = tuple.__new__  # of a named tuple: the constructor of its class takes twice the time
+_new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class Operator(Protocol):
-    """Teleop as cloud knows it: the machine itself, or the socket behind which it lives."""
+    """Teleop as cloud sees it: teleop itself, or the socket to its process."""
 
     @property
     def outputs(self) -> Sequence[Output | Fault]:
-        """What it has said since the last call of `take_outputs`."""
+        """Messages since the last call of `take_outputs`."""
 
     @property
     def outcome(self) -> Outcome | None:
-        """How the mission ended; None while there is none, or cloud has to go on anyway."""
+        """How the mission ended; None while cloud has to go on."""
 
     @property
     def settled(self) -> bool:
-        """Whether the robot is seen to have acted on the last request."""
+        """Whether telemetry shows that the robot has acted on the last request."""
 
     def see(self, seen: Seen, now_ns: int) -> None:
-        """Take note of the newest telemetry."""
+        """Pass on the newest telemetry at `now_ns` [ns]."""
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Do what is due."""
+        """Do what is due at `now_ns` [ns]."""
 
     def take_outputs(self) -> Sequence[Output | Fault]:
-        """Hand over what it has said since the last call."""
+        """Return the messages since the last call."""
 
 
-def is_meant_for(epoch: int, said: Output | Fault) -> bool:
-    """Whether what teleop says may lead the robot in a session.
+def is_for_session(epoch: int, output: Output | Fault) -> bool:
+    """Whether a message from teleop is valid in a session.
 
-    Where to fly, and to start, is meant for one session: teleop may lag, and somebody else may have
-    moved the robot since; it says it again. All else passes whenever it was said. An end and a stop
-    lead nowhere, progress is of the mission that it names, and an acknowledgement arms nothing.
+    A setpoint and a start are valid only in the session for which teleop made them, because another
+    cloud may have moved the robot since; teleop repeats them for the new session. All other
+    messages are always valid, because they cannot make the robot fly.
 
     Args:
-        epoch: Of the session.
-        said: What is to be obeyed in it.
+        epoch: Epoch of the session.
+        output: Message from teleop.
     """
-    if isinstance(said, Setpoint) or (
-        isinstance(said, OperatorRequest) and said.request is Request.START
+    if isinstance(output, Setpoint) or (
+        isinstance(output, OperatorRequest) and output.request is Request.START
     ):
-        return said.epoch in (NO_EPOCH, epoch)
+        return output.epoch in (NO_EPOCH, epoch)
     return True
 
 
-def seen_in(
+def make_seen(
     telemetry: Telemetry, epoch: int, world: str, delays: tuple[float, float, float]
 ) -> Seen:
-    """Make what teleop is told of telemetry.
+    """Make the message that tells teleop of new telemetry.
 
     Args:
-        telemetry: The newest.
-        epoch: Session that it belongs to.
-        world: Names world's process.
+        telemetry: The newest telemetry.
+        epoch: Epoch of its session.
+        world: Text that identifies world's process.
         delays: Horizon, round trip and loop delay of the last command [s]; NaN before the first.
     """
-    known = (
+    fields = (
         epoch,
         telemetry.odometry.position,
         telemetry.guard,
@@ -86,17 +83,17 @@ def seen_in(
         telemetry.reached,
         telemetry.cause,
     )
-    return _new(Seen, known)
+    return _new(Seen, fields)
 
 
 class Alarm:
-    """An emergency stop that has passed teleop by: told to the robot until it is seen to stand.
+    """Repeat an emergency stop until telemetry shows that the guard is in ESTOP.
 
-    Teleop's own machine may hang in its disk, so nobody else repeats it. It waits for a session,
-    and outlives one.
+    Cloud repeats the stop itself, because teleop may wait for its disk. The alarm waits for a
+    session and continues in the next one.
 
     Attributes:
-        sounds: Whether the robot is not seen yet to stand.
+        sounds: Whether the alarm is active.
     """
 
     def __init__(self) -> None:
@@ -104,28 +101,28 @@ class Alarm:
         self._number = self._acted_on = self._due_ns = 0
 
     def sound(self) -> None:
-        """Begin, or go on."""
+        """Start the alarm unless it is active."""
         if not self.sounds:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
     def begin_again(self) -> None:
-        """In another session numbers may begin again."""
+        """Restart the numbers for a new session."""
         self._number = self._acted_on = self._due_ns = 0
 
     def see(self, guard: GuardState, acted_on: int) -> None:
-        """Take note of the guard's state, and of the last request that world has acted on."""
+        """Note the guard's state and the number of the last request that world has acted on."""
         self._acted_on = acted_on
         if guard is GuardState.ESTOP:
             self.sounds = False
 
     def due(self, asked: int, now_ns: int) -> OperatorRequest | None:
-        """Give the request, if a copy of it has to leave.
+        """Return the request if a copy of it is due.
 
-        World acts on rising numbers only: what has reached it before the alarm takes its number.
+        World acts on rising numbers only, so the alarm needs a number above all others.
 
         Args:
-            asked: The highest number of a request so far.
-            now_ns: Now [ns].
+            asked: Highest number of a request so far.
+            now_ns: Cloud's monotonic clock [ns].
         """
         if not self.sounds or now_ns < self._due_ns:
             return None

@@ -1,4 +1,4 @@
-"""Checks of plug-in parameters: values from the experiment file come in, checked floats go out.
+"""Check parameters of plug-ins from the experiment file.
 
 Every error names the parameter, the value and the reason in one line.
 """
@@ -12,7 +12,7 @@ from cloudrc.messages import Vector
 
 
 def not_negative(name: str, value: object) -> float:
-    """Return `value` if it is a finite number >= 0, whatever its unit.
+    """Return `value` if it is a finite number >= 0, in any unit.
 
     Raises:
         ValueError: If it is not.
@@ -20,31 +20,31 @@ def not_negative(name: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{name}: {value!r} is not a number")
     if not isfinite(value) or value < 0:
-        raise ValueError(f"{name}: {value!r} has to be finite and not negative")
+        raise ValueError(f"{name}: {value!r} must be finite and not negative")
     return float(value)
 
 
 def positive(name: str, value: object) -> float:
-    """Return `value` if it is a finite number > 0, whatever its unit.
+    """Return `value` if it is a finite number > 0, in any unit.
 
     Raises:
         ValueError: If it is not.
     """
     number = not_negative(name, value)
     if number == 0:
-        raise ValueError(f"{name}: {value!r} has to be above 0")
+        raise ValueError(f"{name}: {value!r} must be above 0")
     return number
 
 
 def gain(name: str, value: object) -> float:
-    """Return `value` if it can be the gain of an average: above 0, at most 1.
+    """Return `value` if it is a valid gain of an average [1]: above 0, at most 1.
 
     Raises:
         ValueError: If it cannot.
     """
     number = positive(name, value)
     if number > 1:
-        raise ValueError(f"{name}: {value!r} has to be at most 1")
+        raise ValueError(f"{name}: {value!r} must be at most 1")
     return number
 
 
@@ -55,7 +55,7 @@ def vector(name: str, value: object) -> Vector:
         ValueError: If it is not.
     """
     if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 3:
-        raise ValueError(f"{name}: {value!r} has to be three numbers, for x, y and z")
+        raise ValueError(f"{name}: {value!r} must be three numbers, for x, y and z")
     x, y, z = (
         not_negative(f"{name}[{axis}]", item) for axis, item in zip("xyz", value, strict=True)
     )

@@ -1,5 +1,6 @@
-"""Teleop: the operator's wishes come in, setpoints for the controller and requests go out.
+"""Teleop: turn the operator's verbs into missions, setpoints and requests to the robot.
 
-`plan` says what a mission is, `messages` what teleop is told and tells, `mission` flies it. Teleop
-meets the controller and the robot in messages only, so that it can live in another process.
+`wire` defines plans and messages, `mission` flies a mission, `requests` repeats requests to the
+robot, and `service` keeps all missions. Teleop exchanges only messages with controller and robot,
+so it can run in another process.
 """

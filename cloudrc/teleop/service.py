@@ -1,19 +1,13 @@
-"""Missions as a service: orders, verbs and the robot as seen come in; answers and events go out.
+"""Serve missions: keep, queue and fly orders, carry out verbs, and report the robot's state.
 
-Pure, like the machine that it drives, and keeping a book of what it does. Missions have an id of
-ours and, if their sender wishes, a key of theirs: a second order under the same key is answered
-with the mission that the first one made. A mission that was under way when the book was closed
-goes on at the same waypoint, if the world is still the one in which it began.
+Like the state machine `Teleop` that it drives, the service is pure; it stores all events in a
+store. Each mission has an id and, if its sender gives one, a key: a second order with the same key
+gets the mission of the first one. After a restart a mission that was under way continues at the
+same waypoint, if world has not restarted.
 
-The operator's emergency stop over the lives of teleop: it is asked for until it is acknowledged.
-
-That a mission was stopped stands in the book, and so does the acknowledgement once the robot is
-seen to have acted on it. A teleop that finds the one without the other asks again, for the robot
-may not have heard of it; unless that robot has flown something else since, or is another one.
-
-The robot as teleop sees it: telemetry comes in; its state, since when and what is next go out.
-
-What comes next follows from state and mission.
+An emergency stop also survives a restart of teleop. The store contains the stop and, once the robot
+has acted on it, its acknowledgement. A new teleop that finds only the stop sends it again, unless
+the robot has flown another mission since or is another one.
 """
 
 from __future__ import annotations
@@ -26,7 +20,7 @@ from typing import Any
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop import store as missions
+from cloudrc.teleop import store
 from cloudrc.teleop.journal import Entry
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionBook, Order, UnavailableError, busy
@@ -49,40 +43,43 @@ from cloudrc.teleop.wire import (
 )
 
 
-class Stop:
-    """Asks for it, and knows what it has stopped."""
+class PersistentStop:
+    """Send the emergency stop, also after a restart of teleop, until it is acknowledged."""
 
     def __init__(self, book: MissionBook, teleop: Teleop) -> None:
-        """Ask again for what a teleop before this one has asked for."""
+        """Send a stop again that an earlier teleop has sent."""
         self._book, self._teleop = book, teleop
         self._is_released = False
-        self._is_inherited = book.stopped() is not None  # and nobody has asked this process
+        self._is_inherited = book.stopped() is not None  # until this process is asked for a stop
         if self._is_inherited:
             teleop.operate(EmergencyStop(), 0)
 
     @property
     def is_asked(self) -> bool:
-        """Whether the robot has not been seen to have stopped yet."""
+        """Whether a stop is pending: telemetry does not show it yet."""
         return self._teleop.requests.stopping
 
     def ask(self, now_ns: int) -> None:
-        """Stop the rotors at once."""
+        """Stop the rotors at once, at `now_ns` [ns]."""
         self._is_released = self._is_inherited = False
         self._teleop.operate(EmergencyStop(), now_ns)
 
     def release(self, now_ns: int) -> None:
-        """The operator acknowledges it; the robot is told once it has stopped."""
+        """Acknowledge the stop; the robot is told after it has stopped."""
         self._teleop.operate(Acknowledge(), now_ns)
         self._is_released = True
 
-    def meet(self, seen: Seen) -> None:
-        """Take the first look at the robot, before teleop does."""
+    def check_first(self, seen: Seen) -> None:
+        """Check the first telemetry: withdraw a stop that was meant for another robot or mission.
+
+        Call it before teleop gets the telemetry.
+        """
         stopped = self._book.stopped()
         if self._is_inherited and stopped is not None and seen.mission_id != stopped.number:
             self._teleop.requests.withdraw_stop()
 
     def released(self) -> Mission | None:
-        """Give the mission whose stop the robot is seen to be released from, once."""
+        """Return the stopped mission once, when the robot has acted on the acknowledgement."""
         if not self._is_released or not self._teleop.settled:
             return None
         self._is_released = False
@@ -91,37 +88,38 @@ class Stop:
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED = (LAND, ESTOP)
-"""States of the guard that only the operator's acknowledgement leads out of."""
+"""States of the guard that end only when the operator acknowledges them."""
 SILENCE = 1.0
-"""Telemetry that is older tells no more how the robot is, nor a word of cloud that it lives [s]."""
-REST = "after a stop or a touch-down only once it has been still, 0.5 m inside the fence"
-BY_ITSELF = "without commands the robot holds where it flies, then lands, by itself"
-NOT_HEARD = f"the robot is not heard, though cloud is: look at the link and at world; {BY_ITSELF}"
-NO_CLOUD = f"cloud is not heard, and so the robot is not: look at cloud's process; {BY_ITSELF}"
+"""Age after which telemetry, or the last message of cloud, is too old to be valid [s]."""
+REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
+BY_ITSELF = "without commands the robot holds its position, then lands, by itself"
+NOT_HEARD = f"cloud has no telemetry from the robot: check the link and world; {BY_ITSELF}"
+NO_CLOUD = f"teleop does not hear cloud, so there is no telemetry: check cloud; {BY_ITSELF}"
 ALONE = {
     GROUND: f"the robot waits for a mission; it takes off, {REST}",
-    TRACK: "the robot is being told that its mission is over, and holds then",
+    TRACK: "teleop is telling the robot that its mission is over; then the robot holds",
     HOLD: "the robot holds and waits for a mission",
-    LAND: "the robot lands; see why, then: cloudrc mission acknowledge",
-    ESTOP: "the rotors are stopped; see why, then: cloudrc mission acknowledge",
+    LAND: "the robot lands; find the cause, then: cloudrc mission acknowledge",
+    ESTOP: "the rotors are stopped; find the cause, then: cloudrc mission acknowledge",
 }
-"""What comes next while no mission is under way, by the guard's state."""
+"""The next step while no mission is under way, by the guard's state."""
 IN_MISSION = {
     **ALONE,
-    GROUND: f"the robot takes off with the mission's first commands, {REST}; without them for long "
-    "(guard.hold_max_s, 10 s at least) it is in LAND as it stands",
+    GROUND: f"the robot takes off with the mission's first commands, {REST}; if no command comes "
+    "within guard.hold_max_s (at least 10 s), the guard goes to LAND",
     TRACK: "the robot flies its mission",
-    HOLD: "no fresh commands reach the robot: it goes on by itself as soon as they do, and lands "
-    "if they do not for long (guard.hold_max_s)",
+    HOLD: "the robot gets no fresh commands: it continues by itself when they arrive, and lands if "
+    "none arrive within guard.hold_max_s",
 }
-HELD = "the operator holds the mission; to go on: cloudrc mission resume"
+"""The next step while a mission is under way, by the guard's state."""
+HELD = "the operator holds the mission; to continue: cloudrc mission resume"
 
 
-class Sight:
-    """The newest telemetry.
+class RobotView:
+    """The robot as its newest telemetry shows it.
 
     Attributes:
-        seen: What it says; None until the robot has been seen.
+        seen: The newest telemetry; None before the first.
     """
 
     def __init__(self) -> None:
@@ -131,23 +129,23 @@ class Sight:
 
     @property
     def guard(self) -> GuardState:
-        """State of the guard; GROUND until it has been seen."""
+        """State of the guard; GROUND before the first telemetry."""
         return GROUND if self.seen is None else self.seen.guard
 
     @property
     def latched(self) -> str:
-        """Why the guard lets nothing fly before it is acknowledged; "" if it does."""
+        """Why the guard needs an acknowledgement before the robot can fly; "" if it does not."""
         guard = self.guard
         if self.seen is None or guard not in LATCHED:
             return ""
         return f"the guard is in {guard.name} ({self.seen.cause.words}) and lets nothing fly"
 
     def hear(self, now_ns: int) -> None:
-        """Take note that cloud lives, whether it has telemetry or not [ns]."""
+        """Note a message from cloud at `now_ns` [ns]."""
         self._heard_ns = now_ns
 
     def cloud_age(self, now_ns: int) -> float | None:
-        """Say how long cloud has not been heard [s]; None if it never was.
+        """Return the time since the last message from cloud [s]; None before the first.
 
         Args:
             now_ns: Own clock [ns].
@@ -155,10 +153,10 @@ class Sight:
         return None if self._heard_ns is None else (now_ns - self._heard_ns) * 1e-9
 
     def see(self, seen: Seen, now_ns: int) -> bool:
-        """Take note of telemetry as it arrives [ns].
+        """Note new telemetry at `now_ns` [ns].
 
         Returns:
-            Whether the same robot is seen in another session than before.
+            Whether it is the first telemetry of a new session with the same robot.
         """
         before, self.seen, self._seen_ns = self.seen, seen, now_ns
         self.hear(now_ns)
@@ -170,11 +168,11 @@ class Sight:
         return before.epoch != seen.epoch
 
     def show(self, now_ns: int, mission: str | None) -> dict[str, Any] | None:
-        """Say how the robot is, as the API shows it; None if it has not been seen.
+        """Return the robot's state for the API; None before the first telemetry.
 
         Args:
             now_ns: Own clock [ns].
-            mission: State of the one under way, in a word; None if there is none.
+            mission: State of the mission under way; None if there is none.
         """
         seen, age, cloud_age = self.seen, (now_ns - self._seen_ns) * 1e-9, self.cloud_age(now_ns)
         if seen is None or cloud_age is None:
@@ -197,13 +195,13 @@ class Sight:
 
 
 def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
-    """Say what comes next, or what the operator has to do for it.
+    """Describe what the robot does next, or what the operator has to do.
 
     Args:
         guard: State of the guard.
-        age: Of the telemetry that says so [s].
-        cloud_age: How long cloud has not been heard [s], which tells of telemetry.
-        mission: State of the one under way, in a word; None if there is none.
+        age: Age of the newest telemetry [s].
+        cloud_age: Time since the last message from cloud [s].
+        mission: State of the mission under way; None if there is none.
     """
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
@@ -213,16 +211,21 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
 
 
 def _known(value: float) -> float | None:
-    """JSON knows no NaN."""
+    """Replace NaN and infinity, which JSON does not have, by None."""
     return value if isfinite(value) else None
 
 
 SETPOINT_PERIOD_NS = 100_000_000
-"""Time between two copies of the setpoint [ns], so that either process may restart."""
+"""Time between two copies of the setpoint [ns]; copies let either process restart."""
 
 
 class MissionService:
-    """All missions of one robot, flown one after the other."""
+    """Keep and fly all missions of one robot, one after the other.
+
+    Attributes:
+        sight: The robot's state.
+        book: The missions.
+    """
 
     def __init__(
         self,
@@ -232,46 +235,46 @@ class MissionService:
         *,
         salt: bytes,
     ) -> None:
-        """Remember what was before; nothing is flown until the first deadline.
+        """Load the earlier missions; nothing flies before the first deadline.
 
         Args:
-            contact_speed_max: Below which the arm's tip may meet the board [m/s].
-            write: Keeps an entry; raises OSError if it cannot.
-            entries: What was kept before, oldest first.
-            salt: Random, so that the robot never takes a mission for one of another journal.
+            contact_speed_max: Speed limit for the arm's tip when it touches the board [m/s].
+            write: Stores an entry; raises OSError on failure.
+            entries: Entries stored earlier, oldest first.
+            salt: Random bytes that make mission numbers differ from those of another journal.
         """
         self._contact_speed_max = contact_speed_max
         self._outputs: list[Output | Fault] = []
-        self.sight = Sight()
+        self.sight = RobotView()
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
-        self._ends = False  # this process; what has not begun is its successor's
+        self._ends = False  # whether this process ends; the next one starts the queued missions
         self.book = MissionBook(write, entries, salt)
         self._teleop = Teleop(self.book.has_ended)
-        self._stop = Stop(self.book, self._teleop)
+        self._stop = PersistentStop(self.book, self._teleop)
 
     @property
     def over(self) -> bool:
-        """Whether there was something to fly, all of it has ended, and the robot holds."""
+        """Whether there were missions, all have ended, and no request is pending."""
         return bool(self.book.missions) and not self.book.open() and self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Take an order; it is started at once or waits.
+        """Create a mission from an order; it starts at once or waits in the queue.
 
         Returns:
             The mission, and whether it is new: the same key gives the same mission.
 
         Raises:
-            ConflictError: If another one is under way and the order does not want to wait, or too
-                many do, or the operator has to acknowledge first.
-            UnavailableError: If it cannot be kept, or this process ends.
+            ConflictError: If another mission is under way and the order may not wait, the queue is
+                full, or the operator has to acknowledge first.
+            UnavailableError: If the mission cannot be stored, or this process ends.
         """
         known = self.book.with_key(order.key)
         if known is not None:
             return known, False
         waiting = self.book.waits_for(order)
-        self._refuse_to_fly()
+        self._check_can_fly()
         mission = self.book.add(order)
         if waiting:
             self._note(mission, "queued", f"mission waits for {waiting[-1].id}", now_ns)
@@ -280,17 +283,17 @@ class MissionService:
         return mission, True
 
     def cancel(self, mission_id: str, now_ns: int) -> Mission:
-        """End a mission, or take it out of the queue.
+        """End a mission, or remove it from the queue.
 
         Raises:
-            UnknownMissionError: If there is none of this id.
+            UnknownMissionError: If no mission has this id.
             ConflictError: If it has ended.
-            UnavailableError: If it has not begun, and that it will not cannot be kept.
+            UnavailableError: If it is in the queue and the end cannot be stored.
         """
         mission = self.book.find(mission_id)
-        if not mission.ended and mission is self._take_up(now_ns):
+        if not mission.ended and mission is self._start_next(now_ns):
             return self._operate(Cancel(), now_ns)
-        if mission.ended:  # perhaps as it was taken up: in another world
+        if mission.ended:  # also if it has just failed, because world restarted
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         self.book.cancel(mission)
         return mission
@@ -300,25 +303,31 @@ class MissionService:
         return self._operate(Hold(), now_ns)
 
     def resume(self, now_ns: int) -> Mission:
-        """Go on with what is held; raises ConflictError, or UnavailableError at the end."""
-        self._refuse_to_fly()
+        """Continue the held mission.
+
+        Raises:
+            ConflictError: If no mission is held, or the operator has to acknowledge first.
+            UnavailableError: If this process ends.
+        """
+        self._check_can_fly()
         return self._operate(Resume(), now_ns)
 
     def go_to(self, position: Vector, yaw: float, now_ns: int) -> Mission:
-        """Fly to a point: a mission of its own, or another place to be held at.
+        """Fly to a point: as a new mission, or as another place to hold the current one.
 
         Args:
-            position: [m], world frame, shape (3,).
-            yaw: [rad].
+            position: The point [m], world frame, shape (3,).
+            yaw: Heading to hold [rad].
             now_ns: Own clock [ns].
 
         Raises:
-            ConflictError: If a mission is under way that is not held.
-            UnavailableError: If it cannot be kept, or this process ends.
+            ConflictError: If a mission is under way that is not held, or the operator has to
+                acknowledge first.
+            UnavailableError: If the mission cannot be stored, or this process ends.
         """
-        self._refuse_to_fly()
+        self._check_can_fly()
         waiting = self.book.open()
-        if waiting and waiting[0].state != missions.HELD:
+        if waiting and waiting[0].state != store.HELD:
             raise busy(waiting[0], "hold or cancel it first")
         if waiting:
             return self._operate(GoTo(position, yaw), now_ns)
@@ -328,43 +337,43 @@ class MissionService:
         return mission
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
-        """Stop the rotors at once, in every state; give the mission under way, which has failed."""
-        mission = self._take_up(now_ns)
+        """Stop the rotors at once in any state, and return the mission that failed, if any."""
+        mission = self._start_next(now_ns)
         self._stop.ask(now_ns)
         self._collect(now_ns)
         return mission
 
     def acknowledge(self, now_ns: int) -> None:
-        """Release a robot that has landed or was stopped; raises ConflictError in a mission."""
+        """Let a robot fly again that has landed or was stopped; ConflictError in a mission."""
         if self._current is not None:
             raise busy(self._current, "there is nothing to acknowledge")
         self._stop.release(now_ns)
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
-        """Before this process ends: what is flown is held, for a successor to go on with."""
+        """Hold the mission under way before this process ends; the next process continues it."""
         self._ends = True
-        if self._take_up(now_ns) is not None:
+        if self._start_next(now_ns) is not None:
             self._operate(Pause(), now_ns)
 
     @property
     def settled(self) -> bool:
-        """Whether the robot is seen to have acted on the last request."""
+        """Whether telemetry shows that the robot has acted on the last request."""
         return self._teleop.settled
 
     def hear(self, now_ns: int) -> None:
-        """Take note that cloud lives."""
+        """Note a message from cloud at `now_ns` [ns]."""
         self.sight.hear(now_ns)
 
     def see(self, seen: Seen, now_ns: int) -> None:
-        """Take note of the newest telemetry."""
+        """Process new telemetry at `now_ns` [ns]."""
         mission = self._current
         if self.sight.seen is None:
-            self._stop.meet(seen)
-        anew = self.sight.see(seen, now_ns)
+            self._stop.check_first(seen)
+        is_new_session = self.sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
-            self._watch(mission, seen, now_ns)
-            if anew:
+            self._note_contacts(mission, seen, now_ns)
+            if is_new_session:
                 self._note(mission, "new_session", mission.in_new_session(), now_ns)
         self._teleop.see(seen, now_ns)
         if (stopped := self._stop.released()) is not None:
@@ -372,11 +381,11 @@ class MissionService:
         self._collect(now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Start what waits, keep the limits of time, repeat what has to be repeated."""
+        """Start a waiting mission, check time limits, and repeat what is due at `now_ns` [ns]."""
         self.book.catch_up(now_ns)
         if not self._ends:
             in_sight = self.sight.seen is not None
-            self._take_up(now_ns, queued=in_sight and self.book.kept and not self._stopped)
+            self._start_next(now_ns, queued=in_sight and self.book.kept and not self._blocked)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
         if self._setpoint is not None and now_ns >= self._setpoint_ns:
@@ -384,12 +393,12 @@ class MissionService:
             self._outputs.append(self._setpoint)
 
     def take_outputs(self) -> list[Output | Fault]:
-        """Hand over what is to be told, oldest first; faults are for this process' own log."""
+        """Return the messages since the last call, oldest first; faults are for the own log."""
         outputs, self._outputs = self._outputs, []
         return outputs
 
     def state(self, now_ns: int) -> dict[str, Any]:
-        """Say how things are, as the API shows it."""
+        """Return the state of missions and robot for the API at `now_ns` [ns]."""
         mission = self._current
         return {
             "mission": mission.summary() if mission is not None else None,
@@ -399,17 +408,19 @@ class MissionService:
         }
 
     @property
-    def _stopped(self) -> str:
+    def _blocked(self) -> str:
         """Why nothing can fly before the operator acknowledges it; "" if it can."""
         if self._stop.is_asked:
             return "an emergency stop is on its way to the robot"
         return self.sight.latched
 
-    def _refuse_to_fly(self) -> None:
-        if self._ends:  # the robot is asked to hold
-            raise UnavailableError("teleop ends; say it again to the next one")
-        if self._stopped:
-            raise ConflictError(f"{self._stopped}; see why, then: cloudrc mission acknowledge")
+    def _check_can_fly(self) -> None:
+        if self._ends:
+            raise UnavailableError("teleop ends; repeat this when teleop runs again")
+        if self._blocked:
+            raise ConflictError(
+                f"{self._blocked}; find the cause, then: cloudrc mission acknowledge"
+            )
 
     def _operate(self, verb: Verb, now_ns: int) -> Mission:
         mission = self._current
@@ -422,14 +433,14 @@ class MissionService:
         self._collect(now_ns)
         return mission
 
-    def _take_up(self, now_ns: int, *, queued: bool = False) -> Mission | None:
-        """Go on with what was begun before, or begin what is `queued`; give what is under way."""
+    def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
+        """Continue a begun mission or, if `queued`, start a waiting one; return the current one."""
         waiting = self.book.open()
         if self._current is None and waiting:
-            if queued and waiting[0].state == missions.QUEUED:
+            if queued and waiting[0].state == store.QUEUED:
                 self.book.begin(waiting[0], now_ns)
-            if waiting[0].state != missions.QUEUED:
-                self._launch(waiting[0], missions.first_verb(waiting[0]), now_ns)
+            if waiting[0].state != store.QUEUED:
+                self._launch(waiting[0], store.first_verb(waiting[0]), now_ns)
         return self._current
 
     def _launch(self, mission: Mission, verb: Verb, now_ns: int) -> None:
@@ -439,12 +450,12 @@ class MissionService:
             mission.witness = mission.witness.after_restart()
             text = "teleop has restarted; the robot is asked to go on"
             self._note(mission, "restarted", text, now_ns)
-        elif mission.state == missions.QUEUED:
+        elif mission.state == store.QUEUED:
             self._note(mission, "starting", "the robot is asked to start", now_ns)
         self._collect(now_ns)
 
-    def _watch(self, mission: Mission, seen: Seen, now_ns: int) -> None:
-        """Write down at once what the robot touches."""
+    def _note_contacts(self, mission: Mission, seen: Seen, now_ns: int) -> None:
+        """Store new contacts of the robot at once."""
         before = mission.witness
         mission.witness = before.see(seen)
         for event, text in mission.witness.news(before, self._teleop.elapsed(now_ns)):
@@ -455,14 +466,14 @@ class MissionService:
             if isinstance(output, Setpoint):
                 self._setpoint, self._setpoint_ns = output, now_ns + SETPOINT_PERIOD_NS
             elif isinstance(output, MissionEvent):
-                self._follow(output, now_ns)
+                self._process_event(output, now_ns)
             self._outputs.append(output)
         if trouble := self.book.news():
             self._outputs.append(Fault(now_ns, "journal", trouble))
 
-    def _follow(self, event: MissionEvent, now_ns: int) -> None:
+    def _process_event(self, event: MissionEvent, now_ns: int) -> None:
         mission, seen = self._current, self.sight.seen
-        assert mission is not None, "events are of missions only"
+        assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
             changed |= {"world": seen.world, "witness": asdict(Witness.begin(seen))}

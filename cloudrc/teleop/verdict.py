@@ -1,7 +1,7 @@
-"""The verdict on one mission: how it ended and what teleop saw on its way; an exit code comes out.
+"""Judge a mission by its outcome and by what telemetry showed, and derive its exit code.
 
-The same rules, codes and words as in a run's report, from what telemetry tells while it flies.
-Deviation: of the clock's slip only the real-time factor is judged, since teleop sees no lateness.
+The rules, codes and words are those of a run's report.
+Deviation: of the timing only the real-time factor is judged, because teleop does not see lateness.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from typing import Any, Literal
 from cloudrc.teleop.wire import Outcome, Seen
 
 REAL_TIME_FACTOR_MIN = 0.95
-"""Below it the simulated robot was slower than its network [1].
+"""Least valid real-time factor [1]; below it the simulated robot was slower than its network.
 Source: docs/reference/control.md, "Real-time factor"."""
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 """Exit code of each outcome. Source: docs/reference/control.md, "Exit codes"."""
 AWAY = -1
-"""In place of a slip [ns]: world has not been seen yet by this process."""
+"""Value in place of a slip [ns] before this process has seen world."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """One rule that was broken: one word for programs, a sentence for people."""
+    """One broken rule: a code for programs and a text for people."""
 
     code: str
     text: str
@@ -32,11 +32,11 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of a mission.
+    """The verdict on a mission.
 
     Attributes:
-        outcome: As in report.json.
-        failures: Every rule that was broken.
+        outcome: Outcome as in report.json.
+        failures: All broken rules.
     """
 
     outcome: Literal["success", "failure", "invalid", "interrupted"]
@@ -44,22 +44,22 @@ class Verdict:
 
     @property
     def exit_code(self) -> int:
-        """Of a Job that flew the mission."""
+        """Exit code of a Job that flew the mission."""
         return EXIT_CODES[self.outcome]
 
     def as_json(self) -> dict[str, Any]:
-        """For the API and the journal."""
+        """Return the verdict for the API and the journal."""
         failures = [asdict(failure) for failure in self.failures]
         return {"outcome": self.outcome, "exit_code": self.exit_code, "failures": failures}
 
 
 @dataclass(frozen=True, slots=True)
 class Criteria:
-    """What a mission has to keep to besides reaching its waypoints.
+    """Requirements of a mission in addition to its waypoints.
 
     Attributes:
         contact: Whether the arm's tip has to touch the board.
-        contact_speed_max: Below which speed [m/s].
+        contact_speed_max: Limit of the speed at the touch [m/s].
     """
 
     contact: bool
@@ -68,15 +68,16 @@ class Criteria:
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """What has happened to the robot since its mission began; telemetry only counts and shows.
+    """Contacts and slip during a mission, computed from telemetry.
 
     Attributes:
-        pipe_contacts: Telemetry's count when it was last seen.
-        pipe_touches: Of them since the mission began.
-        touch_before: Speed of an earlier mission's touch, still shown [m/s]; None if none.
-        touch_speed: Of this mission's touch [m/s]; None if the board was not touched.
-        slip_began_ns: World's slip when the mission began [ns], less what was not looked at.
-        slip_ns: World's slip when it was last seen [ns]; AWAY after a restart of teleop.
+        pipe_contacts: Last count of contacts in telemetry.
+        pipe_touches: Number of contacts since the mission began.
+        touch_before: Speed of an earlier mission's touch in telemetry [m/s]; None if none.
+        touch_speed: Speed of this mission's touch [m/s]; None if the board was not touched.
+        slip_began_ns: World's slip when the mission began [ns], plus the slip while teleop was
+            away, which does not count.
+        slip_ns: World's slip in the last telemetry [ns]; AWAY after a restart of teleop.
     """
 
     pipe_contacts: int = 0
@@ -88,17 +89,17 @@ class Witness:
 
     @classmethod
     def begin(cls, seen: Seen) -> Witness:
-        """Begin with what is shown at the start of the mission."""
+        """Begin with the telemetry at the start of the mission."""
         before = _known(seen.touch_speed)
         return cls(seen.pipe_contacts, 0, before, None, seen.slip_ns, seen.slip_ns)
 
     def see(self, seen: Seen) -> Witness:
-        """Take in what is shown now; the same object if nothing has happened."""
+        """Process new telemetry; return the same object if nothing has changed."""
         touch = _known(seen.touch_speed)
         if self.touch_speed is not None or touch == self.touch_before:
             touch = self.touch_speed
         new = seen.pipe_contacts - self.pipe_contacts
-        if new < 0:  # the robot was put back to its spawn, and counts from 0
+        if new < 0:  # the robot was reset to its spawn and counts from 0
             new = seen.pipe_contacts
         if not new and touch == self.touch_speed and seen.slip_ns == self.slip_ns:
             return self
@@ -112,11 +113,11 @@ class Witness:
         )
 
     def after_restart(self) -> Witness:
-        """Go on where it was left: no more than the time is slip counted that passed meanwhile."""
+        """Continue after a restart of teleop; the slip in between does not count."""
         return replace(self, slip_began_ns=self.slip_began_ns - self.slip_ns, slip_ns=AWAY)
 
     def news(self, before: Witness, elapsed: float) -> Iterator[tuple[str, str]]:
-        """Say what is touched now and was not before, at `elapsed` [s]: event and text."""
+        """Yield event and text of each new contact at `elapsed` [s]."""
         if self.pipe_touches > before.pipe_touches:
             yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
         if self.touch_speed != before.touch_speed:
@@ -130,13 +131,13 @@ def judge(
     """Judge a mission that has ended.
 
     Args:
-        outcome: How it ended.
-        witness: What happened on the way.
-        criteria: What it had to keep to.
-        waypoints: How many it has.
-        elapsed: How long it took [s].
+        outcome: How the mission ended.
+        witness: Contacts and slip during the mission.
+        criteria: Additional requirements.
+        waypoints: Number of waypoints.
+        elapsed: Duration of the mission [s].
     """
-    if outcome.code == "cancelled":  # what it did not reach is no news
+    if outcome.code == "cancelled":  # unreached waypoints are no failure then
         harm = tuple(_harm(witness))
         return Verdict("interrupted", (Failure(outcome.code, outcome.text), *harm))
     broken = tuple(_broken(outcome, witness, criteria, waypoints))

@@ -1,15 +1,10 @@
-"""The messages of teleop: what it is told by cloud and operator, and what it says about a mission.
+"""Define teleop's messages and encode those between the processes of cloud and teleop.
 
-What it tells the others is defined elsewhere: `Setpoint` to the controller and `OperatorRequest`
-to the robot in `cloudrc.messages`, `MissionEvent` to the recorder in `cloudrc.records`.
+Teleop gets `Seen` from cloud and verbs from the operator. It sends `Setpoint` to the controller,
+`OperatorRequest` to the robot and `MissionEvent` to the recorder.
 
-The plan of a mission: a person's or an experiment's waypoints come in, checked legs go out.
-
-Teleop's datagrams: messages between cloud's and teleop's process become JSON and come back.
-
-One message each: the name of its type, then its fields in order. Both processes are of one image
-and one pod; what arrives is checked all the same, since a file that both can write to is no proof
-of who wrote.
+Each datagram between the processes is a JSON list: the name of the message's type and its fields in
+order. Teleop and cloud check every datagram, because other programs could write to the socket.
 """
 
 from __future__ import annotations
@@ -39,15 +34,15 @@ from cloudrc.records import MissionEvent
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """The way to one waypoint, which is reached by staying near it.
+    """One waypoint and the conditions for reaching it.
 
     Attributes:
         position: Waypoint [m], world frame, shape (3,).
         yaw: Heading to hold [rad].
-        tolerance: Distance that counts as there [m]. Infinite: anywhere counts, and the leg lasts
-            `dwell`; that is how steps at fixed instants are flown.
-        dwell: How long to be seen within the tolerance without a break [s].
-        time_limit: Longest duration of the leg, held time not counted [s].
+        tolerance: Largest distance that counts as at the waypoint [m]. If it is infinite, the leg
+            always lasts `dwell`; steps at fixed instants are flown in this way.
+        dwell: Time to stay within the tolerance without interruption [s].
+        time_limit: Longest duration of the leg without the time it is held [s].
     """
 
     position: Vector
@@ -60,26 +55,26 @@ class Leg:
         """Check the values.
 
         Raises:
-            BadInputError: If one is not a number or out of range.
+            BadInputError: If a value is not a number or out of range.
         """
         if not all(map(isfinite, (*self.position, self.yaw))):
-            raise BadInputError(f"waypoint {self.position}, yaw {self.yaw}: has to be finite")
+            raise BadInputError(f"waypoint {self.position}, yaw {self.yaw}: must be finite")
         if isnan(self.tolerance) or self.tolerance <= 0:
-            raise BadInputError(f"waypoint tolerance {self.tolerance} m: has to be above 0")
+            raise BadInputError(f"waypoint tolerance {self.tolerance} m: must be above 0")
         if not (isfinite(self.dwell) and self.dwell >= 0):
-            raise BadInputError(f"waypoint dwell {self.dwell} s: has to be finite and >= 0")
+            raise BadInputError(f"waypoint dwell {self.dwell} s: must be finite and >= 0")
         if not (isfinite(self.time_limit) and self.time_limit > 0):
-            raise BadInputError(f"time limit {self.time_limit} s: has to be finite and above 0")
+            raise BadInputError(f"time limit {self.time_limit} s: must be finite and above 0")
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A mission.
+    """The plan of a mission.
 
     Attributes:
-        legs: What to fly, in order; at least one.
-        start: From the spawn, in a fresh world, or from here.
-        time_limit: Longest duration of the mission, held time counted [s].
+        legs: Legs to fly, in order; at least one.
+        start: Place of the start: the spawn, in a reset world, or the robot's position.
+        time_limit: Longest duration of the mission, including the time it is held [s].
     """
 
     legs: tuple[Leg, ...]
@@ -95,32 +90,32 @@ class Plan:
         if not self.legs:
             raise BadInputError("a mission needs at least one waypoint")
         if not (isfinite(self.time_limit) and self.time_limit > 0):
-            raise BadInputError(f"time limit {self.time_limit} s: has to be finite and above 0")
+            raise BadInputError(f"time limit {self.time_limit} s: must be finite and above 0")
 
 
 NO_PLAN = Plan((Leg(ZERO),))
-"""Stands in until the first mission starts; never flown."""
+"""Placeholder before the first mission; never flown."""
 
 
 class Seen(NamedTuple):
-    """What the newest telemetry says, as it arrives: cloud to teleop.
+    """The robot's status from the newest telemetry, sent from cloud to teleop.
 
     Attributes:
-        epoch: Session that it belongs to.
-        position: Measured, of the base [m], world frame, shape (3,).
+        epoch: Epoch of the session.
+        position: Measured position of the base [m], world frame, shape (3,).
         guard: State of the guard.
         mission: Number of the last operator request that world has acted on; 0 if none.
-        world: Names world's process: a restarted world has another name, a restarted cloud opens
-            a new epoch in the same world.
-        pipe_contacts: How often the robot has begun to touch a pipe so far.
-        touch_speed: Speed of the arm's tip when it met the board [m/s]; NaN before that.
-        slip_ns: By how much world's clock lags its machine's [ns].
-        horizon: How far cloud looks ahead [s]; NaN before its first command.
-        rtt: Last round trip, hold excluded [s]; NaN likewise.
-        loop_delay: Last `now - echo_stamp`, hold included [s]; NaN likewise.
-        mission_id: The mission that world was told to start last; 0 if none.
-        reached: How many of its waypoints world has been told are reached, or `MISSION_OVER`.
-        cause: Why the guard is in its state.
+        world: Text that identifies world's process; it changes when world restarts. A restart of
+            cloud changes only the epoch.
+        pipe_contacts: Number of contacts with pipes so far.
+        touch_speed: Speed of the arm's tip when it touched the board [m/s]; NaN before that.
+        slip_ns: Lag of world's clock behind its machine's clock [ns].
+        horizon: Prediction horizon of cloud [s]; NaN before its first command.
+        rtt: Last round trip without the hold [s]; NaN before the first.
+        loop_delay: Last `now - echo_stamp`, with the hold [s]; NaN before the first.
+        mission_id: Number of the mission that world was last told to start; 0 if none.
+        reached: Number of its waypoints stored as reached by world, or `MISSION_OVER`.
+        cause: Cause of the guard's state.
     """
 
     epoch: int
@@ -141,12 +136,12 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StartMission:
-    """Operator: fly this plan.
+    """Verb: fly this plan.
 
     Attributes:
-        plan: Checked.
-        mission_id: Names it on board, where its progress is kept, too; 0 for not at all.
-        again: Whether a teleop before this one may have flown it: it is not, once it is over.
+        plan: Plan of the mission.
+        mission_id: Number under which the robot stores the progress; 0 to store none.
+        again: Whether an earlier teleop may have flown it; if it is over, it is not flown again.
     """
 
     plan: Plan
@@ -156,15 +151,15 @@ class StartMission:
 
 @dataclass(frozen=True, slots=True)
 class Continue:
-    """Teleop itself, after a restart: go on with a mission that was under way.
+    """Verb of a restarted teleop: continue a mission that was under way.
 
     Attributes:
-        plan: As it was started.
-        leg: Index of the waypoint that was flown to.
-        elapsed: How long the mission had lasted [s].
-        world: The world that it was flown in; in another one it has failed.
-        held: Whether the operator had stopped it.
-        mission_id: As it was started.
+        plan: Plan of the mission.
+        leg: Index of the current waypoint.
+        elapsed: Duration of the mission so far [s].
+        world: World in which it was flown; in another world it fails.
+        held: Whether the operator held it.
+        mission_id: Number of the mission.
     """
 
     plan: Plan
@@ -177,27 +172,27 @@ class Continue:
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Operator: stop where you are and wait."""
+    """Verb: stop the robot where it is and wait."""
 
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """Operator: go on with the leg that was held."""
+    """Verb: continue the held leg."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cancel:
-    """Operator: end the mission."""
+    """Verb: end the mission."""
 
 
 @dataclass(frozen=True, slots=True)
 class GoTo:
-    """Operator: fly to one point.
+    """Verb: fly to one point.
 
     Attributes:
-        position: [m], world frame, shape (3,).
-        yaw: [rad].
-        mission_id: Names the mission that it is on board; 0 for not at all.
+        position: The point [m], world frame, shape (3,).
+        yaw: Heading to hold [rad].
+        mission_id: Number under which the robot stores the progress; 0 to store none.
     """
 
     position: Vector
@@ -207,45 +202,45 @@ class GoTo:
 
 @dataclass(frozen=True, slots=True)
 class EmergencyStop:
-    """Operator: rotors off, at once, whatever the robot does."""
+    """Verb: stop the rotors at once in any state."""
 
 
 @dataclass(frozen=True, slots=True)
 class Acknowledge:
-    """Operator: I have seen why the robot landed or was stopped; it may fly again."""
+    """Verb: let a robot fly again that has landed or was stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pause:
-    """Teleop itself, before it ends: let the robot hold until a successor goes on."""
+    """Verb of a teleop that ends: let the robot hold until the next teleop continues."""
 
 
 Verb: TypeAlias = (
     StartMission | Continue | Hold | Resume | Cancel | GoTo | EmergencyStop | Acknowledge | Pause
 )
-"""What an operator can say; `Continue` and `Pause` are for teleop alone."""
+"""Verbs of the operator; only teleop itself uses `Continue` and `Pause`."""
 
 Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
-"""What teleop says."""
+"""Messages from teleop."""
 
 
 class State(IntEnum):
-    """Where the mission is."""
+    """State of the mission."""
 
     IDLE = 0
-    """None has been started yet."""
+    """No mission has been started yet."""
     STARTING = 1
-    """The robot has been asked to start and has not been seen to obey."""
+    """Teleop asks the robot to start, and telemetry does not show the start yet."""
     FLYING = 2
-    """On the way to a waypoint."""
+    """The robot flies to a waypoint."""
     HELD = 3
-    """Under way, but the operator has stopped it."""
+    """The operator holds the mission."""
     DONE = 4
     """Every waypoint was reached."""
     FAILED = 5
-    """It could not be finished; the outcome says why."""
+    """The mission failed; the outcome says why."""
     CANCELLED = 6
-    """The operator ended it."""
+    """The operator ended the mission."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +251,7 @@ class Outcome:
         code: "done", "cancelled", "leg_timed_out", "timed_out", "world_restarted",
             "guard_stopped", "emergency_stopped", "taken_over" or "end_lost".
         text: The same in words.
-        waypoint: Index of the waypoint that was flown to at the end.
+        waypoint: Index of the current waypoint at the end.
         reached: Number of waypoints reached.
     """
 
@@ -267,32 +262,32 @@ class Outcome:
 
     @property
     def success(self) -> bool:
-        """True if every waypoint was reached."""
+        """Whether every waypoint was reached."""
         return self.code == "done"
 
 
 Message: TypeAlias = Seen | Output
-"""What goes through the sockets: `Seen` to teleop, the others to cloud."""
+"""Messages between the processes: `Seen` to teleop, the others to cloud."""
 
 ALARM = OperatorRequest(0, Request.ESTOP)
-"""An emergency stop that passes teleop's own machine by; cloud gives it its number."""
+"""Emergency stop that does not wait for teleop's state machine; cloud gives it a number."""
 
-_LEAST, _MOST = -(2**63), 2**63 - 1
+_INT_MIN, _INT_MAX = -(2**63), 2**63 - 1
 _KINDS: dict[str, TypeAdapter[Any]] = {
     kind.__name__: TypeAdapter(kind) for kind in (Seen, Setpoint, OperatorRequest, MissionEvent)
 }
 
 
 def encode(message: Message) -> bytes:
-    """Write a message as one datagram."""
+    """Encode a message as one datagram."""
     return json.dumps([type(message).__name__, message]).encode()
 
 
 def decode(data: bytes) -> Message:
-    """Read a message from its datagram.
+    """Decode a message from its datagram.
 
     Raises:
-        ValueError: If it is not one, or says what cannot be recorded, or told to the robot.
+        ValueError: If it is not a message, or a value does not fit into a recording or datagram.
     """
     try:
         name, fields = json.loads(data)
@@ -304,14 +299,14 @@ def decode(data: bytes) -> Message:
 
 
 def _check_ranges(message: Message) -> None:
-    """Let pass what a recording, and of a request what the tunnel, has room for.
+    """Check that integers fit into a recording, and those of a request also into the tunnel.
 
-    Its number may be higher than the tunnel's: of these cloud keeps count as it drops them.
+    The number of a request may be too high for the tunnel: cloud counts and drops such a request.
 
     Raises:
         ValueError: If a value does not fit.
     """
-    fits = all(_LEAST <= value <= _MOST for value in message if isinstance(value, int))
+    fits = all(_INT_MIN <= value <= _INT_MAX for value in message if isinstance(value, int))
     if isinstance(message, OperatorRequest):
         least = min(message.number, message.mission_id, message.reached)
         fits = fits and least >= 0 and message.reached <= MISSION_OVER

@@ -1,1 +1,1 @@
-"""The UDP tunnel between world and cloud: bytes, sessions, and which datagram counts."""
+"""The authenticated UDP tunnel between world and cloud."""

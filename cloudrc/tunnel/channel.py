@@ -1,44 +1,51 @@
-"""Which datagram of a stream counts: newest wins, or the last to arrive as in the paper's code."""
+"""Classify the datagrams of one stream by their counters: used, late or repeated.
+
+By default the newest datagram wins; the published code uses the last to arrive.
+"""
 
 from __future__ import annotations
 
 WINDOW = 1024
-"""How far back a counter is remembered [datagrams]."""
+"""Number of counters before the newest that a channel remembers [datagrams]."""
 _MASK = (1 << WINDOW) - 1
 
 
-# What became of a datagram, by the name that it is counted under.
+# Outcomes of a datagram, which name the counts.
 USED = "used"
 LATE = "late"
 REPEATED = "repeated"
 
 
 class Channel:
-    """The receiving end of one stream of counters within one epoch."""
+    """Track the received counters of one stream in one epoch."""
 
     def __init__(self, newest_wins: bool) -> None:
         """Start empty.
 
         Args:
             newest_wins: True: a datagram older than the newest is late. False: the last to arrive
-                wins, even if it is older (the published code's policy); repeats are still dropped.
+                is used, even if it is older (the published code's policy). Repeats are dropped
+                either way.
         """
         self._newest_wins = newest_wins
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: a new epoch begins."""
+        """Forget all counters at the start of an epoch."""
         self._newest = -1
         self._seen = 0  # bit k: newest - k has arrived
         self._repeats = 0
 
     @property
     def is_flooded(self) -> bool:
-        """Whether more was repeated than sent, which no link does: to write it all down is work."""
+        """Whether repeats outnumber the datagrams sent.
+
+        No link does that, so the caller need not record each repeat.
+        """
         return self._repeats > self._newest + 1
 
     def take(self, counter: int) -> str:
-        """Say what becomes of the datagram with this counter: USED, LATE or REPEATED."""
+        """Classify the datagram with this counter as USED, LATE or REPEATED."""
         ahead = counter - self._newest
         if ahead > 0:
             self._newest = counter

@@ -1,14 +1,13 @@
-"""Messages to bytes and back: a fixed layout per kind, little-endian, nothing executable.
+"""Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
-A datagram is a 16-byte header (version, direction, epoch, generation, kind, counter), a body of
-exactly the length that its kind has, and a 16-byte tag. Here is only the layout: `session` seals
-and opens. Whatever does not fit raises DecodeError, which names the outcome that it is counted
-under; no other exception leaves `check` or the decoders.
+A datagram has a 16-byte header (version, direction, epoch, generation, kind, counter), a body whose
+length follows from its kind, and a 16-byte tag. This module defines the layout only; `session`
+seals and opens datagrams. `check` and the decoders raise no exception except DecodeError.
 
-The header is in the clear, since a link decides by it, and authenticated. Its last 12 bytes are the
-nonce of the seal: no two datagrams of one direction of an epoch have the same kind and counter.
+The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
+nonce of the cipher: no two datagrams of one direction and epoch have the same kind and counter.
 
-Deviation: the paper's tunnel sends pickled ROS messages, which execute code and weigh 1 kB.
+Deviation: the paper's tunnel sends pickled ROS messages, which can execute code and have 1 kB.
 """
 
 from __future__ import annotations
@@ -30,17 +29,20 @@ from cloudrc.messages import (
 )
 
 VERSION = 5
-"""Of the wire, one per build; another is refused, never spoken. 1 had no tags, 2 not what a request
-is based on, 3 not why the guard is in its state; in 4 a challenge was shorter than its answer."""
+"""Version of the wire format. A build speaks one version and refuses all others.
+
+Version 1 had no tags; 2 had no basis stamp in requests; 3 had no cause of the guard's state; in 4 a
+challenge was shorter than its answer.
+"""
 DATAGRAM_MAX = 512
-"""Longer than any datagram of ours [bytes]; a longer one is refused unread."""
+"""Size of the receive buffer [bytes], above every valid datagram; longer ones are refused."""
 
 
 class Kind(IntEnum):
-    """What a datagram carries; each kind of each direction counts its datagrams on its own.
+    """What a datagram carries; every kind has its own counter in each direction.
 
-    Up to LAST_GREETING they make a session and are authenticated by the pre-shared key; the others
-    belong to one and are sealed with its keys.
+    Kinds up to LAST_GREETING open a session and are authenticated with the pre-shared key. The
+    other kinds belong to a session and are sealed with its keys.
     """
 
     HELLO = 1
@@ -54,30 +56,30 @@ class Kind(IntEnum):
 
 
 class Direction(IntEnum):
-    """Which way a datagram goes."""
+    """Direction of a datagram: uplink is world to cloud, downlink is cloud to world."""
 
     UPLINK = 0
     DOWNLINK = 1
 
 
 class DecodeError(ValueError):
-    """Bytes that are not one of our datagrams; the text is the outcome that is counted."""
+    """A datagram is not valid; the error's text is the outcome under which it is counted."""
 
 
 Header: TypeAlias = tuple[int, int, int, int, int, int]
-"""Version, direction, epoch, generation of the keys, kind and counter."""
+"""Version, direction, epoch, key generation, kind and counter."""
 Datagram: TypeAlias = tuple[int, int, int, int, bytes]
-"""Kind, direction, epoch and counter, which are in the clear in its header, and its body."""
+"""Kind, direction, epoch and counter from the header, and the body."""
 
 
 class Hello(NamedTuple):
-    """Cloud asks for a session.
+    """Cloud's request for a session.
 
     Attributes:
-        nonce: 16 bytes that name the session asked for.
-        clock: 16 bytes that name cloud's monotonic clock.
-        cookie: From world's challenge; zeros at first.
-        suite: Cipher that cloud would like.
+        nonce: 16 bytes that identify the requested session.
+        clock: 16 bytes that identify cloud's monotonic clock.
+        cookie: Cookie from world's challenge; zeros before the first challenge.
+        suite: Cipher that cloud prefers.
     """
 
     nonce: bytes
@@ -87,12 +89,12 @@ class Hello(NamedTuple):
 
 
 class Accept(NamedTuple):
-    """World opens a session, under the epoch in the header.
+    """World's acceptance; the header holds the epoch of the session.
 
     Attributes:
-        nonce: Of the hello answered.
-        world_nonce: 16 bytes that name world's process.
-        clock: 16 bytes that name world's monotonic clock.
+        nonce: Nonce of the hello that this answers.
+        world_nonce: 16 bytes that identify world's process.
+        clock: 16 bytes that identify world's monotonic clock.
         suite: Cipher of the session.
     """
 
@@ -103,11 +105,11 @@ class Accept(NamedTuple):
 
 
 class Busy(NamedTuple):
-    """World refuses one, and says why.
+    """World's refusal of a session.
 
     Attributes:
-        nonce: Of the hello answered.
-        used: Whether this nonce has had its session; else another cloud has authority.
+        nonce: Nonce of the hello that this answers.
+        used: True: this nonce has already had a session. False: another cloud has authority.
     """
 
     nonce: bytes
@@ -121,13 +123,13 @@ _COMMAND = struct.Struct("<qqq3dd")
 _OPERATOR = struct.Struct("<IBBQHq")
 _HELLO = struct.Struct("<16s16s16sB")
 _ACCEPT = struct.Struct("<16s16s16sB")
-_CHALLENGE = struct.Struct("<16s33x")  # as long as a hello, which answers it
+_CHALLENGE = struct.Struct("<16s33x")  # as long as the hello that answers it
 _BUSY = struct.Struct("<16s?")
 
 NUMBER_MAX = 2**32 - 1
-"""The highest number that a request can have."""
+"""Highest number of an operator request."""
 
-_new = tuple.__new__  # of a named tuple: four times as fast as calling it
+_new = tuple.__new__  # makes a named tuple four times as fast as its class does
 _unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
 HEADER_SIZE = _HEADER.size
 BODY_SIZES = {
@@ -149,17 +151,17 @@ _size_of = SIZES.get
 def encode_header(
     kind: int, direction: int, epoch: int, counter: int, generation: int = 0
 ) -> bytes:
-    """Lay out the header; epoch < 2^32, generation < 2^8, counter < 2^64."""
+    """Encode the header; epoch < 2^32, generation < 2^8, counter < 2^64."""
     return _HEADER.pack(VERSION, direction, epoch, generation, kind, counter)
 
 
 def check(data: bytes) -> Header:
-    """Read a datagram's header, and check version, kind and the length that follows from it.
+    """Decode a datagram's header and check version, direction, kind and length.
 
-    Nothing in it is authenticated yet.
+    The header is not authenticated yet.
 
     Raises:
-        DecodeError: "malformed" (too short, too long, unknown kind) or "version".
+        DecodeError: "version" for another version, "malformed" for any other error.
     """
     size = len(data)
     if size < HEADER_SIZE:
@@ -173,10 +175,10 @@ def check(data: bytes) -> Header:
 
 
 def peek(data: bytes) -> tuple[int, int, int]:
-    """Read kind, epoch and counter of a datagram on its way, as a link needs them.
+    """Read kind, epoch and counter of a datagram in transit, without checks.
 
     Raises:
-        DecodeError: "malformed" if it is too short to have them.
+        DecodeError: "malformed" if the datagram is shorter than a header.
     """
     if len(data) < HEADER_SIZE:
         raise DecodeError("malformed")
@@ -184,11 +186,11 @@ def peek(data: bytes) -> tuple[int, int, int]:
     return kind, epoch, counter
 
 
-# Spelled out number by number: that takes half the time of slices and stars.
+# Every number has a name of its own: that takes half the time of slices and unpacking.
 
 
 def encode_telemetry(telemetry: Telemetry) -> bytes:
-    """Lay out the body of a TELEMETRY datagram; the guard's state and its cause come last."""
+    """Encode the body of a TELEMETRY datagram."""
     # fmt: off
     (
         stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, guard, pipes, touch,
@@ -203,7 +205,7 @@ def encode_telemetry(telemetry: Telemetry) -> bytes:
 
 
 def decode_telemetry(body: bytes) -> Telemetry:
-    """Read the body of a TELEMETRY datagram; numbers may be anything, NaN included."""
+    """Decode the body of a TELEMETRY datagram; its floats may have any value, even NaN."""
     # fmt: off
     (
         stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, force, echo_ns, hold_ns,
@@ -222,78 +224,78 @@ def decode_telemetry(body: bytes) -> Telemetry:
 
 
 def decode_stamps(body: bytes) -> tuple[int, int]:
-    """Read only stamp and slip [ns] of a TELEMETRY datagram: enough for one that is not used."""
+    """Decode only the stamp and the slip [ns] of a TELEMETRY datagram."""
     stamp_ns, slip_ns = _STAMPS.unpack_from(body)
     return stamp_ns, slip_ns
 
 
 def encode_command(command: Command) -> bytes:
-    """Lay out the body of a COMMAND datagram."""
+    """Encode the body of a COMMAND datagram."""
     stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate = command
     return _COMMAND.pack(stamp_ns, basis_stamp_ns, basis_hold_ns, x, y, z, yaw_rate)
 
 
 def decode_command(body: bytes) -> Command:
-    """Read the body of a COMMAND datagram; numbers may be anything, NaN included."""
+    """Decode the body of a COMMAND datagram; its floats may have any value, even NaN."""
     stamp_ns, basis_stamp_ns, basis_hold_ns, x, y, z, yaw_rate = _COMMAND.unpack(body)
     return _new(Command, (stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate))
 
 
 def encode_operator(request: OperatorRequest) -> bytes:
-    """Lay out the body of an OPERATOR datagram; the epoch stands in the header."""
-    number, asked, start, mission_id, reached, basis_stamp_ns, _ = request
-    return _OPERATOR.pack(number, asked, start, mission_id, reached, basis_stamp_ns)
+    """Encode the body of an OPERATOR datagram; the header holds the request's epoch."""
+    number, kind, start, mission_id, reached, basis_stamp_ns, _ = request
+    return _OPERATOR.pack(number, kind, start, mission_id, reached, basis_stamp_ns)
 
 
 def decode_operator(body: bytes) -> OperatorRequest:
-    """Read the body of an OPERATOR datagram."""
-    number, request, start, mission_id, reached, basis_stamp_ns = _OPERATOR.unpack(body)
-    if mission_id >> 63:  # telemetry that names such a one is in no recording
+    """Decode the body of an OPERATOR datagram."""
+    number, kind, start, mission_id, reached, basis_stamp_ns = _OPERATOR.unpack(body)
+    if mission_id >> 63:  # a recording holds signed 64-bit integers
         raise DecodeError("malformed")
     try:
-        asked = Request(request), Start(start)
+        kind_and_start = Request(kind), Start(start)
     except ValueError:
         raise DecodeError("malformed") from None
-    return OperatorRequest(number, *asked, mission_id, reached, basis_stamp_ns)
+    return OperatorRequest(number, *kind_and_start, mission_id, reached, basis_stamp_ns)
 
 
 def encode_hello(hello: Hello) -> bytes:
-    """Lay out the body of a HELLO datagram."""
+    """Encode the body of a HELLO datagram."""
     return _HELLO.pack(*hello)
 
 
 def decode_hello(body: bytes) -> Hello:
-    """Read the body of a HELLO datagram."""
+    """Decode the body of a HELLO datagram."""
     return Hello(*_HELLO.unpack(body))
 
 
 def encode_accept(accept: Accept) -> bytes:
-    """Lay out the body of an ACCEPT datagram."""
+    """Encode the body of an ACCEPT datagram."""
     return _ACCEPT.pack(*accept)
 
 
 def decode_accept(body: bytes) -> Accept:
-    """Read the body of an ACCEPT datagram."""
+    """Decode the body of an ACCEPT datagram."""
     return Accept(*_ACCEPT.unpack(body))
 
 
 def encode_challenge(cookie: bytes) -> bytes:
-    """Lay out the body of a CHALLENGE datagram: a cookie of 16 bytes, and zeros."""
+    """Encode the body of a CHALLENGE datagram: a cookie of 16 bytes, then zeros."""
     return _CHALLENGE.pack(cookie)
 
 
 def decode_challenge(body: bytes) -> bytes:
-    """Read the cookie [16 bytes] in the body of a CHALLENGE datagram."""
+    """Decode the cookie of 16 bytes from the body of a CHALLENGE datagram."""
     return body[:16]
 
 
 def encode_busy(busy: Busy) -> bytes:
-    """Lay out the body of a BUSY datagram."""
+    """Encode the body of a BUSY datagram."""
     return _BUSY.pack(*busy)
 
 
 def decode_busy(body: bytes) -> Busy:
-    """Read the body of a BUSY datagram."""
+    """Decode the body of a BUSY datagram."""
     return Busy(*_BUSY.unpack(body))
 
 

@@ -1,4 +1,4 @@
-"""Greetings, world's side: how a cloud gets a session, and why nobody else does.
+"""The handshake of a session: world's side, cloud's side, and the log of why it fails.
 
     cloud                                      world
       HELLO (nonce, clock, no cookie)   -->
@@ -7,25 +7,19 @@
                                         <--    ACCEPT (nonce, world's nonce, clock), a new epoch
                                             or BUSY (nonce)
 
-All of them carry a tag by the pre-shared key: who does not have it is not answered at all. The
-cookie is a MAC over the current two seconds, so world keeps nothing for a hello without it, and a
-captured hello is worth nothing four seconds later. No answer is longer than what it answers, and
-there are at most 20 of them in any second: ten challenges, ten other answers. A captured hello that
-somebody repeats can use up the challenges alone, and these, which name nobody, lead the honest
-cloud on all the same; a hello with a cookie is answered once per counter.
+Every greeting has a tag by the pre-shared key; world does not answer a sender without that key. The
+cookie is a MAC over a time slot of two seconds, so world stores nothing for a hello without a
+cookie, and a captured hello is useless after four seconds. No answer is longer than its hello.
+World sends at most 20 answers per second: ten challenges and ten others. A repeated captured hello
+can use up only the challenges, and the honest cloud can use these, too, because they name nobody. A
+hello with a cookie is answered once per counter.
 
-The cloud that has the session keeps it while it is heard: one datagram, new and sealed with the
-session's keys, in `command_age_max`. Only after that another one gets it, under the next epoch. A
-nonce that has had its session never gets another: a captured hello cannot bring back an old one.
+The cloud with the session keeps it while world hears it: at least one new sealed datagram per
+`command_age_max`. After that another cloud can get a session under the next epoch. A nonce gets
+only one session, so a captured hello cannot bring back an old one.
 
-Deviation: WireGuard derives session keys by Diffie-Hellman too; here the pre-shared key is all, as
-both ends are one owner's, and whoever has that key can command the robot anyway.
-
-Greetings, cloud's side: what its hellos say, and which answers count.
-
-World's side, and what goes over the wire, is in `cloudrc.tunnel.handshake`.
-
-What keeps two ends from having a session, in words for the user, and each only once.
+Deviation: WireGuard also derives session keys by Diffie-Hellman. Here the pre-shared key is enough,
+because one owner has both ends, and anybody with that key can command the robot anyway.
 """
 
 from __future__ import annotations
@@ -58,37 +52,39 @@ from cloudrc.tunnel.session import ACCEPT, AES_256_GCM, ALIVE, CHACHA20_POLY1305
 BUSY, CHALLENGE, OPERATOR = int(Kind.BUSY), int(Kind.CHALLENGE), int(Kind.OPERATOR)
 
 EPOCH_MAX = 2**32 - 1
+"""Last epoch that the header can hold."""
 ANSWERS_MAX = 10
-"""Answers in any second to hellos with a cookie; challenges have the same limit.
+"""Largest number of answers per second to hellos with a cookie; challenges have the same limit.
 Source: WireGuard, 20 handshakes per second and address: both limits together."""
 SECOND_NS = 1_000_000_000
 CHALLENGE_NS = SECOND_NS // 10
-"""Between two challenges [ns]; spread over the second, so that none waits long for the next."""
+"""Least time between two challenges [ns]."""
 COOKIE_NS = 2_000_000_000
-"""A cookie is valid in its slot of this length and in the next one [ns]."""
+"""Length of a cookie's time slot [ns]; a cookie is valid in its slot and in the next one."""
 GRACE_NS = 1_000_000_000
-"""Authority of a cloud whose session is new, until it is heard for the first time [ns]."""
+"""Time for which a cloud keeps a new session before it is heard for the first time [ns]."""
 REPEATS_MAX = 3
-"""An incumbent that is accepted so often and goes on asking gets a new epoch, under its own key, if
-it has another one than the epoch began with, which it has dropped before it learnt of the epoch, or
-is not heard, so that there is nothing to lose."""
+"""Number of repeated acceptances after which the same cloud gets a new epoch under its own key.
+
+It needs one if it is not heard, or if it no longer has the key with which the epoch began.
+"""
 USED_MAX = 64
-"""Old nonces remembered; at ten answers a second none is forgotten while its cookie is valid."""
+"""Number of old nonces remembered; none is forgotten while its cookie is valid."""
 
 
 def epochs_after(last: int) -> Iterator[int]:
-    """Count epochs on; after the last that the header can hold comes 1: nonces are fresh then."""
+    """Count epochs upwards; after EPOCH_MAX comes 1, because the nonces are new by then."""
     while True:
         last = last % EPOCH_MAX + 1
         yield last
 
 
 class Answer(NamedTuple):
-    """What world does about a hello.
+    """World's answer to a hello.
 
     Attributes:
-        outcome: What it is counted under.
-        datagrams: To be sent, none or one.
+        outcome: Name under which the hello is counted.
+        datagrams: Datagrams to send, none or one.
         opened: Whether a new session has been opened.
     """
 
@@ -98,50 +94,50 @@ class Answer(NamedTuple):
 
 
 class Identity(Protocol):
-    """What the door asks of world's identity; `cloudrc.world.identity` explains it."""
+    """The part of world's identity that the handshake needs."""
 
     @property
     def clock_id(self) -> bytes:
-        """Names this machine's monotonic clock."""
+        """Bytes that identify this machine's monotonic clock."""
 
     @property
     def nonce(self) -> bytes:
-        """Names this process."""
+        """Bytes that identify this process."""
 
     @property
     def suite(self) -> int:
-        """Cipher that world would like."""
+        """Cipher that world prefers."""
 
     @property
     def last_epoch(self) -> int:
-        """The last one before this process."""
+        """Last epoch before this process."""
 
     @property
     def next_epoch(self) -> Callable[[], int | None] | None:
-        """Gives persisted epochs, or None while there is none."""
+        """Function that returns the next persisted epoch, or None while there is none."""
 
 
 class Door:
-    """World's side: who has authority, who gets it next, and under which epoch."""
+    """World's side: decide which cloud has authority, and under which epoch."""
 
     def __init__(self, session: Session, identity: Identity, *, age_max_ns: int) -> None:
         """Begin without a session.
 
         Args:
-            session: World's; from here on its epochs are opened here.
-            identity: World's.
-            age_max_ns: How long an incumbent may be silent [ns].
+            session: World's session; this class begins its epochs.
+            identity: World's identity.
+            age_max_ns: Longest silence of the cloud with the session before it loses it [ns].
         """
         self._session = session
         self._nonce, self._clock, self._suite = identity.nonce, identity.clock_id, identity.suite
         self._next_epoch = identity.next_epoch or epochs_after(identity.last_epoch).__next__
-        self._coming: int | None = None  # the epoch to begin next, once it is asked for
+        self._reserved_epoch: int | None = None  # the epoch to begin next
         self._cookies = session.ring.current.derive(identity.nonce, b"cookies")
         self._age_max_ns = age_max_ns
         self._fresh_until_ns = -1
         self._incumbent = Hello(b"", b"", b"", AES_256_GCM)
-        self._repeated = 0  # acceptances of this epoch, since its cloud was last heard
-        self._used: deque[bytes] = deque(maxlen=USED_MAX)
+        self._repeated = 0  # acceptances of this epoch since its cloud was last heard
+        self._used: deque[bytes] = deque(maxlen=USED_MAX)  # nonces that have had a session
         self._challenged_ns = -CHALLENGE_NS
         self._answered_ns: deque[int] = deque(maxlen=ANSWERS_MAX)
         self._counters: dict[bytes, int] = {}  # newest counter answered, by nonce
@@ -154,21 +150,26 @@ class Door:
 
     @property
     def ready(self) -> bool:
-        """Whether there is an epoch to begin: a disk that hangs may have none for a while."""
-        if self._coming is None:
-            self._coming = self._next_epoch()
-        return self._coming is not None
+        """Whether the next epoch is available; the file of epochs may delay it."""
+        if self._reserved_epoch is None:
+            self._reserved_epoch = self._next_epoch()
+        return self._reserved_epoch is not None
 
     def hear(self, now_ns: int) -> None:
-        """Note that the incumbent is alive: a new datagram of its session has come [ns]."""
+        """Note a new datagram of the session at `now_ns` [ns]: its cloud is alive."""
         self._fresh_until_ns = now_ns + self._age_max_ns
         self._repeated = 0
 
     def admit(self, kind: int, counter: int, now_ns: int) -> None:
-        """Let an ALIVE or OPERATOR datagram of the session in, once [ns, monotonic clock].
+        """Accept an ALIVE or OPERATOR datagram of the session once.
+
+        Args:
+            kind: Kind of the datagram.
+            counter: Counter in its header.
+            now_ns: Monotonic clock [ns].
 
         Raises:
-            DecodeError: "malformed" if it is neither, "repeated".
+            DecodeError: "malformed" if it has another kind, "repeated".
         """
         window = self._windows.get(kind)
         if window is None:
@@ -178,11 +179,11 @@ class Door:
         self.hear(now_ns)
 
     def knock(self, hello: Hello, counter: int, now_ns: int) -> Answer:
-        """Decide about the hello that the session has just opened.
+        """Answer the hello that the session has just opened.
 
         Args:
-            hello: Its body.
-            counter: From its header.
+            hello: Body of the hello.
+            counter: Counter in its header.
             now_ns: Monotonic clock [ns].
         """
         if not self._has_cookie(hello, now_ns):
@@ -200,9 +201,9 @@ class Door:
         if hello.nonce == self._incumbent.nonce:
             session = self._session
             self._repeated += 1
-            begun_with_it = session.greeting_key == session.epoch_key
-            if self._repeated <= REPEATS_MAX or (begun_with_it and now_ns <= self._fresh_until_ns):
-                # Whichever key this hello has: cloud takes the answer's for the key of the epoch.
+            same_key = session.greeting_key == session.epoch_key
+            if self._repeated <= REPEATS_MAX or (same_key and now_ns <= self._fresh_until_ns):
+                # Not the key of this hello: cloud uses the answer's key as the key of the epoch.
                 return Answer("hello", [session.greet(ACCEPT, self._accept(), session.epoch_key)])
         elif hello.nonce in self._used:
             return self._answer("hello", BUSY, encode_busy(Busy(hello.nonce, used=True)))
@@ -214,38 +215,44 @@ class Door:
             self._used.append(self._incumbent.nonce)
         self._incumbent = hello
         self._fresh_until_ns = now_ns + max(GRACE_NS, self._age_max_ns)
-        agreement = Agreement(hello.nonce, self._nonce, self._agreed())
+        agreement = Agreement(hello.nonce, self._nonce, self._common_suite())
         self._begin(agreement, self._session.greeting_key)
         return self._answer("hello", ACCEPT, self._accept(), opened=True)
 
     def move_on(self, now_ns: int) -> bytes:
-        """Open the next epoch of the same session [ns], if `ready`; the datagram to tell cloud."""
+        """Begin the next epoch of the same session and make the datagram that tells cloud.
+
+        Call it only if `ready`.
+
+        Args:
+            now_ns: Monotonic clock [ns].
+        """
         self._begin()
-        self._fresh_until_ns = now_ns + max(GRACE_NS, self._age_max_ns)  # until it can be heard
+        self._fresh_until_ns = now_ns + max(GRACE_NS, self._age_max_ns)
         return self._session.greet(ACCEPT, self._accept())
 
     def _remember(self, nonce: bytes, counter: int) -> None:
         counters = self._counters
-        counters.pop(nonce, None)  # the one that is answered last is forgotten last
+        counters.pop(nonce, None)  # so that the nonce answered last is forgotten last
         counters[nonce] = counter
         if len(counters) > USED_MAX:
             del counters[next(iter(counters))]
 
     def _begin(self, agreement: Agreement | None = None, key: Key | None = None) -> None:
-        epoch, self._coming = self._coming or self._next_epoch(), None
-        assert epoch is not None, "ask whether it is `ready`"
+        epoch, self._reserved_epoch = self._reserved_epoch or self._next_epoch(), None
+        assert epoch is not None, "check `ready` first"
         self._session.begin(epoch, agreement, key)
         self._repeated = 0
         for window in self._windows.values():
             window.reset()
 
     def _accept(self) -> bytes:
-        accept = Accept(self._incumbent.nonce, self._nonce, self._clock, self._agreed())
+        accept = Accept(self._incumbent.nonce, self._nonce, self._clock, self._common_suite())
         return encode_accept(accept)
 
-    def _agreed(self) -> int:
-        wishes = (self._incumbent.suite, self._suite)
-        return CHACHA20_POLY1305 if CHACHA20_POLY1305 in wishes else AES_256_GCM
+    def _common_suite(self) -> int:
+        preferred = (self._incumbent.suite, self._suite)
+        return CHACHA20_POLY1305 if CHACHA20_POLY1305 in preferred else AES_256_GCM
 
     def _answer(self, outcome: str, kind: int, body: bytes, *, opened: bool = False) -> Answer:
         session = self._session
@@ -263,45 +270,49 @@ class Door:
 
 
 NO_COOKIE = bytes(16)
+"""Cookie of the first hello."""
 REPLIES_MAX = 3
-"""Challenges that cloud answers at once, between two hellos of its own accord."""
+"""Largest number of challenges that cloud answers between two periodic hellos."""
 COOKIES_MAX = 4096
-"""Cookies that cloud remembers: over two hours of world's, a slot each."""
+"""Number of cookies that cloud remembers, one per time slot: over two hours."""
 EPOCHS = 2**32
-"""An epoch that is less than half of them ahead is newer; after the last one comes 1."""
+"""Number of epochs; one that is less than half of them ahead is newer."""
 LEFT_MAX = 64
-"""Earlier world processes remembered."""
+"""Number of earlier world processes that cloud remembers."""
 
 
-class Knocker:
-    """Cloud's side: what its hellos say, and which answers count."""
+class ClientHandshake:
+    """Cloud's side: make hellos and decide which answers are valid."""
 
     def __init__(self, nonce: bytes, clock: bytes, suite: int) -> None:
         """Begin without a session.
 
         Args:
-            nonce: 16 bytes that name this process; new ones at every start.
-            clock: 16 bytes that name its monotonic clock.
-            suite: Cipher that cloud would like.
+            nonce: 16 bytes that identify this process, new at every start.
+            clock: 16 bytes that identify its monotonic clock.
+            suite: Cipher that cloud prefers.
         """
         self._seed, self._clock, self._suite = nonce, clock, suite
         self._nonce, self._nonces = nonce, 0
         self._cookie = NO_COOKIE
         self._replies = 0
-        self._cookies: dict[bytes, None] = {}  # that have come, in their order
-        self._world = b""
-        self._left: deque[bytes] = deque(maxlen=LEFT_MAX)
+        self._cookies: dict[bytes, None] = {}  # received so far, oldest first
+        self._world = b""  # nonce of the world process with the session
+        self._old_worlds: deque[bytes] = deque(maxlen=LEFT_MAX)
 
-    def hello(self) -> bytes:
-        """The body of a hello of cloud's own accord."""
+    def make_hello(self) -> bytes:
+        """Make the body of a periodic hello."""
         self._replies = REPLIES_MAX
         return self._hello()
 
-    def challenged(self, cookie: bytes) -> bytes | None:
-        """Take a challenge; the body of the hello that answers it, or None if it needs none.
+    def answer_challenge(self, cookie: bytes) -> bytes | None:
+        """Handle a challenge and make the body of the hello that answers it.
 
-        A cookie that has come before is left alone: it is in the next hello if it is the newest,
-        and an old one that somebody repeats must not take the place of that.
+        A repeated cookie is ignored: the next hello has it if it is the newest, and an older one
+        must not replace the newest.
+
+        Returns:
+            The body, or None if no answer is needed.
         """
         if self._replies == 0 or cookie in self._cookies:
             return None
@@ -312,74 +323,86 @@ class Knocker:
             del self._cookies[next(iter(self._cookies))]
         return self._hello()
 
-    def refused(self, busy: Busy) -> bool:
-        """Take a refusal; whether it is one of what cloud asks for, by another's authority."""
-        if busy.nonce != self._nonce:
-            return False
-        if busy.used:  # ours, but lost to another cloud meanwhile
-            self._rename()
-        return not busy.used
-
-    def accepted(self, epoch: int, accept: Accept, current: int, *, asks: bool) -> Agreement | None:
-        """Take an acceptance.
-
-        Another world is taken while cloud asks only: what a process that is gone has sent may come
-        late. Was it taken all the same, the one that lives is among those left: it answers what
-        cloud goes on asking, and is asked under another name.
-
-        Args:
-            epoch: From its header.
-            accept: Its body.
-            current: Epoch of the session until now.
-            asks: Whether cloud wants a session: it has none, or does not hear world in it.
+    def receive_busy(self, busy: Busy) -> bool:
+        """Handle a refusal.
 
         Returns:
-            What the session under the new epoch rests on; None if this is not for us, or old.
+            Whether it answers our hello and another cloud has authority.
+        """
+        if busy.nonce != self._nonce:
+            return False
+        if busy.used:  # our session was lost to another cloud
+            self._change_nonce()
+        return not busy.used
+
+    def receive_accept(
+        self, epoch: int, accept: Accept, current: int, *, asks: bool
+    ) -> Agreement | None:
+        """Handle an acceptance.
+
+        Cloud accepts another world process only while it asks for a session, because a late
+        datagram of a dead process may arrive. If cloud has accepted a dead process nevertheless,
+        the living one counts as old; when it answers again, cloud asks under a new nonce.
+
+        Args:
+            epoch: Epoch in the header.
+            accept: Body of the datagram.
+            current: Epoch of the session until now.
+            asks: Whether cloud wants a session: it has none, or does not hear world.
+
+        Returns:
+            The agreement for the new epoch; None if the acceptance is old or not for us.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):
             return None
-        if accept.world_nonce in self._left:
-            self._rename()
+        if accept.world_nonce in self._old_worlds:
+            self._change_nonce()
             return None
         if known:
             if not 0 < (epoch - current) % EPOCHS < EPOCHS // 2:
                 return None
         elif self._world:
-            self._left.append(self._world)  # a process that is gone does not come back
+            self._old_worlds.append(self._world)  # a dead process does not come back
         self._world = accept.world_nonce
         return Agreement(accept.nonce, accept.world_nonce, accept.suite)
 
-    def _rename(self) -> None:
-        """Ask under another name, of which nothing has been captured."""
+    def _change_nonce(self) -> None:
+        """Use a new nonce, of which nobody can have captured datagrams."""
         self._nonces += 1
         text = b"%s %d" % (self._seed, self._nonces)
         self._nonce = hashlib.sha256(text).digest()[:16]
-        self._left.clear()
+        self._old_worlds.clear()
 
     def _hello(self) -> bytes:
         return encode_hello(Hello(self._nonce, self._clock, self._cookie, self._suite))
 
 
-KEY = "greetings come that our key does not fit: give both ends the same key file"
-BUSY_TEXT = "another cloud controls the robot: this one waits until that is silent"
-NO_EPOCH = "no session and no mission from the spawn can begin: the disk keeps the epochs waiting"
+KEY = "the peer uses another key: give both ends the same key file"
+BUSY_TEXT = "another cloud controls the robot: this one waits until the other is silent"
+NO_EPOCH = "no session and no mission from the spawn can begin: the disk delays the file of epochs"
 SILENCE = "world does not answer: is it running, is the link up, do both ends have the same key?"
 
 
 class Complaints:
-    """Remembers what has been said since the last session began."""
+    """Log each reason why there is no session once, until the next session begins."""
 
     def __init__(self) -> None:
-        """Begin with nothing said."""
-        self._said: set[str] = set()
+        """Begin with nothing logged."""
+        self._logged: set[str] = set()
 
     def forget(self) -> None:
-        """There is a session again."""
-        self._said.clear()
+        """Start again, because there is a session."""
+        self._logged.clear()
 
     def about(self, outcome: str, data: bytes, now_ns: int) -> list[Fault]:
-        """Explain a refused datagram while there is no session [ns, own clock]."""
+        """Log why a datagram was refused while there is no session.
+
+        Args:
+            outcome: Text of the DecodeError.
+            data: The datagram.
+            now_ns: Own clock [ns].
+        """
         if outcome == "version":
             text = (
                 f"peer speaks v{data[0]}, we speak v{VERSION}: "
@@ -391,11 +414,17 @@ class Complaints:
         return []
 
     def say(self, code: str, text: str, now_ns: int) -> list[Fault]:
-        """Say something unless these words have been said [ns, own clock].
+        """Log a fault unless the same text has been logged.
 
-        Anybody may send a datagram of another version: it does not hide what the peer's is.
+        The text decides, not the code: a datagram with any version, which anybody can send, does
+        not hide the version of the peer.
+
+        Args:
+            code: Code of the fault.
+            text: Text of the fault.
+            now_ns: Own clock [ns].
         """
-        if text in self._said:
+        if text in self._logged:
             return []
-        self._said.add(text)
+        self._logged.add(text)
         return [Fault(now_ns, code, text)]

@@ -1,7 +1,7 @@
-"""Pre-shared keys: what is read from a key file, and which keys an end accepts now.
+"""Read and write key files, and decide which pre-shared keys an end accepts.
 
-A key never shows itself: it has no text, cannot be pickled, and hands out only what is derived
-from it. What is derived is bound to the wire's version and to its use, by HKDF-SHA256 (RFC 5869).
+A key never prints itself and cannot be pickled. The tunnel uses keys derived from it by HKDF-SHA256
+(RFC 5869); each is bound to the wire version and to one use.
 """
 
 from __future__ import annotations
@@ -19,49 +19,54 @@ from cloudrc.tunnel.codec import TAG_SIZE, VERSION
 
 KEY_SIZE = 32
 OVERLAP = 300.0
-"""How long the key before stays valid unless the file says otherwise [s].
+"""Default time for which the previous key stays valid [s].
 
 A Secret reaches the two pods up to two minutes apart.
 """
 OVERLAP_MAX = 86_400.0
+"""Longest overlap that a key file may ask for [s]."""
 CLOCK_SLACK = 60.0
-"""By which a machine's wall clock may lie behind that of the one on which a file was made [s]."""
+"""Largest accepted lag of this wall clock behind that of the machine that wrote the file [s]."""
 UNTIL_MAX = 253_402_300_799.0
-"""The last second of the year 9999, since 1970 [s]."""
+"""Last second of the year 9999 [s since 1970]."""
 _LABEL = b"cloudrc %d " % VERSION
 
 
 class Key:
-    """One pre-shared key of 32 bytes, which nobody gets to see."""
+    """A secret pre-shared key of 32 bytes.
 
-    __slots__ = ("_secret", "_tagging", "name")
+    Attributes:
+        name: Short public name that tells two keys apart.
+    """
+
+    __slots__ = ("_secret", "_tag_key", "name")
 
     def __init__(self, secret: bytes) -> None:
-        """Take the key over.
+        """Make a key from its bytes.
 
         Raises:
-            ValueError: If it is not 32 bytes long; the text does not hold it.
+            ValueError: If it is not 32 bytes long; the message does not contain it.
         """
         if len(secret) != KEY_SIZE:
             raise ValueError(f"a key has {KEY_SIZE} bytes, not {len(secret)}")
         self._secret = secret
-        self._tagging = self.derive(b"", b"greeting")
-        self.name = self.derive(b"", b"name")[:4].hex()  # tells two keys apart, and nothing else
+        self._tag_key = self.derive(b"", b"greeting")
+        self.name = self.derive(b"", b"name")[:4].hex()
 
     def derive(self, salt: bytes, use: bytes) -> bytes:
         """Derive 32 bytes for one use."""
         return HKDF(SHA256(), KEY_SIZE, salt, _LABEL + use).derive(self._secret)
 
     def tag(self, data: bytes) -> bytes:
-        """Authenticate a datagram that belongs to no session: HMAC-SHA256, cut to 16 bytes."""
-        return hmac.digest(self._tagging, data, hashlib.sha256)[:TAG_SIZE]
+        """Compute the tag of a greeting: HMAC-SHA256, cut to 16 bytes."""
+        return hmac.digest(self._tag_key, data, hashlib.sha256)[:TAG_SIZE]
 
     def verifies(self, data: bytes, tag: bytes) -> bool:
-        """Check a tag, in constant time."""
+        """Check the tag of a greeting in constant time."""
         return hmac.compare_digest(self.tag(data), tag)
 
     def text(self) -> str:
-        """The key as a key file has it: for writing such a file, and nothing else."""
+        """Return the secret as hexadecimal text; use it only to write a key file."""
         return self._secret.hex()
 
     def __eq__(self, other: object) -> bool:
@@ -78,14 +83,14 @@ class Key:
 
 
 class KeySet(NamedTuple):
-    """What a key file holds.
+    """The content of a key file.
 
     Attributes:
         current: The key to use.
-        previous: One that is still accepted; None if there is none.
-        overlap: For how long, from the moment a process reads this [s].
-        until: When it ends for processes that start later [s], wall clock, since 1970; None if the
-            file does not say.
+        previous: The key before it, accepted for a while; None if there is none.
+        overlap: How long a process accepts it after reading the file [s].
+        until: When it expires for processes that start later [s since 1970], by the wall clock;
+            None if the file does not say.
     """
 
     current: Key
@@ -94,68 +99,67 @@ class KeySet(NamedTuple):
     until: float | None = None
 
     def rotated(self, secret: bytes, wall: float, overlap: float = OVERLAP) -> KeySet:
-        """Put a new key in front of the current one.
+        """Make a key set in which a new key replaces the current one.
 
         Args:
-            secret: The new key, 32 bytes that nobody can guess.
-            wall: What the wall clock says [s since 1970].
-            overlap: For how long the current one stays valid [s].
+            secret: The new key, 32 random bytes.
+            wall: Wall clock [s since 1970].
+            overlap: How long the current key stays valid [s].
         """
         return KeySet(Key(secret), self.current, overlap, float(math.ceil(wall + overlap)))
 
     def left(self, wall: float | None) -> float:
-        """For how long a process that starts now accepts the previous key [s]; 0 for not at all.
+        """Return how long a process that starts now accepts the previous key [s].
 
         Args:
-            wall: What its wall clock says [s since 1970]; None if it has none to go by.
+            wall: Wall clock of the process [s since 1970]; None to use the whole overlap.
         """
         if self.until is None or wall is None:
             return self.overlap
         left = self.until - wall
-        # A clock that shows a time before the file was made does not know how old the file is.
+        # A clock that shows a time before the file was written cannot tell the file's age.
         return 0.0 if left > self.overlap + CLOCK_SLACK else min(max(left, 0.0), self.overlap)
 
     def caution(self, wall: float) -> str:
-        """What a process that starts has to tell about the previous key; "" for nothing.
+        """Return a warning about the previous key for a process that starts; "" if none is needed.
 
         Args:
-            wall: What its wall clock says [s since 1970].
+            wall: Wall clock of the process [s since 1970].
         """
         if self.previous is None or (self.until is not None and self.left(wall) > 0.0):
             return ""
         name, advice = self.previous.name, "drop it: cloudrc key retire FILE"
         if self.until is None:
             return (
-                f"key {name}, the one before, is accepted for {self.overlap:g} s from every start "
-                f"on, for the key file does not say until when; {advice}"
+                f"the previous key {name} is accepted for {self.overlap:g} s after every start, "
+                f"because the key file has no expiry time; {advice}"
             )
         if self.until > wall:
             return (
-                f"key {name}, the one before, is refused: by this machine's clock "
-                f"({_date(wall)}) the key file is not made yet; set the clock"
+                f"the previous key {name} is refused: this machine's clock ({_date(wall)}) is "
+                "behind the time when the key file was written; set the clock"
             )
-        return f"key {name}, the one before, is refused: valid until {_date(self.until)}; {advice}"
+        return f"the previous key {name} is refused: valid until {_date(self.until)}; {advice}"
 
 
 class KeyRing:
-    """The keys that one end accepts; the driver puts new ones in while it flies.
+    """The keys that one end accepts; the driver replaces them in flight.
 
-    The overlap counts on the process's own monotonic clock from the moment it reads the file. A
-    process that starts cannot know how long the file has been there: it accepts the key before only
-    as long as the file says, by the wall clock, which is asked this once. In flight none is.
+    The overlap runs on the process's own monotonic clock from the moment it reads the file. The
+    wall clock is read only at the start of the process, to find out how old the file is.
 
     Attributes:
         current: The key to use.
-        version: Rises whenever new ones are put in.
+        version: Rises with every replacement of the keys.
     """
 
     def __init__(self, keys: KeySet, now_ns: int = 0, wall: float | None = None) -> None:
         """Begin with the keys of a file.
 
         Args:
-            keys: Just read.
+            keys: Content of the file that was just read.
             now_ns: Monotonic clock [ns].
-            wall: What the wall clock says [s since 1970]; None to count the overlap from now.
+            wall: Wall clock [s since 1970]; None to count the overlap from now.
         """
         self.current = keys.current
         self.version = 0
@@ -163,10 +167,9 @@ class KeyRing:
         self._until_ns = now_ns + round(keys.left(wall) * 1e9)
 
     def replace(self, keys: KeySet, now_ns: int) -> None:
-        """Take what the file holds now; the key until now stays valid for the overlap.
+        """Replace the keys; the key used until now stays valid for the overlap.
 
-        The time of a previous key that is known as such already only becomes shorter, whatever is
-        written beside it.
+        If the previous key stays the same, its validity can become shorter but never longer.
         """
         previous, until_ns = keys.previous, now_ns + round(keys.overlap * 1e9)
         if previous is None and keys.current != self.current:
@@ -177,38 +180,38 @@ class KeyRing:
         self.version += 1
 
     def accepted(self, now_ns: int) -> tuple[Key, ...]:
-        """The keys that are valid at this moment, the one to use first."""
+        """Return the keys that are valid now, the current key first."""
         if self._previous is not None and now_ns < self._until_ns:
             return self.current, self._previous
         return (self.current,)
 
 
 def parse(data: bytes) -> KeySet:
-    """Read a key file: 32 bytes, or lines of a name and a value.
+    """Parse a key file: 32 bytes, or lines of a name and a value.
 
-    These are `current HEX`, and perhaps `previous HEX`, `overlap_s SECONDS` and
-    `previous_until_s SECONDS`, since 1970.
+    The lines are `current HEX` and optionally `previous HEX`, `overlap_s SECONDS` and
+    `previous_until_s SECONDS` (since 1970).
 
     Raises:
-        ValueError: What is wrong with it, in words that hold nothing of it.
+        ValueError: If the file is invalid; the message contains nothing of the file.
     """
     if len(data) == KEY_SIZE:
         return KeySet(Key(data))
     try:
         lines = [line.split() for line in data.decode("ascii").splitlines()]
-        words = [line for line in lines if line and not line[0].startswith("#")]
-        fields = {name: value for name, value in words}
+        pairs = [line for line in lines if line and not line[0].startswith("#")]
+        fields = {name: value for name, value in pairs}
     except ValueError:
         raise ValueError(f"neither {KEY_SIZE} bytes nor lines of 'name value'") from None
-    if "current" not in fields or len(fields) != len(words) or fields.keys() - _FIELDS:
-        raise ValueError(f"its lines are 'current', and perhaps {_OTHERS}")
+    if "current" not in fields or len(fields) != len(pairs) or fields.keys() - _FIELDS:
+        raise ValueError(f"expected the line 'current' and optionally {_OPTIONAL}, each once")
     previous = _key(fields["previous"]) if "previous" in fields else None
     overlap, until = _overlap(fields.get("overlap_s")), _until(fields.get("previous_until_s"))
     return KeySet(_key(fields["current"]), previous, overlap, until)
 
 
 def write(keys: KeySet) -> str:
-    """Lay out a key file."""
+    """Write the text of a key file."""
     lines = ["# A key of cloudrc's tunnel: keep it secret. Made by 'cloudrc key new'."]
     lines.append(f"current {keys.current.text()}")
     if keys.previous is not None:
@@ -222,7 +225,7 @@ def _key(text: str) -> Key:
     try:
         return Key(bytes.fromhex(text))
     except ValueError:
-        raise ValueError(f"a key is {2 * KEY_SIZE} hexadecimal digits") from None
+        raise ValueError(f"a key has {2 * KEY_SIZE} hexadecimal digits") from None
 
 
 def _overlap(text: str | None) -> float:
@@ -231,7 +234,7 @@ def _overlap(text: str | None) -> float:
     except ValueError:
         overlap = -1.0
     if not 0 < overlap <= OVERLAP_MAX:
-        raise ValueError(f"overlap_s is above 0 and at most {OVERLAP_MAX:g} [s]")
+        raise ValueError(f"overlap_s must be above 0 and at most {OVERLAP_MAX:g} [s]")
     return overlap
 
 
@@ -241,14 +244,14 @@ def _until(text: str | None) -> float | None:
     except ValueError:
         until = -1.0
     if until is not None and not 0 <= until <= UNTIL_MAX:
-        raise ValueError("previous_until_s is seconds since 1970, before the year 10000")
+        raise ValueError("previous_until_s must be seconds since 1970, before the year 10000")
     return until
 
 
 def _date(wall: float) -> str:
-    """Write an instant [s since 1970] down."""
+    """Format an instant [s since 1970] as ISO 8601."""
     return datetime.fromtimestamp(wall, UTC).isoformat(timespec="seconds")
 
 
 _FIELDS = {"current", "previous", "overlap_s", "previous_until_s"}
-_OTHERS = "'previous', 'overlap_s' and 'previous_until_s'"
+_OPTIONAL = "'previous', 'overlap_s' and 'previous_until_s'"

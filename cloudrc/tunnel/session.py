@@ -1,33 +1,25 @@
-"""One end's session: datagrams of its epoch are sealed on the way out and opened on the way in.
+"""Seal outgoing datagrams and open incoming ones under the keys of one end's session.
 
-`seal` and `open` are the only way to the wire. Keys, one per direction, come by HKDF from the
-pre-shared key, both ends' nonces, the epoch and the generation: a change of any of them makes what
-was captured before worthless. Nothing changes before a tag has been verified.
+Each direction has its own key, derived by HKDF from the pre-shared key, both ends' nonces, the
+epoch and the generation. If one of these changes, captured datagrams become worthless. A datagram
+changes no state before its tag is verified.
 
-Counters run per kind, so that probes and greetings never shift those of telemetry and commands;
-they start again with every epoch, but for the greetings that belong to none: a link decides by the
-counter, and a repeated one would meet the same fate for ever.
+Each kind has its own counter, so that greetings and probes never shift the counters of telemetry
+and commands. Counters restart with every epoch, except those of greetings without an epoch: the
+link draws its impairments from the counter, and a repeated one would always get the same draw.
 
-A generation is a new pair of keys within an epoch. The sender moves on by itself after 120 s or
-2^32 datagrams; the receiver derives what the header asks for, and keeps it if the tag fits. So a
-rekey takes no round trip, resets nothing, and no command is missed. Two keys of a key file change
-over in the same way: each end announces the new one by ALIVE datagrams sealed with it, and whoever
-opens such a datagram seals with that key from then on.
+A generation is a new pair of keys within an epoch. The sender starts one after 120 s or 2^32
+datagrams. The receiver derives the generation that the header names and keeps it if the tag is
+right, so a rekey takes no round trip and loses no command. The ends change to a new pre-shared key
+in the same way: each announces it by ALIVE datagrams sealed with it, and an end that opens such a
+datagram seals with that key from then on.
 
-For tests: `pair()` makes both ends of a session, sealed, the same ones for the same arguments. A
-whole end is sealed if its identity has keys: `WorldIdentity(clock, nonce, ring=KeyRing(...))`.
+The header has one byte for the generation. After a long silence the byte can stand for many
+generations. Trying them all is slow and a forger could cause it, so it is limited per second.
 
-What opens the peer's datagrams: the keys of its newest generations, found by one byte.
-
-A sender moves on to the next generation by itself, and after a silence, or while this machine
-slept, by any number of them: the byte in the header then stands for several. Trying them all takes
-time that a forger could ask for, too, so it is done for a few datagrams in each second alone.
-
-A session without keys, for two ends in one process: virtual time has no wire to protect.
-
-Sealing two datagrams takes some 4 us per 10 ms of flight, a twentieth of what a virtual flight
-takes at all. An end has such a session if it was given no keys; a driver with a socket refuses it
-(`Endpoint.sealed`), so forgetting the key is an error at the start and never plaintext on a wire.
+Two ends in one process may use an unsealed session, because virtual time has no wire to protect and
+sealing would take a twentieth of the flight's time. Drivers with a socket refuse such a session
+(`Endpoint.sealed`), so a missing key is an error at the start and never plaintext on a wire.
 """
 
 from __future__ import annotations
@@ -52,23 +44,25 @@ from cloudrc.tunnel.codec import (
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
 GENERATIONS = 256
+"""Number of generations that the header's byte can tell apart."""
 AHEAD_MAX = 127
-"""Generations that a peer that is heard may be ahead; the header has one byte of them."""
+"""Largest step ahead of an active peer [generations]."""
 FAR_MAX = 64 * GENERATIONS
-"""And so many more one that is not: over a week, for a peer that moves on twice as often."""
+"""Additional step ahead of a silent peer [generations]: over a week, even at twice the usual rate
+of rekeys."""
 FAR_TRIES = 8
-"""Datagrams between two looks for which those are tried, at 0.5 ms each."""
+"""Number of datagrams per second for which `FAR_MAX` is searched; each takes 0.5 ms."""
 SILENCE_NS = 5_000_000_000
-"""Without anything new for so long a peer is not heard [ns]."""
+"""Time without a new datagram after which a peer is silent [ns]."""
 KEPT = 3
-"""Generations that are opened side by side: late datagrams, and a key that is announced."""
+"""Number of generations kept open at a time, for late datagrams and an announced key."""
 
 Cipher: TypeAlias = AESGCM | ChaCha20Poly1305
 Opener: TypeAlias = tuple[Cipher, Key]
 
 
 class Openers:
-    """The keys of one session that open what arrives.
+    """The keys that open the peer's datagrams in one epoch.
 
     Attributes:
         accepted: Pre-shared keys from which they may be derived.
@@ -85,44 +79,44 @@ class Openers:
 
         Args:
             derive: Makes the cipher of a pre-shared key and a generation.
-            key: That the epoch begins with.
-            accepted: Those that may follow.
-            now_ns: When [ns].
+            key: Pre-shared key with which the epoch begins.
+            accepted: Pre-shared keys that may follow.
+            now_ns: Monotonic clock [ns].
         """
         self._derive = derive
         self.accepted = accepted
         self._kept: dict[int, Opener] = {0: (derive(key, 0), key)}  # by the byte of the generation
-        self._newest = 0  # generation that was opened for the first time last
-        self._tried: dict[int, list[Opener]] = {}
+        self._newest = 0  # newest generation opened so far
+        self._derived: dict[int, list[Opener]] = {}  # by generation
         self._far_tries = FAR_TRIES
         self._heard_ns = now_ns
         self._is_heard = self._is_silent = False
 
     def accept(self, accepted: tuple[Key, ...]) -> None:
-        """From now on these pre-shared keys count, and no others."""
+        """Replace the accepted pre-shared keys."""
         self.accepted = accepted
-        self._tried = {}
+        self._derived = {}
         for byte in [byte for byte, (_, key) in self._kept.items() if key not in accepted]:
             del self._kept[byte]
 
     def look(self, now_ns: int) -> None:
-        """Take note of the time [ns]; once a second."""
+        """Update whether the peer is silent at `now_ns` [ns]; call it once a second."""
         if self._is_heard:
             self._heard_ns = now_ns
         self._is_heard = False
         self._is_silent = now_ns - self._heard_ns >= SILENCE_NS
         self._far_tries = FAR_TRIES
-        self._tried = {}
+        self._derived = {}
 
     def hear(self) -> None:
-        """Something new has been opened."""
+        """Note that a new datagram was opened."""
         self._is_heard, self._is_silent = True, False
 
     def open(self, data: bytes, byte: int) -> tuple[bytes, Key, bool]:
-        """Open a datagram whose header has this byte of its generation.
+        """Open a datagram whose header has this generation byte.
 
         Returns:
-            Its body, the pre-shared key behind it, and whether its generation is new to us.
+            Its body, its pre-shared key, and whether its generation is new.
 
         Raises:
             DecodeError: "tag".
@@ -145,9 +139,9 @@ class Openers:
         raise DecodeError("tag")
 
     def _generations(self, byte: int) -> range:
-        """Those that the byte may stand for.
+        """Return the generations that the byte may stand for.
 
-        One a little behind the newest is, too, if its key was not accepted for a while.
+        Some lie a little behind the newest, as their key may not have been accepted until now.
         """
         first = self._newest - KEPT + 1 + (byte - self._newest + KEPT - 1) % GENERATIONS
         first += GENERATIONS * (first < 0)
@@ -158,15 +152,15 @@ class Openers:
         return range(first, last + 1, GENERATIONS)
 
     def _candidates(self, generation: int) -> list[Opener]:
-        """What may open a generation; kept, so that a flood of forged ones derives no key twice."""
-        if generation not in self._tried:
-            self._tried[generation] = [
+        """Return the ciphers of a generation; cached against a flood of forged datagrams."""
+        if generation not in self._derived:
+            self._derived[generation] = [
                 (self._derive(key, generation), key) for key in self.accepted
             ]
-        return self._tried[generation]
+        return self._derived[generation]
 
     def _keep(self, generation: int, opener: Opener) -> None:
-        if generation > self._newest + KEPT:  # after a silence: their bytes are the next ones' soon
+        if generation > self._newest + KEPT:  # after a silence: newer generations reuse their bytes
             self._kept.clear()
         self._kept[generation % GENERATIONS] = opener
         self._newest = generation
@@ -174,9 +168,9 @@ class Openers:
             del self._kept[next(iter(self._kept))]
 
 
-ACCEPT, ALIVE = int(Kind.ACCEPT), int(Kind.ALIVE)  # an enum's member is slow to look up
+ACCEPT, ALIVE = int(Kind.ACCEPT), int(Kind.ALIVE)  # looking up an enum's member is slow
 NO_EPOCH = 0
-"""The epoch of an end that has no session, and of every hello, challenge and refusal."""
+"""Epoch of an end without a session, and of every hello, challenge and refusal."""
 TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {ACCEPT}
 """Kinds that belong to no epoch."""
 
@@ -184,14 +178,15 @@ AES_256_GCM, CHACHA20_POLY1305 = 1, 2
 REKEY_NS = 120_000_000_000
 """Age at which a sender changes its key [ns]. Source: WireGuard, REKEY-AFTER-TIME."""
 REKEY_DATAGRAMS = 2**32
-"""Datagrams of all kinds after which a sender changes its key.
+"""Number of datagrams of all kinds after which a sender changes its key.
 Deviation: WireGuard allows 2^60."""
 LOOKS = 3
-"""In a row at which the peer is heard with the key before, until this end goes back to it."""
+"""Number of checks in a row that find the peer using the older key, before this end returns to
+it."""
 
 
 class Agreement(NamedTuple):
-    """What the greetings of two ends agree on; with it each derives the keys of every epoch.
+    """What two ends agree on in the handshake, and derive the keys of every epoch from.
 
     Attributes:
         cloud_nonce: 16 bytes.
@@ -205,7 +200,15 @@ class Agreement(NamedTuple):
 
 
 class Session:
-    """What one end needs to talk under one epoch."""
+    """Keys and counters of one end under the current epoch.
+
+    Attributes:
+        epoch: Current epoch; `NO_EPOCH` without a session.
+        ring: The pre-shared keys.
+        accepted: Pre-shared keys that are accepted now.
+        greeting_key: Key of the last greeting opened.
+        epoch_key: Key with which the epoch began.
+    """
 
     sealed = True
 
@@ -213,42 +216,42 @@ class Session:
         """Start without a session.
 
         Args:
-            sends: The direction that this end sends in; it opens only the other one's datagrams.
-            ring: The pre-shared keys; followed in flight.
+            sends: Direction in which this end sends; it opens datagrams of the other one only.
+            ring: The pre-shared keys; the session follows changes in flight.
             now_ns: Monotonic clock [ns].
         """
         self.epoch = NO_EPOCH
         self.ring = ring
         self.accepted = ring.accepted(now_ns)
         self._ring_version = ring.version
-        self.greeting_key = ring.current  # that the last greeting was opened with
+        self.greeting_key = ring.current
         self._sends, self._opens = int(sends), 1 - int(sends)
         self._counters = dict.fromkeys(map(int, Kind), 0)
         self._agreement: Agreement | None = None
-        self._key = self.epoch_key = ring.current  # in use; that the epoch began with
+        self._key = self.epoch_key = ring.current
         self._generation = self._generation_byte = 0
         self._rekey_ns: int | None = None
         self._rekey_total = 0
         self._announced: tuple[int, Key, Cipher] | None = None
         self._openers: Openers | None = None  # of the epoch
-        self._newest = dict.fromkeys(map(int, Kind), -1)  # counters that the peer was heard with
-        self._heard = ring.current  # key that it was last heard with
-        self._apart = 0  # looks in a row at which that was another one than ours
+        self._newest = dict.fromkeys(map(int, Kind), -1)  # newest counter received, by kind
+        self._peer_key = ring.current  # with which the peer was last heard
+        self._mismatches = 0  # checks in a row that found another key there than ours
         self._tended_ns = now_ns
 
     def begin(self, epoch: int, agreement: Agreement | None = None, key: Key | None = None) -> None:
-        """Begin a new epoch: new keys, and counters start again but for those of no epoch.
+        """Begin an epoch: derive new keys and restart the counters of the kinds with an epoch.
 
         Args:
-            epoch: Its number.
-            agreement: Of the greetings; None for that of the epoch before.
-            key: That they were authenticated with; None for the one in use.
+            epoch: Number of the epoch.
+            agreement: Result of the handshake; None for that of the previous epoch.
+            key: Pre-shared key of the handshake; None for the key in use.
         """
         self.epoch = epoch
         self._counters |= dict.fromkeys(self._counters.keys() - TIMELESS, 0)
         self._agreement = agreement or self._agreement
-        self._key = self.epoch_key = self._heard = key or self._key
-        self._generation = self._generation_byte = self._apart = 0
+        self._key = self.epoch_key = self._peer_key = key or self._key
+        self._generation = self._generation_byte = self._mismatches = 0
         self._rekey_ns = None
         self._rekey_total = self._sent() + REKEY_DATAGRAMS
         self._announced = None
@@ -257,7 +260,7 @@ class Session:
         self._newest = dict.fromkeys(self._newest, -1)
 
     def seal(self, kind: int, body: bytes) -> bytes:
-        """Make the datagram of the session that carries `body`."""
+        """Seal `body` as the next datagram of this kind."""
         counters = self._counters
         counter = counters[kind]
         counters[kind] = counter + 1
@@ -265,7 +268,7 @@ class Session:
         return header + self._cipher.encrypt(header[4:], body, header)
 
     def greet(self, kind: int, body: bytes, key: Key | None = None) -> bytes:
-        """Make a greeting, authenticated with a pre-shared key; by default the one in use."""
+        """Make a greeting authenticated with a pre-shared key, by default the one in use."""
         counter = self._counters[kind]
         self._counters[kind] = counter + 1
         epoch = NO_EPOCH if kind in TIMELESS else self.epoch
@@ -273,42 +276,42 @@ class Session:
         return data + (key or self._key).tag(data)
 
     def open(self, data: bytes) -> Datagram:
-        """Verify a datagram and take it apart; nothing changes unless its tag is right.
+        """Verify and decode a datagram; nothing changes unless its tag is right.
 
         Raises:
-            DecodeError: "malformed", "version", "direction" for one of our own direction,
-                "old_epoch" for one of another epoch, or "tag".
+            DecodeError: "malformed", "version", "direction" (our own direction), "old_epoch"
+                (another epoch) or "tag".
         """
         _, direction, epoch, generation, kind, counter = check(data)
         if direction != self._opens:
             raise DecodeError("direction")
         if self._ring_version != self.ring.version:
-            self._take_up_keys()
+            self._update_keys()
         if kind <= LAST_GREETING:
             return kind, direction, epoch, counter, self._open_greeting(data)
         if epoch != self.epoch or not epoch:
             raise DecodeError("old_epoch")
-        assert self._openers is not None, "an epoch has them"
-        body, key, anew = self._openers.open(data, generation)
-        if counter >> 63:  # nobody counts as far, and what is flown by it could not be recorded
+        assert self._openers is not None, "an epoch has openers"
+        body, key, is_new = self._openers.open(data, generation)
+        if counter >> 63:  # a recording holds signed 64-bit integers
             raise DecodeError("malformed")
-        if counter > self._newest[kind]:  # what is repeated anybody can send
+        if counter > self._newest[kind]:  # anybody can repeat an older datagram
             self._newest[kind] = counter
-            self._hear(key, anew)
+            self._hear(key, is_new)
         return kind, direction, epoch, counter, body
 
     def next_counter(self, kind: int) -> int:
-        """The counter that the next datagram of this kind will carry."""
+        """Return the counter of the next datagram of this kind."""
         return self._counters[kind]
 
     def tend(self, now_ns: int) -> list[bytes]:
-        """Do what time asks for: rekey, take up new keys, drop old ones; call it once a second.
+        """Do what is due: rekey, adopt new keys, drop old ones; call it once a second.
 
         Returns:
             Datagrams to send: the announcement of a key that the peer has not used yet.
         """
         self._tended_ns = now_ns
-        self._take_up_keys()
+        self._update_keys()
         if self._openers is None:
             return []
         self._openers.look(now_ns)
@@ -321,38 +324,38 @@ class Session:
             self._rekey_ns, self._rekey_total = now_ns + REKEY_NS, self._sent() + REKEY_DATAGRAMS
         return [] if self._key == self.ring.current else [self._announce()]
 
-    def _take_up_keys(self) -> None:
-        """A key that is not accepted any more opens nothing from now on."""
+    def _update_keys(self) -> None:
+        """Adopt the keys of the ring; keys that are no longer accepted open nothing."""
         self._ring_version = self.ring.version
         self.accepted = self.ring.accepted(self._tended_ns)
         if self._openers is not None and self._openers.accepted != self.accepted:
             self._openers.accept(self.accepted)
 
-    def _hear(self, key: Key, anew: bool) -> None:
-        """The peer seals with this key, or, in a generation that is new, announces it perhaps."""
+    def _hear(self, key: Key, is_new: bool) -> None:
+        """Note the key of a datagram; in a new generation it may be only an announcement."""
         assert self._openers is not None
         self._openers.hear()
-        if not anew:
-            self._heard = key
+        if not is_new:
+            self._peer_key = key
         elif key == self.ring.current != self._key:
             self._move_on(key)
 
     def _key_for_peer(self) -> Key:
-        """The one to seal with: which the peer is heard with, for it may not have ours any more."""
-        heard = self._heard if self._heard in self.accepted else self.ring.current
-        self._apart = self._apart + 1 if heard != self._key else 0
-        looks = 1 if heard == self.ring.current or self._key not in self.accepted else LOOKS
-        return heard if self._apart >= looks else self._key
+        """Return the key to seal with: the peer's, because it may not have ours any more."""
+        peer = self._peer_key if self._peer_key in self.accepted else self.ring.current
+        self._mismatches = self._mismatches + 1 if peer != self._key else 0
+        looks = 1 if peer == self.ring.current or self._key not in self.accepted else LOOKS
+        return peer if self._mismatches >= looks else self._key
 
     def _sent(self) -> int:
         return sum(self._counters.values())
 
     def _move_on(self, key: Key) -> None:
-        """Seal with the next generation, of this key."""
+        """Seal with the next generation of this key from now on."""
         self._generation = self._next_generation
         self._generation_byte = self._generation % GENERATIONS
         self._key = key
-        self._apart = 0
+        self._mismatches = 0
         self._cipher = self._derive(key, self._sends, self._generation)
         self._announced = None
 
@@ -361,7 +364,7 @@ class Session:
         return 1 + (self._announced[0] if self._announced else self._generation)
 
     def _announce(self) -> bytes:
-        """Say, sealed with the new key, that this end has it."""
+        """Make a datagram sealed with the new key, which tells the peer that this end has it."""
         key = self.ring.current
         if self._announced is None or self._announced[1] != key:
             generation = self._next_generation
@@ -384,7 +387,7 @@ class Session:
         return self._derive(key, self._opens, generation)
 
     def _derive(self, key: Key, direction: int, generation: int) -> Cipher:
-        assert self._agreement is not None, "greetings come first"
+        assert self._agreement is not None, "the handshake comes first"
         cloud, world, suite = self._agreement
         use = b"session %d %d %d %d" % (suite, direction, self.epoch, generation)
         secret = key.derive(cloud + world, use)
@@ -394,7 +397,7 @@ class Session:
 def pair(
     epoch: int = 1, secret: bytes = bytes(32), suite: int = AES_256_GCM
 ) -> tuple[Session, Session]:
-    """Make world's and cloud's end of one session, for tests; the same for the same arguments."""
+    """Make world's and cloud's end of a session for tests; equal arguments give equal keys."""
     world, cloud = (
         Session(sends, KeyRing(KeySet(Key(secret))))
         for sends in (Direction.UPLINK, Direction.DOWNLINK)
@@ -405,12 +408,12 @@ def pair(
 
 
 NO_SECRET = KeySet(Key(bytes(32)))
-"""What the greetings within one process are authenticated with."""
+"""Key of the greetings within one process, where nothing is secret."""
 NO_TAG = bytes(TAG_SIZE)
 
 
 class UnsealedSession(Session):
-    """A session whose datagrams are as long as sealed ones; nothing but their tag is missing."""
+    """A session for two ends in one process: datagrams keep their length but have no tag."""
 
     sealed = False
 
@@ -419,16 +422,16 @@ class UnsealedSession(Session):
         super().__init__(sends, KeyRing(NO_SECRET))
 
     def seal(self, kind: int, body: bytes) -> bytes:
-        """Make the datagram of the session that carries `body`."""
+        """Seal `body` as the next datagram of this kind."""
         counter = self._counters[kind]
         self._counters[kind] = counter + 1
         return encode_header(kind, self._sends, self.epoch, counter) + body + NO_TAG
 
     def open(self, data: bytes) -> Datagram:
-        """Check a datagram and take it apart.
+        """Check and decode a datagram.
 
         Raises:
-            DecodeError: As `Session.open`; "tag" for greetings only.
+            DecodeError: As in `Session.open`; "tag" for greetings only.
         """
         _, direction, epoch, _, kind, counter = check(data)
         if direction != self._opens:
@@ -440,10 +443,10 @@ class UnsealedSession(Session):
         return kind, direction, epoch, counter, data[HEADER_SIZE:-TAG_SIZE]
 
     def tend(self, now_ns: int) -> list[bytes]:
-        """There is nothing to do."""
+        """Do nothing: an unsealed session has no keys to change."""
         return []
 
 
 def make_session(sends: Direction, ring: KeyRing | None, now_ns: int = 0) -> Session:
-    """Make an end's session: sealed if it has keys, else one that must stay in its process."""
+    """Make an end's session: sealed if it has keys, else unsealed and only for one process."""
     return UnsealedSession(sends) if ring is None else Session(sends, ring, now_ns)

@@ -230,7 +230,8 @@ def test_emergency_stop_and_acknowledgement(
     said = capsys.readouterr().out.splitlines()
     assert re.search(r" m, seen 0\.\d\d s ago$", said[-3])
     assert re.fullmatch(r"guard ESTOP for \d+\.\d s: emergency stop", said[-2])
-    assert said[-1] == "next: the rotors are stopped; see why, then: cloudrc mission acknowledge"
+    after = "the rotors are stopped; find the cause, then: cloudrc mission acknowledge"
+    assert said[-1] == f"next: {after}"
     assert mission("acknowledge") == 0
     api.until(lambda: api.get("/v1/state")["seen"]["guard"] == "GROUND")
     assert capsys.readouterr().out.splitlines() == [

@@ -1,4 +1,4 @@
-"""A control loop without ends: telemetry for it, and what it commands."""
+"""Provide a control loop without endpoints, telemetry for it, and its commands."""
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.controllers.pid import build as pid
@@ -27,7 +27,7 @@ def command(a_loop, now_ms):
 
 
 class Integrating(Controller):
-    """Says how often it was asked."""
+    """A plug-in that counts its calls."""
 
     def __init__(self):
         self.asked = 0

@@ -1,4 +1,4 @@
-"""Every plug-in file is found in its folder and held to the contract of its kind."""
+"""Check every plug-in file against the contract of its kind."""
 
 import importlib
 import inspect
@@ -65,7 +65,7 @@ def test_the_shipped_plugins_are_found():
 
 
 @every_plugin
-def test_build_needs_no_parameter_annotates_all_and_makes_its_kind(module, kind):
+def test_build_has_defaults_annotations_and_the_right_kind(module, kind):
     signature = inspect.signature(module.build, eval_str=True)
     for parameter in signature.parameters.values():
         assert parameter.annotation is not parameter.empty, parameter
@@ -75,7 +75,7 @@ def test_build_needs_no_parameter_annotates_all_and_makes_its_kind(module, kind)
 
 
 @every_plugin
-def test_the_docstrings_say_what_it_is_where_it_comes_from_and_what_parameters_mean(module, kind):
+def test_docstrings_have_a_source_and_explain_all_parameters(module, kind):
     assert "Source:" in module.__doc__
     assert inspect.getdoc(type(module.build()))
     for name in inspect.signature(module.build).parameters:
@@ -109,7 +109,7 @@ def test_horizon_is_finite_and_never_negative(module, given_samples, age):
 @given(uplink=st.floats(0, 0.5), downlink=st.floats(0, 0.5), hold=st.floats(0, 0.01))
 @fewer
 def test_horizon_of_a_constant_loop_is_its_delay(module, uplink, downlink, hold):
-    """It may count the hold on the robot, as the paper's tau_n does, but nothing more."""
+    """It may include the hold on the robot, as the paper's tau_n does, but nothing more."""
     estimator, offset, rtt = module.build(), 3.0, uplink + downlink
     for _ in range(300):
         estimator.update(DelaySample(rtt + hold, rtt, downlink - offset))
@@ -157,7 +157,7 @@ def test_a_predictor_forgets_everything_when_it_is_reset(module):
         used.observe(Odometry(k * 10**7, ZERO, UPRIGHT, (0.1 * k * k, -k, 2.0), (1.0, 2.0, 3.0)))
         used.commanded(Command(k, k, 0, (1.0, 2.0, 3.0), 0.5))
     used.reset()
-    # The stamps of a new session may begin anywhere, earlier ones included.
+    # The stamps of a new session may begin anywhere, even earlier.
     for k in range(5):
         sample = Odometry(k * 10**7, ZERO, UPRIGHT, (0.2 * k, 0.0, 1.0), ZERO)
         used.observe(sample)

@@ -6,7 +6,7 @@ from cloudrc.cloud.estimators import DelaySample, ewma, running_mean, running_me
 
 
 def loop_delay(seconds):
-    """A sample whose other delays would give another answer if they were used."""
+    """Make a sample whose other delays would give another result if they were used."""
     return DelaySample(loop_delay=seconds, rtt=seconds - 0.006, applied_minus_stamp=-777.0)
 
 
@@ -32,7 +32,7 @@ def test_running_mean_hardly_notices_a_step_after_a_long_time():
     assert estimator.horizon(0.0) == pytest.approx((1000 * 0.020 + 100 * 0.070) / 1100)
 
 
-def test_running_mean_500_is_the_same_mean_for_the_first_500_samples():
+def test_running_mean_500_is_a_mean_for_the_first_500_samples():
     estimator, reference = running_mean_500.build(), running_mean.build()
     for k in range(500):
         feed(estimator, 0.020 + k * 1e-4)
@@ -40,7 +40,7 @@ def test_running_mean_500_is_the_same_mean_for_the_first_500_samples():
         assert estimator.horizon(0.0) == reference.horizon(0.0)
 
 
-def test_running_mean_500_keeps_a_gain_of_one_in_500_from_then_on():
+def test_running_mean_500_then_keeps_a_gain_of_1_in_500():
     estimator = running_mean_500.build()
     feed(estimator, 0.020, 1000)
     feed(estimator, 0.070, 100)
@@ -55,7 +55,7 @@ def test_running_mean_500_takes_another_count():
     assert estimator.horizon(0.0) == pytest.approx(0.065)  # 50 + (80 - 50) / 2
 
 
-def test_ewma_starts_with_its_first_sample_and_then_moves_by_the_gain():
+def test_ewma_starts_at_the_first_sample_and_moves_by_the_gain():
     estimator = ewma.build()
     feed(estimator, 0.040)
     assert estimator.horizon(0.0) == pytest.approx(0.040)
@@ -73,12 +73,12 @@ def test_ewma_tracks_half_a_step_within_fourteen_samples():
 
 
 @pytest.mark.parametrize("offset", [0.0, 1.234, -86_400.0])
-def test_split_adds_the_age_of_this_packet_and_the_offset_of_the_clocks_cancels(offset):
+def test_split_adds_the_age_and_cancels_the_clock_offset(offset):
     estimator = split.build()
     uplink, downlink = 0.030, 0.050
     estimator.update(DelaySample(9.0, 9.0, applied_minus_stamp=downlink - offset))
     assert estimator.horizon(uplink + offset) == pytest.approx(0.080, abs=1e-9)
-    # A slow packet is known to be slow at once; nothing is averaged.
+    # The age of a slow packet counts at once, without averaging.
     assert estimator.horizon(0.090 + offset) == pytest.approx(0.140, abs=1e-9)
 
 
@@ -97,12 +97,12 @@ def test_split_is_never_negative_when_the_clock_of_world_jumps():
 
 @pytest.mark.parametrize("gain", [0, -0.1, 1.5, float("nan"), float("inf"), "fast", True])
 @pytest.mark.parametrize("build", [ewma.build, split.build])
-def test_a_gain_that_makes_no_average_is_refused(build, gain):
+def test_a_gain_outside_0_to_1_is_refused(build, gain):
     with pytest.raises(ValueError, match=r"^gain: .*(above 0|at most 1|finite|not a number)"):
         build(gain=gain)
 
 
 @pytest.mark.parametrize("count_max", [0, -3, 2.5, float("nan")])
-def test_a_count_that_counts_nothing_is_refused(count_max):
+def test_an_invalid_count_is_refused(count_max):
     with pytest.raises(ValueError, match=r"^count_max: "):
         running_mean_500.build(count_max=count_max)

@@ -1,4 +1,4 @@
-"""The control loop: what telemetry says about delays, and when the reference is frozen."""
+"""The control loop: delays from telemetry, and when the loop freezes."""
 
 import pytest
 
@@ -27,7 +27,7 @@ def test_a_command_names_its_basis_and_how_long_it_was_held():
 
 
 def test_a_repeated_echo_is_no_sample():
-    """While the downlink is silent one command is echoed over and over, older each time."""
+    """While the downlink is silent, world echoes the same command with a growing age."""
     a_loop = loop()
     a_loop.observe(telemetry(100, echo_ms=1000), 1090 * MS)
     for k in range(1, 2000):
@@ -60,7 +60,7 @@ def test_a_horizon_out_of_range_is_clamped_and_counted(horizon, clamped):
     assert a_loop.counts["horizon_clamped"] == 1
 
 
-def test_a_silent_echo_freezes_the_reference_after_horizon_and_400_ms():
+def test_a_silent_echo_freezes_after_horizon_plus_400_ms():
     controller = Integrating()
     a_loop = loop(controller=controller)
     a_loop.observe(telemetry(100, echo_ms=1000), 1100 * MS)  # a horizon of 100 ms
@@ -75,7 +75,7 @@ def test_a_silent_echo_freezes_the_reference_after_horizon_and_400_ms():
     assert command(a_loop, 1520)[0].velocity == (1.0, 0.0, 0.0)
 
 
-def test_before_the_first_echo_there_is_as_much_time():
+def test_the_first_echo_has_as_much_time():
     a_loop = loop(controller=Integrating())
     a_loop.observe(telemetry(100), 1100 * MS)
     assert command(a_loop, 2000)[0].velocity == (1.0, 0.0, 0.0)
@@ -85,7 +85,7 @@ def test_before_the_first_echo_there_is_as_much_time():
     assert command(a_loop, 2410)[0].velocity == (1.0, 0.0, 0.0)
 
 
-def test_while_frozen_the_predictor_is_told_to_expect_no_motion():
+def test_while_frozen_the_predictor_gets_commands_of_zero():
     told = []
 
     class Listening(Predictor):

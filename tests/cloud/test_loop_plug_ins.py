@@ -1,4 +1,4 @@
-"""What plug-ins may do to the control loop: raise and return anything, without an end to it."""
+"""Plug-ins may raise and return anything: the control loop goes on."""
 
 from collections import Counter
 from math import inf, nan
@@ -39,7 +39,7 @@ class Closing(Estimator, Predictor, Controller):
 
 
 class Speechless(Estimator, Predictor, Controller):
-    """Raises what cannot be said."""
+    """Raises an exception without a text."""
 
     class Error(Exception):
         def __str__(self):
@@ -75,7 +75,7 @@ class NotFinite(Estimator, Predictor, Controller):
 
 @pytest.mark.parametrize("bad", [Raising, Leaving, Closing, Speechless, OutOfShape, NotFinite])
 @pytest.mark.parametrize("kind", ["estimator", "predictor", "controller"])
-def test_a_plug_in_that_fails_is_replaced_counted_and_reported_once(kind, bad):
+def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     broken = {kind: bad if kind == "estimator" else bad()}
     a_loop = loop(**broken)
     for k in range(3):
@@ -87,7 +87,7 @@ def test_a_plug_in_that_fails_is_replaced_counted_and_reported_once(kind, bad):
     (fault,) = a_loop.take_faults()
     assert fault.code == f"{kind}_failed"
     assert "\n" not in fault.text
-    assert f"mend cloud.{kind}" in fault.text
+    assert f"fix cloud.{kind}" in fault.text
 
 
 ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
@@ -95,7 +95,7 @@ ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
 
 @pytest.mark.parametrize("field", ["velocity", "proportional", "integral", "derivative"])
 @pytest.mark.parametrize("wrong", [(0.1, 0.2), (0.1, 0.2, 0.3, 0.4), "abc", None, (None,) * 3])
-def test_what_is_no_triple_of_numbers_is_not_flown(field, wrong):
+def test_an_output_that_is_not_three_numbers_is_not_flown(field, wrong):
     class Odd(Controller):
         def update(self, *arguments):
             return ANY._replace(**{field: wrong})
@@ -116,7 +116,7 @@ def test_an_output_without_its_terms_is_not_flown():
     assert command(a_loop, 1094)[0].velocity == ZERO
 
 
-def test_arrays_and_generators_become_numbers_that_can_be_told():
+def test_arrays_and_generators_become_plain_numbers():
     class Arrays(Estimator, Predictor, Controller):
         def horizon(self, age):
             return np.float32(0.5)
@@ -135,7 +135,7 @@ def test_arrays_and_generators_become_numbers_that_can_be_told():
     assert str(from_line(to_line(control))) == str(control)
 
 
-def test_plug_ins_that_fail_as_they_begin_anew_are_told_with_the_next_telemetry():
+def test_a_failing_reset_is_reported_with_the_next_telemetry():
     times = Counter()
 
     class Once:
@@ -167,10 +167,10 @@ def test_plug_ins_that_fail_as_they_begin_anew_are_told_with_the_next_telemetry(
     faults = {fault.code: (fault.stamp_ns, fault.text) for fault in a_loop.take_faults()}
     assert set(faults) == {"estimator_failed", "predictor_failed", "controller_failed"}
     assert {stamp_ns for stamp_ns, _ in faults.values()} == {1090 * MS}
-    assert "it is asked on as it is" in faults["controller_failed"][1]
+    assert "cloud goes on using it" in faults["controller_failed"][1]
 
 
-def test_ctrl_c_in_a_plug_in_is_the_persons():
+def test_ctrl_c_in_a_plug_in_ends_the_program():
     class Interrupted(Controller):
         def update(self, *arguments):
             raise KeyboardInterrupt
@@ -181,7 +181,7 @@ def test_ctrl_c_in_a_plug_in_is_the_persons():
         command(a_loop, 1094)
 
 
-def test_what_a_plug_in_says_is_cut_to_a_line_that_can_be_written():
+def test_a_long_error_of_a_plug_in_is_cut_to_one_line():
     class Verbose(Controller):
         def update(self, *arguments):
             raise ValueError("no caf\udce9 " + "x" * 100_000)
@@ -192,4 +192,4 @@ def test_what_a_plug_in_says_is_cut_to_a_line_that_can_be_written():
     (fault,) = a_loop.take_faults()
     assert "ValueError: no caf\\udce9 xxx" in fault.text
     assert len(fault.text.encode()) < 2200
-    assert fault.text.endswith("mend cloud.controller or choose another")
+    assert fault.text.endswith("fix cloud.controller or choose another")

@@ -1,4 +1,4 @@
-"""The alarm: an emergency stop that cloud sees through alone, until the robot is seen to stand."""
+"""The alarm: cloud repeats an emergency stop until the guard is in ESTOP."""
 
 from cloudrc.cloud.operator import REPEAT_NS, Alarm
 from cloudrc.messages import GuardState, OperatorRequest, Request
@@ -12,11 +12,11 @@ def sounding():
     return alarm
 
 
-def test_it_is_silent_before_anybody_sounds_it():
+def test_an_alarm_sends_nothing_before_it_starts():
     assert Alarm().due(3, 10**18) is None
 
 
-def test_it_is_repeated_under_one_number_until_the_guard_is_seen_to_have_stopped():
+def test_an_alarm_repeats_one_number_until_the_guard_stops():
     alarm = sounding()
     first = alarm.due(3, 50)
     assert first == OperatorRequest(4, Request.ESTOP)
@@ -27,21 +27,21 @@ def test_it_is_repeated_under_one_number_until_the_guard_is_seen_to_have_stopped
     assert alarm.due(4, 10**18) is None
 
 
-def test_a_request_that_came_first_under_its_number_does_not_swallow_it():
+def test_an_alarm_gets_a_new_number_if_its_own_is_taken():
     """World acts on rising numbers only."""
     alarm = sounding()
     alarm.due(3, 0)
-    alarm.see(TRACK, 4)  # a start of teleop's own counting
+    alarm.see(TRACK, 4)  # a start with a number of teleop
     assert alarm.due(4, REPEAT_NS).number == 5
 
 
-def test_a_request_after_it_does_not_overtake_it():
+def test_an_alarm_stays_above_later_requests():
     alarm = sounding()
     alarm.due(3, 0)
     assert alarm.due(7, REPEAT_NS).number == 8
 
 
-def test_sounded_twice_it_goes_on_and_after_its_end_it_begins_again():
+def test_an_alarm_can_start_again_after_its_end():
     alarm = sounding()
     alarm.due(3, 0)
     alarm.sound()

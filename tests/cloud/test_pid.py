@@ -38,7 +38,7 @@ def test_derivative_brakes_the_measured_velocity():
     assert output.velocity == pytest.approx((-1.0, 0.5, 0.0))
 
 
-def test_a_step_of_the_setpoint_does_not_kick_through_the_derivative():
+def test_a_step_of_the_setpoint_causes_no_derivative_kick():
     controller = pid.build(gain_p=(1.0, 1.0, 1.0), gain_d=(0.5, 0.5, 0.5))
     moving = at(ZERO, velocity=x(2.0))
     before = controller.update(moving, Setpoint(ZERO), DT)
@@ -70,7 +70,7 @@ def test_reset_empties_the_integral():
     assert controller.update(at(ZERO), Setpoint(x(1.0)), DT).integral == ZERO
 
 
-def test_a_saturated_axis_does_not_wind_up_and_the_others_integrate():
+def test_only_a_saturated_axis_stops_integrating():
     controller = pid.build(
         gain_p=(1.0, 1.0, 1.0), gain_i=(1.0, 1.0, 1.0), velocity_max=(1.0, 1.0, 1.0)
     )
@@ -80,7 +80,7 @@ def test_a_saturated_axis_does_not_wind_up_and_the_others_integrate():
     assert output.integral == pytest.approx((0.0, 0.4995, 0.0))
 
 
-def test_a_saturated_axis_still_integrates_an_error_that_drives_it_back():
+def test_a_saturated_axis_integrates_an_opposite_error():
     controller = pid.build(
         gain_p=(1.0, 1.0, 1.0),
         gain_i=(1.0, 1.0, 1.0),
@@ -96,14 +96,14 @@ def test_a_saturated_axis_still_integrates_an_error_that_drives_it_back():
 
 
 @pytest.mark.parametrize("limit", [{"speed_max": 1.0}, {"velocity_max": (1.0, 1.0, 1.0)}])
-def test_a_long_way_at_the_limit_ends_without_the_overshoot_of_a_wound_up_integral(limit):
+def test_saturation_causes_no_overshoot_by_windup(limit):
     controller = pid.build(gain_p=(1.0, 1.0, 1.0), gain_i=(0.2, 0.2, 0.2), **limit)
     position, highest = 0.0, 0.0
     for _ in range(4000):
         output = controller.update(at(x(position)), Setpoint(x(10.0)), DT)
         position += output.velocity[0] * DT
         highest = max(highest, position)
-    # Wound up over the 9 s at the limit, the integral would hold 9 m/s there: metres too far.
+    # Without anti-windup the integral would reach 9 m/s in 9 s: an overshoot of metres.
     assert highest < 10.3
     assert position == pytest.approx(10.0, abs=0.01)
 
@@ -129,7 +129,7 @@ def test_yaw_turns_the_short_way_round():
     assert output.yaw_rate == pytest.approx(2.0 * 20 * pi / 180)
 
 
-def test_a_limit_does_not_turn_a_number_that_is_not_one_into_full_speed():
+def test_a_limit_does_not_turn_nan_into_full_speed():
     controller = pid.build(velocity_max=(1.0, 1.0, 1.0), gain_i=(1.0, 1.0, 1.0))
     output = controller.update(at(x(float("nan"))), Setpoint(ZERO), DT)
     assert output.velocity[0] != output.velocity[0]
@@ -152,8 +152,6 @@ def test_a_limit_does_not_turn_a_number_that_is_not_one_into_full_speed():
         ({"speed_max": True}, r"speed_max: True is not a number"),
     ],
 )
-def test_a_parameter_that_cannot_be_used_is_named_with_its_value_and_the_reason(
-    parameters, message
-):
+def test_an_invalid_parameter_is_named_with_value_and_reason(parameters, message):
     with pytest.raises(ValueError, match=rf"^{message}"):
         pid.build(**parameters)

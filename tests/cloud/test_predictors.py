@@ -28,7 +28,7 @@ def command(velocity):
 
 
 def accelerate(predictor, velocities, period_ns=10_000_000):
-    """Let it observe these x velocities; return the last sample."""
+    """Let the predictor observe these x velocities; return the last sample."""
     for k, velocity in enumerate(velocities):
         sample = SAMPLE._replace(stamp_ns=k * period_ns, velocity=(velocity, 0.0, 0.0))
         predictor.observe(sample)
@@ -68,7 +68,7 @@ def test_a_body_that_does_not_turn_keeps_its_orientation(module):
     assert module.build().predict(still, 1.0).orientation_wxyz == UPRIGHT
 
 
-def test_commanded_velocity_uses_the_last_command_not_the_measurement():
+def test_commanded_velocity_uses_the_last_command():
     predictor = commanded_velocity.build()
     predictor.commanded(command((9.0, 9.0, 9.0)))
     predictor.commanded(command((1.0, 0.0, -2.0)))
@@ -85,7 +85,7 @@ def test_commanded_velocity_stands_still_without_a_command():
     assert predictor.predict(SAMPLE, 0.2).position == SAMPLE.position
 
 
-def test_constant_acceleration_adds_the_acceleration_of_recent_velocities():
+def test_constant_acceleration_uses_recent_velocities():
     predictor = constant_acceleration.build()
     newest = accelerate(predictor, [0.0, 0.1, 0.2])  # 10 m/s^2
     prediction = predictor.predict(newest, 0.1)
@@ -104,7 +104,7 @@ def test_constant_acceleration_ignores_a_repeated_or_late_stamp():
     assert predictor.predict(newest, 0.1) == other.predict(newest, 0.1)
 
 
-def test_constant_acceleration_forgets_what_is_older_than_its_window():
+def test_constant_acceleration_forgets_samples_before_its_window():
     predictor = constant_acceleration.build(window=0.02)
     newest = accelerate(predictor, [0.0, 5.0, 6.0, 6.0, 6.0])
     assert predictor.predict(newest, 0.1).velocity == pytest.approx((6.0, 0.0, 0.0))

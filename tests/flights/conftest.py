@@ -1,4 +1,4 @@
-"""Both ends around nothing, no robot and no loop: for a million short lives of the session.
+"""Provide both endpoints, alone or in flights, and the silences and kills of the tests.
 
 Fly an experiment in virtual time, without files, and judge it.
 
@@ -45,7 +45,7 @@ from cloudrc.report.document import Run
 from cloudrc.report.write import Assessment, assess
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
-from cloudrc.tunnel.handshake import Knocker
+from cloudrc.tunnel.handshake import ClientHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import AES_256_GCM, Session, make_session
 from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
@@ -57,7 +57,7 @@ KEY = Key(b"k" * 32)
 
 
 def bare_robot() -> SimpleNamespace:
-    """A robot that flies whatever the session lets through."""
+    """A robot that flies every accepted command."""
     guard = SimpleNamespace(
         state=GuardState.TRACK,
         cause=Cause.COMMAND,
@@ -84,7 +84,7 @@ def bare_robot() -> SimpleNamespace:
 def bare_world(
     nonce: bytes = b"w", last_epoch: int = 0, ring: KeyRing | None = None, start_ns: int = 0
 ) -> WorldEndpoint:
-    """World's end, sealed if it gets keys."""
+    """Make world's end, sealed if it gets keys."""
     identity = WorldIdentity(CLOCK, nonce.ljust(16), last_epoch, ring)
     return WorldEndpoint(
         bare_robot(),
@@ -97,7 +97,7 @@ def bare_world(
 
 
 class NoLoop:
-    """Stands for cloud's loop: it knows when the robot was seen, and computes nothing."""
+    """Stand-in for cloud's loop that only notes the newest telemetry."""
 
     def __init__(self) -> None:
         self.faults: list[Fault] = []
@@ -112,7 +112,7 @@ class NoLoop:
 
 
 def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
-    """Cloud's end; what is put into its `teleop.outputs` it sends."""
+    """Make cloud's end; it sends the messages in its `teleop.outputs`."""
     teleop = SimpleNamespace(
         outputs=[], outcome=None, settled=True,
         see=lambda seen, now_ns: None, handle_deadline=lambda now_ns: None,
@@ -128,15 +128,15 @@ def ring() -> KeyRing:
 
 
 class BareCloud:
-    """A cloud process that greets and commands when it is told to."""
+    """A cloud process that sends hellos and commands on request."""
 
     def __init__(self, nonce: bytes, keys: KeyRing | None) -> None:
         self.session: Session = make_session(Direction.DOWNLINK, keys)
-        self.knocker = Knocker(nonce.ljust(16), CLOCK, AES_256_GCM)
+        self.handshake = ClientHandshake(nonce.ljust(16), CLOCK, AES_256_GCM)
         self.heard: list[str] = []
 
     def hello(self) -> bytes:
-        return self.session.greet(Kind.HELLO, self.knocker.hello())
+        return self.session.greet(Kind.HELLO, self.handshake.make_hello())
 
     def command(self, now_ns: int = 0) -> bytes:
         body = codec.encode_command(Command(now_ns, now_ns, 0, ZERO, 0.0))
@@ -157,20 +157,20 @@ class BareCloud:
             return None
         self.heard.append(Kind(kind).name)
         if kind == Kind.CHALLENGE:
-            hello = self.knocker.challenged(codec.decode_challenge(body))
+            hello = self.handshake.answer_challenge(codec.decode_challenge(body))
             return hello and self.session.greet(Kind.HELLO, hello)
         if kind == Kind.BUSY:
-            self.knocker.refused(codec.decode_busy(body))
+            self.handshake.receive_busy(codec.decode_busy(body))
         if kind == Kind.ACCEPT:
             accept = codec.decode_accept(body)
-            agreement = self.knocker.accepted(epoch, accept, self.session.epoch, asks=True)
+            agreement = self.handshake.receive_accept(epoch, accept, self.session.epoch, asks=True)
             if agreement is not None:
                 self.session.begin(epoch, agreement)
         return None
 
 
 class Bare:
-    """One world and some clouds, joined by a link that loses and delays nothing."""
+    """One world and some clouds, connected by a link without loss and delay."""
 
     def __init__(self, keys: KeyRing) -> None:
         self.keys, self.now_ns = keys, 0
@@ -224,7 +224,7 @@ LIMIT_NS = 150_000_000_000
 
 
 class Ends(NamedTuple):
-    """Both ends and what joins them."""
+    """Both endpoints and their link."""
 
     world: WorldEndpoint
     cloud: CloudEndpoint
@@ -232,7 +232,7 @@ class Ends(NamedTuple):
 
 
 def join(experiment: ResolvedExperiment, *, offset_ns: int = 0) -> Ends:
-    """Put an experiment together; with an offset the two clocks are not shared."""
+    """Assemble an experiment; with an offset the two ends have different clocks."""
     world_clock = b"another clock..." if offset_ns else SHARED_CLOCK
     world = assembly.build_world(experiment, WorldIdentity(world_clock, b"world".ljust(16)))
     cloud = assembly.build_cloud(
@@ -243,7 +243,7 @@ def join(experiment: ResolvedExperiment, *, offset_ns: int = 0) -> Ends:
 
 
 def records(experiment: ResolvedExperiment, **options: int) -> tuple[list[Record], list[Record]]:
-    """Fly; the records of world and of cloud."""
+    """Fly and return the records of world and of cloud."""
     _, cloud, run = join(experiment, **options)
     of_world: list[Record] = []
     of_cloud: list[Record] = []
@@ -257,7 +257,7 @@ def records(experiment: ResolvedExperiment, **options: int) -> tuple[list[Record
 
 
 def fly(name: str, *settings: str) -> Assessment:
-    """Fly; numbers and verdict."""
+    """Fly and return numbers and verdict."""
     experiment = load_experiment(name, settings)
     return assess(
         Recording.from_records(*records(experiment)), experiment, Run("virtual", "virtual")
@@ -265,12 +265,12 @@ def fly(name: str, *settings: str) -> Assessment:
 
 
 def numbers(assessment: Assessment) -> dict[str, float]:
-    """The numbers alone, in their units."""
+    """Return only the values of the numbers."""
     return {name: number.value for name, number in assessment.numbers.items()}
 
 
 def digest(experiment: ResolvedExperiment) -> str:
-    """SHA-256 of all records of a flight."""
+    """Compute the SHA-256 of all records of a flight."""
     digest = RecordHash()
     for each in records(experiment):
         digest.update(each)
@@ -282,12 +282,12 @@ PATIENCE = (
     "criteria.time_limit_s=200",
     *(f"mission.waypoints.{k}.time_limit_s=200" for k in range(7)),
 )
-"""So that no limit of time ends a mission that waits for its link."""
+"""Time limit that a mission waiting for its link does not reach."""
 SLOW = ("cloud.controller.speed_max=1.5",)
 
 
 class Instant(NamedTuple):
-    """The robot after one tick."""
+    """State of the robot after one tick."""
 
     stamp_ns: int
     state: GuardState
@@ -386,7 +386,7 @@ def _watch(robot, trace: list[Instant], begin_ns: int) -> None:
 
 COUNT = 200
 DAILY = range(COUNT)[13::40]
-"""Indices of those in the pipes that are not left to the night."""
+"""Indices of the instants in the pipes that are tested in every run."""
 REST = [k for k in range(COUNT) if k not in DAILY]
 LAST_S = 27.0
 """Uncapped the board is touched 1 s later; at 1.5 m/s 4.9 s later, 2.2 s after pipe 3's mouth."""
@@ -401,7 +401,7 @@ there is nothing left to resume."""
 
 
 class MidPipe(NamedTuple):
-    """An instant [s] at which the undisturbed robot's base is in the pipe of this index."""
+    """Return an instant [s] at which the undisturbed robot is in the pipe of this index."""
 
     start_s: float
     pipe: int
@@ -409,7 +409,7 @@ class MidPipe(NamedTuple):
 
 @cache
 def undisturbed(*settings: str) -> Flight:
-    """The flight without any silence or kill."""
+    """Fly without any silence or kill."""
     return fly("paper", *PATIENCE, *settings).flight
 
 
@@ -439,21 +439,24 @@ HOVER = load_experiment("hover", ["link.profile=ideal"])
 
 
 class Talk:
-    """A sealed world; the cloud is what the test says."""
+    """A sealed world with clouds that the test controls."""
 
     def __init__(self, last_epoch: int = 0, nonce: bytes = b"world", key: Key = KEY) -> None:
         ring = KeyRing(KeySet(KEY))
         identity = WorldIdentity(SHARED_CLOCK, nonce.ljust(16), last_epoch, ring)
         self.world = assembly.build_world(HOVER, identity)
         self.key, self.now_ns, self.records = key, 0, []
-        self.clouds: dict[bytes, tuple[Session, Knocker]] = {}
+        self.clouds: dict[bytes, tuple[Session, ClientHandshake]] = {}
         self.session = self.cloud(b"cloud")[0]
 
-    def cloud(self, nonce: bytes) -> tuple[Session, Knocker]:
+    def cloud(self, nonce: bytes) -> tuple[Session, ClientHandshake]:
         """The cloud process of this name; from here on the one that speaks."""
         if nonce not in self.clouds:
             session = Session(Direction.DOWNLINK, KeyRing(KeySet(self.key)))
-            self.clouds[nonce] = session, Knocker(nonce.ljust(16), SHARED_CLOCK, AES_256_GCM)
+            self.clouds[nonce] = (
+                session,
+                ClientHandshake(nonce.ljust(16), SHARED_CLOCK, AES_256_GCM),
+            )
         self.session = self.clouds[nonce][0]
         return self.clouds[nonce]
 
@@ -479,18 +482,20 @@ class Talk:
 
     def hello(self, nonce: bytes) -> int:
         """Greet as this cloud, up to world's answer; the epoch that it got, 0 if none."""
-        session, knocker = self.cloud(nonce)
-        self.send(session.greet(Kind.HELLO, knocker.hello()))
+        session, handshake = self.cloud(nonce)
+        self.send(session.greet(Kind.HELLO, handshake.make_hello()))
         answers = self.hear(Kind.CHALLENGE, Kind.ACCEPT)
         for kind, _, body in answers:
             if kind == Kind.CHALLENGE:
                 self.send(
-                    session.greet(Kind.HELLO, knocker.challenged(codec.decode_challenge(body)))
+                    session.greet(
+                        Kind.HELLO, handshake.answer_challenge(codec.decode_challenge(body))
+                    )
                 )
                 answers = self.hear(Kind.ACCEPT)
         for _, epoch, body in answers:
             accept = codec.decode_accept(body)
-            agreement = knocker.accepted(epoch, accept, session.epoch, asks=True)
+            agreement = handshake.receive_accept(epoch, accept, session.epoch, asks=True)
             if agreement is not None:
                 session.begin(epoch, agreement)
             return epoch

@@ -1,4 +1,4 @@
-"""What was captured in one run is worth nothing in the next, even if world has lost its epochs."""
+"""Datagrams captured in one run are refused in the next, even if world has lost its epochs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SECOND_NS = 1_000_000_000
 
 
 class Captured(VirtualRun):
-    """A flight of sealed ends with somebody who listens on the link."""
+    """Fly with sealed ends and capture all datagrams on the link."""
 
     def __init__(self, world_nonce: bytes, cloud_nonce: bytes, last_epoch: int = 0) -> None:
         ring = KeyRing(KeySet(Key(b"k" * 32)))
@@ -66,7 +66,7 @@ def first() -> Captured:
 
 
 def accepted(run: Captured) -> dict[str, int]:
-    """What a replay can do at worst: counts of what was let through."""
+    """Return the counts of accepted datagrams of a replay."""
     counts = {f"world {n}": run.world._counts[n] for n in ("used", "late", "repeated", "busy")}
     counts |= {f"cloud {n}": run.cloud._counts[n] for n in ("used", "late", "repeated", "busy")}
     return counts | {"sessions": run.world._session.epoch + run.cloud._session.epoch}
@@ -83,14 +83,14 @@ def test_a_run_replayed_after_both_restarts_is_not_accepted(first, last_epoch, s
     assert accepted(run) == before
     count = sum(map(len, first.heard.values()))
     figure("a run replayed after both restarts: accepted", 0, "==", 0, count=count)
-    # A challenge tells nothing, and a hello that answers an old one asks for nothing new.
+    # A challenge and a hello that answers an old one change nothing.
     assert set(drawn) <= {Kind.CHALLENGE, Kind.HELLO}
     assert len(drawn) <= 4, "a captured run of seconds makes nobody talk"
     run.go(run.now_ns + 6 * SECOND_NS)
     assert run.cloud.teleop.outcome is None or run.cloud.teleop.outcome.success
 
 
-def test_the_same_run_replayed_while_it_lasts_is_all_repeated():
+def test_a_run_replayed_during_the_run_is_all_repeated():
     run = Captured(b"world 1", b"cloud 1")
     run.go(4 * SECOND_NS)
     captured = {way: list(heard) for way, heard in run.heard.items()}
@@ -105,12 +105,12 @@ def test_the_same_run_replayed_while_it_lasts_is_all_repeated():
             run.cloud.receive_datagram(data, run.now_ns)
     used = [r for r in run.world.take_records() + run.cloud.take_records()
             if isinstance(r, Arrival) and r.used]  # fmt: skip
-    # What was still on the link counts once, when its copy arrives first.
+    # A datagram still on the link counts once, if its copy arrives first.
     assert len({(r.uplink, r.epoch, r.counter) for r in arrivals + used}) == len(arrivals + used)
     assert run.world._session.epoch == epoch
 
 
-def test_a_flood_of_what_is_repeated_is_counted_and_not_recorded_one_by_one():
+def test_a_flood_of_repeats_is_counted_but_not_recorded():
     run = Captured(b"world 1", b"cloud 1")
     run.go(2 * SECOND_NS)
     heard = {way: [d for d in data if peek(d)[0] in FLOWING] for way, data in run.heard.items()}
@@ -126,7 +126,7 @@ def test_a_flood_of_what_is_repeated_is_counted_and_not_recorded_one_by_one():
 
 
 def test_sealed_and_unsealed_flights_are_the_same_flight():
-    """Virtual time leaves the seal out; nothing else may change by that."""
+    """Flights in virtual time are unsealed; nothing else may differ."""
     from cloudrc.record.hash import RecordHash
 
     digests = []
@@ -175,8 +175,8 @@ def greetings(run: Captured, kind: Kind, *, to_world: bool) -> list[bytes]:
 
 @pytest.mark.parametrize("rate_hz", [18, 25, 100, 500])
 @pytest.mark.parametrize("which", ["old hello", "fresh hello", "hellos", "challenges", "all"])
-def test_so_does_one_while_captured_greetings_are_repeated(first, which, rate_hz):
-    """Greetings carry the tag of a key that outlives them; they must lock nobody out."""
+def test_repeated_greetings_do_not_delay_a_restarted_cloud(first, which, rate_hz):
+    """Captured greetings keep valid tags; they must not keep out an honest cloud."""
     run = Captured(b"world 2", b"cloud 2", 4096)
     run.world._door._next_epoch = iter(range(1, 9)).__next__
     run.go(4 * SECOND_NS)
@@ -196,5 +196,5 @@ def test_so_does_one_while_captured_greetings_are_repeated(first, which, rate_hz
         for data in to_cloud:
             run.cloud.receive_datagram(data, run.now_ns)
         run.go(run.now_ns + SECOND_NS // rate_hz)
-    # An old challenge may take the place of a new one; the next slot of time has another cookie.
+    # An old challenge may replace a new one until the next time slot.
     is_back(run, restarted_ns, SECOND_NS + (COOKIE_NS if to_cloud else 0))

@@ -1,4 +1,4 @@
-"""The cloud process killed anywhere in the paper's mission: hold, and a new process goes on."""
+"""A kill of cloud anywhere in the paper's mission: the robot holds, a new process continues."""
 
 from math import hypot
 
@@ -12,13 +12,13 @@ from cloudrc.records import SessionOpened
 from tests.flights.conftest import DAILY, DAILY_ANYWHERE, REST, REST_ANYWHERE, SLOW, mid_pipe
 
 AWAY = 3.0
-"""Until there is a new process [s]."""
+"""Time until there is a new process [s]."""
 SAMPLE = 0.01
-"""Between two looks at where the robot is [s]."""
+"""Time between two samples of the robot's position [s]."""
 
 
 def fly_and_kill(at):
-    """A SIGKILL of cloud; what comes back has nothing of what the one before knew.
+    """Kill cloud; the new process knows nothing of the old one.
 
     With the index of the pipe that the base was in at the kill, -1 for none.
     """
@@ -35,7 +35,7 @@ def fly_and_kill(at):
 
 
 def calm_after(flight, start, end):
-    """How long the robot is faster than it counts as standing, up to the last time it is [s]."""
+    """Return when the robot was last too fast to count as standing [s]."""
     fast = [
         time
         for record in flight.trajectory()
@@ -46,7 +46,7 @@ def calm_after(flight, start, end):
 
 
 def greeted_after(flight, back):
-    """How many sessions world has opened since then."""
+    """Return how many sessions world has opened since then."""
     opened = [r for r in flight.of_world if isinstance(r, SessionOpened) and r.end == "world"]
     return sum(r.stamp_ns >= back * 1e9 for r in opened)
 
@@ -85,7 +85,7 @@ def check_kill_mid_pipe(figure, k):
 
 @pytest.mark.promise("brakes-without-commands")
 @pytest.mark.parametrize("k", DAILY)
-def test_when_its_cloud_is_killed_the_robot_stops_and_a_new_one_flies_on(k, figure):
+def test_a_new_cloud_flies_on_after_a_kill(k, figure):
     check_kill_mid_pipe(figure, k)
 
 

@@ -1,4 +1,4 @@
-"""The same experiment and seed give the same records, bit by bit, whatever the clocks say."""
+"""The same experiment and seed give identical records, for any clocks."""
 
 import os
 import subprocess
@@ -46,7 +46,7 @@ def test_twenty_runs_give_the_same_records():
 
 @pytest.mark.parametrize("offset_ns", [1_234_567_891, 86_400_000_000_000])
 def test_the_clocks_of_the_ends_need_not_agree(offset_ns):
-    """Everything that cloud does depends on ages, never on what its clock says."""
+    """Cloud depends on ages only, never on the value of its clock."""
     shared, apart = records(short()), records(short(), offset_ns=offset_ns)
     ours = Recording.from_records(*shared)
     theirs = Recording.from_records(*apart, offset_ns=-offset_ns)

@@ -1,4 +1,4 @@
-"""Both ends by their contract: sessions, bad datagrams, restarts, stalls; no link between them."""
+"""The contract of both endpoints without a link: sessions, bad datagrams, restarts, stalls."""
 
 from itertools import pairwise
 
@@ -39,15 +39,15 @@ def test_without_a_session_world_is_silent():
     assert talk.world.take_datagrams() == []
 
 
-def test_every_new_cloud_process_gets_a_rising_epoch_and_a_repeated_hello_the_same():
+def test_every_cloud_process_gets_a_new_epoch():
     talk, epochs = Talk(last_epoch=41), []
     for nonce in (b"one", b"one", b"two", b"two", b"three"):
-        talk.wait(talk.now_ns + 1_100 * MS)  # the one before has fallen silent
+        talk.wait(talk.now_ns + 1_100 * MS)  # the previous cloud is silent by now
         epochs.append(talk.hello(nonce))
     assert epochs == [42, 42, 43, 43, 44]
 
 
-def test_a_command_is_applied_at_the_first_tick_after_its_arrival(talk):
+def test_a_command_is_applied_at_the_next_tick(talk):
     talk.wait(21_300_000)
     talk.send(talk.command(basis_ns=20 * MS))
     talk.wait(40 * MS)
@@ -113,7 +113,7 @@ def test_a_bad_datagram_is_dropped_and_counted(talk, spoil, outcome):
     assert talk.take(CommandApplied) == []
 
 
-def test_what_is_beyond_all_reason_or_stale_is_refused_and_counted(talk):
+def test_absurd_and_stale_commands_are_refused_and_counted(talk):
     talk.wait(500 * MS)
     talk.send(talk.command((float("nan"), 0.0, 0.0)))
     talk.send(talk.command(basis_ns=100 * MS))
@@ -122,9 +122,9 @@ def test_what_is_beyond_all_reason_or_stale_is_refused_and_counted(talk):
     assert [change.state for change in talk.take(GuardChange)] == []
 
 
-def test_after_a_stall_what_waited_in_the_socket_is_stale_and_the_clock_slips(talk):
+def test_after_a_stall_waiting_commands_are_stale(talk):
     data = talk.command()
-    talk.now_ns = 5_000 * MS  # the process stood still; the datagram lay in the socket
+    talk.now_ns = 5_000 * MS  # the process stalled while the datagram was in the socket
     talk.send(data)
     assert talk.world.slip_ns > 4_000 * MS
     assert talk.counts()["stale"] == 1
@@ -139,7 +139,7 @@ def test_a_short_delay_is_caught_up_without_slipping(talk):
     assert {b - a for a, b in pairwise(stamps)} == {10 * MS}
 
 
-def test_a_start_from_the_spawn_resets_the_world_under_a_new_epoch():
+def test_a_start_from_the_spawn_begins_a_new_epoch():
     ends = join(load_experiment("hover", ["link.profile=ideal", "mission.waypoints.0.dwell_s=0.5"]))
     of_world = []
     ends.run.fly(lambda: ends.cloud.mission_over, 20_000 * MS, lambda w, c: of_world.extend(w))
@@ -168,7 +168,7 @@ def test_one_mission_can_follow_another_from_here():
 
 
 def fly_with_restart(restart):
-    """Hover; at 2 s one end is replaced by a new process; returns records of both ends."""
+    """Hover, replace one end by a new process at 2 s, and return the records of both ends."""
     ends = join(load_experiment("hover", ["mission.waypoints.0.dwell_s=8"]))
     of_world, of_cloud = [], []
 
@@ -182,7 +182,7 @@ def fly_with_restart(restart):
     return new, of_world, of_cloud
 
 
-def test_a_restarted_world_opens_a_higher_epoch_and_fails_the_mission():
+def test_a_restart_of_world_fails_the_mission():
     def restart(ends):
         identity = WorldIdentity(SHARED_CLOCK, b"another world".ljust(16), last_epoch=2)
         world = assembly.build_world(EXPERIMENT, identity, lambda: ends.run.now_ns)
@@ -194,7 +194,7 @@ def test_a_restarted_world_opens_a_higher_epoch_and_fails_the_mission():
     assert ends.cloud.teleop.outcome.code == "world_restarted"
 
 
-def test_a_restarted_cloud_gets_a_new_epoch_and_flies_its_mission():
+def test_a_restarted_cloud_gets_a_new_epoch_and_flies():
     def restart(ends):
         identity = CloudIdentity(SHARED_CLOCK, b"another cloud".ljust(16))
         experiment = load_experiment(

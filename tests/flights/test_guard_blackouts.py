@@ -1,4 +1,4 @@
-"""A silent link anywhere in the paper's mission: hold, touch nothing, go on, finish."""
+"""A silent link anywhere in the paper's mission: the robot holds, then finishes the mission."""
 
 import pytest
 
@@ -25,7 +25,7 @@ from tests.flights.conftest import (
 
 LONG = ("guard.hold_max_s=100",)
 FEW = (13, 133)
-"""Those of the instants in the pipes that are not left to the night, uncapped."""
+"""Instants in the pipes that are tested in every run without the cap."""
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def check_minute(figure, start_s, calm_within, *settings, where="anywhere"):
         figure(text, measured, "<=", asked, unit)
     assert silence.outcome == "done"
     assert silence.touched == []
-    # Of the newest command that was applied: not before the limit, and within a tick after it.
+    # The age of the newest applied command is at the limit or up to a tick above.
     assert 0.250 < silence.basis_age <= 0.252 + 1e-9
     assert silence.held_after <= 0.252
     assert silence.calm_after <= calm_within
@@ -72,7 +72,7 @@ def check_minute_mid_pipe(figure, k, calm_within, *settings):
 
 @pytest.mark.promise("brakes-without-commands")
 @pytest.mark.parametrize("k", DAILY)
-def test_without_its_cloud_the_robot_stops_within_a_second_and_stays(k, figure):
+def test_without_its_cloud_the_robot_stops_within_a_second(k, figure):
     check_minute_mid_pipe(figure, k, 1.0, *SLOW)
 
 
@@ -83,7 +83,7 @@ def test_without_its_cloud_the_robot_stops_at_any_instant(k, figure):
 
 
 @pytest.mark.parametrize("start_s", DAILY_ANYWHERE)
-def test_without_its_cloud_the_robot_stops_outside_of_the_pipes_too(start_s, figure):
+def test_without_its_cloud_the_robot_stops_outside_pipes_too(start_s, figure):
     assert check_minute(figure, start_s, 1.0, *SLOW).pipe == -1
 
 
@@ -100,7 +100,7 @@ def test_a_hold_of_almost_a_minute_is_resumed_as_any_other():
     assert silence.resumed_after <= 1.0
 
 
-def test_after_a_silence_too_late_to_keep_a_mission_from_its_end_the_robot_holds():
+def test_a_silence_at_the_missions_end_lets_the_robot_hold():
     silence = fly_through(undisturbed(*SLOW).end_ns * 1e-9 - 0.02, 60.5, *LONG, *SLOW)
     assert (silence.outcome, silence.touched) == ("done", [])
     assert 0.250 < silence.basis_age <= 0.252 + 1e-9
@@ -110,19 +110,19 @@ def test_after_a_silence_too_late_to_keep_a_mission_from_its_end_the_robot_holds
 
 
 @pytest.mark.parametrize("k", FEW)
-def test_uncapped_it_takes_a_little_longer(k, figure):
+def test_without_the_cap_stopping_takes_a_little_longer(k, figure):
     check_minute_mid_pipe(figure, k, 1.4)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("k", [k for k in range(COUNT) if k not in FEW])
-def test_uncapped_it_takes_a_little_longer_at_any_instant(k, figure):
+def test_without_the_cap_stopping_at_any_instant_takes_longer(k, figure):
     check_minute_mid_pipe(figure, k, 1.4)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("start_s", ANYWHERE)
-def test_uncapped_it_takes_a_little_longer_anywhere(start_s, figure):
+def test_without_the_cap_stopping_anywhere_takes_longer(start_s, figure):
     check_minute(figure, start_s, 1.4)
 
 
@@ -175,8 +175,8 @@ def fly_records(*settings, until_s=None):
     return ends, of_world, of_cloud
 
 
-def test_a_silent_downlink_freezes_the_reference_until_the_echo_is_back():
-    """With an integral and `commanded_velocity`, which would both drift off."""
+def test_a_silent_downlink_freezes_until_the_echo_is_back():
+    """It uses an integral and `commanded_velocity`, which would both drift."""
     _, _, of_cloud = fly_records(
         *PATIENCE,
         "cloud.predictor=commanded_velocity",
@@ -193,7 +193,7 @@ def test_a_silent_downlink_freezes_the_reference_until_the_echo_is_back():
     assert [r for r in of_cloud if isinstance(r, MissionEvent)][-1].event == "done"
 
 
-def test_a_downlink_that_never_comes_back_lands_and_the_run_still_ends():
+def test_a_lost_downlink_lands_the_robot_and_ends_the_run():
     ends, of_world, _ = fly_records(
         "link.downlink.blackouts=[{start_s: 11.3, duration_s: 1000}]", "guard.hold_max_s=20"
     )
@@ -204,8 +204,8 @@ def test_a_downlink_that_never_comes_back_lands_and_the_run_still_ends():
     assert ends.run.now_ns < 100e9
 
 
-def test_a_robot_that_could_not_take_off_does_not_when_its_mission_is_over():
-    """The start was the last that it heard; no word of the mission's end gets through."""
+def test_a_robot_does_not_take_off_after_its_mission_is_over():
+    """The robot receives the start but not the end of the mission."""
     ends, of_world, _ = fly_records(
         "link.downlink.blackouts=[{start_s: 0.29, duration_s: 100}]", until_s=110
     )
@@ -215,8 +215,8 @@ def test_a_robot_that_could_not_take_off_does_not_when_its_mission_is_over():
     assert ends.world.robot.guard.state is GuardState.LAND
 
 
-def test_a_robot_that_may_not_hold_for_long_still_waits_for_its_first_command():
-    """It comes a round trip behind the start."""
+def test_a_short_hold_limit_still_waits_for_a_first_command():
+    """The first command comes a round trip after the start."""
     _, of_world, _ = fly_records("link.profile=satellite", "guard.hold_max_s=0.1", until_s=4)
     changes = [r.state for r in of_world if isinstance(r, GuardChange)]
     assert changes == [GuardState.GROUND, GuardState.TRACK]

@@ -1,4 +1,4 @@
-"""What the operator says reaches the guard on board, and only what it acts on is confirmed."""
+"""Operator requests reach the guard, which confirms only those that it acts on."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from tests.flights.conftest import MS, talking
 
 @pytest.fixture
 def talk():
-    """Flying; the request to start was number 1."""
+    """Fly; the request to start had number 1."""
     talk = talking()
     fly(talk, 10)
     return talk
@@ -63,7 +63,7 @@ def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
 def test_a_start_that_was_held_back_on_the_way_starts_nothing(
     talk, start, held_back, ahead, outcome
 ):
-    """Its mission may be over by then, and given up; nobody expects the robot to take off."""
+    """Its mission may be over by then, so nobody expects the robot to take off."""
     talk.request(2, Request.END, Start.HERE)
     talk.now_ns += ahead
     captured = talk.asked(3, Request.START, start)
@@ -71,13 +71,13 @@ def test_a_start_that_was_held_back_on_the_way_starts_nothing(
     talk.send(captured)
     assert talk.world._counts[outcome] == (outcome != "")
     assert talk.world.robot.guard.armed == (outcome == "")
-    if outcome:  # said anew, it is obeyed
+    if outcome:  # repeated, it is obeyed
         talk.send(talk.asked(4, Request.START, start))
         assert talk.world.robot.guard.armed
 
 
 @pytest.mark.parametrize("request_", [Request.END, Request.ESTOP])
-def test_what_stops_the_robot_does_so_however_late_it_comes(talk, request_):
+def test_a_late_stop_still_stops_the_robot(talk, request_):
     captured = talk.asked(2, request_, Start.HERE)
     talk.wait(talk.now_ns + 200_000 * MS)
     talk.send(captured)
@@ -86,7 +86,7 @@ def test_what_stops_the_robot_does_so_however_late_it_comes(talk, request_):
 
 
 def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
-    """World's clock stood still meanwhile: the age of what it was based on says nothing."""
+    """World's clock stood still in the meantime, so the age of its basis is meaningless."""
     captured = talk.asked(2, Request.START, Start.SPAWN)
     talk.now_ns += 60_000 * MS
     talk.send(captured)
@@ -94,7 +94,7 @@ def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
     assert talk.world._orders.number == 1
 
 
-def test_a_command_that_waits_as_the_robot_is_stopped_is_not_told_to_be_flown(talk):
+def test_a_command_waiting_during_a_stop_is_not_echoed(talk):
     applied = len(talk.take(CommandApplied))
     talk.send(talk.command())
     talk.request(2, Request.ESTOP, Start.HERE)
@@ -102,8 +102,8 @@ def test_a_command_that_waits_as_the_robot_is_stopped_is_not_told_to_be_flown(ta
     assert len(talk.take(CommandApplied)) == applied
 
 
-def test_its_keys_are_looked_after_by_the_machines_clock(talk):
-    """World's own lags behind it by what it could not make up for."""
+def test_world_rekeys_by_the_machines_clock(talk):
+    """World's simulated clock lags behind the machine's clock by the slip."""
     talk.wait(talk.now_ns + 100 * MS)
     before_ns = talk.now_ns
     talk.world.handle_deadline(before_ns + 60_000 * MS)
@@ -116,7 +116,7 @@ def test_the_end_of_a_mission_is_confirmed_even_while_latched(talk):
     assert ask(talk, 3, Request.END) == (GuardState.ESTOP, 3)
 
 
-def test_in_hold_commands_are_heard_but_neither_flown_nor_echoed(talk):
+def test_in_hold_commands_are_neither_flown_nor_echoed(talk):
     talk.wait(talk.now_ns + 2_000 * MS)
     applied = len(talk.take(CommandApplied))
     echo_ns = talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns
@@ -127,7 +127,7 @@ def test_in_hold_commands_are_heard_but_neither_flown_nor_echoed(talk):
     assert talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns > echo_ns
 
 
-def test_what_was_limited_is_counted(talk):
+def test_limited_commands_are_counted(talk):
     for _ in range(10):
         talk.send(talk.command((0.0, 0.0, 9.0)))
         talk.wait(talk.now_ns + 10 * MS)
@@ -143,8 +143,8 @@ def test_only_a_hold_within_a_mission_is_counted_as_held(talk):
     assert talk.counts()["held_seconds"] == held
 
 
-def test_what_the_robot_has_touched_is_told_until_another_mission_starts(talk):
-    """Cloud may die right after the touch: its successor has to learn of it."""
+def test_contacts_are_reported_until_the_next_mission_starts(talk):
+    """Cloud may die right after the touch; the next cloud must learn of it."""
     ask(talk, 2, Request.END)
     talk.world._orders.touches.pipes = 1
     talk.wait(talk.now_ns + 300 * MS)
@@ -157,8 +157,8 @@ def test_what_the_robot_has_touched_is_told_until_another_mission_starts(talk):
     assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == 0
 
 
-def test_what_the_cloud_before_has_said_does_not_count_for_the_next_one(talk):
-    """Nine fresh commands of one and a single one of another are no proof of a link."""
+def test_requests_of_an_earlier_cloud_do_not_count(talk):
+    """Nine fresh commands of one cloud and one of another do not prove a link."""
     fly(talk, 100)
     ask(talk, 2, Request.END)
     talk.request(3, Request.START, Start.HERE)

@@ -1,4 +1,4 @@
-"""Key files, ends and the link go wrong by chance: once it is calm both ends hear each other again.
+"""Random faults of key files, ends and link: afterwards both ends hear each other again.
 
 Both ends and their driver are the real ones, the robot does nothing: a minute takes 50 ms.
 """
@@ -25,11 +25,11 @@ from tests.flights.conftest import MS, bare_cloud, bare_world
 ENDS = ("world", "cloud")
 KEYS = [Key(letter * 32) for letter in (b"a", b"b", b"c", b"d")]
 CALM, END = 30.0, 45.0
-"""From when on nothing befalls them but the last key file, and when they are judged [s]."""
+"""When the faults end, except for the last key file, and when the ends are checked [s]."""
 
 
 class Two:
-    """World and cloud; whatever can happen to their session is scheduled by chance."""
+    """World and cloud with a random schedule of all faults of their session."""
 
     def __init__(self, seed: int) -> None:
         self.chance = chance = random.Random(seed)
@@ -150,7 +150,7 @@ class Two:
 
 
 @pytest.mark.parametrize("first", [0, pytest.param(1_000, marks=pytest.mark.full)])
-def test_once_it_is_calm_both_ends_hear_each_other(first: int) -> None:
+def test_after_the_rotations_both_ends_hear_each_other(first: int) -> None:
     seeds, judged = range(first, 4 * first or 40), 0
     for seed in seeds:
         two = Two(seed)

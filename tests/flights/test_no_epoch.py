@@ -1,4 +1,4 @@
-"""A disk that hangs has no epochs: what needs a new one is refused, and all else goes on."""
+"""Without an epoch from the disk, only requests that need a new epoch are refused."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from tests.flights.conftest import MS, talking
 
 @pytest.fixture
 def disk() -> list[int]:
-    """The epochs that it has."""
+    """The epochs that the disk has."""
     return []
 
 
@@ -33,9 +33,9 @@ def told(talk):
     return [fault.text for fault in talk.take(Fault)]
 
 
-def test_another_cloud_gets_a_session_as_soon_as_there_is_an_epoch(talk, disk):
+def test_a_cloud_gets_a_session_as_soon_as_an_epoch_exists(talk, disk):
     for _ in range(3):
-        talk.wait(talk.now_ns + 1_100 * MS)  # the one before has fallen silent
+        talk.wait(talk.now_ns + 1_100 * MS)  # the previous cloud is silent by now
         assert talk.hello(b"two") == 0
     assert told(talk) == [NO_EPOCH]
     assert talk.world._session.epoch == 1
@@ -44,7 +44,7 @@ def test_another_cloud_gets_a_session_as_soon_as_there_is_an_epoch(talk, disk):
     assert talk.hello(b"two") == 2
 
 
-def test_the_one_that_flies_goes_on_and_a_start_from_the_spawn_waits_for_an_epoch(talk, disk):
+def test_only_a_start_from_the_spawn_waits_for_an_epoch(talk, disk):
     for number in (2, 3):
         talk.request(number, Request.START, Start.SPAWN, mission_id=7)
         telemetry = fly(talk)
@@ -58,7 +58,7 @@ def test_the_one_that_flies_goes_on_and_a_start_from_the_spawn_waits_for_an_epoc
     assert talk.world._orders.mission_id == 7
 
 
-def test_what_needs_no_epoch_is_obeyed(talk):
+def test_requests_that_need_no_epoch_are_obeyed(talk):
     talk.request(2, Request.END, Start.SPAWN)
     talk.request(3, Request.START, Start.HERE)
     talk.request(4, Request.ESTOP, Start.SPAWN)

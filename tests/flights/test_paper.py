@@ -1,4 +1,4 @@
-"""The paper's mission and what it has to reach, in virtual time; fewer seeds than `-m full`."""
+"""The paper's mission and its required numbers, in virtual time; `-m full` flies more seeds."""
 
 import pytest
 
@@ -70,6 +70,6 @@ def test_every_other_profile_flies_too(profile):
     assert flight.verdict.failures == ()
 
 
-def test_noise_on_the_odometry_is_flown_with():
+def test_the_paper_flies_with_noisy_odometry():
     noise = "world.sensors={position_noise_m: 0.005, velocity_noise_mps: 0.02}"
     assert fly("paper", noise).verdict.failures == ()

@@ -1,4 +1,4 @@
-"""The whole loop in virtual time: the robot keeps its mission's progress; a stuck leg fails."""
+"""Flights in virtual time: the robot stores its mission's progress, and a stuck leg fails."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.flights.conftest import Talk, join, records
 ID = 2**62 + 5
 
 
-def test_the_robot_knows_every_waypoint_soon_after_it_is_reached() -> None:
+def test_the_robot_stores_every_waypoint_reached() -> None:
     world, cloud = records(load_experiment("paper"))
     reached = [r for r in cloud if isinstance(r, MissionEvent) and r.event == "reached"]
     shown = {}
@@ -30,7 +30,7 @@ def test_the_robot_knows_every_waypoint_soon_after_it_is_reached() -> None:
 
 
 class Operated(Talk):
-    """A world that is asked for things."""
+    """A world that gets requests."""
 
     def ask(self, request: Request, number: int = 0, **what: int) -> Telemetry:
         what |= {"basis_stamp_ns": self.world_ns}
@@ -63,12 +63,12 @@ def test_progress_rises_and_belongs_to_the_mission_started_last(talk: Operated) 
     assert progress(ask(Request.PROGRESS, mission_id=ID, reached=1)) == (ID, 2)
     assert progress(ask(Request.PROGRESS, mission_id=ID + 1, reached=9)) == (ID, 2)
     assert progress(ask(Request.END, 2)) == (ID, 2)
-    assert progress(ask(Request.START, 3, mission_id=ID)) == (ID, 2)  # the same one goes on
+    assert progress(ask(Request.START, 3, mission_id=ID)) == (ID, 2)  # the same mission continues
     assert progress(ask(Request.START, 4, mission_id=ID + 1)) == (ID + 1, 0)
 
 
 def test_from_the_spawn_a_mission_begins_anew(talk: Operated) -> None:
-    """Its first half may be known on board alone, and the robot does not stand where that ended."""
+    """The old progress must not count, because the mission restarts at the spawn."""
     talk.ask(Request.START, 1, mission_id=ID)
     talk.ask(Request.PROGRESS, mission_id=ID, reached=2)
     again = OperatorRequest(2, Request.START, Start.SPAWN, ID)
@@ -77,7 +77,7 @@ def test_from_the_spawn_a_mission_begins_anew(talk: Operated) -> None:
     assert progress(talk.take(TelemetrySent)[-1].telemetry) == (ID, 0)
 
 
-def test_it_outlives_the_cloud(talk: Operated) -> None:
+def test_progress_on_board_survives_a_restart_of_cloud(talk: Operated) -> None:
     talk.ask(Request.START, 1, mission_id=ID)
     talk.ask(Request.PROGRESS, mission_id=ID, reached=2)
     talk.wait(talk.now_ns + 2_000_000_000)  # the first one is not fresh any more
@@ -97,8 +97,8 @@ def test_an_alarm_gets_a_number_that_world_acts_on() -> None:
     assert changes[0] is GuardState.ESTOP
 
 
-def test_a_leg_that_takes_three_times_what_is_expected_fails_and_the_robot_holds() -> None:
-    """Its tolerance is finer than the sensor's noise: it can be flown to, and never be reached."""
+def test_a_leg_that_takes_three_times_too_long_fails() -> None:
+    """Its tolerance is below the sensor's noise, so the waypoint is never reached."""
     experiment = load_experiment(
         "hover",
         [
@@ -124,7 +124,7 @@ def limits(mission: Mission, **options: float) -> list[float]:
     return [leg.time_limit for leg in assembly.mission_plan(mission, 60.0, **options).legs]
 
 
-def test_a_legs_own_limit_comes_first_and_the_default_follows_way_speed_and_dwell() -> None:
+def test_the_limit_of_a_leg_defaults_to_three_times_its_time() -> None:
     points = [
         Waypoint(position_m=(0.0, 0.0, 1.0), dwell_s=0.0),
         Waypoint(position_m=(3.0, 4.0, 1.0), dwell_s=2.0),

@@ -1,4 +1,4 @@
-"""A flight's delays become a trace; replayed, the trace gives the delays of the flight again."""
+"""A trace of a flight's delays gives the same delays when it is replayed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def fly(*settings: str) -> tuple[Recording, dict[Direction, Packets]]:
 
 @pytest.fixture(scope="module")
 def traces(tmp_path_factory: pytest.TempPathFactory) -> dict[Direction, Path]:
-    """Of a flight over a bad link: jitter, losses and delay in bursts."""
+    """Fly over a bad link: jitter, losses and delay in bursts."""
     folder = tmp_path_factory.mktemp("traces")
     _, packets = fly("link.profile=lossy")
     for way in BOTH:
@@ -43,7 +43,7 @@ def test_a_replayed_minute_gives_its_delays_again(
     traces: dict[Direction, Path],
     replayed: tuple[Recording, dict[Direction, Packets]],
 ) -> None:
-    """The link's time begins with 0 in virtual time: delays are held against the row in force."""
+    """In virtual time the link begins at 0, so each delay is compared with its row."""
     arrivals, trace = replayed[0][f"/{way}_delay"], read_trace(traces[way])
     assert trace.times[-1] > 59.0
     assert trace.losses is not None
@@ -63,7 +63,7 @@ def test_a_replay_loses_what_the_flight_lost(
     traces: dict[Direction, Path],
     replayed: tuple[Recording, dict[Direction, Packets]],
 ) -> None:
-    """One row for each packet: none is met twice, so runs of losses keep their length."""
+    """Each packet has its own row, so runs of losses keep their length."""
     recording, packets = replayed
     trace, again = read_trace(traces[way]), packets[way]
     assert trace.losses is not None

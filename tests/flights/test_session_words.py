@@ -1,4 +1,4 @@
-"""Cloud's end: what teleop has said for one session does not lead the robot in the next."""
+"""Cloud does not use setpoints and starts that teleop made for another session."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ELSEWHERE = (5.0, 5.0, 1.0)
 
 @pytest.fixture
 def ends() -> Ends:
-    """In flight."""
+    """Provide ends in flight."""
     ends = join(HOVER)
     ends.run.fly(lambda: False, 4 * S, lambda world, cloud: None)
     ends.cloud.take_datagrams()
@@ -31,7 +31,7 @@ def ends() -> Ends:
 
 
 def say(ends: Ends, *words: Setpoint | OperatorRequest) -> list[int]:
-    """Kinds of what cloud sends at once."""
+    """Return the kinds of the datagrams that cloud sends at once."""
     ends.cloud.teleop.outputs.extend(words)
     ends.cloud._take_from_teleop()
     return [peek(data)[0] for data in ends.cloud.take_datagrams()]
@@ -48,7 +48,7 @@ def test_a_setpoint_for_another_session_is_not_flown(ends: Ends) -> None:
         assert ends.cloud._setpoint == mine
 
 
-def test_nothing_starts_in_a_session_before_the_robot_is_seen_in_it(ends: Ends) -> None:
+def test_nothing_starts_before_the_first_telemetry(ends: Ends) -> None:
     start, end = (OperatorRequest(99, request) for request in (Request.START, Request.END))
     assert say(ends, start) == [Kind.OPERATOR]
     ends.cloud._loop.reset()  # as a new session does
@@ -56,8 +56,8 @@ def test_nothing_starts_in_a_session_before_the_robot_is_seen_in_it(ends: Ends) 
     assert say(ends, end) == [Kind.OPERATOR]
 
 
-def test_a_start_that_was_said_in_another_session_is_not_passed_on(ends: Ends) -> None:
-    """Teleop lags, as behind a slow disk; meanwhile somebody else may have moved the robot."""
+def test_a_start_for_another_session_is_not_passed_on(ends: Ends) -> None:
+    """Teleop is slow; in the meantime another cloud may have moved the robot."""
     epoch = ends.cloud._session.epoch
     for start in Start:
         said = OperatorRequest(99, Request.START, start)
@@ -67,10 +67,10 @@ def test_a_start_that_was_said_in_another_session_is_not_passed_on(ends: Ends) -
     assert ends.cloud._counts["words_dropped"] == 2 * len(Start)
 
 
-def test_when_the_numbers_are_used_up_nothing_breaks_and_the_next_session_has_them_all_again(
+def test_used_up_numbers_last_until_the_next_session(
     ends: Ends,
 ) -> None:
-    """Somebody with the keys has asked for something under the highest number of all."""
+    """A sender with the keys has used the highest number of all."""
     cloud, run = ends.cloud, ends.run
     said = OperatorRequest(NUMBER_MAX, Request.END)
     assert say(ends, said) == [Kind.OPERATOR]
@@ -85,14 +85,14 @@ def test_when_the_numbers_are_used_up_nothing_breaks_and_the_next_session_has_th
 
 
 @pytest.mark.parametrize("request_", [each for each in Request if each is not Request.START])
-def test_what_arms_nothing_is_passed_on_whenever_it_was_said(ends: Ends, request_: Request) -> None:
+def test_requests_that_arm_nothing_are_always_passed_on(ends: Ends, request_: Request) -> None:
     epoch = ends.cloud._session.epoch
     said = OperatorRequest(99, request_, epoch=epoch - 1)
     assert say(ends, said, said._replace(epoch=epoch)) == [Kind.OPERATOR] * 2
 
 
 class Lagging:
-    """A teleop of its own process; what it says comes late, as from behind a slow disk."""
+    """A teleop in its own process whose messages are late."""
 
     outcome, settled = None, True
 
@@ -100,7 +100,7 @@ class Lagging:
         self._teleop = teleop
         self._late: list[tuple[int, Output | Fault]] = []
         self.outputs: list[Output | Fault] = []
-        self.epochs: dict[int, int] = {}  # each one seen, and when first [ns]
+        self.epochs: dict[int, int] = {}  # epochs seen, and when first [ns]
 
     def see(self, seen: Seen, now_ns: int) -> None:
         self.epochs.setdefault(seen.epoch, now_ns)
@@ -117,8 +117,8 @@ class Lagging:
         return outputs
 
 
-def test_a_teleop_that_lags_starts_its_mission_in_the_session_that_it_has_seen() -> None:
-    """Its first order is on the way while cloud restarts; it arrives in the next session."""
+def test_a_slow_teleop_starts_missions_in_the_session_it_saw() -> None:
+    """Its first start is under way while cloud restarts, and arrives in the next session."""
     ends = join(HOVER)
     teleop = ends.cloud.teleop = Lagging(ends.cloud.teleop)
     changes: list[GuardChange] = []
@@ -136,10 +136,10 @@ def test_a_teleop_that_lags_starts_its_mission_in_the_session_that_it_has_seen()
     assert changes[-1].state is GuardState.TRACK
 
 
-def test_after_a_stall_cloud_looks_after_its_keys_once_not_for_each_second_of_it(
+def test_after_a_stall_cloud_maintains_its_keys_once(
     ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Looks are a second apart: an end that hears its peer with another key counts them."""
+    """Checks must be a second apart, because an end counts those that find another key."""
     looks: list[int] = []
     monkeypatch.setattr(ends.cloud._session, "tend", lambda now_ns: looks.append(now_ns) or [])
     woken_ns = ends.run.now_ns + 60 * S

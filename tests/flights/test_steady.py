@@ -1,4 +1,4 @@
-"""Hover and steps: the steady error of the published limits, and how well predictors predict."""
+"""Hover and steps: the steady error of the published limits, and the prediction errors."""
 
 from statistics import mean
 

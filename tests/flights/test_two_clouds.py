@@ -1,4 +1,4 @@
-"""Two clouds, one robot: who has authority, and that what is applied never goes back."""
+"""Two clouds and one robot: which cloud has authority, and that no command is reverted."""
 
 from itertools import product
 
@@ -44,14 +44,14 @@ def test_a_silent_incumbent_loses_authority_at_the_age_limit(silence, epoch):
 
 
 @pytest.mark.parametrize(("silence", "epoch"), [(1000, 1), (1001, 2)])
-def test_one_that_has_not_been_heard_yet_has_a_second(silence, epoch):
+def test_a_new_session_has_one_second_to_be_heard(silence, epoch):
     bare = a_session()
     bare.wait(silence)
     bare.send(bare.cloud("b").hello())
     assert bare.world._session.epoch == epoch
 
 
-def test_an_idle_cloud_keeps_authority_by_saying_that_it_is_there():
+def test_an_idle_cloud_keeps_authority_by_alive_datagrams():
     bare = a_session()
     for _ in range(10):
         bare.wait(200)
@@ -60,7 +60,7 @@ def test_an_idle_cloud_keeps_authority_by_saying_that_it_is_there():
     assert bare.world._session.epoch == 1
 
 
-def test_repeats_of_what_the_incumbent_said_do_not_keep_its_authority():
+def test_repeated_datagrams_do_not_keep_authority():
     bare = a_session()
     cloud = bare.cloud("a")
     captured = [cloud.session.seal(Kind.ALIVE, b""), cloud.command(), cloud.start(0)]
@@ -74,7 +74,7 @@ def test_repeats_of_what_the_incumbent_said_do_not_keep_its_authority():
     assert bare.world._session.epoch == 2
 
 
-def test_the_one_that_lost_authority_gets_it_back_under_a_new_name():
+def test_a_cloud_regains_authority_under_a_new_nonce():
     bare = a_session()
     bare.wait(1100)
     a_session("b", bare)
@@ -85,7 +85,7 @@ def test_the_one_that_lost_authority_gets_it_back_under_a_new_name():
     assert bare.cloud("a").session.epoch == bare.world._session.epoch == 3
 
 
-def test_a_new_process_has_a_session_within_a_second_of_the_last_command_of_the_old():
+def test_a_new_cloud_has_a_session_within_a_second():
     bare = a_session()
     bare.send(bare.cloud("a").command())
     tries = 0
@@ -96,7 +96,7 @@ def test_a_new_process_has_a_session_within_a_second_of_the_last_command_of_the_
     assert tries == 3
 
 
-def test_a_captured_hello_of_a_cloud_that_is_gone_opens_nothing():
+def test_a_captured_hello_of_a_dead_cloud_opens_nothing():
     bare = a_session()
     captured = list(bare.sent)
     del bare.clouds["a"]
@@ -105,7 +105,7 @@ def test_a_captured_hello_of_a_cloud_that_is_gone_opens_nothing():
     bare.wait(1100)  # b is silent, and the cookie is still valid
     for data in captured:
         bare.send(data)
-    bare.wait(5000)  # and now it is not
+    bare.wait(5000)  # and now it is no longer valid
     for data in captured:
         bare.send(data)
     assert bare.world._session.epoch == 2
@@ -130,25 +130,25 @@ ACTIONS = {
 
 
 def act(bare: Bare, name: str) -> None:
-    """What a cloud does: command if it has a session, and ask for one in any case."""
+    """Let a cloud command if it has a session, and ask for one in any case."""
     cloud = bare.cloud(name)
     if cloud.session.epoch:
         bare.send(cloud.command(bare.now_ns))
-        cloud.held = cloud.command(bare.now_ns)  # one that the link holds back until the replay
+        cloud.held = cloud.command(bare.now_ns)  # the link delays it until the replay
         bare.sent.append(cloud.held)
     if cloud.session.epoch != bare.world._session.epoch or not cloud.session.epoch:
         bare.send(cloud.hello())
 
 
 def spawn(bare: Bare) -> None:
-    """Whoever has the session starts a mission from the spawn."""
+    """Let the cloud with the session start a mission from the spawn."""
     for cloud in bare.clouds.values():
         if cloud.session.epoch == bare.world._session.epoch != 0:
             bare.send(cloud.start(bare.world._orders.number + 1))
 
 
 def check(names: tuple[str, ...]) -> None:
-    """Play one interleaving: what is applied rises, and an epoch belongs to one cloud."""
+    """Play one interleaving: applied counters rise, and an epoch belongs to one cloud."""
     bare, applied, owner = Bare(ring()), [], {}
     for name in names:
         ACTIONS[name](bare)
@@ -172,13 +172,13 @@ BACK = "two-cloud interleavings to depth {}: commands that go back"
 
 
 @pytest.mark.promise("one-cloud-flies")
-def test_no_short_interleaving_takes_a_command_back(figure):
+def test_no_short_interleaving_reverts_a_command(figure):
     assert explore(BASIC, 5) == 4**5
     assert explore(list(ACTIONS), 4) == 6**4
     figure(BACK.format("5"), 0, "==", 0, count=4**5)
 
 
-def test_the_check_finds_commands_that_go_back(monkeypatch):
+def test_the_check_finds_reverted_commands(monkeypatch):
     monkeypatch.setattr("cloudrc.tunnel.channel.Channel.take", lambda channel, counter: "used")
     with pytest.raises(AssertionError):
         explore(BASIC, 4)
@@ -186,7 +186,7 @@ def test_the_check_finds_commands_that_go_back(monkeypatch):
 
 @pytest.mark.full
 @pytest.mark.parametrize("first", list(product(BASIC, repeat=2)))
-def test_no_interleaving_of_ten_takes_a_command_back(first, figure):
+def test_no_interleaving_of_ten_reverts_a_command(first, figure):
     for names in product(BASIC, repeat=8):
         check(first + names)
     figure(BACK.format("10"), 0, "==", 0, count=4**8)
@@ -194,6 +194,6 @@ def test_no_interleaving_of_ten_takes_a_command_back(first, figure):
 
 @pytest.mark.full
 @pytest.mark.parametrize("first", list(ACTIONS))
-def test_no_interleaving_of_seven_with_restarts_takes_a_command_back(first):
+def test_no_interleaving_of_7_with_restarts_reverts_a_command(first):
     for names in product(ACTIONS, repeat=6):
         check((first, *names))

@@ -1,4 +1,4 @@
-"""No wall clock reaches the control path: whatever it does, the flight is the same, bit by bit."""
+"""No wall clock affects the control path: the flight is identical for any wall clock."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_the_flight_is_the_same_whatever_the_wall_clock_does(
 
 
 def wall_clocks(tree: ast.AST) -> list[str]:
-    """Calls that read a wall clock."""
+    """Find calls that read a wall clock."""
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
@@ -71,9 +71,9 @@ CONTROL_PATH = ("world/", "cloud/", "teleop/", "tunnel/", "link/", "endpoint", "
                 "drivers/process", "drivers/keyfile", "drivers/epochs",
                 "drivers/virtual", "drivers/teleop")  # fmt: skip
 ALLOWED = {
-    # The kernel stamps datagrams by the wall clock: turned into an age at once, within 0 to 50 ms.
+    # The kernel's stamps of datagrams are converted to an age of 0 to 50 ms at once.
     "link/relay_io.py": ["time.time_ns"],
-    # A line of the audit log says when: people read it, and nothing that flies.
+    # Only people read the time in a line of the audit log.
     "teleop/auth.py": ["time.time"],
 }
 
@@ -94,5 +94,5 @@ def test_nothing_on_the_control_path_reads_a_wall_clock() -> None:
 @pytest.mark.parametrize(
     "code", ["time.time()", "from time import time_ns", "datetime.now()", "datetime.date.today()"]
 )
-def test_a_wall_clock_is_found(code: str) -> None:
+def test_the_check_finds_a_wall_clock(code: str) -> None:
     assert wall_clocks(ast.parse(code))

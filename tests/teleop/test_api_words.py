@@ -102,9 +102,9 @@ def test_what_the_plan_refuses_is_the_senders_fault(
     idle: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*args: object, **kwargs: object) -> None:
-        raise BadInputError("time limit inf s: has to be finite and above 0")
+        raise BadInputError("time limit inf s: must be finite and above 0")
 
     monkeypatch.setattr("cloudrc.teleop.api.check_way", refuse)
     status, refusal = idle.post("/v1/goto", {"position_m": [0.5, 0.0, 0.7]})
     models.Refusal.model_validate(refusal)
-    assert (status, refusal["detail"]) == (422, "time limit inf s: has to be finite and above 0")
+    assert (status, refusal["detail"]) == (422, "time limit inf s: must be finite and above 0")

@@ -108,7 +108,7 @@ def test_while_it_is_on_its_way_and_until_it_is_acknowledged_no_mission_begins()
     flight.downlink = False
     flight.teleop.stop_rotors(flight.now_ns)
     flight.step(seconds=0.2)
-    with pytest.raises(ConflictError, match="an emergency stop is on its way to the robot; see"):
+    with pytest.raises(ConflictError, match="an emergency stop is on its way to the robot; find"):
         flight.create(queue=True)
     flight.downlink = True
     flight.step(seconds=0.2)

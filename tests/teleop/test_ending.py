@@ -57,7 +57,7 @@ def test_nothing_is_begun_while_teleop_ends(before, say):
     flight.teleop.pause(flight.now_ns)
     flight.step(seconds=0.2)
     kept, asked = list(flight.kept), len(flight.requests)
-    with pytest.raises(UnavailableError, match="teleop ends; say it again to the next one"):
+    with pytest.raises(UnavailableError, match="teleop ends; repeat this when teleop runs again"):
         say(flight)
     flight.step(seconds=0.5)
     assert flight.kept == kept

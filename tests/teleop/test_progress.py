@@ -67,7 +67,7 @@ def test_what_the_robot_knows_counts_after_a_restart():
     assert [(e.event, e.waypoint) for e in flight.events] == [
         ("resumed", 0), ("reached", 0), ("reached", 1),
     ]  # fmt: skip
-    assert "known on board to be reached" in flight.events[1].text
+    assert "reached, as the robot reports," in flight.events[1].text
     assert flight.setpoints[-1].position == C
     flight.step(position=C)
     assert flight.state == "DONE"
@@ -221,7 +221,7 @@ def test_with_a_full_disk_the_flight_goes_on_and_the_robot_is_the_witness():
     flight.step(position=C, seconds=0.1)
     view = flight.view("m1")
     assert (flight.reached(), view["verdict"]["exit_code"]) == ([0, 1, 2], 0)
-    assert "known on board to be reached" in str(view["events"])
+    assert "reached, as the robot reports," in str(view["events"])
 
 
 def test_a_full_disk_refuses_a_mission_before_anything_is_asked_of_the_robot():

@@ -134,7 +134,7 @@ def test_the_operator_holds_moves_and_resumes():
     flight.step()
     assert flight.setpoints[-1].position == B
     assert flight.names(mission_id)[-3:] == ["held", "goto", "resumed"]
-    with pytest.raises(ConflictError, match="has to be held"):
+    with pytest.raises(ConflictError, match="must be held"):
         flight.teleop.resume(flight.now_ns)
 
 

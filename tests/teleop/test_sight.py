@@ -20,15 +20,15 @@ def texts(flight, mission_id, event):
 @pytest.mark.parametrize(
     ("guard", "mission", "said"),
     [
-        (GROUND, None, "waits for a mission; it takes off, after a stop or a touch-down only once"),
+        (GROUND, None, "waits for a mission; it takes off, after a stop or a landing only when"),
         (GROUND, "flying", "takes off with the mission's first commands, after a stop"),
-        (TRACK, None, "is being told that its mission is over"),
+        (TRACK, None, "is telling the robot that its mission is over"),
         (TRACK, "flying", "flies its mission"),
         (TRACK, "held", "cloudrc mission resume"),
         (HOLD, None, "waits for a mission"),
-        (HOLD, "flying", "goes on by itself as soon as they do"),
-        (HOLD, "held", "goes on by itself as soon as they do"),
-        *((stop, how, "see why, then: cloudrc mission acknowledge")
+        (HOLD, "flying", "continues by itself when they arrive"),
+        (HOLD, "held", "continues by itself when they arrive"),
+        *((stop, how, "find the cause, then: cloudrc mission acknowledge")
           for stop in (LAND, ESTOP) for how in (None, "flying", "held")),
     ],
 )  # fmt: skip
@@ -57,7 +57,7 @@ def test_the_robot_is_shown_with_its_state_why_since_when_and_what_comes_next():
     assert (seen(flight)["guard"], seen(flight)["guard_for_s"]) == ("HOLD", 0.0)
     flight.step(seconds=3.2)
     assert seen(flight)["guard_for_s"] == pytest.approx(3.2)
-    assert "goes on by itself" in seen(flight)["next_step"]
+    assert "continues by itself" in seen(flight)["next_step"]
 
 
 def test_since_when_goes_on_through_a_silence_and_a_new_session_and_not_into_another_world():

@@ -1,4 +1,4 @@
-"""World's door, and what is said before it: what the tests of the greetings share."""
+"""Share a world that answers hellos between the tests of the handshake."""
 
 from types import SimpleNamespace
 
@@ -14,7 +14,7 @@ NONCE, CLOCK, WORLD = b"n" * 16, b"c" * 16, b"w" * 16
 
 
 class Doorstep:
-    """A door, and what is said before it."""
+    """World's side of the handshake, with a cloud that sends hellos."""
 
     def __init__(self, nonce=WORLD, suite=AES_256_GCM, **options):
         ring = KeyRing(KeySet(KEY))
@@ -31,19 +31,19 @@ class Doorstep:
     def knock(
         self, nonce=NONCE, cookie=NO_COOKIE, clock=CLOCK, suite=AES_256_GCM, counter=None
     ):  # fmt: skip
-        """With the counter given, or the next one."""
+        """Send a hello with this counter, or the next one."""
         self.counter += 1
         counter = self.counter if counter is None else counter
         return self.door.knock(Hello(nonce, clock, cookie, suite), counter, self.now_ns)
 
     def answer(self, *given, **named):
-        """Kind, epoch and body of what a hello is answered with."""
+        """Return kind, epoch and body of the answer to a hello."""
         (data,) = self.knock(*given, **named).datagrams
         kind, _, epoch, _, body = self.cloud.open(data)
         return kind, epoch, body
 
     def cookie(self, nonce=NONCE):
-        """Of a challenge, as soon as there may be one."""
+        """Return the cookie of a challenge, as soon as world may send one."""
         self.now_ns = max(self.now_ns, self.door._challenged_ns + CHALLENGE_NS)
         kind, _, body = self.answer(nonce)
         assert kind == Kind.CHALLENGE

@@ -27,17 +27,17 @@ from tests.flights.conftest import MS, Bare, BareCloud, bare_cloud, ring
 
 LONGEST = 2048
 STEPS_NS = tuple(round(ms * MS) for ms in (1, 30, 400, 1_500, 6_000, 150_000))
-"""By which time passes; a peer is silent after 5 s, and moves on to new keys after 120 s."""
+"""Steps of time [ns]; a peer is silent after 5 s and rekeys after 120 s."""
 TOLD_MAX = 256
-"""Complaints of a cloud that hears nobody: other versions, and the wrong key, each once."""
+"""Largest number of faults of a cloud without a session: each version and the wrong key once."""
 DOWNLINK = (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE)
 
 
 class Target:
-    """A world and a cloud in a session, with every frame that was ever valid between them."""
+    """A world and a cloud in a session, with every frame that was valid between them."""
 
     def __init__(self, pace: int = 5_000) -> None:
-        """Begin; time passes after every `pace` datagrams that are tried."""
+        """Begin a session; time passes after every `pace` datagrams."""
         self.pace, self.now_ns = pace, 0
         self.bare = Bare(ring())
         self.world = self.bare.world
@@ -71,7 +71,7 @@ class Target:
             end.receive_datagram(data, self.now_ns)
 
     def state(self) -> tuple:
-        """All that a datagram that is let through would change."""
+        """Return all state that an accepted datagram would change."""
         accepted = ("used", "late", "repeated", "stale", "hello", "busy", "accept_ignored",
                     "unanswered")  # fmt: skip
         ends = (self.world, self.cloud)
@@ -88,7 +88,7 @@ class Target:
         )
 
     def try_one(self, program: bytes) -> None:
-        """Make a hostile datagram of a fuzzer's bytes, and give it to both ends."""
+        """Make a hostile datagram from a fuzzer's bytes and give it to both ends."""
         data = self.make(program)
         if data in self.known:
             return
@@ -103,7 +103,7 @@ class Target:
             self.before = self.state()
 
     def pass_time(self, choice: int) -> None:
-        """Let both ends do what is due after a step; they hear each other, or what is old."""
+        """Advance time; both ends then get each other's datagrams or captured ones."""
         self.asked = 0
         step, heard = divmod(choice, 2)
         self.now_ns += STEPS_NS[step % len(STEPS_NS)]
@@ -125,7 +125,7 @@ class Target:
             end.take_datagrams()
 
     def due(self, end: object) -> list[bytes]:
-        """What an end sends now."""
+        """Return the datagrams that an end sends now."""
         end.handle_deadline(self.now_ns)
         return end.take_datagrams()
 
@@ -134,12 +134,14 @@ class Target:
         assert self.world.take_datagrams() == self.world.take_records() == []
         asked = [codec.peek(data)[0] for data in self.cloud.take_datagrams()]
         self.asked += len(asked)
-        # World may have moved on, it thinks: one hello in 100 ms, the first of which just went.
+        # Cloud may assume a new epoch: it sends one hello in 100 ms, the first of which is gone.
         assert self.asked <= (self.now_ns > 0), "more hellos than are due"
         assert set(asked) <= {Kind.HELLO}
         told = self.cloud.take_records()
         self.told += len(told)
-        assert not told or self.cloud._asks(self.now_ns), "a session that is heard has no faults"
+        assert not told or self.cloud._wants_session(self.now_ns), (
+            "a session that is heard has no faults"
+        )
         assert self.told <= TOLD_MAX, "the user is told the same again"
         assert all(isinstance(one, Fault) and one.code in ("version", "key") for one in told)
 
@@ -165,7 +167,7 @@ class Target:
 
 
 def memory() -> float:
-    """Memory that this process has now [MiB]; its peak would hide what leaks below it. Linux."""
+    """Return this process's memory now [MiB]; the peak would hide a leak below it. Linux."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 2**20
 

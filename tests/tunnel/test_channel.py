@@ -1,4 +1,4 @@
-"""Channels: which datagram of a stream counts, judged by a set that remembers everything."""
+"""Channels, compared with a set that remembers every counter."""
 
 from itertools import product
 
@@ -84,11 +84,11 @@ def test_the_window_agrees_with_a_set(counters, newest_wins):
 
 
 STRIDE = 93
-"""Sixteen counters this far apart reach over the window: 15 * 93 > 1024."""
+"""Step between sixteen counters, so that they span more than the window: 15 * 93 > 1024."""
 
 
 def explore(depth, newest_wins, stride):
-    """Every sequence of `depth` of 16 counters, a prefix taken once; how many there were."""
+    """Try every sequence of `depth` out of 16 counters, each prefix once; return their number."""
     counters = [n * stride for n in range(16)]
     channel, checked = Channel(newest_wins), 0
 

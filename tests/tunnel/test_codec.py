@@ -1,4 +1,4 @@
-"""The wire: what goes in comes out again, and nothing else gets in."""
+"""The codec: every message survives a round trip, and everything else is refused."""
 
 import struct
 
@@ -52,7 +52,7 @@ requests = st.builds(
     st.integers(0, 2**63 - 1),
     st.integers(0, 2**16 - 1),
     st.integers(-1, 2**63 - 1),
-    epoch=st.just(0),  # is for cloud alone
+    epoch=st.just(0),  # not in the datagram's body
 )
 
 
@@ -87,12 +87,12 @@ def test_a_request_comes_back_as_it_was(request_):
 
 @given(requests, st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
-def test_for_which_session_a_request_is_meant_is_not_told_to_the_robot(request_, epoch):
+def test_the_epoch_of_a_request_is_not_in_its_body(request_, epoch):
     said = request_._replace(epoch=epoch)
     assert codec.encode_operator(said) == codec.encode_operator(request_)
 
 
-def test_the_header_lies_where_the_design_puts_it():
+def test_the_header_has_the_documented_layout():
     data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788, generation=9)
     assert data == bytes([5, 1, 4, 3, 2, 1, 9, 6]) + bytes.fromhex("8877665544332211")
     assert codec.peek(data) == (Kind.COMMAND, 0x01020304, 0x1122334455667788)
@@ -105,7 +105,7 @@ def test_a_direction_that_does_not_exist_is_refused():
         codec.check(bytes(data))
 
 
-def test_no_greeting_is_longer_than_the_one_it_answers_and_nothing_is_longer_than_the_most():
+def test_no_answer_is_longer_than_its_hello():
     answers = (Kind.CHALLENGE, Kind.ACCEPT, Kind.BUSY)
     assert all(codec.SIZES[kind] <= codec.SIZES[Kind.HELLO] for kind in answers)
     assert codec.SIZES[Kind.HELLO] <= codec.SIZES[Kind.CHALLENGE]
@@ -184,7 +184,7 @@ def test_a_mission_that_no_recording_can_name_is_refused():
 
 
 @pytest.mark.parametrize(("place", "field", "kind"), [(-2, 7, GuardState), (-1, -1, Cause)])
-def test_a_state_or_cause_of_the_guard_that_does_not_exist_is_refused(place, field, kind):
+def test_an_unknown_state_or_cause_of_the_guard_is_refused(place, field, kind):
     body = bytearray(codec.BODY_SIZES[Kind.TELEMETRY])
     body[place] = max(kind)
     assert codec.decode_telemetry(bytes(body))[field] is max(kind)
@@ -195,6 +195,6 @@ def test_a_state_or_cause_of_the_guard_that_does_not_exist_is_refused(place, fie
 
 
 @pytest.mark.parametrize("size", range(codec.HEADER_SIZE))
-def test_a_link_is_told_what_is_too_short_for_a_header(size):
+def test_peek_refuses_a_datagram_shorter_than_a_header(size):
     with pytest.raises(DecodeError, match=r"^malformed$"):
         codec.peek(bytes(size))

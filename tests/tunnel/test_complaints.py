@@ -1,4 +1,4 @@
-"""What keeps two ends from talking is said once, in words, and only while they do not talk."""
+"""Why two ends have no session is logged once, and only while they have none."""
 
 import pytest
 
@@ -16,7 +16,7 @@ def faults(bare):
     return [record for record in bare.world.take_records() if isinstance(record, Fault)]
 
 
-def test_another_version_is_told_once():
+def test_another_version_is_logged_once():
     bare = Bare(ring())
     hello = bytes([6]) + bare.cloud("a").hello()[1:]
     for _ in range(3):
@@ -27,7 +27,7 @@ def test_another_version_is_told_once():
     assert bare.world._counts["version"] == 3
 
 
-def test_another_key_is_told_once():
+def test_another_key_is_logged_once():
     bare = Bare(ring())
     for _ in range(3):
         bare.world.receive_datagram(BareCloud(b"a", OTHER).hello(), 0)
@@ -45,32 +45,32 @@ def test_within_a_session_garbage_is_only_counted():
 
 
 @pytest.mark.parametrize("outcome", ["malformed", "direction", "old_epoch"])
-def test_what_anybody_may_send_is_not_worth_a_word(outcome):
+def test_garbage_is_not_logged(outcome):
     assert Complaints().about(outcome, bytes(16), 0) == []
 
 
 @pytest.mark.parametrize("kind", Kind)
-def test_a_tag_is_worth_a_word_if_it_is_a_greetings(kind):
+def test_only_a_wrong_tag_of_a_greeting_is_logged(kind):
     data = codec.encode_header(kind, 1, 1, 1)
     said = [Fault(7, "key", KEY)] if kind <= Kind.BUSY else []
     assert Complaints().about("tag", data, 7) == said
 
 
-def test_of_another_version_both_are_named():
+def test_a_version_fault_names_both_versions():
     complaints = Complaints()
     text = "peer speaks v9, we speak v5: run the same version of cloudrc at both ends"
     assert complaints.about("version", bytes([9, 1, 2]), 7) == [Fault(7, "version", text)]
     assert complaints.about("version", bytes([9, 1, 2]), 8) == []
 
 
-def test_garbage_does_not_hide_that_the_peer_speaks_another_version():
+def test_garbage_does_not_hide_the_peers_version():
     complaints = Complaints()
     assert len(complaints.about("version", bytes(16), 7)) == 1
     (fault,) = complaints.about("version", bytes([4]) + bytes(15), 8)
     assert fault.text.startswith("peer speaks v4, ")
 
 
-def test_after_a_session_it_is_said_again():
+def test_after_a_session_the_fault_is_logged_again():
     complaints = Complaints()
     assert complaints.say("x", "text", 7) == [Fault(7, "x", "text")]
     assert complaints.say("x", "text", 8) == []

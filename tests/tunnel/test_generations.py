@@ -1,4 +1,4 @@
-"""Generations of keys: how far a peer may have moved on, and what a byte of them stands for."""
+"""Generations of keys: how far ahead a peer may be, and which generations a byte stands for."""
 
 import pytest
 
@@ -16,11 +16,11 @@ from cloudrc.tunnel.session import (
 )
 
 BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
-GENERATION = 6  # where it stands in the header
+GENERATION = 6  # offset in the header
 
 
 def after(rekeys, *, silence_ns=0):
-    """Both ends of a session; cloud has moved on, and world has heard nothing for so long [ns]."""
+    """Make a session in which cloud has rekeyed and world has heard nothing for `silence_ns`."""
     world, cloud = pair()
     world.tend(0)
     world.tend(silence_ns)
@@ -46,14 +46,14 @@ def refuses(world, data):
         (AHEAD_MAX + 1, SILENCE_NS, False),
     ],
 )
-def test_a_peer_that_is_not_heard_may_have_moved_on_further(rekeys, silence_ns, refused):
+def test_a_silent_peer_may_be_many_generations_ahead(rekeys, silence_ns, refused):
     world, cloud = after(rekeys, silence_ns=silence_ns)
     assert refuses(world, cloud.seal(Kind.COMMAND, BODY)) == refused
 
 
 @pytest.mark.parametrize("rekeys", [128, 255, 256, 300, 700])
-def test_however_long_an_end_slept_it_hears_its_peer_some_seconds_after(rekeys):
-    """Its own clock stood still meanwhile; the peer's did not."""
+def test_after_any_sleep_an_end_hears_its_peer_in_seconds(rekeys):
+    """Its clock stood still in the meantime; the peer's did not."""
     world, cloud = after(rekeys, silence_ns=SILENCE_NS)
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[4] == BODY
     cloud.tend((rekeys + 1) * REKEY_NS)
@@ -69,7 +69,7 @@ def test_generations_go_on_beyond_the_byte_of_the_header():
         assert world.open(cloud.seal(Kind.ALIVE, b""))[3] == number
 
 
-def test_what_is_heard_is_not_silent_and_what_is_repeated_is_not_heard():
+def test_repeats_do_not_end_the_silence_of_a_peer():
     world, cloud = pair()
     old = cloud.seal(Kind.COMMAND, BODY)
     for data in (old, cloud.seal(Kind.COMMAND, BODY)):
@@ -91,8 +91,8 @@ def test_a_peer_that_has_just_been_heard_is_not_far_ahead():
 
 
 @pytest.mark.parametrize(("rekeys", "refused"), [(FAR_MAX, False), (FAR_MAX + 1, True)])
-def test_so_far_ahead_counts_from_where_the_peer_was_heard_last(rekeys, refused):
-    """And not from the first generation, from which a month's session is as far away."""
+def test_the_step_ahead_counts_from_the_last_generation_heard(rekeys, refused):
+    """It does not count from the first generation, which is far away after a month."""
     world, cloud = after(AHEAD_MAX)
     world.open(cloud.seal(Kind.COMMAND, BODY))
     world.tend(1)
@@ -116,9 +116,9 @@ def test_a_forged_generation_opens_nothing_and_keeps_little():
     world, cloud = pair()
     for byte in range(1, 256):
         assert refuses(world, forged(cloud, byte))
-    assert len(world._openers._tried) <= AHEAD_MAX
+    assert len(world._openers._derived) <= AHEAD_MAX
     world.tend(1)
-    assert world._openers._tried == {}
+    assert world._openers._derived == {}
 
 
 def forged(cloud, byte):
@@ -127,7 +127,7 @@ def forged(cloud, byte):
     return bytes(data)
 
 
-def test_in_a_silence_forged_generations_are_tried_a_few_times_a_second(monkeypatch):
+def test_during_a_silence_few_forged_generations_are_tried(monkeypatch):
     world, cloud = after(0, silence_ns=SILENCE_NS)
     derived, derive = [], Session._derive
     monkeypatch.setattr(Session, "_derive", lambda *how: (derived.append(how), derive(*how))[1])
@@ -140,7 +140,7 @@ def test_in_a_silence_forged_generations_are_tried_a_few_times_a_second(monkeypa
         world.tend(world._tended_ns + 1)
 
 
-def test_an_honest_peer_is_found_behind_them():
+def test_an_honest_peer_is_found_behind_forged_datagrams():
     world, cloud = after(300, silence_ns=SILENCE_NS)
     for byte in range(FAR_TRIES):
         assert refuses(world, forged(cloud, 200 + byte))

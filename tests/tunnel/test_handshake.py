@@ -1,4 +1,4 @@
-"""World's side of the greetings: cookies, names, and who has authority."""
+"""World's side of the handshake: cookies, nonces, and which cloud has authority."""
 
 from types import SimpleNamespace
 
@@ -58,7 +58,7 @@ def test_a_cookie_lasts_its_slot_and_the_next(step, slots, opened):
     assert step.knock(cookie=cookie).opened == opened
 
 
-def test_a_cookie_of_the_process_before_is_worth_nothing(step):
+def test_a_cookie_of_an_earlier_process_is_invalid(step):
     other = Doorstep(nonce=b"v" * 16)
     assert not other.knock(cookie=step.cookie()).opened
 
@@ -127,7 +127,7 @@ def test_the_suite_is_chacha_if_one_end_is_slow_at_aes(wishes, agreed):
     assert step.world._agreement == Agreement(NONCE, WORLD, agreed)
 
 
-def test_a_door_opens_from_the_first_moment_of_its_clock(step):
+def test_a_session_can_open_at_time_zero(step):
     step.now_ns = 0
     assert step.knock(cookie=step.cookie()).opened
 
@@ -151,7 +151,7 @@ def test_a_session_rests_on_the_key_of_its_hello():
         step.now_ns += 2 * SECOND_NS
 
 
-def test_whichever_acceptance_comes_first_names_the_key_of_the_session():
+def test_the_first_acceptance_decides_the_key_of_the_session():
     step = Doorstep()
     old, new = KEY, Key(b"n" * 32)
     step.world.ring.replace(KeySet(new), step.now_ns)
@@ -163,14 +163,14 @@ def test_whichever_acceptance_comes_first_names_the_key_of_the_session():
     assert step.world._key == old
 
 
-def test_an_acceptance_that_is_repeated_names_the_key_that_its_epoch_began_with():
-    """World moved on, its acceptance was lost, and the key is no more that of the first hello."""
+def test_a_repeated_acceptance_has_the_key_of_its_epoch():
+    """World began a new epoch under another key, and its acceptance was lost."""
     step = Doorstep()
     step.knock(cookie=step.cookie())
     keys = KeySet(new := Key(b"n" * 32))
     step.world.ring.replace(keys, step.now_ns)
     step.now_ns += round(keys.overlap * 1e9) + SECOND_NS
-    step.world.tend(step.now_ns)  # seals with the new one from here on
+    step.world.tend(step.now_ns)  # seals with the new key from here on
     step.world.accepted = (new, KEY)
     for epoch, epoch_key in ((1, KEY), (2, new)):
         for hello_key in (new, KEY):
@@ -188,8 +188,8 @@ def test_an_acceptance_that_is_repeated_names_the_key_that_its_epoch_began_with(
     [((), REPEATS_MAX, True), ((2,), 2 + REPEATS_MAX, True), (range(5), 5, False)],
     ids=["never heard", "heard before the third", "always heard"],
 )
-def test_a_cloud_that_has_dropped_the_key_of_its_epoch_gets_another_epoch(heard, repeated, opened):
-    """World moved on under the old key, which cloud had no more when the acceptance came."""
+def test_a_cloud_without_the_key_of_its_epoch_gets_a_new_one(heard, repeated, opened):
+    """World began an epoch under the old key, which cloud dropped before the acceptance came."""
     step = Doorstep()
     step.world.ring.replace(KeySet(new := Key(b"n" * 32)), step.now_ns)
     step.world.tend(step.now_ns)
@@ -216,7 +216,7 @@ def test_answers_are_never_longer_than_the_hello(step):
     assert all(len(answer.datagrams[0]) <= hello for answer in answers)
 
 
-def test_the_door_knows_whether_the_clock_is_shared(step):
+def test_world_knows_whether_the_clock_is_shared(step):
     step.knock(cookie=step.cookie())
     assert step.door.shares_clock
     step.now_ns += 2 * SECOND_NS
@@ -244,8 +244,8 @@ def test_a_repeat_does_not_count_as_a_sign_of_life(step):
     assert step.knock(b"m" * 16, step.cookie()).opened
 
 
-def test_an_incumbent_that_asks_and_is_not_heard_gets_another_epoch(step):
-    """What it seals cannot be opened here, for whatever reason: nothing is lost with the epoch."""
+def test_a_silent_incumbent_that_asks_gets_a_new_epoch(step):
+    """World cannot open its datagrams for some reason, so a new epoch loses nothing."""
     step.knock(cookie=step.cookie())
     for counter in range(2 * REPEATS_MAX):
         step.now_ns += SECOND_NS // 5
@@ -259,7 +259,7 @@ def test_an_incumbent_that_asks_and_is_not_heard_gets_another_epoch(step):
     assert step.world.epoch == 2
 
 
-def test_who_has_a_session_is_given_time_to_be_heard_in_its_next_epoch(step):
+def test_the_next_epoch_gives_its_cloud_time_to_be_heard(step):
     step.knock(cookie=step.cookie())
     step.door.admit(Kind.OPERATOR, 0, step.now_ns)
     step.now_ns += 250 * MS
@@ -270,12 +270,12 @@ def test_who_has_a_session_is_given_time_to_be_heard_in_its_next_epoch(step):
     assert step.knock(b"another".ljust(16), step.cookie()).opened
 
 
-def test_a_new_epoch_of_the_same_session_keeps_who_has_it(step):
+def test_a_new_epoch_of_a_session_keeps_its_cloud(step):
     step.knock(cookie=step.cookie())
     step.door.admit(Kind.OPERATOR, 0, step.now_ns)
     kind, epoch, _ = codec.peek(step.door.move_on(step.now_ns))[0], step.world.epoch, None
     assert (kind, epoch) == (Kind.ACCEPT, 2)
-    step.door.admit(Kind.OPERATOR, 0, step.now_ns)  # counters begin again
+    step.door.admit(Kind.OPERATOR, 0, step.now_ns)  # counters restart
 
 
 def test_epochs_rise_from_the_last_one():

@@ -1,4 +1,4 @@
-"""How many hellos world answers, and that nobody can use up another one's answers."""
+"""How many hellos world answers, and that no sender can use up the answers of another."""
 
 import pytest
 
@@ -18,7 +18,7 @@ def step():
     return Doorstep()
 
 
-def test_used_names_are_remembered_for_longer_than_a_cookie_lasts():
+def test_used_nonces_are_remembered_longer_than_a_cookie_lasts():
     assert USED_MAX * SECOND_NS // ANSWERS_MAX * 2 > 2 * COOKIE_NS
 
 
@@ -34,14 +34,14 @@ def test_no_more_than_twenty_answers_in_any_second(step):
         assert later - first >= SECOND_NS
 
 
-def test_hellos_without_a_cookie_cannot_use_up_the_answers_to_those_with_one(step):
+def test_hellos_without_cookies_use_up_only_challenges(step):
     cookie = step.cookie()
     for _ in range(1000):
         assert step.knock(b"m" * 16).outcome == "unanswered"
     assert step.knock(cookie=cookie).opened
 
 
-def test_a_challenge_is_never_further_than_a_tenth_of_a_second(step):
+def test_challenges_are_at_most_100_ms_apart(step):
     for _ in range(50):
         assert step.knock().datagrams
         step.now_ns += CHALLENGE_NS - 1
@@ -78,7 +78,7 @@ def test_a_hello_with_a_cookie_is_answered_once(step):
     assert step.knock(b"m" * 16, step.cookie(), counter=0).opened
 
 
-def test_an_incumbent_that_asks_too_often_keeps_its_epoch_until_it_is_not_fresh(step):
+def test_a_fresh_incumbent_keeps_its_epoch_however_often_it_asks(step):
     step.knock(cookie=step.cookie())
     step.door.hear(step.now_ns)
     for _ in range(REPEATS_MAX):
@@ -89,7 +89,7 @@ def test_an_incumbent_that_asks_too_often_keeps_its_epoch_until_it_is_not_fresh(
     assert step.knock(cookie=step.door._cookie(step.now_ns)).opened
 
 
-def test_what_is_remembered_is_bounded(step):
+def test_the_memory_of_nonces_is_bounded(step):
     for number in range(3 * USED_MAX):
         step.now_ns += 2 * SECOND_NS
         step.knock(b"%016d" % number, step.door._cookie(step.now_ns))
@@ -106,7 +106,7 @@ def test_the_counter_that_was_answered_last_is_forgotten_last(step):
     assert NONCE in step.door._counters
 
 
-def test_whoever_is_answered_last_is_forgotten_last(step):
+def test_the_nonce_that_was_answered_last_is_forgotten_last(step):
     first, second, *others = (b"%16d" % number for number in range(USED_MAX + 1))
     for nonce in (first, second, *others[:-1], first, others[-1]):
         step.door._remember(nonce, 0)
@@ -114,7 +114,7 @@ def test_whoever_is_answered_last_is_forgotten_last(step):
     assert first in step.door._counters
 
 
-def test_without_an_epoch_a_hello_is_not_answered_and_takes_nothing_away():
+def test_without_an_epoch_a_hello_changes_nothing():
     epochs = [1]
     step = Doorstep(next_epoch=lambda: epochs.pop() if epochs else None)
     assert step.knock(cookie=step.cookie()).opened

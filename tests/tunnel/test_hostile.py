@@ -26,7 +26,7 @@ def target() -> Target:
 
 
 def flood(target: Target, count: int, seed: int) -> None:
-    """So many datagrams, made by chance alone."""
+    """Try `number` random datagrams."""
     rng = random.Random(seed)
     for _ in range(count):
         target.try_one(rng.randbytes(rng.choice((6, 8, 12, 40, 200))))
@@ -38,7 +38,7 @@ def test_hostile_datagrams_are_not_accepted(target: Target) -> None:
     assert target.tried > 25_000
 
 
-def test_time_passes_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_passes_between_hostile_datagrams(monkeypatch: pytest.MonkeyPatch) -> None:
     looked: Counter[tuple[bool, bool]] = Counter()
     generations = Openers._generations
 
@@ -69,7 +69,7 @@ def test_every_truncation_and_every_longer_version_is_refused(figure: Callable[.
     figure("frames cut short or made longer: accepted", 0, "==", 0, count=LONGEST * len(kinds))
 
 
-def test_the_check_notices_what_is_let_through() -> None:
+def test_the_check_finds_accepted_hostile_datagrams() -> None:
     target = Target()
     fresh = target.frames[-6]
     target.world.receive_datagram(fresh, 0)
@@ -81,11 +81,11 @@ needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux: /
 
 
 @needs_linux
-def test_what_leaks_is_noticed_below_a_peak_too() -> None:
+def test_a_memory_leak_below_a_peak_is_found() -> None:
     peak = b"x" * (128 << 20)
     del peak
     before = memory()
-    with mmap(-1, 64 << 20) as leak:  # from the kernel: malloc may have as much to give back
+    with mmap(-1, 64 << 20) as leak:  # from the kernel, because malloc may reuse freed memory
         for at in range(0, len(leak), PAGESIZE):
             leak[at] = 1
         assert memory() - before == pytest.approx(len(leak) / 2**20, abs=1.0)
@@ -97,7 +97,7 @@ def test_a_million_hostile_datagrams(target: Target, figure: Callable[..., None]
     tried = target.tried
     flood(target, 100_000, seed=2)
     before = memory()
-    flood(target, 902_000, seed=3)  # a few are frames that both ends know, and are not tried
+    flood(target, 902_000, seed=3)  # a few are valid frames, which are not tried
     grown, tried = memory() - before, target.tried - tried
     assert tried >= 1_000_000
     figure("hostile datagrams by chance: accepted", 0, "==", 0, count=tried)
@@ -107,10 +107,10 @@ def test_a_million_hostile_datagrams(target: Target, figure: Callable[..., None]
 
 @pytest.mark.process
 @pytest.mark.parametrize(
-    ("runs", "least"),  # some of what the fuzzer makes are frames that both ends know
+    ("runs", "least"),  # the fuzzer also makes valid frames
     [(1_150_000, 1_000_000), pytest.param(11_500_000, 10_000_000, marks=pytest.mark.full)],
 )
-def test_coverage_guided_ones(
+def test_coverage_guided_hostile_datagrams(
     runs: int, least: int, tmp_path: Path, figure: Callable[..., None]
 ) -> None:
     if (sys.platform, platform.machine()) != ("linux", "x86_64"):

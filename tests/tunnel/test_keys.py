@@ -25,7 +25,7 @@ def test_a_key_has_32_bytes(size):
     "show",
     [repr, str, "{}".format, "{!r}".format, lambda key: repr(KeySet(key)), lambda k: repr([k])],
 )
-def test_a_key_shows_nothing_of_itself(show):
+def test_the_text_of_a_key_does_not_show_the_key(show):
     text = show(Key(SECRET))
     assert SECRET.hex()[:8] not in text
     assert repr(SECRET)[2:10] not in text
@@ -63,7 +63,7 @@ def test_a_tag_fits_only_its_key_and_its_data():
     assert not B.verifies(b"data", tag)
 
 
-def test_what_is_derived_depends_on_salt_and_use():
+def test_a_derived_key_depends_on_salt_and_use():
     derived = {A.derive(salt, use) for salt in (b"", b"s") for use in (b"u", b"v")}
     assert len(derived) == 4
 
@@ -75,11 +75,11 @@ def test_what_is_derived_depends_on_salt_and_use():
         *(ROTATED._replace(until=until) for until in (0.0, 253_402_300_799.0)),
     ],
 )
-def test_a_file_holds_what_was_written(keys):
+def test_a_written_key_file_parses_to_the_same_keys(keys):
     assert parse(write(keys).encode()) == keys
 
 
-def test_a_file_says_what_it_is():
+def test_a_key_file_explains_itself():
     assert write(KeySet(A)).startswith(
         "# A key of cloudrc's tunnel: keep it secret. Made by 'cloudrc key new'.\ncurrent "
     )
@@ -97,49 +97,50 @@ HEX = SECRET.hex()
     [
         (
             "",
-            "^its lines are 'current', and perhaps 'previous', 'overlap_s' and 'previous_until_s'$",
+            "^expected the line 'current' and optionally 'previous', 'overlap_s' and "
+            "'previous_until_s', each once$",
         ),
-        ("# only a comment", "its lines are"),
-        (f"previous {HEX}", "its lines are"),
-        (f"current {HEX}\nnext {HEX}", "its lines are"),
-        (f"current {HEX}\ncurrent {HEX}", "its lines are"),
+        ("# only a comment", "expected the line"),
+        (f"previous {HEX}", "expected the line"),
+        (f"current {HEX}\nnext {HEX}", "expected the line"),
+        (f"current {HEX}\ncurrent {HEX}", "expected the line"),
         (HEX, "neither 32 bytes nor lines"),
         (f"current {HEX} {HEX}", "neither 32 bytes nor lines"),
         (f"current {HEX[:-2]}", "64 hexadecimal digits"),
         (f"current {HEX[:-1]}x", "64 hexadecimal digits"),
         (f"current {HEX}\nprevious x", "64 hexadecimal digits"),
         *(
-            (f"current {HEX}\noverlap_s {wrong}", "overlap_s is above 0")
+            (f"current {HEX}\noverlap_s {wrong}", "overlap_s must be above 0")
             for wrong in ("0", "-1", "nan", "inf", "86401", "soon")
         ),
         *(
             (
                 f"current {HEX}\nprevious_until_s {wrong}",
-                "^previous_until_s is seconds since 1970, before the year 10000$",
+                "^previous_until_s must be seconds since 1970, before the year 10000$",
             )
             for wrong in ("-1", "nan", "inf", "253402300800", "soon")
         ),
     ],
 )
-def test_a_wrong_file_is_refused_in_words_without_the_key(text, said):
+def test_the_error_of_a_wrong_file_does_not_show_the_key(text, said):
     with pytest.raises(ValueError, match=said) as caught:
         parse(text.encode())
     assert HEX[:8] not in str(caught.value)
     assert caught.value.__suppress_context__ or caught.value.__context__ is None
 
 
-def test_bytes_that_are_no_text_are_refused():
+def test_bytes_that_are_not_text_are_refused():
     with pytest.raises(ValueError, match="neither 32 bytes"):
         parse(b"\xff" * 40)
 
 
-def test_the_previous_key_is_valid_for_the_overlap_from_reading_on():
+def test_the_previous_key_is_valid_for_the_overlap():
     ring = KeyRing(KeySet(A, B, 10.0), now_ns=5 * SECOND_NS)
     assert ring.accepted(15 * SECOND_NS - 1) == (A, B)
     assert ring.accepted(15 * SECOND_NS) == (A,)
 
 
-def test_a_new_key_leaves_the_one_until_now_valid_for_the_overlap():
+def test_a_replaced_key_stays_valid_for_the_overlap():
     ring = KeyRing(KeySet(A))
     ring.replace(KeySet(B, None, 10.0), 100 * SECOND_NS)
     assert ring.current == B
@@ -153,23 +154,23 @@ def test_the_file_says_which_key_is_previous():
     assert ring.accepted(1) == (B, C)
 
 
-def test_the_same_key_again_makes_no_previous_one():
+def test_the_same_key_again_makes_no_previous_key():
     ring = KeyRing(KeySet(A))
     ring.replace(KeySet(A), 0)
     assert ring.accepted(0) == (A,)
 
 
-def test_what_is_written_is_whole_seconds_since_1970():
+def test_a_key_file_has_whole_seconds_since_1970():
     assert write(ROTATED).splitlines()[-1] == "previous_until_s 1795000300"
     assert "until" not in write(ROTATED._replace(until=None))
 
 
-def test_a_rotation_puts_the_new_key_before_the_current_one_and_forgets_the_one_before_that():
+def test_a_rotation_keeps_the_new_and_the_current_key_only():
     assert KeySet(B, A).rotated(b"c" * 32, MADE, 10.0) == KeySet(C, B, 10.0, MADE + 10.0)
     assert KeySet(A).rotated(b"b" * 32, MADE) == KeySet(B, A, OVERLAP, MADE + OVERLAP)
 
 
-def test_a_rotated_key_file_says_the_whole_second_after_which_the_old_key_is_refused():
+def test_the_expiry_of_a_rotated_key_is_rounded_up_to_1_s():
     keys = KeySet(A).rotated(b"b" * 32, MADE + 0.25, 10.0)
     assert keys.until == MADE + 11.0
     assert parse(write(keys).encode()) == keys
@@ -191,7 +192,7 @@ def test_a_rotated_key_file_says_the_whole_second_after_which_the_old_key_is_ref
         (None, 300.0),
     ],
 )
-def test_a_process_that_starts_later_accepts_the_previous_key_for_what_is_left(wall, left):
+def test_a_later_start_accepts_the_previous_key_for_less_time(wall, left):
     began_ns = 5 * SECOND_NS
     ring = KeyRing(ROTATED, began_ns, wall)
     end_ns = began_ns + round(left * SECOND_NS)
@@ -200,15 +201,15 @@ def test_a_process_that_starts_later_accepts_the_previous_key_for_what_is_left(w
 
 
 @pytest.mark.parametrize("wall", [MADE, 0.0, MADE + 1e9])
-def test_of_a_file_that_does_not_say_until_when_the_overlap_counts_from_each_start(wall):
+def test_without_an_expiry_the_overlap_counts_from_each_start(wall):
     ring = KeyRing(ROTATED._replace(until=None), now_ns=0, wall=wall)
     assert ring.accepted(300 * SECOND_NS - 1) == (B, A)
     assert ring.accepted(300 * SECOND_NS) == (B,)
 
 
 @pytest.mark.promise("old-keys-expire")
-def test_a_clock_that_is_set_back_gives_no_more_than_the_overlap():
-    """It is asked at the start alone: whatever it says then, the process counts by itself."""
+def test_a_wrong_clock_cannot_extend_the_overlap():
+    """The wall clock is read only at the start; then the process uses its monotonic clock."""
     for wall in range(round(MADE) - 400, round(MADE) + 400, 7):
         assert ROTATED.left(float(wall)) <= 300.0
 
@@ -224,29 +225,29 @@ def test_a_clock_that_is_set_back_gives_no_more_than_the_overlap():
         (
             ROTATED,
             0.0,
-            "refused: by this machine's clock (1970-01-01T00:00:00+00:00) the key file is not made "
-            "yet; set the clock",
+            "refused: this machine's clock (1970-01-01T00:00:00+00:00) is behind the time when "
+            "the key file was written; set the clock",
         ),
         (
             KeySet(B, A),
             MADE,
-            "accepted for 300 s from every start on, for the key file does not say until when; "
+            "accepted for 300 s after every start, because the key file has no expiry time; "
             "drop it: cloudrc key retire FILE",
         ),
     ],
 )
-def test_what_is_doubtful_about_the_previous_key_is_told(keys, wall, said):
-    assert keys.caution(wall) == f"key {A.name}, the one before, is {said}"
+def test_a_doubtful_previous_key_gives_a_warning(keys, wall, said):
+    assert keys.caution(wall) == f"the previous key {A.name} is {said}"
 
 
 @pytest.mark.parametrize("keys", [KeySet(B), ROTATED])
-def test_otherwise_nothing_is(keys):
+def test_a_valid_previous_key_gives_no_warning(keys):
     assert keys.caution(MADE + 299.0) == ""
 
 
 @pytest.mark.promise("old-keys-expire")
-def test_what_is_written_anew_beside_a_previous_key_makes_its_time_no_longer():
-    ring = KeyRing(ROTATED, now_ns=0, wall=MADE + 300.0)  # it is over
+def test_a_new_file_cannot_extend_the_previous_keys_time():
+    ring = KeyRing(ROTATED, now_ns=0, wall=MADE + 300.0)  # it has expired
     ring.replace(KeySet(B, A, 600.0), 10 * SECOND_NS)
     assert ring.accepted(10 * SECOND_NS) == (B,)
     ring = KeyRing(KeySet(B, A, 20.0))
@@ -257,7 +258,7 @@ def test_what_is_written_anew_beside_a_previous_key_makes_its_time_no_longer():
     assert ring.accepted(15 * SECOND_NS) == (C,)
 
 
-def test_a_previous_key_that_is_taken_out_of_the_file_is_refused_at_once():
+def test_a_previous_key_removed_from_the_file_is_refused():
     ring = KeyRing(KeySet(B, A, 20.0))
     ring.replace(KeySet(B), SECOND_NS)
     assert ring.accepted(SECOND_NS) == (B,)

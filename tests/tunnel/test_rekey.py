@@ -12,7 +12,7 @@ from cloudrc.tunnel.session import KEPT, REKEY_NS, Agreement, Session, pair
 BODY = bytes(codec.BODY_SIZES[Kind.COMMAND])
 SECOND_NS = 1_000_000_000
 OLD, NEW, WRONG = Key(b"o" * 32), Key(b"n" * 32), Key(b"w" * 32)
-GENERATION = 6  # where it stands in the header
+GENERATION = 6  # offset in the header
 
 
 class Ends:
@@ -59,7 +59,7 @@ def generation(data):
 
 
 @pytest.mark.promise("keys-change-in-flight")
-def test_after_two_minutes_the_keys_are_new_and_every_datagram_is_opened():
+def test_a_rekey_after_two_minutes_loses_no_datagram():
     ends = Ends()
     assert ends.pass_time(119) == 0
     assert generation(ends.cloud.seal(Kind.COMMAND, BODY)) == 0
@@ -87,7 +87,7 @@ def test_the_keys_of_two_generations_differ():
 
 
 @pytest.mark.parametrize(("sent", "moved"), [(9, 0), (10, 1)])
-def test_so_many_datagrams_make_new_keys(monkeypatch, sent, moved):
+def test_a_rekey_follows_a_number_of_datagrams(monkeypatch, sent, moved):
     assert session.REKEY_DATAGRAMS == 2**32
     monkeypatch.setattr(session, "REKEY_DATAGRAMS", 10)
     _, cloud = pair()
@@ -98,7 +98,7 @@ def test_so_many_datagrams_make_new_keys(monkeypatch, sent, moved):
     for _ in range(8):
         cloud.seal(Kind.COMMAND, BODY)
     cloud.tend(2)
-    assert generation(cloud.seal(Kind.COMMAND, BODY)) == 1  # the count begins anew
+    assert generation(cloud.seal(Kind.COMMAND, BODY)) == 1  # the count restarts
 
 
 def test_late_datagrams_of_the_generation_before_are_opened():
@@ -110,7 +110,7 @@ def test_late_datagrams_of_the_generation_before_are_opened():
     assert world.open(late)[3] == 0
 
 
-def test_generations_long_gone_are_forgotten():
+def test_old_generations_are_forgotten():
     world, cloud = pair()
     cloud.tend(0)
     late = cloud.seal(Kind.COMMAND, BODY)
@@ -125,12 +125,12 @@ def test_generations_long_gone_are_forgotten():
 @pytest.mark.promise("keys-change-in-flight")
 @pytest.mark.parametrize("order", [("world", "cloud"), ("cloud", "world")])
 @pytest.mark.parametrize("apart", [0, 1, 90])
-def test_a_rotation_goes_through_without_losing_a_datagram(order, apart):
+def test_a_rotation_loses_no_datagram(order, apart):
     ends = Ends()
     ends.pass_time(50)
     ends.rotate(order[0])
     announced = ends.pass_time(apart)
-    assert announced <= apart  # the other end cannot open what says that there is a new key
+    assert announced <= apart  # the other end cannot open an announcement
     ends.rotate(order[1])
     assert ends.pass_time(2) <= 1
     assert ends.world._key == ends.cloud._key == NEW
@@ -154,14 +154,14 @@ def test_an_announced_generation_is_used_for_nothing_else():
     world.ring.replace(KeySet(NEW), 0)
     announced = [world.tend(second * SECOND_NS) for second in (1, 2)]
     assert [(generation(d), codec.peek(d)[2]) for (d,) in announced] == [(1, 0), (1, 1)]
-    (again,) = world.tend(REKEY_NS)  # the old key moves on, beyond what was announced
+    (again,) = world.tend(REKEY_NS)  # the old key gets the generation after the announced one
     assert generation(world.seal(Kind.ALIVE, b"")) == 2
     assert generation(again) == 3
     assert world.next_counter(Kind.ALIVE) == 4
     assert cloud.open(world.seal(Kind.ALIVE, b""))[3] == 4
 
 
-def test_datagrams_of_the_generation_before_the_last_are_opened_with_the_keys_at_hand(monkeypatch):
+def test_late_datagrams_are_opened_without_deriving_keys(monkeypatch):
     world, cloud = pair()
     cloud.tend(0)
     late = cloud.seal(Kind.COMMAND, BODY)
@@ -207,7 +207,7 @@ def test_a_second_rotation_replaces_the_first():
     assert ends.world._key == ends.cloud._key == Key(b"m" * 32)
 
 
-def test_while_two_keys_are_valid_greetings_of_both_are_taken():
+def test_greetings_with_either_valid_key_are_accepted():
     ends = Ends()
     ends.rotate("world")
     ends.pass_time(1)
@@ -218,7 +218,7 @@ def test_while_two_keys_are_valid_greetings_of_both_are_taken():
 
 
 def test_an_end_that_had_a_wrong_key_goes_on_with_the_right_one():
-    """Its peer has used that one all the time, and was heard while the wrong one was there."""
+    """Its peer has used the right key all the time, and was heard in the meantime."""
     ends = Ends(overlap=2.0)
     ends.rotate("cloud")
     ends.pass_time(3)
@@ -233,7 +233,7 @@ def test_an_end_that_had_a_wrong_key_goes_on_with_the_right_one():
     assert ends.hear_each_other()
 
 
-def test_what_was_heard_in_the_epoch_before_tells_nothing_of_this_one():
+def test_a_new_epoch_forgets_the_peers_key():
     ends = Ends()
     for end in ("world", "cloud"):
         ends.rotate(end)
@@ -246,13 +246,13 @@ def test_what_was_heard_in_the_epoch_before_tells_nothing_of_this_one():
     assert ends.world._key == ends.cloud._key == NEW
 
 
-def test_whatever_befell_the_key_files_once_they_are_the_same_both_ends_hear_each_other():
+def test_with_equal_key_files_both_ends_hear_each_other_again():
     for chance in map(random.Random, range(1500)):
         ends = Ends(overlap=chance.choice((2.0, 5.0, 30.0)))
         for _ in range(chance.randint(1, 6)):
             ends.rotate(chance.choice(("world", "cloud")), chance.choice((OLD, NEW, WRONG)))
             if chance.random() < 0.5:
-                ends.hear_each_other()  # before either has looked at its file
+                ends.hear_each_other()  # before either has read its file
             ends.pass_time(chance.choice((0, 0, 1, 2, 3, 7)), deliver=chance.random() < 0.8)
         last = chance.choice((OLD, NEW, Key(b"l" * 32)))
         for end in chance.sample(("world", "cloud"), 2):

@@ -1,4 +1,4 @@
-"""Key files that differ and have one key in common: the ends come together on that one."""
+"""Key files that differ but have one key in common: both ends change to that key."""
 
 import pytest
 
@@ -12,7 +12,7 @@ HELLO = bytes(codec.BODY_SIZES[Kind.HELLO])
 
 
 def rotated():
-    """Both ends use the new key, and accept the one before for five minutes."""
+    """Make ends that use the new key and accept the old one for five minutes."""
     ends = Ends()
     for end in ("world", "cloud"):
         ends.rotate(end)
@@ -22,14 +22,14 @@ def rotated():
 
 
 def go_back(ends):
-    """Cloud alone seals with the old key again, and has been heard with it once."""
+    """Let only cloud return to the old key; world has heard it once with that key."""
     ends.rotate("cloud", OLD)
     ends.cloud._move_on(OLD)
     ends.world.open(ends.cloud.seal(Kind.ALIVE, b""))
 
 
 def look(ends, *, heard):
-    """World looks, a second later, after it has heard this."""
+    """Let world receive this and check its keys a second later."""
     ends.world.open(heard)
     ends.now_ns += SECOND_NS
     return ends.world.tend(ends.now_ns)
@@ -37,7 +37,7 @@ def look(ends, *, heard):
 
 @pytest.mark.parametrize("first", ["world", "cloud"])
 def test_one_end_that_is_rolled_back_is_followed(first):
-    """It knows the new key for two seconds more, the other one the old key for minutes."""
+    """One end accepts the new key for 2 s more; the other accepts the old key for minutes."""
     ends = rotated()
     ends.rings[first].replace(KeySet(OLD, NEW, 2.0), ends.now_ns)
     ends.pass_time(3 + LOOKS)
@@ -46,7 +46,7 @@ def test_one_end_that_is_rolled_back_is_followed(first):
     assert ends.hear_each_other()
 
 
-def test_a_peer_that_is_heard_with_the_key_before_is_given_time():
+def test_a_peer_with_the_older_key_is_given_time():
     ends = rotated()
     go_back(ends)
     for _ in range(LOOKS - 1):
@@ -62,7 +62,7 @@ def test_a_peer_that_is_heard_with_the_key_before_is_given_time():
 
 
 @pytest.mark.parametrize("between", ["heard", "begun"])
-def test_the_looks_are_counted_in_a_row(between):
+def test_only_checks_in_a_row_count(between):
     ends = rotated()
     new = ends.cloud.seal(Kind.COMMAND, bytes(codec.BODY_SIZES[Kind.COMMAND]))
     go_back(ends)
@@ -81,7 +81,7 @@ def test_the_looks_are_counted_in_a_row(between):
 
 
 @pytest.mark.parametrize("end", ["world", "cloud"])
-def test_what_was_captured_before_a_rotation_leads_nobody_back(end):
+def test_captured_datagrams_do_not_restore_the_old_key(end):
     ends = Ends()
     peer, end = (ends.cloud, ends.world) if end == "world" else (ends.world, ends.cloud)
     captured = peer.seal(Kind.ALIVE, b"")
@@ -97,7 +97,7 @@ def test_what_was_captured_before_a_rotation_leads_nobody_back(end):
 
 
 @pytest.mark.promise("old-keys-expire")
-def test_a_key_that_is_retired_opens_nothing_from_then_on():
+def test_a_retired_key_opens_nothing():
     ends = rotated()
     ends.cloud._move_on(OLD)
     ends.world.open(ends.cloud.seal(Kind.ALIVE, b""))
@@ -107,7 +107,7 @@ def test_a_key_that_is_retired_opens_nothing_from_then_on():
             ends.world.open(data)
 
 
-def test_a_key_that_is_not_valid_any_more_is_left_at_once_for_the_one_that_is_heard():
+def test_an_expired_key_is_replaced_by_the_peers_key_at_once():
     ends = Ends()
     ends.world.ring.replace(KeySet(NEW, OLD, 300.0), 0)
     ends.pass_time(1)

@@ -1,4 +1,4 @@
-"""Sessions: whose datagrams are opened, and that nothing changes before a tag is right."""
+"""Sessions: which datagrams are opened, and that nothing changes before a tag is verified."""
 
 import pytest
 from hypothesis import given, settings
@@ -28,9 +28,9 @@ def a_session(sends=Direction.DOWNLINK, secret=bytes(32)):
 
 
 def state(session):
-    """All that a datagram could change; ciphers by where they are."""
+    """Return all state that a datagram could change; ciphers by their addresses."""
     known = {} if session._openers is None else vars(session._openers)
-    known = {name: value for name, value in known.items() if name not in ("_tried", "_far_tries")}
+    known = {name: value for name, value in known.items() if name not in ("_derived", "_far_tries")}
     return {name: repr(value) for name, value in (vars(session) | known).items()}
 
 
@@ -49,7 +49,7 @@ def test_the_other_end_opens_what_one_end_seals(ends):
     assert datagram == (Kind.COMMAND, Direction.DOWNLINK, 1, 1, BODY)
 
 
-def test_a_sealed_datagram_shows_its_header_and_nothing_of_its_body():
+def test_a_sealed_datagram_hides_its_body():
     _, cloud = pair(epoch=7)
     data = cloud.seal(Kind.COMMAND, BODY)
     assert codec.peek(data) == (Kind.COMMAND, 7, 0)
@@ -57,7 +57,7 @@ def test_a_sealed_datagram_shows_its_header_and_nothing_of_its_body():
     assert all(BODY[i : i + 4] not in data for i in range(len(BODY) - 3))
 
 
-def test_an_unsealed_one_is_as_long_and_is_opened_by_no_sealed_end():
+def test_no_sealed_end_opens_an_unsealed_datagram():
     world, _ = pair()
     data = unsealed()[1].seal(Kind.COMMAND, BODY)
     assert len(data) == codec.SIZES[Kind.COMMAND]
@@ -65,10 +65,10 @@ def test_an_unsealed_one_is_as_long_and_is_opened_by_no_sealed_end():
         world.open(data)
 
 
-def test_what_is_no_datagram_of_ours_costs_no_cryptography(monkeypatch):
+def test_a_malformed_datagram_costs_no_cryptography(monkeypatch):
     world, cloud = pair()
     data = cloud.seal(Kind.COMMAND, BODY)
-    longest = codec.DATAGRAM_MAX + 1  # what an end reads of a longer one
+    longest = codec.DATAGRAM_MAX + 1  # size that an end reads of a longer one
     other = bytes([data[0] ^ 1]) + data[1:]
 
     def tried(*given):
@@ -108,7 +108,7 @@ def test_another_epoch_is_refused(ends):
 
 
 @pytest.mark.parametrize("make", [a_session, lambda: UnsealedSession(Direction.DOWNLINK)])
-def test_without_a_session_nothing_is_opened_but_greetings(make):
+def test_without_a_session_only_greetings_are_opened(make):
     cloud, (world, _) = make(), pair(epoch=NO_EPOCH)
     with pytest.raises(DecodeError, match=r"^old_epoch$"):
         cloud.open(world.seal(Kind.TELEMETRY, bytes(codec.BODY_SIZES[Kind.TELEMETRY])))
@@ -160,12 +160,12 @@ def test_no_nonce_is_used_twice_in_an_epoch():
     assert len(set(nonces)) == 150
 
 
-def test_an_end_cannot_begin_without_greetings():
-    with pytest.raises(AssertionError, match=r"^greetings come first$"):
+def test_an_end_cannot_begin_without_a_handshake():
+    with pytest.raises(AssertionError, match=r"^the handshake comes first$"):
         a_session().begin(1)
 
 
-def test_kinds_count_on_their_own_and_an_epoch_begins_them_anew():
+def test_each_kind_has_its_own_counter_in_each_epoch():
     _, session = pair()
     session.seal(Kind.COMMAND, BODY)
     assert session.next_counter(Kind.COMMAND) == 1
@@ -175,7 +175,7 @@ def test_kinds_count_on_their_own_and_an_epoch_begins_them_anew():
 
 
 @pytest.mark.parametrize("kind", [Kind.HELLO, Kind.CHALLENGE, Kind.BUSY])
-def test_greetings_belong_to_no_epoch_and_count_on(kind):
+def test_counters_of_greetings_continue_across_epochs(kind):
     _, session = pair()
     session.greet(kind, b"")
     session.begin(5)
@@ -207,7 +207,7 @@ def test_an_acceptance_belongs_to_the_epoch_that_it_opens():
     assert codec.peek(session.greet(Kind.ACCEPT, b"")) == (Kind.ACCEPT, 5, 0)
 
 
-def test_a_greeting_of_another_key_is_refused_and_of_the_same_is_named():
+def test_a_greeting_with_another_key_is_refused():
     world, stranger = a_session(Direction.UPLINK), a_session(secret=b"x" * 32)
     with pytest.raises(DecodeError, match=r"^tag$"):
         world.open(stranger.greet(Kind.HELLO, HELLO))
@@ -217,7 +217,7 @@ def test_a_greeting_of_another_key_is_refused_and_of_the_same_is_named():
 
 
 def datagrams(count):
-    """Sealed datagrams of every kind, both directions, and greetings; with who opens them."""
+    """Make datagrams of every kind in both directions, each with the end that opens it."""
     world, cloud = pair()
     made = []
     for number in range(count):
@@ -232,7 +232,7 @@ def datagrams(count):
 
 
 def flip_every_bit(made):
-    """How many of all copies with one bit flipped were opened."""
+    """Flip each bit of each datagram; return how many copies were opened, and their number."""
     accepted = flips = 0
     for data, opener in made:
         opener.open(data)
@@ -260,7 +260,7 @@ def test_no_bit_of_a_thousand_datagrams_can_be_flipped(figure):
 
 @given(st.sampled_from(datagrams(5)), st.data())
 @settings(max_examples=200, deadline=None)
-def test_what_is_refused_changes_nothing(made, data):
+def test_a_refused_datagram_changes_nothing(made, data):
     good, opener = made
     cut = data.draw(st.integers(0, len(good)))
     spoiled = good[:cut] + data.draw(st.binary(max_size=len(good) - cut + 3))
@@ -273,7 +273,7 @@ def test_what_is_refused_changes_nothing(made, data):
         assert spoiled == good
 
 
-def test_the_suite_that_ends_agree_on_is_aes_unless_they_say_else():
+def test_the_default_suite_is_aes():
     assert AGREEMENT.suite == AES_256_GCM
 
 

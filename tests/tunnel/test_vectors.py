@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from cloudrc.messages import Command
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Busy, Direction, Hello, Kind
-from cloudrc.tunnel.handshake import Door, Knocker
+from cloudrc.tunnel.handshake import ClientHandshake, Door
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, REKEY_NS, Session, pair
 
@@ -52,7 +52,7 @@ HKDF_VECTORS = [
 
 
 def derived(key, salt, info, length=32):
-    """HKDF-SHA256 by hand: extract, expand."""
+    """Compute HKDF-SHA256 by hand: extract, expand."""
     inner = hmac.digest(salt or bytes(32), key, hashlib.sha256)
     block, out = b"", b""
     for number in range(1, -(-length // 32) + 1):
@@ -73,7 +73,7 @@ def test_a_key_derives_by_hkdf_with_version_and_use():
     assert Key(SECRET).derive(b"salt", b"use") == derived(SECRET, b"salt", label)
 
 
-def test_a_keys_name_is_made_of_nothing_but_what_is_derived():
+def test_the_name_of_a_key_is_derived_from_it():
     assert Key(SECRET).name == derived(SECRET, b"", b"cloudrc 5 name")[:4].hex()
 
 
@@ -124,7 +124,7 @@ def test_chacha20_poly1305_is_that_of_rfc_8439():
 
 
 def by_hand(suite, direction, epoch, generation, kind, counter, body):
-    """A sealed datagram as docs/wire.md describes it."""
+    """Make a sealed datagram as docs/wire.md describes it."""
     use = b"cloudrc 5 session %d %d %d %d" % (suite, direction, epoch, generation)
     key = derived(SECRET, b"cloud".ljust(16) + b"world".ljust(16), use)
     header = struct.pack("<BBIBBQ", 5, direction, epoch, generation % 256, kind, counter)
@@ -163,14 +163,14 @@ def test_a_cookie_can_be_made_from_the_description_alone():
     assert answer[16:-16] == cookie + bytes(33)
 
 
-def test_the_second_name_of_a_cloud_is_made_of_the_first():
-    knocker = Knocker(b"n" * 16, bytes(16), 1)
-    knocker.refused(Busy(b"n" * 16, used=True))
+def test_a_clouds_next_nonce_is_derived_from_the_first():
+    handshake = ClientHandshake(b"n" * 16, bytes(16), 1)
+    handshake.receive_busy(Busy(b"n" * 16, used=True))
     second = hashlib.sha256(b"n" * 16 + b" 1").digest()[:16]
-    assert codec.decode_hello(knocker.hello()).nonce == second
-    knocker.refused(Busy(second, used=True))
+    assert codec.decode_hello(handshake.make_hello()).nonce == second
+    handshake.receive_busy(Busy(second, used=True))
     third = hashlib.sha256(b"n" * 16 + b" 2").digest()[:16]
-    assert codec.decode_hello(knocker.hello()).nonce == third
+    assert codec.decode_hello(handshake.make_hello()).nonce == third
 
 
 FROZEN = {
@@ -193,7 +193,7 @@ FROZEN = {
 
 @pytest.mark.parametrize(("suite", "kind"), FROZEN)
 def test_the_wire_stays_as_it_is(suite, kind):
-    """A change here is another version of the wire: raise codec.VERSION with it."""
+    """If this changes, the wire format changes: raise codec.VERSION, too."""
     world, cloud = pair(7, SECRET, suite)
     end = world if kind == Kind.TELEMETRY else cloud
     body = bytes(n % 251 for n in range(codec.BODY_SIZES[kind]))

@@ -1,4 +1,4 @@
-"""Controllers: estimate and setpoint become a velocity command; one file each.
+"""Controllers compute a velocity command from the estimate and the setpoint; one file each.
 
 A plug-in file has a `build(**parameters)` with annotated parameters that returns a `Controller`.
 """
@@ -11,14 +11,14 @@ from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
 
 
 class ControlOutput(NamedTuple):
-    """What a controller wants, and why.
+    """The command of a controller and its terms.
 
     Attributes:
-        velocity: [m/s], world frame, shape (3,).
-        yaw_rate: [rad/s].
-        proportional: Share of the velocity [m/s], shape (3,).
-        integral: Likewise.
-        derivative: Likewise.
+        velocity: Commanded velocity [m/s], world frame, shape (3,).
+        yaw_rate: Commanded yaw rate [rad/s].
+        proportional: Proportional term of the velocity [m/s], shape (3,).
+        integral: Integral term of the velocity [m/s], shape (3,).
+        derivative: Derivative term of the velocity [m/s], shape (3,).
     """
 
     velocity: Vector
@@ -29,17 +29,17 @@ class ControlOutput(NamedTuple):
 
 
 class Controller:
-    """Tracks a setpoint."""
+    """Track a setpoint."""
 
     def reset(self) -> None:
-        """Forget everything: a new session or mission begins."""
+        """Forget everything at the start of a session or mission."""
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
         """Compute one command.
 
         Args:
-            estimate: Predicted state. Position [m], velocity [m/s], world frame.
-            setpoint: Where to be. Position [m], yaw [rad].
+            estimate: Predicted position [m] and velocity [m/s], world frame.
+            setpoint: Position [m], world frame, and yaw [rad].
             dt: Time since the last call [s], > 0.
         """
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""Controller: predicted odometry and setpoint come in, a velocity command goes out.
+"""Controller: PID on the position of the predicted odometry.
 
 Source: the paper, eqs. (4) and (5); gains: docs/reference/plant.md, "Cloud controller".
 """
@@ -16,12 +16,12 @@ UNLIMITED: Vector = (inf, inf, inf)
 
 
 class Pid(Controller):
-    """PID on the position; what it commands is a velocity.
+    """PID on the position that commands a velocity.
 
-    Deviation: with positive gains eq. (4) as printed, estimate minus setpoint, diverges; here
-    error = setpoint - estimate. The derivative acts on the measurement, so that a new setpoint
-    does not kick. An axis whose output is limited does not integrate an error that would push it
-    further (conditional anti-windup). The published code has none of the three limits.
+    Deviation: eq. (4) as printed, estimate minus setpoint, diverges with positive gains; here
+    error = setpoint - estimate. The derivative acts on the measurement, so a new setpoint causes no
+    kick. An axis whose output is limited does not integrate an error that would push it further
+    (conditional anti-windup). The published code has none of the three limits.
     """
 
     def __init__(
@@ -34,16 +34,16 @@ class Pid(Controller):
         velocity_max: Vector,
         speed_max: float,
     ) -> None:
-        """Start with an empty integral; what limits nothing is infinite.
+        """Start with an integral of zero; an infinite limit limits nothing.
 
         Args:
             gain_p: Velocity per position error [1/s], shape (3,).
             gain_i: Velocity per integral of the position error [1/s^2], shape (3,).
-            gain_d: Velocity taken back per velocity [1], shape (3,).
+            gain_d: Reduction of the velocity per measured velocity [1], shape (3,).
             gain_yaw: Yaw rate per yaw error [1/s].
-            integral_limit: Of the integral term [m/s], shape (3,).
-            velocity_max: Per axis [m/s], shape (3,).
-            speed_max: Of the whole [m/s].
+            integral_limit: Limit of the integral term per axis [m/s], shape (3,).
+            velocity_max: Limit of the velocity per axis [m/s], shape (3,).
+            speed_max: Limit of the speed [m/s].
         """
         self._gain_p = gain_p
         self._gain_i = gain_i
@@ -57,14 +57,14 @@ class Pid(Controller):
         self._integral = ZERO
 
     def reset(self) -> None:
-        """Empty the integral: a new session or mission begins."""
+        """Set the integral to zero at the start of a session or mission."""
         self._integral = ZERO
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
         """Compute one command: u = P e + I (integral of e) - D v, then the limits.
 
-        The three terms returned are those before the limits, so they sum to the velocity only
-        while no limit holds it. The integral is that of the errors before this one.
+        The three returned terms are not limited, so their sum is the velocity only if no limit
+        acts. The integral contains the errors before this one.
 
         Source: the paper, eq. (5).
 
@@ -105,7 +105,7 @@ class Pid(Controller):
         return (x * scale, y * scale, z * scale)
 
     def _integrate(self, error: Vector, wanted: Vector, velocity: Vector, dt: float) -> None:
-        """Add this error [m] over `dt` [s] where it does not wind up a limited axis."""
+        """Add this error [m] over `dt` [s] on each axis that it does not wind up."""
         x, y, z = (
             max(min(term + gain * e * dt, limit), -limit) if v == u or e * u < 0 else term
             for term, gain, e, u, v, limit in zip(
@@ -121,10 +121,10 @@ class Pid(Controller):
         self._integral = (x, y, z)
 
     def _yaw_rate(self, orientation_wxyz: Quaternion, yaw: float) -> float:
-        """Gain times the yaw error [rad], the short way round."""
+        """Multiply the yaw error [rad], the short way round, by the gain."""
         w, x, y, z = orientation_wxyz
-        seen = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        return self._gain_yaw * remainder(yaw - seen, tau)
+        measured = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return self._gain_yaw * remainder(yaw - measured, tau)
 
 
 def _sum(a: Vector, b: Vector, c: Vector) -> Vector:
@@ -145,15 +145,15 @@ def build(
     Source: docs/reference/plant.md, "Cloud controller": P .8, .8, 1.5; I 0; D 0; no saturation.
 
     Args:
-        gain_p: Per axis [1/s], shape (3,).
-        gain_i: Per axis [1/s^2], shape (3,).
-        gain_d: Per axis [1], shape (3,).
-        gain_yaw: [1/s]; 0 commands no yaw rate, since the published low-level controller holds
-            the yaw at 0 whatever is commanded.
+        gain_p: Proportional gain per axis [1/s], shape (3,).
+        gain_i: Integral gain per axis [1/s^2], shape (3,).
+        gain_d: Derivative gain per axis [1], shape (3,).
+        gain_yaw: Gain of the yaw [1/s]; 0 commands no yaw rate, because the published low-level
+            controller always holds the yaw at 0.
         integral_limit: Largest integral term per axis [m/s], shape (3,); None: no limit.
         velocity_max: Largest velocity per axis [m/s], shape (3,); None: no limit.
-        speed_max: Largest speed [m/s]; the direction is kept. None: no limit. With an integral
-            it should not exceed the guard's own cap, which the anti-windup cannot see.
+        speed_max: Largest speed [m/s]; the direction stays. None: no limit. With an integral it
+            should not exceed the guard's cap, which the anti-windup does not know.
 
     Raises:
         ValueError: If a parameter is not finite or negative; the message names it.

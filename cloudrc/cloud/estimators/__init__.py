@@ -1,4 +1,4 @@
-"""Delay estimators: what arrives says how long the loop is; one file each, found by its name.
+"""Delay estimators compute the horizon of the prediction from echoes; one file each.
 
 A plug-in file has a `build(**parameters)` with annotated parameters that returns an `Estimator`.
 """
@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 
 class DelaySample(NamedTuple):
-    """What one newly echoed command tells about the delays.
+    """The delays that one newly echoed command shows.
 
     Attributes:
-        loop_delay: Arrival of the echo minus the command's stamp [s]; hold on world included.
+        loop_delay: Arrival of the echo minus the command's stamp [s]; includes the hold on world.
         rtt: The same without the hold [s].
         applied_minus_stamp: Instant of application on world's clock minus the command's stamp on
-            cloud's [s]: the downlink delay plus the unknown offset world - cloud.
+            cloud's clock [s]: the downlink delay plus the unknown offset world - cloud.
     """
 
     loop_delay: float
@@ -24,18 +24,18 @@ class DelaySample(NamedTuple):
 
 
 class Estimator:
-    """Estimates the horizon: from the measurement to the application of the command."""
+    """Estimate the horizon: the time from the measurement to the application of the command."""
 
     def update(self, sample: DelaySample) -> None:
-        """Take in one sample; called once per newly echoed command, never for a repeated echo."""
+        """Add one sample; called once per newly echoed command, never for a repeated echo."""
         raise NotImplementedError
 
     def horizon(self, age: float) -> float:
-        """Say how far to look ahead from the newest odometry, for a command that leaves now.
+        """Return how far to predict from the newest odometry for a command that leaves now.
 
         Args:
-            age: Now on cloud's clock minus the odometry's stamp on world's [s]: its uplink delay,
-                how long cloud has held it, and the unknown offset cloud - world.
+            age: Now on cloud's clock minus the odometry's stamp on world's clock [s]: its uplink
+                delay, its time in cloud, and the unknown offset cloud - world.
 
         Returns:
             Horizon [s]; 0 before the first sample.

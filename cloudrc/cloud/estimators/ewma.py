@@ -1,4 +1,4 @@
-"""Delay estimator: loop delays come in, their exponentially weighted average goes out.
+"""Delay estimator: the exponentially weighted moving average of the loop delay.
 
 Source: docs/reference/control.md, "Delay estimators": a gain of 0.05 follows a step of the delay
 three times as well as the paper, eq. (1), and is no worse at a constant delay.
@@ -11,7 +11,7 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 
 
 class Ewma(Estimator):
-    """Exponentially weighted moving average of the loop delay; its first sample starts it."""
+    """Exponentially weighted moving average of the loop delay, starting at the first sample."""
 
     def __init__(self, gain: float) -> None:
         """Start empty.
@@ -30,7 +30,7 @@ class Ewma(Estimator):
             self._average += self._gain * (sample.loop_delay - self._average)
 
     def horizon(self, age: float) -> float:
-        """Return the average [s]; the age of this very odometry (in [s]) plays no part."""
+        """Return the average [s]; `age` [s] is not used."""
         return 0.0 if self._average is None else max(0.0, self._average)
 
 

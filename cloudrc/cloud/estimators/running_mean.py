@@ -1,4 +1,4 @@
-"""Delay estimator: the loop delays so far come in, their mean goes out.
+"""Delay estimator: the mean of all loop delays so far.
 
 Source: the paper, eq. (1).
 """
@@ -11,7 +11,7 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 class RunningMean(Estimator):
     """Mean of all loop delays since the session began.
 
-    Slow by design: after 60 s a step of the delay takes another 60 s to be half tracked.
+    It is slow by design: after 60 s, it takes another 60 s to follow half of a step of the delay.
     """
 
     def __init__(self) -> None:
@@ -19,15 +19,15 @@ class RunningMean(Estimator):
         self._mean = 0.0
 
     def update(self, sample: DelaySample) -> None:
-        """Add one loop delay [s]: mean += (sample - mean) / (k + 1), k samples before it.
+        """Add one loop delay [s] after k samples: mean += (sample - mean) / (k + 1).
 
-        Source: the paper, eq. (1), as printed; tau_n is `loop_delay`, with the hold on the robot.
+        Source: the paper, eq. (1), as printed; tau_n is `loop_delay`, which includes the hold.
         """
         self._count += 1
         self._mean += (sample.loop_delay - self._mean) / self._count
 
     def horizon(self, age: float) -> float:
-        """Return the mean [s]; the age of this very odometry (in [s]) plays no part."""
+        """Return the mean [s]; `age` [s] is not used."""
         return max(0.0, self._mean)
 
 

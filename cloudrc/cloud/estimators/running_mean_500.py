@@ -1,7 +1,7 @@
-"""Delay estimator: a running mean of the loop delay that stops slowing down after 500 samples.
+"""Delay estimator: a running mean of the loop delay whose gain stays at 1/500 after 500 samples.
 
-Source: the authors' published code. It speaks of a window of 500 samples, but computes a
-mean whose gain 1/(k+1) stays at 1/500 from then on: an exponential average.
+Source: the authors' published code. Its comments describe a window of 500 samples, but it computes
+a mean with the gain 1/(k+1) down to 1/500: from then on an exponential average.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from cloudrc.cloud.parameters import positive
 
 
 class CappedRunningMean(Estimator):
-    """Running mean whose gain falls to 1/count_max and no further."""
+    """Running mean whose gain falls to 1/count_max and then stays."""
 
     def __init__(self, count_max: int) -> None:
         """Start empty.
@@ -30,7 +30,7 @@ class CappedRunningMean(Estimator):
         self._mean += (sample.loop_delay - self._mean) / self._count
 
     def horizon(self, age: float) -> float:
-        """Return the mean [s]; the age of this very odometry (in [s]) plays no part."""
+        """Return the mean [s]; `age` [s] is not used."""
         return max(0.0, self._mean)
 
 
@@ -44,5 +44,5 @@ def build(count_max: int = 500) -> CappedRunningMean:
         ValueError: If `count_max` is not a whole number above 0.
     """
     if positive("count_max", count_max) % 1:
-        raise ValueError(f"count_max: {count_max!r} has to be a whole number")
+        raise ValueError(f"count_max: {count_max!r} must be a whole number")
     return CappedRunningMean(int(count_max))

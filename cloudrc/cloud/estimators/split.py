@@ -1,9 +1,9 @@
-"""Delay estimator: the age of this very odometry plus the average delay of the way back.
+"""Delay estimator: the age of this odometry plus the average delay of the downlink.
 
 Source: docs/reference/control.md, "Delay estimators": the best of those compared, because it
-measures the jitter of the uplink per packet and has to guess only that of the downlink.
+measures the uplink delay of each packet and estimates only that of the downlink.
 
-No synchronised clocks are needed. With `offset` = cloud's clock minus world's,
+The clocks need no synchronisation. With `offset` = cloud's clock minus world's,
 
     now - stamp of the odometry          = its age so far + offset    (exact, this packet)
     application - stamp of the command   = downlink delay - offset    (averaged)
@@ -39,7 +39,7 @@ class Split(Estimator):
             )
 
     def horizon(self, age: float) -> float:
-        """Return the age of this odometry plus the average downlink [s]; the offsets cancel."""
+        """Return `age` [s] plus the average of the downlink [s]; the clock offsets cancel."""
         if self._applied_minus_stamp is None:
             return 0.0
         return max(0.0, age + self._applied_minus_stamp)

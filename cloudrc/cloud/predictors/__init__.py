@@ -1,11 +1,9 @@
-"""Predictors: odometry that is old by `horizon` becomes a prediction; one file each.
+"""Predictors extrapolate odometry by the horizon; one file each.
 
 A plug-in file has a `build(**parameters)` with annotated parameters that returns a `Predictor`.
 
-Rotation ahead in time, shared by the predictors: orientation and body rate in, orientation out.
-
-q(t + tau) = q(t) * exp(omega tau / 2), exact while the body's angular velocity is constant. The
-paper says only "similarly the orientation".
+All predictors extrapolate the orientation by q(t + tau) = q(t) * exp(omega tau / 2), which is exact
+while the body's angular velocity is constant. The paper says only "similarly the orientation".
 
 Source: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, eqs. (101), (214).
 """
@@ -18,26 +16,26 @@ from cloudrc.messages import Command, Odometry, Quaternion, Vector
 
 
 class Predictor:
-    """Moves odometry ahead in time. Only `predict` has to be written."""
+    """Extrapolate odometry; a plug-in has to define only `predict`."""
 
     def observe(self, odometry: Odometry) -> None:
-        """Take note of a newly arrived odometry sample (called once each, stamps rising)."""
+        """Note a newly arrived odometry sample; called once each, with rising stamps."""
 
     def commanded(self, command: Command) -> None:
-        """Take note of a command that has just been sent."""
+        """Note a command that has just been sent."""
 
     def reset(self) -> None:
-        """Forget everything: a new session begins."""
+        """Forget everything at the start of a session."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Move `odometry` ahead.
+        """Extrapolate `odometry` by `horizon`.
 
         Args:
-            odometry: Newest sample delivered. Position [m], velocity [m/s], world frame.
-            horizon: Time to look ahead [s], >= 0.
+            odometry: Newest sample. Position [m], velocity [m/s], world frame.
+            horizon: Time from the sample to the predicted state [s], >= 0.
 
         Returns:
-            A new sample; `stamp_ns` advanced by `horizon`.
+            A new sample whose `stamp_ns` is later by `horizon`.
         """
         raise NotImplementedError
 
@@ -45,12 +43,12 @@ class Predictor:
 def rotate_ahead(
     orientation_wxyz: Quaternion, angular_velocity_body: Vector, horizon: float
 ) -> Quaternion:
-    """Turn an orientation by a constant body rate.
+    """Rotate an orientation at a constant body rate.
 
     Args:
         orientation_wxyz: Unit quaternion, body to world, shape (4,).
-        angular_velocity_body: [rad/s], body frame, shape (3,).
-        horizon: How long it turns [s].
+        angular_velocity_body: Angular velocity [rad/s], body frame, shape (3,).
+        horizon: Duration of the rotation [s].
 
     Returns:
         Unit quaternion, body to world, shape (4,).

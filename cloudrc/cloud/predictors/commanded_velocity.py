@@ -1,7 +1,7 @@
-"""Predictor: odometry and the last command come in; where that command leads goes out.
+"""Predictor: extrapolate the position with the last commanded velocity.
 
-Source: the authors' published code, which multiplies the delay with the velocity that it commanded
-last, not with the measured one of the paper, eq. (3).
+Source: the authors' published code. It multiplies the delay by the last commanded velocity, not by
+the measured velocity as in the paper, eq. (3).
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from cloudrc.messages import ZERO, Command, Odometry
 class CommandedVelocity(Predictor):
     """Last commanded velocity times horizon.
 
-    With a proportional controller u = -K (p + u tau) solves to u = -K p / (1 + K tau): this
-    predictor lowers the gain as the delay grows. It damps well and predicts badly.
+    With a proportional controller, u = -K (p + u tau) gives u = -K p / (1 + K tau): this predictor
+    lowers the gain as the delay grows. It damps well but predicts badly.
     """
 
     def __init__(self) -> None:
@@ -29,9 +29,9 @@ class CommandedVelocity(Predictor):
         self._commanded = ZERO
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Move a sample ahead: p + u tau; the velocity stays as measured.
+        """Extrapolate a sample: p + u tau; the velocity stays as measured.
 
-        Source: the authors' published code; the orientation by its measured rate, as in the others.
+        Source: the authors' published code; the orientation turns as in the other predictors.
 
         Args:
             odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.

@@ -1,6 +1,6 @@
-"""Predictor: odometry comes in; where it leads at the acceleration of late goes out.
+"""Predictor: extrapolate with the measured velocity and the recent acceleration.
 
-Source: the paper, eq. (3), with its acceleration, taken here from recent velocities;
+Source: the paper, eq. (3), with the acceleration computed from recent velocities;
 docs/reference/control.md, "Predictors", (d).
 """
 
@@ -20,14 +20,14 @@ class ConstantAcceleration(Predictor):
         """Start without an acceleration.
 
         Args:
-            window: Longest time between the two velocities that are compared [s].
+            window: Longest time between the two compared velocities [s].
         """
         self._window_ns = round(window * 1e9)
         self._recent: deque[Odometry] = deque()
         self._acceleration = ZERO
 
     def observe(self, odometry: Odometry) -> None:
-        """Take the acceleration [m/s^2] between this sample and the oldest in the window.
+        """Compute the acceleration [m/s^2] between this sample and the oldest in the window.
 
         A stamp that does not rise is ignored. After a gap longer than the window the acceleration
         is zero until the next sample.
@@ -42,12 +42,12 @@ class ConstantAcceleration(Predictor):
         self._acceleration = _mean_acceleration(oldest, odometry) if len(recent) > 1 else ZERO
 
     def reset(self) -> None:
-        """Forget all samples: no acceleration until there are two again."""
+        """Forget all samples; the acceleration is zero until there are two again."""
         self._recent.clear()
         self._acceleration = ZERO
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Move a sample ahead: p + v tau + a tau^2 / 2, v + a tau.
+        """Extrapolate a sample: p + v tau + a tau^2 / 2, v + a tau.
 
         Source: the paper, eq. (3b), for the velocity.
         Deviation: eq. (3a) as printed has no acceleration in the position.
@@ -60,7 +60,7 @@ class ConstantAcceleration(Predictor):
         vx, vy, vz = odometry.velocity
         ax, ay, az = self._acceleration
         rate = odometry.angular_velocity_body
-        # Change of velocity over the horizon; half of it is the change of the mean velocity.
+        # From here on the change of the velocity over the horizon [m/s].
         ax, ay, az = ax * horizon, ay * horizon, az * horizon
         return Odometry(
             odometry.stamp_ns + round(horizon * 1e9),
@@ -76,7 +76,7 @@ class ConstantAcceleration(Predictor):
 
 
 def _mean_acceleration(start: Odometry, end: Odometry) -> Vector:
-    """Mean acceleration between two samples [m/s^2], shape (3,)."""
+    """Compute the mean acceleration between two samples [m/s^2], shape (3,)."""
     per_second = 1e9 / (end.stamp_ns - start.stamp_ns)
     ax, ay, az = start.velocity
     bx, by, bz = end.velocity
@@ -87,8 +87,8 @@ def build(window: float = 0.05) -> ConstantAcceleration:
     """Make the predictor.
 
     Args:
-        window: Longest time between the two velocities that are compared [s]; at least one
-            period of the odometry. Longer is calmer under noise and lags more, by half of it.
+        window: Longest time between the two compared velocities [s]; at least one period of the
+            odometry. A longer window reduces the noise but lags more, by half its length.
 
     Raises:
         ValueError: If `window` is not above 0.

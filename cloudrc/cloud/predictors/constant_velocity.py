@@ -1,4 +1,4 @@
-"""Predictor: odometry comes in; where it leads at constant velocity goes out.
+"""Predictor: extrapolate with the measured velocity.
 
 Source: the paper, eqs. (2) and (3).
 """
@@ -13,9 +13,10 @@ class ConstantVelocity(Predictor):
     """Measured velocity times horizon; the orientation turns on at the measured rate."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Move a sample ahead: p + v tau, v + a tau with a = 0.
+        """Extrapolate a sample: p + v tau, v + a tau with a = 0.
 
-        Source: the paper, eq. (3a); eq. (3b) with zero acceleration, as the robot measures none.
+        Source: the paper, eq. (3a); eq. (3b) without acceleration, which the robot does not
+        measure.
 
         Args:
             odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.

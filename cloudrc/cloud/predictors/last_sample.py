@@ -1,4 +1,4 @@
-"""Predictor: odometry comes in and goes out as it is, as if nothing moved on the way.
+"""Predictor: use the last odometry without a prediction.
 
 Source: docs/reference/control.md, "Predictors", (a): the baseline for the others.
 """
@@ -10,10 +10,10 @@ from cloudrc.messages import Odometry
 
 
 class LastSample(Predictor):
-    """No prediction: pose and twist are taken to be what they were."""
+    """No prediction: pose and twist stay as measured."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Return the sample for `horizon` [s] later, with only its stamp moved."""
+        """Return the sample with a stamp that is later by `horizon` [s]."""
         return Odometry(
             odometry.stamp_ns + round(horizon * 1e9),
             odometry.position,
