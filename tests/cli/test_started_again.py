@@ -46,7 +46,7 @@ def test_both_together_keep_within_the_limit(tmp_path: Path) -> None:
     for _ in range(3):
         recorder = drained(started(path, limit), 30)
         recorder.close()
-        assert "it has grown to its limit" in recorder.error
+        assert "the file has reached its size limit" in recorder.error
         sizes = [each.stat().st_size for each in tmp_path.iterdir()]
         assert sum(sizes) < limit + 2 * 16_000, "each ends with the chunk that was open"
     assert len(sizes) == 2

@@ -37,7 +37,7 @@ for name in {NEEDED}:
 
 def test_flying_needs_none_of_them() -> None:
     code = (
-        "from cloudrc.record import columns, hash, offset, order, recorder, topics\n"
+        "from cloudrc.record import columns, hash, recorder, topics\n"
         "import cloudrc.drivers.recording\n"
         "print(len(columns.Recording.from_records([])['/pid']))"
     )
@@ -45,5 +45,5 @@ def test_flying_needs_none_of_them() -> None:
 
 
 def test_hash_and_recorder_do_not_even_need_numpy() -> None:
-    code = "from cloudrc.record import hash, order, recorder, topics; print('numpy' in sys.modules)"
+    code = "from cloudrc.record import hash, recorder, topics; print('numpy' in sys.modules)"
     assert run(code, []) == "False"
