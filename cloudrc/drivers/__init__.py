@@ -1,1 +1,4 @@
-"""Drivers: the only clocks, sockets and threads of the loop; they know endpoints by contract."""
+"""Run the endpoints: only drivers own the control loop's clocks, sockets and threads.
+
+They know the endpoints by the contract in `cloudrc/endpoint.py` alone.
+"""

@@ -1,10 +1,10 @@
-"""The epoch file: world's epochs rise through restarts, and each is on disk before it is used.
+"""Keep world's epochs in a file, so that they rise through restarts.
 
-A block of them is reserved at the start, and the next one by a thread when half of it is used, so
-that the flight does not wait for a slow disk. While one hangs for so long that the block is used
-up, there is no epoch. What is left of a block is given up at the next start. A file that is lost,
-or cannot be written, costs only that epochs begin again: the keys of a session come from fresh
-nonces too, so nothing old is accepted.
+Each epoch is on disk before it is used. A block of epochs is reserved at the start; a thread
+reserves the next block when half of it is used, so that the flight does not wait for a slow disk.
+If the disk hangs until the block is used up, there is no epoch. A restart skips the rest of a
+block. If the file is lost or cannot be written, epochs begin again; that is safe, since the keys of
+a session also come from fresh nonces.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from cloudrc.files import draft, read
 from cloudrc.tunnel.handshake import EPOCH_MAX
 
 BLOCK = 4096
-"""Epochs reserved at once; a restart every minute uses them up in two years."""
+"""Number of epochs reserved at once; with a restart every minute all epochs last two years."""
 SIZE_MAX = 64
-"""Longest file that is read [bytes]; the largest epoch has 10 digits."""
+"""Size limit of the file [bytes]; the largest epoch has 10 digits."""
 
 
 class EpochFile:
     """Hands out epochs, strictly rising."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        """Read the file, and reserve the first block of this process.
+        """Read the file and reserve the first block of this process.
 
         Args:
-            path: Of the file.
-            say: Is told why epochs are not kept through a restart; later on by a thread.
+            path: The epoch file.
+            say: Called with the reason if epochs are not kept; also called from a thread.
         """
         self._path, self._say = path, say
         self._block = range(0)
@@ -43,9 +43,9 @@ class EpochFile:
         Thread(target=self._reserve_ahead, name="epochs", daemon=True).start()
 
     def take(self) -> int | None:
-        """The next epoch, of which it is on disk that it may have been used; never waits.
+        """Return the next epoch without waiting; it is reserved on disk.
 
-        None while the disk keeps the next block waiting and this one is used up.
+        None if this block is used up and the next one is not on disk yet.
         """
         if not self._block and self._reserved:
             self._block = self._reserved.popleft()
@@ -57,12 +57,12 @@ class EpochFile:
         return epoch
 
     def _reserve_ahead(self) -> None:
-        """Do so whenever half of a block is used: waits, in a thread of its own."""
+        """Reserve the next block each time half of a block is used; runs in a thread."""
         while True:
             self._reserve(self._used.get())
 
     def _reserve(self, used: int) -> None:
-        """Put on disk that a block behind the last epoch `used` may be, however long that takes."""
+        """Reserve on disk the block that follows the epoch `used`; may wait for the disk."""
         first = used + 1 if used + BLOCK < EPOCH_MAX else 1
         block = range(first, first + BLOCK)
         try:
@@ -82,28 +82,28 @@ class EpochFile:
         except ValueError:  # no file, too long or no text
             text = ""
         if not text.isdecimal() or int(text) > EPOCH_MAX:
-            self._note(f"it holds no epoch{self._set_aside()}; epochs begin again")
+            self._note(f"holds no epoch{self._set_aside()}; epochs begin again")
             return 0
         return int(text)
 
     def _set_aside(self) -> str:
-        """Keep what may be somebody's, named by mistake; say so."""
+        """Rename a file that may have been named by mistake; return words for the message."""
         aside = self._path.with_name(f"{self._path.name}.no-epoch")
         try:
             self._path.replace(aside)
         except OSError:
-            return ""  # nor will it be written
-        return f" and is kept as {aside.name}"
+            return ""  # then it cannot be replaced either
+        return f" and was renamed {aside.name}"
 
-    def _note(self, what: str) -> None:
-        self._say(f"{self._path}: {what}")
+    def _note(self, text: str) -> None:
+        self._say(f"{self._path}: {text}")
 
 
 def replace_durably(path: Path, data: bytes, mode: int = 0o600) -> None:
-    """Put a file in the place of another, whole or not at all, and wait until it is on disk.
+    """Replace a file atomically and wait until it is on disk.
 
     Raises:
-        OSError: If it cannot; then the old file is as it was.
+        OSError: If that fails; the old file is unchanged.
     """
     with draft(path, mode) as file:
         file.write(data)

@@ -1,19 +1,14 @@
-"""The metrics of a process: fed with its records like the recorder, scraped by Prometheus.
+"""Serve the metrics and probes of a process over HTTP.
 
     exporter = Exporter("world")
-    exporter.serve("127.0.0.1:9100")    /metrics, /healthz and /readyz, on threads of their own
+    exporter.serve("127.0.0.1:9100")    /metrics, /healthz and /readyz, on separate threads
     exporter.see(records)               on the loop's thread: less than 1 us per record
-    exporter.ready(True)                a process that is no end of the tunnel says when it is
+    exporter.ready(True)                only in a process that is no end of the tunnel
 
-What `see` takes in is kept in plain numbers; Prometheus' text is made of them when it is scraped,
-at most four times a second.
+`see` updates plain numbers; a scrape turns them into Prometheus' text, at most four times a second.
 
-The small HTTP server of every process: metrics and probes, answered on threads of their own.
-
-No client can do harm: a connection lives 5 s at most, whatever it sends or does not read, and when
-too many are open the oldest gives way, so that a probe always gets its answer.
-
-CPU throttling of this container: the kernel's cpu.stat comes in, counts and seconds go out.
+Slow or hostile clients cannot block a probe: a connection lives at most 5 s, and when too many are
+open the server closes the oldest.
 """
 
 from __future__ import annotations
@@ -42,15 +37,16 @@ from cloudrc.exposition.table import Kind, Labels, Metric, of_role
 from cloudrc.records import Counted, Record
 
 CONNECTIONS_MAX = 16
+"""Largest number of open connections."""
 LIFETIME = 5.0
-"""Of one connection [s]; the scrape timeout of Prometheus is 10 s by default."""
+"""Longest time that a connection stays open [s]; Prometheus' default scrape timeout is 10 s."""
 LOOK_PERIOD = 0.25
-"""How often it is looked for connections that have lived too long [s]."""
+"""Time between two checks for connections older than `LIFETIME` [s]."""
 PLAIN = "text/plain; charset=utf-8"
 
 
 class Answer(NamedTuple):
-    """What a path answers: HTTP status, content and its type."""
+    """An HTTP answer: status, content and content type."""
 
     status: int
     content: bytes
@@ -63,10 +59,9 @@ Pages = Mapping[str, Callable[[], Answer]]
 class ProbeServer(socketserver.ThreadingTCPServer):
     """Serves pages until it is closed.
 
-    Not `http.server.HTTPServer`, which asks the name service for its own name, and may wait for it.
-    A flood of connections fills the queue of those that wait to be taken, and behind a full one the
-    kernel drops kubelet's, too: tried again after 1 s, perhaps in vain, its probe fails after 2 or
-    5 s, though nothing is wrong. So the queue is as long as that of the API.
+    It does not use `http.server.HTTPServer`, which may wait for a name server.
+    The accept queue is long: if a flood of connections fills it, the kernel drops kubelet's
+    connections, too, and its probes fail although the process is healthy.
     """
 
     allow_reuse_address = True
@@ -75,14 +70,14 @@ class ProbeServer(socketserver.ThreadingTCPServer):
     request_queue_size = 1_024
 
     def __init__(self, address: tuple[str, int], pages: Pages) -> None:
-        """Bind and begin to answer.
+        """Bind and start to answer.
 
         Args:
             address: Host and port; port 0 lets the kernel choose.
-            pages: By path.
+            pages: Functions that make the answers, by path.
 
         Raises:
-            MissingPrerequisiteError: If the address cannot be had.
+            MissingPrerequisiteError: If the address cannot be bound.
         """
         self.pages = pages
         self._open: dict[Any, float] = {}
@@ -97,37 +92,37 @@ class ProbeServer(socketserver.ThreadingTCPServer):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop answering; takes a quarter of a second."""
+        """Stop the server; takes up to 0.25 s."""
         self.shutdown()
         self.server_close()
         self._thread.join(1.0)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer on a thread; the oldest connection gives way if there are too many."""
+        """Answer on a thread; close the oldest connection if too many are open."""
         with self._guard:
             if len(self._open) >= CONNECTIONS_MAX:
                 oldest = min(self._open, key=self._open.__getitem__)
                 del self._open[oldest]
-                _cut(oldest)
+                _shut_down(oldest)
             self._open[request] = time.monotonic()
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
-        """Forget and close a connection, however it ended."""
+        """Close a connection and remove it from the open ones."""
         with self._guard:
             self._open.pop(request, None)
         super().shutdown_request(request)
 
     def service_actions(self) -> None:
-        """Now and then: cut the connections that have lived long enough."""
-        until = time.monotonic() - LIFETIME
+        """Shut down the connections older than `LIFETIME`; called every `LOOK_PERIOD`."""
+        oldest = time.monotonic() - LIFETIME
         with self._guard:
-            for request, since in self._open.items():
-                if since < until:
-                    _cut(request)
+            for request, opened in self._open.items():
+                if opened < oldest:
+                    _shut_down(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that leaves early is no news."""
+        """Ignore clients that disconnect early."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -137,7 +132,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = LIFETIME
 
     def do_GET(self) -> None:
-        """Answer with the page, if there is one."""
+        """Answer with the page of the path, or 404."""
         page = self.server.pages.get(self.path.partition("?")[0])
         paths = ", ".join(self.server.pages)
         answer = page() if page else Answer(404, f"there are {paths}\n".encode())
@@ -148,11 +143,11 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(answer.content)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests are not logged: there is one every few seconds."""
+        """Log nothing: a request comes every few seconds."""
 
 
-def _cut(request: socket.socket) -> None:
-    """End a connection under the thread that serves it, which then notices."""
+def _shut_down(request: socket.socket) -> None:
+    """Shut down a connection; the thread that serves it then gets an error."""
     with contextlib.suppress(OSError):
         request.shutdown(socket.SHUT_RDWR)
 
@@ -169,16 +164,16 @@ def _explain(address: tuple[str, int], error: OSError) -> str:
 
 ROOT = Path("/sys/fs/cgroup")
 STATS = ("cpu.stat", "cpu/cpu.stat", "cpu,cpuacct/cpu.stat")
-"""Version 2 first; the others are mounts of version 1. A container sees its own group there."""
+"""Files with a container's CPU counts: cgroup version 2 first, then two mounts of version 1."""
 
 
 class Throttling(NamedTuple):
-    """What the CPU limit has done so far.
+    """How much the CPU limit has throttled this container so far.
 
     Attributes:
-        periods: CFS periods in which something wanted to run.
-        throttled: Those of them in which it was stopped.
-        seconds: For how long, over all CPUs [s].
+        periods: Number of CFS periods in which a thread was runnable.
+        throttled: Number of them in which threads were throttled.
+        seconds: Throttled time, summed over all CPUs [s].
     """
 
     periods: int
@@ -187,7 +182,7 @@ class Throttling(NamedTuple):
 
 
 def read_throttling(root: Path = ROOT) -> Throttling | None:
-    """Read the counts; None where the kernel keeps none, as outside of containers.
+    """Read the counts; None where the kernel has none, for example outside of containers.
 
     Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
     Documentation/scheduler/sched-bwc.rst (throttled_time of version 1, in ns).
@@ -206,97 +201,99 @@ def read_throttling(root: Path = ROOT) -> Throttling | None:
 
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
-"""What `generate_latest` writes."""
+"""Content type of what `generate_latest` writes."""
 JSON = "application/json"
 KEPT = 0.25
-"""A page is shown to whoever asks within this time [s]. To make one takes 1.4 ms, for which the
-loop may have to wait: four a second are less than one wake in a hundred."""
+"""Time for which a page is reused [s]; to make one takes 1.4 ms and may delay the loop."""
 CONFIG_DIGITS = 12
-"""Of the hash of the configuration that the process was given, as git shortens one. A run on one
-machine gives all, and report.json has the whole hash of that; in a cluster its hash may be another,
-for there what plug-ins fill in is left open."""
+"""Length of the shortened hash of the process's configuration [hexadecimal digits].
+
+In local mode it is the start of the hash in report.json. In a cluster the hashes may differ, since
+there plug-ins fill in their defaults later.
+"""
 STILL_MAX = 5.0
-"""A loop that has said nothing for so long stands still [s]; each says something every second."""
+"""A loop without a record for this long stands still [s]; a healthy one makes one every second."""
 
 
 class Exporter:
     """The metrics of one process."""
 
     def __init__(self, role: str, *, missions: bool = True) -> None:
-        """Begin with nothing seen, served or ready.
+        """Begin without records; nothing is served and the process is not ready.
 
         Args:
             role: "world", "cloud", "teleop" or "link".
-            missions: Whether they are told here; False in a cloud whose teleop tells them.
+            missions: Whether this process exports missions; False in a cloud with a separate
+                teleop, which exports them.
         """
         self._role, self._metrics = role, of_role(role)
         self._live = Live(role, missions=missions)
         self._sync_age: Callable[[], float | None] = lambda: None
         self._said_ready, self._config = False, ""
-        self._seen_at: float | None = None  # no loop is alive or dead before it has begun
+        self._seen_at: float | None = None  # None: the loop has not begun, so it is not dead
         self._server: ProbeServer | None = None
-        self._making = threading.Lock()
-        self._made_at, self._made = -inf, Answer(503, b"")
+        self._page_lock = threading.Lock()
+        self._made_at, self._made_page = -inf, Answer(503, b"")
         self._registry = CollectorRegistry()
         self._registry.register(self)
         ProcessCollector(registry=self._registry)
 
     def see(self, records: Iterable[Record]) -> None:
-        """Take in records of this process, oldest first; never waits."""
+        """Update the metrics with records of this process, oldest first; never waits."""
         self._seen_at = time.monotonic()
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Say whether this process is ready; world and cloud need not, their records tell."""
+        """Set whether this process is ready; for world and cloud their records show it."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
     def runs(self, fingerprint: str) -> None:
-        """Say the hash of the configuration by which this process runs."""
+        """Set the hash of the configuration that this process runs."""
         self._config = fingerprint[:CONFIG_DIGITS]
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Say who shapes a direction of the link from now on; only with the role "link".
+        """Set the shaper of a direction of the link; only with the role "link".
 
         Args:
             shaper: "relay" or "netem".
             direction: "uplink" or "downlink".
-            mode: What was asked for: "auto", "relay" or "netem".
+            mode: The shaper that the user asked for: "auto", "relay" or "netem".
         """
         assert self._live.link is not None, "only a link is shaped"
         self._live.link.shaped(shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:
-        """Say which mean delay [s] the profile in force asks for; only with the role "link"."""
+        """Set the mean delay [s] of the profile in force; only with the role "link"."""
         assert self._live.link is not None, "only a link is shaped"
         self._live.link.asked(direction, delay)
 
     def unresolved(self, count: int) -> None:
-        """Say how often the peer's name could not be resolved so far, from any thread."""
+        """Set how often the peer's name could not be resolved so far; from any thread."""
         self._live.see([Counted(0, "link", "unresolved", count)])
 
     def recording(self, sync_age: Callable[[], float | None]) -> None:
-        """Say who knows how old the recording on the disk is [s]; None while there is none."""
+        """Set the function that returns the time since the last sync [s], or None before one."""
         self._sync_age = sync_age
 
     def tells(self, tell: Callable[[], str]) -> None:
-        """Answer /link.json with this JSON from now on; only with the role "link"."""
-        assert self._live.link is not None, "an end tells of its check"
+        """Set the function that writes the JSON of /link.json; only with the role "link"."""
+        assert self._live.link is not None, "an end serves its own check"
         self._live.link.tell = tell
 
     @property
     def is_ready(self) -> bool:
-        """Whether this process has said so, or as an end of the tunnel hears the other end."""
+        """Whether `ready` was set or, for an end of the tunnel, its peer has answered."""
         return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
 
     def serve(self, address: str | tuple[str, int]) -> int:
-        """Begin to answer on HOST:PORT.
+        """Start to answer on HOST:PORT.
 
         Returns:
-            The port: the kernel's choice where 0 was asked for.
+            The port; for port 0, the one that the kernel has chosen.
 
         Raises:
-            MissingPrerequisiteError: If the address cannot be had.
+            MissingPrerequisiteError: If the address cannot be bound.
         """
         if isinstance(address, str):
             host, _, port = address.rpartition(":")
@@ -311,20 +308,20 @@ class Exporter:
         return int(self._server.server_address[1])
 
     def close(self) -> None:
-        """Stop answering."""
+        """Stop the server."""
         if self._server is not None:
             self._server.close()
             self._server = None
 
     def collect(self) -> Iterator[Family]:
-        """Give everything known now, as the registry asks for it."""
-        readings = self._live.read() | self._of_process()
+        """Yield all current metrics to the registry."""
+        readings = self._live.read() | self._process_readings()
         for metric in self._metrics:
             reading = readings.get(metric.name)
             if reading:
                 yield _family(metric, reading)
 
-    def _of_process(self) -> Readings:
+    def _process_readings(self) -> Readings:
         readings: Readings = {
             "cloudrc_build_info": {(__version__, self._role, self._config): 1.0},
             "cloudrc_ready": plain(self.is_ready),
@@ -339,23 +336,23 @@ class Exporter:
         return readings
 
     def text(self) -> str:
-        """Write what Prometheus scrapes."""
+        """Format the metrics for Prometheus."""
         return generate_latest(self._registry).decode()
 
     def _page(self) -> Answer:
-        """Tell what `text` said at most `KEPT` ago; who asks while it is made waits for it."""
-        with self._making:
+        """Return the text of at most `KEPT` ago; requests wait while a new one is made."""
+        with self._page_lock:
             now = time.monotonic()
             if now - self._made_at >= KEPT:
                 self._made_at = now
-                self._made = Answer(200, self.text().encode(), TEXT_FORMAT)
-            return self._made
+                self._made_page = Answer(200, self.text().encode(), TEXT_FORMAT)
+            return self._made_page
 
     def _readiness(self) -> Answer:
         return Answer(200, b"ready\n") if self.is_ready else Answer(503, b"no peer yet\n")
 
     def _liveness(self) -> Answer:
-        """Whether this process' own loop moves; the link and the other end are no part of it."""
+        """Answer whether this process's own loop runs, whatever the link and the other end do."""
         still = None if self._seen_at is None else time.monotonic() - self._seen_at
         if still is None or still <= STILL_MAX:
             return Answer(200, b"alive\n")
@@ -363,7 +360,7 @@ class Exporter:
 
 
 def _family(metric: Metric, reading: dict[Labels, float] | Histogram) -> Family:
-    """Put a reading into the library's words."""
+    """Convert a reading to a metric family of prometheus_client."""
     name, names = metric.name, list(metric.labels)
     if isinstance(reading, Histogram):
         bounds = [*map(str, reading.bounds), "+Inf"]

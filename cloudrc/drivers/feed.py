@@ -1,8 +1,7 @@
-"""What a process tells the one that started it: a few of its records, one line of JSON each.
+"""Send a few records of a process to its supervisor, one line of JSON each.
 
-A process in flight writes lines to its standard output, which must never block it: if nobody reads
-them they are lost. The supervisor makes records of them again. What a plug-in prints must not get
-among them: it goes to standard error, that is to the process's log.
+The process writes the lines to its standard output, which must never block it: if nobody reads
+them, they are lost. Prints of plug-ins go to standard error, the process's log, instead.
 """
 
 from __future__ import annotations
@@ -27,42 +26,43 @@ from cloudrc.records import (
 READY = "ready"
 """The line that a process writes once it can receive."""
 PERIOD_NS = 100_000_000
+"""Time between two records of a type in `SAMPLED` [ns]."""
 EVENTS = (GuardChange, MissionEvent, Fault, LinkChanged)
-"""Every one of these is told."""
+"""Record types that are all sent."""
 SAMPLED = (TelemetrySent, Control)
-"""Of these one every 100 ms."""
+"""Record types of which one is sent every `PERIOD_NS`."""
 
 
 class Feed:
-    """The telling end: picks records and writes them to a pipe that does not block."""
+    """Sends selected records to a pipe without blocking."""
 
     def __init__(self, descriptor: int, *, watched: bool = True) -> None:
-        """Begin.
+        """Make the pipe non-blocking.
 
         Args:
-            descriptor: Where to write.
-            watched: Whether a supervisor reads it. Where none does, as in a container, what is
-                written becomes a log: the events alone, in words.
+            descriptor: File descriptor of the pipe.
+            watched: Whether a supervisor reads it. If not, as in a container, only events are
+                written, as the words of a log.
         """
         self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
         self._links: dict[bool, str] = {}
-        self._rest = b""  # of a line that was longer than the pipe had room for
+        self._rest = b""  # of a line for which the pipe had too little room
         os.set_blocking(descriptor, False)
 
     @classmethod
     def on_stdout(cls, *, watched: bool = True) -> Feed:
-        """Keep standard output for the feed alone; whoever prints writes to standard error now."""
+        """Reserve standard output for the feed; redirect all other prints to standard error."""
         feed = cls(os.dup(1), watched=watched)
         os.dup2(2, 1)
         return feed
 
     def ready(self) -> None:
-        """Say that the process can receive."""
+        """Report that the process can receive."""
         self._write(READY)
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Tell those of the records that somebody who watches wants to see."""
+        """Send the records that a supervisor wants to see."""
         for record in records:
             if isinstance(record, EVENTS):
                 if isinstance(record, LinkChanged) and not self._is_news(record):
@@ -72,12 +72,12 @@ class Feed:
                 self._write(to_line(record))
 
     def _is_news(self, record: LinkChanged) -> bool:
-        """Tell a change of the link from one that is noted again because a mission begins.
+        """Check that the link has changed; `LinkNotes` repeats its note when a mission begins.
 
-        A change of the other direction, which is recorded here, too, is no news of this one.
+        Each direction is compared with its own last note.
         """
-        told, self._links[record.uplink] = self._links.get(record.uplink), record.conditions
-        return told != record.conditions and bool(record.cause)
+        last, self._links[record.uplink] = self._links.get(record.uplink), record.conditions
+        return last != record.conditions and bool(record.cause)
 
     def _due(self, record: Record) -> bool:
         last_ns = self._told_ns.get(type(record))
@@ -87,23 +87,23 @@ class Feed:
         return True
 
     def _write(self, line: str) -> None:
-        """Write a line, or lose it whole: what is left of a longer one goes before the next."""
+        """Write a line or drop it whole; the rest of a partly written line comes first."""
         data = line.encode(errors="backslashreplace") + b"\n"
         try:
             self._rest = self._rest[os.write(self._descriptor, self._rest) :]
             if not self._rest:
                 self._rest = data[os.write(self._descriptor, data) :]
-        except OSError:  # full or closed: to watch is a courtesy, to fly is not
+        except OSError:  # full or closed: the flight continues without the feed
             pass
 
 
 def to_line(record: Record) -> str:
-    """Write a record as one line of JSON: the name of its type, then its fields in order."""
+    """Format a record as one line of JSON: the name of its type, then its fields in order."""
     return json.dumps([type(record).__name__, record])
 
 
 def in_words(event: GuardChange | MissionEvent | Fault | LinkChanged) -> str:
-    """Say what has happened, for a log or a screen."""
+    """Describe an event for a log or a screen."""
     if isinstance(event, GuardChange):
         return f"guard: {event.state.name}, {event.cause}"
     if isinstance(event, LinkChanged):
@@ -115,28 +115,28 @@ def in_words(event: GuardChange | MissionEvent | Fault | LinkChanged) -> str:
 
 
 def from_line(line: str) -> Record:
-    """Read a record from its line.
+    """Parse a record from its line.
 
     Raises:
-        ValueError: If it is not one.
+        ValueError: If the line is no record.
     """
     try:
         name, values = json.loads(line)
         kind = getattr(kinds, name)
         if kind not in get_args(Record):
             raise ValueError(name)
-        record: Record = _build(kind, values)
+        record: Record = _from_json(kind, values)
     except (TypeError, AttributeError, ValueError, RecursionError) as error:
         raise ValueError(f"not a record: {line!r}") from error
     return record
 
 
-def _build(kind: Any, value: Any) -> Any:
-    """Make a value of this type from what JSON has for it."""
+def _from_json(kind: Any, value: Any) -> Any:
+    """Convert a JSON value to this type."""
     if hasattr(kind, "_fields"):
         hints = get_type_hints(kind)
         fields = zip(kind._fields, value, strict=True)
-        return kind(*[_build(hints[name], item) for name, item in fields])
+        return kind(*[_from_json(hints[name], item) for name, item in fields])
     if get_origin(kind) is tuple:
         return tuple(value)
     return kind(value) if isinstance(kind, type) and issubclass(kind, IntEnum) else value

@@ -1,6 +1,6 @@
-"""The key file: read at the start, and followed in flight, since a Secret may be rotated.
+"""Read an end's key file and follow its changes in flight, since a Secret may be rotated.
 
-The loop looks at it twice a second, as at the route: one system call as long as nothing changes.
+The loop checks the file twice a second, by one system call while nothing changes.
 """
 
 from __future__ import annotations
@@ -14,26 +14,27 @@ from cloudrc.records import Fault
 from cloudrc.tunnel.keys import KeyRing, KeySet, parse
 
 PERIOD_NS = 500_000_000
-"""How often it is asked whether the file has changed [ns]."""
+"""Time between two checks of the file [ns]."""
 SIZE_MAX = 4096
-"""Of a key file [bytes]."""
+"""Size limit of a key file [bytes]."""
 MAKE = "make one: cloudrc key new FILE"
+"""Remedy in the message about a missing or bad key file."""
 
 
 class KeyFile:
-    """The keys of one end; `ring` always holds those that are valid."""
+    """The keys of one end; `ring` always holds the valid ones."""
 
     def __init__(self, path: Path, now_ns: int, wall: float | None = None) -> None:
         """Read the file for the first time.
 
         Args:
-            path: Of the file.
+            path: The key file.
             now_ns: Monotonic clock [ns].
-            wall: What the wall clock says [s since 1970], to find a previous key whose time is
-                over; None to go without.
+            wall: Wall clock [s since 1970], to detect an expired previous key; None to skip that
+                check.
 
         Raises:
-            BadInputError: If it is not there or holds no key.
+            BadInputError: If the file is missing or holds no key.
         """
         self._path = path
         self._seen = version(path)
@@ -43,29 +44,29 @@ class KeyFile:
         self._caution = "" if wall is None else self._keys.caution(wall)
 
     def follow(self, now_ns: int) -> list[Fault]:
-        """Look whether the file has changed, if that is due [ns, monotonic clock].
+        """Check the file for changes, if a check is due at `now_ns` [ns, monotonic clock].
 
         Returns:
-            What is to be told: a new key, why the old ones stay, and at first what is wrong with
-            the key before.
+            Records of a new key or of the reason to keep the old ones; at the first call the
+            warning about an expired previous key.
         """
         if now_ns < self._due_ns:
             return []
         self._due_ns = now_ns + PERIOD_NS
-        told, self._caution = self._caution, ""
-        return [Fault(now_ns, "key", told)] if told else self._look(now_ns)
+        caution, self._caution = self._caution, ""
+        return [Fault(now_ns, "key", caution)] if caution else self._poll(now_ns)
 
-    def _look(self, now_ns: int) -> list[Fault]:
+    def _poll(self, now_ns: int) -> list[Fault]:
         seen = version(self._path)
-        if seen == self._seen or seen is None:  # a file that is gone for a moment changes nothing
+        if seen == self._seen or seen is None:  # ignore a file that is missing for a moment
             return []
         self._seen = seen
         try:
             keys = read_keys(self._path)
         except BadInputError as error:
-            self._seen = None  # who may read it leaves no trace in what is seen of a file
-            told, self._trouble = self._trouble, f"the keys stay as they were: {error}"
-            return [] if told == self._trouble else [Fault(now_ns, "key", self._trouble)]
+            self._seen = None  # try again: `version` does not show a change of permissions
+            last, self._trouble = self._trouble, f"the old keys stay in use: {error}"
+            return [] if last == self._trouble else [Fault(now_ns, "key", self._trouble)]
         self._trouble = ""
         if keys == self._keys:
             return []
@@ -73,30 +74,30 @@ class KeyFile:
         self.ring.replace(keys, now_ns)
         name = keys.current.name
         if keys.current != before:
-            text = f"new key {name}; the one before is valid for {keys.overlap:g} s more"
+            text = f"new key {name}; the previous one is valid for {keys.overlap:g} s more"
         elif keys.previous is None:
-            text = f"key {name} alone; the one before is not valid any more"
+            text = f"key {name} alone; the previous one is no longer valid"
         else:
-            text = f"key {name} as before; what is said of the one before changed"
+            text = f"key {name} unchanged; the entry of the previous one changed"
         return [Fault(now_ns, "key", text)]
 
 
 def read_keys(path: Path, named: str = "--key ", remedy: str = MAKE) -> KeySet:
-    """Read a key file, without waiting for anybody.
+    """Read a key file without waiting, even if it is a pipe.
 
     Args:
-        path: Of the file.
-        named: By which flag.
-        remedy: What to do if it holds no key.
+        path: The key file.
+        named: Option that names it, for messages.
+        remedy: What to do if it holds no key, for messages.
 
     Raises:
-        BadInputError: What is wrong with it and what to do, without a word of it.
+        BadInputError: If the file holds no key; never quotes its content.
     """
     try:
         data = read(path, SIZE_MAX)
     except OSError as error:
         raise BadInputError(f"{named}{path}: {error.strerror or error}; {remedy}") from None
-    except ValueError as error:  # which names the file
+    except ValueError as error:  # its text names the file
         raise BadInputError(f"{named}{error}; {remedy}") from None
     try:
         return parse(data)
@@ -105,5 +106,5 @@ def read_keys(path: Path, named: str = "--key ", remedy: str = MAKE) -> KeySet:
 
 
 def is_exposed(path: Path) -> bool:
-    """Whether every user of this machine can read a key file."""
+    """Check whether other users of this machine can read or write a key file."""
     return bool(path.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH))

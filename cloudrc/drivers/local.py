@@ -1,14 +1,13 @@
-"""Local mode: relay, world, teleop and cloud as processes on this machine, and who watches them.
+"""Run relay, world, teleop and cloud as processes on this machine and supervise them.
 
-The supervisor starts them in the order in which they need each other, reads what they tell, and
-ends all of them when teleop ends because the mission is over, when another one dies, or when the
-user interrupts.
+The supervisor starts the processes in the order of their dependencies and reads their feeds. It
+ends all of them when teleop ends after the mission, when another process dies, or when the user
+interrupts.
 
-Flights under way on this machine: each says where it is, so that its operator need not know.
-
-A small file per flight, in a folder that is this user's alone: what stands in it is believed, which
-a run's folder, that may have come from anywhere, is not. It is locked for as long as the flight
-lasts: what a killed one has left behind is known by that, and taken away.
+Each flight has a small file that names its folder and its operator's API. The file lies in a folder
+that only this user can write, so other programs may trust it; they cannot trust a run's folder,
+which may come from elsewhere. The file is locked during the flight: an unlocked one was left by a
+killed flight and is removed.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ PRIVATE = 0o700
 
 
 def places() -> list[Path]:
-    """Where such files may be; a login has both places, a job of cron perhaps only the second.
+    """List the folders for flight files; a login has both, a cron job perhaps only the second.
 
     Source: XDG Base Directory Specification.
     """
@@ -54,12 +53,12 @@ def places() -> list[Path]:
 
 @contextlib.contextmanager
 def announced(run: Path, api: str = "") -> Iterator[bool]:
-    """Tell of the flight of a run's folder for as long as the block lasts; say whether it is told.
+    """Announce a flight by a file while the block runs; yield whether the file was written.
 
-    Where no such file can be written it flies all the same.
+    The flight continues without the file.
 
     Args:
-        run: Its folder.
+        run: Folder of the run.
         api: Address of its operator's API; "" without one.
     """
     path, lock = None, -1
@@ -77,9 +76,10 @@ def announced(run: Path, api: str = "") -> Iterator[bool]:
 
 
 def under_way() -> dict[Path, str]:
-    """Folders of the runs of this user that fly now, the newest first, with their APIs' addresses.
+    """Find this user's current flights.
 
-    A run without an API has "" there.
+    Returns:
+        Folder of the run -> address of its API ("" without one), newest first.
     """
     found = []
     for place in places():
@@ -94,17 +94,17 @@ def under_way() -> dict[Path, str]:
 
 
 def _write(place: Path, run: Path, api: str) -> tuple[Path, int]:
-    """Make the file, locked from the moment that it has its name."""
+    """Create the flight file; it is locked before it gets its final name."""
     place.mkdir(mode=PRIVATE, parents=True, exist_ok=True)
     if not _is_ours(place):
-        raise PermissionError(f"{place} is not this user's alone")
+        raise PermissionError(f"other users can access {place}")
     path = place / f"{os.getpid()}-{secrets.token_hex(4)}.json"
     new = path.with_suffix(".new")
     lock = os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        told = {"schemaVersion": 1, "run": str(run.resolve()), "api": api}
-        os.write(lock, json.dumps(told).encode() + b"\n")
+        flight = {"schemaVersion": 1, "run": str(run.resolve()), "api": api}
+        os.write(lock, json.dumps(flight).encode() + b"\n")
         new.rename(path)
     except OSError:
         os.close(lock)
@@ -114,19 +114,19 @@ def _write(place: Path, run: Path, api: str) -> tuple[Path, int]:
 
 
 def _read(path: Path) -> tuple[Path, str] | None:
-    """Read where a flight and its API are; None if it is over: then its file is taken away."""
+    """Read a flight's folder and API address; if the flight is over, delete the file: None."""
     with path.open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
-            told = json.loads(file.read())
-            return Path(told["run"]), str(told.get("api", ""))
+            flight = json.loads(file.read())
+            return Path(flight["run"]), str(flight.get("api", ""))
     path.unlink(missing_ok=True)
     return None
 
 
 def _is_ours(place: Path) -> bool:
-    """Say whether it is this user's, and nobody else can look into it or write to it."""
+    """Check that this user owns a path and nobody else can read or write it."""
     try:
         state = place.stat()
     except OSError:
@@ -135,42 +135,45 @@ def _is_ours(place: Path) -> bool:
 
 
 START_LIMIT = 60.0
-"""For a process to become ready [s]; a cold start reads some 100 MB from disk."""
+"""Longest time for a process to become ready [s]; a cold start reads some 100 MB from disk."""
 STOP_LIMIT = 1.5
-"""For a process to end by itself once it is asked to [s]."""
+"""Longest time for a process to end after it was asked to [s]; then it is killed."""
 TELL_ALWAYS = ("world", "cloud")
+"""Processes that write to their feed continuously."""
 SILENCE_LIMIT = 5.0
-"""A process that has told something and then nothing for so long hangs [s]."""
+"""A process of `TELL_ALWAYS` that writes nothing for this long has hung [s]."""
 LOOPBACK = "127.0.0.1"
 API_FILE = "api.json"
-"""In the folder of a run that flies: where its operator's API is, for other programs. Ours take
-that from the user's own `flights`: a folder may have come from anywhere, and say anything."""
+"""File in a run's folder with the address of its API during the flight, for other programs.
+
+cloudrc itself reads the address from the flight file, since a run's folder is not trusted.
+"""
 AUDIT_FILE = "audit.jsonl"
-"""Likewise, and afterwards, too: who commanded what over it, if anybody did."""
+"""File in a run's folder that logs who sent which command over the API; it stays afterwards."""
 UNANNOUNCED = (
-    "no folder for the file by which 'cloudrc mission' finds this run (XDG_STATE_HOME); give it "
-    "--api {}"
+    "'cloudrc mission' cannot find this run: no folder for its flight file (XDG_STATE_HOME); give "
+    "it --api {}"
 )
 LINK_FOLDER = "link"
-"""Likewise: where its relay tells what it does, and is told to do otherwise."""
+"""Folder in a run's folder for the relay's state and its changed profile during the flight."""
 
 
 class ProcessDiedError(InvalidRunError):
-    """One of the processes ended before the mission was over."""
+    """A process ended before the mission was over."""
 
 
 @dataclass
 class Child:
-    """One of the processes.
+    """A process of the run.
 
     Attributes:
-        name: Of its command.
+        name: Name of its command.
         process: Running or ended.
-        log: Gets what it writes to standard error.
-        unread: The beginning of a line of its feed whose end has not come yet.
-        heard: When it last told something [s], monotonic clock; None before the first time.
-        ready: Whether it has said so.
-        garbled: Whether it has told what is no record.
+        log: File with its standard error.
+        unread: Start of a feed line whose end has not arrived yet.
+        heard: When its last feed line arrived [s], monotonic clock; None before the first.
+        ready: Whether it can receive.
+        garbled: Whether it has written a line that is no record.
     """
 
     name: str
@@ -182,7 +185,7 @@ class Child:
     garbled: bool = field(default=False)
 
     def last_words(self) -> str:
-        """The last line that it wrote to its log, if any."""
+        """Return the last line of its log, if any."""
         lines = self.log.read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else "it left no message"
 
@@ -193,37 +196,37 @@ class LocalRun:
     def __init__(
         self, folder: Path, see: Callable[[list[Record]], None], *, api: bool = True
     ) -> None:
-        """Prepare; nothing is started yet.
+        """Prepare the run; no process is started yet.
 
         Args:
-            folder: Of the run; has config.yaml, gets world.mcap, cloud.mcap and four logs.
-            see: Gets the records that the processes tell about.
-            api: Whether the operator gets an API while it flies; it is announced, and api.json
-                says where.
+            folder: Folder of the run; has config.yaml, gets world.mcap, cloud.mcap and four logs.
+            see: Gets the records of the processes' feeds.
+            api: Whether the operator gets an API during the flight; the flight file and api.json
+                hold its address.
         """
         self._folder, self._see, self._api = folder, see, api
-        self._key = folder  # until there is one
+        self._key = folder  # replaced by the key file in `fly`
         self._children: list[Child] = []
         self._selector = selectors.DefaultSelector()
 
     def fly(self, limit: float) -> None:
-        """Fly until teleop says that the mission is over.
+        """Fly until teleop reports the end of the mission. All processes have ended afterwards.
 
         Args:
             limit: Longest duration [s].
 
         Raises:
-            ProcessDiedError: If a process ends too early; it is named.
-            TimedOutError: If the limit is reached, or one falls silent; it is named.
-            KeyboardInterrupt: If the user interrupts. The processes have ended in every case.
+            ProcessDiedError: If a process ends too early; names it.
+            TimedOutError: If the limit is reached or a process falls silent; names it.
+            KeyboardInterrupt: If the user interrupts.
         """
-        # A socket's path is short; that of the run's folder need not be.
-        # Nobody else may look into this one, which holds the key of this run alone, too.
+        # A Unix socket's path must be short; the path of the run's folder may be long.
+        # The folder is private, since it also holds this run's key.
         with (
             tempfile.TemporaryDirectory(prefix="cloudrc-") as sockets,
-            announced(self._folder, url := self._url(sockets)) as told,
+            announced(self._folder, url := self._url(sockets)) as is_announced,
         ):
-            if url and not told:
+            if url and not is_announced:
                 self._see([Fault(0, "unannounced", UNANNOUNCED.format(url))])
             self._key = Path(sockets) / "key"
             self._key.touch(0o600)
@@ -259,12 +262,12 @@ class LocalRun:
         self._start(name, *ways, f"--record={record}", *options)
 
     def _url(self, sockets: str) -> str:
-        """Where the operator's API is, below the folder of the sockets; "" without one."""
+        """Return the address of the operator's API in the folder of the sockets; "" without one."""
         return f"unix:{sockets}/api.sock" if self._api else ""
 
     def _start_teleop(self, sockets: str) -> None:
         api: list[str] = []
-        if self._api:  # a socket file that this user alone can open: no token is needed
+        if self._api:  # only this user can open the socket file: no token is needed
             api = [
                 f"--api={self._url(sockets)}",
                 f"--api-file={self._folder / API_FILE}",
@@ -283,7 +286,7 @@ class LocalRun:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 env={**os.environ, PARENT: str(os.getpid())},
-                start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them
+                start_new_session=True,  # Ctrl-C reaches only the supervisor, which ends them
             )
         child = Child(name, process, log)
         assert process.stdout is not None
@@ -292,28 +295,28 @@ class LocalRun:
         self._children.append(child)
 
     def _wait_until_ready(self) -> None:
-        until = time.monotonic() + START_LIMIT
+        deadline = time.monotonic() + START_LIMIT
         while waiting := [child.name for child in self._children if not child.ready]:
-            if time.monotonic() > until:
+            if time.monotonic() > deadline:
                 raise TimedOutError(f"{' and '.join(waiting)}: not ready within {START_LIMIT:g} s")
             self._listen()
             self._check_alive()
 
     def _watch(self, limit: float) -> None:
-        until = time.monotonic() + limit
+        deadline = time.monotonic() + limit
         teleop = next(child for child in self._children if child.name == "teleop")
         while teleop.process.poll() is None:
-            if time.monotonic() > until:
+            if time.monotonic() > deadline:
                 raise TimedOutError(f"the flight was ended after {limit:g} s, its limit")
             self._see(self._listen())
             self._check_alive()
-            self._check_awake()
+            self._check_silence()
         self._check_alive()
         self._see(self._listen())
 
     def _listen(self) -> list[Record]:
-        """What the processes have told since the last call; waits 50 ms at most."""
-        told: list[Record] = []
+        """Return the records of all feeds since the last call; waits at most 50 ms."""
+        records: list[Record] = []
         for key, _ in self._selector.select(0.05):
             child: Child = key.data
             data = os.read(key.fd, 65_536)
@@ -324,18 +327,18 @@ class LocalRun:
                 if line == READY.encode():
                     child.ready = True
                 else:
-                    told += _told(child, line)
+                    records += _parse_line(child, line)
                     if child.name in TELL_ALWAYS:
                         child.heard = time.monotonic()
-        return told
+        return records
 
-    def _check_awake(self) -> None:
+    def _check_silence(self) -> None:
         now = time.monotonic()
         for child in self._children:
             if child.heard is not None and now - child.heard > SILENCE_LIMIT:
                 raise TimedOutError(
-                    f"the {child.name} process has been silent for {SILENCE_LIMIT:g} s and was "
-                    f"ended; see {child.log}"
+                    f"the {child.name} process was silent for {SILENCE_LIMIT:g} s and was ended; "
+                    f"see {child.log}"
                 )
 
     def _check_alive(self) -> None:
@@ -350,13 +353,13 @@ class LocalRun:
             )
 
     def _stop(self) -> None:
-        """End what still runs: politely, then for good."""
+        """End the processes that still run: first by SIGTERM, then by SIGKILL."""
         for child in self._children:
             child.process.terminate()
-        until = time.monotonic() + STOP_LIMIT
+        deadline = time.monotonic() + STOP_LIMIT
         for child in self._children:
             try:
-                child.process.wait(max(0.0, until - time.monotonic()))
+                child.process.wait(max(0.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
                 child.process.kill()
                 child.process.wait()
@@ -366,18 +369,18 @@ class LocalRun:
                 child.process.stdout.close()
 
 
-def _told(child: Child, line: bytes) -> list[Record]:
-    """Read a line of a feed; one that is no record is said once, and ends no flight."""
+def _parse_line(child: Child, line: bytes) -> list[Record]:
+    """Parse a line of a feed; report a bad line once per process, and continue the flight."""
     try:
         return [from_line(line.decode())]
     except ValueError as error:
         if child.garbled:
             return []
         child.garbled = True
-        what = in_one_line(str(error))[:120]
-        return [Fault(0, "feed", f"of the {child.name} process a line was left out: {what}")]
+        reason = in_one_line(str(error))[:120]
+        return [Fault(0, "feed", f"skipped a line of the {child.name} process: {reason}")]
 
 
 def _free_addresses(count: int) -> list[str]:
-    """UDP addresses on this machine that nobody uses now."""
+    """Find unused UDP addresses on this machine."""
     return [f"{LOOPBACK}:{port}" for port in free_ports(count)]

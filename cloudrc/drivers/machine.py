@@ -1,7 +1,4 @@
-"""What a process knows of its machine: whose monotonic clock it reads, which cipher is fast.
-
-Python again: what a process of its own is to run goes in, the words of its command come out.
-"""
+"""Describe this machine: its monotonic clock, its fast cipher and its Python interpreter."""
 
 from __future__ import annotations
 
@@ -16,21 +13,21 @@ MACOS_BOOT_ID = ("sysctl", "-n", "kern.bootsessionuuid")
 
 
 def clock_id() -> bytes:
-    """Name the monotonic clock: two processes share it if and only if they get the same 16 bytes.
+    """Identify the monotonic clock: two processes with the same 16 bytes share it.
 
-    The kernel's boot id names it, since every boot starts a clock anew. Where there is none, the
-    bytes are random: then nobody shares the clock, and one-way delays are not reported.
+    The kernel's boot id identifies it, since each boot restarts the clock. Without a boot id the
+    bytes are random: then the ends do not share a clock, and one-way delays are not reported.
     """
     text = _boot_id().replace("-", "").strip()
     try:
-        named = bytes.fromhex(text)
+        boot = bytes.fromhex(text)
     except ValueError:
-        named = b""
-    return named if len(named) == 16 else os.urandom(16)
+        boot = b""
+    return boot if len(boot) == 16 else os.urandom(16)
 
 
 def has_fast_aes() -> bool:
-    """Whether the processor computes AES itself; where nobody can say, it is taken to."""
+    """Check whether the processor has AES instructions; True where that is unknown."""
     try:
         lines = CPU_INFO.read_text(errors="replace").splitlines()
     except OSError:
@@ -51,10 +48,10 @@ def _boot_id() -> str:
 
 
 def interpreter(*words: str) -> list[str]:
-    """Put this interpreter before its words, as `-m cloudrc relay`.
+    """Build a command that runs this Python interpreter, such as with `-m cloudrc relay`.
 
-    Python looks into the working folder first, which may be a run got from somebody else: the new
-    process does so only if this one does, as below `python -m`.
+    Python imports from the working folder first, which may be a run from somebody else. The new
+    process does so only if this one does, for example under `python -m`.
     """
     here = os.getcwd() in sys.path or "" in sys.path
     return [sys.executable, *(() if here else ("-P",)), *words]

@@ -1,13 +1,11 @@
-"""One end as a process of its own: signals stop it, what it records goes to its file and its feed.
+"""Run one end as a process: record it, feed its supervisor, and stop on signals.
 
-It ends on SIGTERM or SIGINT, and when the process that started it is gone.
+The process ends on SIGTERM or SIGINT, and when its parent process is gone.
 
-What an end records of the link that shapes what it sends: the link's state file in, records out.
-
-The link's process publishes its state whenever it has changed it (`cloudrc/link/state.py`). A look
-at the file costs a system call and is made ten times a second. How late a relay's datagrams left is
-in a file beside it, and noted every other second. The link's process is not trusted: whatever its
-files hold, the loop goes on.
+An end also records the state of the link that shapes what it sends. The link's process publishes
+the state in a file (`cloudrc/link/state.py`), which the end checks ten times a second. A second
+file tells how late the relay's datagrams left. The link's process is not trusted: whatever its
+files hold, the loop continues.
 """
 
 from __future__ import annotations
@@ -46,26 +44,29 @@ if TYPE_CHECKING:
 
 
 PERIOD_NS = 100_000_000
-"""Between two looks [ns]."""
+"""Time between two checks of the state file [ns]."""
 RELEASED_PERIOD_NS = 2_000_000_000
-"""Between two notes of how late datagrams left [ns]."""
+"""Time between two records of how late datagrams left [ns]."""
 BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
-"""With these a mission begins: a recording that is cut there has to say what the link was."""
+"""Records that may begin a mission: a recording cut there must contain the link's state."""
 NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
-"""What comes of a file that cannot be read, or in which stands what nobody would write."""
+"""Errors that an unreadable or malformed file can raise."""
 
 
 class LinkNotes:
-    """Follows the file; what cannot be read changes nothing, what is too long is not noted."""
+    """Turns the link's state file into records.
+
+    An unreadable file changes nothing. A file that is too long is not recorded.
+    """
 
     def __init__(self, path: Path, *, uplink: bool) -> None:
         """Follow the file at `path`, which need not be there yet.
 
         Args:
-            path: State of the link.
-            uplink: Which direction this end sends in.
+            path: State file of the link.
+            uplink: Whether this end sends on the uplink.
         """
-        self._path, self._place, self._uplink = path, str(path), uplink
+        self._path, self._name, self._uplink = path, str(path), uplink
         self._seen: tuple[int, int, int] | None = None
         self._since_ns: int | None = None
         self._note: LinkChanged | None = None
@@ -73,16 +74,16 @@ class LinkNotes:
         self._due_ns = self._released_ns = self._noted_ns = 0
 
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
-        """Say what there is to be noted after these records.
+        """Return what to record about the link after these records.
 
         Args:
             records: What the end has just recorded.
             now_ns: The machine's monotonic clock [ns].
-            slip_ns: By how much the end's own clock lags [ns].
+            slip_ns: Lag of the end's own clock [ns].
 
         Returns:
-            One record if the link has changed or a mission may have begun; now and then those of
-            how late a relay is.
+            A record if the link has changed or a mission may have begun; every
+            `RELEASED_PERIOD_NS` also how late the relay's datagrams left.
         """
         if now_ns >= self._released_ns:
             self._released_ns = now_ns + RELEASED_PERIOD_NS
@@ -90,7 +91,7 @@ class LinkNotes:
         return self._changed(records, now_ns, slip_ns)
 
     def _changed(self, records: Iterable[Record], now_ns: int, slip_ns: int) -> list[Record]:
-        changed = now_ns >= self._due_ns and self._look(now_ns)
+        changed = now_ns >= self._due_ns and self._poll(now_ns)
         if not changed and BEGINNINGS.isdisjoint(map(type, records)):
             return []
         note, later = self._note, (now_ns - self._noted_ns) * 1e-9
@@ -100,26 +101,26 @@ class LinkNotes:
         return [note._replace(stamp_ns=now_ns - slip_ns, age=age, time_line=time_line)]
 
     def _late(self, stamp_ns: int) -> list[Record]:
-        """Say how late datagrams left since the relay began; nothing where none does."""
+        """Return how late datagrams left since the relay began; nothing without a relay."""
         try:
-            told = json.loads(read(self._released, STATE_MAX))
-            counts = {name: int(n) for name, n in told.items() if name in RELEASED}
+            found = json.loads(read(self._released, STATE_MAX))
+            counts = {name: int(n) for name, n in found.items() if name in RELEASED}
         except NONSENSE:
             return []
         way = "uplink" if self._uplink else "downlink"
         return [Counted(stamp_ns, "link", f"{way}_{name}", n) for name, n in counts.items()]
 
-    def _look(self, now_ns: int) -> bool:
-        """Read the file if it is another one; say whether the state has changed."""
+    def _poll(self, now_ns: int) -> bool:
+        """Read the file if it was replaced; return whether the state has changed."""
         self._due_ns = now_ns + PERIOD_NS
-        seen = version(self._place)
+        seen = version(self._name)
         if seen == self._seen:
             return False
-        self._seen = seen  # nonsense stays nonsense until it is another file
+        self._seen = seen  # do not read a malformed file twice
         try:
             state = from_text(read(self._path, STATE_MAX).decode())
             self._note = _note(state, self._uplink, now_ns)
-        except TooLongError:  # a long time line is in force, and nothing that was noted before
+        except TooLongError:  # a long time line is in force: the last note no longer holds
             self._note = self._since_ns = None
             return False
         except NONSENSE:
@@ -148,26 +149,26 @@ def _note(state: LinkState, uplink: bool, now_ns: int) -> LinkChanged:
 
 
 PARENT = "CLOUDRC_PARENT"
-"""Variable of the environment in which a supervisor tells its own process id."""
+"""Environment variable that holds the supervisor's process id."""
 
 
 class StopSignal:
-    """True once the process shall end.
+    """Returns True once the process shall end.
 
-    To be made first of all: the first process of a container ignores SIGTERM until then.
+    Create it first: the first process of a container ignores SIGTERM until then.
     """
 
     def __init__(self) -> None:
-        """Take over SIGTERM and SIGINT, and remember who started this process."""
+        """Handle SIGTERM and SIGINT, and remember the parent process."""
         self._asked = False
-        # As it was told by who started this: that may be gone by the time this line is reached.
-        told = os.environ.pop(PARENT, "")
-        self._parent = int(told) if told.isdecimal() else os.getppid()
+        # The supervisor passes its own id, since it may be gone before this line runs.
+        parent = os.environ.pop(PARENT, "")
+        self._parent = int(parent) if parent.isdecimal() else os.getppid()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._ask)
 
     def __call__(self) -> bool:
-        """Say whether somebody has asked for the end, or nobody is left to ask."""
+        """Check whether a signal has arrived or the parent process is gone."""
         return self._asked or os.getppid() != self._parent
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
@@ -175,21 +176,21 @@ class StopSignal:
 
 
 class Takes(Recorder, Protocol):
-    """A recorder that records can be put into; `cloudrc.record.recorder` has it.
+    """A recorder that accepts records, such as that of `cloudrc.record.recorder`.
 
     Attributes:
-        error: Why something was not recorded, in words; "" if all is well.
-        dropped: How many records did not reach the file.
+        error: Why something was not recorded, in words; "" without an error.
+        dropped: Number of records that did not reach the file.
     """
 
     error: str
 
     @property
     def dropped(self) -> int:
-        """Number of records that did not reach the file."""
+        """Return the number of records that did not reach the file."""
 
     def put(self, records: Iterable[Record]) -> None:
-        """Take records over; never waits and never raises."""
+        """Queue records; never waits and never raises."""
 
 
 def run_end(
@@ -208,43 +209,44 @@ def run_end(
     check: StandingCheck | None = None,
     keys: KeyFile | None = None,
 ) -> bool:
-    """Fly one end until it is asked to stop or `over()`; its recording is whole afterwards.
+    """Run one end until `stop()` or `over()`, then complete its recording.
 
     Args:
         endpoint: World or cloud.
         peer: Its socket.
-        recorder: Where its records go.
+        recorder: Gets its records.
         end: "world" or "cloud".
-        stop: Made before anything that takes its time, so that nobody asks in vain.
-        over: Whether this end is done by itself.
-        slip_ns: By how much world's clock lags [ns].
-        exporter: Gets the records too, if they are to become metrics.
+        stop: Whether somebody has asked this end to stop. Create it before anything slow, so that
+            no request is missed.
+        over: Whether this end has finished by itself.
+        slip_ns: Lag of world's clock [ns].
+        exporter: Turns the records into metrics; None for no metrics.
         watched: Whether a supervisor reads the feed.
-        choose: Says what of its records is recorded.
-        link: File in which the link tells its state; its changes are recorded.
-        check: Judges the link by what this end hears.
-        keys: Followed, if there is such a file.
+        choose: Selects the records that are recorded.
+        link: State file of the link, whose changes are recorded; None without one.
+        check: Compares the link with its profile by what this end receives.
+        keys: Key file that is followed for new keys; None without one.
 
     Returns:
-        True if it was done by itself, False if it was stopped.
+        True if the end finished by itself, False if it was stopped.
     """
     feed, thread = Feed.on_stdout(watched=watched), RecordingThread(recorder)
-    watch = _Watch(end, link, check, keys, slip_ns, thread.take_steps)
-    taps = _Taps(end, recorder, feed, exporter, choose, watch)
+    observers = _Observers(end, link, check, keys, slip_ns, thread.take_steps)
+    sink = _RecordSink(end, recorder, feed, exporter, choose, observers)
     if exporter is not None:
         exporter.recording(thread.sync_age)
     thread.start()
     feed.ready()
     try:
-        serve(endpoint, peer, end=end, sink=taps, stop=lambda: stop() or over(), slip_ns=slip_ns)
+        serve(endpoint, peer, end=end, sink=sink, stop=lambda: stop() or over(), slip_ns=slip_ns)
     finally:
-        taps.record_losses(time.monotonic_ns() - slip_ns())
+        sink.record_losses(time.monotonic_ns() - slip_ns())
         thread.stop()
     return over()
 
 
-class _Watch:
-    """What an end notes beside its flight: new keys, the link, a wall clock that was set."""
+class _Observers:
+    """Records what happens around an end: new keys, link changes, steps of the wall clock."""
 
     def __init__(
         self,
@@ -260,7 +262,7 @@ class _Watch:
         self._check, self._keys, self._slip_ns = check, keys, slip_ns
 
     def after(self, records: list[Record]) -> list[Record]:
-        """Say what is to be noted after these records."""
+        """Return what to record after these records."""
         now_ns, slip_ns = time.monotonic_ns(), self._slip_ns()
         noted: list[Record] = [told(step, now_ns - slip_ns) for step in self._clock_steps()]
         if self._keys is not None:
@@ -272,8 +274,8 @@ class _Watch:
         return noted
 
 
-class _Taps:
-    """Where an end's records go: into its recording, to who watches, into its metrics."""
+class _RecordSink:
+    """Passes an end's records to its recording, its feed and its metrics."""
 
     def __init__(
         self,
@@ -282,16 +284,16 @@ class _Taps:
         feed: Feed,
         exporter: Exporter | None,
         choose: Callable[[list[Record]], list[Record]],
-        watch: _Watch,
+        observers: _Observers,
     ) -> None:
         self._end, self._recorder, self._feed = end, recorder, feed
-        self._exporter, self._choose, self._watch = exporter, choose, watch
+        self._exporter, self._choose, self._observers = exporter, choose, observers
         self._trouble, self._dropped = "", 0
 
     def __call__(self, records: list[Record]) -> None:
-        """Take records in; never waits."""
+        """Pass records on; never waits."""
         recorder, exporter = self._recorder, self._exporter
-        records = records + self._watch.after(records)
+        records = records + self._observers.after(records)
         recorder.put(self._choose(records))
         self._feed.tell(records)
         if exporter is not None:
@@ -304,7 +306,7 @@ class _Taps:
             self._feed.tell([Fault(records[-1].stamp_ns, "recorder", self._trouble)])
 
     def record_losses(self, stamp_ns: int) -> None:
-        """Note in the recording what did not reach it."""
+        """Record the number of records that were lost."""
         self._recorder.put([self._losses(stamp_ns)])
 
     def _losses(self, stamp_ns: int) -> Counted:

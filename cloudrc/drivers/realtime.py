@@ -1,13 +1,11 @@
-"""Real time: one endpoint, one UDP socket, the machine's monotonic clock.
+"""Run one endpoint in real time on a UDP socket and the machine's monotonic clock.
 
 The loop sleeps until the endpoint's next deadline or the next datagram, whichever comes first.
-All datagrams that are drained in one wake carry the same instant, as the endpoint's contract asks.
+All datagrams of one wake get the same instant, as the endpoint's contract requires.
 
-The route file: one line HOST:PORT that says where this pod's end of the tunnel has to send.
-
-The link's process writes it once the way is open, and again when the peer moves; the loop looks at
-it twice a second. A look costs a system call, so the host is a number: a name would have to be
-asked for, and the loop would wait for the answer.
+In a pod, a route file holds the address of the other end as one line HOST:PORT. The link's process
+writes it when the link is up and whenever the peer moves; the loop checks it twice a second. HOST
+is a numeric address, since a name server would block the loop.
 """
 
 from __future__ import annotations
@@ -30,18 +28,18 @@ Address = tuple[str, int]
 
 
 class Route:
-    """Follows the file; what cannot be read changes nothing."""
+    """Follows the route file; an unreadable file changes nothing."""
 
     def __init__(self, path: Path) -> None:
-        """Follow the file at `path`, which need not be there yet."""
+        """Follow the file at `path`, which may appear later."""
         self._path = path
         self._seen: tuple[int, int, int] | None = None
         self._address: Address | None = None
 
     def look(self) -> Address | None:
-        """Where to send; None before the file has been there.
+        """Return the address to send to; None before the file was first read.
 
-        A file that is gone, or half written, leaves the last address in place.
+        The last address stays if the file is missing or half written.
         """
         try:
             seen = version(self._path)
@@ -54,48 +52,51 @@ class Route:
 
 
 def parse(text: str) -> Address:
-    """Read HOST:PORT.
+    """Parse HOST:PORT.
 
     Raises:
-        ValueError: If it is not an IPv4 address in numbers and a port.
+        ValueError: If it is not a numeric IPv4 address and a port.
     """
     host, _, port = text.strip().rpartition(":")
     try:
         numeric = str(IPv4Address(host))
     except AddressValueError as error:
-        raise ValueError(f"'{host}' is not an address in numbers") from error
+        raise ValueError(f"'{host}' is not a numeric IPv4 address") from error
     if not port.isdecimal() or not 0 < int(port) < 65_536:
         raise ValueError(f"'{port}' is not a port")
     return numeric, int(port)
 
 
 DRAIN_MAX = 256
-"""Datagrams taken per wake, so that a flood cannot keep the loop from its deadlines."""
+"""Limit of datagrams per wake, so that a flood cannot keep the loop from its deadlines."""
 RECEIVE_BUFFER = 1 << 22
-"""Asked of the kernel, which may give less: room for honest datagrams behind a flood [bytes]."""
+"""Requested size of the socket's buffer [bytes], room for valid datagrams behind a flood."""
 BACKLOG_MAX = 2 * RECEIVE_BUFFER // 512
-"""More than can wait in the socket: Linux doubles the room, a datagram takes 768 bytes at least."""
+"""Limit of datagrams after a stall, above what can wait in the socket: Linux doubles the buffer,
+and a datagram takes at least 768 bytes of it."""
 STALL_NS = 50_000_000
-"""After a wake this late all that waits is taken at once: it came before that wake [ns]."""
+"""After a wake later than this the loop takes all waiting datagrams at once: they arrived before
+the wake [ns]."""
 STALL_AGAIN_NS = 1_000_000_000
-"""After a wake that was itself late only one this late [ns]: a flood that takes that long to take
-in would keep the loop in it. What honest peers send in less fits into `DRAIN_MAX`."""
+"""As `STALL_NS`, after a wake that followed a stall [ns]. It is longer, so that a flood, which
+takes long to receive, cannot look like a stall again and again."""
 SINK_PERIOD_NS = 20_000_000
+"""Longest time between two hand-overs of records [ns]."""
 WAIT_MAX_NS = 100_000_000
+"""Longest wait for a datagram [ns]; then `stop` is checked again."""
 ROUTE_PERIOD_NS = 500_000_000
-"""How often it is asked whether the route has changed [ns]."""
+"""Time between two checks of the route file [ns]."""
 
 
 @dataclass
 class Peer:
-    """A UDP socket and whom it talks to.
+    """A UDP socket and the address of its peer.
 
     Attributes:
         socket: Bound, not blocking.
-        address: Of the other end of the tunnel, or of the relay before it; None while the route
-            to it is unknown.
-        route: Says where the other end is, and may change its mind; None if it never moves.
-        unsent: How many datagrams could not be sent.
+        address: Address of the other end of the tunnel or of its relay; None while it is unknown.
+        route: Route file that holds the address; None if the address is fixed.
+        unsent: Number of datagrams that could not be sent.
     """
 
     socket: socket.socket
@@ -106,19 +107,19 @@ class Peer:
 
     @classmethod
     def bind(cls, listen: tuple[str, int], where: tuple[str, int] | Route) -> Peer:
-        """Bind a socket at `listen`; send to an address, or to where a route leads."""
+        """Bind a socket at `listen`, for a fixed peer address or for that of a route file."""
         if isinstance(where, Route):
             return cls(bind(listen), None, where)
         return cls(bind(listen), where)
 
     def follow(self, now_ns: int) -> None:
-        """Look where the route leads, if that is due at `now_ns` [ns]."""
+        """Update the address from the route file, if a check is due at `now_ns` [ns]."""
         if self.route is not None and now_ns >= self._followed_ns:
             self._followed_ns = now_ns + ROUTE_PERIOD_NS
             self.address = self.route.look()
 
     def receive(self, most: int = DRAIN_MAX) -> list[bytes]:
-        """What waits in the socket; one byte too many marks an oversized datagram."""
+        """Return at most `most` waiting datagrams; an oversized one keeps one byte too many."""
         datagrams: list[bytes] = []
         while len(datagrams) < most:
             try:
@@ -130,7 +131,7 @@ class Peer:
         return datagrams
 
     def send(self, datagrams: list[bytes]) -> None:
-        """Send; what the network refuses counts as lost, as UDP has it."""
+        """Send datagrams; those that the socket refuses are lost and counted."""
         if self.address is None:
             self.unsent += len(datagrams)
             return
@@ -155,15 +156,15 @@ def bind(listen: tuple[str, int]) -> socket.socket:
 
 
 def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[int]:
-    """Find ports on 127.0.0.1 that nobody uses now."""
+    """Find unused ports on 127.0.0.1."""
     sockets = [socket.socket(socket.AF_INET, kind) for _ in range(count)]
     try:
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [int(one.getsockname()[1]) for one in sockets]
+        for sock in sockets:
+            sock.bind(("127.0.0.1", 0))
+        return [int(sock.getsockname()[1]) for sock in sockets]
     finally:
-        for one in sockets:
-            one.close()
+        for sock in sockets:
+            sock.close()
 
 
 def serve(
@@ -182,16 +183,16 @@ def serve(
         peer: Its socket.
         end: "world" or "cloud", for the records.
         sink: Gets the records, at least every 20 ms; must not block.
-        stop: Asked at every wake, at most 100 ms apart.
-        slip_ns: By how much world's clock lags [ns].
+        stop: Called at every wake, at most 100 ms apart.
+        slip_ns: Lag of world's clock [ns].
 
     Raises:
-        ValueError: If its datagrams are not sealed.
+        ValueError: If the endpoint's datagrams are not sealed.
     """
     if not endpoint.sealed:
-        raise ValueError(f"{end} has no key, and nothing leaves a process unsealed")
+        raise ValueError(f"{end} has no key; a process must seal all its datagrams")
     gc.collect()
-    gc.freeze()  # what is loaded now stays: the collector need not look at it in flight
+    gc.freeze()  # keep the collector away from the objects loaded so far
     stalled, sink_ns = False, time.monotonic_ns()
     while not stop():
         deadline_ns = endpoint.next_deadline_ns()

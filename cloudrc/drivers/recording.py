@@ -1,16 +1,12 @@
-"""The recording of a process in real time: a thread that empties the recorder into its file.
+"""Write a process's recording to its file from a background thread.
 
-It takes a few records at a time and rests in between, so that the loop, which shares the
-interpreter with it, is never kept waiting for longer than a fraction of a millisecond. With each
-flush it looks whether the wall clock was set, at which the loop may not look. A second thread waits
-for the disk: one that takes seconds keeps nothing from the operating system, which keeps what it
-has when the process is killed.
+The thread writes a few records at a time and sleeps in between, so that it delays the loop, which
+shares the interpreter, by less than a millisecond. A second thread waits for the disk: even if a
+sync takes seconds, the operating system gets the data and keeps it if the process is killed.
 
-Steps of the machine's wall clock, for people: nothing that flies may look at it.
-
-It is seen against the clock that counts since boot, which nobody sets and which, unlike the
-monotonic one, goes on while the machine sleeps. The thread of the recording looks; what an end
-records of it is a fault with the size of the step.
+With each flush the thread also checks whether somebody set the wall clock, which the loop never
+reads. It compares it with the clock since boot, which nobody sets and which, unlike the monotonic
+clock, continues while the machine sleeps.
 """
 
 from __future__ import annotations
@@ -34,43 +30,44 @@ from cloudrc.records import (
 )
 
 STEP = 0.1
-"""A smaller difference between two looks is no step [s]."""
+"""Smallest difference between two checks that counts as a step [s]."""
 DRIFT_MAX = 1e-3
-"""By which the two clocks may differ in speed: kernels slew by half of it at most."""
+"""Largest relative drift of the two clocks [1]; kernels slew by at most half of it."""
 _SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # the former: Linux
 
 
 class WallClock:
-    """Finds out that the wall clock was set."""
+    """Detects that the wall clock was set."""
 
     def __init__(self) -> None:
-        """Take it as it is now."""
+        """Read both clocks for the first time."""
         self._wall, self._boot = _now()
 
     def step(self) -> float:
-        """Look again; say by how much it was set since the look before [s], 0 if it was not."""
+        """Return by how much the clock was set since the last call [s]; 0 if it was not."""
         wall, boot = _now()
-        passed, seemed = boot - self._boot, wall - self._wall
+        elapsed = boot - self._boot
+        step = wall - self._wall - elapsed
         self._wall, self._boot = wall, boot
-        return seemed - passed if abs(seemed - passed) > STEP + DRIFT_MAX * passed else 0.0
+        return step if abs(step) > STEP + DRIFT_MAX * elapsed else 0.0
 
 
 def told(step: float, stamp_ns: int) -> Fault:
-    """Make what is recorded of a step.
+    """Make the record of a step of the wall clock.
 
     Args:
-        step: By how much it was set [s].
-        stamp_ns: When that was noticed [ns], own clock of the end.
+        step: Size of the step [s].
+        stamp_ns: When it was detected [ns], own clock of the end.
     """
     text = (
-        f"wall clock stepped by {step:+.1f} s: the flight does not notice;"
-        " times of day before and after it do not compare"
+        f"wall clock stepped by {step:+.1f} s: the flight is not affected;"
+        " do not compare times of day before and after the step"
     )
     return Fault(stamp_ns, CLOCK_SET, text)
 
 
 def _now() -> tuple[float, float]:
-    """The wall clock, and the one that counts since boot [s], with no stall in between."""
+    """Read the wall clock and the clock since boot [s], without a stall in between."""
     while True:
         before, wall = time.clock_gettime(_SINCE_BOOT), time.time()
         boot = time.clock_gettime(_SINCE_BOOT)
@@ -79,40 +76,41 @@ def _now() -> tuple[float, float]:
 
 
 AFTERWARDS_NS = 90_000_000_000
-"""For so long after the robot has last followed the cloud, all is recorded still [ns]: until it has
-landed after a loss of the link."""
+"""Time after the robot last followed the cloud in which all is still recorded [ns]; it covers the
+landing after a loss of the link."""
 PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
+"""Record types that are made all the time, with or without a flight."""
 BATCH = 16
-"""Records written at a time."""
+"""Number of records written at a time."""
 IDLE = 0.1
-"""Rest when the queue is empty [s]: a wake costs more than a few records."""
+"""Sleep after the queue was emptied [s]; a wake costs more than a few records."""
 BUSY = 0.001
-"""Rest when more is waiting [s]."""
+"""Sleep while more records wait [s]."""
 FLUSH = 0.25
-"""Longest time between two flushes [s]: with the rests, a killed process loses less than 0.5 s."""
+"""Longest time between two flushes [s]; a killed process loses less than 0.5 s."""
 
 
 class Recorder(Protocol):
-    """What the thread empties; `cloudrc.record.recorder` has it. No method raises."""
+    """The part of a recorder that the thread uses. No method raises."""
 
     def drain(self, max_records: int = ...) -> int:
-        """Write out at most so many records; say how many were taken from the queue."""
+        """Write at most `max_records` records; return how many were taken from the queue."""
 
     def flush(self, *, sync: bool = ...) -> None:
-        """Hand what was written to the operating system."""
+        """Hand the written data to the operating system."""
 
     def sync(self) -> bool:
-        """Have what was flushed survive the machine; may take seconds. Say whether it does."""
+        """Sync the flushed data to the disk, which may take seconds; return whether it worked."""
 
     def close(self) -> None:
-        """Write out the rest and end the file."""
+        """Write the remaining records and end the file."""
 
 
 class FlightsOnly:
-    """Lets through what happens while the robot flies, and of the rest what is an event.
+    """Selects all records during a flight, and only events otherwise.
 
-    A pod outlives its missions: 100 samples a second of a robot that keeps its place would fill
-    its volume within hours.
+    A pod outlives its missions: 100 samples a second of an idle robot would fill its volume within
+    hours.
     """
 
     def __init__(self, flies: Callable[[], bool]) -> None:
@@ -125,7 +123,7 @@ class FlightsOnly:
         self._until_ns = 0
 
     def __call__(self, records: list[Record]) -> list[Record]:
-        """Choose what is to be recorded."""
+        """Select the records to keep."""
         if not records:
             return records
         stamp_ns = records[-1].stamp_ns
@@ -137,18 +135,21 @@ class FlightsOnly:
 
 
 class SyncAge:
-    """What a power cut would take of a recording: all since the newest sync that is done began."""
+    """Measures how much of a recording a power cut would destroy.
+
+    That is all since the start of the last completed sync.
+    """
 
     def __init__(self) -> None:
-        """Begin with nothing that would be left."""
+        """Begin without a completed sync."""
         self._safe: float | None = None
 
     def done(self, began: float) -> None:
-        """Note that a sync which `began` then [s] is done."""
+        """Note that the sync that `began` then [s] has completed."""
         self._safe = began
 
     def read(self, now: float) -> float | None:
-        """Say how much is at risk `now` [s]; None if nothing is safe yet."""
+        """Return the time at risk at `now` [s]; None before the first completed sync."""
         return None if self._safe is None else now - self._safe
 
 
@@ -156,14 +157,14 @@ class RecordingThread:
     """Runs a recorder in the background from `start` to `stop`."""
 
     def __init__(self, recorder: Recorder) -> None:
-        """Make the thread; it does not run yet.
+        """Create the thread; it does not run yet.
 
         Args:
-            recorder: The loop puts into it; nobody else may drain it.
+            recorder: The loop adds records to it; only this thread drains it.
         """
         self._recorder = recorder
         self._stopping = threading.Event()
-        # A daemon, so that a disk that hangs cannot keep the process from ending.
+        # A daemon thread, so that a hanging disk cannot keep the process from ending.
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._flushed, self._over = threading.Event(), False
         self._age = SyncAge()
@@ -171,23 +172,23 @@ class RecordingThread:
         self._syncing = threading.Thread(target=self._sync, name="recording-sync", daemon=True)
 
     def start(self) -> None:
-        """Begin to write."""
+        """Start both threads."""
         self._thread.start()
         self._syncing.start()
 
     def sync_age(self) -> float | None:
-        """Say for how long what is recorded is not safe yet [s]; None if nothing is."""
+        """Return how much of the recording is not on disk yet [s]; None before the first sync."""
         return self._age.read(time.monotonic())
 
     def take_steps(self) -> list[float]:
-        """Hand over by how much the wall clock was set, each time since the last call [s]."""
+        """Return the steps of the wall clock since the last call [s]."""
         return [self._steps.popleft() for _ in range(len(self._steps))]
 
     def stop(self, timeout: float = 1.5) -> bool:
-        """Write out the rest, end the file and wait for that.
+        """Write the remaining records, end the file and wait for both.
 
         Args:
-            timeout: How long to wait [s].
+            timeout: Longest time to wait [s].
 
         Returns:
             True if the file was ended in time.

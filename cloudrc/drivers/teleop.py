@@ -1,14 +1,10 @@
-"""Teleop in a process of its own: its machine in real time, and what cloud has in its place.
+"""Run teleop in its own process and connect it with cloud over Unix datagram sockets.
 
     cloud process: CloudEndpoint - RemoteTeleop  <- two Unix sockets ->  serve_teleop - machine
 
-Either process may restart: setpoint and requests are repeated, and what happened while cloud was
-away is told to it when it is there again.
-
-Unix datagram sockets: two processes of one machine, one message each way at a time.
-
-Nothing here blocks and nothing is certain: what the other's full or missing socket refuses is
-lost, as on a network. Paths are looked up with every datagram, so either process may restart.
+Nothing here blocks. A datagram that the other's full or missing socket refuses is lost, as on a
+network. Either process may restart: the socket's path is looked up for each datagram, setpoint and
+requests are repeated, and events wait until cloud is back.
 """
 
 from __future__ import annotations
@@ -26,23 +22,23 @@ from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
 
 DATAGRAM_MAX = 8_192
-"""Longer than any message of ours [bytes]."""
+"""Size limit of a datagram, above that of all our messages [bytes]."""
 DRAIN_MAX = 1024
-"""Datagrams taken per wake, so that a flood cannot keep a loop from its deadlines; more than wait
-at once: systemd lets 513, so that nothing of a stall is left for the wake behind it."""
+"""Limit of datagrams per wake, so that a flood cannot keep a loop from its deadlines. It is above
+the socket's queue (513 under systemd), so that one wake takes all that waits after a stall."""
 PATH_MAX = 107
-"""Bytes of a socket's path, less its end. Source: unix(7), `sun_path`."""
+"""Longest path of a socket, without its final zero [bytes]. Source: unix(7), `sun_path`."""
 
 
 class UnixPeer:
-    """A Unix datagram socket of our own, and the path of the other's.
+    """Our Unix datagram socket and the path of the other process's socket.
 
     Attributes:
-        unsent: How many datagrams the other did not take.
+        unsent: Number of datagrams that the other socket refused.
     """
 
     def __init__(self, own: Path, other: Path) -> None:
-        """Bind `own`, in the place of what an earlier process may have left there.
+        """Bind `own` and replace a socket that an earlier process left there.
 
         Raises:
             BadInputError: If the path cannot be bound.
@@ -62,7 +58,7 @@ class UnixPeer:
             raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
 
     def receive(self) -> list[bytes]:
-        """Everything that waits in the socket."""
+        """Return the datagrams that wait in the socket."""
         datagrams: list[bytes] = []
         while len(datagrams) < DRAIN_MAX:
             try:
@@ -72,76 +68,77 @@ class UnixPeer:
         return datagrams
 
     def send(self, data: bytes) -> bool:
-        """Send, if the other takes it now; say whether it did."""
+        """Send a datagram; return whether the other socket has accepted it."""
         try:
             self._socket.sendto(data, self._other)
-        except OSError:  # not there, not yet there again, or its queue is full
+        except OSError:  # missing, restarting, or its queue is full
             self.unsent += 1
             return False
         return True
 
     def close(self) -> None:
-        """Close; the path stays, since a successor may have bound it by now."""
+        """Close the socket; its path stays, since a successor may already have bound it."""
         self._socket.close()
 
 
 PERIOD_NS = 20_000_000
-"""Between two deadlines of teleop's machine [ns]."""
+"""Time between two deadlines of teleop's machine [ns]."""
 TELL_NS = PERIOD_NS - 5_000_000
-"""Teleop is told what is seen no more often than this [ns]: every second telemetry."""
+"""Shortest time between two robot states sent to teleop [ns]; that is every second telemetry."""
 ALIVE_NS = 200_000_000
-"""Without telemetry teleop is told so often that cloud lives, by an empty datagram [ns]."""
+"""Time between two empty datagrams that tell teleop, without telemetry, that cloud runs [ns]."""
 STALL_NS = 100_000_000
-"""After a wake this late what waits in the socket shows the past, for it has no room for more than
-the beginning of a stall: the present comes with one of the next wakes [ns]."""
+"""After a wake later than this the socket holds only old datagrams: its queue was full from the
+start of the stall. New ones arrive within the next wakes [ns]."""
 BLIND_WAKES = 5
-"""So many of them may pass without it, and then what is asked is done all the same."""
+"""Limit of wakes that wait for a new datagram after a stall; then teleop continues without one."""
 SILENCE_NS = 1_000_000_000
-"""Teleop speaks at 10 Hz; without a word for so long it is taken to be away [ns]."""
+"""Without a datagram from teleop, which sends at 10 Hz, for this long it counts as away [ns]."""
 EVENTS_KEPT = 256
-"""Events that wait for a cloud that is away."""
+"""Limit of the events that wait while cloud is away."""
 LAST_WORD_NS = 800_000_000
-"""For teleop's last word to stop the robot, through a cloud that is to end as well [ns]: longer
-than teleop repeats it, and short enough for a process that has 1.5 s to end."""
+"""Time that an ending cloud still forwards teleop's last hold request [ns]: longer than teleop
+repeats the request, shorter than the 1.5 s that a process has to end."""
 
 Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
-"""Raises ValueError for what is no message."""
+"""Raises a ValueError if the bytes are no message."""
 Calls = Callable[[], Iterable[Callable[[int], None]]]
-"""What other threads want to be done, here and now [ns]; must not block."""
+"""Returns the calls that other threads have queued, each to be called with now [ns]; must not
+block."""
 
 
 class Machine(Protocol):
-    """What teleop's process runs."""
+    """The state machine that teleop's process runs."""
 
     def hear(self, now_ns: int) -> None:
-        """Take note that cloud lives."""
+        """Note that cloud runs."""
 
     def see(self, seen: Any, now_ns: int) -> None:
-        """Take note of the newest telemetry."""
+        """Note the newest robot state."""
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Do what is due."""
+        """Do what is due at `now_ns` [ns]."""
 
     def take_outputs(self) -> Sequence[Any]:
-        """Hand over what it has said since the last call."""
+        """Return its outputs since the last call."""
 
 
 class RemoteTeleop:
-    """Stands for teleop in cloud's process.
+    """Represents teleop in cloud's process.
 
     Attributes:
         outcome: Always None: cloud does not end with a mission.
         settled: Always true.
-        outputs: What teleop has said since the last call of `take_outputs`.
-        malformed: How many datagrams were no messages.
+        outputs: Teleop's outputs since the last call of `take_outputs`.
+        malformed: Number of datagrams that were no messages.
     """
 
     outcome = None
     settled = True
 
     def __init__(self, peer: UnixPeer, encode: Encode, decode: Decode, start_ns: int) -> None:
-        """Join the socket; teleop has a second from `start_ns` [ns] to speak."""
+        """Begin at `start_ns` [ns]; teleop has a second to send its first datagram."""
         self._peer, self._encode, self._decode = peer, encode, decode
         self._heard_ns, self._silent, self._stalled = start_ns, False, False
         self._tell_ns = self._looked_ns = self._alive_ns = start_ns
@@ -149,17 +146,19 @@ class RemoteTeleop:
         self.malformed = 0
 
     def see(self, seen: Any, now_ns: int) -> None:
-        """Tell teleop what is seen, if it listens; as often as it looks."""
+        """Send the robot's state to teleop, at most every `TELL_NS`."""
         if now_ns >= self._tell_ns:
             self._tell_ns, self._alive_ns = now_ns + TELL_NS, now_ns + ALIVE_NS
             self._peer.send(self._encode(seen))
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Take in what teleop has said; once it has been silent for a second, say so.
+        """Receive teleop's outputs; report a fault once teleop is silent for a second.
 
-        Where there is no telemetry to tell, tell teleop that cloud lives.
-        What led somewhere while cloud stood still may be taken back behind a full socket: teleop
-        says it again if it is not. Not twice in a row: a cloud that is always late flies, too.
+        Without telemetry an empty datagram tells teleop that cloud runs.
+
+        After a stall, starts and waypoints are dropped: teleop may have withdrawn them in a
+        datagram that found the socket full, and it repeats those that still hold. They are not
+        dropped twice in a row, so that a cloud that is always late can fly.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS
@@ -168,28 +167,28 @@ class RemoteTeleop:
         self._looked_ns = now_ns
         for data in self._peer.receive():
             try:
-                said = self._decode(data)
+                output = self._decode(data)
             except ValueError:
                 self.malformed += 1
                 continue
             self._heard_ns, self._silent = now_ns, False
-            if not (self._stalled and _leads(said)):
-                self.outputs.append(said)
+            if not (self._stalled and _moves_robot(output)):
+                self.outputs.append(output)
         if not self._silent and now_ns - self._heard_ns > SILENCE_NS:
             self._silent = True
             text = "teleop has been silent for 1 s: the last setpoint is kept; see teleop's log"
             self.outputs.append(Fault(now_ns, "teleop_silent", text))
 
     def take_outputs(self) -> list[Any]:
-        """Hand over what teleop has said since the last call."""
+        """Return teleop's outputs since the last call."""
         outputs, self.outputs = self.outputs, []
         return outputs
 
 
 class LastWord:
-    """Lets cloud end: a moment later if the robot flies, for that is for teleop to hold.
+    """Delays cloud's end while the robot flies, so that teleop can still request a hold.
 
-    A pod asks all its containers to end at once; what teleop then says has no way but cloud's.
+    A pod ends all its containers at once, and teleop's requests pass through cloud.
     """
 
     def __init__(
@@ -198,18 +197,18 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Wait for nothing yet.
+        """Begin without a request to end.
 
         Args:
-            asked: Whether cloud is to end.
-            flies: Whether the robot is seen to follow commands.
+            asked: Whether somebody has asked cloud to end.
+            flies: Whether telemetry shows that the robot follows commands.
             clock: Own clock [ns].
         """
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
 
     def __call__(self) -> bool:
-        """Whether cloud may end now; asked at every wake."""
+        """Return whether cloud may end now; called at every wake."""
         if not self._asked():
             return False
         if self._until_ns is None:
@@ -231,19 +230,19 @@ def serve_teleop(
     """Run teleop's machine in real time until `stop()` is true.
 
     Args:
-        machine: Gets 50 deadlines a second, before each the newest of what is seen.
+        machine: Gets 50 deadlines a second, before each the newest robot state.
         peer: The socket to cloud.
-        encode: Writes a message for cloud.
-        decode: Reads one from cloud.
+        encode: Encodes a message for cloud.
+        decode: Decodes a message from cloud.
         calls: See `turn`.
         stops: See `turn`.
-        tell: Gets events and faults, at every wake that has some; must not block.
-        stop: Asked at every wake.
+        tell: Gets the events and faults of each wake; must not block.
+        stop: Called at every wake.
     """
     unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
     deadline_ns, blind = time.monotonic_ns(), 0
     while not stop():
-        # Not woken by what comes: telemetry is twice as frequent, and of several the newest counts.
+        # Datagrams do not wake it: telemetry is twice as frequent, and only the newest counts.
         time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
         now_ns = time.monotonic_ns()
         late_ns = now_ns - deadline_ns
@@ -251,8 +250,8 @@ def serve_teleop(
         blind = turn(
             machine, peer, decode, calls, stops=stops, blind=blind, late_ns=late_ns, now_ns=now_ns
         )
-        if not blind and (told := send(machine.take_outputs(), unsent, peer, encode)):
-            tell(told)
+        if not blind and (reports := send(machine.take_outputs(), unsent, peer, encode)):
+            tell(reports)
 
 
 def turn(
@@ -266,34 +265,35 @@ def turn(
     late_ns: int,
     now_ns: int,
 ) -> int:
-    """Do what is due at one wake of teleop.
+    """Do one wake of teleop: receive states, make the queued calls, handle the deadline.
 
     Args:
-        machine: Sees, is asked, and gets its deadline.
+        machine: Gets states, calls and its deadline.
         peer: The socket to cloud.
-        decode: Reads a message from cloud.
-        calls: What is wanted.
-        stops: Of these the emergency stops, which are made first.
-        blind: What was returned at the wake before; 0 at first.
-        late_ns: By how much this wake is late [ns].
+        decode: Decodes a message from cloud.
+        calls: Returns the queued calls.
+        stops: Returns the queued emergency stops, which are made first.
+        blind: Return value of the last wake; 0 at first.
+        late_ns: Lateness of this wake [ns].
         now_ns: Now [ns].
 
     Returns:
-        For how many wakes more teleop does not look; as long as there are any, nothing is done.
+        Number of wakes that teleop still waits for a new datagram; if it is not 0, this wake has
+        done nothing else.
     """
     arrived, was_blind = peer.receive(), blind
-    told = [data for data in arrived if data]  # what is empty shows nothing, past or present
-    blind = blind_for(was_blind, late_ns, bool(told))
+    states = [data for data in arrived if data]  # an empty datagram carries no state
+    blind = blind_for(was_blind, late_ns, bool(states))
     if blind:
         return blind
     if arrived:
         machine.hear(now_ns)
-    for stop in stops():  # first: what has arrived may already show what their alarm has done
+    for stop in stops():  # before the state, which may already show the effect of their alarm
         stop(now_ns)
-    seen = _newest(told, decode)
-    if was_blind and seen is not None:  # first: a call may be about where the robot is
+    seen = _newest(states, decode)
+    if was_blind and seen is not None:  # before the calls, which may depend on the robot's place
         machine.see(seen, now_ns)
-    for call in calls():  # first: what has arrived may already show what a call asked for
+    for call in calls():  # before the state, which may already show the effect of a call
         call(now_ns)
     if not was_blind and seen is not None:
         machine.see(seen, now_ns)
@@ -302,12 +302,14 @@ def turn(
 
 
 def blind_for(before: int, late_ns: int, arrived: bool) -> int:
-    """Say for how many wakes more teleop does not look; a loop that is always late looks in turns.
+    """Return for how many more wakes teleop waits for a new datagram after a stall.
+
+    Lateness does not count while it waits, so that a loop that is always late still continues.
 
     Args:
-        before: What was said at the wake before.
-        late_ns: By how much this one is late [ns].
-        arrived: Whether something waits in the socket.
+        before: Return value of the last wake.
+        late_ns: Lateness of this wake [ns].
+        arrived: Whether a datagram with a state has arrived.
     """
     if before:
         return 0 if arrived else before - 1
@@ -317,37 +319,37 @@ def blind_for(before: int, late_ns: int, arrived: bool) -> int:
 def send(
     outputs: Sequence[Any], unsent: deque[bytes], peer: UnixPeer, encode: Encode
 ) -> list[MissionEvent | Fault]:
-    """Send what is for cloud, first the events that still wait for it in `unsent`.
+    """Send outputs to cloud, first the events that wait in `unsent`.
 
     Returns:
-        What is to be told elsewhere, too.
+        The events and faults among the outputs.
     """
-    told: list[MissionEvent | Fault] = []
+    reports: list[MissionEvent | Fault] = []
     while unsent and peer.send(unsent[0]):
         unsent.popleft()
     for output in outputs:
         if isinstance(output, MissionEvent | Fault):
-            told.append(output)
+            reports.append(output)
         if isinstance(output, Fault):
             continue
         data = encode(output)
-        once = isinstance(output, MissionEvent)
+        is_event = isinstance(output, MissionEvent)
         # Events keep their order; everything else is repeated anyway.
-        if (once and unsent) or not peer.send(data):
-            if once:
+        if (is_event and unsent) or not peer.send(data):
+            if is_event:
                 unsent.append(data)
-    return told
+    return reports
 
 
-def _leads(said: Any) -> bool:
-    """Whether it is to start, or to fly to a waypoint; an end, a stop and a hold are neither."""
-    if isinstance(said, OperatorRequest):
-        return said.request is Request.START
-    return isinstance(said, Setpoint) and said.waypoint >= 0
+def _moves_robot(output: Any) -> bool:
+    """Check whether an output starts a mission or leads to a waypoint."""
+    if isinstance(output, OperatorRequest):
+        return output.request is Request.START
+    return isinstance(output, Setpoint) and output.waypoint >= 0
 
 
 def _newest(arrived: list[bytes], decode: Decode) -> Any:
-    """Decode the last datagram that is a message; None if none is."""
+    """Decode the last datagram that is a valid message; None if there is none."""
     for data in reversed(arrived):
         with suppress(ValueError):
             return decode(data)

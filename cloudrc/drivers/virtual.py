@@ -1,8 +1,7 @@
-"""Virtual time: both ends and the link between them in one process, as fast as it goes.
+"""Run both ends and the link between them in one process, in virtual time.
 
-An event heap in integer nanoseconds. Of several events at one instant, arrivals come first, in the
-order in which they were sent, then world's deadline, then cloud's: the same inputs give the same
-run, bit by bit.
+The run is an event heap in integer nanoseconds. At one instant, arrivals come first, in the order
+of sending, then world's deadline, then cloud's. So the same inputs give the same run, bit by bit.
 """
 
 from __future__ import annotations
@@ -19,27 +18,27 @@ from cloudrc.tunnel.codec import peek
 Sink = Callable[[list[Record], list[Record]], None]
 """Takes the records of world and of cloud since the last call."""
 PERIOD_NS = 100_000_000
-"""How often records are handed over, and whether it is over is asked [ns]."""
+"""Virtual time between two calls of the sink and of `until` [ns]."""
 
 
 class Link(Protocol):
     """One direction of the emulated network.
 
     Attributes:
-        corrupts: Whether `corrupted` is to be asked.
+        corrupts: Whether datagrams may be damaged; then `corrupted` must be called.
     """
 
     corrupts: bool
 
     def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
-        """Give the datagram as it arrives, damaged or not."""
+        """Return the datagram as it arrives, damaged or not."""
 
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> tuple[int, ...]:
-        """When the copies of this datagram arrive [ns]: none, one or two."""
+        """Return when the copies of this datagram arrive [ns]: none, one or two instants."""
 
 
 class VirtualRun:
-    """World, cloud and two links, driven through virtual time."""
+    """A run of world, cloud and two link directions in virtual time."""
 
     def __init__(
         self,
@@ -50,36 +49,36 @@ class VirtualRun:
         *,
         cloud_clock_offset_ns: int = 0,
     ) -> None:
-        """Join the parts; time begins at 0.
+        """Connect the parts; time begins at 0.
 
         Args:
             world: Its clock is virtual time.
             cloud: Its clock is virtual time plus the offset.
-            uplink: World to cloud.
-            downlink: Cloud to world.
+            uplink: Link from world to cloud.
+            downlink: Link from cloud to world.
             cloud_clock_offset_ns: Cloud's clock minus world's [ns].
         """
         self._world, self._cloud = world, cloud
         self._uplink, self._downlink = uplink, downlink
         self._offset_ns = cloud_clock_offset_ns
-        self._flying: list[tuple[int, int, bool, bytes]] = []
+        self._arrivals: list[tuple[int, int, bool, bytes]] = []
         self._sent = 0
         self.now_ns = 0
 
     def fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
-        """Go on until `until()` is true, asked every 100 ms of virtual time, or to the limit.
+        """Run until `until()` is true or the limit is reached.
 
         Args:
-            until: Whether it is over.
-            limit_ns: Virtual time at which it is over in any case [ns].
+            until: Whether the flight is over; called every 100 ms of virtual time.
+            limit_ns: Virtual time at which the run ends in any case [ns].
             sink: Gets all records, every 100 ms of virtual time.
         """
-        collects = gc.isenabled()
-        gc.disable()  # a flight makes no cycles, and its records would be looked at over and over
+        gc_was_on = gc.isenabled()
+        gc.disable()  # a flight makes no cycles; the collector would scan its records in vain
         try:
             self._fly(until, limit_ns, sink)
         finally:
-            if collects:
+            if gc_was_on:
                 gc.enable()
 
     def _fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
@@ -90,15 +89,16 @@ class VirtualRun:
                 return
 
     def _advance(self, end_ns: int) -> None:
-        """Let happen what is due up to and including `end_ns` [ns], one event after the other."""
-        world, cloud, flying, offset_ns = self._world, self._cloud, self._flying, self._offset_ns
+        """Handle all events up to and including `end_ns` [ns], in their order."""
+        world, cloud, offset_ns = self._world, self._cloud, self._offset_ns
+        arrivals = self._arrivals
         world_ns, cloud_ns = world.next_deadline_ns(), cloud.next_deadline_ns() - offset_ns
         while True:
             deadline_ns = world_ns if world_ns <= cloud_ns else cloud_ns
-            if flying and flying[0][0] <= deadline_ns:
-                if flying[0][0] > end_ns:
+            if arrivals and arrivals[0][0] <= deadline_ns:
+                if arrivals[0][0] > end_ns:
                     break
-                self.now_ns, _, to_world, data = heappop(flying)
+                self.now_ns, _, to_world, data = heappop(arrivals)
                 if to_world:
                     world.receive_datagram(data, self.now_ns)
                 else:
@@ -129,4 +129,4 @@ class VirtualRun:
                 data = link.corrupted(epoch, kind, counter, data)
             for arrival_ns in arrivals:
                 self._sent += 1
-                heappush(self._flying, (arrival_ns, self._sent, to_world, data))
+                heappush(self._arrivals, (arrival_ns, self._sent, to_world, data))

@@ -1,1 +1,1 @@
-"""The emulated network between world and cloud: profiles, a pure model, a userspace relay."""
+"""Emulate the network between world and cloud by profiles, a pure model and two shapers."""

@@ -1,19 +1,17 @@
-"""Chance on the link: a stream, a purpose and a block of packets go in, their draws come out.
+"""Draw the random impairments of each packet from counter-based random numbers.
 
-Everything here is a pure function, cached only to be fast. Seed, direction, epoch and kind of
-datagram name a stream, the packet's counter its place in it, so that what befalls a packet depends
-on nothing that was asked before. Draws are made for blocks of 256 packets, one column per purpose:
-a purpose that a profile does not use costs nothing and shifts nothing.
+All functions are pure, with a cache for speed. Seed, direction, epoch and kind of datagram name a
+stream; the packet's counter is its place in the stream. So the impairment of a packet does not
+depend on earlier calls. Draws are made for blocks of 256 packets, one column per purpose: a purpose
+that a profile does not use needs no draws and does not shift the others.
 
-A state that is handed from packet to packet (burst, correlation) starts anew from its stationary
-distribution every 64 blocks (16,384 packets, 164 s at 100 Hz). That bounds the work for a counter
-from anywhere, a forged one included, at the price of one broken link of the chain in 16,384.
+A state that passes from packet to packet (burst, correlation) restarts from its stationary
+distribution every 64 blocks (16,384 packets, 164 s at 100 Hz). This bounds the work for any
+counter, even a forged one; the chain is interrupted once in 16,384 packets.
 
-What befalls each packet whatever the time: a stream's draws go in, delays to add come out.
-
-The fate of a packet is a tuple with one entry per copy that arrives: () if it is lost, two entries
-if it is duplicated. An entry is what jitter and the bad state add to the delay [ns], possibly
-negative, or OVERTAKES.
+The impairment of a packet is a tuple with one entry per copy that arrives: () if it is lost, two
+entries if it is duplicated. An entry is what jitter and the bad state add to the delay [ns],
+possibly negative, or OVERTAKES.
 """
 
 from __future__ import annotations
@@ -31,10 +29,11 @@ from numpy.typing import NDArray
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 
 BLOCK = 256
-"""Packets whose draws are made at once."""
+"""Number of packets whose draws are made together."""
 BLOCK_BITS = 8
+"""Number of the low bits of a counter that give the place in its block."""
 CHAIN_BLOCKS = 64
-"""Blocks after which states start anew."""
+"""Number of blocks after which states restart."""
 
 _CACHED = 256
 _OUTPUTS_PER_COUNT = 4
@@ -44,7 +43,7 @@ StreamKey: TypeAlias = tuple[int, int]
 
 
 class Purpose(IntEnum):
-    """What a column of draws decides."""
+    """What a column of draws is for."""
 
     DELAY = 0
     COPY_DELAY = 1
@@ -57,12 +56,12 @@ class Purpose(IntEnum):
 
 
 def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
-    """Name the stream of one kind of datagram in one session and direction.
+    """Compute the key of the stream of one kind of datagram in one session and direction.
 
     Args:
-        seed: Of the experiment.
+        seed: Seed of the experiment.
         uplink: True for world to cloud.
-        epoch: Of the session.
+        epoch: Epoch of the session.
         kind: Message type in the header.
 
     Returns:
@@ -85,7 +84,7 @@ def uniforms(key: StreamKey, purpose: Purpose, block: int) -> NDArray[np.float64
     """
     counter = np.array([block * (BLOCK // _OUTPUTS_PER_COUNT), 0, 0, purpose], dtype=np.uint64)
     generator = np.random.Philox(key=np.array(key, dtype=np.uint64), counter=counter)
-    # 52 bits and a half, so that neither 0 nor 1 can come out.
+    # 52 bits plus one half, so that the result is never 0 or 1.
     bits = generator.random_raw(BLOCK) >> np.uint64(12)
     values = (bits.astype(np.float64) + 0.5) * 2.0**-52
     values.flags.writeable = False
@@ -94,9 +93,10 @@ def uniforms(key: StreamKey, purpose: Purpose, block: int) -> NDArray[np.float64
 
 @lru_cache(maxsize=_CACHED)
 def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) -> tuple[float, ...]:
-    """Draw standard normal variates, each correlated with the one before.
+    """Draw standard normal variates, each correlated with its predecessor.
 
-    First-order autoregression z_n = c z_(n-1) + sqrt(1 - c^2) e_n, which leaves the marginal exact.
+    They follow the autoregression z_n = c z_(n-1) + sqrt(1 - c^2) e_n, which keeps each of them
+    exactly standard normal.
 
     Deviation: tc-netem mixes (1 - c) new + c old, which narrows the distribution.
 
@@ -127,23 +127,23 @@ def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) ->
 
 @lru_cache(maxsize=_CACHED)
 def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> tuple[bool, ...]:
-    """Run a two-state chain over the packets of a block.
+    """Run the two-state chain over the packets of a block.
 
     Args:
         key: Stream.
         block: Number of the block.
-        bad_start: Chance per packet to turn bad, in [0, 1].
-        bad_end: Chance per packet to turn good, in [0, 1].
+        bad_start: Probability per packet to enter the bad state, in [0, 1].
+        bad_end: Probability per packet to leave it, in [0, 1].
 
     Returns:
-        True where the packet meets the bad state, shape (256,).
+        True for packets in the bad state, shape (256,).
     """
     draws = iter(uniforms(key, Purpose.STATE, block).tolist())
     states = []
     if block % CHAIN_BLOCKS:
         bad = bad_states(key, block - 1, bad_start, bad_end)[-1]
     else:
-        # Stationary share of the bad state; a chain that never leaves the good one has none.
+        # Start with the stationary share of the bad state; it is 0 if bad_start is 0.
         bad = bad_start > 0.0 and next(draws) < bad_start / (bad_start + bad_end)
         states = [bad] if bad_start > 0.0 else []
     for draw in draws:
@@ -153,12 +153,12 @@ def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> 
 
 
 OVERTAKES = -(1 << 62)
-"""Less than minus any delay: the packet leaves at once."""
+"""Entry of a packet that is sent at once, without queue or delay (`reorder`)."""
 
 Fate: TypeAlias = tuple[int, ...]
 
 PARETO_CUT = 1e-3
-"""Share of the Pareto distribution that is cut off at its tail."""
+"""Share of the Pareto distribution's tail that is cut off [1]."""
 
 # Moments of s^(-1/3) for s uniform in (cut, 1).
 _PARETO_MEAN = 1.5 * (1.0 - PARETO_CUT ** (2 / 3)) / (1.0 - PARETO_CUT)
@@ -166,62 +166,62 @@ _PARETO_SQUARE = 3.0 * (1.0 - PARETO_CUT ** (1 / 3)) / (1.0 - PARETO_CUT)
 _PARETO_DEVIATION = sqrt(_PARETO_SQUARE - _PARETO_MEAN**2)
 _PARETO_REACH: float = (_PARETO_MEAN - 1.0) / _PARETO_DEVIATION
 _NORMAL_REACH = 8.3
-"""Of a quantile of the least number above 0 that can be drawn, 2**-54; with correlation no limit,
-but one that would take some 10^15 packets to be passed."""
+"""Largest distance below 0 of a normal variate [1]: that of the smallest uniform draw. With
+correlation a lower value is possible, once in about 10^15 packets."""
 _HALF_ROOT = sqrt(0.5)
 
 
 def fates(
     key: StreamKey, block: int, profile: DirectionProfile, jitter: float, loss: Loss
 ) -> list[Fate]:
-    """Decide what befalls the 256 packets of a block.
+    """Draw the impairments of the 256 packets of a block.
 
-    A packet that is lost is neither duplicated nor does it overtake. The copy of a packet has an
-    independent delay of the same distribution.
+    A lost packet is neither duplicated nor reordered. The copy of a packet has an independent
+    delay of the same distribution.
 
     Deviation: in tc-netem a packet that is both duplicated and lost arrives once.
 
     Args:
         key: Stream.
         block: Number of the block.
-        profile: Distribution, correlation, duplicate and reorder are taken from it.
-        jitter: In force [s].
-        loss: In force.
+        profile: Supplies distribution, correlation, duplicate and reorder.
+        jitter: Jitter in force [s].
+        loss: Loss in force.
 
     Returns:
-        Fates in the order of the counter, shape (256,).
+        Impairments in the order of the counter, shape (256,).
     """
     offsets = _offsets(key, Purpose.DELAY, block, profile, jitter)
     table: list[Fate] = [(offset,) for offset in offsets]
     if profile.reorder:
-        for n in _chosen(key, Purpose.REORDER, block, profile.reorder):
+        for n in _packets_hit(key, Purpose.REORDER, block, profile.reorder):
             table[n] = (OVERTAKES,)
     if profile.duplicate:
         copies = _offsets(key, Purpose.COPY_DELAY, block, profile, jitter)
-        for n in _chosen(key, Purpose.DUPLICATE, block, profile.duplicate):
+        for n in _packets_hit(key, Purpose.DUPLICATE, block, profile.duplicate):
             table[n] = (*table[n], copies[n])
     if isinstance(loss, GilbertElliott):
         _lose_in_bursts(table, key, block, loss)
     elif loss:
-        for n in _chosen(key, Purpose.LOSS, block, loss):
+        for n in _packets_hit(key, Purpose.LOSS, block, loss):
             table[n] = ()
     return table
 
 
 @lru_cache(maxsize=256)
 def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
-    """Say which packets of a block are damaged, and where.
+    """Draw the damaged packets of a block and the place of the flipped bit.
 
     Args:
         key: Stream.
         block: Number of the block.
-        corrupt: Chance per packet, in [0, 1].
+        corrupt: Probability per packet, in [0, 1].
 
     Returns:
         Index in the block -> place of the flipped bit, as a share of the datagram in (0, 1).
     """
     places = uniforms(key, Purpose.CORRUPT_BIT, block)
-    return {n: float(places[n]) for n in _chosen(key, Purpose.CORRUPT, block, corrupt)}
+    return {n: float(places[n]) for n in _packets_hit(key, Purpose.CORRUPT, block, corrupt)}
 
 
 def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfile) -> list[float]:
@@ -229,24 +229,24 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
 
     uniform: in (-1, 1). normal: standard deviation 1. pareto: exponent 3, cut off at its 99.9 %
     quantile, then shifted and scaled to mean 0 and standard deviation 1; it starts at -0.69, has
-    its median at -0.32, its 99 % quantile at 4.3 and ends at 12.1. (Uncut, it would now and then
-    hold a packet for seconds, and with `keep_order` all that follow.) table: one of the profile's
-    values, which have mean 0 and standard deviation 1.
+    its median at -0.32, its 99 % quantile at 4.3 and ends at 12.1. (Without the cut it would
+    sometimes delay a packet by seconds, and with `keep_order` also those after it.) table: the
+    profile's values, with mean 0 and standard deviation 1.
 
-    With a correlation c the variates are made from correlated normal ones, so that their
-    distribution stays exact. c is then the correlation of those: that of the uniform variates is
-    6/pi asin(c/2), less than c by at most 0.018; that of the Pareto variates 0.39 for c = 0.5 and
-    0.86 for 0.9. Of a table's it depends on the table.
+    With a correlation c the variates are computed from normal variates with correlation c, so that
+    their distribution stays exact. The correlation of uniform variates is then 6/pi asin(c/2),
+    at most 0.018 below c; that of Pareto variates is 0.39 for c = 0.5 and 0.86 for c = 0.9; that
+    of a table depends on the table.
 
     Source: tc-netem(8) for the meaning of jitter, iproute2 netem/pareto.c for the exponent.
-    Deviation: netem cuts its normal table off at +-4 and its Pareto table at 4, which leaves the
-    latter 0.82 of the standard deviation asked for; here it is what was asked for.
+    Deviation: netem cuts its normal table off at +-4 and its Pareto table at 4, so that the latter
+    has only 0.82 of the specified standard deviation; here it has all of it.
 
     Args:
         key: Stream.
         purpose: Column.
         block: Number of the block.
-        profile: Distribution and correlation are taken from it.
+        profile: Supplies distribution and correlation.
 
     Returns:
         Variates [1], shape (256,).
@@ -275,7 +275,7 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
 
 
 def reach(profile: DirectionProfile) -> float:
-    """Say how far below 0 the variates of `shape` can be [1]."""
+    """Return the largest distance of a variate of `shape` below 0 [1]."""
     if profile.distribution == "table":
         return -min(profile.table)
     if profile.distribution == "uniform":
@@ -286,7 +286,7 @@ def reach(profile: DirectionProfile) -> float:
 def _from_table(
     key: StreamKey, purpose: Purpose, block: int, table: tuple[float, ...], correlation: float
 ) -> list[float]:
-    """Draw values of a table, each with equal chance; of correlated ones the ranks are alike."""
+    """Draw values of a table with equal probability; a correlation acts on their ranks."""
     shares: list[float] = uniforms(key, purpose, block).tolist()
     if correlation:
         shares = [0.5 * erfc(-_HALF_ROOT * z) for z in normals(key, purpose, block, correlation)]
@@ -297,7 +297,7 @@ def _from_table(
 def _offsets(
     key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfile, jitter: float
 ) -> list[int]:
-    """Scale the jitter of a block to [ns]."""
+    """Draw the jitter of a block [ns]."""
     if not jitter:
         return [0] * BLOCK
     scaled = jitter * 1e9 * np.array(shape(key, purpose, block, profile))
@@ -305,13 +305,13 @@ def _offsets(
     return offsets
 
 
-def _chosen(key: StreamKey, purpose: Purpose, block: int, chance: float) -> list[int]:
-    """Say which packets of a block something with that chance happens to."""
+def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) -> list[int]:
+    """Draw the packets of a block that an event of this probability hits."""
     return [int(n) for n in np.flatnonzero(uniforms(key, purpose, block) < chance)]
 
 
 def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:
-    """Lose and delay what the bad state meets."""
+    """Remove the lost packets from a table and delay those in the bad state."""
     extra = round(loss.delay_bad * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()
     states = bad_states(key, block, loss.bad_start, loss.bad_end)

@@ -1,11 +1,8 @@
-"""The link itself: a datagram's header, size and instant go in, the instants it arrives come out.
+"""Model a link direction: compute when each packet arrives.
 
-Pure: no clock, no socket, no generator whose state others could disturb. The virtual driver and the
-relay ask the same model, so both draw the same delays and losses.
-
-What a profile does to a stream: one direction of the link goes in, its packets' fates come out.
-
-The model itself is asked, packet by packet, so the numbers are those of a flight.
+The model has no clock, no socket and no stateful random generator. The virtual driver and the relay
+use the same model, so both get the same delays and losses. `sample` and `numbers` measure a
+profile with the model itself, so their results are those of a flight.
 """
 
 from __future__ import annotations
@@ -30,7 +27,10 @@ from cloudrc.link.draws import (
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
 
 HEADER_BYTES = 28
-"""IPv4 and UDP headers, which also take time on the wire [bytes]. Source: RFC 791, RFC 768."""
+"""Size of the IPv4 and UDP headers, which also take time on the wire [bytes].
+
+Source: RFC 791, RFC 768.
+"""
 
 _Key = TypeVar("_Key")
 
@@ -41,29 +41,29 @@ _IN_BLOCK = BLOCK - 1
 class LinkDirection:
     """One direction of the link.
 
-    What chance does to a packet depends on seed, direction, epoch, kind and counter alone: not on
-    the order of the calls, on the mode, or on other kinds of datagram. Two things cannot be so,
-    because they are about the packets before: the queue of a bottleneck (`rate`) and `keep_order`.
-    With either, call `send` in the order of sending.
+    The random impairment of a packet depends only on seed, direction, epoch, kind and counter, not
+    on the order of calls, the mode or other kinds of datagram. Two effects depend on earlier
+    packets: the queue of a bottleneck (`rate`) and `keep_order`. With either of them, call `send`
+    in the order of sending.
 
-    A kind whose counter never moves meets the same fate every time: count repeated hellos, too.
+    Packets with the same counter get the same impairment, so repeated hellos need counters, too.
 
     Attributes:
-        corrupts: Whether datagrams may be damaged: then `corrupted` is to be asked.
-        least_delay_ns: No packet arrives sooner than so long after it was sent [ns].
+        corrupts: Whether datagrams may be damaged; then `corrupted` must be called.
+        least_delay_ns: Lower bound of the delay of all packets [ns].
     """
 
     def __init__(
         self, profile: DirectionProfile, seed: int, uplink: bool, origin_ns: int = 0
     ) -> None:
-        """Set up.
+        """Create the direction.
 
         Args:
-            profile: Conditions.
-            seed: Of the experiment.
+            profile: Its conditions.
+            seed: Seed of the experiment.
             uplink: True for world to cloud.
-            origin_ns: When the link came up [ns], on the clock of the `now_ns` given to `send`;
-                time line, trace and blackouts count from it.
+            origin_ns: When the link came up [ns], on the clock of `send`; time line, trace and
+                blackouts count from it.
         """
         self._seed = seed
         self._uplink = uplink
@@ -75,22 +75,22 @@ class LinkDirection:
         self.replace_profile(profile)
 
     def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Let other conditions hold from the next packet on.
+        """Replace the conditions from the next packet on.
 
-        Seed, counts and what stands at the bottleneck stay: packet n meets the fate that it would
-        have met had the link had this profile from the start.
+        Seed, counts and the bottleneck's queue stay. The draws are as if the link had had this
+        profile from the start.
 
         Args:
-            profile: Conditions.
-            restart: Whether their time line counts from the next packet; else from the origin.
+            profile: New conditions.
+            restart: Whether their time line begins at the next packet; otherwise at the origin.
         """
         if restart:
             self._origin_ns = None
         self.corrupts = profile.corrupt > 0.0
         self._profile = profile
         self._timeline = Timeline(profile)
-        overtakes = profile.reorder > 0.0
-        self.least_delay_ns = 0 if overtakes else self._timeline.least_delay_ns(reach(profile))
+        reorders = profile.reorder > 0.0
+        self.least_delay_ns = 0 if reorders else self._timeline.least_delay_ns(reach(profile))
         only = self._timeline.only()
         shaped = only is None or only.blackout or only.rate is not None or profile.keep_order
         self._always = None if shaped else only
@@ -98,26 +98,26 @@ class LinkDirection:
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
 
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
-        """Put one packet on the link.
+        """Send one packet.
 
         Args:
-            epoch: From its header.
-            kind: From its header.
-            counter: From its header, >= 0.
+            epoch: Epoch in its header.
+            kind: Message type in its header.
+            counter: Counter in its header, >= 0.
             size: UDP payload [bytes].
             now_ns: When it is sent [ns].
 
         Returns:
-            When each copy arrives [ns], none before `now_ns`: () if it is lost, one instant, or two
-            if it is duplicated (the copy second, not necessarily later).
+            When each copy arrives [ns], never before `now_ns`: () if it is lost, two instants if
+            it is duplicated (the copy second, not necessarily later).
         """
-        always = self._always
-        if always is None:
+        constant = self._always
+        if constant is None:
             return self._send_shaped(epoch, kind, counter, size, now_ns)
         block = counter >> BLOCK_BITS
         table = self._delays.get((epoch, kind, block))
         if table is None:
-            table = self._delay_table(epoch, kind, block, always)
+            table = self._delay_table(epoch, kind, block, constant)
         delays = table[counter & _IN_BLOCK]
         if len(delays) == 1:
             self._passed += 1
@@ -125,12 +125,13 @@ class LinkDirection:
         return self._counted(tuple([now_ns + delay for delay in delays]))
 
     def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
-        """Give a datagram as it arrives: one bit is flipped if chance wants it so.
+        """Return a datagram as it arrives, perhaps with one bit flipped.
 
-        Only to be asked where `corrupts`; all copies of a packet are damaged alike.
+        Call it only if `corrupts` is true. All copies of a packet are damaged alike.
 
         Source: tc-netem(8), `corrupt`. Deviation: netem flips a bit anywhere in the frame, so that
-        the receiving kernel drops most of them by their checksums; here it is the datagram's.
+        the receiving kernel drops most of the frames by their checksums; here the bit is in the
+        datagram.
         """
         key = stream_key(self._seed, self._uplink, epoch, kind)
         place = bit_flips(key, counter >> BLOCK_BITS, self._profile.corrupt).get(
@@ -145,10 +146,10 @@ class LinkDirection:
         return bytes(damaged)
 
     def counts(self) -> dict[str, int]:
-        """Say how many packets have met which outcome so far.
+        """Return the number of packets by outcome so far.
 
-        `passed` are those of which at least one copy arrives, `duplicated` those of them of which
-        two do; `lost`, `blackout` and `queue` did not arrive, by cause; `corrupted` were damaged.
+        Of `passed` packets at least one copy arrives, of `duplicated` ones two. `lost`, `blackout`
+        and `queue` are the causes of those that do not arrive. `corrupted` ones were damaged.
         """
         return {
             "passed": self._passed,
@@ -160,9 +161,9 @@ class LinkDirection:
         }
 
     def _send_shaped(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
-        """Send where conditions change, or where packets before this one matter.
+        """Send a packet if conditions change over time or depend on earlier packets.
 
-        As in tc-netem, losses come before the bottleneck and a packet that overtakes passes it by.
+        As in tc-netem, losses come before the bottleneck, and a reordered packet skips it.
         """
         if self._origin_ns is None:
             self._origin_ns = now_ns
@@ -191,7 +192,7 @@ class LinkDirection:
         return self._counted(tuple(releases))
 
     def _departure(self, size: int, rate: float | None, now_ns: int) -> int | None:
-        """Queue at the bottleneck; None if the queue is full."""
+        """Queue a packet; return when it leaves the bottleneck [ns], None if the queue is full."""
         if rate is None:
             return now_ns
         departures = self._departures
@@ -211,23 +212,23 @@ class LinkDirection:
             self._duplicated += len(releases) - 1
         return releases
 
-    def _delay_table(self, epoch: int, kind: int, block: int, always: Conditions) -> list[Fate]:
-        """Make the delays of a block where conditions never change: the fast path of `send`."""
-        base = always.delay_ns
+    def _delay_table(self, epoch: int, kind: int, block: int, constant: Conditions) -> list[Fate]:
+        """Compute the delays of a block if conditions never change: the fast path of `send`."""
+        base = constant.delay_ns
         key = stream_key(self._seed, self._uplink, epoch, kind)
-        # Nearly all have one copy: worth a way of its own, since a relay does this in flight.
+        # Nearly all packets have one copy; a special case saves time, since a relay does this live.
         table = [
             (base + fate[0] if base + fate[0] > 0 else 0,)
             if len(fate) == 1
             else tuple([max(0, base + entry) for entry in fate])
-            for fate in fates(key, block, self._profile, always.jitter, always.loss)
+            for fate in fates(key, block, self._profile, constant.jitter, constant.loss)
         ]
         _forget_oldest(self._delays)
         self._delays[epoch, kind, block] = table
         return table
 
     def _fate_table(self, key: tuple[int, int, int, float, Loss]) -> list[Fate]:
-        """Make the fates of a block under one jitter and loss."""
+        """Compute the impairments of a block under one jitter and loss."""
         epoch, kind, block, jitter, loss = key
         stream = stream_key(self._seed, self._uplink, epoch, kind)
         _forget_oldest(self._fates)
@@ -236,7 +237,7 @@ class LinkDirection:
 
 
 def _forget_oldest(tables: dict[_Key, list[Fate]]) -> None:
-    """Keep memory bounded: what is forgotten can be made again."""
+    """Drop the oldest table if there are too many; it can be computed again."""
     if len(tables) >= _TABLES:
         del tables[next(iter(tables))]
 
@@ -246,12 +247,12 @@ Array: TypeAlias = NDArray[Any]
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """Packets of one direction in the order of sending, n of them.
+    """The n packets of one direction in the order of sending.
 
     Attributes:
-        sent: When each left, since the link came up [s], shape (n,).
-        delays: One way [s], NaN for the lost; of copies the first to arrive, shape (n,).
-        copies: How many of each arrived [1], shape (n,).
+        sent: When each was sent, since the link came up [s], shape (n,).
+        delays: One way, of the first copy to arrive [s], NaN for lost packets, shape (n,).
+        copies: Number of copies of each that arrived [1], shape (n,).
     """
 
     sent: Array
@@ -261,21 +262,21 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """A stream in numbers; a float that cannot be known is NaN.
+    """Statistics of a stream; an unknown value is NaN.
 
     Attributes:
-        mean: Of the delay [s].
-        deviation: Its standard deviation [s].
+        mean: Mean delay [s].
+        deviation: Standard deviation of the delay [s].
         least: Shortest delay [s].
-        median: Of the delay [s].
-        p99: Its 99 % quantile [s].
+        median: Median delay [s].
+        p99: 99 % quantile of the delay [s].
         most: Longest delay [s].
-        correlation: Of the delay of one packet with that of the next [1].
-        loss: Share that did not arrive, in [0, 1].
-        runs: Losses in a row, one entry per run.
-        overtaken: Share of those that arrived after one that was sent later, in [0, 1].
+        correlation: Correlation of the delays of successive packets [1].
+        loss: Share of packets that did not arrive, in [0, 1].
+        runs: Length of each run of successive losses.
+        overtaken: Share of arrived packets that came after a packet sent later, in [0, 1].
             Source: RFC 4737, section 3.
-        duplicated: Share of those of which two copies arrived, in [0, 1].
+        duplicated: Share of packets of which two copies arrived, in [0, 1].
     """
 
     mean: float
@@ -295,10 +296,10 @@ def sample(link: LinkDirection, kind: int, count: int, period_ns: int, size: int
     """Send packets at a steady rate.
 
     Args:
-        link: Fresh: its origin is 0.
+        link: A new direction with origin 0.
         kind: Message type in the header.
-        count: How many.
-        period_ns: Between two of them [ns].
+        count: Number of packets.
+        period_ns: Time between two packets [ns].
         size: UDP payload of each [bytes].
     """
     delays = np.full(count, np.nan)
@@ -313,7 +314,7 @@ def sample(link: LinkDirection, kind: int, count: int, period_ns: int, size: int
 
 
 def numbers(stream: Stream) -> Numbers:
-    """Put a stream into numbers."""
+    """Compute the statistics of a stream."""
     arrived = np.isfinite(stream.delays)
     delays = stream.delays[arrived]
     if not len(delays):
@@ -322,7 +323,7 @@ def numbers(stream: Stream) -> Numbers:
     pairs = stream.delays[:-1][both], stream.delays[1:][both]
     varies = len(pairs[0]) > 2 and min(np.std(pairs[0]), np.std(pairs[1])) > 0
     arrival = np.rint((stream.sent + stream.delays)[arrived] * 1e9).astype(np.int64)
-    # Released at one instant, packets leave in the order in which they came.
+    # Packets with the same arrival time keep their order.
     earliest_after = np.minimum.accumulate(arrival[::-1])[::-1][1:]
     overtaken = arrival[:-1] > earliest_after
     least, middle, p99, most = np.quantile(delays, (0.0, 0.5, 0.99, 1.0)).tolist()
@@ -342,7 +343,7 @@ def numbers(stream: Stream) -> Numbers:
 
 
 def loss_runs(stream: Stream) -> tuple[int, ...]:
-    """Count the packets of each run of losses, in order."""
+    """Return the length of each run of successive losses, in order."""
     lost = np.concatenate(([0], np.isnan(stream.delays).astype(np.int8), [0]))
     edges = np.flatnonzero(np.diff(lost))
     return tuple((edges[1::2] - edges[::2]).tolist())

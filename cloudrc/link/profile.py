@@ -1,11 +1,10 @@
-"""What a link is asked to be: the conditions of both directions, in SI, as plain frozen data.
+"""Define the conditions of a link direction and how they change over time, in SI units.
 
-They mirror `config/schema.py`, which reads files and speaks milliseconds; `assembly.py` converts.
-All delays are ONE WAY. Values are taken as checked: `config` and `link/trace.py` do that.
+All delays are ONE WAY. The classes mirror `config/schema.py`, which reads files in milliseconds;
+`assembly.py` converts. The values are not checked here: `config` and `link/traces.py` do that.
 
-Which conditions hold when: a direction's changes, trace and blackouts become one list of pieces.
-
-The model asks it for each packet, with the time since the link came up.
+A `Timeline` merges a direction's changes, trace and blackouts into one list of pieces; the model
+looks up the piece of each packet by the time since the link came up.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from typing import Literal, NamedTuple, TypeAlias
 
 @dataclass(frozen=True, slots=True)
 class GilbertElliott:
-    """Loss in bursts: a two-state Markov chain that moves on with every packet.
+    """Loss in bursts: a two-state Markov chain with one step per packet.
 
     Source: E. N. Gilbert, Bell Syst. Tech. J. 39, 1960; E. O. Elliott, ibid. 42, 1963. In the terms
     of tc-netem's `gemodel`: p = bad_start, r = bad_end, 1-h = loss_bad, 1-k = loss_good.
 
     Attributes:
-        bad_start: Chance per packet to go from the good to the bad state, in [0, 1].
-        bad_end: Chance per packet to go from the bad to the good state, in [0, 1].
+        bad_start: Probability per packet to go from the good to the bad state, in [0, 1].
+        bad_end: Probability per packet to go from the bad to the good state, in [0, 1].
         loss_bad: Loss in the bad state, in [0, 1].
         loss_good: Loss in the good state, in [0, 1].
         delay_bad: Extra delay in the bad state, one way [s].
@@ -38,16 +37,16 @@ class GilbertElliott:
 
 
 Loss: TypeAlias = float | GilbertElliott
-"""Chance of an independent loss in [0, 1], or loss in bursts."""
+"""Probability of an independent loss in [0, 1], or loss in bursts."""
 
 
 def bad_share(loss: GilbertElliott) -> float:
-    """Say which share of packets meets the bad state, in [0, 1]."""
+    """Return the long-run share of packets in the bad state, in [0, 1]."""
     return loss.bad_start / (loss.bad_start + loss.bad_end) if loss.bad_start else 0.0
 
 
 def mean_loss(loss: Loss) -> float:
-    """Say which share of packets is lost in the long run, in [0, 1]."""
+    """Return the share of packets that is lost in the long run, in [0, 1]."""
     if not isinstance(loss, GilbertElliott):
         return loss
     share = bad_share(loss)
@@ -56,14 +55,14 @@ def mean_loss(loss: Loss) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """From `at` on these values hold; None leaves a value as it is.
+    """A change of the conditions at one instant; None keeps a value.
 
     Attributes:
-        at: Since the link came up [s].
+        at: Time since the link came up [s].
         delay: One way [s].
-        jitter: [s], as in `DirectionProfile`.
-        loss: Chance, or bursts.
-        rate: Of the bottleneck [bit/s].
+        jitter: As in `DirectionProfile` [s].
+        loss: Probability, or bursts.
+        rate: Rate of the bottleneck [bit/s].
     """
 
     at: float
@@ -75,11 +74,11 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Blackout:
-    """A time in which nothing that is sent passes.
+    """An interval in which all packets that are sent are lost.
 
     Attributes:
-        start: Since the link came up [s].
-        duration: [s].
+        start: Time since the link came up [s].
+        duration: Length of the interval [s].
     """
 
     start: float
@@ -88,13 +87,13 @@ class Blackout:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Measured conditions over time: each row holds until the next, the last one for ever.
+    """Measured conditions over time: each row holds until the next, the last one without end.
 
-    A trace stands in place of `delay`, and of `loss` if it has any; jitter comes on top of it.
+    A trace replaces `delay`, and `loss` if it has losses; jitter is added to it.
 
     Attributes:
-        times: Since the link came up, strictly rising [s], shape (n,), n >= 1. The first row also
-            holds before its time.
+        times: Time since the link came up, strictly rising [s], shape (n,), n >= 1. The first row
+            also holds before its time.
         delays: One way [s], shape (n,).
         losses: In [0, 1], shape (n,), or None.
     """
@@ -109,21 +108,21 @@ class DirectionProfile:
     """Conditions of one direction.
 
     Attributes:
-        delay: One way [s].
-        jitter: uniform: half width; normal, pareto, table: standard deviation [s]. The mean stays
-            `delay`, except that a delay below 0 becomes 0.
-        distribution: Of the delay about its mean.
-        table: With `distribution` table: values that are drawn with equal chance, mean 0, standard
-            deviation 1, rising, shape (n,) [1]; else ().
-        correlation: Of the jitter of one packet with the next, in [0, 1].
-        loss: Chance, or bursts.
-        duplicate: Chance in [0, 1] that a packet arrives twice; the copy draws a delay of its own.
-        reorder: Chance in [0, 1] that a packet overtakes: neither queue nor delay.
-        corrupt: Chance in [0, 1] that one bit of the datagram is flipped, in all its copies.
-        keep_order: Packets never overtake each other (this undoes `reorder`).
-        rate: Of the bottleneck [bit/s]; None has none.
-        queue_packets: Packets at the bottleneck, the one on the wire included, beyond which the
-            next is dropped.
+        delay: Mean delay, one way [s].
+        jitter: Half width (uniform) or standard deviation (normal, pareto, table) of the delay
+            [s]. A delay below 0 becomes 0.
+        distribution: Distribution of the delay about its mean.
+        table: For the distribution table: values drawn with equal probability, with mean 0 and
+            standard deviation 1, rising, shape (n,) [1]; otherwise ().
+        correlation: Correlation of the jitter of successive packets, in [0, 1].
+        loss: Probability, or bursts.
+        duplicate: Probability in [0, 1] that a packet arrives twice; the copy has its own delay.
+        reorder: Probability in [0, 1] that a packet skips both queue and delay.
+        corrupt: Probability in [0, 1] that one bit of the datagram is flipped, in all its copies.
+        keep_order: Whether packets keep their order (this disables `reorder`).
+        rate: Rate of the bottleneck [bit/s]; None without a bottleneck.
+        queue_packets: Capacity of the bottleneck in packets, with the one on the wire; a packet
+            beyond it is dropped.
         changes: Time line, strictly rising in `at`.
         trace: Measured delay over time.
         blackouts: In any order; they may overlap.
@@ -147,14 +146,14 @@ class DirectionProfile:
 
 
 class Conditions(NamedTuple):
-    """What holds during one piece of time.
+    """The conditions during one piece of the time line.
 
     Attributes:
-        delay_ns: One way [ns].
-        jitter: [s].
-        loss: Chance, or bursts.
-        rate: Of the bottleneck [bit/s]; None has none.
-        blackout: True if nothing passes.
+        delay_ns: Mean delay, one way [ns].
+        jitter: As in `DirectionProfile` [s].
+        loss: Probability, or bursts.
+        rate: Rate of the bottleneck [bit/s]; None without a bottleneck.
+        blackout: True if all packets are lost.
     """
 
     delay_ns: int
@@ -168,7 +167,7 @@ class Timeline:
     """The conditions of one direction over time.
 
     Attributes:
-        starts_ns: When each piece of it begins, since the link came up, rising [ns].
+        starts_ns: Start of each piece, as time since the link came up, rising [ns].
     """
 
     def __init__(self, profile: DirectionProfile) -> None:
@@ -182,26 +181,26 @@ class Timeline:
         self._pieces = [_conditions(profile, instant) for instant in ordered]
 
     def at(self, elapsed_ns: int) -> Conditions:
-        """Say what holds `elapsed_ns` [ns] after the link came up."""
+        """Return the conditions `elapsed_ns` [ns] after the link came up."""
         return self._pieces[max(bisect_right(self.starts_ns, elapsed_ns) - 1, 0)]
 
     def least_delay_ns(self, reach: float) -> int:
-        """Say which delay no packet falls below, whenever it is sent [ns], >= 0.
+        """Return a lower bound of the delay of all packets [ns], >= 0.
 
         Args:
-            reach: How far below its mean a delay can fall, in units of the jitter [1].
+            reach: Largest distance of a delay below its mean, in units of the jitter [1].
         """
         passing = [piece for piece in self._pieces if not piece.blackout]
         least = [piece.delay_ns - round(reach * piece.jitter * 1e9) for piece in passing]
         return max(0, min(least, default=0))
 
     def only(self) -> Conditions | None:
-        """Say what always holds; None if that changes over time."""
+        """Return the conditions if they never change, otherwise None."""
         return self._pieces[0] if len(self._pieces) == 1 else None
 
 
 def settled(profile: DirectionProfile) -> DirectionProfile:
-    """Give the conditions that hold for ever once a time line is over."""
+    """Return the profile of the conditions after the end of a time line."""
     timeline = Timeline(profile)
     last = timeline.at(timeline.starts_ns[-1])
     return replace(
@@ -217,7 +216,7 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
 
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
-    """Work out what holds from `instant` [s] until the next one on the time line."""
+    """Compute the conditions from `instant` [s] until the next one on the time line."""
     delay, jitter, loss, rate = profile.delay, profile.jitter, profile.loss, profile.rate
     for change in profile.changes:
         if change.at > instant:

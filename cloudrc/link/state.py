@@ -1,9 +1,8 @@
-"""What a link tells of itself, in a file beside the route: who shapes it, how, since when and why.
+"""Publish the state of a link direction in a file: its shaper, profile and last change.
 
-The tunnel's end of the same machine follows it and records changes; `cloudrc link set` reads from
-it that a change has taken force; reports show it.
-
-Files of the shared folder that others read while they are written: whole, or not there.
+The file lies beside the route file. The tunnel's end on the same machine follows it and records
+changes, and `cloudrc link set` reads whether a change is in force. All files are written
+atomically, since others read them at the same time.
 """
 
 from __future__ import annotations
@@ -17,30 +16,31 @@ from cloudrc.files import put
 from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
 STATE_FILE = "link.json"
-"""Name of the file, beside the route."""
+"""Name of the state file, beside the route file."""
 STATE_MAX = 1 << 16
-"""Longest that an end of the tunnel reads of it [bytes]: some 800 changes of a time line. What is
-wrong with a profile of 1 MiB takes 2 s to find, in which the loop would stand still."""
+"""Size limit of a state file that an end of the tunnel reads [bytes], about 800 changes of a time
+line; a file of 1 MiB could block the loop for 2 s."""
 RELEASED_SUFFIX = ".released"
-"""Of the file beside it that tells how late a relay's datagrams left so far: names and whole
-numbers, as JSON. A file of its own, since the state is read only when the link changes."""
+"""Suffix of the file that tells how late a relay's datagrams left so far: names and integers as
+JSON. It is a separate file, since the state file is read only when the link changes."""
 RELEASED = frozenset(
     {"released", "released_early", "overflow", "stalled"}
     | {f"release_error_{quantile}_ns" for quantile in ("p50", "p99", "p999")}
 )
-"""The names in it."""
+"""Names in the file of `RELEASED_SUFFIX`."""
 CHANGE_FILE = "change.json"
-"""Name of the file beside the profile that says who changed it and why."""
+"""Name of the file beside the profile that holds the profile's last `Change`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Why a profile was changed, as `cloudrc link set` leaves it beside the profile.
+    """Why a profile was changed, as `cloudrc link set` writes it beside the profile.
 
     Attributes:
-        number: Names this change; "" if nobody told.
-        cause: In words.
-        restart: Whether the profile's time line counts from when it takes force; else it goes on.
+        number: Identity of the change; "" if it is unknown.
+        cause: Reason, in words.
+        restart: Whether the time line restarts when the profile takes effect; otherwise it
+            continues.
     """
 
     number: str = ""
@@ -50,23 +50,23 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """What shapes one direction, and what it was asked for.
+    """The shaper and the profile in force of one direction.
 
     Attributes:
         shaper: "relay" or "netem".
-        reason: Why this one, in words.
-        mode: What was asked for: "auto", "relay" or "netem".
+        reason: Why this shaper, in words.
+        mode: Shaper that the user asked for: "auto", "relay" or "netem".
         direction: "uplink" or "downlink".
-        profile: Both directions, as in a profile's file, defaults left out.
-        since: When that took force, UTC, for people.
-        since_ns: The same on the machine's monotonic clock [ns].
-        changes: How often it has changed since the link came up.
-        change: Number of the last change that took force; "" if it had none.
+        profile: Both directions, as in a profile's file, without defaults.
+        since: When the profile took effect, UTC, for people.
+        since_ns: The same instant on the machine's monotonic clock [ns].
+        changes: Number of changes since the link came up.
+        change: Number of the last change that took effect; "" if it is unknown.
         cause: Why it changed, in words; "" before the first change.
-        asked: What holds at the beginning of its time line, as `summary` gives it.
-        origin_ns: From when its time line counts, on that clock [ns]; None: as the one before.
+        asked: Conditions at the start of the time line, as `summary` returns them.
+        origin_ns: Start of the time line on that clock [ns]; None if it continues the last one.
         refused: Number of the last change that was refused; "" if none was.
-        refusal: Why, in words.
+        refusal: Why it was refused, in words.
     """
 
     shaper: str
@@ -86,14 +86,14 @@ class LinkState:
 
 
 def to_text(state: LinkState) -> str:
-    """Write a state as JSON."""
+    """Format a state as JSON."""
     return json.dumps(asdict(state), indent=2) + "\n"
 
 
 def from_text(text: str) -> LinkState:
-    """Read a state; raises a ValueError if the text is none."""
+    """Parse a state; raises a ValueError if the text is not valid."""
     found = json.loads(text)
-    names = {one.name for one in fields(LinkState)}
+    names = {item.name for item in fields(LinkState)}
     try:
         return LinkState(**{name: value for name, value in found.items() if name in names})
     except (TypeError, AttributeError) as error:
@@ -101,7 +101,7 @@ def from_text(text: str) -> LinkState:
 
 
 def read_change(text: str) -> Change:
-    """Read why a profile was changed; what cannot be read is as if nobody had told."""
+    """Parse the change of a profile; an invalid text gives a change without a number."""
     try:
         found = json.loads(text)
         return Change(str(found["number"]), str(found["cause"]), bool(found["restart"]))
@@ -110,11 +110,11 @@ def read_change(text: str) -> Change:
 
 
 def summary(profile: DirectionProfile) -> dict[str, float | None]:
-    """Say in four numbers what a direction is asked to be at the beginning of its time line.
+    """Summarise the conditions at the start of a direction's time line.
 
     Returns:
-        `delay` and `jitter` [s], `loss` in the long run, in [0, 1], and `rate` [bit/s], None if
-        there is no bottleneck.
+        `delay` and `jitter` [s], `loss` in the long run in [0, 1], and `rate` [bit/s], None
+        without a bottleneck.
     """
     first = Timeline(profile).at(0)
     loss = 1.0 if first.blackout else mean_loss(first.loss)
@@ -123,20 +123,20 @@ def summary(profile: DirectionProfile) -> dict[str, float | None]:
 
 
 def publish(path: Path, text: str) -> None:
-    """Write a file in one step, as far as its readers can see.
+    """Write a file atomically.
 
     Args:
         path: The file; its folder exists.
-        text: What stands in it from now on.
+        text: New content.
     """
     put(path, text.encode("utf-8"))
 
 
 def publish_route(path: Path, route: tuple[str, int]) -> None:
-    """Tell this pod's tunnel end where it has to send: one line HOST:PORT."""
+    """Write the route file, one line HOST:PORT, for this pod's end of the tunnel."""
     publish(path, f"{route[0]}:{route[1]}\n")
 
 
 def withdraw(path: Path) -> None:
-    """Remove a file, if it is there."""
+    """Remove a file if it exists."""
     path.unlink(missing_ok=True)

@@ -1,26 +1,18 @@
-"""Measured delays from a file: a CSV trace goes in, a checked `Trace` in SI comes out.
+"""Read measured delays from files and make traces of them.
 
-The file has the header `time_s,delay_ms` or `time_s,delay_ms,loss` and one row per instant, in
-rising order of time; `delay_us` may stand for `delay_ms`. Delays are one way. `read_table` takes
-the same file for the distribution of its delays alone.
+`read_trace` reads a trace: a CSV file with the header `time_s,delay_ms` or `time_s,delay_ms,loss`
+and one row per instant, in rising order of time; `delay_us` may replace `delay_ms`. Delays are one
+way. `read_table` reads only the distribution of the delays from such a file.
 
-What became of packets sent one after the other: a log's packets go in, a trace comes out.
-
-All sources of a trace (a run, ping, irtt, CSV) are read into this form. A packet has one way to
-go: a round trip is halved before it gets here, and only if the user says so.
-
-Logs of ping and irtt: their lines or JSON go in, packets come out.
+`read_ping`, `read_irtt` and `read_csv` read logs as `Packets`, from which `trace_of` makes a trace:
 
     ping -D -i 0.2 -O HOST > ping.log
     irtt client -i 10ms -l 203 -d 1m -o irtt.json HOST
 
-203 bytes are a datagram of telemetry; of commands, 88. ping knows round trips alone. irtt knows
-both ways if the clocks of both hosts agree.
-
-Delays from any CSV file whose columns name their units: its lines go in, packets come out.
-
-`time_ms,delay_us,loss` is when it was sent, one way, and whether it was lost (0 or 1);
-`timestamp_ns,rtt_ms` has round trips, of which half is taken if the user says so.
+A telemetry datagram has 203 bytes, a command 88. ping measures only round trips, of which half is
+used if the user asks for it. irtt measures both directions if the hosts' clocks agree. The columns
+of a CSV log name their units: `time_ms,delay_us,loss` are the time of sending, the one-way delay
+and the loss (0 or 1); `timestamp_ns,rtt_ms` has round trips.
 """
 
 from __future__ import annotations
@@ -42,7 +34,7 @@ from cloudrc.files import read
 from cloudrc.link.profile import Trace
 
 SIZE_MAX = 64 << 20
-"""Longest file that is read [bytes]: half a day at 100 packets a second."""
+"""Size limit of a file [bytes]: half a day at 100 packets a second."""
 _TIME = "time_s"
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _OPTIONAL = "loss"
@@ -54,10 +46,10 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
 
     Args:
         path: The file.
-        size_max: Longest that is read [bytes].
+        size_max: Size limit of the file [bytes].
 
     Returns:
-        Times [s], delays [s] and, if there is such a column, losses in [0, 1].
+        Times [s], delays [s] and, if the file has the column, losses in [0, 1].
 
     Raises:
         BadInputError: If it cannot be read or is not a trace; names file, line, value and remedy.
@@ -71,7 +63,7 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
 
 
 def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:
-    """Read the lines of a text file, or raise a BadInputError that says what to give instead."""
+    """Read the lines of a text file; raise a BadInputError with the remedy if that fails."""
     try:
         return read(path, size_max).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
@@ -82,17 +74,17 @@ def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> 
 
 
 def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
-    """Read the distribution of a trace's delays, whenever they were; lost packets have none.
+    """Read the distribution of a trace's delays, without lost packets.
 
     Args:
         path: The file.
-        size_max: As of `read_trace`.
+        size_max: Size limit of the file [bytes].
 
     Returns:
-        Shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,) [1].
+        The delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,) [1].
 
     Raises:
-        BadInputError: As `read_trace`, and if all delays are the same.
+        BadInputError: As `read_trace`, and if all delays are equal.
     """
     trace = read_trace(path, size_max)
     losses = trace.losses or (0.0,) * len(trace.delays)
@@ -112,7 +104,7 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
 
     Args:
         lines: Header and rows; blank lines are skipped.
-        name: Of the file, for messages.
+        name: Name of the file, for messages.
 
     Returns:
         As `read_trace`.
@@ -137,7 +129,7 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
         if times and time <= times[-1]:
             raise BadInputError(
                 f"{where}: time_s {time:g} does not come after {times[-1]:g}; "
-                "sort the rows by time and give each instant once"
+                "sort the rows by time and give each time once"
             )
         times.append(time)
         delays.append(delay * scale)
@@ -151,16 +143,16 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
 
 
 def _refuse_seconds(longest_ms: float, name: str) -> None:
-    """Refuse a delay of 0.045 "ms": the commonest mistake, and a link that seems to do nothing."""
+    """Reject delays that are in seconds, the most common mistake: the link would seem ideal."""
     if 0.0 < longest_ms < 1.0:
         raise BadInputError(
-            f"trace {name}: delay_ms is {longest_ms:g} at most, which looks like seconds; "
+            f"trace {name}: delay_ms is at most {longest_ms:g}, which looks like seconds; "
             f"multiply by 1000, or name the column delay_us and give {longest_ms * 1e3:g}"
         )
 
 
 def _check_columns(columns: list[str], name: str) -> str:
-    """Refuse a header that lacks a column, or has one that would be ignored; name the delay's."""
+    """Check a header; reject missing, unknown and repeated columns; return the delay's column."""
     found = ",".join(columns) or "nothing"
     for wanted in ((_TIME,), tuple(_SCALES)):
         if not any(column in columns for column in wanted):
@@ -169,7 +161,7 @@ def _check_columns(columns: list[str], name: str) -> str:
     for column in columns:
         if column not in (_TIME, *_SCALES, _OPTIONAL) or columns.count(column) > 1:
             raise BadInputError(
-                f"trace {name}, line 1: column {column!r} is unknown or there twice; {_HEADER}"
+                f"trace {name}, line 1: column {column!r} is unknown or repeated; {_HEADER}"
             )
     given = [column for column in _SCALES if column in columns]
     if len(given) > 1:
@@ -178,7 +170,7 @@ def _check_columns(columns: list[str], name: str) -> str:
 
 
 def _number(row: dict[str, str], column: str, where: str, maximum: float = float("inf")) -> float:
-    """Read one value, at least 0, finite and at most `maximum`."""
+    """Parse a value that is finite, at least 0 and at most `maximum`."""
     text = row[column]
     try:
         value = float(text)
@@ -192,16 +184,16 @@ def _number(row: dict[str, str], column: str, where: str, maximum: float = float
 
 
 LONGEST = 5.0
-"""Half of the delays above this [s] are more likely another unit than a network."""
+"""Longest plausible median delay [s]; above it the values are probably in another unit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Packets:
-    """Packets in the order in which they were sent.
+    """The packets of a log in the order of sending.
 
     Attributes:
-        sent: When each left, on any clock, strictly rising [s], shape (n,).
-        delays: One way [s], None for the lost, shape (n,).
+        sent: When each was sent, on any clock, strictly rising [s], shape (n,).
+        delays: One way [s], None for lost packets, shape (n,).
     """
 
     sent: tuple[float, ...]
@@ -209,29 +201,29 @@ class Packets:
 
     @property
     def arrived(self) -> list[float]:
-        """Delays of those that arrived [s]."""
+        """Return the delays of the packets that arrived [s]."""
         return [delay for delay in self.delays if delay is not None]
 
     @property
     def lost(self) -> int:
-        """How many did not arrive."""
+        """Return the number of lost packets."""
         return len(self.delays) - len(self.arrived)
 
     @property
     def duration(self) -> float:
-        """From the first to the last that was sent [s]."""
+        """Return the time from the first to the last packet sent [s]."""
         return self.sent[-1] - self.sent[0]
 
 
 def in_order(entries: Iterable[tuple[float, float | None]], name: str) -> Packets:
-    """Put packets in the order of sending; of two sent at one instant the first stays.
+    """Sort packets by the time of sending; of packets with the same time keep the first.
 
     Args:
-        entries: When sent [s] and delay [s], None if lost, in any order.
-        name: Of the source, for messages.
+        entries: Time of sending [s] and delay [s] (None if lost), in any order.
+        name: Name of the source, for messages.
 
     Raises:
-        BadInputError: If none arrived, or if a delay is negative.
+        BadInputError: If no packet arrived, or a delay is negative.
     """
     unique: dict[float, float | None] = {}
     for sent, delay in entries:
@@ -240,7 +232,7 @@ def in_order(entries: Iterable[tuple[float, float | None]], name: str) -> Packet
     packets = Packets(tuple(s for s, _ in ordered), tuple(d for _, d in ordered))
     arrived = packets.arrived
     if not arrived:
-        raise BadInputError(f"{name}: no packet in it arrived; there is nothing to make a trace of")
+        raise BadInputError(f"{name}: no packet arrived; give a log with at least one reply")
     if min(arrived) < 0.0:
         raise BadInputError(
             f"{name}: a packet arrived {-min(arrived) * 1e3:.4g} ms before it was sent: the two "
@@ -250,27 +242,27 @@ def in_order(entries: Iterable[tuple[float, float | None]], name: str) -> Packet
 
 
 def check_unit(packets: Packets, unit: str, name: str) -> None:
-    """Refuse delays that look as if they were in another unit.
+    """Reject delays that are probably in another unit.
 
     Args:
-        packets: As read.
-        unit: That they were taken to be in: s, ms, us or ns.
-        name: Of the source and its column, for messages.
+        packets: The packets of a log.
+        unit: Unit in which the delays were read: s, ms, us or ns.
+        name: Name of the source and its column, for messages.
 
     Raises:
-        BadInputError: Says which unit they are likely to be in.
+        BadInputError: If the delays are implausible; names the probable unit.
     """
     factor = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
     top, middle = max(packets.arrived), median(packets.arrived)
     remedy = "name the column after its unit, or say --trust-units"
     if unit != "s" and 0.0 < top * factor < 1.0:
         raise BadInputError(
-            f"{name} is {top * factor:.4g} {unit} at most, which looks like seconds; {remedy}"
+            f"{name} is at most {top * factor:.4g} {unit}, which looks like seconds; {remedy}"
         )
     if middle > LONGEST:
         finer = {"s": "ms", "ms": "us", "us": "ns", "ns": "ns"}[unit]
         raise BadInputError(
-            f"{name} is {middle * factor:.6g} {unit} in the middle, which looks like {finer}; "
+            f"{name} has a median of {middle * factor:.6g} {unit}, which looks like {finer}; "
             f"{remedy}"
         )
 
@@ -278,9 +270,8 @@ def check_unit(packets: Packets, unit: str, name: str) -> None:
 def trace_of(packets: Packets) -> Trace:
     """Make a trace that gives a stream of the same rate the same delays and losses.
 
-    A row holds until the next, so each begins halfway between its packet and the one before: a
-    replayed packet may be late or early by up to half a period and still meets its own row. Time
-    begins with the first packet.
+    Each row begins halfway between its packet and the packet before. So a replayed packet may be
+    late or early by half a period and still gets its own row. Time begins at the first packet.
 
     Returns:
         One row per packet; the losses are None if nothing was lost.
@@ -298,10 +289,10 @@ def trace_of(packets: Packets) -> Trace:
 
 
 def write_trace(trace: Trace) -> str:
-    """Write a trace as the CSV that `trace.read_trace` reads.
+    """Format a trace as the CSV that `read_trace` reads.
 
-    Where all delays are below 1 ms the column is `delay_us`, since the reader takes such
-    milliseconds for mistaken seconds.
+    If all delays are below 1 ms, the column is `delay_us`, since the reader would reject such
+    milliseconds as seconds.
     """
     short = 0.0 < max(trace.delays) < 1e-3
     unit, scale = ("us", 1e6) if short else ("ms", 1e3)
@@ -313,7 +304,7 @@ def write_trace(trace: Trace) -> str:
 
 
 def _short(value: float, digits: int) -> str:
-    """Write a number with at most so many decimals, none of them a zero at the end."""
+    """Format a number with at most `digits` decimals, without trailing zeros."""
     return f"{value:.{digits}f}".rstrip("0").rstrip(".")
 
 
@@ -323,52 +314,53 @@ _STAMP = re.compile(r"\[(\d+(?:\.\d+)?)\] ")
 _REPLY = re.compile(r"icmp_seq=(\d{1,12}) .*\btime[=<](\d+(?:\.\d+)?) ms")
 _WRAP = 1 << 16
 _PACKETS_MAX = 10_000_000
-"""More than ping sends in three weeks at five a second; forged numbers would fill the memory."""
+"""Limit of packets in a log of ping, three weeks at five a second, since a number may be forged."""
 _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
-"""What JSON of any other shape raises."""
+"""Errors that JSON of another layout can raise."""
 _HALVE = (
-    "a trace is one way; if both directions are alike, take half of each round trip with "
-    "--halve-rtt, else measure one way with irtt between synchronised clocks"
+    "a trace is one way; if both directions are alike, use half of each round trip with "
+    "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
 )
 
 
 class _NoStampsError(Exception):
-    """A log of irtt without one-way delays."""
+    """A log of irtt has no one-way delays."""
 
 
 def is_ping(lines: Iterable[str]) -> bool:
-    """Say whether a text looks like the output of ping."""
+    """Check whether a text looks like the output of ping."""
     return any("icmp_seq=" in line or line.startswith("PING ") for line in lines)
 
 
 def read_ping(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
-    """Read what `ping -D` printed.
+    """Read the output of `ping -D`.
 
-    A reply is stamped when it arrived. Sequence numbers without a reply are lost packets, those
-    after the last reply excepted: they may have been under way. Source: ping(8) of iputils.
+    Its stamp is the time of a reply's arrival. Sequence numbers without a reply are lost packets,
+    except after the last reply, where replies may have been on their way.
+
+    Source: ping(8) of iputils.
 
     Args:
-        lines: Of the log; what is no reply is skipped.
-        name: Of the file, for messages.
-        halve: Whether to take half of each round trip; it is refused else.
+        lines: Lines of the log; those without a reply are skipped.
+        name: Name of the file, for messages.
+        halve: Whether to use half of each round trip; it must be true.
 
     Returns:
-        Packets, half a round trip each.
+        Packets with half a round trip as delay.
 
     Raises:
-        BadInputError: If there are no replies or no stamps, or too many packets between the first
-            and the last, or if `halve` is not set.
+        BadInputError: If there are no replies, no stamps or too many packets, or `halve` is false.
     """
     if not halve:
         raise BadInputError(f"{name}: ping measures round trips; {_HALVE}")
     replies = dict(_replies(lines, name))
     if not replies:
-        raise BadInputError(f"{name}: no replies in it; give the output of: ping -D HOST")
+        raise BadInputError(f"{name}: has no replies; give the output of: ping -D HOST")
     first, last = min(replies), max(replies)
     if last - first >= _PACKETS_MAX:
         raise BadInputError(
-            f"{name}: its numbers span {last - first + 1} packets, more than {_PACKETS_MAX}; "
-            "give the output of one ping"
+            f"{name}: its sequence numbers span {last - first + 1} packets, more than "
+            f"{_PACKETS_MAX}; give the output of one ping"
         )
     period = (replies[last][0] - replies[first][0]) / max(last - first, 1)
     entries: list[tuple[float, float | None]] = []
@@ -384,8 +376,11 @@ def read_ping(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
 
 
 def _replies(lines: Iterable[str], name: str) -> Iterator[tuple[int, tuple[float, float]]]:
-    """Find each reply's number, counted on where ping begins anew, its instant and round trip."""
-    turns, newest = 0, 0
+    """Yield the number, the time of sending and the round trip of each reply.
+
+    ping's 16-bit sequence number is unwrapped.
+    """
+    wraps, newest = 0, 0
     seen = set()
     for line in lines:
         reply = _REPLY.search(line)
@@ -394,11 +389,11 @@ def _replies(lines: Iterable[str], name: str) -> Iterator[tuple[int, tuple[float
         stamp = _STAMP.match(line)
         if stamp is None:
             raise BadInputError(f"{name}: its lines have no [time]; run ping with -D")
-        # ping counts to 65535 and on from 0; what comes late may be of the turn before.
-        number = int(reply[1]) + turns * _WRAP
+        # After 65535 ping continues with 0; a late reply may be from before that.
+        number = int(reply[1]) + wraps * _WRAP
         if newest - number > _WRAP // 2:
-            turns, number = turns + 1, number + _WRAP
-        elif number - newest > _WRAP // 2 and turns:
+            wraps, number = wraps + 1, number + _WRAP
+        elif number - newest > _WRAP // 2 and wraps:
             number -= _WRAP
         newest = max(newest, number)
         if number not in seen:
@@ -408,21 +403,21 @@ def _replies(lines: Iterable[str], name: str) -> Iterator[tuple[int, tuple[float
 
 
 def read_irtt(text: str, name: str, direction: Direction, *, halve: bool) -> Packets:
-    """Read what `irtt client -o FILE.json` wrote.
+    """Read the output of `irtt client -o FILE.json`.
 
-    The client is taken for the robot: what it sends is the uplink. A packet of which irtt says
-    only that it is lost, not which way, counts as lost in both.
+    The client stands for the robot: what it sends is the uplink. A packet that irtt reports as
+    lost without the direction counts as lost in both.
 
     Source: irtt-client(1), JSON format 1.
 
     Args:
-        text: Of the file.
-        name: Of the file, for messages.
-        direction: Which of the two to take.
-        halve: Whether to take half of each round trip in place of the one-way delay.
+        text: Content of the file.
+        name: Name of the file, for messages.
+        direction: Direction to read.
+        halve: Whether to use half of each round trip instead of the one-way delay.
 
     Raises:
-        BadInputError: If it is no such file, or if it has no one-way delays and `halve` is not set.
+        BadInputError: If it is not such a file, or has no one-way delays and `halve` is false.
     """
     try:
         trips = json.loads(text)["round_trips"]
@@ -448,11 +443,11 @@ def read_irtt(text: str, name: str, direction: Direction, *, halve: bool) -> Pac
 
 
 def _one_way(trips: list[dict[str, Any]], direction: Direction) -> list[tuple[int, int | None]]:
-    """Read one direction: when each packet left and its delay [ns].
+    """Read the time of sending and the delay of each packet of one direction [ns].
 
-    What was lost in the other direction is left out: the downlink never saw it, or how late it was
-    on the uplink is not known. When a packet that was lost on its way down had left is taken from
-    the middle of the uplink's delays.
+    Packets lost in the other direction are left out: they never reached the downlink, or their
+    uplink delay is unknown. For a packet lost on the downlink, the time of sending is estimated
+    with the median uplink delay.
     """
     if direction == "uplink":
         kept = [trip for trip in trips if _lost(trip) != "true_down"]
@@ -477,7 +472,7 @@ def _lost(trip: dict[str, Any]) -> str:
 
 
 def _delay(trip: dict[str, Any], key: str) -> int | None:
-    """Look a delay up [ns]; None if the packet was lost."""
+    """Return a delay of a packet [ns]; None if it was lost."""
     if _lost(trip) != "false":
         return None
     if key not in trip["delay"]:
@@ -486,7 +481,7 @@ def _delay(trip: dict[str, Any], key: str) -> int | None:
 
 
 def refusal(name: str) -> BadInputError:
-    """Say that a source has round trips alone."""
+    """Make the error for a source that has only round trips."""
     return BadInputError(f"{name}: has round trips; {_HALVE}")
 
 
@@ -497,20 +492,21 @@ LOSSES = ("loss", "lost")
 COLUMNS = "time_s and delay_ms, or with _s, _ms, _us or _ns; rtt_ for round trips; and loss"
 _NONE = ("", "nan", "none", "null", "-")
 _LATE = {"s": 1e11, "ms": 1e14, "us": 1e17}
-"""A time since 1970 above this is in a finer unit: it would be after the year 5000."""
+"""Largest plausible time since 1970 by its unit, about the year 5000; above it the unit is finer
+than the column says."""
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:
-    """Read a CSV file with a header; other columns than those named are skipped.
+    """Read a CSV log with a header; unknown columns are skipped.
 
-    A packet is lost if its delay is empty or not a number, or if `loss` is 1; other shares of loss
-    belong into a trace that a profile reads as it stands.
+    A packet is lost if its delay is empty or no number, or if `loss` is 1. Other values of `loss`
+    are only allowed in a trace (`read_trace`).
 
     Args:
-        lines: Of the file.
-        name: Of the file, for messages.
-        halve: Whether to take half of each round trip; without it round trips are refused.
-        trust_units: Whether to take values that look like another unit all the same.
+        lines: Lines of the file.
+        name: Name of the file, for messages.
+        halve: Whether to use half of each round trip; if false, round trips are rejected.
+        trust_units: Whether to accept values that look like another unit.
 
     Raises:
         BadInputError: Names line, value and remedy.
@@ -532,7 +528,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
         ]
     except csv.Error as error:
         raise BadInputError(f"{name}: {error}; give a CSV file") from None
-    # Of nanoseconds since 1970 a float keeps every 256th, which is near enough for an instant.
+    # For nanoseconds since 1970 a float has a resolution of 256 ns, which is enough here.
     start = rows[0][0] if rows else 0.0
     packets = in_order([((at - start) * SCALES[time_unit], value) for at, value in rows], name)
     if not trust_units:
@@ -541,14 +537,14 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Find the one column of these kinds, and its unit."""
+    """Find the only column of these kinds; return its name and unit."""
     known = {f"{kind}_{unit}": unit for kind in kinds for unit in SCALES}
     found = [column for column in columns if column in known]
     bare = [column for column in columns if column in kinds]
     if len(found) == 1 and columns.count(found[0]) == 1:
         return found[0], known[found[0]]
     if found:
-        raise BadInputError(f"{name}: has {' and '.join(found)}; leave one of them")
+        raise BadInputError(f"{name}: has {' and '.join(found)}; keep only one of them")
     if bare:
         raise BadInputError(
             f"{name}: column {bare[0]} does not say its unit; call it {bare[0]}_s, {bare[0]}_ms, "
@@ -562,7 +558,7 @@ def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, s
 def _row(
     row: dict[str, str], time: tuple[str, str], delay: tuple[str, float], loss: str | None, at: str
 ) -> tuple[float, float | None]:
-    """Read one line: its time in its own unit, and its delay [s] or None if it was lost."""
+    """Parse one line: its time in the column's unit and its delay [s], None if it was lost."""
     name, unit = time
     sent = _csv_number(row.get(name), name, at)
     if sent > _LATE.get(unit, float("inf")):
@@ -570,8 +566,8 @@ def _row(
     gone = loss is not None and _csv_number(row.get(loss), loss, at)
     if gone not in (0, 1):
         raise BadInputError(
-            f"{at}: {loss} is {row[str(loss)]}; give 0 or 1 for a packet; a trace with shares is "
-            "read by a profile as it stands"
+            f"{at}: {loss} is {row[str(loss)]}; give 0 or 1 for a packet; a profile can use a "
+            "trace with other shares directly"
         )
     text = row.get(delay[0])
     if gone or text is None or text.strip().lower() in _NONE:

@@ -1,10 +1,8 @@
-"""Recording: records go in; a hash, MCAP files and columns of numbers come out.
+"""Record flights in MCAP files and read them back as arrays.
 
-`topics` says what is recorded, `hash` identifies a run, `recorder` and `writer` keep it,
-`columns` reads it back, `merge` puts both ends on one clock. What `cloudrc[record]` installs is
-imported only by `ros_types`, `writer` and `reader`.
-
-The packages that recording needs and flying does not: an import error goes in, advice out.
+`topics` defines what is recorded, `hash` identifies a run, `recorder` and `writer` write files,
+`reader` and `columns` read them, `recover` repairs them, `merge` puts both ends on one clock. Only
+`ros`, `writer`, `reader` and `recover` import the packages that `cloudrc[record]` installs.
 """
 
 from __future__ import annotations
@@ -13,13 +11,13 @@ from cloudrc.errors import MissingPrerequisiteError
 
 
 def missing(error: ImportError) -> MissingPrerequisiteError:
-    """Say which package is missing and what installs it.
+    """Name a missing package and the command that installs it.
 
     Args:
-        error: What importing it raised.
+        error: Error of the import.
 
     Returns:
-        The error to raise in its place.
+        The error to raise instead.
     """
     name = (error.name or str(error)).partition(".")[0]
     return MissingPrerequisiteError(

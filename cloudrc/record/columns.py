@@ -1,15 +1,13 @@
-"""The recording as numbers: records or a file go in, one table of arrays per topic comes out.
+"""Read a recording, from a file or from records in memory, as one table of arrays per topic.
 
     recording = Recording.read(path)
     recording["/odometry"]["position"]  # shape (n, 3)
 
-A topic that nothing was recorded under is a table without rows.
+A topic without records is a table without rows.
 
-The order of a recording: records of both ends go in, one sequence of rows comes out.
-
-A row is logged at its stamp or, if that lies before the row ahead of it, at that row's time: log
-times never fall within an end, so that merging two ends by log time puts both in order. Files and
-memory are merged by the same rule and give the same tables.
+The log time of a row is its stamp, or the log time of the row before if that is later. So log times
+never fall within an end, and both ends can be merged by log time. Files and memory are merged by
+the same rule and give the same tables.
 """
 
 from __future__ import annotations
@@ -36,10 +34,10 @@ FIRST_NS = -(2**63)
 
 
 def logged(records: Iterable[Record], offset_ns: int = 0) -> Iterator[tuple[int, Row]]:
-    """Fan one end's records out to rows with their log times.
+    """Convert one end's records to rows with their log times.
 
     Args:
-        records: Of one end, oldest first.
+        records: Records of one end, oldest first.
         offset_ns: Added to every row's stamp [ns].
 
     Yields:
@@ -57,10 +55,10 @@ def logged(records: Iterable[Record], offset_ns: int = 0) -> Iterator[tuple[int,
 def merged(
     world_records: Iterable[Record], cloud_records: Iterable[Record], offset_ns: int = 0
 ) -> Iterator[tuple[int, Row]]:
-    """Put the records of both ends in one order, on world's clock.
+    """Merge the records of both ends into one sequence of rows on world's clock.
 
-    Only the rows' stamps move to world's clock; other stamps inside a row stay on the clock that
-    their description names.
+    Only the rows' stamps are converted; other stamps in a row stay on the clock that their
+    description names.
 
     Args:
         world_records: Oldest first, on world's clock.
@@ -68,7 +66,7 @@ def merged(
         offset_ns: World's clock minus cloud's [ns].
 
     Yields:
-        The log time [ns] and the row; at the same instant world's come first.
+        The log time [ns] and the row; at the same instant world's rows come first.
     """
     world, cloud = logged(world_records), logged(cloud_records, offset_ns)
     return heapq.merge(world, cloud, key=itemgetter(0))
@@ -88,18 +86,18 @@ _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
 
 
 class Table:
-    """The rows of one topic, column by column; its length is the number of rows n.
+    """The columns of one topic; its length is the number of rows n.
 
-    Integers are int64, floats and vectors float64, truth values bool, strings objects; vectors
+    Integers are int64, floats and vectors float64, truth values bool, strings objects. Vectors
     have shape (n, 3), quaternions (n, 4), all others (n,).
     """
 
     def __init__(self, topic: Topic, rows: list[tuple[int, Values]]) -> None:
-        """Turn rows into columns.
+        """Convert rows to columns.
 
         Args:
-            topic: Says what the values are.
-            rows: Stamp [ns] and values of each.
+            topic: Defines the columns.
+            rows: Stamp [ns] and values of each row.
         """
         stamps = [stamp_ns for stamp_ns, _ in rows]
         columns = zip(*[values for _, values in rows], strict=True) if rows else repeat(())
@@ -110,7 +108,7 @@ class Table:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The columns' names, `stamp_ns` first."""
+        """Return the names of the columns, `stamp_ns` first."""
         return tuple(self._columns)
 
     def __len__(self) -> int:
@@ -125,20 +123,20 @@ class Table:
 
 
 class Recording:
-    """Everything that was recorded of a flight, by topic.
+    """The tables of a flight by topic.
 
     Attributes:
-        metadata: Of the file: clock, offset between the clocks; empty if made from records.
-        attachments: Files attached to it, by name.
-        note: What is missing, in words; "" if nothing is.
+        metadata: The file's metadata, such as its clock; empty if made from records.
+        attachments: Attached files, by name.
+        note: What is missing, in words; "" if nothing is missing.
     """
 
     def __init__(self, rows: _Rows, contents: Contents | None = None) -> None:
-        """Take rows by topic; most callers want `read` or `from_records`.
+        """Store rows by topic; most callers use `read` or `from_records`.
 
         Args:
             rows: Stamp [ns] and values of each row, in order, by topic.
-            contents: The file that they come from, if they do.
+            contents: Contents of the file that the rows come from; None without a file.
         """
         self._rows = rows
         self._tables: dict[str, Table] = {}
@@ -158,7 +156,7 @@ class Recording:
         cloud_records: Iterable[Record] = (),
         offset_ns: int = 0,
     ) -> Self:
-        """Make a recording in memory, equal to the one that a merged file gives.
+        """Make a recording in memory, equal to that read from a merged file.
 
         Args:
             world_records: Oldest first, on world's clock.
@@ -172,13 +170,13 @@ class Recording:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read an MCAP file as far as it goes.
+        """Read an MCAP file as far as it is readable.
 
         Args:
-            path: Whole or torn.
+            path: The file, complete or torn.
 
         Raises:
-            BadInputError: If nothing in it can be read.
+            BadInputError: If nothing in it is readable.
             MissingPrerequisiteError: If `cloudrc[record]` is not installed.
         """
         from cloudrc.record.reader import read_contents
@@ -187,10 +185,10 @@ class Recording:
 
     @classmethod
     def from_contents(cls, contents: Contents) -> Self:
-        """Decode what a file held.
+        """Decode the contents of a file.
 
         Args:
-            contents: As read.
+            contents: Result of `read_contents`.
         """
         from cloudrc.record.ros import decode
 
@@ -199,7 +197,7 @@ class Recording:
         for topic, _, data in contents.messages:
             try:
                 rows[topic].append(decode(TOPICS[topic], data))
-            except Exception:  # rosbags on bytes that are not what they claim to be
+            except Exception:  # rosbags may raise anything on malformed bytes
                 unreadable += 1
         recording = cls(rows, contents)
         if unreadable:
@@ -214,10 +212,10 @@ class Recording:
         return self._tables[topic]
 
     def get(self, topic: str) -> Table:
-        """Look a topic up, like `recording[topic]`: without rows if none were recorded.
+        """Return a topic's table, like `recording[topic]`.
 
         Args:
-            topic: A name of the table of topics.
+            topic: A name in `TOPICS`.
         """
         return self[topic]
 

@@ -1,9 +1,9 @@
-"""The identity of a run: records go in, one SHA-256 over all of them comes out.
+"""Identify a run by one SHA-256 over all its records.
 
-A record's bytes are little-endian and do not depend on the process: the length and name of its
-type, then its numbers (integers as 64 bit, floats as IEEE 754 doubles, truth values as one byte),
-then its vectors, then its strings as UTF-8 after their 32-bit length; within each of the three,
-in the order of the fields, a nested record in place of its field.
+A record's bytes are little-endian and the same in every process. They are, in this order: the
+length and name of its type; its numbers (integers as 64 bits, floats as IEEE 754 doubles, truth
+values as one byte); its vectors; its strings as UTF-8, each after its 32-bit length. Within each
+group the order is that of the fields; a nested record takes the place of its field.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ _flatten = chain.from_iterable
 
 
 class RecordHash:
-    """SHA-256 over records in the order in which they are given, however they are batched."""
+    """SHA-256 over records in their order, whatever their batches."""
 
     def __init__(self) -> None:
         self._sha256 = hashlib.sha256()
 
     def update(self, records: Iterable[Record]) -> None:
-        """Take in more records.
+        """Add records to the hash.
 
         Args:
-            records: Oldest first.
+            records: More records, oldest first.
         """
         packers = _PACKERS
         self._sha256.update(b"".join([packers[type(record)](record) for record in records]))
 
     def hexdigest(self) -> str:
-        """Say the hash of all records so far, as 64 hexadecimal digits."""
+        """Return the hash of all records so far, as 64 hexadecimal digits."""
         return self._sha256.hexdigest()
 
 
 def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
-    """Hash what was recorded in real time, where no record but its message has come down to us.
+    """Hash the messages of a file from a real-time run, which has no records in memory.
 
     Args:
-        messages: Topic, log time [ns] and CDR bytes of each, in the order of the file.
+        messages: Topic, log time [ns] and CDR bytes of each message, in the file's order.
     """
     sha256 = hashlib.sha256()
     for topic, log_time_ns, data in messages:
@@ -56,7 +56,7 @@ def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
 
 
 class _Packers(dict[type, _Pack]):
-    """Packers by class, each made when the first record of its class comes."""
+    """Packers by class, each made for the first record of its class."""
 
     def __missing__(self, cls: type) -> _Pack:
         packer = self[cls] = _packer(cls)
@@ -86,7 +86,7 @@ def _packer(cls: type) -> _Pack:
 
 
 def _leaves(cls: type, prefix: str) -> Iterator[tuple[str, str]]:
-    """List the path of every plain value of a record with its code for `struct`."""
+    """Yield the path of each plain value of a record and its `struct` code."""
     for name, kind in get_type_hints(cls).items():
         path = prefix + name
         if hasattr(kind, "_fields"):

@@ -1,20 +1,16 @@
-"""Two recordings become one: each end's file goes in, the mission on world's clock comes out.
+"""Merge the recordings of both ends into one mission on world's clock.
 
-Of cloud's messages only the stamp moves; other stamps inside a message stay on the clock that
-their description names.
+Only the stamp of a cloud message is converted; other stamps in it stay on the clock that their
+description names.
 
-How two clocks lie to each other: both ends' recordings go in, world's minus cloud's comes out.
+The clock offset follows from the packets, since none arrives before it was sent. Each telemetry
+shows that world's clock is ahead of cloud's by at least (sent - arrived), each command by at most
+(arrived - sent). The fastest packets of both directions give the narrowest interval, as wide as the
+smallest round trip without any hold. After a stall, world's clock also lags that of its machine.
 
-No packet arrives before it was sent. So each telemetry says that world's clock is ahead of cloud's
-by at least (sent - arrived), each command by at most (arrived - sent); the quickest packets each
-way leave the narrowest interval, as wide as the smallest round trip without any hold.
-
-World's clock lags its machine's after a stall: instants on that one in, on world's out.
-
-Out of a long recording the last mission: all that two pods recorded in, one flight out.
-
-A pod outlives its missions and records all of them into one file, which is still open when it is
-fetched: that its end is missing is no loss if the mission's own end is there.
+`cut_to_last_mission` takes one mission from a pod's recording, which holds several. A pod's file is
+still open when it is copied, so its end may be missing; the mission is complete if its own end is
+in the file.
 """
 
 from __future__ import annotations
@@ -41,13 +37,13 @@ from cloudrc.records import Record
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """World's clock minus cloud's.
+    """The offset of world's clock from cloud's.
 
     Attributes:
-        offset_ns: To add to cloud's stamps [ns].
-        uncertainty_ns: The true offset is within this of it [ns]; None if that is not known.
-        method: "same clock"; "packets" if estimated from both ways; "first records" if nothing
-            relates the clocks and both recordings are taken to begin together.
+        offset_ns: World's clock minus cloud's, to add to cloud's stamps [ns].
+        uncertainty_ns: Largest error of the offset [ns]; None if it is unknown.
+        method: "same clock"; "packets" if estimated from both directions; "first records" if the
+            clocks are unrelated and both recordings are assumed to begin together.
     """
 
     offset_ns: int
@@ -55,7 +51,7 @@ class ClockOffset:
     method: Literal["same clock", "packets", "first records"]
 
     def metadata(self) -> dict[str, str]:
-        """Write it down for a file's metadata; an unknown uncertainty is absent."""
+        """Format the offset for a file's metadata, without an unknown uncertainty."""
         noted = {"clock_offset_ns": str(self.offset_ns), "clock_offset_method": self.method}
         if self.uncertainty_ns is not None:
             noted["clock_offset_uncertainty_ns"] = str(self.uncertainty_ns)
@@ -66,19 +62,20 @@ SAME_CLOCK = ClockOffset(0, 0, "same clock")
 
 
 def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
-    """Find out how to put cloud's stamps on world's clock.
+    """Estimate the offset that puts cloud's stamps on world's clock.
 
     Source: the clock filter of RFC 5905 (NTP), section 10: the sample of the smallest round trip,
         half of which bounds the error.
-    Deviation: the two ways are minimised apart, so that the quickest packet of each counts; clock
-        drift is not modelled (50 ppm are 3 ms in a minute).
+    Deviation: each direction has its own minimum, that of its fastest packet; clock drift is not
+        modelled (50 ppm are 3 ms in a minute).
 
     Args:
-        world: What world recorded, on its clock.
-        cloud: What cloud recorded, on its clock.
+        world: World's recording, on its clock.
+        cloud: Cloud's recording, on its clock.
 
     Returns:
-        The identity if both name the same clock; else the middle of what the packets allow.
+        An offset of 0 if both files name the same clock; else the middle of the interval that the
+        packets allow.
     """
     clock_id = world.metadata.get("clock_id")
     if clock_id and clock_id == cloud.metadata.get("clock_id"):
@@ -93,17 +90,17 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Find the smallest arrival minus departure [ns], each on its own clock."""
-    departures = dict(zip(_names(sent), sent["stamp_ns"].tolist(), strict=True))
+    """Return the smallest arrival minus departure [ns], each on its own clock."""
+    departures = dict(zip(_packet_ids(sent), sent["stamp_ns"].tolist(), strict=True))
     differences = [
-        stamp_ns - departures[name]
-        for name, stamp_ns in zip(_names(arrived), arrived["stamp_ns"].tolist(), strict=True)
-        if name in departures
+        stamp_ns - departures[packet]
+        for packet, stamp_ns in zip(_packet_ids(arrived), arrived["stamp_ns"].tolist(), strict=True)
+        if packet in departures
     ]
     return min(differences, default=None)
 
 
-def _names(table: Table) -> list[tuple[int, int]]:
+def _packet_ids(table: Table) -> list[tuple[int, int]]:
     return list(zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True))
 
 
@@ -113,25 +110,25 @@ def _first_ns(recording: Recording) -> int:
 
 
 class WorldTime:
-    """Knows by how much world's clock lagged at every instant of a recording."""
+    """Converts instants on world's machine clock to world's clock, which may lag."""
 
     def __init__(self, telemetry: Table) -> None:
-        """Learn it from what telemetry says.
+        """Read the lag from telemetry.
 
         Args:
-            telemetry: Of world; its stamps are on world's clock.
+            telemetry: World's table, with stamps on world's clock.
         """
         self._slip_ns = telemetry["slip_ns"]
         self._machine_ns = telemetry["stamp_ns"] + self._slip_ns
 
     def at(self, machine_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Convert instants; between two samples world's clock is taken to run evenly.
+        """Convert instants; between two samples the lag is interpolated linearly.
 
         Args:
-            machine_ns: On the machine's clock [ns], shape (n,).
+            machine_ns: Instants on the machine's clock [ns], shape (n,).
 
         Returns:
-            On world's clock [ns], shape (n,); rising if the argument rises.
+            The instants on world's clock [ns], shape (n,); rising if the argument rises.
         """
         if not self._slip_ns.any():
             return machine_ns
@@ -147,26 +144,26 @@ _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}
 
 @dataclass(frozen=True, slots=True)
 class Mission:
-    """Both ends' files as one.
+    """The merged recordings of both ends.
 
     Attributes:
         contents: All messages in the order of their log times, on world's clock.
-        offset: How cloud's stamps were put on it.
+        offset: Clock offset that was added to cloud's stamps.
     """
 
     contents: Contents
     offset: ClockOffset
 
     def recording(self) -> Recording:
-        """Turn it into columns."""
+        """Decode the mission to tables."""
         return Recording.from_contents(self.contents)
 
     def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
-        """Write it to an MCAP file.
+        """Write the mission to an MCAP file.
 
         Args:
-            target: Replaced in one step if it exists.
-            attachments: Files to put into it, by name, beside those of both ends.
+            target: Replaced atomically if it exists.
+            attachments: Files to attach, by name, in addition to those of both ends.
 
         Raises:
             OSError: If the file cannot be written.
@@ -181,18 +178,18 @@ class Mission:
 
 
 def merge(world: Path, cloud: Path) -> Mission:
-    """Merge the files of both ends, whole or torn, on world's clock.
+    """Merge the files of both ends, complete or torn, on world's clock.
 
     Args:
         world: World's recording.
         cloud: Cloud's recording.
 
     Returns:
-        The mission; if one of the two cannot be read, the other one on its own clock, and its
-        note says so.
+        The mission. If one file cannot be read, the mission is the other file on its own clock,
+        and its note says so.
 
     Raises:
-        BadInputError: If neither can be read.
+        BadInputError: If neither file can be read.
     """
     read, failures = {}, []
     for end, path in (("world", world), ("cloud", cloud)):
@@ -208,13 +205,13 @@ def merge(world: Path, cloud: Path) -> Mission:
         (only,) = read.values()
         mission = Mission(only, SAME_CLOCK)
     else:
-        mission = _joined(read["world"], read["cloud"])
+        mission = _join(read["world"], read["cloud"])
     if notes:
         mission.contents.note = mission.contents.metadata[MISSING] = "; ".join(notes)
     return mission
 
 
-def _joined(world: Contents, cloud: Contents) -> Mission:
+def _join(world: Contents, cloud: Contents) -> Mission:
     of_world = Recording.from_contents(world)
     offset = clock_offset(of_world, Recording.from_contents(cloud))
     logged_ns = np.array([message[1] for message in cloud.messages], dtype=np.int64)
@@ -241,14 +238,14 @@ def write_mission(
     offset: ClockOffset = SAME_CLOCK,
     attachments: Mapping[str, bytes] | None = None,
 ) -> None:
-    """Write the records of both ends as one mission on world's clock, without files in between.
+    """Write the records of both ends as one mission on world's clock.
 
     Args:
-        target: Replaced in one step if it exists.
+        target: Replaced atomically if it exists.
         world_records: Oldest first, on world's clock.
         cloud_records: Oldest first, on cloud's clock.
-        offset: World's clock minus cloud's; in virtual time both are the same.
-        attachments: Files to put into it, by name: config.yaml, report.json.
+        offset: World's clock minus cloud's; in virtual time both clocks are the same.
+        attachments: Files to attach, by name: config.yaml, report.json.
 
     Raises:
         OSError: If the file cannot be written.
@@ -267,23 +264,23 @@ def _attach(writer: McapWriter, attachments: Mapping[str, bytes]) -> None:
 
 
 UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
-"""Events of a mission that goes on; every other event ends it."""
+"""Events of a mission that continues; every other event ends it."""
 BEFORE_NS = 1_000_000_000
-"""What is kept before a mission starts [ns]: the session and the guard's change that open it."""
+"""Time kept before a mission starts [ns]; it holds the session and the guard's first change."""
 AFTER_NS = 2_000_000_000
-"""What is kept after a mission's end [ns]."""
+"""Time kept after a mission's end [ns]."""
 CUT_SHORT = "cut short"
-"""How the reader's note begins that a file has no end."""
+"""Start of the reader's note about a file without an end."""
 
 
 def cut_to_last_mission(mission: Mission) -> tuple[Mission, bool]:
-    """Keep the last mission of a recording.
+    """Cut a recording down to its last mission.
 
     Args:
-        mission: Both ends' recordings, merged.
+        mission: The merged recordings of both ends.
 
     Returns:
-        The last mission that was started in it, and whether its end is in it.
+        The last mission that was started in it, and whether the mission's end is in it.
     """
     contents = mission.contents
     began, ended = _last_mission(contents)
@@ -302,7 +299,7 @@ def cut_to_last_mission(mission: Mission) -> tuple[Mission, bool]:
 
 
 def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
-    """Stamps [ns] of the last mission's start and of its end; None for what is not there."""
+    """Find the stamps [ns] of the last mission's start and end; None for a missing one."""
     events = [message for message in contents.messages if message[0] == "/mission"]
     table = Recording.from_contents(Contents(events))["/mission"]
     began = ended = None
@@ -312,5 +309,5 @@ def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
         elif event not in UNDER_WAY and ended is None:
             ended = stamp_ns
         elif event in UNDER_WAY and began is None:
-            ended = None  # resumed by a new pod: the start is in the old one's recording
+            ended = None  # resumed by a new pod: the start is in the old pod's recording
     return began, ended

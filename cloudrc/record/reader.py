@@ -1,17 +1,9 @@
-"""The recording's way in: an MCAP file goes in, whole or torn, its messages come out.
+"""Read an MCAP file, even if it is torn or damaged, as far as it is readable.
 
-A process that was killed leaves a file without an end: it is read up to the last whole chunk, and
-what is damaged is left out (`cloudrc/record/reader.py`).
-
-MCAP's records as bytes: where one begins and ends, and what it holds, within bounds.
-
-A file may come from a killed process, a bad disk or somebody who means harm: no length in it is
-believed before it is compared with what is there and with a limit.
-
-A recording as far as it goes: an MCAP file of any worth goes in, its whole records come out.
-
-What cannot be read is left out and counted by kind; after a break in the chain of records the scan
-goes on at the next chunk. Memory stays bounded by one record.
+A killed process leaves a file without an end, which is read up to the last complete chunk. Damaged
+parts are skipped and counted by kind; the scan continues at the next chunk. A file may also be
+hostile, so each length in it is checked against the file and a limit before it is used. Memory is
+bounded by one record.
 """
 
 from __future__ import annotations
@@ -41,16 +33,28 @@ try:
     from mcap import records as kinds
     from mcap.data_stream import ReadDataStream
     from mcap.opcode import Opcode
-    from mcap.records import Chunk, McapRecord
+    from mcap.records import (
+        Attachment,
+        Channel,
+        Chunk,
+        DataEnd,
+        Footer,
+        McapRecord,
+        Message,
+        MessageIndex,
+        Metadata,
+        Schema,
+        Statistics,
+    )
 except ImportError as error:
     raise missing(error) from error
 
 RECORD_MAX = 64 << 20
 """Longest record that is read [bytes]."""
 CHUNK_MAX = 16 << 20
-"""Longest chunk after decompression [bytes]; ours are closed after 1 MiB, those of others 4."""
+"""Longest chunk after decompression [bytes]; ours end after 1 MiB, those of other tools after 4."""
 DEFINITION_MAX = 1 << 20
-"""Longest schema or channel [bytes]: the parts of one become many objects."""
+"""Longest schema or channel [bytes]; its parts become many objects in memory."""
 HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 MAGIC = b"\x89MCAP0\r\n"
@@ -70,17 +74,17 @@ _CLASSES: dict[int, Any] = {
 _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _MARK = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
 _MARK_MAX = 8
-_MARK_OFFSET = 37  # of the name of its compression, from a chunk's first byte
+_MARK_OFFSET = 37  # from a chunk's first byte to the name of its compression
 _BLOCK_MIN, _BLOCK_MAX = 1 << 12, 1 << 20
-"""Searched at a time [bytes]: little at first, for there may be a break after every chunk."""
+"""Size of a searched block [bytes]; the first is small, since each chunk may be damaged."""
 
 
 class DamagedError(ValueError):
-    """Bytes that are not the record that they claim to be."""
+    """Bytes that are not a valid record of their kind."""
 
 
 class _Exact(io.BytesIO):
-    """Bytes of which nobody gets fewer than asked for; mcap's reader would take what there is."""
+    """Bytes whose `read` fails at the end; mcap's reader would accept fewer bytes."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
@@ -90,13 +94,13 @@ class _Exact(io.BytesIO):
 
 
 def parse(opcode: int, payload: bytes) -> McapRecord | None:
-    """Read one record.
+    """Parse one record.
 
     Returns:
-        The record, or None if it is of a kind that nobody needs.
+        The record, or None for a kind that is not used.
 
     Raises:
-        DamagedError: If it is not what it claims to be.
+        DamagedError: If the bytes are not a valid record.
     """
     try:
         if opcode == Opcode.MESSAGE:
@@ -110,7 +114,7 @@ def parse(opcode: int, payload: bytes) -> McapRecord | None:
         record: McapRecord = _CLASSES[opcode].read(ReadDataStream(_Exact(payload)))
     except DamagedError:
         raise
-    except Exception as error:  # whatever a record of nonsense brings up in the library
+    except Exception as error:  # the library may raise anything on a malformed record
         raise DamagedError(f"{type(error).__name__}: {error}") from error
     if opcode == Opcode.ATTACHMENT:
         (crc,) = struct.unpack("<I", payload[-4:])
@@ -120,34 +124,34 @@ def parse(opcode: int, payload: bytes) -> McapRecord | None:
 
 
 def unpack(chunk: Chunk) -> Iterator[McapRecord]:
-    """Take a chunk apart, all of which is looked at first: millions of records may be in it.
+    """Split a chunk into its records, after a check of all of it.
 
     Returns:
-        Its records, each read when it is asked for.
+        Its records, parsed one at a time, since a chunk may hold millions.
 
     Raises:
-        DamagedError: At once, if its checksum or anything in it is wrong, or it is longer than
-            CHUNK_MAX.
+        DamagedError: If its checksum or anything in it is wrong, or it is longer than CHUNK_MAX;
+            raised before the first record.
     """
     data = _decompressed(chunk)
     if len(data) != chunk.uncompressed_size:
         raise DamagedError("length")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise DamagedError("checksum")
-    for opcode, start, end in _inside(data):
+    for opcode, start, end in _payloads(data):
         if opcode == Opcode.MESSAGE:
             if end - start < _MESSAGE.size:
                 raise DamagedError("too short")
         elif opcode in _DEFINITIONS:
             parse(opcode, data[start:end])
         elif opcode in _CLASSES:
-            raise DamagedError("a record that has no place in a chunk")
-    records = (parse(opcode, data[start:end]) for opcode, start, end in _inside(data))
+            raise DamagedError("a chunk must not hold this record")
+    records = (parse(opcode, data[start:end]) for opcode, start, end in _payloads(data))
     return (record for record in records if record is not None)
 
 
-def _inside(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, first byte and the byte after the last of each record's payload."""
+def _payloads(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield the opcode of each record, and the start and end of its payload."""
     at = 0
     while at < len(data):
         if at + HEAD.size > len(data):
@@ -161,7 +165,7 @@ def _inside(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _decompressed(chunk: Chunk) -> bytes:
-    """Never more than the chunk says, and it may not say more than CHUNK_MAX."""
+    """Decompress a chunk to at most the size that it states, which is at most CHUNK_MAX."""
     size = chunk.uncompressed_size
     if size > CHUNK_MAX:
         raise DamagedError("too long")
@@ -170,7 +174,7 @@ def _decompressed(chunk: Chunk) -> bytes:
     if chunk.compression != "zstd":
         raise DamagedError(f"compression {chunk.compression}")
     try:
-        # Not `decompress`: it believes the length in the frame and makes room for it at once.
+        # Not `decompress`, which allocates the length that the frame states without a check.
         with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
             data: bytes = reader.read(size + 1)
     except zstandard.ZstdError as error:
@@ -179,12 +183,12 @@ def _decompressed(chunk: Chunk) -> bytes:
 
 
 def next_chunk(stream: IO[bytes], start: int, size: int) -> int | None:
-    """Find where, from `start` on, the next record is that looks like a chunk.
+    """Find the position of the next record from `start` on that looks like a chunk.
 
     Args:
-        stream: The file; is left anywhere.
-        start: First byte that may belong to it.
-        size: Of the file [bytes].
+        stream: The file; its position changes.
+        start: First byte to search.
+        size: Size of the file [bytes].
     """
     for place in _marks(stream, start + _MARK_OFFSET, size):
         at = place - _MARK_OFFSET
@@ -201,7 +205,7 @@ def next_chunk(stream: IO[bytes], start: int, size: int) -> int | None:
 
 
 def _marks(stream: IO[bytes], start: int, size: int) -> Iterator[int]:
-    """Where the names of compressions stand, in the order of the file."""
+    """Yield the positions of compression names, in the order of the file."""
     length = _BLOCK_MIN
     while start < size:
         stream.seek(start)
@@ -213,21 +217,6 @@ def _marks(stream: IO[bytes], start: int, size: int) -> Iterator[int]:
         length = min(2 * length, _BLOCK_MAX)
 
 
-try:
-    from mcap.opcode import Opcode
-    from mcap.records import (
-        Channel,
-        Chunk,
-        DataEnd,
-        Footer,
-        McapRecord,
-        MessageIndex,
-        Schema,
-        Statistics,
-    )
-except ImportError as error:
-    raise missing(error) from error
-
 KNOWN = {int(opcode) for opcode in Opcode}
 NAMES: dict[int, str] = {
     Opcode.CHUNK: "chunks",
@@ -236,27 +225,28 @@ NAMES: dict[int, str] = {
     Opcode.MESSAGE: "messages",
 }
 ROOM_MIN, ROOM_SHARE = 16 << 20, 64
-"""So much is unpacked of any file [bytes], and so many times the size of a longer one [1].
+"""Limit of the unpacked size of a file: `ROOM_MIN` [bytes] or `ROOM_SHARE` times its size [1].
 
-A writer's index alone takes 16 bytes of the file for each message, of which the longest has 750.
+A valid file stays below: its index takes 16 bytes for each message, and a message has at most 750.
 """
 RECORD_COST = 128
-"""Taken for each record beside its bytes: in memory it is an object [bytes]."""
+"""Memory counted for each record's object, beside its bytes [bytes]."""
 OF_THE_END = (DataEnd, Footer, Statistics)
-"""Kinds that have no place in the data."""
+"""Record types that must not occur in the data."""
 DATA_END_SIZE = 4
+"""Size of the payload of a data end record [bytes]."""
 END_SIZE = HEAD.size + 20 + len(MAGIC)
-"""Of footer and closing magic [bytes]."""
+"""Size of the footer and the closing magic [bytes]."""
 
 
 @dataclass(slots=True)
 class Summary:
-    """What the end of a whole file repeats; its checksum was right.
+    """The summary at the end of a complete file, with a valid checksum.
 
     Attributes:
-        start: Its first byte.
+        start: Position of its first byte.
         definitions: Schemas and channels.
-        messages: How many the file holds; None if it does not say.
+        messages: Number of messages in the file; None if it is not stated.
     """
 
     start: int
@@ -265,29 +255,29 @@ class Summary:
 
 
 class TooMuchError(ValueError):
-    """A file that unpacks to more than any recording does."""
+    """A file that unpacks to more than any valid recording."""
 
 
 class Scan:
     """One pass over a file.
 
     Attributes:
-        summary: The file's own, if it is whole.
-        dropped: What could not be read, by kind: chunks, attachments, metadata, records; and the
-            messages that the index of a damaged chunk tells of.
-        skipped: How many bytes belong to no record [bytes].
-        size: Of the file [bytes].
-        is_mcap: Whether it begins as one.
+        summary: The summary of a complete file; None for another one.
+        dropped: Number of damaged chunks, attachments, metadata and records, by kind; also of the
+            messages that the index lists for a damaged chunk.
+        skipped: Bytes that belong to no record [bytes].
+        size: Size of the file [bytes].
+        is_mcap: Whether the file begins with MCAP's magic.
         ended: Whether the end of the data was reached.
-        checked: Whether the checksum over all data is right; None if there is none to compare.
-        chunks: How many whole ones there were.
+        checked: Whether the checksum over all data is right; None without a checksum.
+        chunks: Number of intact chunks.
     """
 
     def __init__(self, stream: IO[bytes]) -> None:
-        """Look at both ends of a file.
+        """Read the size and the summary of a file.
 
         Args:
-            stream: Binary and seekable.
+            stream: The file, binary and seekable.
         """
         self._stream = stream
         self.size = stream.seek(0, os.SEEK_END)
@@ -302,14 +292,14 @@ class Scan:
         self._broken = self._lost_chunk = False
 
     def definitions(self) -> list[McapRecord]:
-        """Give the schemas and channels of the index, should a chunk with them be lost."""
+        """Return the summary's definitions; the chunk that holds them may be lost."""
         return self.summary.definitions if self.summary else []
 
     def records(self) -> Iterator[McapRecord]:
-        """Give every whole record of the data, those in chunks included, in their order.
+        """Yield every intact record of the data in order, including those in chunks.
 
         Raises:
-            TooMuchError: If it is made to fill the memory.
+            TooMuchError: If the file unpacks to more than any valid recording.
         """
         stream, at = self._stream, len(MAGIC)
         stream.seek(0)
@@ -329,11 +319,11 @@ class Scan:
             payload = stream.read(length)
             at += HEAD.size + length
             if opcode == Opcode.DATA_END and length == DATA_END_SIZE and at <= end:
-                # Anything else of this opcode is a damaged record, not the end.
+                # A record of this opcode elsewhere is damaged and not the end.
                 if self.summary is None or at == end:
                     self._end(payload)
                     if self.summary is None:
-                        self._leave_out(at)
+                        self._count_rest(at)
                     continue
             self._crc = zlib.crc32(payload, zlib.crc32(head, self._crc))
             yield from self._take(opcode, payload)
@@ -366,8 +356,8 @@ class Scan:
         self._room -= size
         if self._room < 0:
             raise TooMuchError(
-                f"its {self.size} bytes unpack to more than those of any recording; it is made to "
-                "fill the memory, use another one"
+                f"its {self.size} bytes unpack to more than those of any recording and would fill "
+                "the memory; use another file"
             )
 
     def _end(self, payload: bytes) -> None:
@@ -376,8 +366,8 @@ class Scan:
         if crc:
             self.checked = not self._broken and crc == self._crc
 
-    def _leave_out(self, at: int) -> None:
-        """Count what lies behind the end, such as a second recording: only the first is kept."""
+    def _count_rest(self, at: int) -> None:
+        """Count the chunks and messages after the end, such as a second recording, as lost."""
         stream, start = self._stream, next_chunk(self._stream, at, self.size)
         if start is None:
             return
@@ -399,11 +389,11 @@ class Scan:
         self.dropped[NAMES.get(opcode, "records")] += 1
 
     def _resume(self, broken: int, opcode: int) -> int:
-        """Where to go on after a break in the chain at `broken`; counts what lies between."""
+        """Find the position to continue after the damage at `broken`; count what is skipped."""
         self._broken = True
         found = next_chunk(self._stream, broken + 1 if broken else 0, self.size)
         if found is not None and broken:
-            self._note(opcode)  # else it is but the end that was never written
+            self._note(opcode)  # if no chunk follows, only the end is missing
         at = self.size if found is None else found
         self.skipped += at - broken
         return at
@@ -448,21 +438,15 @@ def _summary(start: int, data: bytes) -> Summary | None:
     return summary
 
 
-try:
-    from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
-except ImportError as error:
-    raise missing(error) from error
-
-
 @dataclass(slots=True)
 class Contents:
-    """What a file held.
+    """The contents of a file.
 
     Attributes:
-        messages: Topic, log time [ns] and CDR bytes, in the order of the file.
-        metadata: All of the file's metadata; later values of a key replace earlier ones.
+        messages: Topic, log time [ns] and CDR bytes of each, in the order of the file.
+        metadata: All metadata of the file; later values of a key replace earlier ones.
         attachments: The attached files by name.
-        note: What is missing, in words; "" if nothing is.
+        note: What is missing, in words; "" if nothing is missing.
     """
 
     messages: list[tuple[str, int, bytes]] = field(default_factory=list)
@@ -472,24 +456,24 @@ class Contents:
 
 
 def read_contents(path: Path) -> Contents:
-    """Read a file as far as it goes.
+    """Read a file as far as it is readable.
 
     Args:
         path: An MCAP file, possibly torn.
 
     Returns:
-        All messages of whole chunks.
+        All messages of intact chunks.
 
     Raises:
-        BadInputError: If nothing in it can be read, or it unpacks to more than recordings do.
+        BadInputError: If nothing in it is readable, or it unpacks to more than any recording.
     """
     try:
         with BufferedReader(open_file(path)) as stream:
-            reading = _Reading()
-            scan = reading.pass_over(stream)
-            if reading.came_late:
-                reading = _Reading(reading)
-                scan = reading.pass_over(stream)
+            collector = _Collector()
+            scan = collector.pass_over(stream)
+            if collector.came_late:
+                collector = _Collector(collector)
+                scan = collector.pass_over(stream)
     except OSError as error:
         raise BadInputError(
             f"{path}: cannot be read ({error.strerror}); name a recording (.mcap)"
@@ -498,7 +482,7 @@ def read_contents(path: Path) -> Contents:
         raise BadInputError(f"{path}: {error}") from error
     except ValueError as error:
         raise BadInputError(f"{error}; name a recording (.mcap)") from error
-    contents = reading.finish(scan)
+    contents = collector.finish(scan)
     if not scan.ended and not contents.messages:
         reason = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"
         raise BadInputError(
@@ -507,25 +491,25 @@ def read_contents(path: Path) -> Contents:
     return contents
 
 
-class _Reading:
-    """Takes MCAP records in, one after the other, and gathers what they hold.
+class _Collector:
+    """Collects the contents of MCAP records.
 
     Attributes:
-        contents: What was gathered.
-        came_late: Whether a channel was defined behind messages of its own: those are left out, and
-            read by a second pass that knows the channels of the first.
+        contents: The contents collected so far.
+        came_late: Whether a channel was defined after messages of its own. These messages are
+            read in a second pass, which knows the channels of the first.
     """
 
-    def __init__(self, before: _Reading | None = None) -> None:
+    def __init__(self, before: _Collector | None = None) -> None:
         self.contents = Contents()
         self.came_late = False
         self._foreign: set[str] = set()
         self._types: dict[int, tuple[str, str]] = {}
         self._topics: dict[int, str] = dict(before._topics) if before else {}
-        self._homeless: set[int] = set()
+        self._without_channel: set[int] = set()
 
     def pass_over(self, stream: IO[bytes]) -> Scan:
-        """Take all of a file in."""
+        """Collect the contents of a file."""
         scan = Scan(stream)
         for record in chain(scan.definitions(), scan.records()):
             self.take(record)
@@ -536,7 +520,7 @@ class _Reading:
         if isinstance(record, Message):
             topic = self._topics.get(record.channel_id)
             if topic is None:
-                self._homeless.add(record.channel_id)
+                self._without_channel.add(record.channel_id)
             else:
                 contents.messages.append((topic, record.log_time, record.data))
         elif isinstance(record, Schema):
@@ -554,13 +538,13 @@ class _Reading:
         known = topic is not None and topic.ros_type == ros_type and is_known(ros_type, text)
         if known:
             self._topics[channel.id] = channel.topic
-            self.came_late |= channel.id in self._homeless
+            self.came_late |= channel.id in self._without_channel
         else:
             self._topics.pop(channel.id, None)
             self._foreign.add(channel.topic)
 
     def finish(self, scan: Scan) -> Contents:
-        """Add the note to what was gathered."""
+        """Add the note to the contents."""
         messages, notes = self.contents.messages, []
         if not scan.ended:
             until = messages[-1][1] * 1e-9 if messages else 0.0

@@ -1,8 +1,7 @@
-"""The recorder of a process that flies: records go in without waiting, an MCAP file comes out.
+"""Record a real-time process into a file without blocking its loop.
 
-The loop only puts; what writes (`cloudrc/drivers/recording.py`) drains. Between them lies a
-bounded queue that gives up its oldest record when it is full, and counts it. Whatever goes wrong
-with the file, the flight goes on.
+The loop puts records into a bounded queue; a thread (`cloudrc/drivers/recording.py`) writes them. A
+full queue drops its oldest record and counts it. An error of the file never stops the flight.
 """
 
 from __future__ import annotations
@@ -22,33 +21,33 @@ TROUBLE = {
     errno.EROFS: "disk is read-only",
 }
 CAPACITY = 20_000
-"""Records that the queue holds: some 30 s of either end."""
+"""Number of records that the queue holds, about 30 s of either end."""
 
 
 class Sink(Protocol):
-    """What the recorder needs of a writer."""
+    """The part of a writer that the recorder uses."""
 
     def write(self, records: Iterable[Record]) -> None:
-        """Record them, oldest first."""
+        """Write records, oldest first."""
 
     def flush(self) -> None:
-        """Hand everything to the operating system."""
+        """Hand all data to the operating system."""
 
     def sync(self) -> None:
-        """Have what was flushed survive the machine."""
+        """Sync the flushed data to the disk."""
 
     def abandon(self, reason: str) -> int:
-        """After an error: cut off what is torn, note why, say how many records go with it."""
+        """End the file after an error; return the number of records lost with it."""
 
     def close(self) -> None:
-        """End the file."""
+        """Complete and close the file."""
 
 
 class Recorder:
-    """A queue between one thread that puts and one that drains; a third one may `sync`.
+    """A queue between a thread that puts and one that drains; a third thread may `sync`.
 
     Attributes:
-        error: Why something was not recorded, in words; "" if all is well.
+        error: Why something was not recorded, in words; "" without an error.
     """
 
     def __init__(
@@ -58,13 +57,13 @@ class Recorder:
         capacity: int = CAPACITY,
         size_max: int | None = None,
     ) -> None:
-        """Set the queue up; the file is opened by the first drain.
+        """Create the queue; the first drain opens the file.
 
         Args:
-            path: Of the file.
+            path: The file.
             open_sink: Opens it: `lambda path: McapWriter(path, clock="world")`.
-            capacity: Records that the queue holds.
-            size_max: The file is ended when it has grown to this [bytes]; None: never.
+            capacity: Number of records that the queue holds.
+            size_max: Size at which the file is ended [bytes]; None for no limit.
         """
         self.error = ""
         self._size_max = size_max
@@ -76,35 +75,35 @@ class Recorder:
         self._ended = False
         self._overflowed = 0
         self._unwritten = 0
-        self._refused: OSError | None = None  # by `sync`
+        self._sync_error: OSError | None = None
 
     @property
     def dropped(self) -> int:
-        """Number of records that did not reach the file."""
+        """Return the number of records that did not reach the file."""
         return self._overflowed + self._unwritten
 
     def put(self, records: Iterable[Record]) -> None:
-        """Take records over; never waits and never raises.
+        """Queue records; never waits and never raises.
 
         Args:
-            records: Oldest first.
+            records: Records of the process, oldest first.
         """
         queue = self._queue
         queue.extend(records)
         while len(queue) > self._capacity:
-            # The other thread may have emptied the queue since.
+            # The other thread may have emptied the queue in the meantime.
             with contextlib.suppress(IndexError):
                 queue.popleft()
                 self._overflowed += 1
 
     def drain(self, max_records: int = 64) -> int:
-        """Write out what waits in the queue; never raises.
+        """Write records from the queue; never raises.
 
         Args:
-            max_records: At most so many, so that the caller does not keep the loop from running.
+            max_records: Limit of records, so that the caller does not block the loop.
 
         Returns:
-            How many were taken from the queue.
+            Number of records taken from the queue.
         """
         sink = self._sink or self._open()
         taken = 0
@@ -116,42 +115,42 @@ class Recorder:
         return taken
 
     def flush(self, *, sync: bool = True) -> None:
-        """Hand what was written to the operating system; never raises.
+        """Hand the written data to the operating system; never raises.
 
         Args:
-            sync: And to the disk, however long that takes.
+            sync: Whether to sync it to the disk, too, however long that takes.
         """
         if self._sink and not self._ended:
             try:
                 self._sink.flush()
                 if sync:
                     self.sync()
-                if self._refused is not None:
-                    raise self._refused
+                if self._sync_error is not None:
+                    raise self._sync_error
                 if self._size_max is not None and self._path.stat().st_size >= self._size_max:
-                    raise OSError(errno.EFBIG, "it has grown to its limit")
+                    raise OSError(errno.EFBIG, "the file has reached its size limit")
             except OSError as error:
                 self._stop(error)
 
     def sync(self) -> bool:
-        """Have what was flushed survive the machine, however long that takes; never raises.
+        """Sync the flushed data to the disk, however long that takes; never raises.
 
         Returns:
-            Whether it does: False if that failed, or if nothing is recorded into a file.
+            False if that failed or nothing is recorded into a file.
         """
         sink = self._sink
         if sink is not None and not self._ended:
             try:
                 sink.sync()
                 return self._path.is_file()
-            except OSError as error:  # whoever drains gives the file up, at the next flush
-                self._refused = error
-            except ValueError:  # it was closed meanwhile
+            except OSError as error:  # the next flush, in the other thread, ends the file
+                self._sync_error = error
+            except ValueError:  # the file was closed in the meantime
                 pass
         return False
 
     def close(self) -> None:
-        """Write out the rest and end the file; never raises."""
+        """Write the remaining records and close the file; never raises."""
         while self.drain():
             pass
         if self._sink and not self._ended:
@@ -178,13 +177,13 @@ class Recorder:
         except OSError as error:
             self._unwritten += 1
             self._stop(error)
-        except Exception as error:  # a record that cannot be encoded must not end the others
+        except Exception as error:  # one record that cannot be encoded must not stop the others
             self._unwritten += 1
             kind = type(record).__name__
             self.error = f"{self._path}: a record of type {kind} cannot be written: {error}"
 
     def _stop(self, error: OSError) -> None:
-        """Give the file up: what is in it stays readable, what comes now is counted."""
+        """End the file after an error: it stays readable; later records are only counted."""
         self._ended = True
         reason = f"recording stopped: {TROUBLE.get(error.errno or 0, error.strerror or error)}"
         self.error = (

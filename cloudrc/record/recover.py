@@ -1,10 +1,8 @@
-"""A torn or damaged recording goes in, a clean one and an account of what is lost come out.
+"""Repair a torn or damaged recording: copy all that is intact into a new file.
 
-MCAP has no such tool in Python. Everything whole is kept: messages with their stamps, schemas and
-channels, attachments, metadata. The result has an index, checksums, and, if anything is missing, a
-note that says so to whoever reads it.
-
-A file on a disk that is failing: what cannot be read of it costs no more than itself.
+The copy keeps messages with their stamps, schemas, channels, attachments and metadata. It has an
+index, checksums and, if anything is missing, a note about it. On a failing disk only the unreadable
+sectors are lost. MCAP itself has no such tool for Python.
 """
 
 from __future__ import annotations
@@ -23,30 +21,30 @@ from cloudrc.record.reader import Scan, TooMuchError
 from cloudrc.record.writer import METADATA, MISSING
 
 SECTOR = 4096
-"""What the kernel reads at once [bytes]."""
+"""Unit in which the kernel reads a disk [bytes]."""
 
 
 class Sectors(io.BufferedReader):
     """A file whose bad sectors read as zeros.
 
     Attributes:
-        bad: Numbers of those that were met.
+        bad: Numbers of the bad sectors found so far.
     """
 
     def __init__(self, raw: io.RawIOBase) -> None:
-        """Take a file over.
+        """Wrap an open file.
 
         Args:
-            raw: Open, without a buffer; is closed with this.
+            raw: The file, without a buffer; closed together with this object.
         """
         super().__init__(raw)
         self.bad: set[int] = set()
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read at most so many bytes; fewer at the end alone.
+        """Read `size` bytes; fewer only at the end of the file.
 
         Raises:
-            OSError: If something else is wrong than a sector.
+            OSError: If the error is not that of a bad sector.
         """
         at = self.tell()
         try:
@@ -54,9 +52,9 @@ class Sectors(io.BufferedReader):
         except OSError as error:
             if error.errno != errno.EIO or size is None or size < 0:
                 raise
-        return self._in_parts(at, size)
+        return self._read_sectors(at, size)
 
-    def _in_parts(self, at: int, size: int) -> bytes:
+    def _read_sectors(self, at: int, size: int) -> bytes:
         whole = self.seek(0, io.SEEK_END)
         end, parts = min(at + size, whole), list[bytes]()
         while at < end:
@@ -83,25 +81,25 @@ except ImportError as error:
     raise missing(error) from error
 
 CHANNELS_MAX = 65_535
-"""Of a file, whose numbers for them have 16 bits; so have those of schemas, never more of them."""
+"""Limit of channels and of schemas in a file, since MCAP numbers them with 16 bits."""
 DEFINITIONS_MAX = 64 << 20
-"""Of all schemas and channels that are kept in mind, in bytes about; those beyond are left out."""
+"""Memory limit of the kept schemas and channels, roughly [bytes]; more of them are left out."""
 ENTRY = 256
-"""Taken for one of a channel's metadata, whatever its length [bytes]."""
+"""Memory counted for a channel's metadata entry, beside its text [bytes]."""
 KEPT = {Message: "messages", Attachment: "attachments", Metadata: "metadata"}
 
 
 @dataclass(slots=True)
 class Recovery:
-    """The account of a recovery.
+    """The result of a recovery.
 
     Attributes:
-        size: Of the damaged file [bytes].
-        kept: How many of each kind are in the new file.
-        dropped: How many of each kind are not; what nobody can know of is only in `bytes_lost`.
-        bytes_lost: Bytes that belong to no whole record [bytes].
+        size: Size of the damaged file [bytes].
+        kept: Number of objects in the new file, by kind.
+        dropped: Number of objects that are known to be lost, by kind.
+        bytes_lost: Bytes that belong to no intact record [bytes].
         notes: What is missing or doubtful, in words.
-        index_is_new: Whether the old file had no index that could be read.
+        index_is_new: Whether the old file had no readable index.
     """
 
     size: int
@@ -113,12 +111,12 @@ class Recovery:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is missing or doubtful."""
+        """Return whether nothing is missing or doubtful."""
         return not self.notes
 
     @property
     def share(self) -> float:
-        """Share that was kept in [0, 1]: of the messages if their number is known, else bytes."""
+        """Return the kept share in [0, 1]: of the messages if their number is known, else bytes."""
         kept, lost = self.kept.get("messages", 0), self.dropped.get("messages", 0)
         if kept + lost and not self.bytes_lost:
             return kept / (kept + lost)
@@ -130,10 +128,10 @@ def recover(source: Path, target: Path) -> Recovery:
 
     Args:
         source: An MCAP file, possibly torn or damaged.
-        target: Written in one step: it is there whole or not at all.
+        target: The new file; written atomically.
 
     Raises:
-        BadInputError: If nothing in the file can be read.
+        BadInputError: If nothing in the file is readable.
         OSError: If the new file cannot be written.
     """
     try:
@@ -152,13 +150,13 @@ def recover(source: Path, target: Path) -> Recovery:
             raise BadInputError(f"{source}: {error}") from error
         recovery = copy.finish(len(stream.bad))
         if not any(recovery.kept.values()) and not recovery.complete:
-            what = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"
-            raise BadInputError(f"{source}: holds nothing that can be read: it {what}")
+            reason = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"
+            raise BadInputError(f"{source}: holds nothing that can be read: it {reason}")
     return recovery
 
 
 class _Copy:
-    """Takes whole records in and writes them to a new file under numbers of its own."""
+    """Copies intact records to a new file and numbers channels and schemas anew."""
 
     def __init__(self, new: IO[bytes], scan: Scan) -> None:
         self._scan = scan
@@ -168,16 +166,16 @@ class _Copy:
         self._channels: dict[int, Channel] = {}
         self._new_schemas: dict[tuple[str, str, bytes], int] = {}
         self._new_channels: dict[tuple[object, ...], int] = {}
-        self._numbers: dict[int, int] = {}  # of a channel, there and here
+        self._numbers: dict[int, int] = {}  # old number of a channel -> its new number
         self._kept = dict.fromkeys(KEPT.values(), 0)
-        self._homeless = 0
+        self._without_channel = 0
         self._room = DEFINITIONS_MAX
-        self._said = ""  # by the recording itself: what it lacks
+        self._old_note = ""  # what the recording itself says is missing
         for record in scan.definitions():
             self._define(record)
 
     def take(self, record: McapRecord) -> None:
-        """Copy a record that is whole."""
+        """Copy an intact record."""
         if isinstance(record, Header):
             self._start(record.profile)
         elif isinstance(record, Message):
@@ -191,7 +189,7 @@ class _Copy:
             self._start()
             self._writer.add_metadata(record.name, record.metadata)
             if record.name == METADATA:
-                self._said = record.metadata.get(MISSING, self._said)
+                self._old_note = record.metadata.get(MISSING, self._old_note)
         else:
             self._define(record)
         kind = KEPT.get(type(record))
@@ -199,12 +197,12 @@ class _Copy:
             self._kept[kind] += 1
 
     def finish(self, bad_sectors: int) -> Recovery:
-        """End the new file; say what is in it and what is not."""
+        """Complete the new file; return what it holds and what is lost."""
         scan = self._scan
         self._start()
-        self._kept["messages"] -= self._homeless
+        self._kept["messages"] -= self._without_channel
         dropped = dict(scan.dropped)
-        lost = dropped.get("messages", 0) + self._homeless
+        lost = dropped.get("messages", 0) + self._without_channel
         if scan.summary and scan.summary.messages is not None:
             lost = max(lost, scan.summary.messages - self._kept["messages"])
         if lost:
@@ -214,8 +212,8 @@ class _Copy:
         new = self._notes(recovery)
         if bad_sectors:
             new.append(f"{bad_sectors} sectors of {SECTOR} bytes cannot be read")
-        recovery.notes = [self._said, *new] if self._said else new
-        if new:  # else what was said is in the new file already
+        recovery.notes = [self._old_note, *new] if self._old_note else new
+        if new:  # otherwise the new file already has the old note
             self._writer.add_metadata(METADATA, {MISSING: "; ".join(recovery.notes)})
         self._writer.finish()
         return recovery
@@ -259,14 +257,18 @@ class _Copy:
     def _message(self, message: Message) -> None:
         number = self._numbers.get(message.channel_id) or self._open(message.channel_id)
         if number is None:
-            self._homeless += 1
+            self._without_channel += 1
             return
         self._writer.add_message(
             number, message.log_time, message.data, message.publish_time, message.sequence
         )
 
     def _open(self, there: int) -> int | None:
-        """Register a channel in the new file; None if the old one's is lost, or too many are."""
+        """Register a channel in the new file; None if its definition is lost or the file is full.
+
+        Args:
+            there: Number of the channel in the old file.
+        """
         channel = self._channels.get(there)
         if channel is None or (channel.schema_id and channel.schema_id not in self._schemas):
             return None

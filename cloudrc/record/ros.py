@@ -1,13 +1,11 @@
-"""The edge to ROS 2: rows of topics go in, CDR bytes of ROS messages come out, and back again.
+"""Convert rows of topics to ROS 2 messages in CDR and back.
 
-Here and nowhere else quaternions turn from `wxyz` to `xyzw` and an odometry's velocity from the
-world frame to the body frame. Every message opens with a `std_msgs/Header` whose stamp is the
-row's; the frames are `world` and `base_link`. rosbags does the encoding.
+Only here do quaternions change from `wxyz` to `xyzw`, and an odometry's velocity from the world
+frame to the body frame. Every message begins with a `std_msgs/Header` that has the row's stamp; the
+frames are `world` and `base_link`.
 
-The ROS 2 message types of the recording: the table of topics goes in, definitions come out.
-
-The types in `cloudrc_msgs` are written from `cloudrc/record/topics.py`, with a comment and a unit
-for each field; the others are ROS's own. rosbags parses, encodes and hashes them all.
+The message types in `cloudrc_msgs` are generated from `cloudrc/record/topics.py`, with a comment
+and a unit for each field; the others are ROS's own. rosbags parses, encodes and hashes all of them.
 """
 
 from __future__ import annotations
@@ -52,9 +50,9 @@ def _own_definition(ros_type: str) -> str:
 _OWN = {t.ros_type: _own_definition(t.ros_type) for t in TOPICS.values() if _OURS in t.ros_type}
 
 TEXT_MAX = 1 << 16
-"""Longest definition that is compared [characters]; ours and ROS's own have some thousand."""
+"""Longest definition that is parsed [characters]; ours and ROS's own have a few thousand."""
 STORE = get_typestore(Stores.ROS2_JAZZY)
-"""Rosbags' types, ours among them."""
+"""The message types of rosbags, including ours."""
 for _name, _text in _OWN.items():
     STORE.register(get_types_from_msg(_text, _name))
 
@@ -65,8 +63,8 @@ def _whole_definition(ros_type: str) -> str:
     return _OWN.get(ros_type, own) + mark + needed
 
 
-# All is generated on import: rosbags takes some milliseconds for each type, and in flight the
-# thread that writes would keep the loop waiting for so long at the first message of each.
+# All types are generated on import: rosbags takes milliseconds for each, and in flight the writing
+# thread would block the loop for that time.
 _NAMES = {topic.ros_type for topic in TOPICS.values()}
 _DEFINITIONS = {name: _whole_definition(name) for name in _NAMES}
 _HASHES = {name: STORE.hash_rihs01(name) for name in _NAMES}
@@ -75,41 +73,42 @@ for _name in _NAMES:
 
 
 def definition(ros_type: str) -> str:
-    """Write a message type out for a schema in the encoding `ros2msg`.
+    """Return a message type's definition in the encoding `ros2msg`.
 
     Args:
-        ros_type: As in the table of topics.
+        ros_type: Type of a topic.
 
     Returns:
-        Its definition, our own with a comment and a unit for each field, and those it needs.
+        Its definition and those of the types it uses; ours have a comment and a unit for each
+        field.
     """
     return _DEFINITIONS[ros_type]
 
 
 def type_hash(ros_type: str) -> str:
-    """Say the RIHS01 hash by which ROS 2 tells a message type.
+    """Return the RIHS01 hash by which ROS 2 identifies a message type.
 
     Args:
-        ros_type: As in the table of topics.
+        ros_type: Type of a topic.
     """
     return _HASHES[ros_type]
 
 
 @lru_cache(maxsize=256)
 def is_known(ros_type: str, text: str) -> bool:
-    """Tell whether a definition found in a file has the layout that `decode` expects.
+    """Check whether a definition from a file has the layout that `decode` expects.
 
     Args:
         ros_type: Name of the message type.
-        text: Its definition in the encoding `ros2msg`; comments do not matter.
+        text: Its definition in the encoding `ros2msg`; comments are ignored.
     """
     if text == definition(ros_type):
         return True
-    if len(text) > TEXT_MAX:  # its parser takes its time
+    if len(text) > TEXT_MAX:  # its parser is slow
         return False
     try:
         found = get_types_from_msg(text, ros_type)
-    except Exception:  # rosbags' parser of a foreign text: whatever it raises, it is not ours
+    except Exception:  # rosbags' parser may raise anything on a foreign text
         return False
     known = STORE.fielddefs
     return all(name in known and known[name][1] == found[name][1] for name in found)
@@ -117,7 +116,7 @@ def is_known(ros_type: str, text: str) -> bool:
 
 _SECOND_NS = 1_000_000_000
 _ENCAPSULATION = 4
-"""Bytes ahead of the message proper; the second one is 1 if it is little-endian."""
+"""Size of the header before the message [bytes]; its second byte is 1 for little-endian."""
 
 _type: dict[str, Any] = dict(STORE.types)
 _Time, _Header = _type["builtin_interfaces/msg/Time"], _type["std_msgs/msg/Header"]
@@ -134,12 +133,12 @@ _UNKNOWN = _Vector3(np.nan, np.nan, np.nan)
 
 
 def encode(topic: Topic, stamp_ns: int, values: Values) -> bytes:
-    """Turn a row into the CDR bytes of its ROS message.
+    """Encode a row as the CDR bytes of its ROS message.
 
     Args:
-        topic: The row's.
-        stamp_ns: The row's [ns]; it becomes the header's stamp.
-        values: In the order of the topic's fields.
+        topic: Topic of the row.
+        stamp_ns: Stamp of the row, which becomes the header's stamp [ns].
+        values: Values in the order of the topic's fields.
 
     Returns:
         Little-endian CDR with its encapsulation header.
@@ -151,10 +150,10 @@ def encode(topic: Topic, stamp_ns: int, values: Values) -> bytes:
 
 
 def decode(topic: Topic, data: bytes) -> tuple[int, Values]:
-    """Turn the CDR bytes of a ROS message back into a row.
+    """Decode the CDR bytes of a ROS message to a row.
 
     Args:
-        topic: The one that the message was recorded under.
+        topic: Topic of the message.
         data: CDR with its encapsulation header.
 
     Returns:
@@ -166,10 +165,10 @@ def decode(topic: Topic, data: bytes) -> tuple[int, Values]:
 
 
 def shifted(data: bytes, offset_ns: int) -> bytes:
-    """Move a message's stamp without decoding the rest of it.
+    """Shift a message's stamp without decoding the rest of it.
 
     Args:
-        data: CDR of any of our messages: all of them open with the stamp of their header.
+        data: CDR of one of our messages, which all begin with the stamp of their header.
         offset_ns: Added to the stamp [ns].
     """
     if offset_ns == 0:
@@ -181,7 +180,7 @@ def shifted(data: bytes, offset_ns: int) -> bytes:
 
 
 def _rotate(orientation_wxyz: Quaternion, vector: Vector) -> Vector:
-    """Turn a vector from the body frame to the world frame: v + 2 u x (u x v + w v).
+    """Rotate a vector from the body frame to the world frame: v + 2 u x (u x v + w v).
 
     This is Rodrigues' formula for the unit quaternion (w, u).
     """

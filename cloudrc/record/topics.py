@@ -1,14 +1,8 @@
-"""The recording's one table: records go in, rows of topics come out.
+"""Define the topics of a recording and convert records to their rows.
 
-A record fans out to one or more topics; a topic is a table whose columns are the fields below,
-named as in `cloudrc/records.py`, after the column `stamp_ns`. Quaternions are `wxyz` and velocities
-in the world frame here, whatever the ROS type asks for (`cloudrc/record/ros.py` converts).
-
-What a topic is: a table of the recording, its columns and their units.
-
-The topics themselves are listed in `cloudrc/record/topics.py`.
-
-What both ends record of the link between them: the link's part of the table of topics.
+A record gives a row in one or more topics. A topic is a table with the column `stamp_ns` and the
+fields below, which are named as in `cloudrc/records.py`. Here quaternions are `wxyz` and velocities
+in the world frame; `cloudrc/record/ros.py` converts them for ROS.
 """
 
 from __future__ import annotations
@@ -25,7 +19,7 @@ from cloudrc.records import Record
 Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion"]
 Values: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = tuple[str, int, Values]
-"""Topic, stamp [ns] on the clock of the end that recorded it, values in the order of the fields."""
+"""Topic, stamp [ns] on the clock of the recording end, values in the order of the fields."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +27,11 @@ class Field:
     """A column of a topic.
 
     Attributes:
-        name: Of the column and of the ROS field.
-        kind: What one value is; vectors have shape (3,), quaternions shape (4,).
-        unit: In words, "" if it has none.
-        text: What it means.
-        path: Where the record holds it, dotted; "" if that is its name.
+        name: Name of the column and of the ROS field.
+        kind: Type of a value; vectors have shape (3,), quaternions shape (4,).
+        unit: Unit of the values; "" without one.
+        text: Meaning of the values.
+        path: Dotted path of the value in the record; "" if it is the name.
     """
 
     name: str
@@ -52,13 +46,13 @@ class Topic:
     """A table of the recording.
 
     Attributes:
-        name: As in MCAP, with its slash.
+        name: Name in the MCAP file, with its slash.
         ros_type: Message type; those in `cloudrc_msgs` are defined by `fields`.
-        source: Record class that it is made from.
-        end: Who records it: "world", "cloud" or "either".
-        text: What one row is.
+        source: Record class of the rows.
+        end: End that records it: "world", "cloud" or "either".
+        text: Meaning of a row.
         fields: The columns after `stamp_ns`.
-        stamp_path: Where the record holds the row's stamp, dotted.
+        stamp_path: Dotted path of the row's stamp in the record.
     """
 
     name: str
@@ -76,19 +70,19 @@ LINK_TOPICS = (
         "cloudrc_msgs/msg/LinkChanged",
         rec.LinkChanged,
         "either",
-        "What shapes what this end sends was seen first, has changed or is told again, in real time"
+        "The emulated link of this end was first seen, has changed or is repeated, in real time"
         " only, clock of its end",
         (
             Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
             Field("shaper", "string", "", "relay or netem"),
-            Field("cause", "string", "", "why it changed; empty if it is as it came up"),
-            Field("age", "float", "s", "it had been in force for so long"),
-            Field("time_line", "float", "s", "its time line had run for so long; NaN: as before"),
-            Field("delay", "float", "s", "asked for at the time line's beginning, one way"),
-            Field("jitter", "float", "s", "likewise"),
-            Field("loss", "float", "1", "likewise, in the long run"),
-            Field("rate", "float", "bit/s", "likewise; NaN without a bottleneck"),
-            Field("conditions", "string", "", "all that is asked for, as JSON"),
+            Field("cause", "string", "", "why it changed; empty before the first change"),
+            Field("age", "float", "s", "time since these conditions took effect"),
+            Field("time_line", "float", "s", "time since the time line began; NaN: as before"),
+            Field("delay", "float", "s", "profile's delay at the start of the time line, one way"),
+            Field("jitter", "float", "s", "profile's jitter at the start of the time line"),
+            Field("loss", "float", "1", "profile's mean loss at the start of the time line"),
+            Field("rate", "float", "bit/s", "likewise its rate; NaN without a bottleneck"),
+            Field("conditions", "string", "", "the profile as JSON"),
         ),
     ),
     Topic(
@@ -96,26 +90,26 @@ LINK_TOPICS = (
         "cloudrc_msgs/msg/LinkChecked",
         rec.LinkChecked,
         "either",
-        "One number of the link that this end hears, judged in flight, in real time only, clock of"
+        "A measured quantity of the link to this end, judged in flight, in real time only, clock of"
         " its end",
         (
             Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
             Field("quantity", "string", "", "mean, deviation, variation, round_trip, loss..."),
-            Field("asked", "float", "s or 1", "what a true link shows: a delay, or a share"),
-            Field("measured", "float", "s or 1", "likewise"),
-            Field("low", "float", "s or 1", "least that is believed, likewise"),
-            Field("high", "float", "s or 1", "most that is believed, likewise"),
+            Field("asked", "float", "s or 1", "expected from the profile: a delay or a share"),
+            Field("measured", "float", "s or 1", "measured: a delay or a share"),
+            Field("low", "float", "s or 1", "lowest accepted value"),
+            Field("high", "float", "s or 1", "highest accepted value"),
             Field(
                 "verdict",
                 "string",
                 "",
-                "ok, off, open where there were too few to say; told judges nothing",
+                "ok, off, or open with too few datagrams; told is not judged",
             ),
-            Field("datagrams", "int", "", "that this rests on"),
+            Field("datagrams", "int", "", "number of datagrams measured"),
         ),
     ),
 )
-"""Topics whose records drivers make."""
+"""Topics of the link, whose records the drivers make."""
 
 
 __all__ = ["MEANINGS", "SAMPLING", "TOPICS", "rows"]
@@ -131,17 +125,17 @@ def _pose_and_twist(path: str) -> tuple[Field, ...]:
     )
 
 
-_EPOCH = Field("epoch", "int", "", "session it belongs to")
+_EPOCH = Field("epoch", "int", "", "epoch of its session")
 _COUNTER = Field("counter", "int", "", "counter in the datagram's header")
 _BASIS = Field("basis_stamp_ns", "int", "ns", "stamp of the odometry used, world's clock")
 _END = Field("end", "string", "", "who recorded it: world, cloud or link")
-_SLIP = Field("slip_ns", "int", "ns", "world's clock behind its machine's monotonic clock")
+_SLIP = Field("slip_ns", "int", "ns", "lag of world's clock behind the machine's monotonic clock")
 _GUARD = "0 GROUND, 1 TRACK, 2 HOLD, 3 LAND, 4 ESTOP"
 _ECHO = "stamp of the newest command applied, cloud's clock; -1 if none"
 _ARRIVAL = (
     _EPOCH,
     _COUNTER,
-    Field("delay", "float", "s", "one way; NaN if the ends cannot prove that they share a clock"),
+    Field("delay", "float", "s", "one way; NaN unless the ends share a clock"),
     Field("used", "bool", "", "true if it became the newest, false if late, repeated or refused"),
 )
 
@@ -160,22 +154,24 @@ _TABLE = (
         "cloudrc_msgs/msg/Telemetry",
         rec.TelemetrySent,
         "world",
-        "The rest of the telemetry that left, world's clock",
+        "The other fields of the telemetry sent, world's clock",
         (
             _EPOCH,
             _COUNTER,
             Field("odometry_stamp_ns", "int", "ns", "its odometry's stamp", "telemetry.stamp_ns"),
             Field("tip_force", "float", "N", "on the arm's tip", "telemetry.tip_force"),
             Field("echo_stamp_ns", "int", "ns", _ECHO, "telemetry.echo_stamp_ns"),
-            Field("echo_hold_ns", "int", "ns", "world held it so long", "telemetry.echo_hold_ns"),
+            Field("echo_hold_ns", "int", "ns", "time in world", "telemetry.echo_hold_ns"),
             Field("slip_ns", "int", "ns", _SLIP.text, "telemetry.slip_ns"),
             Field("mission", "int", "", "last mission request acted on", "telemetry.mission"),
             Field("guard", "int", "", _GUARD, "telemetry.guard"),
             Field("pipe_contacts", "int", "", "begun in this mission", "telemetry.pipe_contacts"),
-            Field("touch_speed", "float", "m/s", "tip on the board", "telemetry.touch_speed"),
-            Field("mission_id", "int", "", "mission started last", "telemetry.mission_id"),
-            Field("reached", "int", "", "waypoints known on board", "telemetry.reached"),
-            Field("cause", "int", "", "why; in words: /guard", "telemetry.cause"),
+            Field(
+                "touch_speed", "float", "m/s", "of the tip on the board", "telemetry.touch_speed"
+            ),
+            Field("mission_id", "int", "", "of the last mission started", "telemetry.mission_id"),
+            Field("reached", "int", "", "waypoints reached, as world knows", "telemetry.reached"),
+            Field("cause", "int", "", "of the guard's state; words: /guard", "telemetry.cause"),
         ),
     ),
     Topic(
@@ -208,7 +204,7 @@ _TABLE = (
         "cloudrc_msgs/msg/Arrival",
         rec.Arrival,
         "cloud",
-        "Telemetry arrived at cloud, late ones included, cloud's clock",
+        "Telemetry arrived at cloud, including late ones, cloud's clock",
         _ARRIVAL,
     ),
     Topic(
@@ -216,7 +212,7 @@ _TABLE = (
         "cloudrc_msgs/msg/Arrival",
         rec.Arrival,
         "world",
-        "A command arrived at world, late ones included, world's clock",
+        "A command arrived at world, including late ones, world's clock",
         _ARRIVAL,
     ),
     Topic(
@@ -240,7 +236,7 @@ _TABLE = (
         "cloudrc_msgs/msg/Contact",
         rec.Contact,
         "world",
-        "The robot began to touch something, world's clock",
+        "The robot touched something, world's clock",
         (
             Field("body", "string", "", "the scene's body: pipe_1, board, floor"),
             Field("position", "vector", "m", "of the base, world frame"),
@@ -295,9 +291,9 @@ _TABLE = (
             _EPOCH,
             _COUNTER,
             _BASIS,
-            Field("horizon", "float", "s", "by how much the odometry was moved ahead"),
-            Field("rtt", "float", "s", "last round trip, hold excluded; NaN before the first"),
-            Field("loop_delay", "float", "s", "last round trip, hold included: tau_n of the paper"),
+            Field("horizon", "float", "s", "time by which the odometry was predicted ahead"),
+            Field("rtt", "float", "s", "last round trip without the hold; NaN before the first"),
+            Field("loop_delay", "float", "s", "last round trip with the hold: tau_n of the paper"),
             Field("measured", "vector", "m", "position in the odometry used, world frame"),
         ),
     ),
@@ -319,11 +315,11 @@ _TABLE = (
         "cloudrc_msgs/msg/MissionEvent",
         rec.MissionEvent,
         "cloud",
-        "The mission moved on, cloud's clock",
+        "An event of the mission, cloud's clock",
         (
             Field("event", "string", "", "started, reached, held, resumed, cancelled, done..."),
             Field("waypoint", "int", "", "index of the waypoint concerned; -1 if none"),
-            Field("text", "string", "", "the same in words"),
+            Field("text", "string", "", "the event in words"),
         ),
     ),
     Topic(
@@ -331,7 +327,7 @@ _TABLE = (
         "cloudrc_msgs/msg/Fault",
         rec.Fault,
         "either",
-        "Something went wrong that did not stop the flight, clock of its end",
+        "A fault that did not stop the flight, clock of its end",
         (
             Field("code", "string", "", "one word"),
             Field("text", "string", "", "what, where, what to do"),
@@ -342,11 +338,11 @@ _TABLE = (
         "cloudrc_msgs/msg/Counted",
         rec.Counted,
         "either",
-        "How often something has happened so far, clock of its end",
+        "A counter, clock of its end",
         (
             _END,
             Field("name", "string", "", "what is counted"),
-            Field("total", "int", "", "since the start"),
+            Field("total", "int", "", "count since the start"),
         ),
     ),
     *LINK_TOPICS,
@@ -355,11 +351,11 @@ _TABLE = (
         "cloudrc_msgs/msg/Lateness",
         rec.Lateness,
         "either",
-        "How late a wake was, in real time only, clock of its end",
+        "The lateness of a wake, in real time only, clock of its end",
         (
             _END,
             Field("lateness", "float", "s", "now minus the deadline"),
-            Field("busy", "float", "s", "how long handling it took"),
+            Field("busy", "float", "s", "time to handle it"),
             _SLIP,
         ),
     ),
@@ -448,13 +444,13 @@ _UPLINK, _DOWNLINK = _EXTRACT.pop(rec.Arrival)
 
 
 def rows(record: Record) -> list[Row]:
-    """Fan a record out to its topics.
+    """Convert a record to its rows.
 
     Args:
-        record: Any record of either end.
+        record: A record of either end.
 
     Returns:
-        One row per topic, in the order of the table.
+        One row for each topic of the record, in the order of `TOPICS`.
     """
     if isinstance(record, rec.Arrival):
         name, stamp, values = _UPLINK if record.uplink else _DOWNLINK

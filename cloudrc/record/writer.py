@@ -1,9 +1,9 @@
-"""The recording's way out: records go in, an MCAP file that ROS 2 tools read comes out.
+"""Write records to an MCAP file that ROS 2 tools can read.
 
-Profile `ros2`, schemas as `ros2msg`, messages as `cdr`, chunks compressed by zstd with their CRC.
-A chunk is closed and handed to the operating system after at most half a second of recording, so
-that a process that is killed loses no more. Chunks, attachments, the data as a whole and the index
-have checksums: no wrong byte goes unnoticed.
+The profile is `ros2`, schemas are `ros2msg`, messages `cdr`, chunks compressed by zstd. A chunk
+goes to the operating system after at most half a second of recording, so that a killed process
+loses no more. Chunks, attachments, the data section and the index have checksums, so that a reader
+detects every wrong byte.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cloudrc.record.topics import TOPICS, Row, rows
 from cloudrc.records import Record
 
 try:
-    import zstandard  # noqa: F401  (mcap finds it by itself, but says less if it is missing)
+    import zstandard  # noqa: F401  (mcap imports it, but with a worse error if it is missing)
     from mcap.data_stream import RecordBuilder
     from mcap.records import DataEnd, Footer, Metadata
     from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
@@ -33,36 +33,36 @@ except ImportError as error:
 CHUNK_NS = 500_000_000
 """Longest time between the first and the last message of a chunk [ns]."""
 METADATA = "cloudrc"
-"""Name of the metadata record that says whose clock the file is on."""
+"""Name of the file's metadata record, which names the clock."""
 MISSING = "missing"
-"""Key of the metadata that says what a file lacks."""
+"""Key in the metadata with what is missing from the file, in words."""
 
 
 class McapWriter:
     """Writes the rows of one end, or of a whole mission, to one MCAP file."""
 
     def __init__(self, target: Path | IO[bytes], *, clock: str, clock_id: str = "") -> None:
-        """Open the file and write its head.
+        """Open the file and write its header.
 
         Args:
             target: A path, overwritten if it exists, or a binary stream that the caller closes.
-            clock: Whose clock the stamps are on: "world" or "cloud".
-            clock_id: What names that clock, such as the kernel's boot id; two files with the same
-                one can be merged as they are; "" if nothing names it.
+            clock: End whose clock the stamps are on: "world" or "cloud".
+            clock_id: Identity of the machine's clock, such as the kernel's boot id; files with the
+                same one need no clock offset; "" if it is unknown.
 
         Raises:
             OSError: If the file cannot be written.
         """
         self._owned = isinstance(target, Path)
-        # Unbuffered, since mcap's writer has a buffer of its own, which `abandon` has to pass by.
+        # Unbuffered: mcap's writer has its own buffer, and `abandon` writes past it.
         self._stream: IO[bytes] | FileIO
         self._stream = target.open("wb", buffering=0) if isinstance(target, Path) else target
         # Any, because mcap's writer is not annotated throughout.
         self._mcap: Any = Writer(
             self._stream, compression=CompressionType.ZSTD, enable_data_crcs=True
         )
-        self._whole = 0  # so many bytes have reached the file and end with a whole record
-        self._open_records = 0  # written since
+        self._whole = 0  # number of bytes in the file up to the last complete chunk
+        self._open_records = 0  # number of records written after these bytes
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._latest_ns = 0
@@ -71,10 +71,10 @@ class McapWriter:
         self.note({"clock": clock, "clock_id": clock_id, "version": __version__})
 
     def write(self, records: Iterable[Record]) -> None:
-        """Record everything that the records fan out to.
+        """Write all rows of the records.
 
         Args:
-            records: Oldest first.
+            records: Records of one end, oldest first.
         """
         for record in records:
             for row in rows(record):
@@ -82,20 +82,20 @@ class McapWriter:
             self._open_records += 1
 
     def write_row(self, row: Row, log_time_ns: int) -> None:
-        """Record one row.
+        """Write one row.
 
         Args:
             row: Topic, stamp and values.
-            log_time_ns: As of `write_message`.
+            log_time_ns: See `write_message` [ns].
         """
         topic, stamp_ns, values = row
         self.write_message(topic, log_time_ns, encode(TOPICS[topic], stamp_ns, values))
 
     def write_message(self, topic: str, log_time_ns: int, data: bytes) -> None:
-        """Record a message that is encoded already.
+        """Write an encoded message.
 
         Args:
-            topic: A name of the table of topics.
+            topic: A name in `TOPICS`.
             log_time_ns: When it was recorded [ns]; raised to that of the last message, or zero.
             data: Its CDR bytes.
         """
@@ -112,17 +112,17 @@ class McapWriter:
         """Add to the file's metadata; a later value of a key replaces an earlier one.
 
         Args:
-            metadata: Such as the epoch, once it is known.
+            metadata: Values by key.
         """
         self._mcap.add_metadata(METADATA, dict(metadata))
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
-        """Put a whole file into the recording.
+        """Attach a file to the recording.
 
         Args:
-            name: Such as config.yaml or report.json.
+            name: Name of the file, such as config.yaml or report.json.
             data: Its bytes.
-            media_type: Such as application/json.
+            media_type: Its media type, such as application/json.
         """
         self._mcap.add_attachment(0, self._latest_ns, name, media_type, data)
 
@@ -134,31 +134,31 @@ class McapWriter:
         self._open_records = 0
 
     def sync(self) -> None:
-        """Have what was flushed survive the machine; may take seconds on a slow disk."""
+        """Sync the flushed data to the disk, which may take seconds."""
         if self._owned:
             try:
                 os.fsync(self._stream.fileno())
             except OSError as error:
-                if error.errno != errno.EINVAL:  # a pipe, or a file that leads nowhere
+                if error.errno != errno.EINVAL:  # EINVAL: a pipe or device, which has no sync
                     raise
 
     def abandon(self, reason: str) -> int:
-        """After an error: cut off what is torn, note why, end the file, as far as there is room.
+        """End the file after an error: cut its torn end off and add a note, if there is space.
 
         Args:
-            reason: What a reader is told is missing.
+            reason: Why the recording stopped, for the readers of the file.
 
         Returns:
-            How many records of those that were taken are lost with it.
+            Number of written records that are lost.
         """
         note, end = RecordBuilder(), RecordBuilder()
         Metadata(METADATA, {MISSING: reason}).write(note)
         DataEnd(0).write(end)
         Footer(0, 0, 0).write(end)
         first = b"" if self._whole else MCAP0_MAGIC
-        # No end without the note, even if there is room: it would pass for that of a whole file.
+        # Never write the end without the note: the file would look complete.
         for rest in (first + _bytes(note) + _bytes(end) + MCAP0_MAGIC, b""):
-            with suppress(OSError, ValueError):  # not even room for that: just whole chunks
+            with suppress(OSError, ValueError):  # no space: leave only the complete chunks
                 self._stream.seek(self._whole)
                 self._stream.truncate()
                 if self._stream.write(rest) == len(rest):
@@ -169,8 +169,8 @@ class McapWriter:
         return self._open_records
 
     def close(self) -> None:
-        """Write the index and close the file; after an error it can be abandoned."""
-        self.flush()  # so that the last chunk is there even if there is no room for the index
+        """Write the index and close the file; after an error, call `abandon`."""
+        self.flush()  # keeps the last chunk even if there is no space for the index
         self._mcap.finish()
         self._mcap.flush()
         self._stream.flush()
@@ -192,7 +192,7 @@ class McapWriter:
         if ros_type not in self._schemas:
             text = definition(ros_type).encode()
             self._schemas[ros_type] = self._mcap.register_schema(ros_type, "ros2msg", text)
-        # Both keys are those of rosbag2's own files.
+        # rosbag2 writes both keys, too.
         metadata = {"offered_qos_profiles": "", "topic_type_hash": type_hash(ros_type)}
         schema = self._schemas[ros_type]
         channel = int(self._mcap.register_channel(topic, "cdr", schema, metadata))
@@ -201,6 +201,6 @@ class McapWriter:
 
 
 def _bytes(builder: Any) -> bytes:
-    """What mcap's builder, which is not annotated, holds."""
+    """Return the bytes of an mcap builder, which has no type annotations."""
     data: bytes = builder.end()
     return data

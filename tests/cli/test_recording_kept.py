@@ -46,7 +46,7 @@ def test_both_recordings_together_stay_within_the_limit(tmp_path: Path) -> None:
     for _ in range(3):
         recorder = record(started(path, limit), 30)
         recorder.close()
-        assert "it has grown to its limit" in recorder.error
+        assert "the file has reached its size limit" in recorder.error
         sizes = [each.stat().st_size for each in tmp_path.iterdir()]
         assert sum(sizes) < limit + 2 * 16_000, "each recording ends with its open chunk"
     assert len(sizes) == 2

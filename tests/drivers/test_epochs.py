@@ -187,7 +187,7 @@ def test_a_file_that_holds_no_epoch_is_told_and_epochs_begin_again(
     file = opened(path)
     kept = path.with_name("epoch.no-epoch")
     assert troubles[0] == (
-        f"{path}: it holds no epoch and is kept as {kept.name}; epochs begin again"
+        f"{path}: holds no epoch and was renamed {kept.name}; epochs begin again"
     )
     assert kept.read_bytes() == torn
     assert file.take() == 1
@@ -199,7 +199,7 @@ def test_a_pipe_in_the_place_of_the_file_is_not_waited_for(
 ) -> None:
     os.mkfifo(path)
     assert opened(path).take() == 1
-    assert troubles[0].startswith(f"{path}: it holds no epoch and is kept as ")
+    assert troubles[0].startswith(f"{path}: holds no epoch and was renamed ")
 
 
 def test_a_file_that_cannot_be_read_is_told_and_epochs_begin_again(

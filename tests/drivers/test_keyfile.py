@@ -70,7 +70,7 @@ def test_a_file_that_is_wrong_leaves_the_keys_and_is_told_once(path: Path, wrong
     keys = KeyFile(path, 0)
     put(path, wrong)
     (said,) = keys.follow(PERIOD_NS)
-    assert said.text.startswith("the keys stay as they were: ")
+    assert said.text.startswith("the old keys stay in use: ")
     assert keys.follow(2 * PERIOD_NS) == []
     assert keys.ring.current == Key(FIRST)
     put(path, SECOND)
@@ -252,7 +252,7 @@ def test_a_key_that_is_retired_is_gone_from_the_file_and_from_who_follows_it(
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert read_keys(path) == KeySet(made.current)
     (told,) = follower.follow(PERIOD_NS)
-    assert told.text == f"key {made.current.name} alone; the one before is not valid any more"
+    assert told.text == f"key {made.current.name} alone; the previous one is no longer valid"
     assert follower.ring.accepted(PERIOD_NS) == (made.current,)
 
 
@@ -261,7 +261,7 @@ def test_other_words_about_the_key_before_are_no_new_key(path: Path) -> None:
     keys = KeyFile(path, 0)
     put(path, write(KeySet(Key(SECOND), Key(FIRST), 60.0)).encode())
     (said,) = keys.follow(PERIOD_NS)
-    assert said.text == f"key {Key(SECOND).name} as before; what is said of the one before changed"
+    assert said.text == f"key {Key(SECOND).name} unchanged; the entry of the previous one changed"
     assert keys.ring.accepted(10_000_000_000) == (Key(SECOND),)
 
 
@@ -282,7 +282,7 @@ def test_a_pipe_in_the_place_of_the_file_leaves_the_keys_and_is_not_read(path: P
     try:
         os.write(pipe, text)
         (said,) = keys.follow(PERIOD_NS)
-        assert said.text.startswith(f"the keys stay as they were: --key {path}: not a file; ")
+        assert said.text.startswith(f"the old keys stay in use: --key {path}: not a file; ")
         assert os.read(pipe, 2 * len(text)) == text
     finally:
         os.close(pipe)

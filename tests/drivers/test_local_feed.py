@@ -29,7 +29,7 @@ def test_a_line_that_is_no_record_is_said_once_and_ends_no_flight(tmp_path: Path
     )
     fault, *told = run._listen()
     assert (told, child.ready, child.heard is not None) == ([EVENT, EVENT], True, True)
-    assert "of the cloud process a line was left out" in str(fault)
+    assert "skipped a line of the cloud process" in str(fault)
     run._selector.close()
     os.close(reader)
     os.close(writer)

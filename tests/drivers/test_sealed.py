@@ -42,7 +42,7 @@ def run(endpoint: object) -> list[bytes]:
 
 
 def test_the_driver_with_a_socket_refuses_an_end_without_keys() -> None:
-    with pytest.raises(ValueError, match="world has no key, and nothing leaves a process unsealed"):
+    with pytest.raises(ValueError, match="world has no key; a process must seal all its datagrams"):
         run(bare_world())
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.drivers.exporter import Exporter
-from cloudrc.drivers.process import _Watch
+from cloudrc.drivers.process import _Observers
 from cloudrc.drivers.recording import RecordingThread, WallClock, told
 from cloudrc.faults.walls import Wall, steppable_wall_clock
 from cloudrc.record.recorder import Recorder
@@ -58,7 +58,7 @@ def test_the_thread_of_the_recording_notices_it_whether_anybody_scrapes_or_not(w
 
 def test_an_end_records_it_on_its_own_clock_and_counts_it() -> None:
     steps = [[60.0, -1.0], []]
-    watch = _Watch("world", None, None, None, lambda: 5_000_000_000, lambda: steps.pop(0))
+    watch = _Observers("world", None, None, None, lambda: 5_000_000_000, lambda: steps.pop(0))
     began_ns = time.monotonic_ns() - 5_000_000_000
     records = watch.after([])
     assert [type(record) for record in records] == [Fault, Fault]

@@ -47,8 +47,8 @@ def test_one_way_delays_are_not_halved() -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("time_s,delay_ms\n0,0.045\n1,0.07", "delay_ms is 0.07 ms at most, which looks like sec"),
-        ("time_s,delay_s\n0,45\n1,70", "delay_s is 57.5 s in the middle, which looks like ms"),
+        ("time_s,delay_ms\n0,0.045\n1,0.07", "delay_ms is at most 0.07 ms, which looks like sec"),
+        ("time_s,delay_s\n0,45\n1,70", "delay_s has a median of 57.5 s, which looks like ms"),
         ("time_s,delay_ms\n1700000000000,45", "time_s is 1700000000000, a finer unit than s"),
         ("time,delay_ms\n0,45", "column time does not say its unit; call it time_s, time_ms"),
         ("time_s,delay\n0,45", "column delay does not say its unit"),

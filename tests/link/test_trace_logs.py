@@ -53,7 +53,7 @@ def test_ping_counts_on_after_65535() -> None:
     ("text", "says"),
     [
         ("64 bytes from 192.0.2.1: icmp_seq=1 ttl=57 time=40 ms", "run ping with -D"),
-        ("PING 192.0.2.1 (192.0.2.1) 56(84) bytes of data.", "no replies in it"),
+        ("PING 192.0.2.1 (192.0.2.1) 56(84) bytes of data.", "has no replies"),
     ],
 )
 def test_a_ping_that_cannot_be_used_is_refused(text: str, says: str) -> None:

@@ -49,10 +49,10 @@ def test_nothing_arrived_or_arrived_before_it_was_sent() -> None:
 @pytest.mark.parametrize(
     ("delay", "unit", "says"),
     [
-        (45e-6, "ms", "is 0.045 ms at most, which looks like seconds; name the column"),
-        (0.5e-6, "us", "is 0.5 us at most"),
-        (45.0, "s", "is 45 s in the middle, which looks like ms"),
-        (45.0, "ms", "is 45000 ms in the middle, which looks like us"),
+        (45e-6, "ms", "is at most 0.045 ms, which looks like seconds; name the column"),
+        (0.5e-6, "us", "is at most 0.5 us"),
+        (45.0, "s", "has a median of 45 s, which looks like ms"),
+        (45.0, "ms", "has a median of 45000 ms, which looks like us"),
     ],
 )
 def test_a_delay_in_another_unit_is_refused(delay: float, unit: str, says: str) -> None:

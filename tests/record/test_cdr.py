@@ -92,7 +92,7 @@ def test_a_definition_stands_on_its_own(ros_type: str) -> None:
 
 def test_our_own_types_explain_every_field() -> None:
     own, _, _ = definition("cloudrc_msgs/msg/DelayEstimate").partition("=" * 80)
-    assert "float64 horizon  # [s] by how much the odometry was moved ahead" in own
+    assert "float64 horizon  # [s] time by which the odometry was predicted ahead" in own
     assert all("#" in line for line in own.splitlines())
 
 
@@ -102,7 +102,7 @@ def test_our_own_types_explain_every_field() -> None:
         (("# [s]", "# seconds:"), True),
         (("float64 delay", "float32 delay"), False),
         (("bool used", "bool use"), False),
-        (("int64 epoch  # session it belongs to\n", ""), False),
+        (("int64 epoch  # epoch of its session\n", ""), False),
         (("int64 epoch", "int64 ("), False),
     ],
 )

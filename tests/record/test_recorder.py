@@ -190,10 +190,10 @@ def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> N
             pass
         recorder.flush()
     recorder.close()
-    assert "recording stopped: it has grown to its limit" in recorder.error
+    assert "recording stopped: the file has reached its size limit" in recorder.error
     assert recorder.dropped > 0
     assert 20_000 <= path.stat().st_size < 100_000
-    assert Recording.read(path).note == "recording stopped: it has grown to its limit"
+    assert Recording.read(path).note == "recording stopped: the file has reached its size limit"
 
 
 @pytest.mark.parametrize("room", [0, 1500, *range(20_000, 60_000, 7_000)])

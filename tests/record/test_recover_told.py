@@ -54,7 +54,7 @@ def recovered(path: Path) -> Path:
     ("make", "said"),
     [
         (full, "recording stopped: disk full"),
-        (ended, "recording stopped: it has grown to its limit"),
+        (ended, "recording stopped: the file has reached its size limit"),
         (recovered, "cut short: the file has no end; "),
     ],
 )
