@@ -8,7 +8,7 @@ import pytest
 
 from cloudrc.config.schema import Criteria
 from cloudrc.geometry.scene import load_scene
-from cloudrc.metrics import SHIPPED, Flight, control, link, measure_all, mission, motion
+from cloudrc.metrics import SHIPPED, Flight, control, flight, link, measure_all, mission
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from tests.metrics.conftest import DONE, ONE_PIPE, flown, paper, straight_flight
@@ -36,7 +36,7 @@ def test_the_promised_names_are_there() -> None:
 
 
 def test_no_two_rows_have_one_name() -> None:
-    assert len(SHIPPED) == sum(len(table.METRICS) for table in (motion, control, link, mission))
+    assert len(SHIPPED) == sum(len(table.METRICS) for table in (flight, control, link, mission))
 
 
 @pytest.mark.parametrize("name", SHIPPED)
