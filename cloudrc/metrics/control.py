@@ -152,7 +152,7 @@ METRICS = (
     Metric(
         "rtt_p95",
         "s",
-        "95th percentile of the round trip from command to echo, without the hold time in world.",
+        "Round trip from command to echo, without the hold time in world: 95th percentile.",
         _rtt_p95,
     ),
     Metric(
@@ -209,7 +209,7 @@ METRICS = (
         Metric(
             f"{end}_lateness_p99",
             "s",
-            f"99th percentile of how late {end} woke for its deadlines; real time only.",
+            f"Lateness of {end}'s wakes: 99th percentile; real time only.",
             partial(_lateness_p99, end=end),
         )
         for end in ("world", "cloud")
