@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from cloudrc.config.schema import Change, Direction
-from cloudrc.report.figures.marks import at, band
+from cloudrc.report.figures.marks import band, bounds_at
 
 
 def bounds(direction: Direction, time: float) -> tuple[float, float]:
     steps = band(direction)
     assert steps is not None
-    low, high = at(steps, np.array([time]))
+    low, high = bounds_at(steps, np.array([time]))
     return low[0], high[0]
 
 

@@ -14,7 +14,7 @@ from cloudrc.messages import GuardState
 from cloudrc.records import Control, GuardChange
 from cloudrc.report.figures import NAMES, draw_all, flight
 from cloudrc.report.figures.marks import LEGEND, legend, mark_events
-from cloudrc.report.figures.snapshots import WALL_COLOUR, is_swallowed, pipe_faces
+from cloudrc.report.figures.snapshots import WALL_COLOUR, is_inside_pipe, pipe_faces
 from cloudrc.report.figures.style import RC, Subject, new_figure
 from tests.metrics.conftest import ONE_PIPE, START, Log, at, flown
 
@@ -44,7 +44,7 @@ def test_where_pipes_meet_no_rim_is_drawn_in_the_other() -> None:
     first, second, _ = load_scene("pipes").pipes
     centre = np.array(second.centre)
     faces = pipe_faces(second, np.array([0.0, 0.0, 1.0]), centre, second.length)
-    met = [face for face in faces if is_swallowed(face, first)]
+    met = [face for face in faces if is_inside_pipe(face, first)]
     assert 0 < len(met) < len(faces)
     assert {face.colour for face in met} == {WALL_COLOUR}
     for face in met:

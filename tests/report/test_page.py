@@ -79,7 +79,7 @@ def test_it_says_what_happened_in_words(page: str) -> None:
     text = re.sub(r"\s", " ", re.sub(r"<[^>]+>", "", page))
     assert "The mission succeeded." in text
     assert "The drone reached all 7 waypoints in 30.9 s" in text
-    assert "It flew through 3 pipes, never nearer than 152 mm to a wall." in text
+    assert "It flew through 3 pipes and never came closer than 152 mm to a wall." in text
     assert "Its arm touched the board after 27.7 s at 0.12 m/s" in text
     assert "cloudrc run config.yaml --mode virtual" in text
     assert "a" * 64 in text
@@ -163,5 +163,5 @@ def test_words_for_a_flight_that_went_wrong() -> None:
     text = prose.summary(flight, {name: Number(v, "", "") for name, v in values.items()})
     assert text == (
         "The drone reached 1 of 2 waypoints in 10.0 s. It flew through one pipe and touched a wall "
-        "once. It never touched the board. The guard on board took over once, for 2.5 s in all."
+        "once. It never touched the board. The guard on board took over once, for 2.5 s in total."
     )

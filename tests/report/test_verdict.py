@@ -132,17 +132,17 @@ def test_the_robot_never_flew() -> None:
     log.change(GuardChange, lambda n, change: None)
     (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
     assert failure.code == "not_started"
-    assert failure.text.endswith("fresh commands came, but no request to start")
+    assert failure.text.endswith("fresh commands arrived, but no request to start")
 
 
 @pytest.mark.parametrize(
     ("arrived", "words"),
     [
-        (lambda n, a: a._replace(used=False), "was 0.090 s old or older when the command came"),
+        (lambda n, a: a._replace(used=False), "was 0.090 s old or older when the command arrived"),
         (lambda n, a: a._replace(used=False), "guard.command_age_max_ms"),
         # The start opens a session of its own: what was fresh before it does not count.
         (lambda n, a: a._replace(used=n < 9, epoch=1 if n < 9 else 2), "command_age_max_ms"),
-        (lambda n, a: a if a.uplink else None, "no command came"),
+        (lambda n, a: a if a.uplink else None, "no command arrived"),
     ],
 )
 def test_why_the_robot_never_flew(
