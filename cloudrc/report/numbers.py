@@ -56,7 +56,7 @@ SHARES = ("loss_", "late_")
 """Prefixes of the names of numbers that are shown in per cent."""
 
 
-def rows(numbers: Mapping[str, Number]) -> str:
+def table_rows(numbers: Mapping[str, Number]) -> str:
     """Lay out the table's body as HTML, a `tbody` for each group that has numbers."""
     grouped = {name for names in GROUPS.values() for name in names}
     groups = {**GROUPS, "Others": tuple(name for name in numbers if name not in grouped)}

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 from cloudrc import __version__
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.metrics import Flight, Number
-from cloudrc.report import numbers as table
 from cloudrc.report.document import Failure, Run, Verdict
+from cloudrc.report.numbers import table_rows
 
 if TYPE_CHECKING:
     from cloudrc.report.figures import Picture
@@ -157,7 +157,7 @@ def render(
         notes=_list([escape(note) for note in notes], "note"),
         facts=_facts(run, experiment),
         figures="\n".join(_figure(n, picture) for n, picture in enumerate(pictures, start=1)),
-        numbers=table.rows(numbers),
+        numbers=table_rows(numbers),
         repeat=escape(repeat),
         command=escape(command),
         hash=f"<p>SHA-256 of all records: <code>{escape(digest)}</code></p>" if digest else "",
@@ -184,7 +184,7 @@ def _facts(run: Run, experiment: ResolvedExperiment) -> str:
         "Experiment": experiment.name,
         "Mode": run.mode,
         "Seed": str(experiment.seed),
-        "Link profile": f"{experiment.link.profile}, by {run.shaper}",
+        "Link profile": f"{experiment.link.profile} ({run.shaper})",
         "Datagram order": f"{experiment.tunnel.order} wins",
         "Delay estimator": cloud.estimator.name,
         "Predictor": cloud.predictor.name,

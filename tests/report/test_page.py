@@ -11,11 +11,10 @@ import matplotlib
 import pytest
 
 from cloudrc.metrics import Number
-from cloudrc.report import numbers as table
-from cloudrc.report import page as prose
 from cloudrc.report.document import Failure, Run, Verdict, environment_document
 from cloudrc.report.figures import NAMES, Picture
-from cloudrc.report.page import render
+from cloudrc.report.numbers import handy
+from cloudrc.report.page import render, summary
 from cloudrc.report.write import assess, write_report
 from tests.metrics.conftest import ONE_PIPE, flown, paper, touch
 
@@ -149,7 +148,7 @@ def test_what_strangers_wrote_cannot_break_out_of_the_page() -> None:
     ],
 )
 def test_numbers_in_handy_units(name: str, number: Number, expected: tuple[str, str]) -> None:
-    assert table.handy(name, number) == expected
+    assert handy(name, number) == expected
 
 
 def test_words_for_a_flight_that_went_wrong() -> None:
@@ -160,7 +159,7 @@ def test_words_for_a_flight_that_went_wrong() -> None:
         **{"duration": 10.0, "waypoints_reached": 1.0, "hold_count": 1.0, "hold_time": 2.5},
         **{"pipe_contacts": 1.0, "min_clearance": -0.01},
     }
-    text = prose.summary(flight, {name: Number(v, "", "") for name, v in values.items()})
+    text = summary(flight, {name: Number(v, "", "") for name, v in values.items()})
     assert text == (
         "The drone reached 1 of 2 waypoints in 10.0 s. It flew through one pipe and touched a wall "
         "once. It never touched the board. The guard on board took over once, for 2.5 s in total."

@@ -28,10 +28,10 @@ ALT = "Two scatter plots over time: one-way delays, and the loop delay with its 
 CAPTION = (
     "Delays. (a) Each dot is the one-way delay of a datagram that arrived, late ones included; the "
     "band is the link profile. (b) Each dot is the loop delay of one echo: the time from a "
-    "command's stamp to its echo (the paper's τₙ). The solid line is the estimate, which is the "
-    "horizon of the prediction. The band is the sum of both directions of the link profile, the "
-    "dashed line its mean. Only applied commands have echoes; if the newest command wins, these "
-    "are the fast ones, so the loop delay lies below the mean of the profile."
+    "command's stamp to its echo (the paper's τₙ). The solid line is the delay estimate, over "
+    "which the controller predicts. The band is the sum of both directions of the link profile, "
+    "the dashed line its mean. Only applied commands have echoes; if the newest command wins, "
+    "these are the fast ones, so the loop delay lies below the mean of the profile."
 )
 MARGIN = 1.25
 """Upper end of the delay axis, divided by the 99.5th percentile of the delays [1]."""

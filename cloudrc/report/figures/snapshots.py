@@ -152,7 +152,7 @@ def _circle(count: int) -> Array:
     return np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
 
 
-ALT = "Six line drawings of the robot along its way, in the pipes cut open, up to the board."
+ALT = "Six line drawings of the robot along its path, with the pipes cut open, up to the board."
 CAPTION = (
     "Snapshots. The robot at six instants, evenly spaced by distance flown (in a hover, by time) "
     "until the contact or the end. Pose and scale are true, pipes are cut open towards the reader, "
