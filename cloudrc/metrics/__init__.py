@@ -110,12 +110,12 @@ def check(own: Iterable[str]) -> None:
         found[name] = choice
 
 
-def not_measured(asked: Iterable[str], own: Iterable[str]) -> list[str]:
+def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
     """Write a note for each metric file that an experiment names but `own` does not."""
     names = set(map(name_of, own))
     return [
         f"{METRIC_NOTE}{name_of(choice)} is not measured: name its file with --metric"
-        for choice in asked
+        for choice in named
         if plugins.is_path(choice) and name_of(choice) not in names
     ]
 
