@@ -1,5 +1,5 @@
-"""Exposition: records of a flight come in, what Prometheus scrapes comes out, without I/O.
+"""Exposition: Prometheus metrics of a process, computed from its records, without I/O.
 
-`table` says which metrics there are; code, documentation, dashboards and tests read it. `live`
-keeps their values, fed with the records of one process; `cloudrc.drivers.exporter` serves them.
+`table` defines all metrics; code, documentation, dashboards and tests read it. `live` keeps their
+current values. `cloudrc.drivers.exporter` serves them.
 """

@@ -1,4 +1,4 @@
-"""The table of metrics as a page: it comes in, docs/metrics.md goes out (`make docs`)."""
+"""Write docs/metrics.md from the table of metrics (`make docs`)."""
 
 from __future__ import annotations
 
@@ -11,20 +11,22 @@ HEAD = """\
 
 <!-- Written by `make docs` from cloudrc/exposition/table.py: edit that. -->
 
-Every process serves `/metrics` for Prometheus, `/healthz` (200 while its own loop has moved in the
-last 5 s) and `/readyz` (200 once it hears its peer) where `--metrics HOST:PORT` says; in the
-cluster that is port 9100 of `world` and `cloud`, 9101 of `teleop` and 9102 of `link`. All values
-are in base units, all labels have closed sets of values but for the two of `cloudrc_build_info`
-that name a version and a configuration, and a value that cannot be known is absent, never zero.
-A page is made at most four times a second, whoever asks, and is at most 0.25 s old. Beside these
-there are the usual `process_*` metrics: CPU, memory, file descriptors.
+Every process serves three pages at the address of its option `--metrics HOST:PORT`: `/metrics` for
+Prometheus, `/healthz` (200 if its loop ran in the last 5 s) and `/readyz` (200 while it hears its
+peer). In the cluster the ports are 9100 for `world` and `cloud`, 9101 for `teleop` and 9102 for
+`link`.
+
+All values are in base units. A value that cannot be known is absent, never zero. Every label has a
+closed set of values, except the labels `version` and `config` of `cloudrc_build_info`. The page is
+made at most four times a second, so it is at most 0.25 s old. It also has the usual `process_*`
+metrics: CPU, memory, file descriptors.
 """
 
 QUERIES = {
     "Round trip, 95th percentile": (
         "histogram_quantile(0.95, sum by (le) (rate(cloudrc_rtt_seconds_bucket[1m])))"
     ),
-    "Mean uplink delay; downlink likewise": (
+    "Mean uplink delay (the downlink has the same query)": (
         "rate(cloudrc_uplink_delay_seconds_sum[1m]) / rate(cloudrc_uplink_delay_seconds_count[1m])"
     ),
     "Loss by direction": (
@@ -35,26 +37,26 @@ QUERIES = {
         " / rate(cloudrc_predictions_judged_total[1m]))"
     ),
     "PID terms of one axis": 'cloudrc_pid_output{axis="x"}',
-    "Share of the time stopped by a CPU limit": (
+    "Share of time stopped by the CPU limit": (
         "rate(cloudrc_cpu_throttled_seconds_total[1m])"
         " * on (instance) group_left (role) cloudrc_build_info"
     ),
-    "Wakes later than 1 ms, as a share": (
+    "Share of wakes later than 1 ms": (
         '1 - sum by (instance) (rate(cloudrc_loop_lateness_seconds_bucket{le="0.001"}[1m]))'
         " / sum by (instance) (rate(cloudrc_loop_lateness_seconds_count[1m]))"
     ),
-    "Processes by configuration; a release has one, link containers none": (
+    "Processes by configuration (one per release; link containers have none)": (
         "count by (config) (cloudrc_build_info)"
     ),
     "World slower than real time": "cloudrc_real_time_factor < 0.95",
 }
 OPEN = {
     "version": "the version",
-    "config": "the first 12 digits of the SHA-256 of the configuration that the process was given, "
-    "its defaults written out, those of plug-ins left open (a run on one machine gives all: of it "
-    "`config_sha256` in report.json has the same digits); empty where a process has none",
+    "config": "the first 12 digits of the SHA-256 of the process's configuration, with all "
+    "defaults except those of plug-ins (a run on one machine includes these too, so the digits are "
+    "those of `config_sha256` in report.json); empty for a process without configuration",
 }
-"""What is said of labels whose values are not listed."""
+"""Label with an open set of values -> its description."""
 
 
 def page() -> str:
@@ -76,7 +78,7 @@ def _table(metrics: Iterable[Metric]) -> str:
 
 
 def _labels(metric: Metric) -> str:
-    """Name the labels with their values."""
+    """List the labels with their values."""
     sets = [
         f"`{label}`: {', '.join(values) or OPEN[label]}" for label, values in metric.labels.items()
     ]

@@ -1,15 +1,7 @@
-"""What world exposes besides what both ends do: the robot, its guard, contacts, real time.
+"""Current metrics of world and cloud, the two ends of the tunnel, computed from their records.
 
-What an end tells of the standing check of the link: the verdict, and all of it as JSON.
-
-What both ends of the tunnel expose: session, datagrams, one-way delay, how the loop keeps up.
-
-Predictions and delay estimates held to what arrives later: control periods in, errors out.
-
-Everything is computed from `Control` records, on the clock that each stamp belongs to, so it works
-without a shared clock.
-
-What cloud exposes besides what both ends do: delays in the loop, prediction, control.
+Errors of predictions and delay estimates come from `Control` records alone. Each stamp is compared
+only with stamps of its own clock, so the errors are right without a shared clock.
 """
 
 from __future__ import annotations
@@ -24,11 +16,11 @@ from cloudrc.exposition.parts import (
     Histogram,
     Readings,
     Stream,
-    by,
-    chosen,
-    known,
+    by_label,
     per_axis,
     plain,
+    select,
+    unless_nan,
 )
 from cloudrc.exposition.table import (
     AXES,
@@ -63,43 +55,43 @@ from cloudrc.records import (
     TelemetrySent,
 )
 
-_KNOWN = ("stamp_ns", "uplink")
-"""Of no use to a reader, or said once for all."""
+_LEFT_OUT = ("stamp_ns", "uplink")
+"""Fields that /link.json leaves out of its rows: the same for all rows, or of no use."""
 
 
 class Check:
-    """The newest verdict on the direction that an end hears."""
+    """The newest verdict on an end's incoming direction of the link."""
 
     def __init__(self, direction: str) -> None:
-        """Begin before the first; the direction is "uplink" or "downlink"."""
+        """Start without a verdict; the direction is "uplink" or "downlink"."""
         self._direction = direction
         self._newest: tuple[LinkChecked, ...] = ()
 
     def see(self, record: LinkChecked) -> None:
-        """Take note of one quantity; those of an older verdict are forgotten."""
+        """Store the verdict on one quantity; quantities of an older check are dropped."""
         newest = self._newest
         if newest and newest[0].stamp_ns != record.stamp_ns:
             newest = ()
-        self._newest = (*newest, record)  # replaced, not changed: others may be reading it
+        self._newest = (*newest, record)  # a new tuple: another thread may be reading the old one
 
     @property
     def verdict(self) -> str:
-        """Of all quantities: "ok", "off", or "open" while there is too little to say."""
+        """Overall verdict: "ok", "off", or "open" while there are too few datagrams."""
         verdicts = {record.verdict for record in self._newest} - {"told"}
         return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
 
     def text(self) -> str:
-        """Say all that is known now, as JSON."""
+        """Return the page /link.json: the overall verdict and a row per quantity."""
         rows = [
             {
                 key: value
                 for key, value in record._asdict().items()
-                if key not in _KNOWN and not (isinstance(value, float) and not isfinite(value))
+                if key not in _LEFT_OUT and not (isinstance(value, float) and not isfinite(value))
             }
             for record in self._newest
         ]
-        found = {"direction": self._direction, "verdict": self.verdict, "rows": rows}
-        return json.dumps(found, indent=2) + "\n"
+        document = {"direction": self._direction, "verdict": self.verdict, "rows": rows}
+        return json.dumps(document, indent=2) + "\n"
 
     def read(self) -> Readings:
         """See `Part`."""
@@ -109,20 +101,20 @@ class Check:
 
 
 CLOCK_SET = "wall_clock"
-"""Code of the fault that tells that the wall clock was set; see `cloudrc.drivers.wall_clock`."""
+"""Fault code of a step of the wall clock; `cloudrc.drivers.recording` detects steps."""
 SILENCE_NS = 2_000_000_000
-"""An end that has heard nothing for so long has no peer [ns]."""
+"""An end has no peer after this time without a new datagram [ns]."""
 
 
 class End:
-    """World or cloud; the incoming direction is the one that it hears.
+    """Metrics that world and cloud share: session, datagrams, one-way delay, timing of the loop.
 
     Attributes:
-        check: The standing check of that direction.
+        check: Verdict on the incoming direction of the link.
     """
 
     def __init__(self, incoming: str, outgoing: str) -> None:
-        """Begin before the first session; the directions are "uplink" and "downlink"."""
+        """Start before the first session; the directions are "uplink" and "downlink"."""
         self._incoming, self._outgoing = incoming, outgoing
         others = ONLY_CLOUD if incoming == DIRECTIONS[1] else ONLY_WORLD
         self._outcomes = tuple(name for name in OUTCOMES[1:] if name not in others)
@@ -135,52 +127,52 @@ class End:
         self._busy = 0.0
         self._clock_steps = 0
         self._sessions, self._epoch, self._opened_ns = 0, 0, NEVER_NS
-        self._heard_ns = self._woke_ns = self._deadline_ns = NEVER_NS
+        self._arrival_ns = self._woke_ns = self._deadline_ns = NEVER_NS
         self._silent = True  # no telemetry or command has arrived in this session
-        # What the newest datagram used tells about the age of what this end knows.
+        # Arrival [ns] and one-way delay [s] of the newest used datagram: the age of information.
         self._newest_ns, self._newest_delay = NEVER_NS, nan
 
     def handlers(self) -> Handlers:
         """See `Part`."""
         return {
-            Arrival: self._see_arrival,
-            Counted: self._see_count,
-            Fault: self._see_fault,
-            Lateness: self._see_wake,
-            SessionOpened: self._see_session,
+            Arrival: self._on_arrival,
+            Counted: self._on_count,
+            Fault: self._on_fault,
+            Lateness: self._on_wake,
+            SessionOpened: self._on_session,
             LinkChecked: self.check.see,
         }
 
     @property
     def has_peer(self) -> bool:
-        """Whether the other end has been heard within 2 s."""
-        return self._opened_ns != NEVER_NS and self._woke_ns - self._heard_ns < SILENCE_NS
+        """Whether a new datagram of the other end has arrived within 2 s."""
+        return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
 
-    def _see_arrival(self, record: Arrival) -> None:
+    def _on_arrival(self, record: Arrival) -> None:
         stamp_ns, _, epoch, counter, delay, used = record
-        if self._stream.take(epoch, counter):  # those that are repeated anybody can send
+        if self._stream.take(epoch, counter):  # a replay is no sign of life: anybody can send it
             if not self._silent:
-                self._gap.observe((stamp_ns - self._heard_ns) * 1e-9)
-            self._heard_ns, self._silent = stamp_ns, False
+                self._gap.observe((stamp_ns - self._arrival_ns) * 1e-9)
+            self._arrival_ns, self._silent = stamp_ns, False
         if delay == delay:  # not NaN: both ends share a clock
             self._one_way.observe(delay)
         if used:
             self._newest_ns, self._newest_delay = stamp_ns, delay
 
-    def _see_count(self, record: Counted) -> None:
+    def _on_count(self, record: Counted) -> None:
         self._counts[record.name] = record.total
 
-    def _see_fault(self, record: Fault) -> None:
+    def _on_fault(self, record: Fault) -> None:
         self._clock_steps += record.code == CLOCK_SET
 
-    def _see_session(self, record: SessionOpened) -> None:
+    def _on_session(self, record: SessionOpened) -> None:
         self._sessions += 1
         self._epoch = record.epoch
-        self._opened_ns = self._heard_ns = record.stamp_ns
+        self._opened_ns = self._arrival_ns = record.stamp_ns
         self._silent = True
         self._newest_delay = nan
 
-    def _see_wake(self, record: Lateness) -> None:
+    def _on_wake(self, record: Lateness) -> None:
         stamp_ns, _, lateness, busy, slip_ns = record
         now_ns = stamp_ns + slip_ns
         if self._deadline_ns != NEVER_NS:
@@ -189,8 +181,8 @@ class End:
         self._lateness.observe(lateness)
         self._busy += busy
 
-    def _see_age(self, now_ns: int) -> None:
-        """Once per period: how old what this end knows is now [ns, own clock]."""
+    def _count_age(self, now_ns: int) -> None:
+        """Count the age of information at `now_ns` [ns, own clock], once per period."""
         delay = self._newest_delay
         if delay == delay:
             self._age.observe(delay + (now_ns - self._newest_ns) * 1e-9)
@@ -198,7 +190,7 @@ class End:
     def read(self) -> Readings:
         """See `Part`."""
         counts, stream, incoming = self._counts, self._stream, (self._incoming,)
-        received = chosen(self._outcomes, counts)
+        received = select(self._outcomes, counts)
         datagrams: dict[Labels, float] = {(*incoming, name): n for name, n in received.items()}
         datagrams[self._outgoing, "sent"] = counts.get("sent", 0)
         readings: Readings = self.check.read() | {
@@ -215,24 +207,25 @@ class End:
             "cloudrc_clock_steps_total": plain(self._clock_steps),
             "cloudrc_recorder_dropped_records_total": plain(counts.get("recorder_dropped", 0)),
         }
-        if self._one_way.cumulative()[-1]:  # a delay that nobody can know is absent, never zero
+        if self._one_way.cumulative()[-1]:  # unknown without a shared clock: absent, never zero
             readings[f"cloudrc_{self._incoming}_delay_seconds"] = self._one_way
             readings["cloudrc_age_of_information_seconds"] = self._age
         return readings
 
 
 STEP_NS = 1_000_000_000
+"""Time between two samples of the real-time factor [ns]."""
 STEPS = 10
-"""The real-time factor is that of the last 10 s, or of what there is."""
+"""Steps over which the real-time factor is computed [1]: 10 s."""
 ADMITTED = "cloud said hello"
-"""Why a session is opened for a cloud that had none; see `cloudrc.records.SessionOpened`."""
+"""Cause of a session that world opens for a newly connected cloud; see `SessionOpened`."""
 
 
 class WorldEnd(End):
-    """The robot's end."""
+    """Metrics of world: those of both ends, the robot, guard, contacts, real-time factor."""
 
     def __init__(self) -> None:
-        """Begin on the ground."""
+        """Start with the robot on the ground."""
         uplink, downlink = DIRECTIONS
         super().__init__(incoming=downlink, outgoing=uplink)
         self._truth: GroundTruth | None = None
@@ -241,7 +234,7 @@ class WorldEnd(End):
         self._contacts = dict.fromkeys(BODIES, 0)
         self._slip_ns = self._admitted = 0
         self._basis_ns, self._command_age = NEVER_NS, Histogram(DELAY_BUCKETS)
-        # Instants of world's clock and of the machine's [ns].
+        # Samples of world's clock and of the machine's clock [ns].
         self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
         self._instant_ns = NEVER_NS
 
@@ -249,44 +242,44 @@ class WorldEnd(End):
         """See `Part`."""
         return {
             **super().handlers(),
-            GroundTruth: self._see_truth,
-            TelemetrySent: self._see_telemetry,
-            CommandApplied: self._see_command,
-            GuardChange: self._see_guard,
-            Contact: self._see_contact,
+            GroundTruth: self._on_truth,
+            TelemetrySent: self._on_telemetry,
+            CommandApplied: self._on_command,
+            GuardChange: self._on_guard,
+            Contact: self._on_contact,
         }
 
     @property
     def has_peer(self) -> bool:
-        """As of any end; a cloud that has nothing to command yet is heard once, at its hello."""
+        """As for any end; but a cloud without commands yet is heard only once, at its hello."""
         return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
 
-    def _see_session(self, record: SessionOpened) -> None:
-        super()._see_session(record)
+    def _on_session(self, record: SessionOpened) -> None:
+        super()._on_session(record)
         self._admitted += record.cause == ADMITTED
 
-    def _see_truth(self, record: GroundTruth) -> None:
+    def _on_truth(self, record: GroundTruth) -> None:
         self._truth = record
 
-    def _see_command(self, record: CommandApplied) -> None:
+    def _on_command(self, record: CommandApplied) -> None:
         self._basis_ns = record.basis_stamp_ns
 
-    def _see_telemetry(self, record: TelemetrySent) -> None:
-        self._see_age(record.stamp_ns)
-        if record.telemetry.guard is GuardState.TRACK:  # nowhere else a command is in use
+    def _on_telemetry(self, record: TelemetrySent) -> None:
+        self._count_age(record.stamp_ns)
+        if record.telemetry.guard is GuardState.TRACK:  # no other state uses commands
             self._command_age.observe((record.stamp_ns - self._basis_ns) * 1e-9)
 
-    def _see_guard(self, record: GuardChange) -> None:
+    def _on_guard(self, record: GuardChange) -> None:
         if record.state != self._guard or record.state is GuardState.GROUND:
-            self._changes[GUARD_STATES[record.state]] += 1  # touch-down is told, but stays LAND
+            self._changes[GUARD_STATES[record.state]] += 1  # touch-down repeats LAND: not a change
         self._guard = record.state
 
-    def _see_contact(self, record: Contact) -> None:
+    def _on_contact(self, record: Contact) -> None:
         kind = record.body.rstrip("_0123456789")
         self._contacts[kind if kind in self._contacts else "other"] += 1
 
-    def _see_wake(self, record: Lateness) -> None:
-        super()._see_wake(record)
+    def _on_wake(self, record: Lateness) -> None:
+        super()._on_wake(record)
         now_ns = self._deadline_ns
         self._slip_ns = record.slip_ns
         if now_ns >= self._instant_ns:
@@ -301,13 +294,13 @@ class WorldEnd(End):
             "cloudrc_sessions_refused_total": plain(self._counts.get("busy", 0)),
             "cloudrc_command_age_seconds": self._command_age,
             "cloudrc_guard_state": plain(self._guard),
-            "cloudrc_guard_transitions_total": by(self._changes),
-            "cloudrc_guard_limited_total": by(
+            "cloudrc_guard_transitions_total": by_label(self._changes),
+            "cloudrc_guard_limited_total": by_label(
                 {limit: self._counts.get(f"limited_{limit}", 0) for limit in LIMITS}
             ),
             "cloudrc_guard_held_seconds_total": plain(self._counts.get("held_seconds", 0)),
             "cloudrc_guard_starts_refused_total": plain(self._counts.get("start_refused", 0)),
-            "cloudrc_contacts_total": by(self._contacts),
+            "cloudrc_contacts_total": by_label(self._contacts),
             "cloudrc_world_slip_seconds_total": plain(self._slip_ns * 1e-9),
             "cloudrc_world_stalls_total": plain(self._counts.get("stalls", 0)),
         }
@@ -328,35 +321,35 @@ class WorldEnd(End):
 
 
 GAP_MAX_NS = 50_000_000
-"""Between measurements further apart nothing is interpolated, and nothing judged [ns]."""
+"""Largest gap between two measurements over which positions are interpolated [ns]."""
 WAITING_MAX = 256
-"""Predictions that wait for their measurement; a horizon of 1 s leaves 100."""
+"""Most predictions that wait for their measurement [1]; a horizon of 1 s needs 100."""
 
 
 class PredictionJudge:
-    """Compares each position predicted for an instant with the one measured at that instant.
+    """Compare each predicted position with the position measured at the same instant.
 
     Attributes:
-        error: The newest: predicted minus measured [m], shape (3,); NaN before the first.
+        error: Newest error: predicted minus measured [m], shape (3,); NaN before the first.
         square: Sum of the squared lengths of all errors [m^2].
-        judged: Number of predictions compared.
+        judged: Number of compared predictions.
     """
 
     def __init__(self) -> None:
-        """Begin with nothing predicted."""
+        """Start without predictions."""
         self.error: Vector = (nan, nan, nan)
         self.square = 0.0
         self.judged = 0
         self.reset()
 
     def reset(self) -> None:
-        """Forget predictions and measurements: a new session begins."""
+        """Drop predictions and measurements at the start of a new session."""
         self._waiting: list[tuple[int, Vector]] = []
         self._measured_ns = NEVER_NS
         self._measured: Vector = (nan, nan, nan)
 
     def take(self, control: Control) -> None:
-        """Take a period's measurement, judge what was predicted up to it, keep its prediction."""
+        """Compare waiting predictions with a period's measurement, then store its prediction."""
         stamp_ns, waiting = control.basis_stamp_ns, self._waiting
         if stamp_ns > self._measured_ns:
             before_ns, before = self._measured_ns, self._measured
@@ -380,37 +373,37 @@ class PredictionJudge:
 
 
 class DelayJudge:
-    """Compares each delay estimate with the time that passed until its command was applied.
+    """Compare each delay estimate with the true time until its command was applied.
 
-    An echo tells when a command was applied on world's clock: the echoing odometry's stamp minus
-    the hold. Its age in cloud tells which command it was.
+    An echo gives the instant at which world applied the command, on world's clock: the stamp of the
+    echoing odometry minus the hold time. The echo's age in cloud identifies the command.
 
     Attributes:
-        error: The newest: estimate minus what really passed [s]; NaN before the first.
+        error: Newest error: estimate minus true time [s]; NaN before the first.
     """
 
     def __init__(self) -> None:
-        """Begin with nothing estimated."""
+        """Start without commands."""
         self.error = nan
         self.reset()
 
     def reset(self) -> None:
-        """Forget the commands: a new session begins."""
+        """Drop all commands at the start of a new session."""
         self._sent: dict[int, Control] = {}
         self._sent_before: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:
-        """Remember a command."""
+        """Store a command that was sent."""
         if len(self._sent) >= WAITING_MAX:
             self._sent_before, self._sent = self._sent, {}
         self._sent[control.stamp_ns] = control
 
     def echoed(self, control: Control, arrival_ns: int) -> None:
-        """Judge the command that this period's odometry echoed.
+        """Compute the error of the command that this period's odometry echoed.
 
         Args:
-            control: Of the first period after the echo.
-            arrival_ns: When that odometry arrived [ns], cloud's clock.
+            control: First control period after the echo.
+            arrival_ns: Arrival of that odometry [ns], cloud's clock.
         """
         stamp_ns = arrival_ns - round(control.loop_delay * 1e9)
         sent = self._sent.get(stamp_ns) or self._sent_before.get(stamp_ns)
@@ -420,10 +413,10 @@ class DelayJudge:
 
 
 class CloudEnd(End):
-    """The remote controller's end."""
+    """Metrics of cloud: those of both ends, delays in the loop, prediction, control."""
 
     def __init__(self) -> None:
-        """Begin with nothing measured."""
+        """Start before the first control period."""
         uplink, downlink = DIRECTIONS
         super().__init__(incoming=uplink, outgoing=downlink)
         self._rtt, self._loop = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
@@ -434,28 +427,28 @@ class CloudEnd(End):
 
     def handlers(self) -> Handlers:
         """See `Part`."""
-        return {**super().handlers(), Control: self._see_control}
+        return {**super().handlers(), Control: self._on_control}
 
-    def _see_session(self, record: SessionOpened) -> None:
-        super()._see_session(record)
+    def _on_session(self, record: SessionOpened) -> None:
+        super()._on_session(record)
         self._prediction.reset()
         self._delay.reset()
 
-    def _see_arrival(self, record: Arrival) -> None:
-        super()._see_arrival(record)
+    def _on_arrival(self, record: Arrival) -> None:
+        super()._on_arrival(record)
         if record.used:
             self._used_count += 1
 
-    def _see_control(self, record: Control) -> None:
+    def _on_control(self, record: Control) -> None:
         self._control = record
-        self._see_age(record.stamp_ns)
+        self._count_age(record.stamp_ns)
         self._prediction.take(record)
         loop_delay = record.loop_delay
         if loop_delay != self._loop_delay and loop_delay == loop_delay:  # a new echo
             self._loop_delay = loop_delay
             self._loop.observe(loop_delay)
             self._rtt.observe(record.rtt)
-            if self._used_count == 1:  # of two odometries nobody can say which one echoed
+            if self._used_count == 1:  # with two odometries, which one echoed is unknown
                 self._delay.echoed(record, self._newest_ns)
         self._used_count = 0
         self._delay.sent(record)
@@ -467,7 +460,7 @@ class CloudEnd(End):
         readings |= {
             "cloudrc_rtt_seconds": self._rtt,
             "cloudrc_loop_delay_seconds": self._loop,
-            "cloudrc_delay_estimate_error_seconds": known(self._delay.error),
+            "cloudrc_delay_estimate_error_seconds": unless_nan(self._delay.error),
             "cloudrc_prediction_error_meters": per_axis(prediction.error),
             "cloudrc_prediction_error_square_meters_total": plain(prediction.square),
             "cloudrc_predictions_judged_total": plain(prediction.judged),
@@ -479,18 +472,18 @@ class CloudEnd(End):
                 (plugin,): counts.get(f"{plugin}_failed", 0) for plugin in PLUGINS
             },
         }
-        return readings if self._control is None else readings | _of_period(self._control)
+        return readings if self._control is None else readings | _read_period(self._control)
 
 
-def _of_period(control: Control) -> Readings:
-    """What the newest period of the control loop says."""
+def _read_period(control: Control) -> Readings:
+    """Read the metrics of one control period."""
     terms = (control.proportional, control.integral, control.derivative)
     return {
-        "cloudrc_delay_estimate_seconds": known(control.horizon),
-        "cloudrc_tracking_error_meters": per_axis(_minus(control.setpoint, control.measured)),
+        "cloudrc_delay_estimate_seconds": unless_nan(control.horizon),
+        "cloudrc_tracking_error_meters": per_axis(_difference(control.setpoint, control.measured)),
         "cloudrc_setpoint_meters": per_axis(control.setpoint),
         "cloudrc_command_velocity_meters_per_second": per_axis(control.command),
-        "cloudrc_command_yaw_rate_radians_per_second": known(control.yaw_rate),
+        "cloudrc_command_yaw_rate_radians_per_second": unless_nan(control.yaw_rate),
         "cloudrc_pid_output": {
             (axis, name): term[index]
             for name, term in zip(TERMS, terms, strict=True)
@@ -499,5 +492,5 @@ def _of_period(control: Control) -> Readings:
     }
 
 
-def _minus(one: Vector, other: Vector) -> Vector:
+def _difference(one: Vector, other: Vector) -> Vector:
     return (one[0] - other[0], one[1] - other[1], one[2] - other[2])

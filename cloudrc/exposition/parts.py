@@ -1,11 +1,7 @@
-"""What the parts of a process's metrics have in common: handlers of records, readings for a scrape.
+"""Building blocks of live metrics: `Part`, a fast histogram, and loss counters of one direction.
 
-A handler runs on the loop's thread and has one microsecond: it keeps the newest record, counts, and
-leaves everything else to `read`, which runs on the thread that is scraped.
-
-A histogram that costs little: one search and two additions per value.
-
-What arrives in one direction: counters come in; expected, lost and reordered are counted.
+A handler of records runs on the loop's thread and has a budget of 1 us. So it only keeps the newest
+record and counts. `read` does all other work, on the thread that serves the scrape.
 """
 
 from __future__ import annotations
@@ -20,17 +16,17 @@ from cloudrc.messages import Vector
 
 
 class Histogram:
-    """Counts values by buckets; one thread observes, any other may read.
+    """Count values in buckets; one thread observes, any other thread may read.
 
     Attributes:
-        bounds: Upper bounds of the buckets, each included, rising.
+        bounds: Upper bounds of the buckets, inclusive, rising.
         total: Sum of all values.
     """
 
     __slots__ = ("_counts", "bounds", "total")
 
     def __init__(self, bounds: tuple[float, ...]) -> None:
-        """Begin empty."""
+        """Start without values."""
         self.bounds = bounds
         self.total = 0.0
         self._counts = [0] * (len(bounds) + 1)
@@ -41,8 +37,8 @@ class Histogram:
         self.total += value
 
     def cumulative(self) -> list[int]:
-        """How many values are at most each bound; the last is how many there are in all."""
-        counts, below = list(self._counts), 0  # copied at once: the other thread may go on
+        """Count the values up to each bound; the last entry counts all values."""
+        counts, below = list(self._counts), 0  # one atomic copy: the loop's thread may count on
         for index, count in enumerate(counts):
             below += count
             counts[index] = below
@@ -51,63 +47,63 @@ class Histogram:
 
 Handlers: TypeAlias = Mapping[type, Callable[[Any], None]]
 Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
-"""By metric: a value for each tuple of label values, or a histogram, which has no labels."""
+"""Metric name -> its value for each tuple of label values, or a histogram (without labels)."""
 
 
 class Part(Protocol):
-    """Some of the metrics of one process."""
+    """A group of metrics of one process."""
 
     def handlers(self) -> Handlers:
-        """Which records it wants to see; no two parts of a process want the same."""
+        """Map each class of records that this part uses to its handler; parts share no class."""
 
     def read(self) -> Readings:
-        """Say all that is known now; what is not known is absent."""
+        """Return the current values; unknown values are absent."""
 
 
 def plain(value: float) -> dict[Labels, float]:
-    """A metric without labels, of one `value` [base unit of the metric]."""
+    """Return a reading without labels of `value` [base unit of the metric]."""
     return {(): value}
 
 
-def known(value: float) -> dict[Labels, float]:
-    """The same; absent if `value` [base unit of the metric] is NaN."""
+def unless_nan(value: float) -> dict[Labels, float]:
+    """Return a reading without labels of `value` [base unit of the metric]; absent if NaN."""
     return {} if isnan(value) else {(): value}
 
 
 def per_axis(vector: Vector) -> dict[Labels, float]:
-    """A metric with the label axis; absent where `vector` [base unit of the metric] is NaN."""
+    """Return a reading per axis of `vector` [base unit of the metric]; NaN axes are absent."""
     values = zip(AXES, vector, strict=True)
     return {(axis,): value for axis, value in values if not isnan(value)}
 
 
-def by(counts: Mapping[str, float]) -> dict[Labels, float]:
-    """A metric with one label."""
+def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
+    """Return a reading with one label, given its values by label value."""
     return {(name,): count for name, count in counts.items()}
 
 
-def chosen(names: Iterable[str], counts: Mapping[str, float]) -> dict[str, float]:
-    """The counts of these names, 0 where nothing was counted."""
+def select(names: Iterable[str], counts: Mapping[str, float]) -> dict[str, float]:
+    """Select counts by name; a missing count is 0."""
     return {name: counts.get(name, 0) for name in names}
 
 
 WINDOW = 128
-"""So many datagrams later one that has not arrived is lost: 1.28 s at 100 Hz."""
+"""A missing datagram counts as lost after this many newer ones [1]: 1.28 s at 100 Hz."""
 _MASK = (1 << WINDOW) - 1
 _OLDEST = 1 << (WINDOW - 1)
 
 
 class Stream:
-    """The counters of one direction, epoch by epoch.
+    """Count lost and reordered datagrams of one direction from their counters, epoch by epoch.
 
     Attributes:
         lost: Datagrams that had not arrived when they left the window.
-        reordered: Datagrams that arrived after a newer one; repeated ones are none.
+        reordered: Datagrams that arrived after a newer one, without repeated ones.
     """
 
     __slots__ = ("_before", "_epoch", "_first", "_newest", "_seen", "lost", "reordered")
 
     def __init__(self) -> None:
-        """Begin before the first datagram."""
+        """Start before the first datagram."""
         self.lost = self.reordered = 0
         self._before = 0  # expected in earlier epochs
         self._epoch = self._first = self._newest = -1
@@ -115,16 +111,16 @@ class Stream:
 
     @property
     def expected(self) -> int:
-        """How many datagrams have left the window: those that are judged, arrived or lost."""
+        """Number of datagrams that have left the window: each is known to be arrived or lost."""
         return self._before + max(0, self._newest - self._first - WINDOW + 1)
 
     def take(self, epoch: int, counter: int) -> bool:
-        """Note that the datagram with this counter has arrived; True if it is sure to be new.
+        """Count the arrival of a datagram; return True if it is certainly new.
 
-        Any other may be one that was caught and sent again, which takes no key.
+        Any other may be a replay: sending a captured datagram again needs no key.
         """
         if epoch != self._epoch:
-            # What was sent before the first arrival may have been sent to nobody: not judged.
+            # Datagrams sent before the first arrival do not count: nobody may have listened yet.
             self._before = self.expected
             self._epoch, self._first, self._newest, self._seen = epoch, counter, counter, _MASK
             return True
@@ -145,7 +141,7 @@ class Stream:
         return True
 
     def _skip(self, ahead: int) -> None:
-        """Move the window; those between never arrive, or late."""
+        """Move the window by more than one datagram: those skipped are lost or late."""
         leaving = min(ahead, WINDOW)
         self.lost += leaving - (self._seen >> (WINDOW - leaving)).bit_count()
         self.lost += ahead - leaving

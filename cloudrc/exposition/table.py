@@ -1,17 +1,7 @@
-"""The table of all Prometheus metrics: name, kind, meaning, closed label sets, who exposes it.
+"""The table of all Prometheus metrics: name, type, meaning, labels, and who exposes it.
 
-Names follow Prometheus' rules: prefix `cloudrc_`, base units, counters end in `_total`. Every
-label has a closed set of values, so that one pod stays below 200 series.
-
-The closed sets that labels take their values from, and the buckets of the histograms.
-
-What one Prometheus metric is: its name, type, meaning, labels, and who exposes it.
-
-The part of the table of metrics that is the standing check of the link.
-
-The metrics of the emulated link: who shapes it, what was asked for, what became of datagrams.
-
-The metrics of missions, of the API that takes them, and of the journal that keeps them.
+Names follow the rules of Prometheus: prefix `cloudrc_`, base units, counters end in `_total`. Each
+label has a closed set of values, which keeps one pod below 200 series.
 """
 
 from __future__ import annotations
@@ -47,16 +37,18 @@ OUTCOMES = (
     "busy",
     "unanswered",
 )
-"""What becomes of a datagram; all but "sent" are told by its receiver."""
+"""What can happen to a datagram. The sender counts "sent", the receiver all others."""
 ONLY_WORLD = {"stale", "range", "future", "hello", "unanswered"}
+"""Outcomes that only world counts."""
 ONLY_CLOUD = {"accept_ignored"}
+"""Outcomes that only cloud counts."""
 LIMITS = ("speed", "yaw_rate", "fence")
-"""Of the guard."""
+"""Limits of the guard."""
 PLUGINS = ("estimator", "predictor", "controller")
 GUARD_STATES = ("ground", "track", "hold", "land", "estop")
-"""In the order of `cloudrc.messages.GuardState`."""
+"""States of the guard, in the order of `cloudrc.messages.GuardState`."""
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
-"""In the order of `cloudrc.cloud.teleop.messages.State`."""
+"""States of a mission, in the order of `cloudrc.teleop.wire.State`."""
 MISSION_OUTCOMES = (
     "done",
     "cancelled",
@@ -70,34 +62,36 @@ MISSION_OUTCOMES = (
     "other",
 )
 API_REFUSALS = ("token", "role", "busy", "slow")
-"""Why the API does not serve: no valid token, a reader's token, too many requests or connections,
-a client that dawdles."""
+"""Why the API rejects a request: no valid token; a reader's token for an operator's request; too
+many requests or connections; a client that sends too slowly."""
 ORDER_REFUSALS = ("invalid", "conflict")
-"""Why an order is not flown: a value that cannot be used, a mission in the way."""
+"""Why the API refuses an order: an invalid value; another mission is active."""
 BODIES = ("pipe", "board", "floor", "other")
-"""Kinds of bodies: `pipe_2` is a "pipe", and what else a scene may have is "other"."""
+"""Kinds of bodies: `pipe_2` is a "pipe"; a body of any other kind counts as "other"."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
-"""As `cloudrc.link.relay.Lanes.outcomes` explains them."""
+"""What can happen to a datagram at the relay; `cloudrc.link.relay.Lanes.outcomes` explains each."""
 SHAPERS = ("relay", "netem")
 LINK_MODES = ("auto", "relay", "netem")
 
 DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
+"""Upper bounds for delays and ages [s]."""
 GAP_BUCKETS = (0.05, 0.25)
-"""More than jitter makes of a period of 10 ms, and the age at which the guard holds; only two, for
-a pod has less than 200 series."""
+"""Upper bounds for gaps between arrivals [s]: more than jitter explains, and the age at which the
+guard holds. Only two, to stay below 200 series per pod."""
 PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
-"""Around the 10 ms of both loops."""
+"""Upper bounds for loop periods [s], around the 10 ms of both loops."""
 LATENESS_BUCKETS = (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1)
+"""Upper bounds for late wakes [s]."""
 RELEASE_PERCENTILES = {"50": "p50", "99": "p99", "99.9": "p999"}
-"""Label -> how `cloudrc.link.lateness` names it."""
+"""Label value -> name in the relay's `release_error_*` counts."""
 STEP_PERCENTILES = {"50": "p50", "99": "p99"}
-"""Label -> how `cloudrc.link.netem_steps` names it."""
+"""Label value -> name in netem's `step_lateness_*` counts."""
 
 Labels = tuple[str, ...]
 
 
 class Kind(Enum):
-    """What Prometheus calls the type of a metric."""
+    """Type of a metric, as Prometheus names it."""
 
     COUNTER = "counter"
     GAUGE = "gauge"
@@ -105,14 +99,14 @@ class Kind(Enum):
 
 
 class Metric(NamedTuple):
-    """One metric.
+    """One Prometheus metric.
 
     Attributes:
-        name: As it is scraped; a histogram adds `_bucket`, `_sum` and `_count`.
+        name: As scraped; a histogram adds `_bucket`, `_sum` and `_count`.
         kind: Its type.
-        meaning: One sentence or two: the HELP text.
-        roles: Which processes expose it.
-        labels: Name -> all values that it may have.
+        meaning: The HELP text, one or two sentences.
+        roles: Processes that expose it.
+        labels: Label name -> all its possible values.
         buckets: Upper bounds of a histogram, rising, in the metric's unit.
     """
 
@@ -125,127 +119,130 @@ class Metric(NamedTuple):
 
 
 def counter(name: str, meaning: str, roles: tuple[str, ...], **labels: Labels) -> Metric:
-    """What only rises."""
+    """Define a counter."""
     return Metric(name, Kind.COUNTER, meaning, roles, labels)
 
 
 def gauge(name: str, meaning: str, roles: tuple[str, ...], **labels: Labels) -> Metric:
-    """What is so now."""
+    """Define a gauge."""
     return Metric(name, Kind.GAUGE, meaning, roles, labels)
 
 
-def delay(name: str, meaning: str, roles: tuple[str, ...]) -> Metric:
-    """How often a delay was how long."""
+def delay_histogram(name: str, meaning: str, roles: tuple[str, ...]) -> Metric:
+    """Define a histogram of delays."""
     return Metric(name, Kind.HISTOGRAM, meaning, roles, buckets=DELAY_BUCKETS)
 
 
 def numbered(names: Labels) -> str:
-    """Say which number stands for which state."""
+    """List states with their numbers: "0 idle, 1 starting"."""
     return ", ".join(f"{number} {name}" for number, name in enumerate(names))
 
 
 CHECK = (
     gauge(
         "cloudrc_link_believed",
-        "1 if the direction that this end hears is proven to be what was asked for, 0 if it is"
-        " not (/link.json of the same port says why); absent while there are too few datagrams to"
-        " say.",
+        "1 if the incoming direction of the link behaves as configured, 0 if it does not"
+        " (/link.json on the same port says why); absent while there are too few datagrams to"
+        " decide.",
         ENDS,
         direction=DIRECTIONS,
     ),
 )
-"""Entries of the table."""
+"""The check of the link in flight."""
 
 
 LINKS = (
     Metric(
         "cloudrc_link_info",
         Kind.GAUGE,
-        "1; its labels say who shapes a direction of the link, and which mode was asked for.",
+        "Always 1; the labels say what shapes a direction of the link, and the configured mode.",
         (LINK,),
         {"shaper": SHAPERS, "direction": DIRECTIONS, "mode": LINK_MODES},
     ),
     gauge(
         "cloudrc_link_delay_seconds",
-        "Mean one-way delay that the profile in force asks for.",
+        "Mean one-way delay that the current link profile sets.",
         (LINK,),
         direction=DIRECTIONS,
     ),
     gauge(
         "cloudrc_link_step_lateness_seconds",
-        "How late netem's qdisc took the last 10,000 steps of its time line; absent without steps.",
+        "Lateness of the last 10,000 changes of netem's qdisc on the profile's time line; absent"
+        " without changes.",
         (LINK,),
         percentile=tuple(STEP_PERCENTILES),
     ),
     counter(
         "cloudrc_link_datagrams_total",
-        "Datagrams at the shaper by what became of them.",
+        "Datagrams at the shaper, by outcome.",
         (LINK,),
         outcome=LINK_OUTCOMES,
     ),
     counter(
         "cloudrc_link_restored_total",
-        "How often another hand had removed or changed netem's qdisc, and it was put back.",
+        "Times that another program removed or changed netem's qdisc and it was restored.",
         (LINK,),
     ),
     gauge(
         "cloudrc_link_release_error_seconds",
-        "How late datagrams left the relay in the last 10 s; absent with netem.",
+        "Lateness of datagrams that left the relay in the last 10 s; absent with netem.",
         (LINK,),
         percentile=tuple(RELEASE_PERCENTILES),
     ),
     counter(
         "cloudrc_link_released_early_total",
-        "Datagrams that left the relay before they were due: none, unless its code is wrong; absent"
+        "Datagrams that left the relay before they were due; above 0 the relay has a bug; absent"
         " with netem.",
         (LINK,),
     ),
     counter(
         "cloudrc_dns_errors_total",
-        "Times that the peer's name could not be resolved; the last address known is kept.",
+        "Failed look-ups of the peer's name; the last known address stays in use.",
         (LINK,),
     ),
 )
-"""A part of the table."""
+"""The emulated link."""
 
 
 MISSIONS = (
-    # Mission: in the process that flies it.
+    # Mission: exposed by the process that flies it.
     gauge("cloudrc_mission_state", f"State of the mission: {numbered(MISSION_STATES)}.", MISSION),
-    gauge("cloudrc_mission_waypoint", "Index of the waypoint flown to; -1 if none.", MISSION),
+    gauge("cloudrc_mission_waypoint", "Index of the next waypoint; -1 if none.", MISSION),
     counter("cloudrc_waypoints_reached_total", "Waypoints reached.", MISSION),
-    counter("cloudrc_missions_total", "Missions ended.", MISSION, outcome=MISSION_OUTCOMES),
+    counter(
+        "cloudrc_missions_total", "Missions ended, by outcome.", MISSION, outcome=MISSION_OUTCOMES
+    ),
     # Teleop: its API and its journal.
     counter("cloudrc_api_requests_total", "Requests that the API has served.", (TELEOP,)),
     counter(
         "cloudrc_api_rejected_total",
-        "Requests refused and connections cut off by the API.",
+        "Requests rejected and connections closed by the API, by reason.",
         (TELEOP,),
         reason=API_REFUSALS,
     ),
     counter(
         "cloudrc_missions_refused_total",
-        "Orders that the API refused: of what cannot be flown, or while a mission is in the way.",
+        "Mission orders that the API refused: invalid, or in conflict with another mission.",
         (TELEOP,),
         reason=ORDER_REFUSALS,
     ),
     counter(
         "cloudrc_stream_dropped_events_total",
-        "Events that were forgotten before a reader of the stream, who was too slow, had them.",
+        "Events that slow readers of the event stream missed.",
         (TELEOP,),
     ),
     counter(
         "cloudrc_audit_dropped_total",
-        "Lines of the audit log that a slow or full disk did not take.",
+        "Lines of the audit log that were dropped because the disk was slow or full.",
         (TELEOP,),
     ),
     counter(
         "cloudrc_journal_repaired_total",
-        "Times that the journal was found damaged and mended.",
+        "Times that the journal was found damaged and repaired.",
         (TELEOP,),
     ),
 )
-"""A part of the table."""
+"""Missions, the API that accepts them, and the journal that stores them."""
 
 
 _ENTRIES = (
@@ -253,8 +250,8 @@ _ENTRIES = (
     Metric(
         "cloudrc_build_info",
         Kind.GAUGE,
-        "1; its labels say which process of which version this is, and by which configuration it "
-        "runs: two ends that differ in it were told different things.",
+        "Always 1; the labels name the process, its version and its configuration. Both ends of a"
+        " run have the same configuration.",
         ROLES,
         {"version": (), "role": ROLES, "config": ()},
     ),
@@ -264,43 +261,43 @@ _ENTRIES = (
     ),
     counter(
         "cloudrc_cpu_throttled_periods_total",
-        "CFS periods in which this container was stopped by its CPU limit.",
+        "CFS periods in which the CPU limit stopped this container.",
         ROLES,
     ),
     counter(
         "cloudrc_cpu_throttled_seconds_total",
-        "Time for which this container was stopped by its CPU limit.",
+        "Time for which the CPU limit stopped this container.",
         ROLES,
     ),
     # Both ends: session and link.
-    gauge("cloudrc_session_epoch", "Number of the session under way.", ENDS),
-    counter("cloudrc_sessions_opened_total", "Sessions opened since this process began.", ENDS),
+    gauge("cloudrc_session_epoch", "Epoch number of the current session.", ENDS),
+    counter("cloudrc_sessions_opened_total", "Sessions opened since this process started.", ENDS),
     counter(
         "cloudrc_clouds_admitted_total",
-        "Clouds that were given a session: the first one, a restarted one, another one.",
+        "Cloud processes that got a session: the first, one that restarted, or another one.",
         (WORLD,),
     ),
     counter(
         "cloudrc_sessions_refused_total",
-        "Requests for a session that were refused because another cloud has authority.",
+        "Session requests refused because another cloud controls the robot.",
         (WORLD,),
     ),
     counter(
         "cloudrc_datagrams_total",
-        "Datagrams by what became of them; told once a second.",
+        "Datagrams by outcome; updated once a second.",
         ENDS,
         direction=DIRECTIONS,
         outcome=OUTCOMES,
     ),
     counter(
         "cloudrc_datagrams_expected_total",
-        "Telemetry or command datagrams judged so far: arrived, or lost on the link.",
+        "Incoming telemetry or command datagrams whose fate is known: arrived or lost.",
         ENDS,
         direction=DIRECTIONS,
     ),
     counter(
         "cloudrc_datagrams_lost_total",
-        "Those of the expected that had not arrived when 128 newer ones were sent.",
+        "Expected datagrams that had not arrived when the peer had sent 128 newer ones.",
         ENDS,
         direction=DIRECTIONS,
     ),
@@ -313,55 +310,55 @@ _ENTRIES = (
     Metric(
         "cloudrc_link_gap_seconds",
         Kind.HISTOGRAM,
-        "Time from one telemetry (at cloud) or command (at world) to the next that arrived.",
+        "Time between two arrivals: of telemetry at cloud, of commands at world.",
         ENDS,
         buckets=GAP_BUCKETS,
     ),
-    delay(
+    delay_histogram(
         "cloudrc_uplink_delay_seconds",
         "One-way delay from world to cloud, late datagrams included; absent unless both ends"
         " prove that they share a clock.",
         (CLOUD,),
     ),
-    delay(
+    delay_histogram(
         "cloudrc_downlink_delay_seconds",
         "One-way delay from cloud to world, late datagrams included; absent unless both ends"
         " prove that they share a clock.",
         (WORLD,),
     ),
     *CHECK,
-    delay(
+    delay_histogram(
         "cloudrc_age_of_information_seconds",
-        "Now minus the stamp of the newest datagram used, in every period: of odometry in cloud,"
-        " of commands in world; absent unless both ends prove that they share a clock.",
+        "Age of the newest datagram used, sampled every period: odometry in cloud, commands in"
+        " world; absent unless both ends prove that they share a clock.",
         ENDS,
     ),
     # Cloud: delays as the loop sees them.
-    delay(
+    delay_histogram(
         "cloudrc_rtt_seconds",
-        "Round trip of applied commands, the hold in world excluded; one sample per new echo.",
+        "Round trip of applied commands, without the hold time in world; one sample per echo.",
         (CLOUD,),
     ),
-    delay(
+    delay_histogram(
         "cloudrc_loop_delay_seconds",
-        "From a command's stamp to its echo, the hold in world included: the paper's tau.",
+        "Time from a command's stamp to its echo, with the hold time in world: the paper's tau.",
         (CLOUD,),
     ),
     gauge(
         "cloudrc_delay_estimate_seconds",
-        "By how much the newest odometry is moved ahead: the delay estimate, clamped.",
+        "Delay estimate, clamped: the horizon over which the newest odometry is predicted.",
         (CLOUD,),
     ),
     gauge(
         "cloudrc_delay_estimate_error_seconds",
-        "Delay estimate minus the time that really passed from odometry to the application of"
-        " the command; of the newest command echoed.",
+        "Delay estimate minus the true time from the odometry to the application of the command,"
+        " for the newest echoed command.",
         (CLOUD,),
     ),
     # Cloud: prediction and control.
     gauge(
         "cloudrc_prediction_error_meters",
-        "Position predicted for an instant minus the one measured at that instant; the newest.",
+        "Newest prediction error: predicted minus measured position at the same instant.",
         (CLOUD,),
         axis=AXES,
     ),
@@ -381,7 +378,7 @@ _ENTRIES = (
         (CLOUD,),
         axis=AXES,
     ),
-    gauge("cloudrc_setpoint_meters", "Setpoint of the position.", (CLOUD,), axis=AXES),
+    gauge("cloudrc_setpoint_meters", "Position setpoint, world frame.", (CLOUD,), axis=AXES),
     gauge(
         "cloudrc_pid_output",
         "Terms of the controller's output [m/s], in the newest period.",
@@ -391,16 +388,24 @@ _ENTRIES = (
     ),
     gauge(
         "cloudrc_command_velocity_meters_per_second",
-        "Velocity commanded, world frame.",
+        "Commanded velocity, world frame.",
         (CLOUD,),
         axis=AXES,
     ),
-    gauge("cloudrc_command_yaw_rate_radians_per_second", "Yaw rate commanded.", (CLOUD,)),
-    counter("cloudrc_horizon_clamped_total", "Delay estimates above 1 s or below 0.", (CLOUD,)),
-    counter("cloudrc_commands_frozen_total", "Commands to stand still: no echo comes.", (CLOUD,)),
+    gauge("cloudrc_command_yaw_rate_radians_per_second", "Commanded yaw rate.", (CLOUD,)),
+    counter(
+        "cloudrc_horizon_clamped_total",
+        "Delay estimates above 1 s or below 0, which were clamped.",
+        (CLOUD,),
+    ),
+    counter(
+        "cloudrc_commands_frozen_total",
+        "Zero-velocity commands sent because no echo arrives.",
+        (CLOUD,),
+    ),
     counter(
         "cloudrc_plugin_failures_total",
-        "Calls of a plug-in that raised or gave something not finite.",
+        "Plug-in calls that raised an exception or returned a value that is not finite.",
         (CLOUD,),
         plugin=PLUGINS,
     ),
@@ -409,78 +414,83 @@ _ENTRIES = (
         "cloudrc_position_meters", "True position of the base, world frame.", (WORLD,), axis=AXES
     ),
     gauge("cloudrc_tip_force_newtons", "Force on the touch sensor at the arm's tip.", (WORLD,)),
-    delay(
+    delay_histogram(
         "cloudrc_command_age_seconds",
-        "Age of the command that is flown, in every period of TRACK: since the odometry it was"
-        " computed from, by world's own clock, as the guard judges it.",
+        "Age of the current command, sampled every period in TRACK: time since the odometry that"
+        " it was computed from, on world's clock, as the guard sees it.",
         (WORLD,),
     ),
     gauge("cloudrc_guard_state", f"State of the guard: {numbered(GUARD_STATES)}.", (WORLD,)),
     counter(
         "cloudrc_guard_transitions_total",
-        "Changes of the guard into a state.",
+        "Changes of the guard's state, by new state.",
         (WORLD,),
         state=GUARD_STATES,
     ),
     counter(
         "cloudrc_guard_limited_total",
-        "Commands (ticks: fence) that a limit of the guard changed.",
+        "Commands that a limit of the guard changed; for the fence, ticks instead of commands.",
         (WORLD,),
         limit=LIMITS,
     ),
     counter(
         "cloudrc_guard_held_seconds_total",
-        "Time in HOLD while a mission was on; told once a second.",
+        "Time in HOLD during missions; updated once a second.",
         (WORLD,),
     ),
     counter(
         "cloudrc_guard_starts_refused_total",
-        "Starts refused in LAND or ESTOP, or for want of an epoch.",
+        "Mission starts refused: in LAND or ESTOP, or because no new epoch was available.",
         (WORLD,),
     ),
     counter(
         "cloudrc_contacts_total",
-        "Times that the robot began to touch a body of the scene, by its kind.",
+        "Times that the robot came into contact with a body of the scene, by kind of body.",
         (WORLD,),
         body=BODIES,
     ),
     gauge(
         "cloudrc_real_time_factor",
-        "Simulated by machine time over the last 10 s; below 0.95 a run is invalid.",
+        "Simulated time divided by machine time over the last 10 s; below 0.95 a run is invalid.",
         (WORLD,),
     ),
     counter(
         "cloudrc_world_slip_seconds_total",
-        "By how much world's clock has fallen behind its machine's.",
+        "Time by which world's clock has fallen behind the machine's clock.",
         (WORLD,),
     ),
     counter(
         "cloudrc_world_stalls_total",
-        "Wakes after which what waited in the socket was stale.",
+        "Wakes so late that the datagrams waiting in the socket were stale.",
         (WORLD,),
     ),
     # Both ends: the process.
     Metric(
         "cloudrc_loop_period_seconds",
         Kind.HISTOGRAM,
-        "Time between two deadlines handled.",
+        "Time between two handled deadlines.",
         ENDS,
         buckets=PERIOD_BUCKETS,
     ),
     Metric(
         "cloudrc_loop_lateness_seconds",
         Kind.HISTOGRAM,
-        "How long after its deadline the loop woke.",
+        "Delay from a deadline to the wake of the loop.",
         ENDS,
         buckets=LATENESS_BUCKETS,
     ),
-    counter("cloudrc_loop_busy_seconds_total", "Time spent in handling deadlines.", ENDS),
+    counter("cloudrc_loop_busy_seconds_total", "Time spent handling deadlines.", ENDS),
     counter(
         "cloudrc_words_dropped_total",
-        "Words of teleop for another session, or without a number left, which are not passed on.",
+        "Teleop messages dropped because they were for another session or no request number was"
+        " left.",
         (CLOUD,),
     ),
-    counter("cloudrc_loop_missed_periods_total", "Commands skipped by a late loop.", (CLOUD,)),
+    counter(
+        "cloudrc_loop_missed_periods_total",
+        "Commands that a late loop skipped.",
+        (CLOUD,),
+    ),
     counter(
         "cloudrc_recorder_dropped_records_total",
         "Records that did not reach the recording.",
@@ -488,14 +498,14 @@ _ENTRIES = (
     ),
     gauge(
         "cloudrc_recorder_sync_age_seconds",
-        "What a power cut would take of the recording: the time since the newest sync that is done"
-        " began; absent without a recording, rising for good once it was given up.",
+        "Time since the start of the newest completed sync of the recording: the part that a power"
+        " cut would lose; absent without a recording, rising forever after recording failed.",
         ENDS,
     ),
     counter(
         "cloudrc_clock_steps_total",
-        "Times that the wall clock was found to have been set, each told with its size as a fault;"
-        " nothing that flies looks at it.",
+        "Times that the wall clock was set, each recorded as a fault with its size; flight does not"
+        " depend on the wall clock.",
         ENDS,
     ),
     *MISSIONS,
@@ -507,5 +517,5 @@ METRICS: Mapping[str, Metric] = MappingProxyType({metric.name: metric for metric
 
 
 def of_role(role: str) -> list[Metric]:
-    """List the metrics that a process of this role exposes."""
+    """List the metrics that processes of a role expose."""
     return [metric for metric in _ENTRIES if role in metric.roles]

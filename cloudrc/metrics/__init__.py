@@ -1,14 +1,14 @@
-"""Metrics: a recorded flight becomes one number with a unit.
+"""Compute metrics of a recorded flight: each is one number with a unit.
 
-A metric that ships is a row of the table METRICS in `flight`, `control`, `link` or `mission`: name,
-unit, meaning, and the function that computes it. A metric of your own is one Python file with
+A shipped metric is a row of the table METRICS in `flight`, `control`, `link` or `mission`: name,
+unit, meaning, and the function that computes it. Your own metric is one Python file with
 
-- a docstring, whose first line says in one sentence what the number is: the report prints it;
+- a docstring; its first line says in one sentence what the number means: the report prints it;
 - `UNIT`, an SI unit as text: "s", "m", "m/s", "N", or "1" for counts and shares;
-- `measure(flight: Flight) -> float | None`, which returns None if the number cannot be known.
+- `measure(flight: Flight) -> float | None`, which returns None if the number is unknown.
 
-Name the file in an experiment (`report.metrics`), or name its module in the entry-point group
-`cloudrc.metrics` of a package: installed metrics are in every report.
+Name the file in an experiment (`report.metrics`), or list its module in the entry-point group
+`cloudrc.metrics` of a package: every report measures installed metrics.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from pathlib import Path
 
 from cloudrc import plugins
 from cloudrc.errors import BadInputError
-from cloudrc.metrics import control, link, mission
-from cloudrc.metrics import flight as motion
+from cloudrc.metrics import control, flight, link, mission
 from cloudrc.metrics.flight import Flight, Metric
 
 __all__ = [
@@ -40,12 +39,12 @@ __all__ = [
 
 
 METRIC_NOTE = "metric "
-"""How a note on a metric begins."""
+"""Prefix of a note on a metric."""
 SHIPPED = {
     metric.name: metric
-    for metric in (*motion.METRICS, *control.METRICS, *link.METRICS, *mission.METRICS)
+    for metric in (*flight.METRICS, *control.METRICS, *link.METRICS, *mission.METRICS)
 }
-"""Metrics that ship, by name."""
+"""Shipped metrics by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +52,9 @@ class Number:
     """One measured number.
 
     Attributes:
-        value: Finite, in `unit`.
-        unit: SI, as text; "1" for counts and shares.
-        meaning: One sentence.
+        value: Finite value in `unit`.
+        unit: SI unit as text; "1" for counts and shares.
+        meaning: What it means, one sentence.
     """
 
     value: float
@@ -67,10 +66,10 @@ def find(choice: str) -> Metric:
     """Find a metric.
 
     Args:
-        choice: Name of a shipped or installed metric, or path of a Python file, which is run.
+        choice: Name of a shipped or installed metric, or path of a Python file, which is executed.
 
     Raises:
-        BadInputError: If there is none, or what is there is no metric.
+        BadInputError: If it does not exist, or is not a metric.
     """
     if choice in SHIPPED:
         return SHIPPED[choice]
@@ -90,18 +89,18 @@ def find(choice: str) -> Metric:
 
 
 def name_of(choice: str) -> str:
-    """Give the name of a metric in report.json: a file's name without `.py`, or its own."""
+    """Return the name of a metric in report.json: for a file, its name without `.py`."""
     return Path(choice).stem if plugins.is_path(choice) else choice
 
 
 def check(own: Iterable[str]) -> None:
-    """Refuse metrics that cannot be used, before a flight is spent on them.
+    """Check the user's metrics before the flight.
 
     Args:
         own: Names or paths, as for `find`.
 
     Raises:
-        BadInputError: For the first one that is wrong, or if two have the same name.
+        BadInputError: For the first invalid metric, or if two have the same name.
     """
     found: dict[str, str] = {}
     for choice in own:
@@ -111,26 +110,26 @@ def check(own: Iterable[str]) -> None:
         found[name] = choice
 
 
-def not_measured(asked: Iterable[str], own: Iterable[str]) -> list[str]:
-    """Write a note for each file that an experiment asks for and that is not in `own`."""
+def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
+    """Write a note for each metric file that an experiment names but `own` does not."""
     names = set(map(name_of, own))
     return [
         f"{METRIC_NOTE}{name_of(choice)} is not measured: name its file with --metric"
-        for choice in asked
+        for choice in named
         if plugins.is_path(choice) and name_of(choice) not in names
     ]
 
 
 def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Number], list[str]]:
-    """Measure everything that there is a metric for.
+    """Measure all shipped and installed metrics, and the user's own.
 
     Args:
         flight: A recorded flight.
-        own: More metrics than the shipped and installed ones, as for `find`.
+        own: The user's own metrics, as for `find`.
 
     Returns:
-        Number by name, sorted, without those that cannot be known; and a note for each metric that
-        failed. A user's metric may raise: this costs its own number, never the report.
+        Numbers by name, sorted, without unknown ones; and a note for each metric that failed. An
+        exception in a user's metric costs its own number, never the report.
     """
     numbers: dict[str, Number] = {}
     notes: list[str] = []

@@ -1,4 +1,4 @@
-"""Metrics of the control loop: estimates, predictions, tracking, round trips, and real time."""
+"""Metrics of the control loop: estimation, prediction, tracking, round trips, and real time."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from cloudrc.metrics.flight import Array, Flight, Metric, mean, percentile, rms
 
 
 def round_trips(flight: Flight) -> dict[str, Array]:
-    """Take the control periods in which a new echo had come in.
+    """Select the control periods with a new echo.
 
-    A period without an echo repeats the values of the period before. To count it would give the
-    most weight to a silent downlink, whose last echo is repeated for seconds.
+    A period without a new echo repeats the previous values. Counting it would give too much weight
+    to a silent downlink, whose last echo is repeated for seconds.
     """
     control = flight.control
     pair = np.stack([control["rtt"], control["loop_delay"]], axis=1)
@@ -23,10 +23,10 @@ def round_trips(flight: Flight) -> dict[str, Array]:
 
 
 def _rtt_mean(flight: Flight) -> float | None:
-    """Average over the echoes.
+    """Average over all echoes.
 
-    It describes the commands that were applied. With newest-wins these are the quick ones, so it
-    reads lower than the link profile; the one-way delays judge the link itself.
+    Only applied commands have an echo. If the newest command wins, these are the fast ones, so the
+    mean lies below the link profile. Use the one-way delays to judge the link itself.
     """
     return mean(round_trips(flight)["rtt"])
 
@@ -40,9 +40,9 @@ def _loop_delay_mean(flight: Flight) -> float | None:
 
 
 def _age_of_information_mean(flight: Flight) -> float | None:
-    """Average now minus the odometry's stamp over all control periods.
+    """Average the age of the odometry over all control periods.
 
-    It is known only if both ends prove that they share a clock, which the one-way delays show.
+    None unless both ends prove that they share a clock; only then are one-way delays recorded.
     """
     if not np.isfinite(flight.during("/uplink_delay")["delay"]).any():
         return None
@@ -56,10 +56,10 @@ def _commands_applied(flight: Flight) -> float | None:
 
 
 def _prediction_error_rms(flight: Flight) -> float | None:
-    """Compare the predicted with the true position, over all commands applied.
+    """Compare the predicted with the true position at the application of each command.
 
-    It judges the predictor and the delay estimate together: a command acts at the instant of its
-    application, whatever instant it was computed for.
+    The error includes that of the predictor and that of the delay estimate: a command acts when it
+    is applied, even if it was computed for another instant.
 
     Source: docs/reference/control.md, "Predictors".
     """
@@ -70,29 +70,29 @@ def _prediction_error_rms(flight: Flight) -> float | None:
 def _estimate_error_rms(flight: Flight) -> float | None:
     """Compare the estimated with the true position, over all control periods.
 
-    It judges the predictor alone: the instant meant is the odometry's stamp plus the horizon,
-    right or wrong.
+    The error is that of the predictor alone: both positions are at the odometry's stamp plus the
+    horizon, even if the horizon is wrong.
     """
     control = flight.control
-    meant_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
-    return rms(control["position"] - flight.true_position(meant_ns))
+    target_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
+    return rms(control["position"] - flight.true_position(target_ns))
 
 
 def _delay_estimate_error_rms(flight: Flight) -> float | None:
-    """Compare the horizon with the time that passed, over all commands applied.
+    """Compare the horizon with the true delay, over all applied commands.
 
-    That time runs from the measurement to the first tick of the low-level controller that uses
-    the command, all on world's clock.
+    The true delay is the time from the odometry to the first tick of the low-level controller that
+    uses the command, on world's clock.
     """
     applied = flight.applied
     return rms(applied.horizon - (applied.stamp_ns - applied.basis_stamp_ns) * 1e-9)
 
 
 def _tracking_rms(flight: Flight, column: str) -> float | None:
-    """Compare the setpoint with a position of cloud, over all control periods.
+    """Compare the setpoint with a position that cloud knows, over all control periods.
 
-    The distance to the next waypoint dominates it; it says nothing about how accurate the estimate
-    is: for that read estimate_error_rms.
+    The distance to the next waypoint dominates this number. For the accuracy of the estimate use
+    estimate_error_rms.
 
     Source: the paper, error figure.
     """
@@ -100,10 +100,10 @@ def _tracking_rms(flight: Flight, column: str) -> float | None:
 
 
 def wakes(flight: Flight, end: str) -> dict[str, Array]:
-    """Take the rows of /lateness that one end recorded during the flight.
+    """Select the rows of /lateness that one end recorded during the flight.
 
     Args:
-        flight: Of any mode; a recording of virtual time has no such rows.
+        flight: A flight of any mode; in virtual time there are no such rows.
         end: "world" or "cloud".
     """
     columns = flight.during("/lateness")
@@ -116,7 +116,7 @@ def _lateness_p99(flight: Flight, end: str) -> float | None:
 
 
 def _world_slip(flight: Flight) -> float | None:
-    """Subtract the slip at the start from the slip at the end."""
+    """Subtract the slip at the start of the flight from the slip at its end."""
     slips = wakes(flight, "world")["slip_ns"]
     return float(slips[-1] - slips[0]) * 1e-9 if len(slips) else None
 
@@ -124,7 +124,7 @@ def _world_slip(flight: Flight) -> float | None:
 def _real_time_factor(flight: Flight) -> float | None:
     """Divide simulated time by simulated time plus slip.
 
-    It has to be 1. Below 1 the simulated robot was slower than the network that it was flown over.
+    It must be close to 1. Below 1 the simulated robot was slower than the network.
     """
     slipped = _world_slip(flight)
     if slipped is None or not flight.end_ns:
@@ -134,7 +134,7 @@ def _real_time_factor(flight: Flight) -> float | None:
 
 
 def _missed_periods(flight: Flight) -> float | None:
-    """Take the last count of cloud; None in virtual time, in which nothing takes time."""
+    """Return the last count of cloud; None in virtual time."""
     if not len(flight.recording["/lateness"]):
         return None
     count = flight.recording["/count"]
@@ -146,68 +146,70 @@ METRICS = (
     Metric(
         "rtt_mean",
         "s",
-        "Round trip from command to echo, the time that world held the command excluded: mean.",
+        "Mean round trip from command to echo, without the hold time in world.",
         _rtt_mean,
     ),
     Metric(
-        "rtt_p95", "s", "Round trip from command to echo, hold excluded: 95th percentile.", _rtt_p95
+        "rtt_p95",
+        "s",
+        "Round trip from command to echo, without the hold time in world: 95th percentile.",
+        _rtt_p95,
     ),
     Metric(
         "loop_delay_mean",
         "s",
-        "Round trip from command to echo, hold included: mean of the paper's tau_n.",
+        "Mean round trip from command to echo, with the hold time in world: the paper's tau_n.",
         _loop_delay_mean,
     ),
     Metric(
         "age_of_information_mean",
         "s",
-        "Age of the newest odometry that cloud has when it computes a command: mean.",
+        "Mean age of cloud's newest odometry when it computes a command.",
         _age_of_information_mean,
     ),
     Metric(
         "commands_applied",
         "1",
-        "How many commands reached the low-level controller.",
+        "Number of commands that reached the low-level controller.",
         _commands_applied,
     ),
     Metric(
         "prediction_error_rms",
         "m",
-        "Distance between where cloud expected the robot and where it was when the command was "
-        "applied.",
+        "RMS distance between cloud's predicted position and the true position when the command "
+        "was applied.",
         _prediction_error_rms,
     ),
     Metric(
         "estimate_error_rms",
         "m",
-        "Distance between cloud's estimate and the true position at the instant that it is meant "
-        "for.",
+        "RMS distance between cloud's predicted position and the true position at the instant for "
+        "which cloud predicted it.",
         _estimate_error_rms,
     ),
     Metric(
         "delay_estimate_error_rms",
         "s",
-        "Difference between the horizon and the time that really passed until the command was "
-        "applied.",
+        "RMS difference between the horizon and the true delay from odometry to applied command.",
         _delay_estimate_error_rms,
     ),
     Metric(
         "tracking_rms_measured",
         "m",
-        "Distance between the setpoint and the measurement that cloud used: RMS.",
+        "RMS distance between the setpoint and the measured position that cloud used.",
         partial(_tracking_rms, column="measured"),
     ),
     Metric(
         "tracking_rms_estimated",
         "m",
-        "Distance between the setpoint and cloud's own estimate: RMS.",
+        "RMS distance between the setpoint and cloud's estimated position.",
         partial(_tracking_rms, column="position"),
     ),
     *(
         Metric(
             f"{end}_lateness_p99",
             "s",
-            f"How late {end}'s process woke up for its deadlines: 99th percentile; real time only.",
+            f"Lateness of {end}'s wakes: 99th percentile; real time only.",
             partial(_lateness_p99, end=end),
         )
         for end in ("world", "cloud")
@@ -215,19 +217,19 @@ METRICS = (
     Metric(
         "world_slip",
         "s",
-        "How much time world's clock lost against its machine's because the simulation was late.",
+        "Time that world's clock lost against the machine's clock because the simulation was late.",
         _world_slip,
     ),
     Metric(
         "real_time_factor",
         "1",
-        "Time that passed in the simulation by time that passed on the machine; real time only.",
+        "Simulated time divided by time on the machine's clock; real time only.",
         _real_time_factor,
     ),
     Metric(
         "missed_periods",
         "1",
-        "How many periods of 10 ms cloud let pass without a command, being busy; real time only.",
+        "Number of 10 ms periods without a command because cloud was late; real time only.",
         _missed_periods,
     ),
 )

@@ -1,8 +1,7 @@
-"""The flight as metrics see it: a recording cut to its mission; and metrics of the robot's motion.
+"""Define `Flight`, a recording cut to its mission, and the metrics of the robot's motion.
 
-All stamps are on world's clock. Time zero is the instant at which the guard first lets commands
-through (TRACK): only from there on does the robot move. The flight ends with the mission's last
-event, or with the recording if there is none.
+All stamps are on world's clock. Time zero is the guard's first change to TRACK: before it the robot
+does not move. The flight ends with the event that ends the mission, else with the recording.
 """
 
 from __future__ import annotations
@@ -31,20 +30,20 @@ CONTROL_TOPICS = (
     "/delay_estimate",
     "/pid",
 )
-"""Topics of one period of the control loop."""
+"""Topics that together record the periods of the control loop."""
 UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
-"""Events of a mission that continues; every other event ends it."""
+"""Events after which a mission continues; every other event ends it."""
 
 
 @dataclass(frozen=True, slots=True)
 class AppliedCommands:
-    """Commands that reached the low-level controller, joined with what cloud knew; n rows.
+    """Commands that the low-level controller applied, joined with their control periods; n rows.
 
     Attributes:
         stamp_ns: Instant of application [ns], world's clock, shape (n,).
-        basis_stamp_ns: Stamp of the odometry it was computed from [ns], world's clock, shape (n,).
+        basis_stamp_ns: Stamp of the odometry behind the command [ns], world's clock, shape (n,).
         horizon: Time from that odometry to the instant that cloud predicted [s], shape (n,).
-        predicted: Position that cloud expected [m], shape (n, 3).
+        predicted: Position that cloud predicted [m], shape (n, 3).
     """
 
     stamp_ns: Array
@@ -55,11 +54,11 @@ class AppliedCommands:
 
 @dataclass(frozen=True)
 class Flight:
-    """A recording and what is needed to judge it.
+    """A recorded flight, its criteria and its scene.
 
     Attributes:
-        recording: All topics, cloud's shifted to world's clock.
-        criteria: What makes a flight a success.
+        recording: All topics; cloud's stamps are shifted to world's clock.
+        criteria: Criteria of success.
         waypoints: Number of waypoints of the mission.
         scene: Pipes and board.
     """
@@ -78,7 +77,7 @@ class Flight:
 
     @cached_property
     def end_ns(self) -> int | None:
-        """The mission's last event, or the last true state [ns]; None if the robot never flew."""
+        """Event that ended the mission, else last true state [ns]; None if the robot never flew."""
         if self.start_ns is None:
             return None
         if self.ending is not None:
@@ -88,7 +87,7 @@ class Flight:
 
     @cached_property
     def ending(self) -> tuple[int, str, str] | None:
-        """Stamp [ns], event and text of the event that ended the mission; None if none did."""
+        """Stamp [ns], name and text of the event that ended the mission; None without one."""
         mission = self.recording["/mission"]
         rows = zip(mission["stamp_ns"], mission["event"], mission["text"], strict=True)
         for stamp, event, text in rows:
@@ -97,11 +96,11 @@ class Flight:
         return None
 
     def seconds(self, stamp_ns: Any) -> Any:
-        """Convert stamps on world's clock [ns] to the time since the start [s]."""
+        """Convert stamps on world's clock [ns] to time since the start [s]."""
         return (stamp_ns - (self.start_ns or 0)) * 1e-9
 
     def during(self, topic: str) -> dict[str, Array]:
-        """Take the rows of a topic from the start to the end of the flight, both included."""
+        """Select the rows of a topic from the start to the end of the flight, both included."""
         return _within(_columns(self.recording[topic]), self.start_ns, self.end_ns)
 
     def true_position(self, stamp_ns: Array) -> Array:
@@ -117,7 +116,7 @@ class Flight:
         stamps, positions = truth["stamp_ns"], truth["position"]
         if len(stamps) == 0:
             return np.full((len(stamp_ns), 3), np.nan)
-        # Differences to the first stamp are exact in float64; the stamps themselves need not be.
+        # Differences to the first stamp are exact in float64; the stamps themselves may not be.
         at, known = (stamp_ns - stamps[0]).astype(float), (stamps - stamps[0]).astype(float)
         axes = [np.interp(at, known, positions[:, i], np.nan, np.nan) for i in range(3)]
         return np.stack(axes, axis=1)
@@ -135,7 +134,7 @@ class Flight:
     @cached_property
     def _control(self) -> dict[str, Array]:
         tables = [_columns(self.recording[topic]) for topic in CONTROL_TOPICS]
-        # A torn recording may end with a period of which some topics are missing.
+        # In the last period of a torn recording some topics may be missing.
         stamps = reduce(np.intersect1d, [table["stamp_ns"] for table in tables])
         columns: dict[str, Array] = {}
         for table in tables:
@@ -159,7 +158,7 @@ class Flight:
 
     @cached_property
     def pipes_flown(self) -> int:
-        """Number of different pipes that the base was inside of."""
+        """Number of different pipes that the base was in."""
         if not len(self.truth["stamp_ns"]):
             return 0
         indices = np.unique(pipe_index(self.scene, self.truth["position"]))
@@ -189,7 +188,7 @@ def _columns(table: Table) -> dict[str, Array]:
 
 
 def _within(columns: Columns, start_ns: int | None, end_ns: int | None) -> dict[str, Array]:
-    """Take the rows from `start_ns` to `end_ns`, both included; none if there is no start."""
+    """Select the rows from `start_ns` to `end_ns`, both included; none without a start."""
     stamps = columns["stamp_ns"]
     if start_ns is None or end_ns is None:
         rows = np.zeros(len(stamps), dtype=bool)
@@ -216,30 +215,30 @@ class Metric:
 
 
 def mean(values: Array) -> float | None:
-    """Average the finite ones of `values`, shape (n,), any unit; None if there are none."""
+    """Average the finite `values`, shape (n,), any unit; None if there are none."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
 
 
 def percentile(values: Array, percent: float) -> float | None:
-    """Take a percentile; None if nothing is finite.
+    """Compute a percentile; None if no value is finite.
 
     Args:
-        values: Shape (n,), any unit; those that are not finite do not count.
-        percent: Share of them that lies below [%].
+        values: Shape (n,), any unit; only finite values count.
+        percent: Share of the values below the result [%].
     """
     finite = values[np.isfinite(values)]
     return float(np.percentile(finite, percent)) if len(finite) else None
 
 
 def rms(errors: Array) -> float | None:
-    """Take the root of the mean square of the lengths of error vectors.
+    """Compute the RMS length of error vectors.
 
     Args:
-        errors: Shape (n,) or (n, 3), any unit; rows that are not finite do not count.
+        errors: Shape (n,) or (n, 3), any unit; only finite rows count.
 
     Returns:
-        In the unit of `errors`; None if no row counts.
+        RMS in the unit of `errors`; None if no row is finite.
     """
     squares = np.square(errors) if errors.ndim == 1 else np.square(errors).sum(axis=1)
     square = mean(squares)
@@ -261,32 +260,32 @@ def _speed_max(flight: Flight) -> float | None:
 
 
 def _min_clearance(flight: Flight) -> float | None:
-    """Take the minimum over the samples inside a pipe; negative if a wall was penetrated."""
+    """Compute the minimum over the samples inside a pipe; negative if a wall was penetrated."""
     inside = flight.clearance[flight.inside]
     return float(inside.min()) if len(inside) else None
 
 
 def _min_clearance_flight(flight: Flight) -> float | None:
-    """Take the minimum over all samples. The board does not count: it is there to be touched."""
+    """Compute the minimum over all samples; the board does not count, as the arm must touch it."""
     return float(flight.clearance.min()) if len(flight.clearance) else None
 
 
 METRICS = (
     Metric("duration", "s", "Time from the start of the mission to its end.", _duration),
     Metric(
-        "distance_flown", "m", "Length of the way that the robot's base has flown.", _distance_flown
+        "distance_flown", "m", "Length of the path that the robot's base flew.", _distance_flown
     ),
     Metric("speed_max", "m/s", "Largest true speed of the robot's base.", _speed_max),
     Metric(
         "min_clearance",
         "m",
-        "Smallest distance between the robot and a pipe's wall while its base is inside a pipe.",
+        "Smallest distance between the robot and a pipe's wall while the base is inside a pipe.",
         _min_clearance,
     ),
     Metric(
         "min_clearance_flight",
         "m",
-        "Smallest distance between the robot and a pipe, inside or outside, from start to end.",
+        "Smallest distance between the robot and a pipe during the whole flight.",
         _min_clearance_flight,
     ),
 )

@@ -1,7 +1,6 @@
-"""Metrics of the link, each for both directions: delay, loss, lateness, and the relay's own counts.
+"""Metrics of each direction of the link: delay, loss, late datagrams, and the relay's own counts.
 
-All datagrams that arrive judge the link, the late ones included: those that the loop uses are a
-selection of the quick ones.
+They include late datagrams: the datagrams that the loop uses are only the fast ones.
 """
 
 from __future__ import annotations
@@ -14,22 +13,24 @@ import numpy as np
 from cloudrc.metrics.flight import Flight, Metric, mean
 
 WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
-"""Direction -> its words in the meaning of a metric."""
+"""Direction -> its description in the meaning of a metric."""
 SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
 """Direction -> topic with one row per datagram sent that way."""
 SETTLING_NS = 2_000_000_000
-"""Time after which a datagram counts as lost [ns]."""
+"""Time after which a datagram that has not arrived counts as lost [ns]."""
 PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
+"""Name of a percentile -> its description."""
 RELAY_COUNTS = {
-    "relay_overflow": "that the relay had no room for.",
-    # These left later than the release errors say.
-    "relay_stalled": "that waited 50 ms or more for the relay to look at them.",
-    "released_early": "that left before they were due: none, unless the code is wrong.",
+    "relay_overflow": "that the relay dropped because its queue was full.",
+    # The release errors do not include this time.
+    "relay_stalled": "that waited 50 ms or more until the relay read them.",
+    "released_early": "that left before they were due; above 0 the relay has a bug.",
 }
+"""Metric of the relay's counts -> end of its meaning."""
 
 
 def _delay_mean(flight: Flight, way: str) -> float | None:
-    """Average; None if the two ends could not prove that they share a clock."""
+    """Average the delay; None if the two ends could not prove that they share a clock."""
     return mean(flight.during(f"/{way}_delay")["delay"])
 
 
@@ -41,8 +42,8 @@ def _late(flight: Flight, way: str) -> float | None:
 def loss(flight: Flight, way: str) -> float | None:
     """Compute the share of the datagrams sent during the flight that never arrived [1].
 
-    Datagrams are joined by epoch and counter. Those of the recording's last seconds may still be
-    on their way and do not count.
+    Datagrams are joined by epoch and counter. Those of the last seconds of the recording may still
+    arrive and do not count.
     """
     sent, arrivals = flight.during(SENT[way]), flight.recording[f"/{way}_delay"]
     world = flight.recording["/telemetry"]["stamp_ns"]
@@ -55,25 +56,25 @@ def loss(flight: Flight, way: str) -> float | None:
 
 
 def _relay_count(flight: Flight, name: str, scale: float = 1.0) -> float | None:
-    """Take the relay's last total of a count since it began; None if no relay shaped the link."""
+    """Return the relay's last total of a count; None if no relay shaped the link."""
     count = flight.recording["/count"]
     rows = zip(count["name"], count["total"], strict=True)
     totals = [int(total) for one, total in rows if one == name]
     return totals[-1] * scale if totals else None
 
 
-def _of_way(way: str, words: str) -> Iterator[Metric]:
+def _direction_metrics(way: str, words: str) -> Iterator[Metric]:
     """Yield the metrics of one direction."""
     yield Metric(
         f"{way}_delay_mean",
         "s",
-        f"One-way delay {words}: mean over all datagrams that arrived, late ones included.",
+        f"Mean one-way delay {words} of all datagrams that arrived, late ones included.",
         partial(_delay_mean, way=way),
     )
     yield Metric(
         f"late_{way}",
         "1",
-        f"Share of the datagrams {words} that arrived but came too late to be used.",
+        f"Share of the arrived datagrams {words} that were too late to be used.",
         partial(_late, way=way),
     )
     yield Metric(
@@ -86,7 +87,7 @@ def _of_way(way: str, words: str) -> Iterator[Metric]:
         yield Metric(
             f"release_error_{name}_{way}",
             "s",
-            f"How late the relay released datagrams {words}: {share}.",
+            f"Delay with which the relay released datagrams {words} after they were due: {share}.",
             partial(_relay_count, name=f"{way}_release_error_{name}_ns", scale=1e-9),
         )
     for name, what in RELAY_COUNTS.items():
@@ -96,4 +97,4 @@ def _of_way(way: str, words: str) -> Iterator[Metric]:
         )
 
 
-METRICS = tuple(metric for way, words in WAYS.items() for metric in _of_way(way, words))
+METRICS = tuple(metric for way, words in WAYS.items() for metric in _direction_metrics(way, words))

@@ -1,4 +1,4 @@
-"""Metrics of the mission: waypoints, contacts, error at rest, the guard's holds, and faults."""
+"""Metrics of the mission: waypoints, contacts, steady error, holds of the guard, and faults."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from cloudrc.messages import GuardState
 from cloudrc.metrics.flight import Array, Flight, Metric, mean
 
 BOARD = "board"
-"""Name of the scene's body that the arm has to touch."""
+"""Name of the scene's body that the arm must touch."""
 PRESSING_NS = 2_000_000_000
 """Last part of the mission, over which the steady contact force is averaged [ns]."""
 RESTING_NS = 5_000_000_000
 """Last part of the flight, over which the steady error is averaged [ns]."""
 SETTLING_NS = 10_000_000_000
-"""Time for which the setpoint must have stood still before that [ns]. Source:
+"""Time before `RESTING_NS` for which the setpoint must not have moved [ns]. Source:
 docs/reference/control.md, "Steady state": the slowest variant that settles needs 8 to 15 s to
 stay within 1 cm."""
 FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "horizon_clamped")
-"""Counts of cloud that are faults."""
+"""Counts of cloud that count as faults."""
 
 
 def _waypoints_reached(flight: Flight) -> float | None:
@@ -31,7 +31,7 @@ def _waypoints_reached(flight: Flight) -> float | None:
 
 
 def first_touch(flight: Flight) -> dict[str, Array] | None:
-    """Find the row of /contact in which the arm's tip first touched the board, if it did."""
+    """Find the row of /contact of the arm's first touch of the board; None if there is none."""
     contact = flight.during("/contact")
     touches = np.flatnonzero((contact["body"] == BOARD) & contact["tip"].astype(bool))
     return {name: column[touches[0]] for name, column in contact.items()} if len(touches) else None
@@ -48,9 +48,9 @@ def _tip_speed(flight: Flight) -> float | None:
 
 
 def _peak_contact_force(flight: Flight) -> float | None:
-    """Take the maximum of the touch sensor; None if the board was never touched.
+    """Return the maximum of the touch sensor; None if the arm never touched the board.
 
-    It depends on the contact parameters of the simulator: compare it within one scene only.
+    It depends on the contact parameters of the simulator: compare only flights in one scene.
     """
     if first_touch(flight) is None:
         return None
@@ -59,9 +59,10 @@ def _peak_contact_force(flight: Flight) -> float | None:
 
 
 def _steady_contact_force(flight: Flight) -> float | None:
-    """Average the touch sensor over the end of a mission that was flown to its end.
+    """Average the touch sensor over the last part of a completed mission.
 
-    The peak at impact depends on the simulator's contact parameters, the steady force does not.
+    Unlike the peak at impact, the steady force does not depend on the simulator's contact
+    parameters.
     """
     touch = first_touch(flight)
     if touch is None or flight.ending is None or flight.ending[1] != "done":
@@ -84,12 +85,12 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
     """Average the distance of the true position from the setpoint along one axis.
 
     Args:
-        flight: Of any kind.
+        flight: Any flight.
         axis: 0, 1 or 2 for x, y or z, world frame.
 
     Returns:
-        Mean of the absolute error [m] over the last 5 s; None unless the setpoint stood still over
-        them and the 10 s before, and nothing touched the arm.
+        Mean absolute error [m] over the last 5 s; None if in the last 15 s the setpoint moved or
+        the arm touched something.
     """
     control = flight.control
     if flight.end_ns is None or flight.start_ns is None:
@@ -110,7 +111,7 @@ def holds(flight: Flight) -> list[tuple[int, int]]:
     """List the intervals in HOLD during the flight.
 
     Returns:
-        Start and end of each [ns], world's clock, in order.
+        Start and end of each interval [ns], world's clock, in order.
     """
     if flight.end_ns is None:
         return []
@@ -124,7 +125,7 @@ def holds(flight: Flight) -> list[tuple[int, int]]:
 
 
 def hold_count(flight: Flight) -> float | None:
-    """Count the intervals in HOLD before the mission's end [1]; None if nothing was flown."""
+    """Count the intervals in HOLD before the mission's end [1]; None if the robot never flew."""
     return None if flight.start_ns is None else float(len(holds(flight)))
 
 
@@ -135,9 +136,9 @@ def _hold_time(flight: Flight) -> float | None:
 
 
 def _fault_count(flight: Flight) -> float | None:
-    """Sum the failures counted by cloud, and what else was noted as a fault.
+    """Sum the failures that cloud counted and all other recorded faults.
 
-    A fault that repeats is noted once, as a record, and counted every time.
+    A repeated failure has one fault record, but its count includes every time.
     """
     if flight.start_ns is None:
         return None
@@ -152,7 +153,7 @@ def _fault_count(flight: Flight) -> float | None:
 
 
 def _recorder_dropped(flight: Flight) -> float | None:
-    """Sum the last counts of both ends; None if nothing was counted."""
+    """Sum the last counts of both ends; None without counts."""
     count = flight.recording["/count"]
     last = {
         str(end): int(value)
@@ -166,8 +167,7 @@ METRICS = (
     Metric(
         "waypoints_reached",
         "1",
-        "How many of the mission's waypoints were reached, each within its tolerance for its "
-        "dwell.",
+        "Number of waypoints reached: the robot stayed within the tolerance for the dwell time.",
         _waypoints_reached,
     ),
     Metric(
@@ -191,15 +191,15 @@ METRICS = (
     Metric(
         "steady_contact_force",
         "N",
-        "Force on the arm's tip once it presses steadily: mean over the last 2 s of the mission.",
+        "Mean force on the arm's tip over the last 2 s of the mission.",
         _steady_contact_force,
     ),
-    Metric("pipe_contacts", "1", "How often the robot began to touch a pipe.", _pipe_contacts),
+    Metric("pipe_contacts", "1", "Number of contacts with a pipe.", _pipe_contacts),
     *(
         Metric(
             f"steady_error_{name}",
             "m",
-            f"Distance from a resting setpoint along {name}: mean over the last 5 s of a hover.",
+            f"Mean distance from the setpoint along {name} over the last 5 s of a hover.",
             partial(_steady_error, axis=axis),
         )
         for axis, name in enumerate("xyz")
@@ -207,26 +207,25 @@ METRICS = (
     Metric(
         "hold_count",
         "1",
-        "How often the guard took over because no fresh command was there.",
+        "Number of times that the guard went to HOLD because fresh commands were missing.",
         hold_count,
     ),
     Metric(
         "hold_time",
         "s",
-        "How long the guard flew by itself because no fresh command was there.",
+        "Total time in HOLD, in which the guard flies without commands.",
         _hold_time,
     ),
     Metric(
         "fault_count",
         "1",
-        "How often something went wrong that did not stop the flight: a predictor that raised, a "
-        "clamp.",
+        "Number of faults that did not stop the flight, such as an exception in a predictor.",
         _fault_count,
     ),
     Metric(
         "recorder_dropped",
         "1",
-        "How many records the recorder had to drop so that the loop did not have to wait.",
+        "Number of records that the recorder dropped because the loop must not wait for the disk.",
         _recorder_dropped,
     ),
 )

@@ -1,1 +1,1 @@
-"""The report: a recorded flight becomes a verdict, numbers, figures and one page to read."""
+"""Judge and measure a recorded flight; write its report with numbers, figures and one page."""

@@ -1,14 +1,12 @@
-"""The files for programs: what was measured and judged becomes report.json and environment.json.
+"""Judge a run and build the documents report.json and environment.json.
 
-The verdict: a flight, its numbers and the mode go in; success or what went wrong comes out.
+The verdict is the first of these that applies:
 
-Rules, in the order in which they decide:
-
-- `interrupted`: somebody stopped the run, or its recording ends before the mission does;
-- `invalid`: it was to fly in real time and did not, so its numbers mean nothing;
-- `failure`: one of the rules below was broken; each broken one is listed with time and place;
-- `success`: every waypoint reached, the board touched gently enough, no pipe touched, the guard
-  never worse than HOLD, within the time limit, world never restarted.
+- `interrupted`: the run was stopped, or its recording ends before the mission;
+- `invalid`: the run did not keep real time although it had to, so its numbers mean nothing;
+- `failure`: a criterion of success is not met; each one is listed with time and place;
+- `success`: all waypoints reached within the time limit, the board touched slowly enough, no pipe
+  touched, the guard only in TRACK or HOLD, world never restarted.
 """
 
 from __future__ import annotations
@@ -33,21 +31,21 @@ from cloudrc.metrics.mission import first_touch
 from cloudrc.records import REAL_TIME_FACTOR_MIN
 
 SLIP_MAX = 0.25
-"""World's clock may lose so much in a flight [s]: the guard's usual limit on a command's age, above
-which a slow machine and not the network would decide what the guard does."""
+"""Most time that world's clock may lose in a valid flight [s]: the guard's default limit on the age
+of a command. Above it a slow machine, not the network, could decide what the guard does."""
 
 Outcome = Literal["success", "failure", "invalid", "interrupted"]
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """One rule that was broken.
+    """A criterion of success that is not met.
 
     Attributes:
         code: One word, for programs.
-        text: The same for people: what, where, when.
-        time: Since the start of the mission [s]; None if it has no instant.
-        place: True position of the base then [m], shape (3,); None if it has none.
+        text: Description for people.
+        time: Time since the start of the mission [s]; None if there is no instant.
+        place: True position of the base at that time [m], shape (3,); None if unknown.
     """
 
     code: str
@@ -58,7 +56,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of the run: the outcome and every rule that was broken, the earliest first."""
+    """Verdict on a run: the outcome and all failures, the earliest first."""
 
     outcome: Outcome
     failures: tuple[Failure, ...]
@@ -70,33 +68,33 @@ def judge(
     """Judge a run.
 
     Args:
-        flight: As recorded.
-        numbers: What was measured of it.
-        real_time: True if it was to keep real time: any mode but virtual.
-        interrupted: True if it was stopped, or if its recording is torn.
+        flight: The recorded flight.
+        numbers: Its measured numbers.
+        real_time: True if the run had to keep real time: any mode except virtual.
+        interrupted: True if the run was stopped, or if its recording is torn.
     """
-    harm = tuple(_harm(flight))
+    violations = tuple(_violations(flight))
     if interrupted and flight.ending is None:
-        return Verdict("interrupted", (_interruption(flight), *harm))
-    told = {failure.code for failure in harm}
-    broken = [*harm, *(f for f in _missed(flight, numbers) if f.code not in told)]
-    broken.sort(key=lambda failure: inf if failure.time is None else failure.time)
+        return Verdict("interrupted", (_interruption(flight), *violations))
+    codes = {failure.code for failure in violations}
+    failures = [*violations, *(f for f in _unmet_goals(flight, numbers) if f.code not in codes)]
+    failures.sort(key=lambda failure: inf if failure.time is None else failure.time)
     slow = tuple(_not_real_time(numbers)) if real_time else ()
-    outcome: Outcome = "invalid" if slow else "failure" if broken else "success"
-    return Verdict(outcome, (*slow, *broken))
+    outcome: Outcome = "invalid" if slow else "failure" if failures else "success"
+    return Verdict(outcome, (*slow, *failures))
 
 
 def _interruption(flight: Flight) -> Failure:
     if flight.end_ns is None:
-        return Failure("interrupted", "the run was stopped before the mission began")
-    return _failure(flight, "interrupted", "the run ends before the mission does", flight.end_ns)
+        return Failure("interrupted", "the run was stopped before the mission started")
+    return _failure(flight, "interrupted", "the run ended before the mission", flight.end_ns)
 
 
 def _not_real_time(numbers: Mapping[str, Number]) -> Iterator[Failure]:
     factor, slip = numbers.get("real_time_factor"), numbers.get("world_slip")
     advice = "close other programs or give the run more cores"
     if factor is None or slip is None:
-        yield Failure("not_real_time", "nothing was recorded that proves that it kept real time")
+        yield Failure("not_real_time", "the recording does not prove that the run kept real time")
     elif factor.value < REAL_TIME_FACTOR_MIN:
         text = f"real-time factor {factor.value:.3f} is below {REAL_TIME_FACTOR_MIN}: {advice}"
         yield Failure("not_real_time", text)
@@ -105,8 +103,8 @@ def _not_real_time(numbers: Mapping[str, Number]) -> Iterator[Failure]:
         yield Failure("not_real_time", text)
 
 
-def _missed(flight: Flight, numbers: Mapping[str, Number]) -> Iterator[Failure]:
-    """What the mission was to reach and did not."""
+def _unmet_goals(flight: Flight, numbers: Mapping[str, Number]) -> Iterator[Failure]:
+    """Yield the goals of the mission that it did not reach."""
     if flight.start_ns is None or flight.end_ns is None:
         yield Failure("not_started", f"the robot never left the ground: {_why_grounded(flight)}")
         return
@@ -128,16 +126,16 @@ def _missed(flight: Flight, numbers: Mapping[str, Number]) -> Iterator[Failure]:
 
 
 def _why_grounded(flight: Flight) -> str:
-    """Say what kept the commands of a flight that never began from being flown."""
+    """Say why the guard never applied a command in a flight that did not start."""
     arrivals, control = flight.recording["/downlink_delay"], flight.recording["/delay_estimate"]
     if not len(control):
         return "its telemetry or cloud's answers were lost, so cloud computed no command"
     if not len(arrivals):
-        return "no command came"
-    # The start opens a session of its own: what was fresh before it does not count.
+        return "no command arrived"
+    # The start of a mission opens a new session: commands of older sessions do not count.
     last = arrivals["epoch"] == arrivals["epoch"].max()
     if arrivals["used"][last].any():
-        return "fresh commands came, but no request to start"
+        return "fresh commands arrived, but no request to start"
     keys = zip(control["epoch"], control["counter"], strict=True)
     basis_ns = dict(zip(keys, control["basis_stamp_ns"], strict=True))
     rows = (arrivals[name][last] for name in ("epoch", "counter", "stamp_ns"))
@@ -147,15 +145,16 @@ def _why_grounded(flight: Flight) -> str:
         if (epoch, counter) in basis_ns
     ]
     if not ages_ns:
-        return "no fresh command came"
+        return "no fresh command arrived"
     return (
         f"the odometry behind each command was {min(ages_ns) * 1e-9:.3f} s old or older when the"
-        " command came, beyond the limit guard.command_age_max_ms; shorten the delay or raise it"
+        " command arrived, above the limit guard.command_age_max_ms; shorten the delay or raise"
+        " the limit"
     )
 
 
-def _harm(flight: Flight) -> Iterator[Failure]:
-    """What must not happen at any time."""
+def _violations(flight: Flight) -> Iterator[Failure]:
+    """Yield events that must not happen at any time of the flight."""
     touch, speed_max = first_touch(flight), flight.criteria.contact_speed_max_mps
     if touch is not None and flight.criteria.contact:
         speed = float(np.linalg.norm(touch["tip_velocity"]))
@@ -173,7 +172,7 @@ def _harm(flight: Flight) -> Iterator[Failure]:
     for stamp_ns, state, cause in zip(
         guard["stamp_ns"], guard["state"], guard["cause"], strict=True
     ):
-        before, repeated = state, state == before  # LAND also tells of its touch-down
+        before, repeated = state, state == before  # a touch-down repeats LAND
         if state not in (GuardState.TRACK, GuardState.HOLD) and not repeated:
             text = f"the guard went to {GuardState(state).name}: {cause}"
             yield _failure(flight, "guard_intervened", text, int(stamp_ns))
@@ -181,14 +180,14 @@ def _harm(flight: Flight) -> Iterator[Failure]:
     for stamp_ns, end, cause in zip(
         session["stamp_ns"], session["end"], session["cause"], strict=True
     ):
-        # The session that the mission itself opened may carry the stamp of the start.
+        # The session that the mission itself opens may have the stamp of the start.
         if end == "world" and stamp_ns > (flight.start_ns or 0):
             text = f"world opened a new session in flight: {cause}"
             yield _failure(flight, "world_restarted", text, int(stamp_ns))
 
 
 def _failure(flight: Flight, code: str, text: str, stamp_ns: int | None) -> Failure:
-    """Fill in time and place of a rule that was broken at an instant [ns]."""
+    """Make a failure with time and place, given its instant [ns]."""
     if stamp_ns is None:
         return Failure(code, text)
     x, y, z = flight.true_position(np.array([stamp_ns]))[0]
@@ -208,20 +207,20 @@ PACKAGES = (
     "rosbags",
     "matplotlib",
 )
-"""Those whose version can change what a run or its report says."""
+"""Packages whose version can change the results of a run or its report."""
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What the recording itself does not say about a run.
+    """Facts about a run that are not in its recording.
 
     Attributes:
         mode: "virtual", "local" or "cluster".
         shaper: What emulated the link: "virtual", "relay" or "netem".
-        records_sha256: Of all records in virtual time, of all messages in real time, by
-            `record.hash`; None if they are not all there.
-        interrupted: True if somebody stopped it.
-        notes: What a reader should know, a sentence each.
+        records_sha256: Hash of all records in virtual time, of all messages in real time, by
+            `record.hash`; None if the recording is incomplete.
+        interrupted: True if the run was stopped.
+        notes: Notes for the reader, a sentence each.
     """
 
     mode: str
@@ -241,15 +240,15 @@ def report_document(
     clock_offset: Mapping[str, Any] | None,
     complete: bool,
 ) -> dict[str, Any]:
-    """Put together what report.json says.
+    """Build report.json.
 
     Args:
-        run: What the recording does not say.
-        experiment: That was flown.
-        verdict: Of it.
-        numbers: Measured; what is not in it cannot be known and stays absent.
-        notes: What a reader should know, a sentence each.
-        clock_offset: How cloud's stamps came on world's clock, by `clock_offset_document`.
+        run: Facts about the run that are not in its recording.
+        experiment: The experiment.
+        verdict: The verdict on the run.
+        numbers: Measured numbers; unknown ones are absent.
+        notes: Notes for the reader, a sentence each.
+        clock_offset: Document by `clock_offset_document`.
         complete: False if the recording is torn.
     """
     document = {
@@ -273,13 +272,13 @@ def report_document(
 
 
 def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
-    """Say how cloud's stamps were put on world's clock.
+    """Describe how cloud's stamps were shifted to world's clock.
 
     Args:
-        metadata: Of the recording.
+        metadata: Metadata of the recording.
 
     Returns:
-        The method and, where it is known, the uncertainty; None if both ends share a clock.
+        The method and, if known, the uncertainty; None if both ends share a clock.
     """
     method = metadata.get("clock_offset_method", "same clock")
     if method == "same clock":
@@ -290,7 +289,7 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
 
 
 def environment_document() -> dict[str, Any]:
-    """Say on what the report was made: nothing in it names a user or a machine."""
+    """Describe the software and hardware that made the report, without user or host names."""
     return {
         "schemaVersion": SCHEMA_VERSION,
         "python": platform.python_version(),
@@ -303,7 +302,7 @@ def environment_document() -> dict[str, Any]:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a document for people and programs; numbers that are not finite are refused."""
+    """Write a document as JSON; raise ValueError if a number is not finite."""
     text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False)
     put(path, f"{text}\n".encode())
 
@@ -314,7 +313,7 @@ def _failure_document(failure: Failure) -> dict[str, Any]:
 
 
 def _known(entries: dict[str, Any]) -> dict[str, Any]:
-    """Leave out what is not known: absent, never zero or null."""
+    """Remove unknown entries, which are None: they are absent, never zero or null."""
     return {name: value for name, value in entries.items() if value is not None}
 
 
@@ -326,7 +325,7 @@ def _version(name: str) -> str | None:
 
 
 def _processor() -> str:
-    """The processor's model where the system tells, else what Python knows of it."""
+    """Read the processor's model from /proc/cpuinfo, else ask Python."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""The table of numbers: what was measured goes in, rows in groups and in handy units come out."""
+"""Lay out the table of numbers of the report: rows in groups, in readable units."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "missed_periods",
     ),
 }
-"""Groups of the table in its order; a metric that is in none comes last, under "Others"."""
+"""Groups of the table, in order; metrics in no group come last, under "Others"."""
 SHARES = ("loss_", "late_")
-"""Names of numbers without unit that are shown in per cent begin so."""
+"""Prefixes of the names of numbers that are shown in per cent."""
 
 
-def rows(numbers: Mapping[str, Number]) -> str:
+def table_rows(numbers: Mapping[str, Number]) -> str:
     """Lay out the table's body as HTML, a `tbody` for each group that has numbers."""
     grouped = {name for names in GROUPS.values() for name in names}
     groups = {**GROUPS, "Others": tuple(name for name in numbers if name not in grouped)}
@@ -71,7 +71,7 @@ def rows(numbers: Mapping[str, Number]) -> str:
 
 
 def handy(name: str, number: Number) -> tuple[str, str]:
-    """Write a number in the unit in which it reads best: the digits, the unit."""
+    """Format a number in a readable unit; return its digits and the unit."""
     value, unit = number.value, number.unit
     if value == 0:
         return "0", "" if unit == "1" else unit
@@ -85,7 +85,7 @@ def handy(name: str, number: Number) -> tuple[str, str]:
 
 
 def _digits(value: float) -> str:
-    """Four significant digits, at most three behind the point: 27.60, 0.237, 16.99."""
+    """Format with four significant digits, at most three decimals: 27.60, 0.237, 16.99."""
     places = 3 if abs(value) < 1 else 3 - len(str(int(abs(value)))) + 1
     return f"{value:.{max(places, 0)}f}"
 

@@ -1,9 +1,6 @@
-"""The page: verdict, numbers and figures go in; one HTML file that needs nothing else comes out.
+"""Write the page report.html: verdict, a summary in words, numbers and figures in one file.
 
-Pictures are inside the page, fonts are the reader's own: it opens from a disk, makes no request,
-and prints.
-
-The verdict in words: what happened on this flight, for somebody who reads only one paragraph.
+The page embeds its pictures, uses the reader's fonts and makes no request to the network.
 """
 
 from __future__ import annotations
@@ -21,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 from cloudrc import __version__
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.metrics import Flight, Number
-from cloudrc.report import numbers as table
 from cloudrc.report.document import Failure, Run, Verdict
+from cloudrc.report.numbers import table_rows
 
 if TYPE_CHECKING:
     from cloudrc.report.figures import Picture
@@ -37,12 +34,12 @@ HEADLINES = {
 
 
 def headline(verdict: Verdict) -> str:
-    """Say in one short sentence what became of the run."""
+    """Write the outcome as one short sentence."""
     return HEADLINES[verdict.outcome]
 
 
 def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:
-    """Say in a few sentences what happened, with what is known of it."""
+    """Summarize the flight in a few sentences, with the known numbers."""
     if flight.start_ns is None:
         return "The robot never left the ground."
     known = {name: number.value for name, number in numbers.items()}
@@ -58,14 +55,14 @@ def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:
 
 def _waypoints(flight: Flight, known: Mapping[str, float]) -> str:
     reached = f"{known.get('waypoints_reached', 0):.0f}"
-    took = f" in {known['duration']:.1f} s" if "duration" in known else ""
-    far = f", {known['distance_flown']:.1f} m" if "distance_flown" in known else ""
+    duration = f" in {known['duration']:.1f} s" if "duration" in known else ""
+    distance = f" and flew {known['distance_flown']:.1f} m" if "distance_flown" in known else ""
     count = flight.waypoints
     if reached == str(count):
         goal = "its waypoint" if count == 1 else f"all {count} waypoints"
     else:
         goal = f"{reached} of {count} waypoints"
-    return f"The drone reached {goal}{took}{far}."
+    return f"The drone reached {goal}{duration}{distance}."
 
 
 def _pipes(flight: Flight, known: Mapping[str, float]) -> str:
@@ -78,7 +75,7 @@ def _pipes(flight: Flight, known: Mapping[str, float]) -> str:
         times = "once" if touched == 1 else f"{touched:.0f} times"
         return f"It flew through {pipes} and touched a wall {times}."
     nearest = known["min_clearance"] * 1e3
-    return f"It flew through {pipes}, never nearer than {nearest:.0f} mm to a wall."
+    return f"It flew through {pipes} and never came closer than {nearest:.0f} mm to a wall."
 
 
 def _contact(flight: Flight, known: Mapping[str, float]) -> str:
@@ -89,7 +86,7 @@ def _contact(flight: Flight, known: Mapping[str, float]) -> str:
         f"at {known['tip_speed']:.2f} m/s"
     )
     if "steady_contact_force" in known:
-        text += f" and then pressed on it with {known['steady_contact_force']:.2f} N"
+        text += f" and then pressed against it with {known['steady_contact_force']:.2f} N"
     return text + "."
 
 
@@ -97,8 +94,8 @@ def _link(known: Mapping[str, float]) -> str:
     if "prediction_error_rms" not in known or "rtt_mean" not in known:
         return ""
     return (
-        f"The round trip took {known['rtt_mean'] * 1e3:.0f} ms on average; the remote controller "
-        f"predicted where its commands would act to within "
+        f"The mean round trip was {known['rtt_mean'] * 1e3:.0f} ms. The remote controller "
+        f"predicted the robot's position with an error of "
         f"{known['prediction_error_rms'] * 1e3:.0f} mm (RMS)."
     )
 
@@ -108,13 +105,13 @@ def _guard(known: Mapping[str, float]) -> str:
         return ""
     count = known["hold_count"]
     if not count:
-        return "The guard on board never had to take over."
+        return "The guard on board never took over."
     times = "once" if count == 1 else f"{count:.0f} times"
-    return f"The guard on board took over {times}, for {known.get('hold_time', 0):.1f} s in all."
+    return f"The guard on board took over {times}, for {known.get('hold_time', 0):.1f} s in total."
 
 
 _UNIT = re.compile(r"(\d) (s|m|mm|ms|N|m/s)\b")
-"""A number and its unit: the line may not break between them."""
+"""A number and its unit, between which a line must not break."""
 ACCENTS = {
     "success": "#00694b",
     "failure": "#a33a00",
@@ -136,16 +133,16 @@ def render(
     """Fill in the page.
 
     Args:
-        run: What the recording does not say.
-        experiment: That was flown.
-        flight: As recorded.
-        verdict: Of it.
-        numbers: Measured.
-        notes: What a reader should know, a sentence each.
-        pictures: In the order of the page.
-        environment: What environment.json says.
+        run: Facts about the run that are not in its recording.
+        experiment: The experiment.
+        flight: The recorded flight.
+        verdict: The verdict on the run.
+        numbers: Measured numbers.
+        notes: Notes for the reader, a sentence each.
+        pictures: Figures in the order of the page.
+        environment: Content of environment.json.
     """
-    again, command = _again(run)
+    repeat, command = _repeat(run)
     digest = run.records_sha256
     return Template(files(__package__).joinpath("page.html").read_text("utf-8")).substitute(
         version=escape(__version__),
@@ -160,8 +157,8 @@ def render(
         notes=_list([escape(note) for note in notes], "note"),
         facts=_facts(run, experiment),
         figures="\n".join(_figure(n, picture) for n, picture in enumerate(pictures, start=1)),
-        numbers=table.rows(numbers),
-        again=escape(again),
+        numbers=table_rows(numbers),
+        repeat=escape(repeat),
         command=escape(command),
         hash=f"<p>SHA-256 of all records: <code>{escape(digest)}</code></p>" if digest else "",
         config=escape(dump(experiment)),
@@ -169,14 +166,15 @@ def render(
     )
 
 
-def _again(run: Run) -> tuple[str, str]:
-    """Say how to fly the same again, and how alike it will be."""
+def _repeat(run: Run) -> tuple[str, str]:
+    """Return a text and the command for repeating the run."""
     command = shlex.join(["cloudrc", "run", "config.yaml", "--mode", run.mode])
     if run.mode == "virtual":
-        return "In this folder; the same records come out, bit by bit:", command
+        return "Run this in the folder of the report; the records will be identical:", command
     return (
-        "In this folder. Chance on the link is drawn from the same seed; the machine's own timing "
-        "differs from run to run, so the numbers agree but not to the last digit:"
+        "Run this in the folder of the report. The random numbers of the link come from the same "
+        "seed. The timing of the machine differs between runs, so the numbers will be close but "
+        "not identical:"
     ), command
 
 
@@ -186,8 +184,8 @@ def _facts(run: Run, experiment: ResolvedExperiment) -> str:
         "Experiment": experiment.name,
         "Mode": run.mode,
         "Seed": str(experiment.seed),
-        "Link profile": f"{experiment.link.profile}, by {run.shaper}",
-        "Late datagrams": f"{experiment.tunnel.order} wins",
+        "Link profile": f"{experiment.link.profile} ({run.shaper})",
+        "Datagram order": f"{experiment.tunnel.order} wins",
         "Delay estimator": cloud.estimator.name,
         "Predictor": cloud.predictor.name,
         "Controller": cloud.controller.name,

@@ -1,4 +1,4 @@
-"""Writes a report: a run's folder and its recording go in; page, figures and numbers come out."""
+"""Write the report of a run: report.json, environment.json, report.html and figures."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from cloudrc.report.document import (
     write_json,
 )
 
-BEFORE_MAX = 16 << 20
-"""Longest report.json that is read [bytes]; notes may be many."""
+REPORT_BYTES_MAX = 16 << 20
+"""Largest report.json that is read [bytes]; it may have many notes."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class Assessment:
     """A run, measured and judged.
 
     Attributes:
-        run: What the recording does not say.
-        experiment: That was flown.
-        flight: As recorded.
-        numbers: Measured; those that cannot be known are absent.
-        verdict: Success, or what went wrong.
-        notes: What a reader should know, a sentence each.
-        document: What report.json says.
+        run: Facts about the run that are not in its recording.
+        experiment: The experiment.
+        flight: The recorded flight.
+        numbers: Measured numbers; unknown ones are absent.
+        verdict: The verdict on the run.
+        notes: Notes for the reader, a sentence each.
+        document: Content of report.json.
     """
 
     run: Run
@@ -52,8 +52,8 @@ class Assessment:
     document: dict[str, Any]
 
 
-class _Before(BaseModel):
-    """What is taken over from a report that was written before, whoever wrote it."""
+class _EarlierReport(BaseModel):
+    """Content of an earlier report.json that a new report keeps."""
 
     mode: Literal["virtual", "local", "cluster"]
     shaper: str
@@ -68,20 +68,20 @@ def assess(
     run: Run,
     own: Iterable[str] = (),
 ) -> Assessment:
-    """Measure and judge a run; nothing is written and no picture drawn.
+    """Measure and judge a run without writing files or drawing figures.
 
     Args:
-        recording: Of both ends, on world's clock.
-        experiment: That was flown. The metrics that it names are not run: it may come from
-            somebody else.
-        run: What the recording does not say.
-        own: The user's own metrics, names or paths; they are run.
+        recording: Recording of both ends, on world's clock.
+        experiment: The experiment. Metric files that it names are not executed: the experiment may
+            come from somebody else.
+        run: Facts about the run that are not in its recording.
+        own: The user's own metrics, names or paths; files are executed.
     """
     mission = experiment.mission
     waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
     scene = load_scene(experiment.world.scene)
     flight = Flight(recording, experiment.criteria, waypoints, scene)
-    numbers, troubles = measure_all(flight, own)
+    numbers, metric_notes = measure_all(flight, own)
     torn = not recording.complete
     verdict = judge(
         flight,
@@ -91,7 +91,7 @@ def assess(
     )
     incomplete = (f"The recording is incomplete: {recording.note}.",) if torn else ()
     faults = tuple(f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text)
-    notes = tuple(dict.fromkeys((*run.notes, *incomplete, *faults, *troubles)))
+    notes = tuple(dict.fromkeys((*run.notes, *incomplete, *faults, *metric_notes)))
     document = report_document(
         run,
         experiment,
@@ -116,19 +116,19 @@ def write_report(
     """Write report.json and environment.json, and report.html with its figures.
 
     Args:
-        folder: Of the run; what an earlier report left there is replaced.
-        recording: Of both ends, on world's clock.
-        experiment: That was flown.
-        run: What the recording does not say.
+        folder: Folder of the run; files of an earlier report are replaced.
+        recording: Recording of both ends, on world's clock.
+        experiment: The experiment.
+        run: Facts about the run that are not in its recording.
         own: The user's own metrics, as for `assess`.
-        page: Whether to draw figures and page; the numbers are written in any case.
+        page: Whether to write report.html and the figures.
 
     Returns:
-        What report.json holds.
+        Content of report.json.
 
     Raises:
-        MissingPrerequisiteError: If the page is wanted and matplotlib is not installed; the numbers
-            are written before.
+        MissingPrerequisiteError: If `page` is True and matplotlib is not installed; report.json is
+            written before.
     """
     assessment = assess(recording, experiment, run, own)
     write_json(folder / "report.json", assessment.document)
@@ -140,12 +140,12 @@ def write_report(
 
 
 def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
-    """Read what a run left, whole or torn: the arguments of `write_report`.
+    """Read the folder of a run, complete or torn, as arguments for `write_report`.
 
-    If the run died before it could join the recordings of both ends, they are joined now.
+    If the run ended before it merged the recordings of both ends, they are merged now.
 
     Raises:
-        BadInputError: If the folder holds no experiment or no recording that can be read.
+        BadInputError: If the folder has no experiment or no readable recording.
     """
     if not (folder / "config.yaml").is_file():
         raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
@@ -155,12 +155,12 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
 
 
 def _read_recording(folder: Path) -> Recording:
-    joined = folder / "mission.mcap"
+    merged = folder / "mission.mcap"
     ends = folder / "world.mcap", folder / "cloud.mcap"
-    if not any(path.is_file() for path in (joined, *ends)):
+    if not any(path.is_file() for path in (merged, *ends)):
         raise BadInputError(f"{folder}: has no mission.mcap; name the folder of a run")
     try:
-        recording = Recording.read(joined)
+        recording = Recording.read(merged)
         if recording.complete:
             return recording
     except (BadInputError, FileNotFoundError):
@@ -172,22 +172,22 @@ def _read_recording(folder: Path) -> Recording:
     from cloudrc.record.merge import merge
 
     mission = merge(*ends)
-    mission.write(joined)
+    mission.write(merged)
     return mission.recording()
 
 
 def _read_run(folder: Path, recording: Recording) -> Run:
-    """Learn what the recording does not say from the report that was written before, if any."""
+    """Read facts that are not in the recording from an earlier report.json, else guess them."""
     try:
-        before = _Before.model_validate_json(read(folder / "report.json", BEFORE_MAX))
+        earlier = _EarlierReport.model_validate_json(read(folder / "report.json", REPORT_BYTES_MAX))
     except (OSError, ValueError):
-        # Only in real time do the drivers note how late they are.
+        # Only real-time runs record lateness.
         real_time = len(recording["/lateness"]) > 0
         return Run("local", "relay") if real_time else Run("virtual", "virtual")
-    # What metrics had to say they say again, unless they have been mended since.
-    notes = tuple(note for note in before.notes if not note.startswith(METRIC_NOTE))
-    interrupted = before.verdict == "interrupted"
-    return Run(before.mode, before.shaper, before.records_sha256, interrupted, notes)
+    # Metrics are measured again and write their notes anew.
+    notes = tuple(note for note in earlier.notes if not note.startswith(METRIC_NOTE))
+    interrupted = earlier.verdict == "interrupted"
+    return Run(earlier.mode, earlier.shaper, earlier.records_sha256, interrupted, notes)
 
 
 def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any]) -> None:
@@ -196,7 +196,7 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
     except ImportError as error:
         raise MissingPrerequisiteError(
             f"report.html needs {error.name}, which is not installed; report.json is written; "
-            "for the page run: pip install 'cloudrc[report]'"
+            "for the page, run: pip install 'cloudrc[report]'"
         ) from error
     from cloudrc.report.page import render
 
@@ -204,13 +204,13 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
     subject = Subject(assessment.flight, experiment.uplink, experiment.downlink)
     try:
         pictures = draw_all(subject)
-    except ValueError as error:  # matplotlib's, of values that no flight has
+    except ValueError as error:  # from matplotlib, for values that no flight has
         raise BadInputError(
-            f"{folder}: what is recorded cannot be drawn ({in_words(error)}); report.json is "
-            "written, look into the recording"
+            f"{folder}: the recorded values cannot be drawn ({in_words(error)}); report.json is "
+            "written, check the recording"
         ) from error
     figures = folder / "figures"
-    if figures.is_symlink():  # of a run got from somebody else: it may lead anywhere
+    if figures.is_symlink():  # a run from somebody else may contain a link to anywhere
         raise BadInputError(f"{figures}: is a link; remove it, figures are kept with their run")
     figures.mkdir(exist_ok=True)
     for picture in pictures:

@@ -1,7 +1,4 @@
-"""Control periods to feed: everything that a test does not name is still.
-
-What Prometheus would have of a flight of the fault suite, and what the rules make of it.
-"""
+"""Helpers: control periods at rest; the time series of a flight, and the alerts that they fire."""
 
 from __future__ import annotations
 
@@ -27,8 +24,8 @@ MS = 1_000_000
 
 
 def period(stamp_ms: float, basis_ms: float, **fields: Any) -> Control:
-    """One period at `stamp_ms` of cloud's clock, from odometry of `basis_ms` of world's."""
-    still = Control(
+    """Make a control period at `stamp_ms`, cloud's clock, from odometry of `basis_ms`, world's."""
+    at_rest = Control(
         round(stamp_ms * MS),
         1,
         0,
@@ -48,19 +45,19 @@ def period(stamp_ms: float, basis_ms: float, **fields: Any) -> Control:
         ZERO,
         ZERO,
     )
-    return still._replace(**fields)
+    return at_rest._replace(**fields)
 
 
 RULES = Path(__file__).resolve().parents[2] / "charts" / "cloudrc" / "files" / "rules.yaml"
 PERIOD = 5
-"""Of the scrapes [s]."""
+"""Time between scrapes [s]."""
 AFTER = 11
-"""For so long a flight that is over is scraped still [s]."""
+"""Time for which scrapes continue after a flight [s]."""
 ROLES = ("world", "cloud", "teleop")
 
 
 def series(flight: Flight) -> list[dict[str, str]]:
-    """Every series of a flight, one value for each scrape."""
+    """Return every series of a flight, one value per scrape."""
     times = range(0, int(flight.now) + AFTER, PERIOD)
     values: dict[str, list[str]] = {}
     for role in ROLES:
@@ -71,13 +68,13 @@ def series(flight: Flight) -> list[dict[str, str]]:
 
 
 def scrapes(flight: Flight, role: str, times: range) -> Iterator[Readings]:
-    """What a process shows at each of these instants [s]."""
+    """Yield the readings of a process at each time [s]."""
     live, seen, sent = Live(role, missions=role != "cloud"), 0, 0
     for time in times:
         records = asks.seen_by(flight, role, time)
         for record in records[seen:]:
             if isinstance(record, Counted) and record.name == "sent":
-                if record.total < sent:  # another process, which counts from 0
+                if record.total < sent:  # a new process, which counts from 0
                     live = Live(role, missions=role != "cloud")
                 sent = record.total
             live.see([record])
@@ -102,7 +99,7 @@ def samples(role: str, readings: Readings) -> Iterator[tuple[str, float]]:
 
 
 def fired(flight: Flight, folder: Path) -> set[str]:
-    """Which of the chart's alerts a flight has fired; promtool knows."""
+    """Return the alerts of the chart that a flight fires, evaluated by promtool."""
     expression = 'group by (alertname) (last_over_time(ALERTS{alertstate="firing"}[1d]))'
     test: dict[str, Any] = {
         "interval": f"{PERIOD}s",
@@ -112,7 +109,7 @@ def fired(flight: Flight, folder: Path) -> set[str]:
     document = {"rule_files": ["rules.yaml"], "evaluation_interval": "5s", "tests": [test]}
     shutil.copy(RULES, folder / "rules.yaml")
     (folder / "tests.yaml").write_text(yaml.safe_dump(document))
-    # No sample is expected, so that every one that there is is named as one too many.
+    # The test expects no sample, so promtool lists every sample as unexpected.
     command = ["promtool", "test", "rules", "tests.yaml"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     found = set(re.findall(r'{alertname="(\w+)"}', done.stderr))

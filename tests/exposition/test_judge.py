@@ -1,4 +1,4 @@
-"""Errors of predictions and delay estimates: worked by hand, and against the truth of a flight."""
+"""Errors of predictions and delay estimates: computed by hand, and from a flight's ground truth."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from tests.flights.conftest import records
 
 
 def flying_along_x(predicted_lead: float, *, every_ms: int = 10) -> Iterator[Control]:
-    """1 m/s along x, seen every 10 ms, predicted 25 ms ahead with an error of `predicted_lead`."""
+    """Yield a flight at 1 m/s along x, predicted 25 ms ahead with an error `predicted_lead` [m]."""
     for at in range(0, 400, every_ms):
         x = at * 1e-3
         predicted = (x + 0.025 + predicted_lead, 0.0, 0.0)
         yield period(7000 + at, at, measured=(x, 0.0, 0.0), position=predicted, horizon=0.025)
 
 
-def test_a_prediction_is_held_to_the_measurement_of_its_instant() -> None:
+def test_a_prediction_is_compared_at_its_own_instant() -> None:
     judge = PredictionJudge()
     for control in flying_along_x(0.01):
         judge.take(control)
     assert judge.error == pytest.approx((0.01, 0.0, 0.0))
-    assert judge.judged == 37  # the last three wait for what is measured 25 ms later
+    assert judge.judged == 37  # the last three wait for a measurement 25 ms later
     assert judge.square == pytest.approx(37 * 0.01**2)
 
 
-def test_a_right_prediction_has_no_error_between_two_measurements() -> None:
+def test_a_correct_prediction_between_measurements_has_no_error() -> None:
     judge = PredictionJudge()
     for control in flying_along_x(0.0):
         judge.take(control)
     assert judge.square == pytest.approx(0.0, abs=1e-18)
 
 
-def test_nothing_is_judged_across_a_gap() -> None:
+def test_no_prediction_is_compared_across_a_gap() -> None:
     judge = PredictionJudge()
     for control in flying_along_x(0.01, every_ms=60):
         judge.take(control)
@@ -47,7 +47,7 @@ def test_nothing_is_judged_across_a_gap() -> None:
     assert math.isnan(judge.error[0])
 
 
-def test_nothing_is_judged_across_sessions() -> None:
+def test_no_prediction_is_compared_across_sessions() -> None:
     judge = PredictionJudge()
     judge.take(period(0, 0, horizon=0.01, position=(9.0, 9.0, 9.0)))
     judge.reset()
@@ -56,7 +56,7 @@ def test_nothing_is_judged_across_sessions() -> None:
     assert judge.square == 0.0
 
 
-def test_odometry_that_goes_back_is_not_measured() -> None:
+def test_older_odometry_is_not_a_measurement() -> None:
     judge = PredictionJudge()
     for basis in (0, 10, 5, 20, 15, 30):
         x = basis * 1e-3
@@ -67,15 +67,15 @@ def test_odometry_that_goes_back_is_not_measured() -> None:
     assert judge.judged >= 3
 
 
-def test_a_delay_estimate_is_held_to_the_time_that_passed() -> None:
+def test_a_delay_estimate_is_compared_with_the_true_delay() -> None:
     judge = DelayJudge()
-    judge.sent(period(1000, 500, horizon=0.08))  # odometry of 500 ms becomes a command
-    # Applied at 600 ms of world's clock: 100 ms after that odometry. Echoed 3 ms later.
+    judge.sent(period(1000, 500, horizon=0.08))  # a command from odometry of 500 ms
+    # World applies it at 600 ms, 100 ms after the odometry, and echoes it 3 ms later.
     judge.echoed(period(1150, 603, loop_delay=0.145, rtt=0.142), 1145 * MS)
     assert judge.error == pytest.approx(-0.02)
 
 
-def test_an_echo_of_nobody_knows_what_is_not_judged() -> None:
+def test_an_echo_of_an_unknown_command_is_ignored() -> None:
     judge = DelayJudge()
     judge.sent(period(1000, 500, horizon=0.08))
     judge.echoed(period(1150, 603, loop_delay=0.144, rtt=0.141), 1145 * MS)
@@ -83,7 +83,7 @@ def test_an_echo_of_nobody_knows_what_is_not_judged() -> None:
 
 
 @pytest.mark.parametrize("offset_ns", [0, 5_000_000_000])
-def test_errors_of_a_flight_are_those_that_the_truth_gives(offset_ns: int) -> None:
+def test_delay_errors_of_a_flight_match_its_ground_truth(offset_ns: int) -> None:
     experiment = load_experiment("hover", ["link.profile=paper-p2"])
     world, cloud = records(experiment, offset_ns=offset_ns)
     controls = {(c.epoch, c.counter): c for c in cloud if isinstance(c, Control)}
@@ -101,4 +101,4 @@ def test_errors_of_a_flight_are_those_that_the_truth_gives(offset_ns: int) -> No
             assert isinstance(error, dict)
             seen.add(round(error[()] * 1e6))
     assert len(seen) > 100
-    assert len(seen - truth) <= 0.01 * len(seen), "to the microsecond, but for rounding"
+    assert len(seen - truth) <= 0.01 * len(seen), "equal to 1 us, except for rounding"

@@ -1,4 +1,4 @@
-"""What a process exposes: histograms and counts of a flight, readiness, mission, absent values."""
+"""Current metrics of a process: histograms and counts of a flight, peer, mission, absent values."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def flight() -> Flight:
     return records(load_experiment("hover", ["link.profile=paper-p2"]))
 
 
-def test_a_value_is_counted_up_to_its_bound_and_no_further() -> None:
+def test_a_bucket_includes_its_upper_bound() -> None:
     values = Histogram((0.01, 0.1))
     for each in (0.005, 0.01, 0.0101, 5.0):
         values.observe(each)
@@ -59,7 +59,7 @@ def test_a_value_is_counted_up_to_its_bound_and_no_further() -> None:
 
 
 @pytest.mark.parametrize(("role", "index"), [("world", 0), ("cloud", 1)])
-def test_one_way_delays_are_those_that_arrived(flight: Flight, role: str, index: int) -> None:
+def test_one_way_delays_include_all_arrivals(flight: Flight, role: str, index: int) -> None:
     live = Live(role)
     live.see(flight[index])
     delays = [r.delay for r in flight[index] if isinstance(r, Arrival)]
@@ -82,8 +82,8 @@ def test_without_a_shared_clock_one_way_delays_are_absent() -> None:
 
 
 @pytest.mark.parametrize("offset_ns", [0, 7_000_000_000])
-def test_the_age_of_a_command_is_that_of_its_basis_while_it_is_flown(offset_ns: int) -> None:
-    """It takes no shared clock; on the ground and in HOLD no command is in use."""
+def test_command_age_is_that_of_its_odometry_in_track(offset_ns: int) -> None:
+    """It needs no shared clock; on the ground and in HOLD no command is in use."""
     of_world, _ = records(load_experiment("hover", ["link.profile=paper-p2"]), offset_ns=offset_ns)
     basis_ns, ages, others = 0, [], 0
     for record in of_world:
@@ -126,10 +126,10 @@ def test_errors_and_terms_are_signed_and_by_axis() -> None:
     assert value(live, "cloudrc_tracking_error_meters", "x") == 1.0
     assert value(live, "cloudrc_tracking_error_meters", "y") == -0.5
     assert value(live, "cloudrc_pid_output", "z", "derivative") == -0.7
-    assert live.read()["cloudrc_prediction_error_meters"] == {}  # nothing judged yet
+    assert live.read()["cloudrc_prediction_error_meters"] == {}  # no prediction compared yet
 
 
-def test_counts_become_datagrams_of_their_direction() -> None:
+def test_counts_are_assigned_to_their_direction() -> None:
     live = Live("world")
     totals = {"sent": 7, "late": 3, "stalls": 1, "held_seconds": 4, "unheard_of": 9}
     for name, total in totals.items():
@@ -141,7 +141,7 @@ def test_counts_become_datagrams_of_their_direction() -> None:
     assert value(live, "cloudrc_guard_held_seconds_total") == 4
 
 
-def test_what_one_shaper_alone_knows_is_absent_with_the_other() -> None:
+def test_counts_of_one_shaper_are_absent_with_the_other() -> None:
     relay, netem = Live("link"), Live("link")
     relay.see([Counted(0, "link", "released_early", 3)])
     netem.see([Counted(0, "link", "restored", 2)])
@@ -172,13 +172,13 @@ def test_guard_and_contacts_are_counted() -> None:
     assert contacts["pipe",] == 2
 
 
-def test_the_real_time_factor_is_that_of_the_last_ten_seconds() -> None:
+def test_the_real_time_factor_covers_the_last_ten_seconds() -> None:
     live = Live("world")
     live.see([wake(0)])
     assert "cloudrc_real_time_factor" not in live.read()
     live.see([wake(10 * k) for k in range(1, 500)])
     assert value(live, "cloudrc_real_time_factor") == pytest.approx(1.0)
-    # From 5 s on it loses 1 ms in 10 ms: after 20 s everything before is forgotten.
+    # From 5 s on it loses 1 ms in 10 ms; at 20 s the window has only such periods.
     live.see([wake(10 * k, slip_ms=k - 500) for k in range(500, 2000)])
     assert value(live, "cloudrc_real_time_factor") == pytest.approx(0.9)
     assert value(live, "cloudrc_world_slip_seconds_total") == pytest.approx(1.499)
@@ -201,7 +201,7 @@ def heard(role: str, *seen: Record) -> bool:
 
 
 @pytest.mark.parametrize("role", table.ENDS)
-def test_an_end_has_a_peer_while_it_hears_it(role: str) -> None:
+def test_an_end_has_a_peer_while_datagrams_arrive(role: str) -> None:
     opened = SessionOpened(0, role, 1, "")
     arrival = Arrival(1000 * MS, role == "cloud", 1, 0, math.nan, True)
     assert not heard(role)
@@ -215,10 +215,8 @@ def test_an_end_has_a_peer_while_it_hears_it(role: str) -> None:
 
 @pytest.mark.parametrize("role", table.ENDS)
 @pytest.mark.parametrize(("behind", "hears"), [(0, False), (1, True), (500, False)])
-def test_a_datagram_that_is_sent_again_is_no_sign_of_life(
-    role: str, behind: int, hears: bool
-) -> None:
-    """Whoever has caught one can send it again without a key; one that is only late is new."""
+def test_a_replayed_datagram_is_no_sign_of_life(role: str, behind: int, hears: bool) -> None:
+    """Replaying a captured datagram needs no key; a late one that is new does count."""
     opened = SessionOpened(0, role, 1, "")
     first, newest = (
         Arrival(100 * MS, role == "cloud", 1, counter, math.nan, True) for counter in (0, 600)
@@ -228,10 +226,16 @@ def test_a_datagram_that_is_sent_again_is_no_sign_of_life(
 
 
 @pytest.mark.parametrize("role", table.ENDS)
-def test_a_gap_lies_between_two_arrivals_of_a_session_and_nobody_hides_it(role: str) -> None:
+def test_a_gap_is_between_arrivals_of_a_session_despite_replays(role: str) -> None:
     live = Live(role)
     live.see([SessionOpened(0, role, 1, "")])
-    for at_ms, counter in ((500, 0), (510, 2), (550, 1), (600, 2), (750, 3)):  # 2 is sent again
+    for at_ms, counter in (
+        (500, 0),
+        (510, 2),
+        (550, 1),
+        (600, 2),
+        (750, 3),
+    ):  # counter 2 is replayed
         live.see([Arrival(at_ms * MS, role == "cloud", 1, counter, math.nan, True)])
     live.see([SessionOpened(900 * MS, role, 2, "")])
     live.see([Arrival(990 * MS, role == "cloud", 2, 0, math.nan, True)])
@@ -240,19 +244,19 @@ def test_a_gap_lies_between_two_arrivals_of_a_session_and_nobody_hides_it(role: 
     assert gap.total == pytest.approx(0.01 + 0.04 + 0.2)
 
 
-def test_world_waits_for_the_first_command_of_a_cloud_that_has_none_yet() -> None:
+def test_world_has_a_peer_before_its_first_command() -> None:
     assert heard("world", SessionOpened(0, "world", 1, ""), wake(60_000))
     assert not heard("cloud", SessionOpened(0, "cloud", 1, ""), wake(60_000))
 
 
-def test_a_mission_that_starts_from_spawn_opens_a_session_and_admits_nobody(flight: Flight) -> None:
+def test_a_start_from_spawn_opens_a_session_but_admits_no_cloud(flight: Flight) -> None:
     live = Live("world")
     live.see(flight[0])
     assert value(live, "cloudrc_sessions_opened_total") == 2
     assert value(live, "cloudrc_clouds_admitted_total") == 1
 
 
-def test_the_mission_is_told_by_its_events() -> None:
+def test_mission_metrics_follow_the_events() -> None:
     live = Live("teleop")
     seen = []
     for event, waypoint in (
@@ -287,6 +291,6 @@ def test_the_mission_is_told_by_its_events() -> None:
     assert value(live, "cloudrc_missions_total", "leg_timed_out") == 1
 
 
-def test_a_cloud_whose_mission_is_elsewhere_exposes_none() -> None:
+def test_a_cloud_with_separate_teleop_exposes_no_mission() -> None:
     assert not any("mission" in name for name in Live("cloud").read())
     assert "cloudrc_mission_state" in Live("teleop").read()

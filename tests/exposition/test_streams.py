@@ -1,4 +1,4 @@
-"""Loss and reordering by counters alone: worked by hand, and against a count of everything."""
+"""Loss and reordering from counters: computed by hand, and compared with a full count."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ def taken(*counters: int, epoch: int = 1) -> Stream:
     return stream
 
 
-def test_nothing_is_judged_before_its_time_is_over() -> None:
+def test_a_datagram_counts_after_it_leaves_the_window() -> None:
     stream = taken(0, 2, *range(3, WINDOW + 1))
     assert (stream.expected, stream.lost) == (1, 0)  # only number 0 has left the window
     stream.take(1, WINDOW + 1)
     assert (stream.expected, stream.lost) == (2, 1)
 
 
-def test_one_that_arrives_late_is_reordered_and_not_lost() -> None:
+def test_a_late_datagram_is_reordered_not_lost() -> None:
     stream = taken(0, 2, 1, *range(3, 2 * WINDOW))
     assert (stream.lost, stream.reordered) == (0, 1)
 
 
-def test_a_repeated_one_is_nothing_new() -> None:
+def test_a_repeated_datagram_does_not_count() -> None:
     stream = taken(0, 1, 1, 0, 2)
     assert (stream.lost, stream.reordered) == (0, 0)
 
 
-def test_a_new_epoch_starts_with_what_arrives_first() -> None:
+def test_a_new_epoch_starts_at_its_first_arrival() -> None:
     stream = taken(*range(2 * WINDOW))
     for counter in range(1000, 1000 + WINDOW):
         stream.take(2, counter)
     assert (stream.expected, stream.lost) == (WINDOW, 0)
 
 
-def test_a_long_silence_is_lost() -> None:
+def test_datagrams_of_a_long_silence_are_lost() -> None:
     stream = taken(0, 1000, *range(1001, 1001 + WINDOW))
     assert (stream.expected, stream.lost) == (1001, 999)
 
 
 @given(seed=st.integers(0, 10_000), loss=st.floats(0, 0.9), jitter=st.integers(0, 60))
 @settings(max_examples=40, deadline=None)
-def test_it_counts_what_really_is_missing(seed: int, loss: float, jitter: int) -> None:
+def test_counts_match_the_true_loss_and_reordering(seed: int, loss: float, jitter: int) -> None:
     rng, count = random.Random(seed), 400
     sent = [0] + [n for n in range(1, count) if rng.random() >= loss]
     sent[1:] = sorted(sent[1:], key=lambda n: n + rng.random() * jitter)

@@ -1,4 +1,4 @@
-"""The table of metrics: names by the rules, closed labels, everything counted is in it."""
+"""The table of metrics: names by the rules, closed label sets, an entry for every count."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_delays_are_resolved_from_5_ms_to_1_s() -> None:
     assert (table.DELAY_BUCKETS[0], table.DELAY_BUCKETS[-1]) == (0.005, 1.0)
 
 
-def test_the_names_that_others_build_on_are_there() -> None:
+def test_the_names_that_others_use_exist() -> None:
     wanted = {
         "cloudrc_rtt_seconds": (),
         "cloudrc_uplink_delay_seconds": (),
@@ -73,7 +73,7 @@ def test_the_shipped_bodies_are_known() -> None:
     assert {body.rstrip("_0123456789") for body in bodies} <= set(table.BODIES)
 
 
-def test_whatever_the_ends_count_is_a_metric() -> None:
+def test_every_count_of_the_ends_is_a_metric() -> None:
     found: set[str] = set()
     for part in ("world", "cloud", "tunnel"):
         for path in (ROOT / "cloudrc" / part).rglob("*.py"):
@@ -92,14 +92,14 @@ def test_every_role_has_the_metrics_of_a_process() -> None:
         assert {"cloudrc_build_info", "cloudrc_cpu_throttled_seconds_total"} <= names
 
 
-def test_the_page_names_every_metric_and_its_queries_name_no_other() -> None:
+def test_the_page_names_exactly_the_metrics_of_the_table() -> None:
     assert all(f"`{name}`" in page() for name in METRICS)
     for query in QUERIES.values():
         for name in re.findall(r"cloudrc_\w+", query):
             assert re.sub(r"(?<!_total)_(bucket|sum|count)$", "", name) in METRICS
 
 
-def test_no_label_is_one_that_prometheus_keeps_for_itself() -> None:
-    """promtool refuses them outside of histograms and summaries."""
+def test_no_label_is_reserved_by_prometheus() -> None:
+    """promtool refuses reserved labels outside of histograms and summaries."""
     labels = {label for metric in METRICS.values() for label in metric.labels}
     assert not labels & {"le", "quantile", "job", "instance", "namespace", "pod"}

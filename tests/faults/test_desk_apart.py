@@ -76,7 +76,7 @@ class Story:
         return [said.event for _, said in self.heard if isinstance(said, MissionEvent)]
 
 
-def test_it_sees_the_newest_every_20_ms_and_is_heard_at_the_next_deadline(patch: Patch) -> None:
+def test_teleop_sees_the_newest_state_every_20_ms(patch: Patch) -> None:
     story = Story(patch, until=10.0)
     looks = [look for look in story.looks if look.at > 5.0]
     steps = {round((b.at - a.at) * 1e9) for a, b in pairwise(looks)}
@@ -107,7 +107,7 @@ def test_after_a_stop_it_passes_over_what_its_socket_has_kept(patch: Patch) -> N
     assert story.of(Setpoint, 10.0, 10.2)
 
 
-def test_what_is_said_in_a_turn_leaves_after_the_fsync_and_every_entry_takes_one(
+def test_messages_of_a_turn_are_sent_after_its_fsync(
     patch: Patch,
 ) -> None:
     story = Story(patch, Event("held", 8.0, 1.0), Event("journal_slow", 7.9, 1.0, 0.5), until=12.0)
@@ -121,7 +121,7 @@ def test_what_is_said_in_a_turn_leaves_after_the_fsync_and_every_entry_takes_one
     assert first.age <= 0.02
 
 
-def test_who_is_killed_in_an_fsync_has_written_it_and_said_nothing(patch: Patch) -> None:
+def test_a_kill_during_an_fsync_stores_but_sends_nothing(patch: Patch) -> None:
     slow, killed = Event("journal_slow", 7.9, 1.0, 0.5), Event("teleop_killed", 8.2, 1.0)
     story = Story(patch, slow, Event("held", 8.0, 0.1), killed, until=9.1)
     assert story.desk.events[-1].event == "held"
@@ -151,7 +151,7 @@ def _hold_and_resume(service: MissionService, now_ns: int) -> None:
     service.resume(now_ns)
 
 
-def test_it_lives_on_while_cloud_is_away_and_what_it_says_is_lost_but_for_events(
+def test_while_cloud_is_down_only_teleops_events_survive(
     patch: Patch,
 ) -> None:
     story = Story(patch, Event("cloud_killed", 8.0, 2.0), Event("held", 8.5, 0.5), until=9.9)
@@ -170,7 +170,7 @@ def test_a_frozen_cloud_has_room_for_eleven_words(patch: Patch) -> None:
     assert len(story.of(Setpoint, 10.99, 11.005)) == UNIX_SOCKET_MAX
 
 
-def test_a_frozen_cloud_passes_on_no_start_that_its_socket_has_kept() -> None:
+def test_a_frozen_cloud_forwards_no_old_start() -> None:
     """There was no room for the end behind it: the rotors turned until that was said again."""
     flight = Flight("link.profile=ideal", seed=3, apart=True, start=False)
     inject(flight, Schedule(3, events=(Event("cloud_paused", 8.0, 3.03),)), Wall())
@@ -185,7 +185,7 @@ def _cancel(service: MissionService, now_ns: int) -> None:
     service.cancel(service.book.open()[0].id, now_ns)
 
 
-def test_calls_come_before_what_has_arrived_and_those_to_the_dead_are_dropped(
+def test_calls_run_before_telemetry_and_die_with_teleop(
     patch: Patch,
 ) -> None:
     story, order = Story(patch, until=5.0), list[str]()
@@ -226,7 +226,7 @@ def test_a_fault_of_the_process_takes_teleop_apart(kind: str) -> None:
     assert not Schedule(3, events=(Event("journal_full", 8.0, 2.0),)).has_teleop_apart
 
 
-def test_a_socket_of_this_machine_takes_as_many_as_that_of_the_model(tmp_path: Path) -> None:
+def test_a_real_socket_queues_as_many_as_the_model(tmp_path: Path) -> None:
     waiting = int(Path("/proc/sys/net/unix/max_dgram_qlen").read_text())
     ours, other = tmp_path / "ours", tmp_path / "other"
     writer, reader = UnixPeer(ours, other), UnixPeer(other, ours)

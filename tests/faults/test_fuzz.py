@@ -64,7 +64,7 @@ def test_an_adversary_flies_alone_or_amid_every_kind_of_fault() -> None:
         assert set(mine) == {True, False}
 
 
-def test_the_operators_voice_says_every_word_and_the_operator_is_not_heard(
+def test_the_operator_attack_sends_all_requests_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     heard: list[OperatorRequest] = []
@@ -91,7 +91,7 @@ def test_what_the_guard_lands_for_is_acknowledged_in_the_air() -> None:
     assert flight.watch.counts == {}
 
 
-def test_what_falls_out_of_the_fence_by_the_operators_word_is_told_and_fails_nothing(
+def test_a_fall_by_operator_stop_is_reported_without_failing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def falling(schedule: Schedule, keep: bool = False) -> Finding:
@@ -113,7 +113,7 @@ def test_one_seed_is_one_flight() -> None:
     assert first.sha256 != fly(compose(6), keep=True).sha256
 
 
-def test_every_kind_of_fault_is_composed_and_ends_before_the_calm() -> None:
+def test_every_kind_of_fault_occurs_and_ends_before_the_calm() -> None:
     events = [event for seed in range(400) for event in compose(seed).events]
     assert {event.kind for event in events} == set(KINDS)
     assert max(event.end for event in events) <= CALM
@@ -169,7 +169,7 @@ def test_a_schedule_that_names_what_there_is_not_is_bad_input(
     assert "nope" in error
 
 
-def test_a_fault_of_the_link_is_not_lost_on_a_profile_with_a_time_line() -> None:
+def test_a_link_fault_keeps_the_time_line_of_the_profile() -> None:
     profile = DirectionProfile(changes=(Change(5.0, delay=0.1),))
     silence, waves = Event("blackout", 1.0, 1.0), Event("loss", 1.0, 1.0, 0.5)
     assert shaped(Schedule(1, events=(silence,)), profile, "up").changes == profile.changes
@@ -212,7 +212,7 @@ def test_no_zero_is_told_of_what_was_not_looked_at(capsys: pytest.CaptureFixture
             assert told == {"judged": 1, "broken": 0, "bound": 1.0}, "p is never above 1"
 
 
-def test_a_flight_that_leaves_no_time_to_find_back_is_not_judged_for_being_stuck() -> None:
+def test_a_flight_too_short_to_recover_is_not_judged_stuck() -> None:
     late = Schedule(1, events=(Event("blackout", 44.0, 8.0),))
     assert "stuck" in judged(replace(late, duration=62.0))
     assert "stuck" not in judged(replace(late, duration=61.0))

@@ -79,7 +79,7 @@ def test_it_is_left_alone_when_the_rest_is_taken_out(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["teleop_shut_down", "pod_shut_down"])
-def test_teleop_that_is_asked_to_end_pauses_and_its_successor_goes_on(kind: str) -> None:
+def test_a_teleop_shutdown_pauses_and_its_successor_continues(kind: str) -> None:
     flight = Flight(seed=3)
     event = Event(kind, 8.0, 4.0, 0.25)
     inject(flight, Schedule(3, events=(event,)), Wall())
@@ -94,9 +94,7 @@ def test_teleop_that_is_asked_to_end_pauses_and_its_successor_goes_on(kind: str)
 
 
 @pytest.mark.parametrize(("step", "keys"), [(0.0, 2), (60.0, 1), (-3600.0, 1)])
-def test_who_starts_asks_the_wall_clock_whether_the_key_before_is_valid(
-    step: float, keys: int
-) -> None:
+def test_at_startup_the_wall_clock_decides_on_the_previous_key(step: float, keys: int) -> None:
     events = (Event("key_rotated", 1.0), Event("wall_clock", 1.5, value=step))
     flight = Flight(seed=3)
     inject(flight, Schedule(3, events=(*events, Event("world_killed", 2.0, 0.1))), Wall())
@@ -166,7 +164,7 @@ def test_a_rotation_amid_a_wrong_key_ends_with_the_key_of_world() -> None:
     assert _flown(Event("key_wrong", 8.0, 4.0, 0.5), rotated, until=30.0) == set()
 
 
-def test_a_few_impossible_numbers_do_not_land_it_many_do_until_it_is_acknowledged(
+def test_only_many_invalid_values_land_the_robot(
     monkeypatch: Patch,
 ) -> None:
     few, many = (Event("values_invalid", 8.0, 4.0, value) for value in (3.0, 8.0))
@@ -228,7 +226,7 @@ def test_a_teleop_that_stands_still_does_not_see_the_robot(kind: str, monkeypatc
     assert gaps[1] >= 2.0e9
 
 
-def test_a_needless_process_of_teleop_is_left_out_and_one_that_it_takes_is_not() -> None:
+def test_shrinking_removes_only_an_unneeded_teleop_process() -> None:
     schedule = Schedule(5, events=(Event("blackout", 1.0, 1.0),), apart=True)
     assert not shrink(schedule, lambda each: bool(each.events)).apart
     assert shrink(schedule, lambda each: each.apart).apart

@@ -90,7 +90,7 @@ def test_what_was_flown_until_it_is_told_to_stop_is_told(
     assert f"stopped; {at} of 20 were flown; continue with '{rest}'" in error
 
 
-def test_a_terminal_that_is_closed_says_so_twice_and_a_second_wish_ends_it_at_once() -> None:
+def test_two_hangups_stop_gently_a_second_signal_at_once() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     with faults_fuzz.stopping() as stop:
         for _ in range(2):

@@ -38,7 +38,7 @@ def test_rotors_stop_where_the_robot_stands(
     assert world.tick(ZERO, state=state, turns=False) == kinds
 
 
-def test_a_word_or_a_hit_stops_them_anywhere_and_hard_braking_does_not() -> None:
+def test_an_operator_or_a_hit_may_stop_rotors_not_hard_braking() -> None:
     for word in ("stop", "put_on_ground"):
         world = World()
         world.tick(ZERO, state=HOLD)
@@ -52,7 +52,7 @@ def test_a_word_or_a_hit_stops_them_anywhere_and_hard_braking_does_not() -> None
     assert world.tick(ZERO, ZERO, state=ESTOP, ruled=False) - {"tick"} == set()
 
 
-def test_what_stood_still_in_the_air_falls_and_what_slides_off_has_touched() -> None:
+def test_stopped_rotors_in_the_air_or_after_touch_may_fall() -> None:
     for steps, kinds in ((0, set()), (-496, set()), (-497, {"rest"})):
         world = World()
         world.tick(ZERO, ZERO, state=LAND)

@@ -47,7 +47,7 @@ def step(world: World, state: GuardState, ms: int = TICK_MS) -> set[str]:
     ("count", "apart_ms", "kinds"),
     [(10, 55, set()), (10, 56, {"stale"}), (9, 10, {"stale"}), (0, 10, {"stale"}), (30, 55, set())],
 )
-def test_a_hold_is_left_on_ten_fresh_commands_within_half_a_second(
+def test_a_hold_ends_after_ten_fresh_commands_in_half_a_second(
     count: int, apart_ms: int, kinds: set[str]
 ) -> None:
     world = World()
@@ -59,7 +59,7 @@ def test_a_hold_is_left_on_ten_fresh_commands_within_half_a_second(
 
 
 @pytest.mark.parametrize("word", ["forget_commands", "end_mission"])
-def test_what_came_before_another_session_or_mission_is_not_fresh(word: str) -> None:
+def test_commands_of_an_older_session_or_mission_are_stale(word: str) -> None:
     world = World()
     world.tick(ZERO, state=HOLD, released=False)
     for n in range(9):
@@ -70,7 +70,7 @@ def test_what_came_before_another_session_or_mission_is_not_fresh(word: str) -> 
     assert world.tick(ZERO, state=TRACK, released=False) == {"stale"}
 
 
-def test_what_is_refused_does_not_count_nor_what_was_flown_before_the_hold() -> None:
+def test_refused_and_older_commands_do_not_end_a_hold() -> None:
     world = World()
     for n in range(10):
         offer(world, n)
@@ -85,7 +85,7 @@ def test_what_is_refused_does_not_count_nor_what_was_flown_before_the_hold() -> 
     assert any("on 0 fresh" in breach.text for breach in world.watch.breaches)
 
 
-def test_a_robot_that_was_put_on_the_ground_starts_on_one_command() -> None:
+def test_a_robot_put_on_the_ground_starts_on_one_command() -> None:
     world = World()
     world.tick(ZERO, state=HOLD, released=False)
     world.guard.put_on_ground(0, "from spawn")
@@ -94,7 +94,7 @@ def test_a_robot_that_was_put_on_the_ground_starts_on_one_command() -> None:
 
 
 @pytest.mark.parametrize(("apart_ms", "kinds"), [(998, {"hold"}), (1000, set())])
-def test_track_begins_a_second_after_the_last_one_at_the_earliest(
+def test_track_begins_at_least_a_second_after_the_last_track(
     apart_ms: int, kinds: set[str]
 ) -> None:
     world = World()
@@ -108,9 +108,7 @@ def test_track_begins_a_second_after_the_last_one_at_the_earliest(
 @pytest.mark.parametrize(
     ("cause", "kinds"), [(Cause.SILENCE, {"hold"}), (Cause.SESSION, set()), (Cause.ENDED, set())]
 )
-def test_a_hold_for_silence_begins_a_second_after_the_last_hold_at_the_earliest(
-    cause: Cause, kinds: set[str]
-) -> None:
+def test_holds_for_silence_begin_at_least_a_second_apart(cause: Cause, kinds: set[str]) -> None:
     for apart_ms, found in ((998, kinds), (1000, set())):
         world = World()
         step(world, TRACK, 1000)
@@ -121,7 +119,7 @@ def test_a_hold_for_silence_begins_a_second_after_the_last_hold_at_the_earliest(
         assert step(world, HOLD) == found
 
 
-def test_a_hold_is_no_breach_where_commands_go_back_to_older_odometry() -> None:
+def test_a_hold_after_commands_on_older_odometry_is_allowed() -> None:
     for bases_ms, kinds in (((9, 8), set()), ((8, 9), {"hold"}), ((9, 9), {"hold"})):
         world = World()
         step(world, TRACK, 1000)
@@ -150,7 +148,7 @@ def test_who_was_put_on_the_ground_has_no_last_hold() -> None:
         assert step(world, HOLD) == kinds
 
 
-def test_a_hold_that_had_not_left_the_ground_is_over_in_the_tick_that_it_began_in() -> None:
+def test_a_hold_on_the_ground_ends_in_its_first_tick() -> None:
     """The guard waits for ten seconds from then on, not from the last command before TRACK."""
     world, readings = World(), sensed()
     world.guard = world.robot.guard = Guard(replace(LIMITS, hold_max_ns=2 * SECOND))
@@ -217,7 +215,7 @@ def test_nobody_lands_before_that_time(state: GuardState, hold_max_ms: int, wait
         assert step(world, LAND) == kinds
 
 
-def test_nobody_lands_out_of_track_unless_commands_were_impossible() -> None:
+def test_landing_from_track_needs_impossible_commands() -> None:
     world = World()
     step(world, TRACK, 100)
     assert step(world, LAND) == {"hold"}
@@ -227,7 +225,7 @@ def test_nobody_lands_out_of_track_unless_commands_were_impossible() -> None:
     assert step(world, LAND) == set()
 
 
-def test_what_was_impossible_is_no_reason_to_land_later_nor_what_was_seldom_so() -> None:
+def test_old_or_rare_impossible_commands_justify_no_landing() -> None:
     world = World()
     world.say_what_is_impossible()
     step(world, HOLD, 100)
@@ -251,7 +249,7 @@ def test_out_of_hold_the_reference_grows_slowly(growth: float, kinds: set[str]) 
         assert set(world.watch.counts) == kinds
 
 
-def test_in_the_end_it_grows_as_elsewhere_and_slows_down_as_hard_as_it_must() -> None:
+def test_at_a_holds_end_speed_grows_slowly_but_may_drop_fast() -> None:
     world = World()
     step(world, HOLD, 1000)
     world.guard.reference = (1.0, 0.0, 0.0)

@@ -82,5 +82,5 @@ def test_a_guard_that_ends_a_hold_otherwise_is_found(
     assert kind in fly(HELD).kinds
 
 
-def test_the_same_flight_is_nobodys_breach_with_the_guard_as_it_is() -> None:
+def test_the_same_flight_with_the_current_guard_has_no_breach() -> None:
     assert fly(HELD).breaches == ()

@@ -49,7 +49,7 @@ def inside(mortal: Mortal) -> Ticker:
     return mortal.inner
 
 
-def test_a_killed_end_hears_and_sends_nothing_until_a_new_one_is_there() -> None:
+def test_a_killed_endpoint_is_silent_until_its_successor_runs() -> None:
     mortal = Mortal(Ticker, Clock())
     old = inside(mortal)
     mortal.at(0.025, mortal.kill)
@@ -64,7 +64,7 @@ def test_a_killed_end_hears_and_sends_nothing_until_a_new_one_is_there() -> None
     assert inside(mortal).heard == []
 
 
-def test_what_arrives_while_it_stands_still_waits_and_comes_at_one_instant() -> None:
+def test_datagrams_wait_during_a_freeze_and_arrive_together() -> None:
     mortal = Mortal(Ticker, Clock())
     mortal.at(0.005, lambda now_ns: mortal.freeze(now_ns, 0.100))
     run(mortal, 6)

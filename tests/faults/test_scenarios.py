@@ -238,7 +238,7 @@ def test_what_cannot_be_done_is_said_at_once_and_in_one_line(
     assert (out, err.count("\n")) == ("", 1)
 
 
-def test_an_experiment_takes_the_last_seed_that_is_counted_from_the_largest_one() -> None:
+def test_an_experiment_accepts_the_last_possible_seed() -> None:
     last = SEED_MAX + COUNT_MAX - 1
     assert load_experiment("paper", [f"seed={last}"]).seed == last
     assert seed(str(SEED_MAX)) == SEED_MAX

@@ -20,7 +20,7 @@ def change(at_ms: int, state: GuardState, cause: Cause = Cause.COMMAND) -> Guard
 
 
 @pytest.mark.parametrize("kind", ["world_killed", "wall_clock"])
-def test_a_robot_that_nothing_reaches_is_stuck_whether_or_not_it_is_a_new_one(
+def test_an_unreachable_robot_is_stuck_also_in_a_new_world(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A new world that hears nothing changes nothing; its forerunner was in TRACK."""
@@ -37,7 +37,7 @@ def test_a_robot_that_nothing_reaches_is_stuck_whether_or_not_it_is_a_new_one(
     assert told in finding.breaches[0].text
 
 
-def test_a_world_that_is_down_flies_nothing_and_a_new_one_begins_on_the_ground() -> None:
+def test_a_killed_world_and_its_successor_are_on_the_ground() -> None:
     flight = Flight().fly(2.0)
     assert seen_now(flight.world.inner) == (TRACK, "fresh command")
     flight.kill_world(flight.run.now_ns, 0.5)
@@ -72,13 +72,13 @@ def test_what_a_contact_has_stopped_flew_when_it_began(
     assert state_before(changes, 2010 * MS, 0) is state
 
 
-def test_who_has_acknowledged_a_landing_right_above_something_still_lands_on_it() -> None:
+def test_an_early_acknowledgement_does_not_undo_a_landing() -> None:
     for held_ms, state in ((1900, LAND), (1800, HOLD)):
         changes = [change(0, LAND), change(held_ms, HOLD, Cause.NOT_DOWN)]
         assert state_before(changes, 2010 * MS, 0) is state
 
 
-def test_a_crash_onto_the_floor_is_a_collision_though_it_stops_the_rotors() -> None:
+def test_a_crash_onto_the_floor_is_a_collision() -> None:
     for flown, kinds in ((TRACK, {"collision"}), (HOLD, {"collision"}), (LAND, set())):
         flight = Flight(start=False)
         contact = Contact(2010 * MS, "floor", ZERO, (0.0, 0.0, -3.0), ZERO, False)

@@ -24,7 +24,7 @@ def fly(seeds: Iterable[int], *settings: str) -> tuple[int, list[str]]:
 
 
 @pytest.mark.promise("stays-inside-the-fence")
-def test_a_hostile_cloud_does_not_get_a_stiffer_robot_out_of_the_fence() -> None:
+def test_a_hostile_cloud_keeps_a_stiffer_robot_in_the_fence() -> None:
     flown, broken = fly(range(1, 7), STIFFER)
     assert flown > 1
     assert broken == []

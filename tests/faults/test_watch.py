@@ -13,12 +13,12 @@ GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
 
 @pytest.mark.parametrize("state", GuardState)
-def test_the_base_may_not_be_outside_in_any_state_rotors_stopped_or_not(state):
+def test_a_base_outside_the_fence_is_a_breach_in_any_state(state):
     assert World().tick(ZERO, state=state) == set()
     assert World().tick(ZERO, state=state, position=OUTSIDE) == {"fence"}
 
 
-def test_stopped_by_the_operators_word_it_may_fall_out_but_not_far_nor_fly_there():
+def test_an_operator_stop_allows_only_a_short_fall_outside():
     world, far = World(), (9.2 + 1.51, 1.0, 1.0)
     world.guard.stop(0)
     assert world.tick(ZERO, state=ESTOP, position=OUTSIDE) == set()
@@ -31,7 +31,7 @@ def test_stopped_by_the_operators_word_it_may_fall_out_but_not_far_nor_fly_there
 
 
 @pytest.mark.parametrize(("speed", "kinds"), [(0.11, set()), (0.13, {"fence"})])
-def test_stopped_by_the_operators_word_it_may_not_take_off_in_its_fall(speed, kinds):
+def test_after_an_operator_stop_no_take_off_while_falling(speed, kinds):
     world = World()
     world.guard.stop(0)
     world.readings.velocity = (0.0, 0.0, -speed)
@@ -51,7 +51,7 @@ def test_a_word_that_stops_no_rotors_excuses_no_fall(state):
     assert world.watch.fallen == 0.0
 
 
-def test_stopped_by_a_hit_it_may_fall_out_but_not_far_nor_fly_there():
+def test_a_hit_allows_only_a_short_fall_outside():
     world, far = World(), (9.2 + 1.51, 1.0, 1.0)
     assert world.tick(ZERO, state=TRACK) == set()
     assert world.tick(ZERO, state=ESTOP, position=OUTSIDE) == set()
@@ -87,7 +87,7 @@ def test_the_reference_turns_no_faster_than_the_cap(yaw_rate):
     assert World(yaw_rate).tick(ZERO) == (set() if yaw_rate == -1.0 else {"cap"})
 
 
-def test_it_may_slow_down_at_once_and_is_not_held_to_the_cap_while_it_brakes():
+def test_braking_may_be_instant_and_exceed_the_cap():
     assert World().tick((0.02, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, -0.02, 0.0)) == set()
     assert World().tick((0.1, 0.0, 0.0), state=HOLD) == set()
     assert World().tick((0.02, 0.0, 0.0), (-0.025, 0.0, 0.0)) == {"cap"}
@@ -142,7 +142,7 @@ def test_a_robot_that_is_left_alone_stops_where_it_can(state):
     assert world.tick(ZERO, state=state, position=(1.0, 4.17, 1.0)) == {"rest"}
 
 
-def test_what_was_hit_excuses_how_far_it_goes_until_it_is_flown_again():
+def test_a_hit_excuses_drift_until_the_next_flight():
     world, pipe = World(), Contact(-2_000_000_000, "pipe_1", INSIDE, ZERO, ZERO, False)
     world.tick(ZERO, state=HOLD)
     world.watch.see(pipe, HOLD, honest=False)
@@ -176,16 +176,14 @@ def test_stopping_counts_towards_the_face_ahead(speed, below, above, can):
         ("floor", False, LAND, set()),
     ],
 )
-def test_under_an_honest_cloud_nothing_but_the_tip_touches_and_that_the_board(
-    body, tip, state, kinds
-):
+def test_with_an_honest_cloud_only_the_tip_touches_the_board(body, tip, state, kinds):
     for honest, found in ((True, kinds), (False, set())):
         watch = Watch(6.0, 12.0, 1.0, 250 * MS)
         watch.see(Contact(0, body, INSIDE, ZERO, ZERO, tip), state, honest)
         assert set(watch.counts) == found
 
 
-def test_a_robot_that_lands_touches_what_lies_below_and_one_that_flies_again_may_not():
+def test_only_a_landing_robot_may_touch_what_is_below():
     world = World()
     pipe = Contact(0, "pipe_3", INSIDE, ZERO, ZERO, False)
     world.tick(ZERO, state=ESTOP)
@@ -209,7 +207,7 @@ def test_a_robot_that_lands_touches_what_lies_below_and_one_that_flies_again_may
         assert set(world.watch.counts) == {"collision"}
 
 
-def test_who_has_just_been_hit_or_whose_rotors_stand_need_not_rest_where_commands_ended():
+def test_after_a_hit_or_without_rotors_no_rest_is_required():
     away = (3.0, 1.0, 1.0)
     for hit_ns, kinds in ((0, set()), (-1_000_000_000, {"rest"})):
         world = World()

@@ -29,7 +29,7 @@ def test_what_is_latched_stays_so_until_the_operator_has_said_so(latched, after)
     assert world.tick(ZERO, state=after, released=False) == {"latch"}
 
 
-def test_an_acknowledgement_counts_in_the_state_that_it_is_for_and_no_longer():
+def test_an_acknowledgement_counts_only_in_its_own_state():
     world = World()
     world.tick(ZERO, released=False)
     world.guard.state = LAND  # it lands and is acknowledged between two ticks
@@ -41,7 +41,7 @@ def test_an_acknowledgement_counts_in_the_state_that_it_is_for_and_no_longer():
 
 
 @pytest.mark.parametrize("before", [LAND, ESTOP])
-def test_what_is_acknowledged_twice_between_two_ticks_was_released_the_first_time(before):
+def test_a_second_acknowledgement_in_a_tick_has_no_effect(before):
     world = World()
     world.tick(ZERO, state=before)
     for world.guard.state in (ESTOP, GROUND):  # one that landed was stopped just then
@@ -57,7 +57,7 @@ def say(world: World, word: str) -> None:
 
 
 @pytest.mark.parametrize("word", ["end_mission", "stop", "put_on_ground"])
-def test_track_is_for_what_the_operator_has_started_and_not_ended(word: str) -> None:
+def test_track_needs_a_mission_that_the_operator_started(word: str) -> None:
     world = World()
     assert world.tick(ZERO) == set()
     say(world, word)
@@ -69,7 +69,7 @@ def test_track_is_for_what_the_operator_has_started_and_not_ended(word: str) -> 
 
 
 @pytest.mark.parametrize("latched", [LAND, ESTOP])
-def test_what_is_latched_has_ended_the_mission_and_hears_no_start(latched: GuardState) -> None:
+def test_a_latched_state_ends_the_mission_and_ignores_starts(latched: GuardState) -> None:
     world = World()
     world.tick(ZERO, state=latched, released=False)
     world.guard.start_mission(0)

@@ -1,7 +1,7 @@
-"""Flights made by hand, of which every number is known.
+"""Synthetic flights with known numbers.
 
-The robot flies at 1 m/s along x from the origin at height 1; 25 telemetries and commands a second.
-Its mission starts at 10 s on both clocks, which are one, and is done at 20 s.
+The robot flies at 1 m/s along x from the origin at a height of 1 m, with 25 telemetries and
+commands per second. The mission lasts from 10 s to 20 s on the shared clock of both ends.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ ONE_PIPE = Scene(
 
 
 def at(seconds: float) -> int:
-    """Stamp of an instant [s] after the start."""
+    """Return the stamp of a time [s] after the start."""
     return START + round(seconds * SECOND)
 
 
@@ -59,13 +59,13 @@ def straight(seconds: float) -> Vector:
 
 @dataclass
 class Log:
-    """Records of both ends, to be changed by a test before they become a flight."""
+    """Records of both ends; a test may change them before it makes a flight of them."""
 
     world: list[Record] = field(default_factory=list)
     cloud: list[Record] = field(default_factory=list)
 
     def change(self, kind: type, how: Callable[[int, Record], Record | None]) -> None:
-        """Replace the n-th record of a class by `how(n, record)`; None takes it out."""
+        """Replace the n-th record of a class by `how(n, record)`; None removes it."""
         for records in (self.world, self.cloud):
             n, changed = 0, []
             for record in records:
@@ -85,7 +85,7 @@ class Log:
         waypoints: int = 1,
         time_limit: float = 60.0,
     ) -> Flight:
-        # Stable: records of one instant stay as they were put in.
+        # A stable sort: records with equal stamps keep their order.
         world, cloud = (sorted(r, key=lambda record: record.stamp_ns) for r in self._both())
         criteria = Criteria(contact=contact, time_limit_s=time_limit)
         return Flight(Recording.from_records(world, cloud), criteria, waypoints, scene)
@@ -95,7 +95,7 @@ class Log:
 
 
 def flown(path: Callable[[float], Vector] = straight) -> Log:
-    """Log a flight along `path`, the position [m] as a function of the time since the start [s]."""
+    """Log a flight along `path`: position [m] as a function of time since the start [s]."""
     log = Log()
     log.world += [
         SessionOpened(START - SECOND, "world", 1, "cloud said hello"),
@@ -155,17 +155,17 @@ def _step(log: Log, counter: int, stamp: int, path: Callable[[float], Vector]) -
 
 @cache
 def straight_flight() -> Flight:
-    """The plain flight through open air; not to be changed."""
+    """Return the flight through open air; tests must not change it."""
     return flown().flight()
 
 
 def touch(seconds: float, body: str = "board", *, tip: bool = True) -> Contact:
-    """A contact with the tip at 0.15 m/s."""
+    """Make a contact with the tip at 0.15 m/s."""
     return Contact(at(seconds), body, straight(seconds), ZERO, (0.12, 0.09, 0.0), tip)
 
 
 def pressing(log: Log, since: float, force: Callable[[int], float]) -> None:
-    """Let a force act on the tip from an instant on [s since the start]."""
+    """Apply a force to the tip from a time on [s since the start]."""
 
     def how(n: int, record: Record) -> Record:
         assert isinstance(record, GroundTruth)
@@ -176,7 +176,7 @@ def pressing(log: Log, since: float, force: Callable[[int], float]) -> None:
 
 @cache
 def paper() -> tuple[ResolvedExperiment, Recording]:
-    """The shipped experiment, flown once in virtual time."""
+    """Fly the shipped experiment once in virtual time."""
     experiment = load_experiment("paper")
     world = build_world(experiment, WorldIdentity(bytes(16), b"w" * 16))
     cloud = build_cloud(experiment, CloudIdentity(bytes(16), b"c" * 16))

@@ -1,4 +1,4 @@
-"""Every row of the tables keeps the contract of metrics, on any recording."""
+"""Every shipped metric keeps the contract of metrics, on any recording."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from cloudrc.config.schema import Criteria
 from cloudrc.geometry.scene import load_scene
-from cloudrc.metrics import SHIPPED, Flight, control, link, measure_all, mission, motion
+from cloudrc.metrics import SHIPPED, Flight, control, flight, link, measure_all, mission
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from tests.metrics.conftest import DONE, ONE_PIPE, flown, paper, straight_flight
@@ -23,7 +23,7 @@ PROMISED = {
     *("tracking_rms_estimated", "hold_count", "real_time_factor", "world_lateness_p99"),
     "cloud_lateness_p99",
 }
-"""Names that others build on.
+"""Names that others use.
 Source: docs/reference/control.md, "Names that others use"."""
 
 
@@ -36,7 +36,7 @@ def test_the_promised_names_are_there() -> None:
 
 
 def test_no_two_rows_have_one_name() -> None:
-    assert len(SHIPPED) == sum(len(table.METRICS) for table in (motion, control, link, mission))
+    assert len(SHIPPED) == sum(len(table.METRICS) for table in (flight, control, link, mission))
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -55,14 +55,14 @@ def test_an_empty_recording_has_no_numbers(name: str) -> None:
 
 
 @pytest.mark.parametrize("lost", sorted(TOPICS))
-def test_a_lost_topic_costs_no_other_number_its_life(lost: str) -> None:
+def test_a_missing_topic_makes_no_metric_fail(lost: str) -> None:
     recording = straight_flight().recording
     rows = {name: recording._rows[name] for name in TOPICS if name != lost}
     _, notes = measure_all(Flight(Recording(rows), Criteria(), 1, ONE_PIPE))
     assert notes == []
 
 
-def test_the_papers_flight_has_every_number_but_those_of_real_time_and_hovering() -> None:
+def test_the_paper_flight_has_all_numbers_of_virtual_flight() -> None:
     numbers, notes = measure_all(flight_of(paper()[1]))
     assert notes == []
     assert list(numbers) == sorted(numbers)
@@ -77,7 +77,7 @@ def test_the_papers_flight_has_every_number_but_those_of_real_time_and_hovering(
     }
 
 
-def test_a_flight_without_an_ending_lasts_as_long_as_its_recording() -> None:
+def test_a_flight_without_an_end_lasts_as_its_recording() -> None:
     log = flown()
     log.cloud = [record for record in log.cloud if record.stamp_ns < DONE]
     assert log.flight().ending is None

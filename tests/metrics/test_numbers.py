@@ -1,4 +1,4 @@
-"""Every metric on a flight made by hand: the numbers are worked out beside it."""
+"""Every metric on a synthetic flight, with numbers computed by hand."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def measured(name: str, flight: Flight) -> float | None:
         ("speed_max", 1.0),
         ("distance_flown", 10.0),  # 10 s at 1 m/s
         ("prediction_error_rms", 0.005),  # off by (3, 4, 0) mm where the command is applied
-        # Applied 90 ms after the measurement, meant for 80 ms after it: 10 mm more along x.
+        # Applied 90 ms after the measurement, predicted for 80 ms after it: 10 mm more along x.
         ("estimate_error_rms", hypot(0.013, 0.004)),
         ("delay_estimate_error_rms", 0.01),
         ("tracking_rms_measured", 0.5),  # the setpoint is (0.3, 0.4, 0) m from the measurement
@@ -49,8 +49,8 @@ def measured(name: str, flight: Flight) -> float | None:
         ("late_uplink", 0.0),
         ("late_downlink", 0.0),
         ("age_of_information_mean", 0.05),
-        ("commands_applied", 251.0),  # 25 a second for 10 s, both ends of it included
-        ("hold_count", 0.0),  # the HOLD after the mission's end is none of its own
+        ("commands_applied", 251.0),  # 25 per second for 10 s, both ends included
+        ("hold_count", 0.0),  # the HOLD after the mission's end does not count
         ("hold_time", 0.0),
         ("fault_count", 0.0),
     ],
@@ -77,14 +77,14 @@ def test_straight_flight(name: str, expected: float) -> None:
         "recorder_dropped",
     ],
 )
-def test_what_cannot_be_known_is_absent(name: str) -> None:
-    """No board was touched, no pipe is there, nothing rested, time was virtual."""
+def test_unknown_numbers_are_absent(name: str) -> None:
+    """The flight has no board contact, no pipe, no rest and no real time."""
     assert measured(name, straight_flight()) is None
 
 
 def test_contact() -> None:
     log = flown()
-    # The floor, a rotor on the board and later touches are not the first touch of the tip.
+    # Contacts of the floor, of a rotor, and later ones are not the tip's first touch.
     log.world += [touch(6, "floor"), touch(7, tip=False), touch(8), touch(9)]
     pressing(log, 8, lambda n: 0.1 if n % 2 else 0.3)
     flight = log.flight(ONE_PIPE, contact=True)
@@ -94,7 +94,7 @@ def test_contact() -> None:
     assert measured("steady_contact_force", flight) == pytest.approx(0.2, abs=3e-3)
 
 
-def test_steady_force_needs_two_seconds_of_contact_and_the_missions_end() -> None:
+def test_steady_force_needs_two_seconds_and_a_completed_mission() -> None:
     late = flown()
     late.world.append(touch(9))
     assert measured("steady_contact_force", late.flight(ONE_PIPE)) is None
@@ -107,13 +107,13 @@ def test_steady_force_needs_two_seconds_of_contact_and_the_missions_end() -> Non
 
 
 def test_clearance_inside_and_outside() -> None:
-    """The pipe's bore is from x = 2 to 7; before it the way is 10 cm beside the axis."""
+    """The pipe is from x = 2 m to 7 m; before it the robot flies 10 cm beside the axis."""
     log = flown(lambda t: (t, 0.1 if t < 2 else 0.0, 1.0))
     flight = log.flight(ONE_PIPE)
-    # On the axis the left rotor's upper rim is nearest: .662 - |(.21 + .128, .05 + .0025)|.
+    # On the axis the left rotor's upper rim is closest: .662 - |(.21 + .128, .05 + .0025)|.
     on_axis = 0.662 - hypot(0.338, 0.0525)
     assert measured("min_clearance", flight) == pytest.approx(on_axis, abs=1e-9)
-    # Just before the pipe the front of the robot is in it, the rotor at y = .21 + .1 with it.
+    # Just before the pipe the robot's front is inside it, with the rotor at y = .21 + .1.
     assert 0.2 < measured("min_clearance_flight", flight) < on_axis - 0.05
 
 
@@ -131,7 +131,7 @@ def test_a_waypoint_counts_once() -> None:
 
 
 def test_a_repeated_echo_counts_once() -> None:
-    """The first echo stands for half of the flight's 251 periods, yet it is one of two."""
+    """The first echo fills half of the flight's 251 periods, but it is one of two echoes."""
     log = flown()
 
     def silent(n: int, control: Control) -> Control:
@@ -169,7 +169,7 @@ def test_late_datagrams_count_in_the_delay() -> None:
     assert measured("uplink_delay_mean", log.flight()) == pytest.approx(0.05, abs=1e-4)
 
 
-def test_without_a_shared_clock_there_are_no_one_way_numbers() -> None:
+def test_without_a_shared_clock_one_way_numbers_are_absent() -> None:
     log = flown()
     log.change(Arrival, lambda n, arrival: arrival._replace(delay=nan))
     for name in ("uplink_delay_mean", "downlink_delay_mean", "age_of_information_mean"):
@@ -198,7 +198,7 @@ def test_hover() -> None:
 
 
 @pytest.mark.parametrize("why", ["moved", "touched", "short"])
-def test_what_does_not_rest_has_no_steady_error(why: str) -> None:
+def test_a_robot_not_at_rest_has_no_steady_error(why: str) -> None:
     log = flown(lambda t: (0.97, 0.0, 1.0))
     log.change(
         Control,
@@ -212,7 +212,7 @@ def test_what_does_not_rest_has_no_steady_error(why: str) -> None:
 
 
 def test_real_time() -> None:
-    """World loses half a second in ten; it is 1 to 100 ms late, cloud half as much."""
+    """World loses 0.5 s in 10 s; its wakes are 1 to 100 ms late, those of cloud half as much."""
     log = flown()
     for n in range(101):
         stamp, late = at(n / 10), (n or 1) * 1e-3
@@ -228,7 +228,7 @@ def test_real_time() -> None:
 
 def test_faults_and_drops() -> None:
     log = flown()
-    # A fault that repeats is told once, here before the mission began, and counted every time.
+    # A repeated fault has one record, here before the mission, but its count includes each time.
     log.cloud += [Fault(START - PERIOD, "predictor_failed", "..."), Fault(at(1), "late", "...")]
     log.cloud += [Counted(at(n), "cloud", "predictor_failed", 7 * n) for n in (1, 2)]
     log.world += [Counted(at(n), "world", "recorder_dropped", n) for n in (1, 2)]
@@ -243,7 +243,7 @@ def test_time_zero_is_the_first_track() -> None:
     assert log.flight().start_ns == START
 
 
-def test_a_relay_tells_how_late_it_was() -> None:
+def test_the_relays_counts_become_numbers() -> None:
     log = flown()
     assert measured("release_error_p99_uplink", log.flight()) is None
     log.world += [

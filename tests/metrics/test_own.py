@@ -1,4 +1,4 @@
-"""A user's own metrics: found by path or installed, measured by a run, refused before it."""
+"""A user's own metrics: found by path or installed, measured by a run, checked before it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def report_of(run: Path) -> dict[str, Any]:
     return json.loads((run / "report.json").read_text())
 
 
-def test_a_run_measures_a_file_and_a_later_report_only_if_it_is_named(folder: Path) -> None:
+def test_a_later_report_measures_a_file_only_if_named(folder: Path) -> None:
     run = folder / "run"
     asked = "report.metrics=[mine/overshoot.py, mine/raises.py]"
     assert main(["run", *SHORT, "--set", asked, "--out", "run"]) == 0
@@ -77,7 +77,7 @@ def test_a_run_measures_a_file_and_a_later_report_only_if_it_is_named(folder: Pa
     assert report_of(run) == first
 
 
-def test_a_sweep_measures_it_too(folder: Path) -> None:
+def test_a_sweep_measures_a_file(folder: Path) -> None:
     line = ["run", *SHORT, "--seeds", "2", "--out", "sweep"]
     assert main([*line, "--set", "report.metrics=mine/overshoot.py"]) == 0
     numbers = json.loads((folder / "sweep" / "sweep.json").read_text())["numbers"]
@@ -108,7 +108,7 @@ def test_a_metric_that_fails_costs_only_its_own_number(folder: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("command", ["run", "run --seeds 2", "report"])
-def test_what_is_no_metric_is_refused_in_one_line(
+def test_an_invalid_metric_is_refused_in_one_line(
     folder: Path, capsys: Captured, command: str, names: list[str], text: str, reason: str
 ) -> None:
     if text:
@@ -127,7 +127,7 @@ def test_what_is_no_metric_is_refused_in_one_line(
 def test_an_installed_metric_is_in_every_report(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names = ("past", "duration")  # what ships cannot be replaced
+    names = ("past", "duration")  # a shipped metric cannot be replaced
     entries = tuple(EntryPoint(name, "overshoot", "cloudrc.metrics") for name in names)
     monkeypatch.syspath_prepend(str(folder / "mine"))
     monkeypatch.setattr(

@@ -1,4 +1,4 @@
-"""The band of the delay figure is what the link was asked to be."""
+"""The band of the delay figure shows the configured link profile."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from cloudrc.config.schema import Change, Direction
-from cloudrc.report.figures.marks import at, band
+from cloudrc.report.figures.marks import band, bounds_at
 
 
 def bounds(direction: Direction, time: float) -> tuple[float, float]:
     steps = band(direction)
     assert steps is not None
-    low, high = at(steps, np.array([time]))
+    low, high = bounds_at(steps, np.array([time]))
     return low[0], high[0]
 
 
@@ -36,7 +36,7 @@ def test_changes_hold_from_their_instant_on() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])  # the second as Excel writes it
-def test_a_trace_stands_in_place_of_the_delay(tmp_path: Path, encoding: str) -> None:
+def test_a_trace_replaces_the_delay(tmp_path: Path, encoding: str) -> None:
     trace = tmp_path / "trace.csv"
     trace.write_text("time_s,delay_ms,loss\n1,30,0\n5,90,0\n", encoding=encoding)
     direction = Direction(delay_ms=5.0, jitter_ms=10.0, trace=str(trace))
@@ -44,5 +44,5 @@ def test_a_trace_stands_in_place_of_the_delay(tmp_path: Path, encoding: str) -> 
     assert bounds(direction, 6.0) == pytest.approx((0.080, 0.100))
 
 
-def test_a_trace_that_is_gone_has_no_band(tmp_path: Path) -> None:
+def test_a_missing_trace_has_no_band(tmp_path: Path) -> None:
     assert band(Direction(trace=str(tmp_path / "gone.csv"))) is None

@@ -1,4 +1,4 @@
-"""report.json and environment.json: their names, what is absent, and what they never say."""
+"""report.json and environment.json: their names, absent values, and what they never contain."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_values() -> None:
     assert all(set(number) == {"value", "unit"} for number in report["numbers"].values())
 
 
-def test_what_is_not_known_is_absent() -> None:
+def test_unknown_values_are_absent() -> None:
     experiment, recording = paper()
     report = assess(recording, experiment, Run("virtual", "virtual")).document
     assert "records_sha256" not in report
@@ -61,7 +61,7 @@ def test_the_same_flight_gives_the_same_document() -> None:
     assert json.dumps(document()) == json.dumps(document())
 
 
-def test_an_offset_between_the_clocks_comes_with_its_uncertainty() -> None:
+def test_a_clock_offset_has_its_uncertainty() -> None:
     metadata = {"clock_offset_method": "packets", "clock_offset_uncertainty_ns": "1500000"}
     uncertainty = {"value": pytest.approx(0.0015), "unit": "s"}
     assert clock_offset_document(metadata) == {"method": "packets", "uncertainty": uncertainty}
@@ -77,7 +77,7 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
         write_json(tmp_path / "report.json", {"value": float("nan")})
 
 
-def test_the_environment_names_the_software_but_no_user_and_no_machine() -> None:
+def test_the_environment_names_software_but_no_user_or_host() -> None:
     environment = environment_document()
     assert environment["packages"]["numpy"]
     assert environment["cores"] >= 1

@@ -1,4 +1,4 @@
-"""Figures mark what happened to the link, and draw flights with little to show."""
+"""Figures mark events of the link and guard, and draw flights with little data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cloudrc.messages import GuardState
 from cloudrc.records import Control, GuardChange
 from cloudrc.report.figures import NAMES, draw_all, flight
 from cloudrc.report.figures.marks import LEGEND, legend, mark_events
-from cloudrc.report.figures.snapshots import WALL_COLOUR, is_swallowed, pipe_faces
+from cloudrc.report.figures.snapshots import WALL_COLOUR, is_inside_pipe, pipe_faces
 from cloudrc.report.figures.style import RC, Subject, new_figure
 from tests.metrics.conftest import ONE_PIPE, START, Log, at, flown
 
@@ -27,8 +27,8 @@ def subject_of(log: Log, uplink: Direction = CALM) -> Subject:
 
 @pytest.mark.parametrize("empty", [False, True])
 @pytest.mark.parametrize("name", NAMES)
-def test_little_to_show_is_no_error(name: str, empty: bool) -> None:
-    """Nobody flew, or nothing but one instant is recorded."""
+def test_a_flight_without_data_is_drawn(name: str, empty: bool) -> None:
+    """The recording is empty or ends at the start."""
     log = flown()
     log.world = [] if empty else [record for record in log.world if record.stamp_ns <= START]
     log.cloud = [] if empty else [record for record in log.cloud if record.stamp_ns <= START]
@@ -39,12 +39,12 @@ def test_little_to_show_is_no_error(name: str, empty: bool) -> None:
     assert drawing.caption(subject)
 
 
-def test_where_pipes_meet_no_rim_is_drawn_in_the_other() -> None:
-    """Sorted by depth its faces would show in patches between those of the other pipe."""
+def test_a_pipes_rim_inside_another_pipe_is_not_drawn() -> None:
+    """Sorted by depth, its faces would appear between those of the other pipe."""
     first, second, _ = load_scene("pipes").pipes
     centre = np.array(second.centre)
     faces = pipe_faces(second, np.array([0.0, 0.0, 1.0]), centre, second.length)
-    met = [face for face in faces if is_swallowed(face, first)]
+    met = [face for face in faces if is_inside_pipe(face, first)]
     assert 0 < len(met) < len(faces)
     assert {face.colour for face in met} == {WALL_COLOUR}
     for face in met:
@@ -53,7 +53,7 @@ def test_where_pipes_meet_no_rim_is_drawn_in_the_other() -> None:
         assert abs(offset[1]) < first.length / 2
 
 
-def test_the_caption_says_where_the_clearance_is_cut_off() -> None:
+def test_the_caption_names_the_end_of_the_clearance_axis() -> None:
     assert "Panel (c) ends at 0.8 m" in flight.caption(subject_of(flown()))
 
 
@@ -67,7 +67,7 @@ def test_holds_blackouts_and_changes_are_marked() -> None:
         GuardChange(at(2), GuardState.HOLD, "command age"),
         GuardChange(at(3), GuardState.TRACK, "fresh command"),
     ]
-    # The link came up one second before the mission began.
+    # The link started one second before the mission.
     uplink = Direction(
         blackouts=(Blackout(start_s=3.0, duration_s=1.0), Blackout(start_s=500.0, duration_s=1.0)),
         changes=(Change(at_s=0.5, delay_ms=1.0), Change(at_s=6.0, delay_ms=9.0)),
@@ -81,7 +81,7 @@ def test_holds_blackouts_and_changes_are_marked() -> None:
     assert [line.get_xdata()[0] for line in axes.lines] == pytest.approx([5.0])
 
 
-def test_waypoints_are_where_the_setpoint_was_when_they_were_new() -> None:
+def test_waypoints_are_the_first_setpoints_of_each() -> None:
     log = flown()
 
     def fly_to(n: int, control: Control) -> Control:
@@ -92,8 +92,8 @@ def test_waypoints_are_where_the_setpoint_was_when_they_were_new() -> None:
     assert subject_of(log).waypoints == {0: (0.0, 2.0, 3.0), 1: (1.0, 2.0, 3.0)}
 
 
-def test_figures_have_no_settings_but_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """matplotlib reads those of the working folder, which may be a run got from somebody else."""
+def test_figures_ignore_the_users_matplotlib_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """matplotlib reads settings in the working folder, which may be somebody else's run."""
     monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
     (picture,) = draw_all(subject_of(flown()))
     theirs = {"text.usetex": True, "axes.facecolor": "red", "lines.linestyle": ":"}

@@ -1,4 +1,4 @@
-"""The page: one file that asks the network for nothing, with words, numbers and figures in it."""
+"""The page: one file without network requests, with text, numbers and figures."""
 
 from __future__ import annotations
 
@@ -11,17 +11,16 @@ import matplotlib
 import pytest
 
 from cloudrc.metrics import Number
-from cloudrc.report import numbers as table
-from cloudrc.report import page as prose
 from cloudrc.report.document import Failure, Run, Verdict, environment_document
 from cloudrc.report.figures import NAMES, Picture
-from cloudrc.report.page import render
+from cloudrc.report.numbers import handy
+from cloudrc.report.page import render, summary
 from cloudrc.report.write import assess, write_report
 from tests.metrics.conftest import ONE_PIPE, flown, paper, touch
 
 
 class Reader(HTMLParser):
-    """Collects what a browser would fetch, and checks that tags are closed."""
+    """Collect what a browser would fetch, and check that tags are closed."""
 
     VOID = ("meta", "img", "br", "link", "hr", "input")
 
@@ -47,7 +46,7 @@ class Reader(HTMLParser):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The whole report of the shipped experiment: every figure is drawn, once."""
+    """Folder with the complete report of the shipped experiment."""
     path = tmp_path_factory.mktemp("run")
     before = dict(matplotlib.rcParams)
     experiment, recording = paper()
@@ -61,7 +60,7 @@ def page(folder: Path) -> str:
     return (folder / "report.html").read_text(encoding="utf-8")
 
 
-def test_it_fetches_nothing(page: str) -> None:
+def test_the_page_fetches_nothing(page: str) -> None:
     reader = Reader(page)
     assert reader.open == []
     assert len(reader.fetched) == len(NAMES)
@@ -75,17 +74,17 @@ def test_every_picture_is_described(page: str) -> None:
     assert all(alt and len(alt) > 20 for alt in alts)
 
 
-def test_it_says_what_happened_in_words(page: str) -> None:
+def test_the_page_summarizes_the_flight(page: str) -> None:
     text = re.sub(r"\s", " ", re.sub(r"<[^>]+>", "", page))
     assert "The mission succeeded." in text
     assert "The drone reached all 7 waypoints in 30.9 s" in text
-    assert "It flew through 3 pipes, never nearer than 152 mm to a wall." in text
+    assert "It flew through 3 pipes and never came closer than 152 mm to a wall." in text
     assert "Its arm touched the board after 27.7 s at 0.12 m/s" in text
     assert "cloudrc run config.yaml --mode virtual" in text
     assert "a" * 64 in text
 
 
-def test_every_number_is_in_it_with_its_meaning(page: str) -> None:
+def test_the_page_has_every_number_with_its_meaning(page: str) -> None:
     experiment, recording = paper()
     for name, number in assess(recording, experiment, Run("virtual", "virtual")).numbers.items():
         assert f"<code>{name}</code>" in page
@@ -101,7 +100,7 @@ def test_figures_are_written_as_png_and_svg(folder: Path) -> None:
     assert set(NAMES) >= {"delay", "odom", "error"}
 
 
-def test_the_paper_error_figure_is_not_sold_as_accuracy(page: str) -> None:
+def test_the_error_caption_warns_about_accuracy(page: str) -> None:
     assert "says nothing about how accurate the estimate is" in " ".join(page.split())
 
 
@@ -127,7 +126,7 @@ def test_failures_say_what_when_and_where() -> None:
     assert "it hit, at 3.50 s, x 1.00, y -2.00, z 0.70 m <code>pipe_touched</code>" in page
 
 
-def test_what_strangers_wrote_cannot_break_out_of_the_page() -> None:
+def test_foreign_text_is_escaped() -> None:
     page = render_with((Failure("x", "<script>alert(1)</script>"),), ("metric <b> & 'c'",))
     assert "<script>" not in page
     assert "metric &lt;b&gt; &amp;" in page
@@ -148,11 +147,11 @@ def test_what_strangers_wrote_cannot_break_out_of_the_page() -> None:
         ("hold_time", Number(0.0, "s", ""), ("0", "s")),
     ],
 )
-def test_numbers_in_handy_units(name: str, number: Number, expected: tuple[str, str]) -> None:
-    assert table.handy(name, number) == expected
+def test_numbers_have_readable_units(name: str, number: Number, expected: tuple[str, str]) -> None:
+    assert handy(name, number) == expected
 
 
-def test_words_for_a_flight_that_went_wrong() -> None:
+def test_the_summary_of_a_failed_flight() -> None:
     log = flown()
     log.world.append(touch(3, "pipe_1"))
     flight = log.flight(ONE_PIPE, contact=True, waypoints=2)
@@ -160,8 +159,8 @@ def test_words_for_a_flight_that_went_wrong() -> None:
         **{"duration": 10.0, "waypoints_reached": 1.0, "hold_count": 1.0, "hold_time": 2.5},
         **{"pipe_contacts": 1.0, "min_clearance": -0.01},
     }
-    text = prose.summary(flight, {name: Number(v, "", "") for name, v in values.items()})
+    text = summary(flight, {name: Number(v, "", "") for name, v in values.items()})
     assert text == (
         "The drone reached 1 of 2 waypoints in 10.0 s. It flew through one pipe and touched a wall "
-        "once. It never touched the board. The guard on board took over once, for 2.5 s in all."
+        "once. It never touched the board. The guard on board took over once, for 2.5 s in total."
     )

@@ -1,4 +1,4 @@
-"""Each rule of the verdict: what breaks it, when and where it says so, and what outranks what."""
+"""Each rule of the verdict: what breaks it, its time and place, and the order of outcomes."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_the_board_was_not_touched() -> None:
 
 
 @pytest.mark.parametrize(("speed", "ok"), [(0.249, True), (0.25, False), (0.4, False)])
-def test_the_board_has_to_be_touched_gently(speed: float, ok: bool) -> None:
+def test_the_board_must_be_touched_slowly(speed: float, ok: bool) -> None:
     log = flown()
     still = (0.0, 0.0, 0.0)
     log.world.append(Contact(at(8), "board", still, still, (speed, 0.0, 0.0), True))
@@ -132,17 +132,17 @@ def test_the_robot_never_flew() -> None:
     log.change(GuardChange, lambda n, change: None)
     (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
     assert failure.code == "not_started"
-    assert failure.text.endswith("fresh commands came, but no request to start")
+    assert failure.text.endswith("fresh commands arrived, but no request to start")
 
 
 @pytest.mark.parametrize(
     ("arrived", "words"),
     [
-        (lambda n, a: a._replace(used=False), "was 0.090 s old or older when the command came"),
+        (lambda n, a: a._replace(used=False), "was 0.090 s old or older when the command arrived"),
         (lambda n, a: a._replace(used=False), "guard.command_age_max_ms"),
-        # The start opens a session of its own: what was fresh before it does not count.
+        # The start opens a new session: commands of older sessions do not count.
         (lambda n, a: a._replace(used=n < 9, epoch=1 if n < 9 else 2), "command_age_max_ms"),
-        (lambda n, a: a if a.uplink else None, "no command came"),
+        (lambda n, a: a if a.uplink else None, "no command arrived"),
     ],
 )
 def test_why_the_robot_never_flew(
@@ -155,7 +155,7 @@ def test_why_the_robot_never_flew(
     assert words in failure.text
 
 
-def test_without_a_period_of_control_the_robot_never_flew() -> None:
+def test_without_control_periods_the_robot_never_flew() -> None:
     log = flown()
     log.change(GuardChange, lambda n, change: None)
     log.change(Control, lambda n, control: None)
@@ -163,7 +163,7 @@ def test_without_a_period_of_control_the_robot_never_flew() -> None:
     assert failure.text.endswith("cloud computed no command")
 
 
-def test_interrupted_before_the_end_says_only_what_is_sure() -> None:
+def test_an_interrupted_run_lists_only_certain_failures() -> None:
     log = without_end(flown())
     log.world.append(touch(3, "pipe_1"))
     verdict = judged(log.flight(ONE_PIPE, contact=True), interrupted=True)
@@ -171,7 +171,7 @@ def test_interrupted_before_the_end_says_only_what_is_sure() -> None:
     assert codes(verdict) == ["interrupted", "pipe_touched"]
 
 
-def test_interrupted_after_the_end_changes_nothing() -> None:
+def test_an_interruption_after_the_end_changes_nothing() -> None:
     assert judged(good().flight(ONE_PIPE, contact=True), interrupted=True).outcome == "success"
 
 
@@ -206,7 +206,7 @@ def test_real_time_is_kept_or_the_run_is_invalid(slip: float, factor: float, out
     verdict = judge(flight, in_time(slip, factor), real_time=True, interrupted=False)
     assert verdict.outcome == outcome
     assert codes(verdict) == ([] if outcome == "success" else ["not_real_time"])
-    # Virtual time has no machine to keep up with.
+    # Virtual time does not depend on the machine.
     verdict = judge(flight, in_time(slip, factor), real_time=False, interrupted=False)
     assert verdict.outcome == "success"
 

@@ -1,4 +1,4 @@
-"""A report is written whole, again from its folder, without figures, and from a torn recording."""
+"""Writing a report: complete, again from its folder, without figures, from a torn recording."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_an_interrupted_run_stays_interrupted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "mission.mcap"])
-def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, name: str) -> None:
+def test_a_folder_without_a_run_is_refused(tmp_path: Path, name: str) -> None:
     (run_folder(tmp_path) / name).unlink()
     with pytest.raises(BadInputError, match=f"has no {name}"):
         read_run(tmp_path)

@@ -76,7 +76,7 @@ def test_a_second_one_is_refused_with_the_id_of_the_first(api):
     assert (status, ended["verdict"]["exit_code"]) == (200, 130)
 
 
-def test_what_is_refused_and_what_a_slow_reader_misses_become_metrics(api, monkeypatch):
+def test_refusals_and_missed_events_are_counted_in_metrics(api, monkeypatch):
     served, live = ServedApi(api.bridge, api.server, api.audit), Live("teleop")
     served.open(api.flight.teleop, lambda: None)
     fly(api)
@@ -165,7 +165,7 @@ def test_a_value_that_cannot_be_used_is_named(idle, body, path, index, words):
     assert idle.get("/v1/missions")["missions"] == []
 
 
-def test_a_key_of_a_digit_that_is_no_number_is_refused_like_any_other(idle):
+def test_a_superscript_digit_as_key_is_refused(idle):
     """Superscripts are digits to `str.isdigit`, and `int` reads none of them."""
     status, refusal = idle.post("/v1/missions", {"waypoints": [], "\u00b3": 1})
     assert status == 422
@@ -183,7 +183,7 @@ def test_a_body_that_is_too_long_is_not_read_on(idle):
     assert (status, "256 KiB" in refusal["detail"]) == (413, True)
 
 
-def test_a_mission_that_does_not_lead_to_the_board_need_not_touch_it(api):
+def test_only_a_mission_to_the_board_must_touch_it(api):
     api.post("/v1/missions", A_MISSION)
     assert not api.flight.teleop.book.find("m1").order.contact
     api.post("/v1/missions/m1/cancel")

@@ -55,7 +55,7 @@ def test_what_a_reader_is_refused_displaces_no_command(monkeypatch):
     ]
 
 
-def test_the_audit_log_is_cut_by_size_and_a_disk_that_refuses_is_told_once(tmp_path):
+def test_the_audit_log_rotates_and_reports_a_bad_disk_once(tmp_path):
     from cloudrc.teleop.auth import Audit
 
     path = tmp_path / "audit.jsonl"
@@ -104,9 +104,7 @@ def test_what_a_slow_disk_makes_too_many_is_dropped_and_counted(tmp_path, monkey
     assert audit.dropped == 3
 
 
-def test_a_disk_that_hangs_keeps_nothing_alive_and_what_is_given_up_is_counted(
-    tmp_path, monkeypatch
-):
+def test_a_hanging_disk_blocks_no_close_and_drops_are_counted(tmp_path, monkeypatch):
     from cloudrc.teleop import auth
 
     begun, released = threading.Event(), threading.Event()

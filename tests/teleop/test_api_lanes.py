@@ -58,7 +58,7 @@ def test_streams_of_readers_leave_an_operator_one(monkeypatch):
             stream.close()
 
 
-def test_an_acknowledgement_that_was_asked_before_a_stop_does_not_release_it():
+def test_an_earlier_acknowledgement_does_not_release_a_stop():
     """The stop passes it by while the loop waits for its disk."""
     with running() as one:
         free = threading.Event()
@@ -76,7 +76,7 @@ def test_an_acknowledgement_that_was_asked_before_a_stop_does_not_release_it():
         assert one.send(one.request("/v1/acknowledge", b"", OPERATOR, "POST"))[0] == 200
 
 
-def test_each_role_waits_in_a_lane_of_its_own_and_operators_first():
+def test_each_role_has_its_own_queue_and_operators_come_first():
     bridge, made = Bridge(), []
     bridge.open(object())
 
@@ -100,7 +100,7 @@ def test_each_role_waits_in_a_lane_of_its_own_and_operators_first():
 
 @pytest.mark.parametrize("method", ["GET", "PUT", "DELETE", "OPTIONS"])
 @pytest.mark.parametrize(("token", "left"), [(READER, 5), (OPERATOR, 4), (STRANGER, 5)])
-def test_the_path_of_the_emergency_stop_is_no_way_round_the_limits(method, token, left):
+def test_the_emergency_stop_path_does_not_bypass_the_limits(method, token, left):
     """`running` has asked once as the operator."""
     with running(limits=TIGHT) as one:
         codes = statuses(one, 9, "/v1/estop", token, method)
@@ -122,9 +122,7 @@ def test_neither_is_its_head():
 
 @pytest.mark.parametrize("path", ["/v1/estop", "/v1/hold", "/v1/missions", "/nowhere"])
 @pytest.mark.parametrize(("token", "refused"), [(READER, 403), (STRANGER, 401)])
-def test_a_flood_of_what_is_not_allowed_is_refused_as_a_flood_and_not_written_down(
-    path, token, refused
-):
+def test_a_flood_of_forbidden_requests_is_refused_unlogged(path, token, refused):
     with running(limits=TIGHT) as one:
         assert statuses(one, 9, path, token, "POST") == [refused] * 5 + [429] * 4
         assert one.alarms == []
@@ -143,7 +141,7 @@ def test_an_operators_stop_is_served_while_others_flood_its_path():
 
 
 @pytest.mark.promise("emergency-stop-gets-through")
-def test_a_stop_that_teleop_does_not_answer_in_time_is_made_all_the_same(monkeypatch):
+def test_a_stop_takes_effect_even_if_teleop_answers_late(monkeypatch):
     """The loop waits for its disk; other calls are dropped, for whoever asked looks again."""
     monkeypatch.setattr(api, "ANSWER_LIMIT", 0.1)
     with running() as one:

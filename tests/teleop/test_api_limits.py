@@ -28,7 +28,7 @@ def is_cut_off(connection):
         connection.close()
 
 
-def test_a_flood_of_either_role_or_of_strangers_is_refused_and_leaves_the_others_alone():
+def test_a_flood_by_one_role_leaves_the_others_alone():
     with running(limits=TIGHT) as one:
         for token, left in (("no-token-that-is-known", 5), (READER, 5), (OPERATOR, 4)):
             # `running` has asked once as the operator.
@@ -137,7 +137,7 @@ def test_a_body_that_does_not_come_is_not_waited_for(monkeypatch):
         connection.close()
 
 
-def test_a_client_that_leaves_in_the_middle_of_its_body_is_no_fault_of_the_api():
+def test_a_client_that_leaves_during_its_body_is_no_api_fault():
     with running() as one:
         one.until(lambda: one.gate.counts["served"] == 1)  # `running` has asked once
         connection = connect(one)

@@ -24,7 +24,7 @@ def until_closed(connection):
     return said
 
 
-def test_little_is_taken_from_a_connection_before_it_is_another_s_turn(monkeypatch):
+def test_the_server_reads_connections_in_small_turns(monkeypatch):
     taken, take = [], server.PatientProtocol.data_received
 
     def seen(protocol, data):
@@ -43,7 +43,7 @@ def test_little_is_taken_from_a_connection_before_it_is_another_s_turn(monkeypat
     assert max(taken) == server.READ_MAX <= 1024
 
 
-def test_chunks_that_are_still_to_come_after_the_answer_are_not_taken_apart():
+def test_chunks_after_the_answer_are_not_parsed():
     with running() as one:
         connection = connect(one)
         connection.settimeout(3.0)  # before its patience ends
@@ -52,7 +52,7 @@ def test_chunks_that_are_still_to_come_after_the_answer_are_not_taken_apart():
         assert until_closed(connection).startswith(b"HTTP/1.1 401 ")
 
 
-def test_a_body_in_chunks_that_has_come_leaves_its_connection_open():
+def test_a_complete_chunked_body_keeps_the_connection_open():
     with running() as one, connect(one) as connection:
         chunked = head("POST", "/v1/hold", "Transfer-Encoding: chunked")
         for _ in range(3):
@@ -62,7 +62,7 @@ def test_a_body_in_chunks_that_has_come_leaves_its_connection_open():
             assert answer.read()
 
 
-def test_a_head_has_no_more_room_than_is_said_if_it_comes_at_once_either():
+def test_an_oversized_head_in_one_piece_is_refused():
     assert server.HEAD_MAX <= 4096, "lines of four bytes each: 64 such heads take a while"
     with running() as one:
         with connect(one) as connection:
@@ -75,7 +75,7 @@ def test_a_head_has_no_more_room_than_is_said_if_it_comes_at_once_either():
 
 
 @pytest.mark.promise("emergency-stop-gets-through")
-def test_a_stop_that_is_there_is_served_though_very_many_come_behind_it_at_once():
+def test_a_stop_before_a_crowd_of_connections_is_served():
     """All of them while the server's thread is busy: it takes them when it is free again."""
     with running() as one:
         loop = one.server._server.servers[0].get_loop()

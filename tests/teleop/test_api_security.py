@@ -53,7 +53,7 @@ def bodies(api, path):
 
 @pytest.mark.promise("api-needs-a-token")
 @pytest.mark.parametrize("token", WRONG)
-def test_without_a_valid_token_every_route_is_401_and_nothing_happens(idle, token):
+def test_without_a_valid_token_every_route_answers_401(idle, token):
     before = idle.flight.kept.copy(), len(idle.flight.requests), len(idle.alarms)
     for method, path in routes(idle):
         headers = {} if token is None else {"Authorization": f"Bearer {token}".encode("latin1")}
@@ -87,7 +87,7 @@ def test_two_headers_are_none(idle):
     connection.close()
 
 
-def test_the_scheme_is_written_in_any_case_and_a_stranger_is_told_what_is_wanted(idle):
+def test_the_bearer_scheme_ignores_case_and_is_announced(idle):
     request = idle.request("/v1/state", headers={"Authorization": f"bEARER {OPERATOR}"}, token=None)
     assert idle.send(request)[0] == 200
     connection = connect(idle)
@@ -142,9 +142,7 @@ def test_a_port_without_a_host_is_served_on_this_machine_alone(port):
     ("where", "told"),
     [("0", False), ("127.0.0.1:0", False), ("localhost:0", False), ("0.0.0.0:0", True)],
 )
-def test_an_address_that_others_reach_is_warned_of_and_asks_for_tokens(
-    where, told, tmp_path, capsys
-):
+def test_a_public_address_needs_tokens_and_gets_a_warning(where, told, tmp_path, capsys):
     options = argparse.Namespace(api=api_address(where), tokens=None, audit=None, api_file=None)
     with pytest.raises(BadInputError, match="needs --tokens DIR"):
         serve_api(options, load_experiment("hover"))
@@ -194,7 +192,7 @@ def test_a_thousand_posts_at_once_under_one_key_are_one_mission():
         assert [entry["kind"] for entry in api.flight.kept].count("mission") == 1
 
 
-def test_an_alarm_goes_out_at_once_and_teleop_is_asked_before_it_can_see_its_effect():
+def test_an_alarm_is_sent_after_teleop_is_asked():
     with running() as api:
         steps, submit = [], api.bridge.submit
         api.bridge.submit = lambda *call, **how: (steps.append("asked"), submit(*call, **how))[1]
@@ -207,7 +205,7 @@ def test_an_alarm_goes_out_at_once_and_teleop_is_asked_before_it_can_see_its_eff
 
 
 @pytest.mark.promise("emergency-stop-gets-through")
-def test_a_stop_while_teleop_starts_is_told_as_soon_as_it_has_started():
+def test_a_stop_during_startup_is_passed_on_once_started():
     """Teleop has just died, an alarm rings, and somebody hits the button: it waits for no retry."""
     with running(ready=False) as api, concurrent.futures.ThreadPoolExecutor(1) as pool:
         answer = pool.submit(api.post, "/v1/estop")
@@ -264,7 +262,7 @@ def test_nothing_but_http_gets_an_answer(idle):
     assert idle.send(upgrade)[0] == 200
 
 
-def test_the_audit_log_names_whoever_connects_and_not_whom_they_name():
+def test_the_audit_log_ignores_forwarded_addresses():
     """uvicorn would believe anybody on this machine that he is a proxy."""
     named = {"X-Forwarded-For": "203.0.113.7", "X-Forwarded-Proto": "https"}
     with running() as api:

@@ -182,9 +182,7 @@ def test_a_token_that_is_taken_away_reads_no_open_stream(monkeypatch):
 
 
 @pytest.mark.parametrize(("revoked", "status"), [(False, b" 409 "), (True, b" 401 ")])
-def test_a_token_that_is_taken_away_while_a_body_arrives_commands_nothing(
-    monkeypatch, revoked, status
-):
+def test_a_token_revoked_during_the_body_commands_nothing(monkeypatch, revoked, status):
     """It may take 5 s to arrive."""
     monkeypatch.setattr(auth, "LOOK_PERIOD", 0.0)
     body = json.dumps({"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}).encode()

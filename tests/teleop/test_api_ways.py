@@ -42,7 +42,7 @@ def test_along_the_bore_and_over_the_pipe_there_is_a_way():
         assert api.post("/v1/resume")[0] == 200
 
 
-def test_a_robot_that_flies_a_mission_is_busy_before_anything_is_in_the_way():
+def test_a_running_mission_is_reported_before_an_obstacle():
     with running() as api:
         _, view = api.post("/v1/missions", {"waypoints": [{"position_m": EAST}]})
         api.until(lambda: api.state_of(view["id"]) == "flying")

@@ -41,7 +41,7 @@ def ids(flight):
     return [e["id"] for e in flight.kept if "id" in e]
 
 
-def test_an_end_that_was_refused_is_kept_before_the_next_mission_is():
+def test_a_refused_end_is_stored_before_the_next_mission():
     flight, mission_id = service_flying()
     flight.full = True
     finish(flight)
@@ -68,7 +68,7 @@ def test_it_is_kept_although_nothing_else_happens():
     assert flight.requests[-1].request is not Request.START
 
 
-def test_while_it_is_refused_no_mission_begins_and_the_disk_is_asked_once_a_second():
+def test_a_full_disk_blocks_missions_and_is_retried_each_second():
     flight, _ = service_flying()
     flight.full = True
     finish(flight)
@@ -93,7 +93,7 @@ def test_the_trouble_is_told_once_until_it_is_over():
     assert [fault.code for fault in flight.faults] == ["journal", "journal"]
 
 
-def test_a_cancelled_mission_does_not_revive_although_its_end_was_never_kept():
+def test_a_cancelled_mission_with_a_lost_end_does_not_restart():
     flight, mission_id = service_flying()
     flight.full = True
     flight.teleop.cancel(mission_id, flight.now_ns)
@@ -109,7 +109,7 @@ def test_a_cancelled_mission_does_not_revive_although_its_end_was_never_kept():
     assert (view["state"], view["verdict"]["failures"][0]["code"]) == ("failed", "end_lost")
 
 
-def test_what_waits_is_cancelled_once_that_is_kept_for_the_next_teleop_would_fly_it():
+def test_a_queued_mission_is_cancelled_once_that_is_stored():
     flight, _ = service_flying()
     waits = flight.create(queue=True)
     flight.full = True
@@ -126,7 +126,7 @@ def test_what_waits_is_cancelled_once_that_is_kept_for_the_next_teleop_would_fly
 
 
 @pytest.mark.parametrize("written", [1, 2])
-def test_a_mission_of_which_the_order_alone_was_kept_is_not_flown_twice(written):
+def test_a_mission_with_only_its_order_stored_is_not_repeated(written):
     flight = ServiceFlight()
     flight.step()
     mission_id = flight.create()
@@ -144,7 +144,7 @@ def test_a_mission_of_which_the_order_alone_was_kept_is_not_flown_twice(written)
     assert flight.view(mission_id)["verdict"]["failures"][0]["code"] == "end_lost"
 
 
-def test_what_waits_begins_on_no_full_disk_either_though_nothing_was_refused_before():
+def test_a_queued_mission_does_not_start_on_a_full_disk():
     """A teleop that has just begun does not know that the disk is full."""
     flight, _ = service_flying()
     waits = flight.create(queue=True)
@@ -179,7 +179,7 @@ class DiskFlight(ServiceFlight):
 
 
 @pytest.mark.parametrize("refused", range(12))
-def test_whichever_entry_a_full_disk_refuses_the_journal_has_all_of_them_in_order(refused):
+def test_the_journal_is_complete_after_any_refused_entry(refused):
     flight = DiskFlight()
     flight.step()
     flight.create()

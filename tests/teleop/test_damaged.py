@@ -10,7 +10,7 @@ from tests.teleop.conftest import B, service_flying
 
 
 @pytest.mark.parametrize("lost", [("started",), ("starting", "started")])
-def test_a_mission_of_which_an_entry_says_where_it_flew_has_begun(lost: tuple[str, ...]) -> None:
+def test_a_mission_with_a_flight_entry_has_started(lost: tuple[str, ...]) -> None:
     """It is gone on with, or ends as the robot has; it does not wait for its turn."""
     flight, mission_id = service_flying()
     flight.step(position=B, seconds=0.1)

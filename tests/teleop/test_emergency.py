@@ -51,7 +51,7 @@ def test_without_a_mission_it_is_asked_all_the_same():
 
 
 @pytest.mark.parametrize("stops", [1, 2])
-def test_after_a_stall_of_teleop_it_is_one_of_the_mission_that_its_alarm_has_stopped(stops):
+def test_after_a_stall_the_stop_belongs_to_the_stopped_mission(stops):
     """Past teleop's loop: it saw the robot stopped, and that was why the mission had failed."""
     (flight, mission_id), bridge = service_flying(), Bridge()
     bridge.open(flight.teleop)
@@ -102,7 +102,7 @@ def test_nothing_supersedes_it():
     assert flight.teleop.outcome.code == "guard_stopped"
 
 
-def test_while_it_is_on_its_way_and_until_it_is_acknowledged_no_mission_begins():
+def test_no_mission_starts_before_the_stop_is_acknowledged():
     flight, _ = service_flying()
     queued = flight.create(queue=True)
     flight.downlink = False
@@ -142,7 +142,7 @@ def test_in_a_mission_there_is_nothing_to_acknowledge():
         machine_flying().operate(Acknowledge())
 
 
-def test_a_robot_that_landed_flies_again_after_the_acknowledgement():
+def test_a_landed_robot_flies_again_once_acknowledged():
     flight, mission_id = service_flying()
     flight.guard = GuardState.LAND
     flight.step(seconds=0.05)
@@ -158,7 +158,7 @@ def test_a_robot_that_landed_flies_again_after_the_acknowledgement():
     assert flight.view(second)["state"] == "flying"
 
 
-def test_before_its_end_teleop_lets_the_robot_hold_and_a_successor_goes_on():
+def test_teleop_pauses_at_shutdown_and_its_successor_continues():
     flight, mission_id = service_flying()
     flight.teleop.pause(flight.now_ns)
     assert flight.kept[-1]["event"] == "paused"
@@ -175,7 +175,7 @@ def test_before_its_end_teleop_lets_the_robot_hold_and_a_successor_goes_on():
 
 @pytest.mark.parametrize("guard", [GuardState.LAND, GuardState.ESTOP])
 @pytest.mark.parametrize("begun", [0, 1], ids=["starting", "flying"])
-def test_what_has_landed_while_teleop_was_away_has_failed_and_waits_for_nothing(guard, begun):
+def test_a_landing_without_teleop_fails_the_mission(guard, begun):
     flight = ServiceFlight()
     flight.downlink = bool(begun)
     mission_id = flight.create()

@@ -65,7 +65,7 @@ def test_nothing_is_begun_while_teleop_ends(before, say):
     assert AWAY not in {setpoint.position for setpoint in flight.setpoints}
 
 
-def test_an_order_that_is_known_is_known_to_a_teleop_that_ends_and_to_the_next():
+def test_a_known_order_stays_known_during_and_after_shutdown():
     flight = idle()
     mission_id = flight.create(key="uid")
     flight.teleop.pause(flight.now_ns)
@@ -84,7 +84,7 @@ def test_where_it_is_seen_the_robot_stays_though_its_end_is_lost():
 
 
 @pytest.mark.parametrize("state", ["flying", "held", "starting"])
-def test_asked_to_end_in_its_first_instant_it_pauses_what_it_has_found_under_way(state):
+def test_an_early_shutdown_pauses_the_current_mission(state):
     """The robot flew on to its waypoint, and nothing was written down."""
     flight = idle() if state == "starting" else held() if state == "held" else service_flying()[0]
     if state == "starting":
@@ -119,7 +119,7 @@ class Neighbour:
 
 
 @pytest.mark.parametrize("fsync_ns", [0, 600_000_000, 1_000_000_000])
-def test_it_says_that_the_robot_is_to_hold_however_long_the_disk_takes(monkeypatch, fsync_ns):
+def test_a_slow_disk_does_not_delay_the_pause_at_shutdown(monkeypatch, fsync_ns):
     """The time for that was over before: the robot flew on to its waypoint."""
     flight, _ = service_flying()
     clock, write = [flight.now_ns], flight.teleop.book._backlog._write
@@ -149,7 +149,7 @@ def test_it_says_that_the_robot_is_to_hold_however_long_the_disk_takes(monkeypat
     assert clock[0] - flight.now_ns < 2_000_000_000
 
 
-def test_a_teleop_that_ends_still_stops_the_rotors_and_releases_the_robot():
+def test_during_shutdown_teleop_still_stops_and_releases():
     flight, _ = service_flying()
     flight.teleop.pause(flight.now_ns)
     flight.step(seconds=0.1)

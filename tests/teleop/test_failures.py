@@ -113,14 +113,14 @@ def test_a_guard_that_lands_or_stops_fails_the_mission(guard):
     assert_failed(flight, "guard_stopped", text)
 
 
-def test_a_guard_that_holds_while_the_link_is_silent_does_not_end_the_mission():
+def test_hold_during_silence_does_not_end_the_mission():
     flight = flying()
     flight.guard = GuardState.HOLD
     flight.step(seconds=20.0)
     assert flight.state == "FLYING"
 
 
-def test_a_request_is_repeated_at_10_hz_until_it_is_acknowledged_and_never_after():
+def test_a_request_repeats_at_10_hz_until_acknowledged():
     flight = Flight()
     flight.downlink = False
     flight.step()
@@ -185,7 +185,7 @@ def test_numbers_go_on_well_above_what_the_robot_shows():
     assert flight.state == "FLYING"
 
 
-def test_what_a_predecessor_asked_last_is_not_taken_for_ones_own_start():
+def test_a_predecessors_request_does_not_acknowledge_our_start():
     """It asked for the mission's end, was gone at once, and the robot shows that only now."""
     repeater, seen = Repeater(), Seen(1, A, GuardState.TRACK, 41)
     repeater.see(seen, 0)

@@ -196,7 +196,7 @@ def test_room_for_a_lock_file_lets_no_second_teleop_in(tmp_path):
         assert second.entries == SOME[:1]
 
 
-def test_without_room_for_a_lock_file_none_comes_beside_who_has_one(tmp_path):
+def test_without_a_lock_file_a_second_writer_is_refused(tmp_path):
     path = tmp_path / "journal"
     with Journal(path):
         (tmp_path / "journal.lock").unlink()

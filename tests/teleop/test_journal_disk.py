@@ -50,7 +50,7 @@ def append_all(disk, done):
             done.append(entry)
 
 
-def test_what_append_has_returned_for_survives_a_kill_at_any_step():
+def test_an_appended_entry_survives_a_kill_at_any_step():
     count = 0
     for disk, done in kills(append_all):
         with opened(disk) as journal:
@@ -74,7 +74,7 @@ def test_an_entry_is_synced_before_it_counts():
     assert on_disk(disk) == SOME
 
 
-def test_a_rewrite_leaves_the_old_or_the_new_after_a_kill_at_any_step():
+def test_a_killed_rewrite_leaves_the_old_or_the_new_journal():
     def script(disk, done):
         with opened(disk) as journal:
             for entry in SOME:
@@ -100,7 +100,7 @@ def test_a_rewrite_leaves_the_old_or_the_new_after_a_kill_at_any_step():
     assert seen == {(1, 0), (1, 1), (2, 0), (2, 1)}
 
 
-def test_mending_is_finished_by_the_next_one_after_a_kill_at_any_step():
+def test_a_killed_repair_is_finished_at_the_next_start():
     def script(disk, done):
         if not disk.names:  # damage in the middle and a torn end
             kill_at, disk.kill_at = disk.kill_at, None
@@ -121,7 +121,7 @@ def test_mending_is_finished_by_the_next_one_after_a_kill_at_any_step():
     assert count > 20
 
 
-def test_a_full_disk_leaves_the_journal_as_it_was_and_may_be_freed():
+def test_a_full_disk_leaves_the_journal_unchanged_until_freed():
     disk = MemoryDisk()
     with opened(disk) as journal:
         journal.append(SOME[0])
@@ -193,7 +193,7 @@ def written():
 
 
 @pytest.mark.parametrize("error", [errno.EROFS, errno.EACCES, errno.ENOSPC, errno.EDQUOT])
-def test_a_disk_that_can_only_be_read_is_read_and_takes_entries_once_it_can(error):
+def test_a_read_only_disk_is_read_and_written_to_later(error):
     disk = written()
     disk.fault = refusing("open", error=error)
     with opened(disk) as journal:
@@ -218,7 +218,7 @@ def test_any_other_refusal_is_an_error():
 
 
 @pytest.mark.parametrize("where", ["end", "middle"])
-def test_damage_on_a_disk_that_can_only_be_read_is_told_and_mended_later(where):
+def test_damage_on_a_read_only_disk_is_repaired_later(where):
     disk = written()
     file = disk.names[PATH]
     data = disk.bytes[file]
@@ -249,7 +249,7 @@ def test_the_first_entry_brings_the_head():
     assert disk.read(PATH).startswith(MAGIC)
 
 
-def test_a_disk_that_comes_back_while_a_damaged_journal_is_opened_has_it_mended():
+def test_a_disk_back_during_opening_gets_its_journal_repaired():
     disk = written()
     file = disk.names[PATH]
     disk.bytes[file] = disk.bytes[file].replace(b'"n":1', b'"n":7')

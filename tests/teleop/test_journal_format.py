@@ -47,7 +47,7 @@ def test_cut_at_any_byte_all_whole_entries_are_there(some, data):
     assert count == len(some) or cut < len(whole(some[: count + 1]))
 
 
-def test_every_flipped_byte_costs_one_entry_at_most_and_is_noticed():
+def test_a_flipped_byte_costs_at_most_one_entry_and_is_noticed():
     full = whole(SOME)
     for at in range(len(full)):
         for bit in (0x01, 0x80):

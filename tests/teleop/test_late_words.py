@@ -10,7 +10,7 @@ from tests.teleop.conftest import AWAY, FROM_SPAWN, ID, THREE, A, B, C, Flight
 
 
 @pytest.mark.parametrize("first_sight", [True, False])
-def test_a_robot_that_stands_ready_for_a_mission_lost_here_does_not_take_off(first_sight):
+def test_a_robot_ready_for_a_lost_mission_does_not_take_off(first_sight):
     """Its order was in a journal that rotted; or it arrives when nobody knows of it any more."""
     flight = Flight()
     if not first_sight:
@@ -37,7 +37,7 @@ def test_a_robot_that_flies_or_stands_for_nobody_is_told_nothing(onboard, guard)
 @pytest.mark.parametrize(
     ("verb", "word"), [(EmergencyStop(), Request.ESTOP), (Acknowledge(), Request.ACKNOWLEDGE)]
 )
-def test_the_operators_word_comes_before_the_end_of_what_was_lost(verb, word):
+def test_an_operator_request_precedes_ending_a_lost_mission(verb, word):
     flight = Flight()
     flight.operate(verb)
     flight.onboard = (ID, 0)
@@ -55,7 +55,7 @@ def started():
     return flight
 
 
-def test_a_predecessors_end_that_comes_late_does_not_keep_the_robot_from_its_mission():
+def test_a_predecessors_late_end_does_not_stop_the_mission():
     flight = started()
     flight.mission += 1
     flight.guard = GuardState.HOLD
@@ -67,7 +67,7 @@ def test_a_predecessors_end_that_comes_late_does_not_keep_the_robot_from_its_mis
 
 
 @pytest.mark.parametrize("guard", [GuardState.HOLD, GuardState.GROUND])
-def test_a_robot_that_rests_while_its_mission_flies_is_told_again(guard):
+def test_a_robot_that_waits_during_its_mission_is_restarted(guard):
     """Another cloud's end in another session, or a predecessor's of the same number as ours."""
     flight = started()
     flight.restart_cloud()
@@ -92,7 +92,7 @@ def test_a_robot_that_flies_and_rests_by_turns_is_told_nothing():
 
 
 @pytest.mark.parametrize("in_sight", [True, False])
-def test_a_mission_from_here_is_not_flown_from_where_somebody_else_has_left_the_robot(in_sight):
+def test_a_mission_from_here_fails_if_another_client_moved_it(in_sight):
     """Whether it was ordered with the robot in sight or before that."""
     flight = Flight()
     flight.onboard, flight.guard = (ID - 1, 3), GuardState.HOLD
@@ -109,7 +109,7 @@ def test_a_mission_from_here_is_not_flown_from_where_somebody_else_has_left_the_
     assert flight.setpoints[-1].position == B
 
 
-def test_a_new_order_to_stop_takes_back_the_acknowledgement_before_it():
+def test_a_new_stop_cancels_an_earlier_acknowledgement():
     flight = started()
     flight.downlink = False
     for verb in (EmergencyStop(), Acknowledge(), EmergencyStop()):
@@ -119,7 +119,7 @@ def test_a_new_order_to_stop_takes_back_the_acknowledgement_before_it():
     assert flight.guard is GuardState.ESTOP
 
 
-def test_the_acknowledgement_of_a_stop_outlives_the_first_sight_of_the_robot():
+def test_an_acknowledgement_survives_the_first_telemetry():
     flight = Flight()
     flight.operate(EmergencyStop())
     flight.operate(Acknowledge())
@@ -130,7 +130,7 @@ def test_the_acknowledgement_of_a_stop_outlives_the_first_sight_of_the_robot():
     assert flight.guard is GuardState.GROUND
 
 
-def test_an_end_tells_that_the_robot_waits_until_somebody_else_has_spoken():
+def test_after_a_foreign_start_the_robot_counts_as_flying():
     flight = started()
     flight.operate(Cancel())
     flight.step(seconds=0.1)
@@ -153,7 +153,7 @@ def test_a_setpoint_says_for_which_session_it_is():
     assert [(type(each), each.epoch) for each in said] == [(Setpoint, 1), (Setpoint, 2)]
 
 
-def test_every_copy_of_a_request_says_in_which_session_the_robot_was_seen():
+def test_each_copy_of_a_request_names_the_current_session():
     flight = Flight()
     flight.step()
     flight.operate(StartMission(FROM_SPAWN, ID))
@@ -169,7 +169,7 @@ def test_every_copy_of_a_request_says_in_which_session_the_robot_was_seen():
     assert len({each.number for each in said}) == 1
 
 
-def test_a_request_that_waits_for_the_robot_is_for_the_session_in_which_it_comes_in_sight():
+def test_a_waiting_request_names_the_first_session_seen():
     flight = Flight()
     flight.operate(EmergencyStop())
     assert flight.teleop.take_outputs() == []
@@ -224,7 +224,7 @@ def test_the_point_where_the_robot_is_held_is_told_again_too():
     assert [setpoint.position for setpoint in flight.setpoints[-2:]] == [C, C]
 
 
-def test_in_another_session_a_start_has_the_robot_stay_until_it_is_seen_to_wait():
+def test_in_a_new_session_a_start_keeps_the_robot_in_place():
     """Somebody else has had it in between, and has left it armed elsewhere."""
     flight = Flight()
     flight.step()
@@ -255,7 +255,7 @@ def test_an_acknowledgement_does_not_tell_that_the_robot_waits():
 
 
 @pytest.mark.parametrize("ended", [True, False])
-def test_who_finds_a_mission_flown_that_is_known_to_be_over_ends_it(ended):
+def test_a_finished_mission_found_flying_is_ended(ended):
     flight = Flight()
     flight.teleop = Teleop(lambda number: ended and number == ID)
     flight.onboard, flight.guard = (ID, 1), GuardState.TRACK

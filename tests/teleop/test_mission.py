@@ -14,7 +14,7 @@ def last_event(flight):
     return flight.events[-1].event
 
 
-def test_without_a_mission_the_setpoint_is_where_the_robot_was_first_seen():
+def test_without_a_mission_the_setpoint_is_the_first_position():
     flight = Flight()
     flight.step(position=A)
     flight.step(position=B)
@@ -23,7 +23,7 @@ def test_without_a_mission_the_setpoint_is_where_the_robot_was_first_seen():
     assert flight.teleop.outcome is None
 
 
-def test_without_a_mission_the_setpoint_follows_a_world_that_restarts():
+def test_without_a_mission_the_setpoint_follows_a_world_restart():
     flight = Flight()
     flight.step(position=A)
     flight.restart()
@@ -31,7 +31,7 @@ def test_without_a_mission_the_setpoint_follows_a_world_that_restarts():
     assert flight.said == [Setpoint(A), Setpoint(B)]
 
 
-def test_a_mission_starts_when_the_robot_is_seen_to_have_started_in_a_new_world():
+def test_a_mission_starts_once_the_new_world_confirms_it():
     flight = Flight()
     flight.step()
     flight.operate(StartMission(PLAN))
@@ -46,7 +46,7 @@ def test_a_mission_starts_when_the_robot_is_seen_to_have_started_in_a_new_world(
     assert flight.events[0].text == "mission started from the spawn, waypoints: 3"
 
 
-def test_the_old_world_does_not_acknowledge_a_start_from_the_spawn():
+def test_the_old_world_does_not_confirm_a_start_from_spawn():
     flight = Flight()
     flight.step()
     flight.operate(StartMission(PLAN))
@@ -108,7 +108,7 @@ def test_the_tolerance_is_a_distance_in_space():
     assert last_event(flight) == "started"
 
 
-def test_legs_of_infinite_tolerance_follow_each_other_at_their_dwell():
+def test_legs_of_infinite_tolerance_last_their_dwell_time():
     legs = tuple(Leg(place, tolerance=float("inf"), dwell=0.4) for place in (A, B, C))
     flight = flying(Plan(legs))
     flight.step(position=AWAY, seconds=1.3)
@@ -120,7 +120,7 @@ def test_legs_of_infinite_tolerance_follow_each_other_at_their_dwell():
     assert flight.state == "DONE"
 
 
-def test_hold_freezes_the_setpoint_where_the_robot_is_seen_and_resume_goes_on():
+def test_hold_freezes_the_setpoint_and_resume_continues():
     flight = flying()
     flight.step(position=A, seconds=0.6)
     flight.step(position=AWAY)
@@ -207,7 +207,7 @@ def ended():
     return flight
 
 
-def test_a_robot_that_may_still_fly_is_led_nowhere_before_it_is_seen_to_start_anew(ended):
+def test_a_flying_robot_gets_no_new_setpoint_before_a_new_start(ended):
     """It would fly past the spawn, through whatever stands between."""
     ended.operate(StartMission(PLAN))
     ended.step(seconds=0.5)
@@ -218,7 +218,7 @@ def test_a_robot_that_may_still_fly_is_led_nowhere_before_it_is_seen_to_start_an
     assert ended.setpoints[-1] == Setpoint(A, 0.3, 0)
 
 
-def test_a_robot_that_holds_after_the_end_finds_the_first_waypoint_aimed_at(ended):
+def test_a_robot_in_hold_gets_the_first_waypoint_at_once(ended):
     ended.downlink = True
     ended.step(seconds=0.15)
     assert ended.guard is GuardState.HOLD
@@ -228,7 +228,7 @@ def test_a_robot_that_holds_after_the_end_finds_the_first_waypoint_aimed_at(ende
 
 
 @pytest.mark.parametrize("acted_on", [False, True])
-def test_what_was_asked_between_an_end_and_a_start_may_have_been_acted_on(ended, acted_on):
+def test_a_request_between_end_and_start_may_have_taken_effect(ended, acted_on):
     ended.downlink = True
     ended.step(seconds=0.15)
     ended.operate(StartMission(Plan((Leg(B),), Start.HERE)))

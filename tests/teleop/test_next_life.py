@@ -44,7 +44,7 @@ def test_its_first_number_is_above_that_of_one_that_was_not_seen():
     assert numbers == [PREDECESSORS + 5_000, PREDECESSORS + 5_010, PREDECESSORS]
 
 
-def test_a_start_under_the_number_of_an_emergency_stop_does_not_settle_it():
+def test_a_start_with_the_stops_number_does_not_confirm_the_stop():
     flight = Flight()
     flight.step()
     flight.downlink = False
@@ -71,7 +71,7 @@ def test_a_start_that_becomes_visible_later_is_ended():
     assert flight.guard is GuardState.HOLD
 
 
-def test_a_mission_is_stopped_by_the_next_teleop_too_if_nobody_has_acknowledged_it():
+def test_the_next_teleop_repeats_an_unacknowledged_stop():
     """The robot may not have heard of it: the link was silent, and then teleop died."""
     flight, mission_id = service_flying()
     waiting = flight.create(queue=True)
@@ -90,7 +90,7 @@ def test_a_mission_is_stopped_by_the_next_teleop_too_if_nobody_has_acknowledged_
     assert flight.view(waiting)["state"] == "flying"
 
 
-def test_a_stop_in_the_first_instant_of_a_teleop_is_one_of_the_mission_under_way():
+def test_an_early_stop_stops_the_current_mission():
     """It stopped nobody's mission: if the robot did not hear, the next teleop flew on."""
     flight, mission_id = service_flying()
     flight.downlink = False
@@ -105,7 +105,7 @@ def test_a_stop_in_the_first_instant_of_a_teleop_is_one_of_the_mission_under_way
 
 
 @pytest.mark.parametrize("since", ["other mission", "other world"])
-def test_a_stop_is_not_asked_again_of_a_robot_that_has_flown_since(since):
+def test_a_stop_is_not_repeated_after_a_later_flight(since):
     """Somebody has acknowledged it elsewhere, or what flies was not written down."""
     flight, _ = service_flying()
     flight.teleop.stop_rotors(flight.now_ns)
@@ -121,7 +121,7 @@ def test_a_stop_is_not_asked_again_of_a_robot_that_has_flown_since(since):
 
 
 @pytest.mark.parametrize("since", ["other mission", "other world"])
-def test_a_stop_before_the_robot_is_seen_is_asked_of_whatever_it_flies(since):
+def test_a_stop_before_first_telemetry_stops_any_flight(since):
     """It was taken for one of the teleop before, which is not asked again of another robot."""
     flight, mission_id = service_flying()
     if since == "other world":
@@ -133,7 +133,7 @@ def test_a_stop_before_the_robot_is_seen_is_asked_of_whatever_it_flies(since):
     assert flight.guard is GuardState.ESTOP
 
 
-def test_a_stop_is_acknowledged_once_the_robot_is_seen_to_be_released():
+def test_a_stop_is_acknowledged_once_the_robot_is_released():
     """Written down before, it would count for a stop that has yet to act."""
     flight, mission_id = service_flying()
     flight.downlink = False
@@ -152,7 +152,7 @@ def test_a_stop_is_acknowledged_once_the_robot_is_seen_to_be_released():
     assert flight.names(mission_id)[-1] == "emergency_stopped"
 
 
-def test_numbers_last_for_a_thousand_lives_on_a_machine_that_is_up_for_years():
+def test_request_numbers_last_for_a_thousand_restarts():
     seen, now_ns = Seen(1, A, GuardState.GROUND, 0), 10 * 365 * 86_400 * 10**9
     for _ in range(1_000):
         repeater = Repeater()
@@ -179,7 +179,7 @@ def test_a_stop_that_was_acknowledged_is_not_asked_again(next_mission):
 
 
 @pytest.mark.parametrize("state", ["flying", "starting"])
-def test_asked_to_end_it_leads_nowhere_though_a_waypoint_is_reached(state):
+def test_while_pausing_no_waypoint_becomes_the_setpoint(state):
     flight = Flight()
     flight.step()
     flight.downlink = state == "flying"
@@ -192,7 +192,7 @@ def test_asked_to_end_it_leads_nowhere_though_a_waypoint_is_reached(state):
     assert flight.setpoints[-1].waypoint == -1
 
 
-def test_a_mission_that_is_held_never_says_that_it_is_resumed_before_it_is():
+def test_a_held_mission_records_no_resume_after_a_restart():
     """Killed between the two, teleop would fly on in its next life."""
     flight, mission_id = service_flying()
     flight.teleop.hold(flight.now_ns)
@@ -202,7 +202,7 @@ def test_a_mission_that_is_held_never_says_that_it_is_resumed_before_it_is():
     assert "resumed" not in flight.names(mission_id)
 
 
-def test_what_waits_is_not_begun_before_what_is_flown_is_written_down():
+def test_a_queued_mission_waits_until_the_first_is_recorded():
     flight, first = service_flying()
     second = flight.create(queue=True)
     flight.full = True
@@ -244,7 +244,7 @@ def test_time_in_which_nobody_looks_is_no_dwell():
     assert flight.state == "DONE"
 
 
-def test_a_successor_with_the_same_flags_goes_on_with_the_mission_under_way():
+def test_a_restart_with_the_same_options_continues_the_mission():
     flight, flags = ServiceFlight(), Namespace(start=True, mission=None, api=None)
     flight.step()
     assert _start(flags, load_experiment("hover"), flight.teleop)

@@ -26,7 +26,7 @@ def test_who_finds_another_mission_on_board_does_not_fly_on(onboard):
     assert asked == [Request.START], "what is not its own it does not end"
 
 
-def test_a_robot_that_stands_ready_for_somebody_else_does_not_take_off():
+def test_a_robot_ready_for_another_mission_does_not_take_off():
     flight = Flight()
     flight.step(position=AWAY)
     flight.operate(StartMission(THREE, ID))
@@ -63,7 +63,7 @@ def test_a_mission_goes_on_with_its_robot_only():
     assert flight.requests == []
 
 
-def test_before_its_start_is_seen_the_mission_before_it_is_on_board():
+def test_before_its_start_the_old_mission_is_no_takeover():
     flight = Flight()
     flight.onboard = (ID + 1, 3)
     flight.downlink = False
@@ -74,7 +74,7 @@ def test_before_its_start_is_seen_the_mission_before_it_is_on_board():
 
 
 @pytest.mark.parametrize("verb", [Cancel(), EmergencyStop()])
-def test_the_robot_is_told_that_a_mission_is_over_before_all_is_reached(verb):
+def test_the_robot_learns_that_a_mission_ended_early(verb):
     flight = Flight()
     flight.step(position=AWAY)
     flight.operate(StartMission(THREE, ID))
@@ -87,7 +87,7 @@ def test_the_robot_is_told_that_a_mission_is_over_before_all_is_reached(verb):
     assert flight.onboard == (ID, MISSION_OVER)
 
 
-def test_a_mission_that_the_robot_knows_to_be_over_is_not_taken_up_again():
+def test_a_mission_that_ended_on_board_is_not_continued():
     """Its end was on a disk that took nothing, and with teleop it was lost."""
     flight = Flight()
     flight.onboard = (ID, MISSION_OVER)
@@ -99,7 +99,7 @@ def test_a_mission_that_the_robot_knows_to_be_over_is_not_taken_up_again():
     assert {setpoint.position for setpoint in flight.setpoints} == {AWAY}
 
 
-def test_a_mission_that_begins_anew_begins_with_its_first_waypoint():
+def test_a_restarted_mission_begins_at_its_first_waypoint():
     """That it had been started before was on a disk that took nothing; the robot knows it."""
     flight = Flight()
     flight.onboard, flight.guard = (ID, 2), GuardState.HOLD
@@ -124,7 +124,7 @@ def test_missions_without_a_number_follow_each_other():
 
 @pytest.mark.parametrize("in_sight", [True, False])
 @pytest.mark.parametrize("again", [True, False])
-def test_what_the_robot_knows_to_be_done_is_flown_again_by_whoever_orders_it_anew(again, in_sight):
+def test_a_completed_mission_flies_again_only_if_ordered_anew(again, in_sight):
     """As a second run of `cloudrc cloud` does; but not by a teleop that finds it in its journal."""
     flight = Flight()
     flight.onboard = (ID, len(FROM_SPAWN.legs))

@@ -74,7 +74,7 @@ def test_what_the_robot_knows_counts_after_a_restart():
 
 
 @pytest.mark.parametrize(("onboard", "aims"), [(0, [A]), (2, [C]), (3, [])])
-def test_the_robot_is_never_led_back_to_what_it_knows_to_be_reached(onboard, aims):
+def test_the_robot_never_flies_back_to_a_reached_waypoint(onboard, aims):
     flight = Flight()
     flight.onboard = (ID, onboard)
     flight.operate(Continue(THREE, 0, 5.0, flight.world, False, ID))
@@ -189,7 +189,7 @@ def fly_killed_at(step):
 
 
 @pytest.mark.promise("waypoints-once-in-order")
-def test_every_waypoint_is_reached_once_and_in_order_wherever_teleop_is_killed():
+def test_waypoints_are_reached_once_in_order_despite_kills():
     """Between write and sync, and everywhere else; power is lost, too."""
     killed, step = True, 0
     while killed:
@@ -204,7 +204,7 @@ def test_every_waypoint_is_reached_once_and_in_order_wherever_teleop_is_killed()
     assert step > 15
 
 
-def test_with_a_full_disk_the_flight_goes_on_and_the_robot_is_the_witness():
+def test_with_a_full_disk_the_robot_remembers_its_waypoints():
     flight = KilledFlight()
     flight.step()
     flight.create(key="uid")
@@ -224,7 +224,7 @@ def test_with_a_full_disk_the_flight_goes_on_and_the_robot_is_the_witness():
     assert "reached, as the robot reports," in str(view["events"])
 
 
-def test_a_full_disk_refuses_a_mission_before_anything_is_asked_of_the_robot():
+def test_a_full_disk_refuses_a_mission_before_any_request():
     flight = KilledFlight()
     flight.step()
     flight.disk.fault = full()
@@ -271,7 +271,7 @@ def test_hold_can_be_asked_of_the_machine_alone():
     assert (flight.state, flight.teleop.leg) == ("HELD", 2)
 
 
-def test_the_last_waypoint_is_written_down_once_though_teleop_died_before_it_was_over():
+def test_the_last_waypoint_is_recorded_once_despite_a_crash():
     flight, mission_id = service_flying()
     flight.step(position=B, seconds=0.1)
     flight.step(position=C, seconds=0.1)

@@ -187,9 +187,7 @@ def disturb(flight, disturbance):
     disturbances=st.lists(st.sampled_from(["hold", "goto", "silence", "detour", "none"])),
 )
 @settings(max_examples=30, deadline=None)
-def test_whatever_disturbs_it_a_mission_reaches_each_waypoint_once_and_in_order(
-    places, start, disturbances
-):
+def test_a_disturbed_mission_reaches_waypoints_once_in_order(places, start, disturbances):
     flight = Flight()
     flight.operate(StartMission(Plan(tuple(Leg(place, dwell=0.1) for place in places), start)))
     flight.step()

@@ -39,7 +39,7 @@ def journal(tmp_path: Path) -> Path:
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize(("cut", "repaired"), [(0, 0), (3, 1)])
-def test_a_torn_journal_shows_in_the_metrics_of_the_teleop_that_finds_it(
+def test_a_torn_journal_is_counted_in_the_metrics(
     cut: int, repaired: int, journal: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     journal.write_bytes(journal.read_bytes()[: -cut or None])

@@ -102,7 +102,7 @@ def test_the_queue_is_bounded():
         flight.create(queue=True)
 
 
-def test_a_queued_mission_is_cancelled_without_the_first_noticing():
+def test_cancelling_a_queued_mission_leaves_the_first_alone():
     flight, first = service_flying()
     second = flight.create(queue=True)
     flight.teleop.cancel(second, flight.now_ns)

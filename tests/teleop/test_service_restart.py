@@ -13,7 +13,7 @@ from cloudrc.teleop.store import SHOWN, ConflictError, MissionBook
 from tests.teleop.conftest import AWAY, A, B, C, ServiceFlight, service_flying
 
 
-def test_teleop_alone_restarts_and_the_mission_goes_on_at_the_same_waypoint():
+def test_after_a_restart_the_mission_continues_at_its_waypoint():
     flight, mission_id = service_flying(key="uid")
     flight.step(position=AWAY, seconds=5.0)
     flight.restart_teleop()
@@ -30,7 +30,7 @@ def test_teleop_alone_restarts_and_the_mission_goes_on_at_the_same_waypoint():
     assert flight.names(mission_id).count("started") == 1
 
 
-def test_a_mission_that_waits_for_its_take_off_is_not_ended_by_who_goes_on_with_it():
+def test_a_mission_before_take_off_survives_a_teleop_restart():
     """The new teleop sees a robot that stands, told of a mission, before it takes that up."""
     flight, mission_id = service_flying()
     flight.guard = GuardState.GROUND
@@ -42,7 +42,7 @@ def test_a_mission_that_waits_for_its_take_off_is_not_ended_by_who_goes_on_with_
     assert {request.request for request in flight.requests[before:]} == {Request.START}
 
 
-def test_a_mission_that_is_cancelled_right_after_a_restart_is_cancelled_in_flight():
+def test_a_cancel_right_after_a_restart_is_a_cancel_in_flight():
     flight, mission_id = service_flying()
     flight.restart_teleop()
     flight.teleop.cancel(mission_id, flight.now_ns)
@@ -53,7 +53,7 @@ def test_a_mission_that_is_cancelled_right_after_a_restart_is_cancelled_in_fligh
     assert flight.guard is GuardState.HOLD
 
 
-def test_a_world_that_slipped_before_a_restart_does_not_make_the_mission_invalid():
+def test_slip_before_a_restart_does_not_invalidate_a_mission():
     """Neither do the seconds count that were flown since the last entry."""
     flight, mission_id = service_flying()
     flight.step(seconds=10.0)
@@ -112,7 +112,7 @@ def test_a_world_that_restarts_fails_the_mission(teleop_too):
     assert view["verdict"]["failures"][0]["code"] == "world_restarted"
 
 
-def test_a_cancel_does_not_hide_that_the_mission_has_failed_with_its_world():
+def test_a_cancel_does_not_hide_a_failure_by_world_restart():
     flight, mission_id = service_flying()
     flight.restart()
     flight.restart_teleop()
@@ -124,7 +124,7 @@ def test_a_cancel_does_not_hide_that_the_mission_has_failed_with_its_world():
     assert view["verdict"]["failures"][0]["code"] == "world_restarted"
 
 
-def test_a_mission_that_had_not_started_begins_anew_in_whatever_world_there_is():
+def test_an_unstarted_mission_starts_in_the_new_world():
     flight = ServiceFlight()
     flight.step()
     flight.downlink = False
@@ -151,7 +151,7 @@ def test_a_held_mission_stays_held():
     assert flight.setpoints[-1].position == B
 
 
-def test_of_very_many_events_the_newest_are_shown_and_all_are_kept():
+def test_only_the_newest_events_are_shown_but_all_are_stored():
     flight, mission_id = service_flying()
     before = len(flight.names(mission_id))
     flight.teleop.hold(flight.now_ns)
@@ -193,7 +193,7 @@ def test_time_goes_on_where_it_stood():
     assert flight.view(mission_id)["verdict"]["failures"][0]["code"] == "timed_out"
 
 
-def test_a_robot_that_is_not_seen_again_fails_the_mission_in_time():
+def test_a_robot_never_seen_again_fails_the_mission():
     flight, mission_id = service_flying()
     flight.uplink = False
     flight.restart_teleop()
@@ -223,7 +223,7 @@ def test_a_queue_survives_and_nothing_new_slips_in():
     assert flight.view(second)["state"] == "queued"
 
 
-def test_a_crash_between_the_last_waypoint_and_the_end_ends_the_mission():
+def test_a_crash_after_the_last_waypoint_completes_the_mission():
     flight, mission_id = service_flying()
     for point in (B, C):
         flight.step(position=point, seconds=0.05)

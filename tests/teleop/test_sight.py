@@ -45,7 +45,7 @@ def test_every_state_has_its_words():
     assert all(next_step(guard, 0.0, 0.0, mission) for guard in GuardState for mission in states)
 
 
-def test_the_robot_is_shown_with_its_state_why_since_when_and_what_comes_next():
+def test_the_state_view_has_cause_duration_and_next_step():
     flight, _ = service_flying()
     flight.step(seconds=0.5)
     before = seen(flight)["guard_for_s"]
@@ -60,7 +60,7 @@ def test_the_robot_is_shown_with_its_state_why_since_when_and_what_comes_next():
     assert "continues by itself" in seen(flight)["next_step"]
 
 
-def test_since_when_goes_on_through_a_silence_and_a_new_session_and_not_into_another_world():
+def test_the_state_duration_ends_only_with_a_new_world():
     flight, _ = service_flying()
     flight.guard = HOLD
     flight.step(seconds=1.0)
@@ -76,7 +76,7 @@ def test_since_when_goes_on_through_a_silence_and_a_new_session_and_not_into_ano
     assert seen(flight)["guard_for_s"] == 0.0
 
 
-def test_a_robot_that_is_not_heard_is_not_shown_as_if_it_were_so_now():
+def test_a_silent_robot_is_shown_with_its_age():
     flight, _ = service_flying()
     flight.guard, flight.cause = HOLD, Cause.SILENCE
     flight.step(seconds=0.5)
@@ -115,7 +115,7 @@ def test_nothing_is_shown_of_a_robot_that_has_not_been_seen():
     assert seen(ServiceFlight()) is None
 
 
-def test_a_controller_that_restarts_is_told_with_the_waypoint_that_is_flown_to_and_once():
+def test_a_controller_restart_is_reported_once_with_its_waypoint():
     flight, mission_id = service_flying()
     flight.restart_cloud()
     flight.step(seconds=1.0)
@@ -137,7 +137,7 @@ def test_so_it_is_while_the_mission_is_held():
     assert flight.view(mission_id)["state"] == "held"
 
 
-def test_the_session_that_a_mission_begins_with_is_no_news_nor_is_one_between_missions():
+def test_sessions_at_mission_start_or_between_are_not_reported():
     flight, mission_id = service_flying()
     flight.teleop.cancel(mission_id, flight.now_ns)
     flight.step(seconds=0.2)
@@ -149,7 +149,7 @@ def test_the_session_that_a_mission_begins_with_is_no_news_nor_is_one_between_mi
     assert "new_session" not in flight.names(mission_id) + flight.names(second)
 
 
-def test_a_teleop_that_restarts_with_the_controller_tells_of_its_own_restart_alone():
+def test_a_joint_restart_is_reported_as_teleops_only():
     flight, mission_id = service_flying()
     flight.restart_cloud()
     flight.restart_teleop()

@@ -44,7 +44,7 @@ def test_every_rule(outcome, witness, contact, expected):
     assert codes(outcome, witness, contact=contact) == expected
 
 
-def test_what_slips_while_teleop_is_away_counts_no_more_than_the_time_that_passes():
+def test_slip_while_teleop_is_down_does_not_count():
     witness = Witness.begin(seen(slip_ns=5)).see(seen(slip_ns=9))
     for shown in (1_000, 5_000):
         witness = witness.after_restart().see(seen(slip_ns=shown))

@@ -1,7 +1,7 @@
-"""The figures: a flight and what was asked for go in, pictures in PNG and SVG come out.
+"""Draw the figures of a report as PNG and SVG.
 
-One file draws one figure; it has `draw(subject)`, `caption(subject)` as in a paper, and an `ALT`
-text for readers who do not see it. No display, GL or pyplot is needed.
+Each module draws one figure. It has `draw(subject)`, `caption(subject)`, and the text `ALT` for
+readers who cannot see the figure. No display, GL or pyplot is needed.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from cloudrc.report.figures.style import RC, Subject
 __all__ = ["NAMES", "Picture", "Subject", "draw_all"]
 
 NAMES = ("flight", "delay", "odom", "error", "snapshots")
-"""The figures in the order of the page; the paper's three are delay, odom and error."""
+"""Figures in the order of the page; delay, odom and error are those of the paper."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure, drawn.
+    """A drawn figure.
 
     Attributes:
-        name: File name without its suffix.
-        png: 200 dpi.
-        svg: The same as vectors.
-        caption: As in a paper.
-        alt: For readers who do not see it.
+        name: File name without suffix.
+        png: Content of the PNG file, 200 dpi.
+        svg: Content of the SVG file.
+        caption: Caption, as in a paper.
+        alt: Description for readers who cannot see the figure.
     """
 
     name: str
@@ -43,11 +43,11 @@ class Picture:
 def draw_all(subject: Subject) -> list[Picture]:
     """Draw every figure.
 
-    matplotlib reads its settings from one place of the process: draw in one thread at a time.
+    The settings of matplotlib are global to the process: draw in one thread at a time.
     """
     pictures = []
     with matplotlib.rc_context():
-        # matplotlib has read a matplotlibrc of the working folder, which may be anybody's run.
+        # matplotlib reads a matplotlibrc in the working folder, which may be somebody else's run.
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(RC)
         for name in NAMES:

@@ -1,4 +1,4 @@
-"""Figure of the delays: every datagram one way, and the loop with what was estimated of it."""
+"""Draw the figure of delays: one-way delay of each datagram; loop delay and its estimate."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from cloudrc.report.figures.style import (
 
 ALT = "Two scatter plots over time: one-way delays, and the loop delay with its estimate."
 CAPTION = (
-    "Delays. (a) Each dot is one datagram that arrived, one way, late ones included; the band is "
-    "what the link profile asks for. (b) Each dot is one echo: the loop delay from a command's "
-    "stamp to its echo (the paper's τₙ); the line is the estimate by which the controller looks "
-    "ahead, the band the sum of both directions of the profile, dashed its mean. Echoes are of "
-    "commands that were applied; where the newest wins these are the quick ones, so the loop lies "
-    "below the profile's mean."
+    "Delays. (a) Each dot is the one-way delay of a datagram that arrived, late ones included; the "
+    "band is the link profile. (b) Each dot is the loop delay of one echo: the time from a "
+    "command's stamp to its echo (the paper's τₙ). The solid line is the delay estimate, over "
+    "which the controller predicts. The band is the sum of both directions of the link profile, "
+    "the dashed line its mean. Only applied commands have echoes; if the newest command wins, "
+    "these are the fast ones, so the loop delay lies below the mean of the profile."
 )
 MARGIN = 1.25
-"""Room above the highest delay that the axis has to show."""
+"""Upper end of the delay axis, divided by the 99.5th percentile of the delays [1]."""
 
 
 def caption(subject: Subject) -> str:
-    """Say what is seen."""
+    """Write the caption."""
     return CAPTION + legend(subject)
 
 
@@ -64,14 +64,14 @@ def _draw_one_way(axes: Axes, subject: Subject) -> None:
             _dots(axes, time, delay, colour, name)
             shown.append(delay)
     if not shown:
-        text = "not known: the two ends\ndo not share a clock"
+        text = "unknown: the two ends\ndo not share a clock"
         axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
     time = np.linspace(0.0, subject.duration, 600)
     tops: list[Array] = []
     for uplink in (True, False):
-        found = bounds(subject, time, uplink=uplink)
-        if found is not None:
-            low, high = found
+        limits = bounds(subject, time, uplink=uplink)
+        if limits is not None:
+            low, high = limits
             label = "_" if tops else "profile"
             axes.fill_between(time, low * 1e3, high * 1e3, color=LIGHT, lw=0, label=label, zorder=1)
             tops.append(high * 1e3)
@@ -98,13 +98,13 @@ def _draw_loop(axes: Axes, subject: Subject) -> None:
 
 
 def _dots(axes: Axes, time: Array, delay: Array, colour: str, name: str) -> None:
-    # Thousands of dots: as a picture inside the vector file they stay small and quick to show.
+    # As pixels inside the SVG file, thousands of dots stay small and fast to display.
     axes.plot(time, delay, ".", ms=1.8, mew=0, color=colour, rasterized=True, zorder=2)
     axes.plot([], [], "o", ms=3.5, mew=0, color=colour, label=name)
 
 
 def _finish(axes: Axes, subject: Subject, label: str, shown: list[Array]) -> None:
-    """Scale the axis so that a single outlier does not flatten the rest, and say what is cut."""
+    """Scale the axis so that outliers do not flatten the rest; write how many are cut off."""
     values = [v[np.isfinite(v)] for v in shown]
     top = max((float(np.percentile(v, 99.5)) for v in values if len(v)), default=1.0) * MARGIN
     top = max(top, 1.0)

@@ -1,4 +1,4 @@
-"""Figure of the errors: what the paper plots, and beside it how accurate the estimate was."""
+"""Draw the figure of errors: distance to the setpoint, as in the paper; error of the estimate."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from cloudrc.report.figures.style import (
 
 ALT = "Two line plots over time: distance to the setpoint, and the error of the estimate."
 CAPTION = (
-    "Errors, with their RMS. (a) Distance from the reference to the measured and to the estimated "
-    "position, as in the paper. It is dominated by how far away the next waypoint is; that the "
-    "estimated curve lies lower says nothing about how accurate the estimate is. (b) How accurate "
-    "it was: distance from the estimate behind each command to the true position at the instant at "
-    "which that command was applied; each one as a dot, and the RMS over half a second as a line. "
-    "In brackets the RMS over the whole flight."
+    "Errors. (a) Distance from the reference to the measured and to the estimated position, as in "
+    "the paper. The distance to the next waypoint dominates both curves; a lower estimated curve "
+    "says nothing about how accurate the estimate is. (b) Accuracy of the estimate: distance from "
+    "the position estimated for each command to the true position when the command was applied. "
+    "Each dot is one command, the line is the RMS over half a second. RMS values in the legends "
+    "are over the whole flight."
 )
 SPAN = 0.5
-"""Over which the RMS moves [s]."""
+"""Window of the moving RMS [s]."""
 
 
 def caption(subject: Subject) -> str:
-    """Say what is seen."""
+    """Write the caption."""
     return CAPTION + legend(subject)
 
 
@@ -75,7 +75,7 @@ def _draw_accuracy(axes: Axes, subject: Subject) -> None:
 
 
 def _moving_rms(time: Array, values: Array) -> Array:
-    """Root mean square of the values in the last `SPAN` seconds, at each instant."""
+    """Compute the RMS of the values in the last `SPAN` seconds at each instant."""
     known = np.isfinite(values)
     squares = np.concatenate([[0.0], np.cumsum(np.where(known, np.square(values), 0.0))])
     counts = np.concatenate([[0], np.cumsum(known)])

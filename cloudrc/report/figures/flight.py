@@ -1,4 +1,4 @@
-"""Figure of the flight: from above, from the side and along the way, coloured by clearance."""
+"""Draw the figure of the flight: path from above, height and clearance along the path."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from cloudrc.report.figures.style import BLACK, GREY, PAGE, VERMILION, Subject, 
 
 ALT = "The flown path from above and from the side through the pipes, coloured by clearance."
 CAPTION_PIPES = (
-    "Flight. (a) From above: pipes cut open, waypoints numbered, the board as a bar, a star where "
-    "the arm first touches it. (b) Height along the way, unrolled, with the bore of each pipe. "
-    "(c) Distance from the robot's outline (rotors, arm, body) to the nearest wall. "
-    "The colour is that distance in all three panels. Panel (c) ends at {ceiling:.1f} m: in free "
-    "air the robot is farther away."
+    "Flight. (a) Path from above: pipes cut open, waypoints numbered, the board as a bar, a star "
+    "where the arm first touches it. (b) Height along the path, with the bore of each pipe. "
+    "(c) Clearance: distance from the robot (rotors, arm, body) to the nearest wall. The colour is "
+    "the clearance in all three panels. Panel (c) ends at {ceiling:.1f} m; outside the pipes the "
+    "clearance can be larger."
 )
-CAPTION_FREE = "Flight. (a) From above, waypoints numbered. (b) Height along the way, unrolled."
+CAPTION_FREE = "Flight. (a) Path from above, waypoints numbered. (b) Height along the path."
 COLOURS = "viridis"
 CLEARANCE_SHOWN = 0.40
-"""Larger clearances [m] all have the last colour: in a pipe there is no more."""
+"""Clearance at the end of the colour scale [m]; inside a pipe it is never larger."""
 CEILING = 2 * CLEARANCE_SHOWN
-"""Largest clearance in panel (c) [m]."""
+"""Upper end of the axis of panel (c) [m]."""
 
 
 def caption(subject: Subject) -> str:
-    """Say what is seen: without pipes there is no clearance to show."""
+    """Write the caption; without pipes it mentions no clearance."""
     if not subject.flight.scene.pipes:
         return CAPTION_FREE
     return CAPTION_PIPES.format(ceiling=CEILING)
@@ -47,18 +47,18 @@ def draw(subject: Subject) -> Figure:
     grid = figure.add_gridspec(2, 2, width_ratios=(1.0, 1.05))
     top = figure.add_subplot(grid[:, 0])
     position = subject.flight.truth["position"]
-    way = _way(position)
+    distance = _distance_flown(position)
     coloured = _draw_top(top, subject, position)
     if not len(subject.flight.clearance):
         side = figure.add_subplot(grid[:, 1])
-        _draw_side(side, subject, way, position)
+        _draw_side(side, subject, distance, position)
         side.set_xlabel("distance flown (m)")
         return figure
     side = figure.add_subplot(grid[0, 1])
-    _draw_side(side, subject, way, position)
+    _draw_side(side, subject, distance, position)
     side.tick_params(labelbottom=False)
     margin = figure.add_subplot(grid[1, 1], sharex=side)
-    _draw_clearance(margin, subject, way)
+    _draw_clearance(margin, subject, distance)
     if coloured is not None:
         bar = figure.colorbar(coloured, ax=[side, margin], extend="max", aspect=40, pad=0.01)
         bar.set_label("clearance (m)")
@@ -66,19 +66,19 @@ def draw(subject: Subject) -> Figure:
     return figure
 
 
-def _way(position: Array) -> Array:
-    """Distance flown up to each sample [m]."""
+def _distance_flown(position: Array) -> Array:
+    """Compute the distance flown up to each sample [m]."""
     steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
     return np.concatenate([np.zeros(min(len(position), 1)), np.cumsum(steps)])
 
 
-def _coloured(axes: Axes, subject: Subject, x: Array, y: Array) -> LineCollection | None:
-    """Draw a path whose colour is the clearance; plain where there is nothing to be clear of."""
+def _draw_path(axes: Axes, subject: Subject, x: Array, y: Array) -> LineCollection | None:
+    """Draw a path coloured by clearance; in one colour if there are no pipes."""
     clearance = subject.flight.clearance
     if len(clearance) != len(x) or len(x) < 2:
         axes.plot(x, y, color=BLACK, lw=1.4)
         return None
-    # 20 points a second are smooth; 100 only make the file larger.
+    # 20 points per second look smooth; 100 would only make the file larger.
     ends = np.append(np.arange(0, len(x) - 1, 5), len(x) - 1)
     points = np.stack([x, y], axis=1)[ends]
     axes.plot(*points.T, color=BLACK, lw=3.0, solid_capstyle="round", zorder=3)
@@ -103,11 +103,11 @@ def _draw_top(axes: Axes, subject: Subject, position: Array) -> LineCollection |
     board = subject.flight.scene.board
     if board is not None:
         axes.plot([board.x, board.x], board.y, color=BLACK, lw=3, solid_capstyle="butt", zorder=3)
-    coloured = _coloured(axes, subject, position[:, 0], position[:, 1])
+    coloured = _draw_path(axes, subject, position[:, 0], position[:, 1])
     for index, (x, y, _) in subject.waypoints.items():
         axes.plot(x, y, "o", ms=8, mfc="white", mec=BLACK, mew=0.6, zorder=5)
         axes.text(x, y, str(index + 1), ha="center", va="center_baseline", fontsize=6.5, zorder=6)
-    tip = _touch(subject)
+    tip = _touch_point(subject)
     if tip is not None:
         axes.plot(*tip[:2], "*", ms=9, color=VERMILION, mec="white", mew=0.5, zorder=7)
     axes.set_aspect("equal", adjustable="datalim")
@@ -116,8 +116,8 @@ def _draw_top(axes: Axes, subject: Subject, position: Array) -> LineCollection |
     return coloured
 
 
-def _touch(subject: Subject) -> Array | None:
-    """Where the arm's tip first touched the board [m], shape (3,)."""
+def _touch_point(subject: Subject) -> Array | None:
+    """Compute the position of the arm's tip at its first touch of the board [m], shape (3,)."""
     touch, truth = first_touch(subject.flight), subject.flight.truth
     if touch is None or not len(truth["stamp_ns"]):
         return None
@@ -152,48 +152,52 @@ def _draw_pipe(axes: Axes, pipe: Pipe) -> None:
         axes.add_patch(Polygon(wall, closed=True, fc=GREY, ec="none", zorder=2))
 
 
-def _draw_side(axes: Axes, subject: Subject, way: Array, position: Array) -> None:
-    panel(axes, "b", "height along the way")
-    for pipe, begin, end in _passages(subject, way, position):
+def _draw_side(axes: Axes, subject: Subject, distance: Array, position: Array) -> None:
+    panel(axes, "b", "height along the path")
+    for pipe, begin, end in _passages(subject, distance, position):
         low, high = pipe.centre[2] - pipe.inner, pipe.centre[2] + pipe.inner
         axes.fill_between([begin, end], low, high, color="#f4f4f4", lw=0, zorder=1)
         axes.hlines([low, high], begin, end, color=GREY, lw=1.5, zorder=2)
     axes.axhline(subject.flight.scene.floor, color=BLACK, lw=0.8)
-    _coloured(axes, subject, way, position[:, 2])
+    _draw_path(axes, subject, distance, position[:, 2])
     axes.margins(y=0.12)
     axes.set_ylabel("$z$ (m)")
 
 
-def _passages(subject: Subject, way: Array, position: Array) -> list[tuple[Pipe, float, float]]:
-    """List the pipes in the order flown, with the distance [m] at which each begins and ends."""
+def _passages(
+    subject: Subject, distance: Array, position: Array
+) -> list[tuple[Pipe, float, float]]:
+    """List the pipes in the order flown, with the distances flown at both ends of each [m]."""
     inside = pipe_index(subject.flight.scene, position)
     changes = np.flatnonzero(np.diff(inside, prepend=-1, append=-1))
     spans = []
     for first, last in pairwise(changes):
         if inside[first] >= 0:
             pipe = subject.flight.scene.pipes[inside[first]]
-            spans.append((pipe, float(way[first]), float(way[last - 1])))
+            spans.append((pipe, float(distance[first]), float(distance[last - 1])))
     return spans
 
 
-def _draw_clearance(axes: Axes, subject: Subject, way: Array) -> None:
-    panel(axes, "c", "clearance along the way")
+def _draw_clearance(axes: Axes, subject: Subject, distance: Array) -> None:
+    panel(axes, "c", "clearance along the path")
     axes.set_ylabel("clearance (m)")
     axes.set_xlabel("distance flown (m)")
     clearance = subject.flight.clearance
     position = subject.flight.truth["position"]
-    for _, begin, end in _passages(subject, way, position):
+    for _, begin, end in _passages(subject, distance, position):
         axes.axvspan(begin, end, color="#f4f4f4", lw=0, zorder=0)
-    _coloured(axes, subject, way, clearance)
+    _draw_path(axes, subject, distance, clearance)
     axes.set_ylim(min(0.0, float(clearance.min())), CEILING)
-    axes.set_xlim(0.0, max(float(way[-1]), 1e-3))
+    axes.set_xlim(0.0, max(float(distance[-1]), 1e-3))
     lowest = np.where(subject.flight.inside, clearance, np.inf).argmin()
     if subject.flight.inside.any():
-        axes.plot(way[lowest], clearance[lowest], "o", ms=4, mfc="none", mec=VERMILION, zorder=6)
+        axes.plot(
+            distance[lowest], clearance[lowest], "o", ms=4, mfc="none", mec=VERMILION, zorder=6
+        )
         text = f"{clearance[lowest]:.3f} m"
         axes.annotate(
             text,
-            (way[lowest], clearance[lowest]),
+            (distance[lowest], clearance[lowest]),
             (0, -11 if clearance[lowest] > 0.1 else 7),
             textcoords="offset points",
             ha="center",

@@ -1,6 +1,6 @@
-"""Figure of a link: what a profile does to a steady stream goes in, four panels come out.
+"""Draw the figure of a link profile: delay and loss over time, delay distribution, runs of losses.
 
-Delay over time with what was lost, the tail of its distribution, and how many were lost in a row.
+`cloudrc link show` uses it.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from cloudrc.report.figures.style import (
 )
 
 RUNS_SHOWN = 20
-"""Runs of losses longer than this are drawn as this."""
+"""Longest run of losses in the figure [1]; longer runs count as this long."""
 BLACKOUT = "#f7dccb"
-"""Colour of the times in which nothing passes: a light one of what is lost."""
+"""Colour of blackouts, a light variant of the colour of losses."""
 DOTS = 6000
-"""Dots in one panel, beyond which they would hide each other."""
+"""Most dots in one panel [1]; more would hide each other."""
 
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """One direction, asked for and drawn; n packets over time, m for the statistics.
+    """One direction of a link: its profile, n packets over time, and m packets for statistics.
 
     Attributes:
-        asked: Conditions asked for.
-        sent: When each packet left, since the link came up [s], shape (n,).
-        delays: One way, NaN for the lost [s], shape (n,).
-        many: Delays for the distribution, NaN for the lost [s], shape (m,).
-        runs: Losses in a row among those, one entry per run.
+        asked: The link profile of this direction.
+        sent: When each packet was sent, since the start of the link [s], shape (n,).
+        delays: One-way delays, NaN for lost packets [s], shape (n,).
+        many: One-way delays for the distribution, NaN for lost packets [s], shape (m,).
+        runs: Lengths of the runs of losses among the m packets.
     """
 
     asked: Direction
@@ -57,21 +57,21 @@ class Way:
     runs: tuple[int, ...]
 
 
-_Named: TypeAlias = tuple[Way, str, str]
+_LabelledWay: TypeAlias = tuple[Way, str, str]
 """A direction, its name and its colour."""
 
 
 def picture(title: str, uplink: Way, downlink: Way | None, kind: str) -> bytes:
-    """Draw a link.
+    """Draw a link as a file.
 
     Args:
-        title: Above the panels.
+        title: Title above the panels.
         uplink: World to cloud.
         downlink: Cloud to world; None for a trace, which has one direction.
-        kind: png, svg or pdf.
+        kind: "png", "svg" or "pdf".
 
     Returns:
-        The file's content; the same for the same link.
+        Content of the file; identical for the same link.
     """
     target = BytesIO()
     with matplotlib.rc_context(RC):
@@ -82,10 +82,10 @@ def picture(title: str, uplink: Way, downlink: Way | None, kind: str) -> bytes:
 
 
 def draw(title: str, uplink: Way, downlink: Way | None) -> Figure:
-    """Draw the panels; call it where `style.RC` is in force."""
+    """Draw the panels; the settings `style.RC` must be active."""
     figure = new_figure(PAGE, 4.4)
     figure.suptitle(title, x=0.01, ha="left", fontsize=9.5)
-    ways: list[_Named] = [(uplink, "uplink" if downlink else "one way", UPLINK)]
+    ways: list[_LabelledWay] = [(uplink, "uplink" if downlink else "one way", UPLINK)]
     if downlink:
         ways.append((downlink, "downlink", DOWNLINK))
     top = 1.12 * max(_top(way) for way, _, _ in ways)
@@ -100,20 +100,20 @@ def draw(title: str, uplink: Way, downlink: Way | None) -> Figure:
 
 
 def _top(way: Way) -> float:
-    """The highest delay that an axis has to show [ms]."""
+    """Compute the largest delay of a direction [ms], at least 1 ms."""
     shown = way.delays[np.isfinite(way.delays)] * 1e3
     return max(float(shown.max(initial=0.0)), 1.0)
 
 
 def _draw_delay(axes: Axes, way: Way, colour: str, top: float) -> None:
-    """Draw each packet as a dot over what was asked for, the lost along the lower edge."""
+    """Draw the profile as a band, each packet as a dot, lost packets along the lower edge."""
     duration = float(way.sent[-1]) if len(way.sent) else 1.0
     steps = marks.band(way.asked)
     if steps is not None and (way.asked.trace is None or way.asked.jitter_ms):
         time = np.linspace(0.0, duration, 2000)
-        low, high = marks.at(steps, time)
+        low, high = marks.bounds_at(steps, time)
         axes.fill_between(time, low * 1e3, high * 1e3, color=LIGHT, lw=0, zorder=1, label="profile")
-    _hatch_blackouts(axes, way.asked, duration)
+    _mark_blackouts(axes, way.asked, duration)
     thin = slice(None, None, max(1, len(way.sent) // DOTS))
     axes.plot(
         way.sent[thin],
@@ -133,13 +133,13 @@ def _draw_delay(axes: Axes, way: Way, colour: str, top: float) -> None:
         axes.plot([], [], "|", ms=5.0, mew=1.0, color=VERMILION, label="lost")
     axes.set_xlim(0.0, duration)
     axes.set_ylim((-0.09 if len(lost) else -0.02) * top, top)
-    axes.set_xlabel("time since the link came up (s)")
+    axes.set_xlabel("time since the link started (s)")
     axes.set_ylabel("one-way delay (ms)")
     _legend(axes)
 
 
-def _hatch_blackouts(axes: Axes, asked: Direction, duration: float) -> None:
-    """Mark when nothing passed; what is too short to be seen is as wide as a line."""
+def _mark_blackouts(axes: Axes, asked: Direction, duration: float) -> None:
+    """Mark blackouts; a short one is drawn at least as wide as a line."""
     shown = [blackout for blackout in asked.blackouts if blackout.start_s < duration]
     for index, blackout in enumerate(shown):
         axes.axvspan(
@@ -148,12 +148,12 @@ def _hatch_blackouts(axes: Axes, asked: Direction, duration: float) -> None:
             color=BLACKOUT,
             lw=0,
             zorder=1.5,
-            label="_" if index else "silent",
+            label="_" if index else "blackout",
         )
 
 
-def _draw_tail(axes: Axes, letter: str, ways: list[_Named]) -> None:
-    """Draw which share of the packets is later than a delay: a tail is seen on a log scale."""
+def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
+    """Draw the share of packets with more than a given delay, on a log scale for the tail."""
     panel(axes, letter, "distribution")
     least = 1e-2
     for (way, name, colour), style in zip(ways, ("-", "--"), strict=False):
@@ -162,7 +162,7 @@ def _draw_tail(axes: Axes, letter: str, ways: list[_Named]) -> None:
             continue
         later = 1.0 - np.arange(1, len(delays) + 1) / len(delays)
         least = min(least, 1.0 / len(delays))
-        # A step at each packet would make a file of megabytes: at most 1500 of them are kept.
+        # A step for each packet would make a file of megabytes: keep about 1500 from each end.
         rows = np.unique(np.geomspace(1, len(delays), 1500).astype(int))
         rows = np.unique(np.concatenate((rows - 1, len(delays) - rows)))
         shown = np.concatenate(([0.0, delays[0]], delays[rows]))
@@ -192,12 +192,12 @@ def _draw_tail(axes: Axes, letter: str, ways: list[_Named]) -> None:
     right = max(axes.get_xlim()[1], 1.0)
     axes.set_xlim(-0.005 * right, right)
     axes.set_xlabel("one-way delay (ms)")
-    axes.set_ylabel("share that is later")
+    axes.set_ylabel("share with more delay")
     _legend(axes)
 
 
-def _draw_runs(axes: Axes, letter: str, ways: list[_Named]) -> None:
-    """Draw how often so many packets in a row are lost, per 1000 that were sent."""
+def _draw_runs(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
+    """Draw the number of loss runs of each length, per 1000 packets sent."""
     panel(axes, letter, "losses in a row")
     longest, most, least = 1, 0.0, np.inf
     offsets = (-0.2, 0.2) if len(ways) == 2 else (0.0,)
@@ -225,7 +225,7 @@ def _draw_runs(axes: Axes, letter: str, ways: list[_Named]) -> None:
 
 
 def _scale_runs(axes: Axes, longest: int, least: float, most: float) -> None:
-    """Choose limits that leave room for nothing but whole decades, and ticks at whole runs."""
+    """Set the limits to whole decades and the ticks to whole run lengths."""
     axes.set_yscale("log")
     axes.set_ylim(10.0 ** np.floor(np.log10(least) - 0.01), 10.0 ** np.ceil(np.log10(most) + 0.01))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -1,11 +1,7 @@
-"""What happened to link and guard: HOLD, blackouts and link changes marked behind the curves.
+"""Mark HOLD, blackouts and link changes in figures; compute the delays that the profile allows.
 
-What the link was asked to be, over time: a direction's conditions become a band of delays.
-
-What the link was asked to be in the course of a flight: the experiment's, then what was set.
-
-Each change that was recorded in flight ends one span and begins the next; within a span a
-direction's own time line runs.
+A span is a time with one link profile. Each change recorded in flight ends a span and begins the
+next. Within a span the profile follows its own time line.
 """
 
 from __future__ import annotations
@@ -30,10 +26,10 @@ from cloudrc.report.figures.style import GREY, PURPLE, VERMILION, Subject
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Delay asked for, in steps; n rows.
+    """Configured delay over time, in n steps.
 
     Attributes:
-        time: When each step begins, since the link came up [s], shape (n,).
+        time: Start of each step, since the start of the link [s], shape (n,).
         low: Delay minus jitter, not below 0 [s], shape (n,).
         high: Delay plus jitter [s], shape (n,).
     """
@@ -44,15 +40,17 @@ class Band:
 
 
 def band(direction: Direction) -> Band | None:
-    """Work out the delays that a direction was asked to have.
+    """Compute the band of delays that a link profile sets.
 
-    For uniform jitter these are the bounds, for the others one standard deviation each way.
+    The band is delay plus and minus jitter: the bounds for uniform jitter, one standard deviation
+    for other distributions.
 
     Returns:
-        None if the delays come from a trace that is no longer there.
+        None if the delays come from a trace that no longer exists.
     """
+    trace = direction.trace
     try:
-        steps = _traced(Path(direction.trace)) if direction.trace else [(0.0, direction.delay_ms)]
+        steps = _trace_delays(Path(trace)) if trace else [(0.0, direction.delay_ms)]
     except BadInputError:
         return None
     delay, jitter = steps[0][1], direction.jitter_ms
@@ -67,33 +65,33 @@ def band(direction: Direction) -> Band | None:
     return Band(time, low, high)
 
 
-def at(steps: Band, time: Array) -> tuple[Array, Array]:
-    """Look up the lower and upper bound [s] at each `time` [s] since the link came up."""
+def bounds_at(steps: Band, time: Array) -> tuple[Array, Array]:
+    """Look up the lower and upper bound [s] at each `time` [s] since the start of the link."""
     rows = np.maximum(np.searchsorted(steps.time, time, side="right") - 1, 0)
     return steps.low[rows], steps.high[rows]
 
 
-def _traced(path: Path) -> list[tuple[float, float]]:
-    """Read instants [s] and delays [ms] of a trace; the first row also holds before its time."""
+def _trace_delays(path: Path) -> list[tuple[float, float]]:
+    """Read times [s] and delays [ms] of a trace; the first row also applies before its time."""
     trace = read_trace(path)
     delays = [delay * 1e3 for delay in trace.delays]
     return [(0.0, delays[0]), *zip(trace.times, delays, strict=True)]
 
 
-SAME = 0.05
-"""Notes of one change that differ by less are of the same [s]."""
+SAME_CHANGE = 0.05
+"""Two records less than this apart describe the same change [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A time in which a direction was asked to be one thing.
+    """A time in which a direction has one link profile.
 
     Attributes:
-        begin: Since the start of the flight [s]; -inf: it was so before.
-        end: Likewise; inf: to the end.
-        origin: When its time line began, likewise [s].
-        direction: Its conditions.
-        cause: Who changed it, in words; "" if it came up so.
+        begin: Time since the start of the flight [s]; -inf if it began before.
+        end: Likewise; inf if it lasts to the end.
+        origin: Start of the profile's time line, likewise [s].
+        direction: The link profile.
+        cause: Cause of the change; "" if the link started with this profile.
     """
 
     begin: float
@@ -104,15 +102,15 @@ class Span:
 
 
 def spans(subject: Subject, *, uplink: bool) -> list[Span]:
-    """List what a direction was asked to be, in order."""
+    """List the spans of a direction, in order."""
     configured = subject.uplink if uplink else subject.downlink
     found = [Span(-inf, inf, subject.link_start, configured, "")]
     for begin, origin, direction, cause in _changes(subject, uplink):
         last = found[-1]
         if not cause and isnan(origin) and direction == last.direction:
-            continue  # it came up as configured
-        if abs(begin - last.begin) < SAME:
-            continue  # noted again
+            continue  # the link started as configured
+        if abs(begin - last.begin) < SAME_CHANGE:
+            continue  # a repeated record
         origin = last.origin if isnan(origin) else origin
         found.append(Span(begin, inf, origin, direction, cause))
     ends = [after.begin for _, after in pairwise(found)] + [inf]
@@ -124,48 +122,48 @@ def spans(subject: Subject, *, uplink: bool) -> list[Span]:
 
 
 def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
-    """Look up the delays that a direction was asked to have.
+    """Look up the delays that the link profile sets for a direction.
 
     Args:
         subject: The flight.
-        time: Since its start [s], shape (n,).
-        uplink: Which direction.
+        time: Time since the start of the flight [s], shape (n,).
+        uplink: True for the uplink, False for the downlink.
 
     Returns:
-        Lower and upper bound [s], shape (n,), NaN where a trace is no longer there; None if all
-        of it is.
+        Lower and upper bound [s], shape (n,), NaN where a trace no longer exists; None if all
+        values are NaN.
     """
     low, high = np.full(len(time), np.nan), np.full(len(time), np.nan)
     for span in spans(subject, uplink=uplink):
         steps = band(span.direction)
         rows = (time >= span.begin) & (time < span.end)
         if steps is not None and rows.any():
-            low[rows], high[rows] = at(steps, time[rows] - span.origin)
+            low[rows], high[rows] = bounds_at(steps, time[rows] - span.origin)
     return None if np.isnan(low).all() and len(time) else (low, high)
 
 
 def set_in_flight(subject: Subject) -> list[tuple[float, str]]:
-    """List when the link was set during the flight [s since its start], and to what."""
+    """List the changes of the link made in flight: time since its start [s], and cause."""
     found: list[tuple[float, str]] = []
     both = [span for uplink in (True, False) for span in spans(subject, uplink=uplink)]
     for span in sorted(both, key=lambda span: span.begin):
         if not span.cause or not 0.0 < span.begin < subject.duration:
             continue
-        # Both directions note one change, a tenth of a second apart at most.
+        # Both directions record the same change, at most 0.1 s apart.
         if not found or found[-1][1] != span.cause or span.begin - found[-1][0] > 1.0:
             found.append((span.begin, span.cause))
     return found
 
 
 def _changes(subject: Subject, uplink: bool) -> list[tuple[float, float, Direction, str]]:
-    """Read the recorded changes: when, since when the time line counts, what, why."""
+    """Read the recorded changes: begin, start of the time line, link profile, cause."""
     table = subject.flight.recording["/link"]
     found = []
     for row in np.flatnonzero(table["uplink"] == uplink):
         stamp = float(subject.flight.seconds(table["stamp_ns"][row]))
         try:
             direction = Direction.model_validate_json(str(table["conditions"][row]))
-        except ValueError:  # of another version
+        except ValueError:  # recorded by another version
             continue
         begin, origin = stamp - table["age"][row], stamp - table["time_line"][row]
         found.append((float(begin), float(origin), direction, str(table["cause"][row])))
@@ -175,27 +173,27 @@ def _changes(subject: Subject, uplink: bool) -> list[tuple[float, float, Directi
 Interval: TypeAlias = tuple[float, float]
 HATCH = "#b0b0b0"
 LABEL_WIDTH = 0.05
-"""Of a number beside a triangle, as a part of the narrowest panel's time axis [1]."""
+"""Width of a number beside a triangle, as a share of the narrowest panel's time axis [1]."""
 ROW_HEIGHT = 8
-"""Between two rows of numbers [points]."""
+"""Distance of two rows of numbers [points]."""
 ROWS = 8
-"""Of numbers, that a panel has room for."""
+"""Rows of numbers for which a panel has room [1]."""
 LEGEND = (
-    " Behind the curves, red: the guard flew by itself (HOLD); hatched: the link was silent; "
-    "dotted: the link changed."
+    " Behind the curves: red, the guard was in HOLD; hatched, a blackout of the link; dotted, a "
+    "change of the link by its profile."
 )
 
 
 def legend(subject: Subject) -> str:
-    """Say what the marks mean, or nothing if there are none."""
+    """Explain the marks in words; "" if there are none."""
     changes = [
         f"{number}: {cause}, at {begin:.1f} s"
         for number, (begin, cause) in enumerate(set_in_flight(subject), start=1)
     ]
-    said = LEGEND if any(_marks(subject)) else ""
-    return said + (
-        f" Triangles: the link was set in flight ({'; '.join(changes)})." * bool(changes)
-    )
+    text = LEGEND if any(_marks(subject)) else ""
+    if changes:
+        text += f" Triangles: the link was set in flight ({'; '.join(changes)})."
+    return text
 
 
 def mark_events(axes: Axes, subject: Subject) -> None:
@@ -214,11 +212,11 @@ def mark_events(axes: Axes, subject: Subject) -> None:
 
 
 def _rows(instants: list[float], width: float) -> Iterator[int]:
-    """Choose the row of each label, from above, so that none is printed over another.
+    """Choose the row of each label, from the top, so that labels do not overlap.
 
     Args:
-        instants: Where each begins, rising [s].
-        width: Of a label [s].
+        instants: Start of each label, rising [s].
+        width: Width of a label [s].
     """
     last = [-inf] * ROWS
     for instant in instants:
@@ -229,7 +227,7 @@ def _rows(instants: list[float], width: float) -> Iterator[int]:
 
 
 def _mark_set(axes: Axes, instant: float, number: int, row: int) -> None:
-    """Mark at [s] that the link was set by hand: a line, a triangle on top, its number in a row."""
+    """Mark a change by the user at an instant [s]: a line, a triangle on top, and its number."""
     place = axes.get_xaxis_transform()
     axes.axvline(instant, color=PURPLE, lw=0.8, zorder=2.5)
     axes.plot(instant, 1.0, "v", ms=6.5, mew=0, color=PURPLE, transform=place, clip_on=False)
@@ -247,7 +245,7 @@ def _mark_set(axes: Axes, instant: float, number: int, row: int) -> None:
 
 
 def _marks(subject: Subject) -> tuple[list[Interval], list[Interval], list[float]]:
-    """List HOLD, blackouts and changes of the link during the flight [s since its start]."""
+    """List HOLD, blackouts and changes by the profile during the flight [s since its start]."""
     flight, duration = subject.flight, subject.duration
     held = [(flight.seconds(start), flight.seconds(end)) for start, end in holds(flight)]
     blackouts: set[Interval] = set()

@@ -1,4 +1,4 @@
-"""Figure of the position: measured, estimated and reference, one panel per axis."""
+"""Draw the figure of the position: reference, measured and estimated, one panel per axis."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from cloudrc.report.figures.style import (
 
 ALT = "Three line plots of the x, y and z position over time: reference, measured, estimated."
 CAPTION = (
-    "Position per axis, as cloud knew it: the reference is the setpoint that the controller "
-    "tracks, measured the newest odometry that had come in, estimated the prediction that the "
-    "command was computed from."
+    "Position per axis, as cloud knew it. Reference: the setpoint that the controller tracks. "
+    "Measured: the newest odometry that had arrived. Estimated: the prediction from which the "
+    "command was computed."
 )
 
 
 def caption(subject: Subject) -> str:
-    """Say what is seen."""
+    """Write the caption."""
     return CAPTION + legend(subject)
 
 
 def draw(subject: Subject) -> Figure:
-    """Draw the three panels over one time axis."""
+    """Draw the three panels with a common time axis."""
     figure = new_figure(PAGE, 4.2)
     control = subject.flight.control
     time = subject.flight.seconds(control["stamp_ns"])

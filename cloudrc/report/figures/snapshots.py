@@ -1,8 +1,6 @@
-"""Figure of snapshots: the robot along its way, in the pipes cut open, drawn from the geometry.
+"""Draw the figure of snapshots: the robot at six instants, with pipes cut open and the board.
 
-Robot, pipes and board as flat polygons: poses and the scene go in, faces in the world come out.
-
-For drawings without a 3-D engine: few, convex, small enough to be sorted by their depth.
+No 3-D engine is needed: all bodies are small convex polygons, drawn in the order of their depth.
 """
 
 from __future__ import annotations
@@ -32,9 +30,9 @@ class Face:
     """A flat convex polygon.
 
     Attributes:
-        corners: [m], shape (k, 3).
+        corners: Corners [m], world frame, shape (k, 3).
         colour: Red, green, blue, each in [0, 1].
-        opacity: In [0, 1].
+        opacity: Opacity in [0, 1].
     """
 
     corners: Array
@@ -46,7 +44,7 @@ def robot_faces(position: Array, orientation_wxyz: Array) -> list[Face]:
     """Build the robot: base, top rod, arm and four rotor discs.
 
     Args:
-        position: Of the base [m], world frame, shape (3,).
+        position: Position of the base [m], world frame, shape (3,).
         orientation_wxyz: Unit quaternion, body to world, shape (4,).
     """
     faces = _box(np.zeros(3), np.array(body.BASE_HALF), BASE_COLOUR)
@@ -57,7 +55,7 @@ def robot_faces(position: Array, orientation_wxyz: Array) -> list[Face]:
     faces += _box(np.array([body.ARM_LENGTH / 2, 0.0, body.ARM_HEIGHT]), arm, ARM_COLOUR)
     for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)):
         hub = np.array([x * body.ROTOR_ARM, y * body.ROTOR_ARM, body.ROTOR_HEIGHT])
-        # A strut from the base to the hub: not in the model, but without it the discs float.
+        # The model has no struts, but without them the rotor discs would float.
         strut = np.array([abs(x) * body.ROTOR_ARM / 2 + 0.006, abs(y) * body.ROTOR_ARM / 2 + 0.006])
         faces += _box(hub * (0.5, 0.5, 1.0), np.array([*strut, 0.006]), ROD_COLOUR)
         disc = hub + body.ROTOR_RADIUS * _circle(28)
@@ -72,13 +70,13 @@ def robot_faces(position: Array, orientation_wxyz: Array) -> list[Face]:
 
 
 def pipe_faces(pipe: Pipe, towards_eye: Array, near: Array, reach: float) -> list[Face]:
-    """Build the half of a pipe that lies away from the eye, cut open along its axis.
+    """Build the half of a pipe that faces away from the eye, cut open along its axis.
 
     Args:
-        pipe: Whole.
+        pipe: The whole pipe.
         towards_eye: Unit vector from the scene to the eye, shape (3,).
-        near: Middle of what is to be seen [m], shape (3,).
-        reach: How far along the pipe to either side of it [m].
+        near: Centre of the visible part [m], shape (3,).
+        reach: Visible length along the pipe on either side of the centre [m].
     """
     centre, axis = np.array(pipe.centre), np.array(pipe.axis)
     middle = float((near - centre) @ axis)
@@ -107,10 +105,10 @@ def pipe_faces(pipe: Pipe, towards_eye: Array, near: Array, reach: float) -> lis
     return faces
 
 
-def is_swallowed(face: Face, other: Pipe) -> bool:
-    """Say whether a cut through a pipe's wall lies in another pipe: where two meet there is none.
+def is_inside_pipe(face: Face, other: Pipe) -> bool:
+    """Return whether a cut through a pipe's wall lies inside another pipe, where they meet.
 
-    Sorted by depth such a face would show in patches between the faces of the other.
+    Such a face is not drawn: sorted by depth, it would appear between faces of the other pipe.
     """
     if face.colour != WALL_COLOUR:
         return False
@@ -140,7 +138,7 @@ def _box(centre: Array, half: Array, colour: Colour) -> list[Face]:
 
 
 def _cylinder(centre: Array, half: Array, colour: Colour) -> list[Face]:
-    """Upright, its sides as flat staves, with its lid."""
+    """Build an upright cylinder with flat sides and a lid."""
     ring = _circle(12) * half
     low, high = centre + ring - (0, 0, half[2]), centre + ring + (0, 0, half[2])
     sides = [
@@ -154,28 +152,29 @@ def _circle(count: int) -> Array:
     return np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
 
 
-ALT = "Six line drawings of the robot along its way, in the pipes cut open, up to the board."
+ALT = "Six line drawings of the robot along its path, with the pipes cut open, up to the board."
 CAPTION = (
-    "Along the way. The robot at six instants, evenly spaced over the distance flown (in a hover "
-    "over time) up to the contact or the end; true pose and scale, pipes cut open towards the "
-    "reader, floor tiles 0.5 m wide. The line is the path flown."
+    "Snapshots. The robot at six instants, evenly spaced by distance flown (in a hover, by time) "
+    "until the contact or the end. Pose and scale are true, pipes are cut open towards the reader, "
+    "floor tiles are 0.5 m wide. The line is the path flown."
 )
 COUNT = 6
+"""Number of panels [1]."""
 MOVING = 0.05
-"""Less way than that in a second [m] is a hover, which has no direction."""
+"""Smallest distance in a second [m] that defines a direction of flight; below it is a hover."""
 REACH = 1.0
-"""What a panel shows to either side of the robot [m]."""
+"""Distance that a panel shows on either side of the robot [m]."""
 ELEVATION, AZIMUTH = np.radians(28.0), np.radians(118.0)
-"""Of the eye: above the horizon, and behind the robot to its right: what lies ahead is seen."""
+"""Angles of the eye [rad]: above the horizon; from the heading, behind the robot on its right."""
 
 
 @dataclass(frozen=True, slots=True)
 class Eye:
-    """A direction to look from, infinitely far: parallel lines stay parallel.
+    """A parallel projection, as seen from an infinite distance.
 
     Attributes:
-        right: Unit vector to the right in the picture, shape (3,).
-        up: Unit vector upwards in it, shape (3,).
+        right: Unit vector to the right of the picture, shape (3,).
+        up: Unit vector to the top of the picture, shape (3,).
         towards: Unit vector towards the eye, shape (3,).
     """
 
@@ -185,7 +184,7 @@ class Eye:
 
 
 def caption(subject: Subject) -> str:
-    """Say what is seen."""
+    """Write the caption."""
     return CAPTION
 
 
@@ -205,7 +204,7 @@ def draw(subject: Subject) -> Figure:
 
 
 def _instants(subject: Subject) -> Array:
-    """Choose rows of the true states: evenly over the distance, or over time in a hover."""
+    """Choose rows of the true states, evenly spaced by distance or, in a hover, by time."""
     truth, touch = subject.flight.truth, first_touch(subject.flight)
     stamps = truth["stamp_ns"]
     if touch is not None:
@@ -228,7 +227,7 @@ def _draw_panel(axes: Axes, subject: Subject, row: int, letter: str) -> None:
         face
         for pipe in scene.pipes
         for face in pipe_faces(pipe, eye.towards, position, REACH)
-        if not any(is_swallowed(face, other) for other in scene.pipes if other is not pipe)
+        if not any(is_inside_pipe(face, other) for other in scene.pipes if other is not pipe)
     ]
     around += board_faces(scene.board) if scene.board else []
     _draw_floor(axes, eye, position, scene.floor)
@@ -239,7 +238,7 @@ def _draw_panel(axes: Axes, subject: Subject, row: int, letter: str) -> None:
 
 
 def _draw_path(axes: Axes, eye: Eye, position: Array, path: Array) -> None:
-    """Draw the last stretch flown: up to the instant at which the robot came into the picture."""
+    """Draw the part of the path flown since the robot entered the picture."""
     far = np.flatnonzero(np.linalg.norm(path - position, axis=1) > 1.5 * REACH)
     seen = _project(eye, path[far[-1] if len(far) else 0 :] - position)
     axes.plot(seen[:, 0], seen[:, 1], color=BLUE, lw=1.0, zorder=2)
@@ -256,7 +255,7 @@ def _label(axes: Axes, subject: Subject, row: int, letter: str) -> None:
 
 
 def _heading(subject: Subject, row: int) -> float:
-    """Direction to draw along [rad]: the axis of the pipe around the robot, else the way flown."""
+    """Compute the heading of the view [rad]: along the pipe around the robot, else its path."""
     scene, positions = subject.flight.scene, subject.flight.truth["position"]
     position = positions[row]
     inside = pipe_index(scene, position[None])[0]
@@ -283,12 +282,12 @@ def _eye(heading: float) -> Eye:
 
 
 def _project(eye: Eye, points: Array) -> Array:
-    """Flatten points, shape (..., 3), to the picture, shape (..., 2)."""
+    """Project points, shape (..., 3), to the picture, shape (..., 2)."""
     return np.stack([points @ eye.right, points @ eye.up], axis=-1)
 
 
 def _draw_faces(axes: Axes, eye: Eye, origin: Array, faces: list[Face], zorder: int) -> None:
-    """Draw from the back to the front, each face shaded by how it is turned to the light."""
+    """Draw faces from back to front, shaded by their angle to the light."""
     ordered = sorted(faces, key=lambda face: float((face.corners @ eye.towards).mean()))
     polygons, colours = [], []
     for face in ordered:

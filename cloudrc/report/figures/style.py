@@ -1,9 +1,7 @@
-"""How figures look: fonts, colours and sizes of a two-column paper, and what all of them share.
+"""Define the style of all figures and `Subject`, the flight that they show.
 
-Colours are those of Okabe and Ito, which readers with any colour vision can tell apart.
-Source: M. Okabe, K. Ito, "Color Universal Design", 2008.
-
-What the figures are drawn from: the flight and what was asked for.
+Fonts and sizes are those of a two-column paper. Readers with any colour vision can distinguish the
+colours. Source: M. Okabe, K. Ito, "Color Universal Design", 2008.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ UPLINK, DOWNLINK = BLUE, ORANGE
 REFERENCE, MEASURED, ESTIMATED = BLACK, ORANGE, BLUE
 
 RC: dict[Any, Any] = {
-    "font.family": "STIXGeneral",  # comes with matplotlib: the same picture on every machine
+    "font.family": "STIXGeneral",  # shipped with matplotlib: same picture on every machine
     "mathtext.fontset": "stix",
     "font.size": 9.0,
     "axes.titlesize": 9.0,
@@ -57,31 +55,31 @@ RC: dict[Any, Any] = {
     "legend.borderaxespad": 0.2,
     "hatch.linewidth": 0.5,
     "svg.fonttype": "path",
-    "svg.hashsalt": "cloudrc",  # the same flight gives the same file, byte by byte
+    "svg.hashsalt": "cloudrc",  # the same flight gives an identical file
     "savefig.dpi": 200,
     "figure.dpi": 100,
 }
-"""Settings of matplotlib while a figure is drawn and saved; `figures.drawing()` puts them back."""
+"""Settings of matplotlib while a figure is drawn and saved."""
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Make an empty figure, `width` by `height` [in], that needs no display and no pyplot."""
+    """Make an empty figure, `width` by `height` [in], without a display or pyplot."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def time_axis(axes: Axes, duration: float) -> None:
-    """Label the abscissa as time since the mission's start, from 0 to `duration` [s]."""
+    """Label the x axis as time since the mission's start, from 0 to `duration` [s]."""
     axes.set_xlim(0.0, max(duration, 1e-3))
     axes.set_xlabel("time since start (s)")
 
 
 def panel(axes: Axes, letter: str, title: str = "") -> None:
-    """Head a panel with its letter, as captions refer to it, and perhaps a title."""
+    """Write a panel's letter and optional title above it."""
     axes.set_title(f"({letter}) {title}".rstrip(), loc="left")
 
 
 def legend_above(axes: Axes, columns: int) -> None:
-    """Put the legend over the panel, where it cannot hide data."""
+    """Put the legend above the panel, where it cannot hide data."""
     axes.legend(
         loc="lower right",
         bbox_to_anchor=(1.0, 1.0),
@@ -93,12 +91,12 @@ def legend_above(axes: Axes, columns: int) -> None:
 
 @dataclass(frozen=True)
 class Subject:
-    """A flight, and what was asked for.
+    """A flight and its configured link.
 
     Attributes:
-        flight: As recorded.
-        uplink: Conditions of the link from world to cloud.
-        downlink: Likewise from cloud to world.
+        flight: The recorded flight.
+        uplink: Configured link profile from world to cloud.
+        downlink: Configured link profile from cloud to world.
     """
 
     flight: Flight
@@ -107,7 +105,7 @@ class Subject:
 
     @cached_property
     def waypoints(self) -> dict[int, Vector]:
-        """Those that were flown to [m], by index: the setpoint as it was when each was new."""
+        """Positions [m] of the waypoints flown to, by index: the first setpoint of each."""
         control = self.flight.control
         indices, rows = np.unique(control["waypoint"], return_index=True)
         points = control["setpoint"][rows].tolist()
@@ -119,12 +117,12 @@ class Subject:
 
     @cached_property
     def duration(self) -> float:
-        """From the start to the end of the flight [s]."""
+        """Duration of the flight [s]."""
         end_ns = self.flight.end_ns
         return 0.0 if end_ns is None else float(self.flight.seconds(end_ns))
 
     @cached_property
     def link_start(self) -> float:
-        """When the link came up, since the start of the mission [s]: with the first datagram."""
+        """Start of the link, at the first datagram, since the start of the mission [s]."""
         stamps = self.flight.recording["/telemetry"]["stamp_ns"]
         return float(self.flight.seconds(stamps[0])) if len(stamps) else 0.0

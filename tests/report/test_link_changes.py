@@ -1,4 +1,4 @@
-"""What was set in flight is drawn: bands change with it, and triangles say when."""
+"""Changes of the link in flight change the bands of figures and are marked with triangles."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TIMED = Direction(
 )
 
 
-def told(
+def changed(
     time: float, uplink: bool, direction: Direction, cause: str, age: float = 0.0, **more: Any
 ) -> LinkChanged:
     conditions = json.dumps(direction.model_dump(mode="json", exclude_defaults=True))
@@ -49,16 +49,18 @@ def low(subject: Subject, time: float, *, uplink: bool = True) -> float:
     return float(found[0][0])
 
 
-def test_a_change_ends_what_was_before_and_not_the_other_direction() -> None:
-    subject = subject_of(told(3.05, True, Direction(delay_ms=120.0), "uplink.delay_ms=120", 0.05))
+def test_a_change_affects_only_its_own_direction() -> None:
+    subject = subject_of(
+        changed(3.05, True, Direction(delay_ms=120.0), "uplink.delay_ms=120", 0.05)
+    )
     assert [low(subject, time) for time in (2.9, 3.1)] == pytest.approx([0.05, 0.12])
     assert low(subject, 3.1, uplink=False) == pytest.approx(0.05)
     assert set_in_flight(subject) == [(pytest.approx(3.0), "uplink.delay_ms=120")]
 
 
-def test_a_new_time_line_counts_from_the_change_and_is_cut_by_the_next() -> None:
+def test_a_time_line_starts_at_its_change_and_ends_at_the_next() -> None:
     subject = subject_of(
-        told(1.0, True, TIMED, "profile timed"), told(4.0, True, CALM, "profile calm")
+        changed(1.0, True, TIMED, "profile timed"), changed(4.0, True, CALM, "profile calm")
     )
     assert [low(subject, t) for t in (0.5, 1.5, 3.5, 4.5)] == pytest.approx(
         [0.05, 0.02, 0.09, 0.05]
@@ -73,37 +75,37 @@ def test_a_new_time_line_counts_from_the_change_and_is_cut_by_the_next() -> None
     )
 
 
-def test_a_single_value_lets_the_time_line_go_on() -> None:
+def test_changing_one_value_keeps_the_time_line() -> None:
     timed = TIMED.model_copy(update={"jitter_ms": 5.0})
     subject = subject_of(
-        told(1.0, True, TIMED, "profile timed"),
-        told(2.0, True, timed, "uplink.jitter_ms=5", time_line=1.0),
-        told(2.5, True, TIMED, "uplink.jitter_ms=0", time_line=math.nan),
+        changed(1.0, True, TIMED, "profile timed"),
+        changed(2.0, True, timed, "uplink.jitter_ms=5", time_line=1.0),
+        changed(2.5, True, TIMED, "uplink.jitter_ms=0", time_line=math.nan),
     )
     assert [low(subject, t) for t in (2.2, 2.9, 3.1)] == pytest.approx([0.015, 0.02, 0.09])
 
 
-def test_notes_of_what_is_known_are_no_changes() -> None:
+def test_repeated_records_are_no_changes() -> None:
     subject = subject_of(
-        told(-1.0, True, CALM, "", time_line=math.nan),  # it came up as configured
-        told(3.0, True, Direction(delay_ms=9.0), "by hand"),
-        told(5.0, True, Direction(delay_ms=9.0), "by hand", 2.0),  # told again
-        told(3.1, False, Direction(delay_ms=9.0), "by hand"),
+        changed(-1.0, True, CALM, "", time_line=math.nan),  # the link started as configured
+        changed(3.0, True, Direction(delay_ms=9.0), "by hand"),
+        changed(5.0, True, Direction(delay_ms=9.0), "by hand", 2.0),  # a repeated record
+        changed(3.1, False, Direction(delay_ms=9.0), "by hand"),
     )
     assert len(spans(subject, uplink=True)) == 2
     assert set_in_flight(subject) == [(pytest.approx(3.0), "by hand")]
 
 
-def test_what_was_set_before_the_mission_holds_from_its_start() -> None:
-    subject = subject_of(told(-0.5, True, Direction(delay_ms=9.0), "by hand", 300.0))
+def test_a_change_before_the_mission_holds_from_its_start() -> None:
+    subject = subject_of(changed(-0.5, True, Direction(delay_ms=9.0), "by hand", 300.0))
     assert low(subject, 0.0) == pytest.approx(0.009)
     assert set_in_flight(subject) == []
 
 
 @pytest.mark.parametrize("count", [4, 8])
-def test_numbers_of_changes_close_together_do_not_print_over_each_other(count: int) -> None:
-    each = [told(3.0 + 0.1 * n, True, CALM, f"number {n + 1}") for n in range(count)]
-    subject = subject_of(*each, told(6.0, True, CALM, "the last"))
+def test_numbers_of_close_changes_do_not_overlap(count: int) -> None:
+    each = [changed(3.0 + 0.1 * n, True, CALM, f"number {n + 1}") for n in range(count)]
+    subject = subject_of(*each, changed(6.0, True, CALM, "the last"))
     with matplotlib.rc_context(RC):
         figure = delay.draw(subject)
         figure.draw_without_rendering()
@@ -116,8 +118,8 @@ def test_numbers_of_changes_close_together_do_not_print_over_each_other(count: i
             assert boxes[-1].y0 == pytest.approx(boxes[0].y0), "back in the first row"
 
 
-def test_the_figure_is_drawn_with_all_of_it() -> None:
-    subject = subject_of(told(1.0, True, TIMED, "profile timed"))
+def test_the_delay_figure_draws_changes() -> None:
+    subject = subject_of(changed(1.0, True, TIMED, "profile timed"))
     with matplotlib.rc_context(RC):
         delay.draw(subject).draw_without_rendering()
     assert "profile timed, at 1.0 s" in delay.caption(subject)
