@@ -17,7 +17,7 @@ from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity, Operator
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.config.overrides import build
+from cloudrc.config.overrides import build_plugin
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
@@ -104,9 +104,9 @@ def build_cloud(
     """
     cloud = experiment.cloud
     loop = ControlLoop(
-        lambda: build("estimators", cloud.estimator),
-        build("predictors", cloud.predictor),
-        build("controllers", cloud.controller),
+        lambda: build_plugin("estimators", cloud.estimator),
+        build_plugin("predictors", cloud.predictor),
+        build_plugin("controllers", cloud.controller),
     )
     start_ns = clock()
     if teleop is None:

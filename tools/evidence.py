@@ -15,8 +15,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.faults_page import rows as search_rows
-from cloudrc.cli.faults_page import summary
+from cloudrc.cli.faults_summary import rows as search_rows
+from cloudrc.cli.faults_summary import summary
 from cloudrc.report.document import environment_document, write_json
 
 Rows = Iterable[Iterable[object]]

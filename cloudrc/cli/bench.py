@@ -16,8 +16,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import output_argument, table, written
-from cloudrc.cli.parser import count
+from cloudrc.cli.output import format_document, output_argument, table
+from cloudrc.cli.parser import read_count
 from cloudrc.drivers.machine import interpreter
 from cloudrc.errors import CloudrcError
 
@@ -161,7 +161,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     output_argument(parser)
     parser.add_argument(
         "--repeats",
-        type=count,
+        type=read_count,
         default=7,
         metavar="N",
         help="how often to measure each part (default: 7)",
@@ -182,7 +182,7 @@ def execute(options: argparse.Namespace) -> int:
     wire = measure_wire()
     if options.output != "table":
         document = {**figures, "wire": {**wire._asdict(), "ratio": wire.ratio}}
-        print(written({"schemaVersion": 1, **document}, options.output))
+        print(format_document({"schemaVersion": 1, **document}, options.output))
         return 0
     rows = [("experiment paper, mode virtual", "us a step", "ratio to raw", "x real time")]
     for name, figure in figures.items():

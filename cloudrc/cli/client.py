@@ -18,15 +18,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
 
-from cloudrc.cli.output import harmless
+from cloudrc.cli.output import escape
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.files import read
 
-ANSWER_LIMIT = 10.0
+REQUEST_TIMEOUT = 10.0
 """Time limit of one request [s]."""
-STREAM_LIMIT = 30.0
+STREAM_TIMEOUT = 30.0
 """Longest silence of a stream of events [s]; the API sends something every 10 s."""
-LATER = (408, 429, 502, 503, 504)
+RETRY_STATUSES = (408, 429, 502, 503, 504)
 """HTTP status codes after which a request is worth repeating."""
 UNIX = "unix:"
 
@@ -80,7 +80,7 @@ class Api:
         Raises:
             UnreachableError: If the connection breaks.
         """
-        connection, stream = self._open("GET", f"/v1/events?after={after}", None, STREAM_LIMIT)
+        connection, stream = self._open("GET", f"/v1/events?after={after}", None, STREAM_TIMEOUT)
         try:
             for line in stream:
                 if line.startswith(b"data: "):
@@ -93,7 +93,7 @@ class Api:
             connection.close()
 
     def _request(self, method: str, path: str, body: bytes | None = None) -> Any:
-        connection, answer = self._open(method, path, body, ANSWER_LIMIT)
+        connection, answer = self._open(method, path, body, REQUEST_TIMEOUT)
         try:
             return json.loads(answer.read())
         except (OSError, ValueError, http.client.HTTPException) as error:
@@ -132,7 +132,7 @@ class Api:
         return kind(parts.hostname or "", parts.port, timeout=limit)
 
 
-def path_of(mission_id: str) -> str:
+def mission_path(mission_id: str) -> str:
     """Return the URL path of a mission; quote any character of its id."""
     return f"/v1/missions/{quote(mission_id, safe='', errors='surrogateescape')}"
 
@@ -154,18 +154,18 @@ def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcEr
     except (OSError, ValueError, http.client.HTTPException):
         body = {}
     detail = body.get("detail") or f"the API answered {answer.status} {answer.reason}"
-    detail = harmless(str(detail))
+    detail = escape(str(detail))
     problems = body.get("problems") or []
     if len(problems) > 1:
         parts = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)
-        lines = [harmless(": ".join(words)) for words in parts]
+        lines = [escape(": ".join(words)) for words in parts]
         detail = "\n  ".join([f"the mission has {len(lines)} problems:", *lines])
     if answer.status in (400, 413, 422):
         return BadInputError(detail)
     if answer.status == 401:
         which = "does not know this token" if with_token else "asks for a token"
         detail = f"the API {which}; name its file: --token-file FILE or CLOUDRC_TOKEN_FILE"
-    return UnreachableError(detail) if answer.status in LATER else ApiError(detail)
+    return UnreachableError(detail) if answer.status in RETRY_STATUSES else ApiError(detail)
 
 
 VARIABLE = "CLOUDRC_TOKEN_FILE"
@@ -191,7 +191,7 @@ def token_file(options: argparse.Namespace) -> Path | None:
     return Path(os.environ[VARIABLE]) if os.environ.get(VARIABLE) else None
 
 
-def reader(path: Path | None) -> Callable[[], str]:
+def token_reader(path: Path | None) -> Callable[[], str]:
     """Make the function that reads the token anew for each request; "" without a file."""
     return (lambda: "") if path is None else (lambda: _read(path))
 

@@ -15,7 +15,7 @@ READY_LIMIT = 300.0
 """Default time for the pods of a release to become ready [s]."""
 
 
-def place_arguments(parser: argparse.ArgumentParser) -> None:
+def release_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags that name a release, as in kubectl."""
     group = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
     group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
@@ -38,7 +38,7 @@ def timeout_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def place(options: argparse.Namespace) -> Release:
+def release_from_flags(options: argparse.Namespace) -> Release:
     """Give the release that the flags name.
 
     Raises:

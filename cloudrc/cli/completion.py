@@ -28,7 +28,7 @@ def execute(options: argparse.Namespace) -> int:
         )
     import shtab
 
-    from cloudrc.cli.parser import COMMANDS, build
+    from cloudrc.cli.parser import COMMANDS, build_parser
 
-    print(shtab.complete(build(COMMANDS, for_completion=True), options.shell))
+    print(shtab.complete(build_parser(COMMANDS, for_completion=True), options.shell))
     return 0

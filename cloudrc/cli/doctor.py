@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from cloudrc.cli.extras import EXTRAS, missing
-from cloudrc.cli.output import output_argument, paint, table, written
+from cloudrc.cli.output import format_document, output_argument, paint, table
 from cloudrc.drivers.machine import interpreter
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 
@@ -298,7 +298,7 @@ def execute(options: argparse.Namespace) -> int:
     checks = list(all_checks(options.mode, options.context))
     blocking = [c.name for c in checks if c.state == "missing" and options.mode in c.modes]
     if options.output != "table":
-        print(written(_document(options.mode, checks, blocking), options.output))
+        print(format_document(_document(options.mode, checks, blocking), options.output))
     else:
         print(_as_text(options.mode, checks, blocking))
     return MissingPrerequisiteError.exit_code if blocking else 0

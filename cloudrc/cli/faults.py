@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.cluster_flags import place_arguments
+from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import harmless, output_argument, paint, table, written
-from cloudrc.cli.parser import COUNT_MAX, count, read_from
-from cloudrc.cli.pool import WorkerDiedError, in_order
+from cloudrc.cli.output import escape, format_document, output_argument, paint, table
+from cloudrc.cli.parser import COUNT_MAX, input_file, read_count
+from cloudrc.cli.pool import WorkerDiedError, map_in_order
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     _run_arguments(parsers["run"])
     _fuzz_arguments(parsers["fuzz"])
     parsers["replay"].add_argument(
-        "file", type=read_from, metavar="FILE", help="schedule of faults (.yaml)"
+        "file", type=input_file, metavar="FILE", help="schedule of faults (.yaml)"
     )
 
 
@@ -72,7 +72,7 @@ def seed(text: str) -> int:
     return int(text)
 
 
-def written_to(text: str) -> Path:
+def output_file(text: str) -> Path:
     """Parse the name of an output file; refuse one that cannot be written."""
     path = Path(text)
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
@@ -80,7 +80,7 @@ def written_to(text: str) -> Path:
     return path
 
 
-def folder(text: str) -> Path:
+def output_folder(text: str) -> Path:
     """Parse the name of an output folder; refuse one that cannot be made."""
     path = Path(text)
     existing = next(each for each in (path, *path.absolute().parents) if each.exists())
@@ -105,23 +105,23 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--all", action="store_true", help="every fault of the mode")
     _modes(parser)
     parser.add_argument("--seed", type=seed, default=1, metavar="N", help="seed (default: 1)")
-    parser.add_argument("--jobs", type=count, default=1, metavar="J", help=JOBS)
+    parser.add_argument("--jobs", type=read_count, default=1, metavar="J", help=JOBS)
     parser.add_argument(
-        "--junit", type=written_to, metavar="FILE", help="write the results as JUnit XML"
+        "--junit", type=output_file, metavar="FILE", help="write the results as JUnit XML"
     )
     text = "write the results as a Markdown page (needs --all)"
-    parser.add_argument("--document", type=written_to, metavar="FILE", help=text)
-    place_arguments(parser)
+    parser.add_argument("--document", type=output_file, metavar="FILE", help=text)
+    release_arguments(parser)
 
 
 def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--seeds", type=count, default=200, metavar="N", help="number of seeds (default: 200)"
+        "--seeds", type=read_count, default=200, metavar="N", help="number of seeds (default: 200)"
     )
     parser.add_argument(
         "--first", type=seed, default=1, metavar="N", help="first seed (default: 1)"
     )
-    parser.add_argument("--jobs", type=count, default=1, metavar="J", help=JOBS)
+    parser.add_argument("--jobs", type=read_count, default=1, metavar="J", help=JOBS)
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument(
         "--adversarial",
@@ -132,10 +132,10 @@ def _fuzz_arguments(parser: argparse.ArgumentParser) -> None:
         "--clean", action="store_true", help="inject no faults: any HOLD is a false alarm"
     )
     text = "write the results as a Markdown page"
-    parser.add_argument("--document", type=written_to, metavar="FILE", help=text)
+    parser.add_argument("--document", type=output_file, metavar="FILE", help=text)
     parser.add_argument(
         "--store",
-        type=folder,
+        type=output_folder,
         default=Path("faults-found"),
         metavar="DIR",
         help="folder for failing schedules, after reduction (default: ./faults-found)",
@@ -151,7 +151,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.cli import faults_fuzz
 
     actions = {
-        "list": show,
+        "list": print_faults,
         "run": run,
         "fuzz": faults_fuzz.fuzz,
         "replay": faults_fuzz.replay,
@@ -165,7 +165,7 @@ PLACE = ("context", "namespace", "release")
 """Options that select a release in a cluster."""
 
 
-def show(options: argparse.Namespace) -> int:
+def print_faults(options: argparse.Namespace) -> int:
     """Print the list of faults."""
     from cloudrc.faults.scenario import scenarios
 
@@ -173,7 +173,7 @@ def show(options: argparse.Namespace) -> int:
     if options.output != "table":
         names = ("id", "name", "mode", "injects", "expects", "loses", "shows")
         faults = [{n: getattr(each, n) for n in names} for each in found]
-        print(written({"schemaVersion": 1, "faults": faults}, options.output))
+        print(format_document({"schemaVersion": 1, "faults": faults}, options.output))
         return 0
     rows = [("fault", "name", "mode", "injection", "expected reaction")]
     rows += [(each.id, each.name, each.mode, each.injects, each.expects) for each in found]
@@ -211,7 +211,7 @@ def run(options: argparse.Namespace) -> int:
         text = document.as_markdown(results, options.seed, mode)
         options.document.write_text(text, encoding="utf-8")
     if options.output != "table":
-        print(written(document.as_json(results, options.seed), options.output))
+        print(format_document(document.as_json(results, options.seed), options.output))
     failed = sum(result.failed for result in results)
     passed = sum(result.passed for result in results)
     say(f"\nseed {options.seed}: {passed} of {len(results)} passed, {failed} failed")
@@ -242,7 +242,7 @@ def _mode(options: argparse.Namespace) -> Mode:
 def _results(chosen: Sequence[Scenario], options: argparse.Namespace) -> Iterator[Result]:
     names = [(each.name, each.mode, options.seed) for each in chosen]
     jobs = options.jobs if _mode(options) == "virtual" else 1
-    return in_order(_run, names, jobs)
+    return map_in_order(_run, names, jobs)
 
 
 def _run(job: tuple[str, Mode, int]) -> Result:
@@ -265,9 +265,9 @@ def _print_result(result: Result, briefly: bool, say: Callable[[str], object]) -
     sha = f"  {outcome.sha256[:12]}" if outcome.sha256 else ""
     say(f"{word:8} {scenario.id:4} {scenario.name:26} {result.seconds:6.1f} s{sha}")
     for reason in filter(None, (result.error, outcome.skipped)):
-        say(f"           {harmless(reason)}")
+        say(f"           {escape(reason)}")
     shown: Iterable[str] = (
-        f"         {'' if check.passed else 'x '}{harmless(check.show())}"
+        f"         {'' if check.passed else 'x '}{escape(check.show())}"
         for check in outcome.checks
         if not (briefly and check.passed)
     )

@@ -13,9 +13,9 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli import faults_page as page
-from cloudrc.cli.output import paint, say, table, unread_is_fine, written
-from cloudrc.cli.pool import WorkerDiedError, in_order
+from cloudrc.cli import faults_summary as page
+from cloudrc.cli.output import format_document, ignore_closed_pipe, paint, print_line, table
+from cloudrc.cli.pool import WorkerDiedError, map_in_order
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def fuzz(options: argparse.Namespace) -> int:
     say = options.output == "table"
     search = Search(options)
     cause, code = "stopped", INTERRUPTED
-    with stopping() as stop:
+    with stop_on_signal() as stop:
         try:
             _fly_all(search, say, stop)
         except WorkerDiedError as error:
@@ -49,7 +49,7 @@ def fuzz(options: argparse.Namespace) -> int:
     if partial:
         rest = page.command(document | _rest(document, options))
         message = f"{cause}; {document['count']} of {options.seeds} were flown"
-        with unread_is_fine(sys.stderr):  # a closed terminal must not prevent the output below
+        with ignore_closed_pipe(sys.stderr):  # a closed terminal must not prevent the output below
             print(f"cloudrc: {message}; continue with '{rest}'", file=sys.stderr, flush=True)
     _print(document, options)
     return code if partial else FAILED if search.failures else 0
@@ -60,7 +60,7 @@ def _print(document: dict[str, Any], options: argparse.Namespace) -> None:
         print("\n" + table(page.rows(document), right=(1, 2)))
         print(f"\n{page.summary(document)}")
     else:
-        print(written(document, options.output))
+        print(format_document(document, options.output))
 
 
 def _rest(document: dict[str, Any], options: argparse.Namespace) -> dict[str, int]:
@@ -110,7 +110,7 @@ class Search:
 
 
 @contextmanager
-def stopping() -> Iterator[Callable[[], bool]]:
+def stop_on_signal() -> Iterator[Callable[[], bool]]:
     """Turn the first signal into a request to stop after the current flight; the second kills.
 
     A closed terminal sends two signals, which count as one. Under `nohup`, SIGHUP stays ignored.
@@ -147,17 +147,17 @@ def replay(options: argparse.Namespace) -> int:
     breaches = [breach._asdict() for breach in finding.breaches]
     if options.output != "table":
         document = {"schemaVersion": 1, "records_sha256": finding.sha256, "breaches": breaches}
-        print(written(document, options.output))
+        print(format_document(document, options.output))
     else:
         for breach in finding.breaches:
-            say(f"{breach.time:8.3f} s  {breach.kind}: {breach.text}")
+            print_line(f"{breach.time:8.3f} s  {breach.kind}: {breach.text}")
         print(f"{'FAILED' if breaches else 'passed'}  records {finding.sha256[:16]}")
     return FAILED if breaches else 0
 
 
 def _findings(seeds: Iterable[int], options: argparse.Namespace) -> Iterator[Finding]:
     work = [(seed, _kind(options)) for seed in seeds]
-    return in_order(_fly, work, options.jobs)
+    return map_in_order(_fly, work, options.jobs)
 
 
 def _kind(options: argparse.Namespace) -> str:

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from cloudrc.cli.output import say
+from cloudrc.cli.output import print_line
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 _Found = TypeVar("_Found")
@@ -34,7 +34,7 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def find_here(
+def find_local_run(
     options: argparse.Namespace, look: Callable[[Path], _Found | None], nobody: str
 ) -> _Found | None:
     """Find the API or the link of the run that is flying here, unless the flags name a cluster.
@@ -72,11 +72,11 @@ def find_here(
     if not others:
         return None
     ((run, found),) = others
-    say(f"cloudrc: using the run in {run}", sys.stderr)
+    print_line(f"cloudrc: using the run in {run}", sys.stderr)
     return found
 
 
-def nobody_here(
+def no_run_error(
     options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
 ) -> MissingPrerequisiteError:
     """Extend a cluster's error: a run on this machine would do, too.
@@ -93,7 +93,7 @@ def nobody_here(
     )
 
 
-def link_of(run: Path) -> Path | None:
+def link_folder_of(run: Path) -> Path | None:
     """Give the folder that controls the relay of a run; None if the run is not flying.
 
     A killed run leaves this folder behind.
@@ -108,7 +108,7 @@ def link_of(run: Path) -> Path | None:
     return folder if run.resolve() in under_way() or quiet_time < QUIET_LIMIT else None
 
 
-def url_of(run: Path) -> str | None:
+def api_url_of(run: Path) -> str | None:
     """Give the URL of the API of this user's run in a folder; None if the run is not flying.
 
     The URL comes from this user's runtime folder, never from the run's folder: that may come from

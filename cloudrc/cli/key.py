@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.output import say
+from cloudrc.cli.output import print_line
 from cloudrc.errors import BadInputError
 
 REMEDY = "name a key file; 'cloudrc key new FILE' makes a new one"
@@ -77,7 +77,7 @@ def _make(options: argparse.Namespace) -> int:
         keys = KeySet(Key(secret))
     _replace(path, keys)
     before = f", beside {keys.previous.name} for {keys.overlap:g} s" if keys.previous else ""
-    say(f"key {keys.current.name}{before}: {path}")
+    print_line(f"key {keys.current.name}{before}: {path}")
     return 0
 
 
@@ -99,10 +99,12 @@ def _retire(path: Path) -> int:
 
     keys = read_keys(path, "", REMEDY)
     if keys.previous is None:
-        say(f"key {keys.current.name} is the only key already: {path}")
+        print_line(f"key {keys.current.name} is the only key already: {path}")
         return 0
     _replace(path, KeySet(keys.current))
-    say(f"key {keys.current.name} is the only key now, {keys.previous.name} is removed: {path}")
+    print_line(
+        f"key {keys.current.name} is the only key now, {keys.previous.name} is removed: {path}"
+    )
     return 0
 
 

@@ -6,7 +6,7 @@ import argparse
 import importlib
 from pathlib import Path
 
-from cloudrc.cli.runtime import address, process_arguments
+from cloudrc.cli.runtime import process_arguments, read_address
 from cloudrc.errors import BadInputError
 
 EPILOG = """\
@@ -87,14 +87,14 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--peer",
-        type=address,
+        type=read_address,
         required=True,
         metavar="HOST:PORT",
         help="address of the other tunnel end",
     )
     parser.add_argument(
         "--listen",
-        type=address,
+        type=read_address,
         default=("127.0.0.1", 7401),
         metavar="HOST:PORT",
         help="where the relay receives datagrams (default: 127.0.0.1:7401)",

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.assembly import link_profile
-from cloudrc.cluster.pods import DIRECTLY
+from cloudrc.cluster.pods import NO_PROXY
 from cloudrc.drivers.machine import interpreter
 from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.realtime import parse
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from cloudrc.config.schema import Profile
 
 LOOPBACK = "127.0.0.1"
-WAYS = ("uplink", "downlink")
+DIRECTIONS = ("uplink", "downlink")
 START_LIMIT = 90.0
 """Time limit for both processes to start [s]; a slow machine loads Python for many seconds."""
 STOP_LIMIT = 2.0
@@ -51,7 +51,7 @@ _CHART_ADVICE, _ADVICE = "set link.mode=relay", "use --shaper relay"
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ShaperAddresses:
     """Addresses of one direction's shaper.
 
     Attributes:
@@ -68,7 +68,7 @@ class Place:
 
 
 @dataclass(slots=True)
-class Shaping:
+class ShaperProcess:
     """Process that shapes one direction.
 
     Attributes:
@@ -78,7 +78,7 @@ class Shaping:
         log: File with its output.
     """
 
-    place: Place
+    place: ShaperAddresses
     folder: Path
     process: subprocess.Popen[bytes]
     log: Path = field(init=False)
@@ -109,7 +109,7 @@ class Shaping:
             done = subprocess.run(words, capture_output=True, text=True, check=False)
             return done.stdout
         try:
-            with DIRECTLY.open(f"http://{host}:{port}/metrics", timeout=_METRICS_TIMEOUT) as page:
+            with NO_PROXY.open(f"http://{host}:{port}/metrics", timeout=_METRICS_TIMEOUT) as page:
                 return str(page.read().decode())
         except OSError:
             return ""
@@ -120,7 +120,7 @@ class Shaping:
         return lines[-1] if lines else "it left no message"
 
 
-def refuse_impossible(asked: Profile | ResolvedExperiment, mode: str) -> None:
+def check_shaper(asked: Profile | ResolvedExperiment, mode: str) -> None:
     """Refuse a profile that the shaper cannot realise.
 
     Args:
@@ -130,7 +130,7 @@ def refuse_impossible(asked: Profile | ResolvedExperiment, mode: str) -> None:
     Raises:
         BadInputError: Names the direction and what netem cannot do.
     """
-    for way in WAYS if mode == "netem" else ():
+    for way in DIRECTIONS if mode == "netem" else ():
         try:
             check(link_profile(getattr(asked, way)))
         except BadInputError as error:
@@ -138,9 +138,9 @@ def refuse_impossible(asked: Profile | ResolvedExperiment, mode: str) -> None:
 
 
 @contextlib.contextmanager
-def shaping(
-    places: Mapping[str, Place], config: str, profile: str, mode: str
-) -> Iterator[dict[str, Shaping]]:
+def run_shapers(
+    places: Mapping[str, ShaperAddresses], config: str, profile: str, mode: str
+) -> Iterator[dict[str, ShaperProcess]]:
     """Run the shapers of both directions; stop them at the end.
 
     Args:
@@ -153,7 +153,7 @@ def shaping(
         CloudrcError: If a shaper ends early; with its message and exit code.
         TimedOutError: If a shaper does not start in time.
     """
-    running: dict[str, Shaping] = {}
+    running: dict[str, ShaperProcess] = {}
     with tempfile.TemporaryDirectory(prefix="cloudrc-verify-") as text:
         folder = Path(text)
         (folder / "experiment.yaml").write_text(config, encoding="utf-8")
@@ -167,7 +167,7 @@ def shaping(
             _stop([one.process for one in running.values()])
 
 
-def _start(folder: Path, way: str, place: Place, mode: str) -> Shaping:
+def _start(folder: Path, way: str, place: ShaperAddresses, mode: str) -> ShaperProcess:
     own = folder / way
     own.mkdir()
     command: Sequence[str] = (
@@ -191,10 +191,10 @@ def _start(folder: Path, way: str, place: Place, mode: str) -> Shaping:
             env={**os.environ, PARENT: str(os.getpid())},
             start_new_session=True,  # Ctrl-C reaches this process alone, which stops them
         )
-    return Shaping(place, own, process)
+    return ShaperProcess(place, own, process)
 
 
-def _wait(running: Mapping[str, Shaping]) -> None:
+def _wait(running: Mapping[str, ShaperProcess]) -> None:
     deadline = time.monotonic() + START_LIMIT
     while not all(one.route() for one in running.values()):
         for way, one in running.items():

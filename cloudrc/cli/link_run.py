@@ -25,8 +25,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.output import say
-from cloudrc.cli.runtime import open_exporter, resolve, warn_if_exposed
+from cloudrc.cli.output import print_line
+from cloudrc.cli.runtime import ipv4_addresses, open_exporter, warn_if_exposed
 from cloudrc.drivers.process import StopSignal
 from cloudrc.link.sidecar import Near, look_near, write_told
 from cloudrc.link.tc import Answer
@@ -48,18 +48,18 @@ def run(options: argparse.Namespace) -> int:
     warn_if_exposed(options.listen)
     exporter = open_exporter(options, "link")
     metrics = Metrics(exporter, options.direction, options.mode) if exporter else None
-    load, handed_path = loader(options.direction), options.route.with_name(HANDED_FILE)
+    load, handed_path = make_profile_loader(options.direction), options.route.with_name(HANDED_FILE)
     profile_file = ProfileFile(options.profile, load, log)
     profiles = Profiles(profile_file, HandedProfile(handed_path, load, log))
     profile, state_path = profiles.first(), options.route.with_name("link.json")
     settings = Settings(options.mode, options.direction, options.route, state_path)
     with TemporaryDirectory(prefix="tc-", dir=options.route.parent) as tables:
         write_tables(Path(tables))
-        programs = runner(tables)
+        programs = make_programs(tables)
         machine = _machine(options, programs, Path(tables))
         sidecar = Sidecar(settings, machine, profile, metrics)
         if exporter:
-            exporter.tells(Teller(sidecar).text)
+            exporter.tells(LinkStatusSource(sidecar).text)
         try:
             sidecar.run(stop, lambda: _start_watching(sidecar, profiles, options, metrics))
         finally:
@@ -69,10 +69,10 @@ def run(options: argparse.Namespace) -> int:
 
 def log(line: str) -> None:
     """Write one line to the log."""
-    say(f"cloudrc link: {line}", sys.stderr)
+    print_line(f"cloudrc link: {line}", sys.stderr)
 
 
-def loader(direction: str) -> Load:
+def make_profile_loader(direction: str) -> Load:
     """Make the function that reads one direction of a profile file."""
     from cloudrc.assembly import link_profile
     from cloudrc.config.load import load_profile
@@ -135,7 +135,7 @@ def _start_watching(
     """Start the threads that watch the profile file and resolve the peer's name."""
     from cloudrc.link.follow import PEER_PAUSE, PROFILE_PERIOD, PeerName
 
-    name = PeerName(options.peer, resolve, log)
+    name = PeerName(options.peer, ipv4_addresses, log)
 
     def poll_profile() -> None:
         sidecar.profile = profiles.poll() or sidecar.profile
@@ -183,7 +183,7 @@ class Metrics:
         self._exporter.see([Counted(stamp_ns, "link", name, n) for name, n in counts.items()])
 
 
-PATIENCE = 5.0
+TOOL_TIMEOUT = 5.0
 """Time limit of one call of tc or ip [s]."""
 NOT_FOUND = 127
 """Exit code when the program does not exist."""
@@ -193,7 +193,7 @@ _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"  # its listing marks the end of an answer
 
 
-def runner(tables: str, prefix: Sequence[str] = ()) -> Programs:
+def make_programs(tables: str, prefix: Sequence[str] = ()) -> Programs:
     """Make the runner of tc and ip.
 
     Args:
@@ -209,7 +209,7 @@ class Programs:
     def __init__(self, environment: Mapping[str, str], prefix: Sequence[str] = ()) -> None:
         """Store the environment and the prefix; start no process."""
         self._environment, self._prefix = environment, tuple(prefix)
-        self._session: Session | None = None
+        self._session: TcSession | None = None
 
     def __call__(self, words: Sequence[str]) -> Answer:
         """Run a command and return its answer."""
@@ -218,7 +218,7 @@ class Programs:
             return self._once(words)
         try:
             if self._session is None:
-                self._session = Session((*self._prefix, *_BATCH), self._environment)
+                self._session = TcSession((*self._prefix, *_BATCH), self._environment)
             return self._session.ask(line, lists=words[1].startswith("-"))
         except (OSError, SessionError):
             # The tc process was killed, or is too old for -batch: start one for this command.
@@ -238,7 +238,7 @@ class Programs:
                 capture_output=True,
                 text=True,
                 env=self._environment,
-                timeout=PATIENCE,
+                timeout=TOOL_TIMEOUT,
                 check=False,
             )
         except FileNotFoundError:
@@ -246,7 +246,7 @@ class Programs:
         except OSError as error:  # no permission, or the limit of processes is reached
             return Answer(1, "", error.strerror or str(error))
         except subprocess.TimeoutExpired:
-            return Answer(1, "", f"no answer within {PATIENCE:g} s")
+            return Answer(1, "", f"no answer within {TOOL_TIMEOUT:g} s")
         return Answer(done.returncode, done.stdout, done.stderr)
 
 
@@ -254,7 +254,7 @@ class SessionError(Exception):
     """The lasting tc process does not answer as expected."""
 
 
-class Session:
+class TcSession:
     """Talk to one `tc -batch -` process."""
 
     def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
@@ -282,7 +282,7 @@ class Session:
             SessionError: If there is no valid answer; close the session then.
         """
         os.write(self._in, f"{line}\n{_END}\n".encode())
-        deadline, unread, text = time.monotonic() + PATIENCE, b"", ""
+        deadline, unread, text = time.monotonic() + TOOL_TIMEOUT, b"", ""
         listings: list[str] = []
         failed = False
         while len(listings) < (2 if lists and not failed else 1):
@@ -328,46 +328,46 @@ def _for_batch(words: Sequence[str]) -> str | None:
     return None
 
 
-PERIOD = 1.0
+STATUS_PERIOD = 1.0
 """How long an answer of /link.json stays valid [s]."""
-NOTHING = "{}\n"
+EMPTY_STATUS = "{}\n"
 """Answer of /link.json before anything is shaped."""
 
 
-def look(host: str, inside: Sequence[str] = ()) -> Near | None:
+def inspect_network(host: str, inside: Sequence[str] = ()) -> Near | None:
     """Find the netem qdiscs of a network namespace and its route to a host.
 
     Args:
         host: IPv4 address.
         inside: Prefix of commands, "ip netns exec NAME"; empty for this namespace.
     """
-    programs = runner("", inside)
+    programs = make_programs("", inside)
     try:
         return look_near(programs, host)
     finally:
         programs.close()
 
 
-class Teller:
+class LinkStatusSource:
     """Describe the state of a sidecar as JSON; for any thread."""
 
     def __init__(
         self,
         sidecar: Sidecar,
-        look: Callable[[str], Near | None] = look,
+        look: Callable[[str], Near | None] = inspect_network,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._sidecar, self._look, self._clock = sidecar, look, clock
-        self._lock, self._text, self._valid_until = threading.Lock(), NOTHING, -PERIOD
+        self._lock, self._text, self._valid_until = threading.Lock(), EMPTY_STATUS, -STATUS_PERIOD
 
     def text(self) -> str:
         """Return the state as JSON; the previous answer if the tools hang."""
-        if not self._lock.acquire(timeout=PERIOD):
+        if not self._lock.acquire(timeout=STATUS_PERIOD):
             return self._text
         try:
             if self._clock() >= self._valid_until:
                 self._text = self._ask()
-                self._valid_until = self._clock() + PERIOD
+                self._valid_until = self._clock() + STATUS_PERIOD
             return self._text
         finally:
             self._lock.release()
@@ -375,5 +375,5 @@ class Teller:
     def _ask(self) -> str:
         status, peer = self._sidecar.told(), self._sidecar.peer
         if status is None or peer is None:
-            return NOTHING
+            return EMPTY_STATUS
         return write_told(replace(status, near=self._look(peer[0])))

@@ -11,15 +11,15 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.cluster_flags import place, place_arguments
-from cloudrc.cli.find_run import find_here, link_of, nobody_here, run_argument
-from cloudrc.cli.output import output_argument, say, written
+from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
+from cloudrc.cli.find_run import find_local_run, link_folder_of, no_run_error, run_argument
+from cloudrc.cli.output import format_document, output_argument, print_line
 from cloudrc.cluster.tools import ClusterError
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
 
 if TYPE_CHECKING:
-    from cloudrc.cluster.link import HandedOver, LinkParts, Place
-    from cloudrc.config.edit import Edit
+    from cloudrc.cluster.link import AppliedEdit, LinkParts, ReleasePlace
+    from cloudrc.config.profile_edit import Edit
     from cloudrc.link.state import LinkState
 
     Look = Callable[[], list[LinkState]]
@@ -39,9 +39,9 @@ examples:
 KEY is a key of a direction in a profile file. With --profile, time lines start
 anew; single values leave them running. The change is recorded. It lasts until
 the next change, the end of the run, or 'helm upgrade'."""
-LOCAL_PATIENCE = 5.0
+LOCAL_TIMEOUT = 5.0
 """Time limit for a local relay to apply a change [s]; it needs about 0.2 s."""
-LOOK_PERIOD = 0.05
+POLL_PERIOD = 0.05
 """Pause between two reads of the link's state [s]."""
 
 
@@ -53,17 +53,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", metavar="NAME", help="shipped profile, or a file")
     run_argument(parser)
     output_argument(parser)
-    place_arguments(parser)
+    release_arguments(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Change the link and print its new state."""
     began, number = monotonic(), secrets.token_hex(4)
-    folder = find_here(options, link_of, "no run flies there")
+    folder = find_local_run(options, link_folder_of, "no run flies there")
     if folder is not None:
         edit, look = _set_here(options, folder, number)
-        late = f"within {LOCAL_PATIENCE:g} s; see {folder.parent / 'relay.log'}"
-        states = _await(look, number, LOCAL_PATIENCE, late)
+        late = f"within {LOCAL_TIMEOUT:g} s; see {folder.parent / 'relay.log'}"
+        states = _await(look, number, LOCAL_TIMEOUT, late)
         took = monotonic() - began
     else:
         handed = _set_in_cluster(options, number)
@@ -71,9 +71,9 @@ def execute(options: argparse.Namespace) -> int:
         took = monotonic() - began
         handed.keep()
     for note in edit.notes:
-        say(f"cloudrc: note: {note}", sys.stderr)
+        print_line(f"cloudrc: note: {note}", sys.stderr)
     if options.output != "table":
-        print(written(_document(states, number, took), options.output))
+        print(format_document(_document(states, number, took), options.output))
     else:
         _show(states, took)
     return 0
@@ -83,7 +83,7 @@ def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[E
     """Write a new profile where the run's relay looks for it."""
     from cloudrc.cli.relay import PROFILE_FILE
     from cloudrc.config.document import Document
-    from cloudrc.config.edit import DIRECTIONS, edit
+    from cloudrc.config.profile_edit import DIRECTIONS, edit_profile
     from cloudrc.link.state import CHANGE_FILE, from_text, publish
 
     def look() -> list[LinkState]:
@@ -96,30 +96,30 @@ def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[E
     states = look()
     if not states:
         raise BadInputError(f"{folder.parent}: no link is up there (yet); wait for the start")
-    made = edit(Document(states[0].profile), options.profile, options.settings)
+    made = edit_profile(Document(states[0].profile), options.profile, options.settings)
     publish(folder / CHANGE_FILE, _change(made, number))
     publish(folder / PROFILE_FILE, json.dumps(made.values, indent=2) + "\n")
     return made, look
 
 
-def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
+def _set_in_cluster(options: argparse.Namespace, number: str) -> AppliedEdit:
     """Give a new profile to both link containers."""
     from concurrent.futures import ThreadPoolExecutor
 
     from cloudrc.cluster.client import DEFAULT_RELEASE
-    from cloudrc.cluster.link import Place
+    from cloudrc.cluster.link import ReleasePlace
 
-    where = Place(options.context, options.namespace, options.release or DEFAULT_RELEASE)
+    where = ReleasePlace(options.context, options.namespace, options.release or DEFAULT_RELEASE)
     with ThreadPoolExecutor(1) as pool:
         looking = pool.submit(_link_of, options, where)
         # Import while the cluster answers: a change should be in force within a second.
-        from cloudrc.cluster.link import hand_profile
-        from cloudrc.config.edit import check
+        from cloudrc.cluster.link import change_profile
+        from cloudrc.config.profile_edit import check_edit
 
         if looking.exception() is not None:
-            check(options.profile, options.settings)  # report a wrong command line first
+            check_edit(options.profile, options.settings)  # report a wrong command line first
         link = looking.result()
-    return hand_profile(
+    return change_profile(
         where,
         link,
         options.profile,
@@ -128,18 +128,18 @@ def _set_in_cluster(options: argparse.Namespace, number: str) -> HandedOver:
     )
 
 
-def _apply_or_take_back(handed: HandedOver, number: str) -> list[LinkState]:
+def _apply_or_take_back(handed: AppliedEdit, number: str) -> list[LinkState]:
     """Wait for the change in both directions; if one refuses, take it back in both."""
-    from cloudrc.cluster.link import PATIENCE
+    from cloudrc.cluster.link import APPLY_LIMIT
 
-    late = f"within {PATIENCE:g} s; see the logs of the link containers"
+    late = f"within {APPLY_LIMIT:g} s; see the logs of the link containers"
     try:
         return _await(lambda: handed.told, number, 0.0, late)  # the containers have waited already
     except CloudrcError as error:
         raise type(error)("; ".join(filter(None, [str(error), handed.take_back()]))) from None
 
 
-def _link_of(options: argparse.Namespace, where: Place) -> LinkParts:
+def _link_of(options: argparse.Namespace, where: ReleasePlace) -> LinkParts:
     """Read the release's link; if there is none, raise the error that says why."""
     from cloudrc.cluster.link import read_link
 
@@ -157,11 +157,11 @@ def _link_of(options: argparse.Namespace, where: Place) -> LinkParts:
     from cloudrc.cluster.pods import find_pod
 
     try:
-        release = place(options)
+        release = release_from_flags(options)
         for part in ("world", "cloud"):
             find_pod(release, part)  # raises the most precise error
     except MissingPrerequisiteError as error:
-        raise nobody_here(options, error, "--run") from None
+        raise no_run_error(options, error, "--run") from None
     raise failed
 
 
@@ -192,7 +192,7 @@ def _await(look: Look, number: str, patience: float, remedy: str) -> list[LinkSt
         if monotonic() > deadline:
             late = [s.direction for s in states if s.change != number] or ["link"]
             raise TimedOutError(f"the {' and '.join(late)} did not apply the change {remedy}")
-        sleep(LOOK_PERIOD)
+        sleep(POLL_PERIOD)
 
 
 class _RefusedError(CloudrcError):

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import harmless, say, table
+from cloudrc.cli.output import escape, print_line, table
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.config.schema import Direction, Profile
     from cloudrc.link.model import Numbers, Stream
     from cloudrc.link.profile import DirectionProfile
-    from cloudrc.report.figures.link import Way
+    from cloudrc.report.figures.link import DirectionSample
 
 EPILOG = """\
 examples:
@@ -28,8 +28,8 @@ The delays come from the same link model as in a flight, packet by packet: a
 flight with the same seed has exactly these delays. All delays are one way."""
 RATE_HZ = 100.0
 """Default rate of packets [1/s]."""
-WAYS = ("uplink", "downlink")
-STEADY = 100_000
+DIRECTIONS = ("uplink", "downlink")
+DEFAULT_PACKETS = 100_000
 """Default number of packets for the statistics of a link that does not change."""
 PACKETS_MAX, RATE_MAX = 10_000_000, 10_000.0
 SECONDS = 30.0
@@ -68,9 +68,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--packets",
         type=int,
-        default=STEADY,
+        default=DEFAULT_PACKETS,
         metavar="N",
-        help=f"packets for the statistics of a link that does not change (default: {STEADY})",
+        help=f"packets for the statistics of an unchanging link (default: {DEFAULT_PACKETS})",
     )
 
 
@@ -81,18 +81,18 @@ def execute(options: argparse.Namespace) -> int:
     if output.suffix[1:] not in KINDS:
         raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
     _check(options)
-    from cloudrc.report.figures.link import picture
+    from cloudrc.report.figures.link import render_link
 
     profile = _profile(options.profile)
-    ways: dict[str, Way] = {}
+    ways: dict[str, DirectionSample] = {}
     counted: dict[str, Numbers] = {}
-    for name in ("uplink",) if _is_trace(options.profile) else WAYS:
+    for name in ("uplink",) if _is_trace(options.profile) else DIRECTIONS:
         ways[name], counted[name] = _way(getattr(profile, name), name, options)
-    title = harmless(": ".join(filter(None, (Path(options.profile).stem, profile.description))))
-    output.write_bytes(picture(title, ways["uplink"], ways.get("downlink"), output.suffix[1:]))
+    title = escape(": ".join(filter(None, (Path(options.profile).stem, profile.description))))
+    output.write_bytes(render_link(title, ways["uplink"], ways.get("downlink"), output.suffix[1:]))
     print(title)
     print(_table(counted))
-    say(str(output))
+    print_line(str(output))
     return 0
 
 
@@ -124,12 +124,14 @@ def _profile(name: str) -> Profile:
     return load_profile(name)
 
 
-def _way(asked: Direction, name: str, options: argparse.Namespace) -> tuple[Way, Numbers]:
+def _way(
+    asked: Direction, name: str, options: argparse.Namespace
+) -> tuple[DirectionSample, Numbers]:
     """Simulate one direction; a longer stream gives the statistics of a steady link."""
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import numbers
     from cloudrc.link.profile import Timeline
-    from cloudrc.report.figures.link import Way
+    from cloudrc.report.figures.link import DirectionSample
 
     profile = link_profile(asked)
     starts_ns = Timeline(profile).starts_ns
@@ -141,7 +143,7 @@ def _way(asked: Direction, name: str, options: argparse.Namespace) -> tuple[Way,
     steady = len(starts_ns) == 1
     many = stream(profile, name, seed, options.packets, rate) if steady else shown
     counted = numbers(many)
-    return Way(asked, shown.sent, shown.delays, many.delays, counted.runs), counted
+    return DirectionSample(asked, shown.sent, shown.delays, many.delays, counted.runs), counted
 
 
 def stream(

@@ -7,13 +7,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.cluster_flags import place, place_arguments
-from cloudrc.cli.output import harmless, output_argument, written
-from cloudrc.cli.pool import end_orderly
+from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
+from cloudrc.cli.output import escape, format_document, output_argument
+from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.cli.link_verify_text import Said
+    from cloudrc.cli.link_verify_text import VerifyReport
     from cloudrc.config.load import ResolvedExperiment
 
 EPILOG = """\
@@ -36,7 +36,7 @@ exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
 3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
 DEFAULT = "paper"
 SHAPERS = ("relay", "netem")
-ENDS_LIMIT = 270.0
+RELEASE_TIMEOUT = 270.0
 """Default time limit for the verdict on a release [s]."""
 
 
@@ -81,7 +81,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         metavar="WORLD,CLOUD",
         help="hosts of a release's two pods, from inside its cluster; used by 'helm test'",
     )
-    place_arguments(parser)
+    release_arguments(parser)
     output_argument(parser)
 
 
@@ -91,26 +91,26 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"--seconds {options.seconds:g}: give a number from 1 to 3600")
     from cloudrc.cli.link_verify_text import as_document, as_text
 
-    end_orderly()  # on a signal, remove namespaces and processes
+    interrupt_on_signals()  # on a signal, remove namespaces and processes
     if options.ends or options.mode == "cluster":
         report = _verify_release(options)
     else:
         from cloudrc.cli.link_verify_run import verify
 
-        experiment = find(options.target, options.settings)
+        experiment = find_experiment(options.target, options.settings)
         report = verify(experiment, options.target, options.shaper, options.seconds, _progress)
     if options.output == "table":
         print(as_text(report))
     else:
-        print(written(as_document(report), options.output))
+        print(format_document(as_document(report), options.output))
     return 0 if report.verdict == "believed" else 1
 
 
-def _verify_release(options: argparse.Namespace) -> Said:
+def _verify_release(options: argparse.Namespace) -> VerifyReport:
     """Query the ends of a release, at given hosts or through the cluster's API."""
     from cloudrc.cli.link_verify_ends import END_PORT, LINK_PORT, Pod, verify_ends
 
-    limit = options.seconds or ENDS_LIMIT
+    limit = options.seconds or RELEASE_TIMEOUT
     if options.ends:
         hosts = options.ends.split(",")
         if len(hosts) != 2 or not all(hosts):
@@ -122,7 +122,7 @@ def _verify_release(options: argparse.Namespace) -> Said:
         return verify_ends(pods, options.release or "cloudrc", limit, _progress)
     from contextlib import ExitStack
 
-    release = place(options)
+    release = release_from_flags(options)
     from cloudrc.cluster.pods import find_pod, forwarded
 
     with ExitStack() as stack:
@@ -135,7 +135,7 @@ def _verify_release(options: argparse.Namespace) -> Said:
         return verify_ends(pods, release.name, limit, _progress)
 
 
-def find(target: str, settings: list[str]) -> ResolvedExperiment:
+def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
     """Find the experiment; a profile replaces the link of the default experiment."""
     from cloudrc.config import shipped
     from cloudrc.config.load import read_experiment
@@ -163,4 +163,4 @@ def _here() -> Path:
 def _progress(line: str) -> None:
     """Show progress in one line, on a terminal only."""
     if sys.stderr.isatty():
-        print(f"\r\x1b[K{harmless(line)}", end="", file=sys.stderr, flush=True)
+        print(f"\r\x1b[K{escape(line)}", end="", file=sys.stderr, flush=True)

@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 
 from cloudrc.cli.link_verify_text import (
     NOT_JUDGED,
-    Said,
+    VerifyReport,
     on_correlation,
     on_deviation,
     on_jitter,
     on_patience,
 )
-from cloudrc.cluster.pods import DIRECTLY, METRICS
+from cloudrc.cluster.pods import METRICS, NO_PROXY
 from cloudrc.errors import TimedOutError
 from cloudrc.link.sidecar import Told, read_told
 from cloudrc.link.verify.causes import (
@@ -41,9 +41,9 @@ from cloudrc.link.verify.standing import PERIOD, rate_in_force, shown
 from cloudrc.tunnel.codec import SIZES, Kind
 
 END_PORT, LINK_PORT = METRICS["world"]["world"], METRICS["world"]["link"]
-LOOK_PERIOD = 2.0
+POLL_PERIOD = 2.0
 """Pause between two polls of the ends [s]."""
-OTHER_LIMIT = 30.0
+SECOND_VERDICT_TIMEOUT = 30.0
 """Longest wait for the second verdict once the first is "off" [s]; both help to find the cause."""
 _HTTP_TIMEOUT = 3.0
 _SENT_MIN = 1500  # counts of fewer datagrams are too inexact to compare
@@ -61,7 +61,7 @@ class Pod:
     link: str
 
 
-def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -> Said:
+def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -> VerifyReport:
     """Wait for the verdicts of both ends and combine them.
 
     Args:
@@ -79,13 +79,13 @@ def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -
     before = {way: _counters(pods[end], way) for way, end in sender.items()}
     while True:
         tell(", ".join(_progress(way, seen.get(way, {})) for way in receiver))
-        time.sleep(LOOK_PERIOD)
+        time.sleep(POLL_PERIOD)
         seen |= {way: found for way, end in receiver.items() if (found := _ask(pods[end]))}
         verdicts = {way: found["verdict"] for way, found in seen.items()}
         if len(seen) == len(receiver) and "open" not in verdicts.values():
             break
         off = len(seen) == len(receiver) and "off" in verdicts.values()
-        off_deadline = min(off_deadline, time.monotonic() + OTHER_LIMIT) if off else inf
+        off_deadline = min(off_deadline, time.monotonic() + SECOND_VERDICT_TIMEOUT) if off else inf
         if time.monotonic() > min(deadline, off_deadline):
             break
     tell("")
@@ -99,7 +99,7 @@ def verify_ends(pods: Mapping[str, Pod], title: str, limit: float, tell: Tell) -
         for way, end in sender.items()
     }
     names = sorted({one.evidence.shaper or "an unknown shaper" for one in findings.values()})
-    return Said(
+    return VerifyReport(
         title=title,
         shaper=f"shaped by {' and '.join(names)}",
         findings=findings,
@@ -120,7 +120,7 @@ def _ask(pod: Pod) -> dict[str, Any] | None:
 
 
 def _get(url: str) -> str:
-    with DIRECTLY.open(url, timeout=_HTTP_TIMEOUT) as page:
+    with NO_PROXY.open(url, timeout=_HTTP_TIMEOUT) as page:
         return str(page.read().decode())
 
 

@@ -30,10 +30,23 @@ from typing import TYPE_CHECKING, Protocol, Self
 import numpy as np
 
 from cloudrc.assembly import link_profile
-from cloudrc.cli.link_processes import LOOPBACK, WAYS, Place, Shaping, refuse_impossible, shaping
-from cloudrc.cli.link_run import look
-from cloudrc.cli.link_verify_text import Said, describe, notes, on_correlation, shaper_in_words
-from cloudrc.config.document import write
+from cloudrc.cli.link_processes import (
+    DIRECTIONS,
+    LOOPBACK,
+    ShaperAddresses,
+    ShaperProcess,
+    check_shaper,
+    run_shapers,
+)
+from cloudrc.cli.link_run import inspect_network
+from cloudrc.cli.link_verify_text import (
+    VerifyReport,
+    describe,
+    notes,
+    on_correlation,
+    shaper_in_words,
+)
+from cloudrc.config.document import write_yaml
 from cloudrc.config.load import dump
 from cloudrc.config.schema import Profile
 from cloudrc.drivers.realtime import free_ports
@@ -64,7 +77,7 @@ PERIOD = 4.0
 _UNKNOWN = Evidence()
 
 
-class Told(Protocol):
+class MetricsSource(Protocol):
     """A source of metrics, such as `Shaping`."""
 
     def metrics(self) -> str:
@@ -72,10 +85,10 @@ class Told(Protocol):
         ...
 
 
-class LateWatch:
+class LatenessWatch:
     """Poll the lateness of both relays on its own thread, as a context manager."""
 
-    def __init__(self, running: Mapping[str, Told], period: float = PERIOD) -> None:
+    def __init__(self, running: Mapping[str, MetricsSource], period: float = PERIOD) -> None:
         """Store the shapers of both directions; poll them once per `period` [s]."""
         self._running, self._period = running, period
         self._late: dict[str, float] = {}
@@ -153,9 +166,9 @@ def _filled(header: bytes, size: int) -> bytes:
     return (header * (size // HEADER_SIZE + 1))[:size]
 
 
-BEGIN = 1.0
+FIRST_PROBE_DELAY = 1.0
 """Time from the start of the link to the first probe [s]."""
-TELL_PERIOD = 1.3
+COUNTS_WAIT = 1.3
 """Wait before reading the counts [s]; the link's processes update them once a second."""
 _PAUSE = 0.3
 _QUIET_MIN, _QUIET_MAX = 0.5, 5.0
@@ -164,7 +177,7 @@ Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class DirectionPlan:
     """Plan for verifying one direction.
 
     Attributes:
@@ -177,7 +190,7 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Bank:
+class ProbeEndpoint:
     """One end of the link.
 
     Attributes:
@@ -186,7 +199,7 @@ class Bank:
     """
 
     own: socket.socket
-    place: Place
+    place: ShaperAddresses
 
 
 def verify(
@@ -196,9 +209,9 @@ def verify(
     seconds: float | None,
     tell: Tell,
     applied: Profile | None = None,
-    meddle: Callable[[Mapping[str, Shaping]], None] | None = None,
+    meddle: Callable[[Mapping[str, ShaperProcess]], None] | None = None,
     routes: Mapping[str, tuple[str, int]] | None = None,
-) -> Said:
+) -> VerifyReport:
     """Measure whether the link of an experiment matches its profile.
 
     Args:
@@ -214,20 +227,20 @@ def verify(
     Raises:
         BadInputError: If the shaper cannot realise the profile.
     """
-    refuse_impossible(experiment, shaper)
+    check_shaper(experiment, shaper)
     tell("planning the probes")
     asked = plan(experiment, seconds, shaper)
     profile = applied or Profile(uplink=experiment.uplink, downlink=experiment.downlink)
-    text = write(profile.model_dump(mode="json", exclude_defaults=True))
-    with banks(shaper) as ends:
+    text = write_yaml(profile.model_dump(mode="json", exclude_defaults=True))
+    with open_probe_endpoints(shaper) as ends:
         places = {way: bank.place for way, bank in ends.items()}
         tell("starting the link")
-        with shaping(places, dump(experiment), text, shaper) as running:
+        with run_shapers(places, dump(experiment), text, shaper) as running:
             if meddle:
                 meddle(running)
-            findings = probe(asked, ends, running, tell, routes)
+            findings = probe_link(asked, ends, running, tell, routes)
     tell("")
-    return Said(
+    return VerifyReport(
         title=title,
         shaper=shaper_in_words(findings),
         findings=findings,
@@ -237,7 +250,9 @@ def verify(
     )
 
 
-def _notes(experiment: ResolvedExperiment, asked: Mapping[str, Asked], shaper: str) -> list[str]:
+def _notes(
+    experiment: ResolvedExperiment, asked: Mapping[str, DirectionPlan], shaper: str
+) -> list[str]:
     """Collect the notes on what is judged loosely or not at all."""
     found = [note for way, one in asked.items() for note in notes(way, one.plan, one.trains)]
     if shaper == "netem":
@@ -249,7 +264,7 @@ def _notes(experiment: ResolvedExperiment, asked: Mapping[str, Asked], shaper: s
 
 def plan(
     experiment: ResolvedExperiment, seconds: float | None, shaper: str = "relay"
-) -> dict[str, Asked]:
+) -> dict[str, DirectionPlan]:
     """Plan the probes of both directions, as large as the tunnel's own datagrams.
 
     Args:
@@ -267,9 +282,9 @@ def plan(
         if before and before.profile == profile and not _has_rate(before):
             plans[way] = replace(before, schedule=replace(before.schedule, size=size))
         else:
-            plans[way] = make_plan(profile, size, seconds, BEGIN)
-    after = BEGIN + max(one.duration for one in plans.values()) + 2.0 * _QUIET_MAX
-    return {way: Asked(one, plan_trains(one.profile, after)) for way, one in plans.items()}
+            plans[way] = make_plan(profile, size, seconds, FIRST_PROBE_DELAY)
+    after = FIRST_PROBE_DELAY + max(one.duration for one in plans.values()) + 2.0 * _QUIET_MAX
+    return {way: DirectionPlan(one, plan_trains(one.profile, after)) for way, one in plans.items()}
 
 
 def _has_rate(one: Plan) -> bool:
@@ -277,13 +292,13 @@ def _has_rate(one: Plan) -> bool:
 
 
 @contextlib.contextmanager
-def banks(shaper: str) -> Iterator[dict[str, Bank]]:
+def open_probe_endpoints(shaper: str) -> Iterator[dict[str, ProbeEndpoint]]:
     """Open both ends of a link: on loopback for the relay, in two namespaces for netem."""
     if shaper == "netem":
-        with banks_of_namespaces() as ends:
+        with open_namespace_endpoints() as ends:
             yield ends
         return
-    owns = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in WAYS]
+    owns = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in DIRECTIONS]
     try:
         for one in owns:
             one.bind((LOOPBACK, 0))
@@ -291,18 +306,20 @@ def banks(shaper: str) -> Iterator[dict[str, Bank]]:
         metrics = [(LOOPBACK, port) for port in free_ports(2, socket.SOCK_STREAM)]
         peers = [one.getsockname() for one in reversed(owns)]
         yield {
-            way: Bank(own, Place(peer, listen, at))
-            for way, own, peer, listen, at in zip(WAYS, owns, peers, listens, metrics, strict=True)
+            way: ProbeEndpoint(own, ShaperAddresses(peer, listen, at))
+            for way, own, peer, listen, at in zip(
+                DIRECTIONS, owns, peers, listens, metrics, strict=True
+            )
         }
     finally:
         for one in owns:
             one.close()
 
 
-def probe(
-    asked: Mapping[str, Asked],
-    ends: Mapping[str, Bank],
-    running: Mapping[str, Shaping],
+def probe_link(
+    asked: Mapping[str, DirectionPlan],
+    ends: Mapping[str, ProbeEndpoint],
+    running: Mapping[str, ShaperProcess],
     tell: Tell,
     routes: Mapping[str, tuple[str, int]] | None = None,
 ) -> dict[str, Findings]:
@@ -322,24 +339,24 @@ def probe(
             (routes or {}).get(way) or _route(running[way]),
             partial(probes.write, way),
         )
-        for way in WAYS
+        for way in DIRECTIONS
     ]
-    origin_ns = max(running[way].state().origin_ns or 0 for way in WAYS)
-    begin_ns = max(time.monotonic_ns() + 50_000_000, origin_ns + round(BEGIN * 1e9))
-    volleys = [_volley(asked[way].plan) for way in WAYS]
-    longest = max(asked[way].plan.duration for way in WAYS)
+    origin_ns = max(running[way].state().origin_ns or 0 for way in DIRECTIONS)
+    begin_ns = max(time.monotonic_ns() + 50_000_000, origin_ns + round(FIRST_PROBE_DELAY * 1e9))
+    volleys = [_volley(asked[way].plan) for way in DIRECTIONS]
+    longest = max(asked[way].plan.duration for way in DIRECTIONS)
     progress, quiet = _progress(tell, f"sending probes for {longest:.0f} s"), _quiet(asked)
     relays = {way: one for way, one in running.items() if not one.place.inside}
-    with LateWatch(relays) as late:
+    with LatenessWatch(relays) as late:
         logs = sound(shores, volleys, probes.read, begin_ns=begin_ns, quiet=quiet, tell=progress)
-        time.sleep(TELL_PERIOD)
+        time.sleep(COUNTS_WAIT)
     evidence = {
         way: late.worst(way, _read_back(running[way], len(log.sent_ns)))
-        for way, log in zip(WAYS, logs, strict=True)
+        for way, log in zip(DIRECTIONS, logs, strict=True)
     }
     durations = _send_trains(asked, shores, probes, tell)
     findings = {}
-    for way, log, drawn in zip(WAYS, logs, durations, strict=True):
+    for way, log, drawn in zip(DIRECTIONS, logs, durations, strict=True):
         sent = np.array([stamp_ns - origin_ns for stamp_ns in log.sent_ns]) * 1e-9
         one = asked[way].plan
         expects = as_sent(one.expects, one.profile, sent, one.schedule.size)
@@ -352,10 +369,10 @@ def probe(
 
 
 def _send_trains(
-    asked: Mapping[str, Asked], shores: list[Shore], probes: Probes, tell: Tell
+    asked: Mapping[str, DirectionPlan], shores: list[Shore], probes: Probes, tell: Tell
 ) -> list[list[float]]:
     """Send trains where a rate is to be measured; return their received durations [s]."""
-    trains = [asked[way].trains for way in WAYS]
+    trains = [asked[way].trains for way in DIRECTIONS]
     if not any(one and one.count for one in trains):
         return [[], []]
     volleys = [
@@ -372,14 +389,14 @@ def _send_trains(
     ]
 
 
-def _read_back(one: Shaping, sent: int) -> Evidence:
+def _read_back(one: ShaperProcess, sent: int) -> Evidence:
     """Read back what a shaper does and has counted."""
     state = one.state()
     in_force = Profile.model_validate_json(_json(state.profile))
     applied = link_profile(getattr(in_force, state.direction))
     known = Evidence(shaper=state.shaper, why=state.reason, layers=1, applied=applied)
     counted = of_metrics(samples(one.metrics()), sent, known)
-    found = with_near(counted, look(one.place.peer[0], one.place.inside))
+    found = with_near(counted, inspect_network(one.place.peer[0], one.place.inside))
     if state.shaper != "netem":
         return found
     return replace(found, applied=found.applied and netem_makes(found.applied))
@@ -391,7 +408,7 @@ def _json(values: object) -> str:
     return json.dumps(values)
 
 
-def _route(one: Shaping) -> tuple[str, int]:
+def _route(one: ShaperProcess) -> tuple[str, int]:
     route = one.route()
     assert route is not None, "shaping() waits for it"
     return route
@@ -402,7 +419,7 @@ def _volley(one: Plan) -> Volley:
     return Volley(PROBE, schedule.size, round(schedule.period * 1e9), schedule.count)
 
 
-def _quiet(asked: Mapping[str, Asked]) -> float:
+def _quiet(asked: Mapping[str, DirectionPlan]) -> float:
     """Return the silence after which missing probes count as lost [s]."""
     expects = [one.plan.expects for one in asked.values()]
     longest = max(one.mean.expected + 15.0 * one.deviation.expected for one in expects)
@@ -421,7 +438,7 @@ _CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
 
 
 @contextlib.contextmanager
-def banks_of_namespaces() -> Iterator[dict[str, Bank]]:
+def open_namespace_endpoints() -> Iterator[dict[str, ProbeEndpoint]]:
     """Create two namespaces and open a socket in each.
 
     Raises:
@@ -432,15 +449,18 @@ def banks_of_namespaces() -> Iterator[dict[str, Bank]]:
             "netem is verified between two network namespaces, which needs root; run this as root,"
             " or verify the relay (--shaper relay)"
         )
-    names = {way: f"cloudrc-{way}-{os.getpid()}" for way in WAYS}
+    names = {way: f"cloudrc-{way}-{os.getpid()}" for way in DIRECTIONS}
     owns: list[socket.socket] = []
     try:
         _join(names)
-        for way in WAYS:
+        for way in DIRECTIONS:
             with _inside(names[way]):
                 owns.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             owns[-1].bind((HOSTS[way], PORT))
-        yield {way: Bank(own, _place(way, names[way])) for way, own in zip(WAYS, owns, strict=True)}
+        yield {
+            way: ProbeEndpoint(own, _place(way, names[way]))
+            for way, own in zip(DIRECTIONS, owns, strict=True)
+        }
     finally:
         for own in owns:
             own.close()
@@ -449,9 +469,9 @@ def banks_of_namespaces() -> Iterator[dict[str, Bank]]:
                 _ip("netns", "del", name)
 
 
-def _place(way: str, name: str) -> Place:
-    other = next(one for one in WAYS if one != way)
-    return Place(
+def _place(way: str, name: str) -> ShaperAddresses:
+    other = next(one for one in DIRECTIONS if one != way)
+    return ShaperAddresses(
         peer=(HOSTS[other], PORT),
         listen=(LOOPBACK, PORT + 1),
         metrics=(LOOPBACK, METRICS_PORT),
@@ -461,7 +481,7 @@ def _place(way: str, name: str) -> Place:
 
 def _join(names: dict[str, str]) -> None:
     """Create both namespaces and join them with a veth pair."""
-    near, far = (names[way] for way in WAYS)
+    near, far = (names[way] for way in DIRECTIONS)
     for name in (near, far):
         _ip("netns", "add", name)
     _ip("-n", near, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", far)

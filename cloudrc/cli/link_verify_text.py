@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import inf, isfinite, isnan
 from typing import Any
 
-from cloudrc.cli.output import harmless, paint, table
+from cloudrc.cli.output import escape, paint, table
 from cloudrc.link.verify.causes import Cause, Findings
 from cloudrc.link.verify.expect import DEVIATION_FLOOR, JITTER_SHARES, has_jitter
 from cloudrc.link.verify.judge import SIZE, Row, Trains
@@ -35,7 +35,7 @@ NOT_JUDGED = "NOT JUDGED"
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class VerifyReport:
     """Result of verifying a link.
 
     Attributes:
@@ -74,7 +74,7 @@ def deciding(rows: Sequence[Row]) -> list[Row]:
     ]
 
 
-def as_text(said: Said) -> str:
+def as_text(said: VerifyReport) -> str:
     """Format a table per direction, the causes, and the verdict in the last line."""
     rows: list[tuple[str, ...]] = []
     for way, found in said.findings.items():
@@ -82,24 +82,24 @@ def as_text(said: Said) -> str:
         rows += [_cells(row) for row in found.rows]
     lines = table(rows, right=[1, 2, 3, 4]).splitlines()
     verdicts = iter([row.verdict for found in said.findings.values() for row in found.rows])
-    painted, index = [harmless(f"{said.title}: {said.shaper}")], 0
+    painted, index = [escape(f"{said.title}: {said.shaper}")], 0
     for way, found in said.findings.items():
         painted += [
             "",
             paint(lines[index], "bold"),
-            paint(harmless(f"  {said.probes[way]}"), "dim"),
+            paint(escape(f"  {said.probes[way]}"), "dim"),
         ]
         for line in lines[index + 1 : index + 1 + len(found.rows)]:
             verdict = next(verdicts)
             cut = line.rindex(verdict)
             painted.append(line[:cut] + paint(verdict, COLOURS[verdict]))
         index += 1 + len(found.rows)
-    painted += ["", *map(harmless, said.notes)] if said.notes else [""]
-    painted += [harmless(f"  {cause.way}: {cause.text}  [{cause.code}]") for cause in said.causes]
+    painted += ["", *map(escape, said.notes)] if said.notes else [""]
+    painted += [escape(f"  {cause.way}: {cause.text}  [{cause.code}]") for cause in said.causes]
     return "\n".join([*painted, _last_line(said)])
 
 
-def _last_line(said: Said) -> str:
+def _last_line(said: VerifyReport) -> str:
     verdict = said.verdict
     colours = {"believed": "green", "not believed": "red", "undecided": "yellow"}
     partly = any(NOT_JUDGED in note for note in said.notes)
@@ -143,7 +143,7 @@ def _range(low: float, high: float) -> str:
     return f"{_number(low)} .. {_number(high)}"
 
 
-def as_document(said: Said) -> dict[str, Any]:
+def as_document(said: VerifyReport) -> dict[str, Any]:
     """Convert to plain values: SI units, shares in [0, 1]; unknown values are left out."""
     return {
         "schemaVersion": 1,

@@ -8,7 +8,7 @@ import shutil
 import sys
 import textwrap
 
-from cloudrc.cli.output import output_argument, paint, written
+from cloudrc.cli.output import format_document, output_argument, paint
 
 PLUGINS = ("estimators", "predictors", "controllers", "metrics")
 YAML = ("experiments", "missions", "profiles")
@@ -38,7 +38,7 @@ def execute(options: argparse.Namespace) -> int:
             kind: [{"name": name, "description": text} for name, text in lines.items()]
             for kind, lines in found.items()
         }
-        print(written({"schemaVersion": 1, **entries}, options.output))
+        print(format_document({"schemaVersion": 1, **entries}, options.output))
         return 0
     print("\n\n".join(f"{paint(kind, 'bold')}\n{_block(lines)}" for kind, lines in found.items()))
     return 0

@@ -6,8 +6,8 @@ import errno
 import sys
 from collections.abc import Sequence
 
-from cloudrc.cli.output import discard_output, harmless
-from cloudrc.cli.parser import COMMANDS, build, describe_unknown
+from cloudrc.cli.output import discard_output, escape
+from cloudrc.cli.parser import COMMANDS, build_parser, describe_unknown
 from cloudrc.errors import BadInputError, CloudrcError
 
 INTERRUPTED = 130
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         message, code = _explain(error)
         # Text from files is escaped. Our own further lines begin with two blanks.
-        shown = "\n  ".join(map(harmless, message.split("\n  ")))
+        shown = "\n  ".join(map(escape, message.split("\n  ")))
         print(f"cloudrc: error: {shown}", file=sys.stderr)
         return code
 
@@ -59,7 +59,7 @@ def _dispatch(given: Sequence[str]) -> int:
         raise BadInputError(
             f"unknown command: {describe_unknown(name, COMMANDS)}; see 'cloudrc --help'"
         )
-    parser = build([name] if name else [])
+    parser = build_parser([name] if name else [])
     if not given:
         parser.print_help()
         return 0

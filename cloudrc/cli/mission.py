@@ -6,9 +6,9 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.client import reader, token_argument, token_file
-from cloudrc.cli.cluster_flags import place_arguments, timeout_argument
-from cloudrc.cli.find_run import find_here, run_argument, url_of
+from cloudrc.cli.client import token_argument, token_file, token_reader
+from cloudrc.cli.cluster_flags import release_arguments, timeout_argument
+from cloudrc.cli.find_run import api_url_of, find_local_run, run_argument
 from cloudrc.cli.output import output_argument
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         token_argument(verb)
         if name != "fly":
             run_argument(verb)
-            place_arguments(verb)
+            release_arguments(verb)
         return verb
 
     run = add("run", "fly a mission and show its progress until the verdict")
@@ -102,8 +102,8 @@ def execute(options: argparse.Namespace) -> int:
         return mission_local.fly(options)
     of_api: Callable[[argparse.Namespace, Api], int] = mission_local.VERBS[verb]
     if options.api:
-        return of_api(options, Api(options.api, reader(token_file(options))))
-    if (url := find_here(options, url_of, NO_API)) is not None:
+        return of_api(options, Api(options.api, token_reader(token_file(options))))
+    if (url := find_local_run(options, api_url_of, NO_API)) is not None:
         return of_api(options, Api(url))  # a local run asks for no token, so send none
     if verb in mission_cluster.VERBS:
         in_cluster: Callable[[argparse.Namespace], int] = mission_cluster.VERBS[verb]

@@ -14,12 +14,12 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.client import Api, reader, token_file
-from cloudrc.cli.cluster_flags import place
+from cloudrc.cli.client import Api, token_file, token_reader
+from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.extras import require
-from cloudrc.cli.find_run import nobody_here
+from cloudrc.cli.find_run import no_run_error
 from cloudrc.cli.mission_local import read_mission
-from cloudrc.cli.output import say, table, written
+from cloudrc.cli.output import format_document, print_line, table
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 UNKNOWN_LIMIT = 600.0
 """Time limit of a mission if neither it nor the release's experiment gives one [s]."""
-LISTED = 20
+PROBLEMS_MAX = 20
 """Largest number of problems to print: a mission in wrong units has one per waypoint."""
 
 
@@ -93,7 +93,7 @@ def _experiment(release: Release) -> Experiment | None:
 
     from cloudrc.cluster.client import FILE, experiment_text
     from cloudrc.cluster.tools import ClusterError
-    from cloudrc.config.document import parse as parse_yaml
+    from cloudrc.config.document import parse_yaml
     from cloudrc.config.schema import Experiment
     from cloudrc.config.shipped import check_name
 
@@ -109,9 +109,9 @@ def _experiment(release: Release) -> Experiment | None:
 def _refuse(name: str, problems: Sequence[Problem]) -> None:
     if len(problems) == 1:
         raise BadInputError(f"{name}: {problems[0]}")
-    lines = [str(problem) for problem in problems[:LISTED]]
-    if len(problems) > LISTED:
-        lines.append(f"and {len(problems) - LISTED} more")
+    lines = [str(problem) for problem in problems[:PROBLEMS_MAX]]
+    if len(problems) > PROBLEMS_MAX:
+        lines.append(f"and {len(problems) - PROBLEMS_MAX} more")
     if lines:
         raise BadInputError("\n  ".join([f"{name} has {len(problems)} problems:", *lines]))
 
@@ -124,7 +124,7 @@ def api(options: argparse.Namespace) -> Iterator[Api]:
 
     token = operator_token(release) if path is None else ""
     with api_url(release.context, release.namespace, release.name) as url:
-        yield Api(url, reader(path) if path else lambda: token)
+        yield Api(url, token_reader(path) if path else lambda: token)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -133,24 +133,24 @@ def _run(options: argparse.Namespace) -> int:
         mission["name"] = options.name
     request = parse(options.mission, mission)
     release = _place(options)
-    from cloudrc.cluster.jobs import follow, patience, run_job
+    from cloudrc.cluster.jobs import follow, follow_limit, run_job
     from cloudrc.cluster.pods import require_release
     from cloudrc.cluster.release import wait_ready
 
     require_release(release)
     limit = check_on(release, options.mission, request)
     # After 'helm install' without --wait this takes some seconds: the link starts last.
-    wait_ready(release, timeout=options.timeout, tell=say)
+    wait_ready(release, timeout=options.timeout, tell=print_line)
     job = run_job(release, mission, limit=limit, queue=options.queue)
     print(f"Job {job.name} in namespace '{release.namespace}'", flush=True)
     try:
-        ended = follow(release, job.name, say, timeout=patience(limit, options.queue))
+        ended = follow(release, job.name, print_line, timeout=follow_limit(limit, options.queue))
     except KeyboardInterrupt:
         command = f"cloudrc mission cancel {job.name} {' '.join(release.cloudrc_flags)}"
         print(f"Job {job.name} is still running; cancel it: {command}", file=sys.stderr)
         raise
     if ended.exit_code is None:
-        say(ended.message)
+        print_line(ended.message)
     return 1 if ended.exit_code is None else ended.exit_code
 
 
@@ -194,7 +194,7 @@ def _cancel(options: argparse.Namespace) -> int:
     from cloudrc.cluster.jobs import cancel
 
     path = token_file(options)
-    say(cancel(release, options.id, reader(path)() if path else None))
+    print_line(cancel(release, options.id, token_reader(path)() if path else None))
     return 0
 
 
@@ -209,10 +209,10 @@ def _logs(options: argparse.Namespace) -> int:
             raise BadInputError(f"no missions {release.where}")
         job = jobs[-1].name
     if options.follow:
-        follow(release, job, say, timeout=86_400.0)
+        follow(release, job, print_line, timeout=86_400.0)
         return 0
     for line in logs(release, job):
-        say(line)
+        print_line(line)
     return 0
 
 
@@ -228,9 +228,9 @@ VERBS: dict[str, Callable[[argparse.Namespace], int]] = {
 def _place(options: argparse.Namespace) -> Release:
     require("a cluster", ("kube",))
     try:
-        return place(options)
+        return release_from_flags(options)
     except MissingPrerequisiteError as error:
-        raise nobody_here(options, error, "--run, --api") from None
+        raise no_run_error(options, error, "--run, --api") from None
 
 
 def _row(job: JobStatus) -> tuple[str, ...]:
@@ -238,5 +238,5 @@ def _row(job: JobStatus) -> tuple[str, ...]:
 
 
 def _print(jobs: list[dict[str, object]], form: str) -> int:
-    print(written({"schemaVersion": 1, "jobs": jobs}, form))
+    print(format_document({"schemaVersion": 1, "jobs": jobs}, form))
     return 0

@@ -14,14 +14,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cloudrc.cli.client import Api, UnreachableError, path_of, reader, token_file
-from cloudrc.cli.output import harmless, say, table, written
-from cloudrc.cli.pool import end_orderly
+from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, token_reader
+from cloudrc.cli.output import escape, format_document, print_line, table
+from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.errors import BadInputError, CloudrcError
 
-PERIOD = 0.5
+POLL_PERIOD = 0.5
 """Pause between two polls of a mission [s]."""
-PATIENCE = 180.0
+API_TIMEOUT = 180.0
 """Longest absence of the API [s]: a pod on another node first loads its image."""
 TERMINATION_LOG = Path("/dev/termination-log")
 """File in a pod whose text `kubectl describe` shows once a container has ended."""
@@ -35,7 +35,7 @@ class WaitedTooLongError(CloudrcError):
     exit_code = 4
 
 
-class Follower:
+class MissionFollower:
     """Follow one mission, through restarts of the API."""
 
     def __init__(
@@ -52,7 +52,7 @@ class Follower:
             patience: Longest absence of the API [s]; None for `PATIENCE`.
         """
         self._api, self._write = api, write
-        self._patience = PATIENCE if patience is None else patience
+        self._patience = API_TIMEOUT if patience is None else patience
         self._last_event = 0
 
     def post(self, mission: Mapping[str, Any]) -> dict[str, Any]:
@@ -68,14 +68,14 @@ class Follower:
             The verdict in the form of the API.
         """
         while True:
-            view = self._retry(lambda: self._api.get(path_of(mission_id)))
+            view = self._retry(lambda: self._api.get(mission_path(mission_id)))
             for event in view["events"]:
                 if event["id"] > self._last_event:
                     self._last_event = event["id"]
                     self._write(f"{event['time_s']:7.2f} s  {event['text']}")
             if view["verdict"] is not None:
                 return dict(view["verdict"])
-            time.sleep(PERIOD)
+            time.sleep(POLL_PERIOD)
 
     def _retry(self, request: Callable[[], _Answer]) -> _Answer:
         """Repeat a request until there is an answer, or patience ends."""
@@ -91,10 +91,10 @@ class Follower:
                 if not reported:
                     self._write(f"{error}; waiting")
                     reported = True
-            time.sleep(PERIOD)
+            time.sleep(POLL_PERIOD)
 
 
-def in_words(verdict: Mapping[str, Any]) -> str:
+def describe_verdict(verdict: Mapping[str, Any]) -> str:
     """Describe a verdict in one line."""
     word = verdict["outcome"].upper()
     failures = [f"{failure['code']}: {failure['text']}" for failure in verdict["failures"]]
@@ -103,7 +103,7 @@ def in_words(verdict: Mapping[str, Any]) -> str:
     return f"{word}: {'; also '.join(failures)}"
 
 
-def leave_message(text: str, path: Path = TERMINATION_LOG) -> None:
+def write_termination_message(text: str, path: Path = TERMINATION_LOG) -> None:
     """Write the termination message for Kubernetes, if this is a pod."""
     try:
         if path.exists():
@@ -136,9 +136,9 @@ def fly(options: argparse.Namespace) -> int:
     """Post a mission and follow it to its verdict; cancel it on an interrupt."""
     if options.api is None:
         raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
-    end_orderly()
-    api = Api(options.api, reader(token_file(options)))
-    follower, mission_id = Follower(api, say), ""
+    interrupt_on_signals()
+    api = Api(options.api, token_reader(token_file(options)))
+    follower, mission_id = MissionFollower(api, print_line), ""
     try:
         mission = read_mission(options.mission)
         order = {**mission, "key": options.key, "queue": options.queue}
@@ -147,13 +147,13 @@ def fly(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         if mission_id:
             with suppress(CloudrcError):
-                api.post(f"{path_of(mission_id)}/cancel")
+                api.post(f"{mission_path(mission_id)}/cancel")
         _end("INTERRUPTED: the Job was stopped, its mission is cancelled")
         return INTERRUPTED
     except CloudrcError as error:
-        leave_message(str(error))
+        write_termination_message(str(error))
         raise
-    _end(in_words(verdict))
+    _end(describe_verdict(verdict))
     return int(verdict["exit_code"])
 
 
@@ -161,16 +161,16 @@ def _run(options: argparse.Namespace, api: Api) -> int:
     mission = read_mission(options.mission)
     if options.name:
         mission["name"] = options.name
-    follower = Follower(api, say, patience=10.0)
+    follower = MissionFollower(api, print_line, patience=10.0)
     mission_id = follower.post({**mission, "queue": options.queue})["id"]
     try:
         verdict = follower.follow(mission_id)
     except KeyboardInterrupt:
         state = "is waiting or flying" if options.queue else "is still flying"
         command = f"cloudrc mission cancel {mission_id}"
-        say(f"mission {mission_id} {state}; cancel it: {command}", sys.stderr)
+        print_line(f"mission {mission_id} {state}; cancel it: {command}", sys.stderr)
         raise
-    say(in_words(verdict))
+    print_line(describe_verdict(verdict))
     return int(verdict["exit_code"])
 
 
@@ -188,13 +188,13 @@ def _list(options: argparse.Namespace, api: Api) -> int:
 
 def _row(mission: dict[str, Any]) -> tuple[str, ...]:
     done = f"{len(mission['reached'])}/{mission['waypoints']}"
-    verdict = in_words(mission["verdict"]) if mission["verdict"] else ""
+    verdict = describe_verdict(mission["verdict"]) if mission["verdict"] else ""
     return mission["id"], mission["name"], mission["state"], done, verdict
 
 
 def _status(options: argparse.Namespace, api: Api) -> int:
     if options.id:
-        mission = api.get(path_of(options.id))
+        mission = api.get(mission_path(options.id))
         if options.output != "table":
             return _print(mission, options.output)
         _print_state(mission)
@@ -208,7 +208,7 @@ def _status(options: argparse.Namespace, api: Api) -> int:
     else:
         print("no mission is under way")
     if state["queue"]:
-        say(f"waiting: {', '.join(state['queue'])}")
+        print_line(f"waiting: {', '.join(state['queue'])}")
     _print_robot(state["seen"], state["cloud_age_s"])
     return 0
 
@@ -220,17 +220,17 @@ def _cancel(options: argparse.Namespace, api: Api) -> int:
         if mission is None:
             raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
         mission_id = mission["id"]
-    _print_state(api.post(f"{path_of(mission_id)}/cancel"))
+    _print_state(api.post(f"{mission_path(mission_id)}/cancel"))
     return 0
 
 
 def _logs(options: argparse.Namespace, api: Api) -> int:
     if not options.follow and options.id:
-        _print_history(api.get(path_of(options.id)))
+        _print_history(api.get(mission_path(options.id)))
         return 0
     if not options.follow:
         missions = [m["id"] for m in api.get("/v1/missions")["missions"]]
-        events = [e for m in missions for e in api.get(path_of(m))["events"]]
+        events = [e for m in missions for e in api.get(mission_path(m))["events"]]
         _print_events(sorted(events, key=lambda event: int(event["id"])))
         return 0
     for event in api.events():
@@ -259,7 +259,7 @@ def _estop(options: argparse.Namespace, api: Api) -> int:
     mission = api.post("/v1/estop")["id"]
     print("emergency stop: sent, and repeated until the rotors have stopped", flush=True)
     if mission:
-        say(f"mission {mission} has failed")
+        print_line(f"mission {mission} has failed")
     return 0
 
 
@@ -293,8 +293,8 @@ def _print_state(mission: dict[str, Any]) -> None:
     """Print the state of a mission in one line."""
     where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
     name = f" ({mission['name']})" if mission["name"] else ""
-    verdict = f"; {in_words(mission['verdict'])}" if mission["verdict"] else ""
-    say(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
+    verdict = f"; {describe_verdict(mission['verdict'])}" if mission["verdict"] else ""
+    print_line(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
 
 
 def _print_robot(seen: dict[str, Any] | None, cloud_age: float | None) -> None:
@@ -311,31 +311,31 @@ def _print_robot(seen: dict[str, Any] | None, cloud_age: float | None) -> None:
     where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
     if seen["guard_for_s"] is None:
         past = f"robot not heard for {seen['age_s']:.1f} s (guard {seen['guard']} then)"
-        say(f"{past}; cloud heard {heard}")
-        say(f"last seen at ({where}) m: {seen['cause']}")
+        print_line(f"{past}; cloud heard {heard}")
+        print_line(f"last seen at ({where}) m: {seen['cause']}")
     else:
         rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
-        say(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
-        say(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
-    say(f"next: {seen['next_step']}")
+        print_line(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
+        print_line(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
+    print_line(f"next: {seen['next_step']}")
 
 
 def _print_history(mission: dict[str, Any]) -> None:
     if left_out := mission.get("events_left_out", 0):
-        say(f"{mission['id']:<4}{left_out} earlier events are not shown")
+        print_line(f"{mission['id']:<4}{left_out} earlier events are not shown")
     _print_events(mission["events"])
 
 
 def _print_events(events: list[dict[str, Any]]) -> None:
     for event in events:
-        say(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}")
+        print_line(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}")
 
 
 def _print(document: dict[str, Any], form: str) -> int:
-    print(written({"schemaVersion": 1, **document}, form))
+    print(format_document({"schemaVersion": 1, **document}, form))
     return 0
 
 
 def _end(text: str) -> None:
-    say(text)
-    leave_message(harmless(text))
+    print_line(text)
+    write_termination_message(escape(text))

@@ -21,14 +21,14 @@ def output_argument(parser: argparse.ArgumentParser, what: str = "") -> None:
     parser.add_argument("-o", "--output", choices=FORMATS, default="table", help=text)
 
 
-def written(document: object, form: str) -> str:
+def format_document(document: object, form: str) -> str:
     """Write plain values as "json" or "yaml"."""
     text = json.dumps(document, indent=2, ensure_ascii=False)
     if form == "json":  # escaped: a terminal must not obey control characters
         return re.sub("[\x7f-\x9f]", lambda found: f"\\u{ord(found[0]):04x}", text)
-    from cloudrc.config.document import write
+    from cloudrc.config.document import write_yaml
 
-    return write(json.loads(text)).rstrip("\n")
+    return write_yaml(json.loads(text)).rstrip("\n")
 
 
 def is_live(stream: TextIO) -> bool:
@@ -46,7 +46,7 @@ def terminal_columns(stream: TextIO) -> int:
 
 
 @contextlib.contextmanager
-def unread_is_fine(stream: TextIO) -> Iterator[None]:
+def ignore_closed_pipe(stream: TextIO) -> Iterator[None]:
     """Ignore that a stream's reader, such as `head`, has closed the pipe.
 
     Flush inside the block: buffered text would fail later, outside it.
@@ -82,7 +82,7 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     Returns:
         Lines without trailing blanks, joined by newlines.
     """
-    rows = [[harmless(cell) for cell in row] for row in rows]
+    rows = [[escape(cell) for cell in row] for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = []
     for row in rows:
@@ -94,14 +94,14 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     return "\n".join(lines)
 
 
-def harmless(text: str) -> str:
+def escape(text: str) -> str:
     """Escape what is not printable, so that text keeps to its line and controls no terminal."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-def say(line: str, stream: TextIO | None = None) -> None:
+def print_line(line: str, stream: TextIO | None = None) -> None:
     """Print a line, escaped and flushed at once (default: on stdout)."""
-    print(harmless(line), file=stream, flush=True)
+    print(escape(line), file=stream, flush=True)
 
 
 def format_number(value: float) -> str:

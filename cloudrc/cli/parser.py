@@ -82,14 +82,14 @@ def _or(names: Sequence[str]) -> str:
     return ", ".join(names[:-1]) + f" or {names[-1]}" if len(names) > 1 else "".join(names)
 
 
-def count(text: str) -> int:
+def read_count(text: str) -> int:
     """Read a whole number from 1 to `COUNT_MAX`; a type for argparse."""
     if not text.isdecimal() or not 1 <= int(text) <= COUNT_MAX:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 1 to {COUNT_MAX}")
     return int(text)
 
 
-def read_from(text: str) -> Path:
+def input_file(text: str) -> Path:
     """Read the path of an input file; a type for argparse.
 
     Refuse a pipe or a device: opening it could wait for ever.
@@ -99,7 +99,7 @@ def read_from(text: str) -> Path:
     return Path(text)
 
 
-def build(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
+def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
     """Build the parser.
 
     Args:

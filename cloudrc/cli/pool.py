@@ -21,7 +21,7 @@ PARENT_PERIOD = 0.5
 """Period in which a worker checks whether its parent still runs [s]."""
 
 
-def end_orderly() -> None:
+def interrupt_on_signals() -> None:
     """Raise KeyboardInterrupt on SIGTERM and SIGHUP, as on Ctrl-C.
 
     A SIGHUP that is ignored from the start stays ignored: `nohup` does that.
@@ -64,7 +64,7 @@ class WorkerDiedError(InvalidRunError):
     """A process of the pool was killed from outside."""
 
 
-def in_order(
+def map_in_order(
     function: Callable[[Work], Result], work: Sequence[Work], jobs: int
 ) -> Iterator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import TextIO
 
-from cloudrc.cli.output import harmless, is_live, paint, terminal_columns, unread_is_fine
+from cloudrc.cli.output import escape, ignore_closed_pipe, is_live, paint, terminal_columns
 from cloudrc.drivers.feed import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import (
@@ -121,7 +121,7 @@ class FlightView:
 
     def _event(self, text: str) -> None:
         """Write an event's line, with position and delay if they fit."""
-        text = harmless(text)
+        text = escape(text)
         width = terminal_columns(self._stream) if self._live else FILE_COLUMNS
         delays = (self._delay_text(), "")
         lines = [_joined((f"  {text:<44}", self._position_text(), delay)) for delay in delays]
@@ -139,7 +139,7 @@ class FlightView:
 
     def _write(self, text: str) -> None:
         """Write at once; a flight goes on if the reader has closed the pipe."""
-        with unread_is_fine(self._stream):
+        with ignore_closed_pipe(self._stream):
             self._stream.write(text)
             self._stream.flush()
 

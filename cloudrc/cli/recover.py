@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import output_argument, say, written
-from cloudrc.cli.parser import read_from
+from cloudrc.cli.output import format_document, output_argument, print_line
+from cloudrc.cli.parser import input_file
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ exit codes: 0 complete, 1 some data is lost (printed), 2 nothing readable"""
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("file", type=read_from, metavar="FILE", help="a recording (.mcap)")
+    parser.add_argument("file", type=input_file, metavar="FILE", help="a recording (.mcap)")
     parser.add_argument(
         "-t",
         "--to",
@@ -56,7 +56,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.output == "table":
         _show(recovery, target)
     else:
-        print(written(_document(recovery, target), options.output))
+        print(format_document(_document(recovery, target), options.output))
     return 0 if recovery.complete else LOSSY
 
 
@@ -69,7 +69,7 @@ def _show(recovery: Recovery, target: Path) -> None:
     kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)
     print(f"kept {recovery.share:.1%}: {kept or 'nothing'}")
     for note in recovery.notes:
-        say(f"lossy: {note}")
+        print_line(f"lossy: {note}")
     if recovery.complete and recovery.index_is_new:
         print("the index was missing or damaged and is rebuilt; nothing is lost")
-    say(str(target))
+    print_line(str(target))

@@ -24,13 +24,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.link_run import loader
-from cloudrc.cli.output import say
+from cloudrc.cli.link_run import make_profile_loader
+from cloudrc.cli.output import print_line
 from cloudrc.cli.runtime import (
-    address,
     listening,
     open_exporter,
     process_arguments,
+    read_address,
     resolve_address,
     warn_if_exposed,
 )
@@ -60,7 +60,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     process_arguments(parser)
     for flag, text in ADDRESSES.items():
-        parser.add_argument(flag, type=address, required=True, metavar="HOST:PORT", help=text)
+        parser.add_argument(flag, type=read_address, required=True, metavar="HOST:PORT", help=text)
     parser.add_argument(
         "--link",
         type=Path,
@@ -112,7 +112,7 @@ def execute(options: argparse.Namespace) -> int:
         relay.run(should_stop)
     else:
         if not options.link:  # else the control has shown it
-            show_asked(exporter, experiment)
+            export_requested_delay(exporter, experiment)
         for way in WAYS:
             exporter.shaped("relay", way, "relay")
         exporter.runs(fingerprint(experiment))
@@ -123,7 +123,7 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
-def show_asked(exporter: Exporter, experiment: ResolvedExperiment) -> None:
+def export_requested_delay(exporter: Exporter, experiment: ResolvedExperiment) -> None:
     """Export the mean delay that the experiment requests of each direction."""
     from cloudrc.assembly import link_profile
     from cloudrc.link.state import summary
@@ -236,7 +236,7 @@ class RelayControl:
         self._released, self._released_at = released, 0.0
         folder.mkdir(exist_ok=True)
         file = folder / PROFILE_FILE
-        self._files = {way: ProfileFile(file, loader(way), _log) for way in links}
+        self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
         self._pending: deque[tuple[str, Loaded]] = deque()
         self._applied: deque[tuple[str, Loaded, int]] = deque()
         self._changes = dict.fromkeys(links, -1)
@@ -313,4 +313,4 @@ class RelayControl:
 
 
 def _log(line: str) -> None:
-    say(f"cloudrc relay: {line}", sys.stderr)
+    print_line(f"cloudrc relay: {line}", sys.stderr)

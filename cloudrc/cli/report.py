@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import output_argument, written
+from cloudrc.cli.output import format_document, output_argument
 from cloudrc.errors import BadInputError
 
 EPILOG = """\
@@ -47,7 +47,7 @@ def execute(options: argparse.Namespace) -> int:
     run = replace(run, notes=(*run.notes, *unmeasured))
     document = write_report(options.run, recording, experiment, run, own=options.metric)
     if options.output != "table":
-        print(written(document, options.output))
+        print(format_document(document, options.output))
     else:
         show(document, options.run)
     return exit_code(document)

@@ -9,11 +9,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from cloudrc.cli.cluster_flags import place, place_arguments, timeout_argument
+from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import is_live, output_argument, say, unread_is_fine, written
-from cloudrc.cli.parser import count
-from cloudrc.cli.pool import end_orderly
+from cloudrc.cli.output import (
+    format_document,
+    ignore_closed_pipe,
+    is_live,
+    output_argument,
+    print_line,
+)
+from cloudrc.cli.parser import read_count
+from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.errors import BadInputError, CloudrcError
 
 if TYPE_CHECKING:
@@ -68,7 +74,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="random seed of this run (default: the experiment's)",
     )
     many.add_argument(
-        "--seeds", type=count, metavar="N", help="fly seeds 1 to N on all cores and print a table"
+        "--seeds",
+        type=read_count,
+        metavar="N",
+        help="fly seeds 1 to N on all cores and print a table",
     )
     parser.add_argument(
         "--set",
@@ -81,13 +90,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="DIR", help="folder of the run (default: a new one in runs/)"
     )
     output_argument(parser, "json, yaml: print only the report")
-    place_arguments(parser)
+    release_arguments(parser)
     timeout_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Fly once or many times."""
-    end_orderly()  # an interrupted flight still gets its report
+    interrupt_on_signals()  # an interrupted flight still gets its report
     mode = options.mode or ("virtual" if options.seeds else "local")
     if options.seeds and mode != "virtual":
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
@@ -121,8 +130,8 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
     mission = experiment.mission
     waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
     if not for_programs:
-        with unread_is_fine(stream):
-            say(
+        with ignore_closed_pipe(stream):
+            print_line(
                 f"{name}: mode {mode}, seed {experiment.seed}, link {experiment.link.profile},"
                 f" {waypoints} waypoint{'s' if waypoints != 1 else ''}"
             )
@@ -130,15 +139,15 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
         report = flight(folder, stream, waypoints)
     except (CloudrcError, KeyboardInterrupt):
         if not (removable and discard(folder)):
-            say(f"the recording is in {folder}", sys.stderr)
+            print_line(f"the recording is in {folder}", sys.stderr)
         raise
     finally:
         if removable and options.out is None and folder.exists():
             point_latest_to(folder)
-    with unread_is_fine(sys.stdout):
+    with ignore_closed_pipe(sys.stdout):
         if for_programs:
             document = json.loads((folder / "report.json").read_text())
-            print(written(document, options.output))
+            print(format_document(document, options.output))
         else:
             show(report, folder)
         sys.stdout.flush()
@@ -169,13 +178,13 @@ def _in_cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> 
     from cloudrc.cluster.tools import program
 
     refuse_local_files(experiment)
-    release = place(options)
+    release = release_from_flags(options)
     for name in ("helm", "kubectl"):
         program(name)
 
     def flight(folder: Path, stream: TextIO, waypoints: int) -> dict[str, Any]:
         def tell(text: str) -> None:
-            say(f"  {text}", stream)
+            print_line(f"  {text}", stream)
 
         return fly_in_cluster(experiment, folder, release, options.timeout, tell)
 

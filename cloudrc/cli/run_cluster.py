@@ -58,7 +58,7 @@ def fly_in_cluster(
 
     _refuse_busy(release)
     began = time.monotonic()
-    given = values(experiment, current_values(release))
+    given = chart_values(experiment, current_values(release))
     install(release, chart_folder(), given, timeout=timeout, tell=tell)
     tell(
         f"release '{release.name}' {release.where} is ready after {time.monotonic() - began:.0f} s"
@@ -73,7 +73,7 @@ def fly_in_cluster(
     return _report(experiment, folder, mission, interrupted)
 
 
-def values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
+def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
     """Give the chart's values for an experiment; other values of the release stay.
 
     Args:
@@ -89,10 +89,10 @@ def values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[st
 
 def _refuse_busy(release: Release) -> None:
     """Refuse to interrupt a flight: installing an experiment replaces both pods."""
-    from cloudrc.cluster.jobs import under_way
+    from cloudrc.cluster.jobs import current_mission
     from cloudrc.cluster.tools import ClusterError
 
-    found, job = under_way(release)
+    found, job = current_mission(release)
     if found:
         end = " ".join(["cloudrc mission cancel", *filter(None, [job]), *release.cloudrc_flags])
         raise ClusterError(
@@ -118,7 +118,7 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
     Raises:
         BadInputError: Names the key of the file.
     """
-    from cloudrc.config.load import FILES
+    from cloudrc.config.load import FILE_READERS
 
     paths = {
         f"cloud.{key}": getattr(experiment.cloud, key).name
@@ -127,7 +127,7 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
     paths |= {
         f"link.{key}.{name}": getattr(getattr(experiment.link, key), name)
         for key in ("uplink", "downlink")
-        for name in FILES
+        for name in FILE_READERS
     }
     for key, name in paths.items():
         if name is not None and ("/" in name or name.endswith(".py")):
@@ -144,14 +144,14 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
     """Fly by a Job; cancel the mission if interrupted."""
-    from cloudrc.cluster.jobs import follow, patience, run_job
+    from cloudrc.cluster.jobs import follow, follow_limit, run_job
     from cloudrc.cluster.tools import ClusterError
 
     limit = experiment.criteria.time_limit_s
     job = run_job(release, mission_document(experiment), limit=limit)
     tell(f"Job {job.name} flies {experiment.name}")
     try:
-        ended = follow(release, job.name, tell, timeout=patience(limit, False))
+        ended = follow(release, job.name, tell, timeout=follow_limit(limit, False))
     except KeyboardInterrupt:
         _cancel(release, job, tell)
         raise
@@ -221,12 +221,12 @@ def _fetch_recordings(release: Release, folder: Path, tell: Tell) -> None:
 
 def _fetch_before(release: Release, folder: Path, tell: Tell) -> None:
     """Copy the earlier recording of a restarted container; the report does not need it."""
-    from cloudrc.cluster.pods import fetch_before
+    from cloudrc.cluster.pods import fetch_previous_recording
 
     for component in COMPONENTS:
         path = folder / f"{component}.before.mcap"
         try:
-            if fetch_before(release, component, path):
+            if fetch_previous_recording(release, component, path):
                 tell(f"{component} was restarted; its earlier recording is in {path}")
         except CloudrcError as error:
             path.unlink(missing_ok=True)

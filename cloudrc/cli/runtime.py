@@ -48,7 +48,7 @@ def process_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--metrics",
-        type=address,
+        type=read_address,
         metavar="HOST:PORT",
         help="serve /metrics, /healthz and /readyz at this address (default: off)",
     )
@@ -70,13 +70,17 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--record-max",
-        type=size,
+        type=read_size,
         metavar="SIZE",
         help="size limit, such as 500M or 1Gi, for this recording and the renamed one together;"
         " recording ends at 90 %% of it (default: no limit)",
     )
     parser.add_argument(
-        "--listen", type=address, required=True, metavar="HOST:PORT", help="address to receive at"
+        "--listen",
+        type=read_address,
+        required=True,
+        metavar="HOST:PORT",
+        help="address to receive at",
     )
     parser.add_argument(
         "--link",
@@ -94,7 +98,7 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
     target = parser.add_mutually_exclusive_group(required=True)
     target.add_argument(
         "--peer",
-        type=address,
+        type=read_address,
         metavar="HOST:PORT",
         help="address to send to; a name is resolved once",
     )
@@ -106,7 +110,7 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def address(text: str) -> Address:
+def read_address(text: str) -> Address:
     """Read HOST:PORT; a type for argparse."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
@@ -114,7 +118,7 @@ def address(text: str) -> Address:
     return host, int(port)
 
 
-def resolve(name: str) -> list[str]:
+def ipv4_addresses(name: str) -> list[str]:
     """Give the IPv4 addresses of a host name.
 
     Raises:
@@ -135,7 +139,7 @@ def resolve_address(flag: str, where: Address) -> Address:
     """
     host, port = where
     try:
-        return resolve(host)[0], port
+        return ipv4_addresses(host)[0], port
     except OSError as error:
         raise BadInputError(
             f"{flag} {host}:{port}: {host} cannot be resolved ({error.strerror or error}); name a"
@@ -143,7 +147,7 @@ def resolve_address(flag: str, where: Address) -> Address:
         ) from error
 
 
-def size(text: str) -> float:
+def read_size(text: str) -> float:
     """Read a size as Kubernetes writes it [bytes]; a type for argparse."""
     found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti)?", text)
     if found is None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.output import harmless, paint, say, table
+from cloudrc.cli.output import escape, paint, print_line, table
 
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
@@ -40,7 +40,7 @@ def show(report: Mapping[str, Any], folder: Path) -> None:
     if faults:
         print(paint(f"  faults noted in flight: {faults:.0f}, see the report", "yellow"))
     print()
-    say(str(folder / "report.html"))
+    print_line(str(folder / "report.html"))
 
 
 def verdict(report: Mapping[str, Any]) -> str:
@@ -51,13 +51,13 @@ def verdict(report: Mapping[str, Any]) -> str:
     if not failures:
         return f"{word}: every waypoint reached, every criterion met"
     first, *others = failures
-    return "\n".join([f"{word}: {harmless(first['text'])}", *map(_further_failure, others)])
+    return "\n".join([f"{word}: {escape(first['text'])}", *map(_further_failure, others)])
 
 
 def _further_failure(failure: Mapping[str, Any]) -> str:
     time = failure.get("time")
     when = f" (at {time:.2f} s)" if time is not None else ""
-    return harmless(f"  also: {failure['text']}{when}")
+    return escape(f"  also: {failure['text']}{when}")
 
 
 def main_numbers(report: Mapping[str, Any]) -> str:
@@ -73,6 +73,6 @@ def main_numbers(report: Mapping[str, Any]) -> str:
 
 def _cells(name: str, entry: Mapping[str, Any]) -> tuple[str, str]:
     from cloudrc.metrics import Number
-    from cloudrc.report.numbers import handy
+    from cloudrc.report.numbers import readable
 
-    return handy(name, Number(entry["value"], entry["unit"], ""))
+    return readable(name, Number(entry["value"], entry["unit"], ""))

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.find_run import new_folder
-from cloudrc.cli.output import format_number, say, table, unread_is_fine, written
+from cloudrc.cli.output import format_document, format_number, ignore_closed_pipe, print_line, table
 from cloudrc.cli.pool import BATCH_MAX, WORKER_KILLED, WorkerDiedError, exit_with_parent
 from cloudrc.cli.summary import EXIT_CODES
 
@@ -130,14 +130,14 @@ def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
         reason = (
             f"{WORKER_KILLED if killed else 'interrupted'}: {len(reports)} of {len(seeds)} seeds"
         )
-        with unread_is_fine(sys.stderr):
+        with ignore_closed_pipe(sys.stderr):
             print(f"\ncloudrc: {reason} are finished", file=sys.stderr, flush=True)
     reports.sort(key=lambda report: int(report["seed"]))
     summary = _write(folder, name, reports, bool(code))
-    with unread_is_fine(sys.stdout):
+    with ignore_closed_pipe(sys.stdout):
         if options.output != "table":
             document = json.loads((folder / "sweep.json").read_text())
-            print(written(document, options.output), flush=True)
+            print(format_document(document, options.output), flush=True)
         else:
             print(f"\n{as_table(summary)}\n\n{folder / 'sweep.json'}", flush=True)
     return code or max(EXIT_CODES[report["verdict"]] for report in reports)
@@ -147,8 +147,10 @@ def _show_run(options: argparse.Namespace, report: dict[str, Any], progress: str
     stream = sys.stdout if options.output == "table" else sys.stderr
     if options.output == "table" or stream.isatty():
         failures = "".join(f": {f['text']}" for f in report["failures"][:1])
-        with unread_is_fine(stream):
-            say(f"{progress:>7}  seed {report['seed']}  {report['verdict']}{failures}", stream)
+        with ignore_closed_pipe(stream):
+            print_line(
+                f"{progress:>7}  seed {report['seed']}  {report['verdict']}{failures}", stream
+            )
 
 
 def _reports(

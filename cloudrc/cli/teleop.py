@@ -22,8 +22,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import say
-from cloudrc.cli.runtime import Address, address, open_exporter, process_arguments, warn_if_exposed
+from cloudrc.cli.output import print_line
+from cloudrc.cli.runtime import (
+    Address,
+    open_exporter,
+    process_arguments,
+    read_address,
+    warn_if_exposed,
+)
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -43,7 +49,7 @@ REPEAT_LIMIT = 2.0
 """How long to repeat an emergency stop [s]. If cloud is blocked for that long, the robot holds."""
 
 
-class Alarm:
+class EmergencyStopSender:
     """Send an emergency stop to cloud, from any thread, without blocking.
 
     The socket of a blocked cloud queues eleven datagrams and refuses more. Then a thread repeats
@@ -156,8 +162,8 @@ def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> Se
     plan = partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps)
     surroundings = Surroundings(scene, criteria.time_limit_s, criteria.contact, plan)
     tokens = Tokens(options.tokens) if options.tokens else None
-    audit = Audit(options.audit, complain)
-    gate = Gate(create_app(bridge, surroundings), tokens, audit, complain=complain)
+    audit = Audit(options.audit, log_line)
+    gate = Gate(create_app(bridge, surroundings), tokens, audit, complain=log_line)
     server = ApiServer(gate, bridge, options.api)
     server.start()
     if options.api_file is not None:
@@ -165,9 +171,9 @@ def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> Se
     return ServedApi(bridge, server, audit)
 
 
-def complain(text: str) -> None:
+def log_line(text: str) -> None:
     """Write a line to the log, from any thread."""
-    say(f"cloudrc teleop: {text}", sys.stderr)
+    print_line(f"cloudrc teleop: {text}", sys.stderr)
 
 
 def api_address(text: str) -> Address | Path:
@@ -176,7 +182,7 @@ def api_address(text: str) -> Address | Path:
         return Path(text.removeprefix("unix:"))
     host, colon, port = text.rpartition(":")
     host = host if colon else LOOPBACK
-    return (host, 0) if host and port == "0" else address(f"{host}:{port}")
+    return (host, 0) if host and port == "0" else read_address(f"{host}:{port}")
 
 
 RESERVE_SIZE = 2 << 20
@@ -190,13 +196,13 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors that mean a full disk."""
 
 
-def room(folder: Path) -> int:
+def free_space(folder: Path) -> int:
     """Return the free space of a folder's volume for this user [bytes]."""
     volume = os.statvfs(folder)
     return volume.f_bavail * volume.f_frsize
 
 
-def shorten(journal: Journal, known: Sequence[Entry], disk: Disk | None = None) -> str:
+def shorten_journal(journal: Journal, known: Sequence[Entry], disk: Disk | None = None) -> str:
     """Reduce the journal to its known entries, also on a full disk, and renew the reserve.
 
     If the disk refuses, teleop continues with the old journal.
@@ -222,7 +228,7 @@ def shorten(journal: Journal, known: Sequence[Entry], disk: Disk | None = None) 
     try:
         reserve.make()
     except OSError as error:
-        complain(
+        log_line(
             f"{reserve.path}: {error.strerror}: without it a restart cannot shorten a journal that "
             "has filled its volume; free space or repair the volume"
         )
@@ -278,7 +284,7 @@ class Reserve:
         if self._size() == RESERVE_SIZE:
             return
         self._disk.remove(self.path)  # the rest of a crash, or a symbolic link
-        if room(self.path.parent) < 2 * RESERVE_SIZE:
+        if free_space(self.path.parent) < 2 * RESERVE_SIZE:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         file = self._disk.open(self.path, new=True)
         try:
@@ -430,7 +436,7 @@ def _fly(
     calls: Calls = list
     stops: Calls = list
     if served is not None:
-        served.open(service, Alarm(lambda: peer.send(wire.encode(wire.ALARM))))
+        served.open(service, EmergencyStopSender(lambda: peer.send(wire.encode(wire.ALARM))))
         calls, stops = served.bridge.take, served.bridge.take_urgent
     feed.ready()
 
@@ -502,8 +508,8 @@ def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> Mi
             "another version? Move it away, or name another file"
         ) from error
     known = [entry for entry in journal.entries if service.book.knows(entry)]
-    if trouble := shorten(journal, known):
-        complain(trouble)
+    if trouble := shorten_journal(journal, known):
+        log_line(trouble)
         journal.trouble = "; ".join(filter(None, (journal.trouble, trouble)))
     return service
 

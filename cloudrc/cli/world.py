@@ -7,8 +7,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from cloudrc.cli.output import unread_is_fine
-from cloudrc.cli.parser import read_from
+from cloudrc.cli.output import ignore_closed_pipe
+from cloudrc.cli.parser import input_file
 from cloudrc.cli.runtime import end_arguments, fast_suite, open_end
 
 
@@ -17,7 +17,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     end_arguments(parser)
     parser.add_argument(
         "--epochs",
-        type=read_from,
+        type=input_file,
         metavar="FILE",
         help="file that keeps the session number across restarts (default: none)",
     )
@@ -52,7 +52,7 @@ def _epochs(path: Path) -> Callable[[], int | None]:
     from cloudrc.drivers.epochs import EpochFile
 
     def warn(problem: str) -> None:
-        with unread_is_fine(sys.stderr):
+        with ignore_closed_pipe(sys.stderr):
             print(f"cloudrc: warning: {problem}", file=sys.stderr, flush=True)
 
     return EpochFile(path, warn).take

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from math import nan
 
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.cloud.operator import Alarm, is_for_session, make_seen
+from cloudrc.cloud.operator import EmergencyStopRepeater, is_for_session, make_robot_status
 from cloudrc.cloud.operator import Operator as Operator
 from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
-from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE, ClientHandshake, Complaints
+from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake, HandshakeLog
 from cloudrc.tunnel.keys import KeyRing
 from cloudrc.tunnel.session import AES_256_GCM, NO_EPOCH, make_session
 
@@ -129,7 +129,7 @@ class CloudEndpoint:
         self._identity = identity
         self._session = make_session(Direction.DOWNLINK, identity.ring, start_ns)
         self._handshake = ClientHandshake(identity.nonce, identity.clock_id, identity.suite)
-        self._complaints = Complaints()
+        self._complaints = HandshakeLog()
         self._channel = Channel(newest_wins)
         self._hellos = 0
         self._clock_is_shared = False
@@ -137,7 +137,7 @@ class CloudEndpoint:
         self._world = ""  # identifies the world process of the session
         self.guard = GuardState.GROUND
         self._delays = (nan, nan, nan)  # horizon, round trip and loop delay of the last command [s]
-        self._alarm, self._missed_periods = Alarm(), MissedPeriods()
+        self._alarm, self._missed_periods = EmergencyStopRepeater(), MissedPeriods()
         self._asked = 0  # highest number of an operator request in this session
         self._tick_ns = start_ns
         self._hello_ns = start_ns
@@ -187,7 +187,7 @@ class CloudEndpoint:
         if self._wants_session(now_ns):
             self._say_hello_if_due(now_ns)
             if now_ns - self._heard_ns > PATIENCE_NS:
-                self._records += self._complaints.say("no_session", SILENCE, now_ns)
+                self._records += self._complaints.say("no_session", SILENCE_TEXT, now_ns)
         self.teleop.handle_deadline(now_ns)
         if self.teleop.outputs:
             self._take_from_teleop()
@@ -267,7 +267,7 @@ class CloudEndpoint:
         self._loop.reset()
         self._setpoint = None  # the robot may have moved; teleop sends a new one
         self._asked = 0  # numbers of the previous session no longer count
-        self._alarm.begin_again()
+        self._alarm.restart_numbers()
         self._world = accept.world_nonce.hex()
         self._clock_is_shared = accept.clock == self._identity.clock_id
         self._heard_ns = now_ns
@@ -293,7 +293,7 @@ class CloudEndpoint:
             self._alarm.see(telemetry.guard, telemetry.mission)
             self._loop.observe(telemetry, now_ns)
             self._asked = max(self._asked, telemetry.mission)
-            self.teleop.see(make_seen(telemetry, epoch, self._world, self._delays), now_ns)
+            self.teleop.see(make_robot_status(telemetry, epoch, self._world, self._delays), now_ns)
             if self.teleop.outputs:
                 self._take_from_teleop()
 
@@ -338,7 +338,7 @@ class CloudEndpoint:
 
     def _record_counts(self, now_ns: int) -> None:
         self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
-        self._datagrams += self._session.tend(now_ns)
+        self._datagrams += self._session.maintain(now_ns)
         for name, count in sorted((self._counts | self._loop.counts).items()):
             self._records.append(Counted(now_ns, "cloud", name, count))
 

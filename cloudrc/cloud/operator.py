@@ -7,7 +7,7 @@ from typing import Protocol
 
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Telemetry
 from cloudrc.records import Fault
-from cloudrc.teleop.wire import Outcome, Output, Seen
+from cloudrc.teleop.wire import Outcome, Output, RobotStatus
 from cloudrc.tunnel.session import NO_EPOCH
 
 REPEAT_NS = 100_000_000
@@ -30,7 +30,7 @@ class Operator(Protocol):
     def settled(self) -> bool:
         """Whether telemetry shows that the robot has acted on the last request."""
 
-    def see(self, seen: Seen, now_ns: int) -> None:
+    def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Pass on the newest telemetry at `now_ns` [ns]."""
 
     def handle_deadline(self, now_ns: int) -> None:
@@ -58,9 +58,9 @@ def is_for_session(epoch: int, output: Output | Fault) -> bool:
     return True
 
 
-def make_seen(
+def make_robot_status(
     telemetry: Telemetry, epoch: int, world: str, delays: tuple[float, float, float]
-) -> Seen:
+) -> RobotStatus:
     """Make the message that tells teleop of new telemetry.
 
     Args:
@@ -83,10 +83,10 @@ def make_seen(
         telemetry.reached,
         telemetry.cause,
     )
-    return _new(Seen, fields)
+    return _new(RobotStatus, fields)
 
 
-class Alarm:
+class EmergencyStopRepeater:
     """Repeat an emergency stop until telemetry shows that the guard is in ESTOP.
 
     Cloud repeats the stop itself, because teleop may wait for its disk. The alarm waits for a
@@ -105,7 +105,7 @@ class Alarm:
         if not self.sounds:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
-    def begin_again(self) -> None:
+    def restart_numbers(self) -> None:
         """Restart the numbers for a new session."""
         self._number = self._acted_on = self._due_ns = 0
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from cloudrc.cluster.tools import ClusterError, explained
+from cloudrc.cluster.tools import ClusterError, explain_errors
 from cloudrc.errors import MissingPrerequisiteError
 
 DEFAULT_RELEASE = "cloudrc"
@@ -75,7 +75,7 @@ class Release:
         from kubernetes import client, config
 
         configuration = client.Configuration()
-        with explained("read the kubeconfig", self.where), _login_errors(self.where):
+        with explain_errors("read the kubeconfig", self.where), _login_errors(self.where):
             load: Any = config.load_kube_config  # not annotated
             load(context=self.context, client_configuration=configuration)
         configuration.retries = False  # callers repeat a request themselves, with a message
@@ -185,7 +185,7 @@ def server_version(release: Release) -> tuple[int, int]:
     Raises:
         ClusterError: If the API server does not answer, or refuses.
     """
-    with explained("get the version", release.where):
+    with explain_errors("get the version", release.where):
         code = release.version.get_code(_request_timeout=ANSWER_LIMIT)
     # The minor version of some vendors has a suffix: "29+".
     found = [re.match(r"\d+", str(text)) for text in (code.major, code.minor)]
@@ -203,7 +203,7 @@ def experiment_text(release: Release) -> str:
     Raises:
         ClusterError: If the ConfigMap cannot be read.
     """
-    with explained("list configmaps", release.where):
+    with explain_errors("list configmaps", release.where):
         found = release.core.list_namespaced_config_map(
             release.namespace,
             label_selector=release.selector(COMPONENT),

@@ -21,7 +21,7 @@ from typing import Any
 from cloudrc.cluster.client import REQUEST_TIMEOUT, Release
 from cloudrc.cluster.pods import (
     API_PORT,
-    DIRECTLY,
+    NO_PROXY,
     OPERATOR,
     VOLUME,
     find_pod,
@@ -29,11 +29,11 @@ from cloudrc.cluster.pods import (
     list_pods,
     missing_secret,
     operator_token,
+    pod_failure,
     refusal,
     secret_name,
-    trouble,
 )
-from cloudrc.cluster.tools import ClusterError, WaitedTooLongError, explained, insist
+from cloudrc.cluster.tools import ClusterError, ExpiredError, explain_errors, retry
 
 COMPONENT = "mission"
 """Label `component` of missions' Jobs, pods and ConfigMaps."""
@@ -53,7 +53,7 @@ QUEUE_ALLOWANCE = 3600
 """Time for earlier missions to end, added for a queued mission [s]."""
 DEADLINE_MAX = 2**31 - 1
 """Largest deadline that Kubernetes accepts [s]."""
-KEEP = 3600
+KEEP_FINISHED = 3600
 """Time for which Kubernetes keeps a finished Job [s]."""
 USER = 10001
 """User and group id in the container."""
@@ -72,7 +72,7 @@ ANSWER_LIMIT = 10.0
 
 
 @dataclass(frozen=True)
-class Follower:
+class JobSettings:
     """Settings of the Job's pod, taken from the release.
 
     Attributes:
@@ -133,7 +133,7 @@ def deadline(limit: float, queue: bool) -> int:
 
 
 def job(
-    release: Release, name: str, follower: Follower, *, limit: float, queue: bool
+    release: Release, name: str, follower: JobSettings, *, limit: float, queue: bool
 ) -> dict[str, Any]:
     """Build the Job that posts the mission, follows it and ends with its verdict.
 
@@ -153,7 +153,7 @@ def job(
             # The key is the Job's UID: a second pod would only read the first one's verdict.
             "backoffLimit": 0,
             "activeDeadlineSeconds": deadline(limit, queue),
-            "ttlSecondsAfterFinished": KEEP,
+            "ttlSecondsAfterFinished": KEEP_FINISHED,
             "template": {
                 "metadata": {"labels": labels(release)},
                 "spec": _pod(name, follower, queue),
@@ -162,7 +162,7 @@ def job(
     }
 
 
-def _pod(name: str, follower: Follower, queue: bool) -> dict[str, Any]:
+def _pod(name: str, follower: JobSettings, queue: bool) -> dict[str, Any]:
     return {
         **follower.placement,
         "restartPolicy": "Never",
@@ -192,7 +192,7 @@ def _operator_secret(secret: str) -> dict[str, Any]:
     }
 
 
-def _container(follower: Follower, queue: bool) -> dict[str, Any]:
+def _container(follower: JobSettings, queue: bool) -> dict[str, Any]:
     arguments = ["mission", "fly", f"--api={follower.api}"]
     arguments += [f"--token-file={TOKENS}/{OPERATOR}", f"--mission={FOLDER}/{FILE}"]
     arguments += [f"--key=$({KEY})", *(["--queue"] if queue else [])]
@@ -272,7 +272,7 @@ def run_job(
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
     follower = find_follower(release)
     body = job(release, name, follower, limit=limit, queue=queue)
-    with explained("create jobs", release.where):
+    with explain_errors("create jobs", release.where):
         created = release.batch.create_namespaced_job(
             release.namespace, body, _request_timeout=REQUEST_TIMEOUT
         )
@@ -286,7 +286,7 @@ def run_job(
 def _create_plan(release: Release, plan: Mapping[str, Any]) -> None:
     """Create the ConfigMap; if that fails, delete the Job, which would wait for it forever."""
     try:
-        with explained("create configmaps", release.where):
+        with explain_errors("create configmaps", release.where):
             release.core.create_namespaced_config_map(
                 release.namespace, plan, _request_timeout=REQUEST_TIMEOUT
             )
@@ -296,7 +296,7 @@ def _create_plan(release: Release, plan: Mapping[str, Any]) -> None:
         raise
 
 
-def find_follower(release: Release) -> Follower:
+def find_follower(release: Release) -> JobSettings:
     """Read a Job's settings from the release's cloud pod and Services."""
     spec = find_pod(release, "cloud").spec
     teleop = next((c for c in spec.containers if c.name == API_CONTAINER), None)
@@ -308,7 +308,7 @@ def find_follower(release: Release) -> Follower:
     pull_secrets = tuple(secret.name for secret in spec.image_pull_secrets or [])
     policy = teleop.image_pull_policy or "IfNotPresent"
     deployment = _cloud_deployment(release)
-    return Follower(
+    return JobSettings(
         teleop.image,
         policy,
         pull_secrets,
@@ -321,7 +321,7 @@ def find_follower(release: Release) -> Follower:
 
 def _cloud_deployment(release: Release) -> Any:
     """Find the release's cloud Deployment; None if there is none."""
-    with explained("list deployments", release.where):
+    with explain_errors("list deployments", release.where):
         found = release.apps.list_namespaced_deployment(
             release.namespace,
             label_selector=release.selector("cloud"),
@@ -351,7 +351,7 @@ def _placement(release: Release, deployment: Any) -> dict[str, Any]:
 
 
 def _api_url(release: Release) -> str:
-    with explained("list services", release.where):
+    with explain_errors("list services", release.where):
         services = release.core.list_namespaced_service(
             release.namespace,
             label_selector=f"app.kubernetes.io/instance={release.name}",
@@ -369,7 +369,7 @@ def _api_url(release: Release) -> str:
 
 def list_jobs(release: Release) -> list[JobStatus]:
     """List the Jobs of a release's missions, the oldest first."""
-    with explained("list jobs", release.where):
+    with explain_errors("list jobs", release.where):
         jobs = release.batch.list_namespaced_job(
             release.namespace,
             label_selector=release.selector(COMPONENT),
@@ -386,7 +386,7 @@ def read_job(release: Release, name: str) -> JobStatus:
     Raises:
         ClusterError: If there is no such Job.
     """
-    with explained("get jobs", release.where):
+    with explain_errors("get jobs", release.where):
         job = release.batch.read_namespaced_job(
             name, release.namespace, _request_timeout=REQUEST_TIMEOUT
         )
@@ -395,7 +395,7 @@ def read_job(release: Release, name: str) -> JobStatus:
 
 def delete_job(release: Release, name: str) -> None:
     """Delete a Job with its pod and ConfigMap; a mission that it has posted continues."""
-    with explained("delete jobs", release.where):
+    with explain_errors("delete jobs", release.where):
         release.batch.delete_namespaced_job(
             name,
             release.namespace,
@@ -456,7 +456,7 @@ def _failure(condition: Any) -> str:
     return f"{condition.reason}: {condition.message}"
 
 
-def patience(limit: float, queue: bool) -> float:
+def follow_limit(limit: float, queue: bool) -> float:
     """Compute the time within which Kubernetes has ended a Job [s].
 
     Args:
@@ -486,16 +486,16 @@ def follow(
     """
     until, written = time.monotonic() + timeout, 0
     while True:
-        status, lines = insist(lambda: _read_job_and_log(release, name), write)
+        status, lines = retry(lambda: _read_job_and_log(release, name), write)
         for line in lines[written:]:
             write(line)
         written = max(written, len(lines))
         if status.state in ("complete", "failed"):
             return status
         if status.state == "pending":
-            insist(partial(_check_can_start, release, status), write)
+            retry(partial(_check_can_start, release, status), write)
         if time.monotonic() > until:
-            raise WaitedTooLongError(
+            raise ExpiredError(
                 f"Job '{name}' has not ended within {timeout:g} s; it continues; "
                 f"see: cloudrc mission status {name} {' '.join(release.cloudrc_flags)}"
             )
@@ -520,7 +520,7 @@ def _log(release: Release, uid: str) -> list[str]:
     pod = pod_of(release, uid)
     if pod is None or not has_started(pod):
         return []
-    with explained("get pods/log", release.where):
+    with explain_errors("get pods/log", release.where):
         text: str = release.core.read_namespaced_pod_log(
             pod.metadata.name, release.namespace, _request_timeout=READ_LIMIT
         )
@@ -533,7 +533,7 @@ def _check_can_start(release: Release, status: JobStatus) -> None:
     if pod is None:
         why = refusal(release, "Job", status.name)
     else:
-        why = trouble(pod) or missing_secret(release, pod)
+        why = pod_failure(pod) or missing_secret(release, pod)
     if why:
         raise ClusterError(
             f"Job '{status.name}' cannot start: {why}; then delete the Job: "
@@ -578,7 +578,7 @@ def cancel(release: Release, name: str, token: str | None = None) -> str:
     return f"Job '{name}' is deleted; it had not posted its mission"
 
 
-def under_way(release: Release) -> tuple[str, str]:
+def current_mission(release: Release) -> tuple[str, str]:
     """Find the mission that flies on a release, or is about to.
 
     Args:
@@ -600,7 +600,7 @@ def under_way(release: Release) -> tuple[str, str]:
         token = operator_token(release)
         with forwarded(release, pod, [API_PORT]) as ports:
             missions = _ask(f"http://127.0.0.1:{ports[API_PORT]}/v1/missions", token)["missions"]
-    except (ClusterError, WaitedTooLongError):
+    except (ClusterError, ExpiredError):
         return "", ""  # unknown: a broken release must not prevent its own repair by an install
     ended = ("done", "failed", "cancelled")
     found = next((m["id"] for m in missions if m["state"] not in ended), None)
@@ -617,7 +617,7 @@ def _ask(url: str, token: str, *, post: bool = False) -> Any:
     headers = {"Authorization": f"Bearer {token}"}
     request = urllib.request.Request(url, headers=headers, method="POST" if post else "GET")
     try:
-        with DIRECTLY.open(request, timeout=ANSWER_LIMIT) as answer:
+        with NO_PROXY.open(request, timeout=ANSWER_LIMIT) as answer:
             return json.loads(answer.read() or b"null")
     except urllib.error.HTTPError as error:
         answer_text = error.read().decode(errors="replace")

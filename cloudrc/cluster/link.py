@@ -22,11 +22,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 from cloudrc.cluster.tools import ClusterError, run
-from cloudrc.config.document import parse as parse_yaml
-from cloudrc.config.document import read as read_document
-from cloudrc.config.document import write as write_yaml
-from cloudrc.config.edit import DIRECTIONS, TIME_LINES, Edit, edit
-from cloudrc.config.load import FILES
+from cloudrc.config.document import parse_yaml, read_document, write_yaml
+from cloudrc.config.load import FILE_READERS
+from cloudrc.config.profile_edit import DIRECTIONS, TIME_LINE_KEYS, Edit, edit_profile
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.link.follow import HANDED_FILE, Handed, write_handed
 from cloudrc.link.state import CHANGE_FILE, STATE_FILE, Change, LinkState, from_text, read_change
@@ -39,9 +37,9 @@ READ_LIMIT = 15.0
 """Time limit for the API server to answer [s]."""
 FOLDER = "/run/cloudrc"
 """Folder in a link container with its route, its state and the change that it gets."""
-PATIENCE = 5.0
+APPLY_LIMIT = 5.0
 """Time limit for the sidecar to apply a change [s]; it takes 0.2 s."""
-HAND_LIMIT = 25.0
+SEND_LIMIT = 25.0
 """Time limit to send a change to a container and to read the answer [s]."""
 SIZE_MAX = 1_000_000
 """Largest size of a ConfigMap's files, a little less than its limit of 1 MiB [bytes]."""
@@ -53,7 +51,7 @@ _KEY = re.compile(r"[^-._a-zA-Z0-9]")
 
 
 @dataclass(frozen=True)
-class Place:
+class ReleasePlace:
     """Context, namespace and name of a release; None is kubectl's default.
 
     Attributes:
@@ -88,7 +86,7 @@ class LinkParts:
     pods: dict[str, str]
 
 
-def read_link(place: Place) -> LinkParts | None:
+def read_link(place: ReleasePlace) -> LinkParts | None:
     """Read a release's link with one kubectl command; None if a part of it is missing.
 
     Raises:
@@ -107,7 +105,7 @@ def read_link(place: Place) -> LinkParts | None:
     return LinkParts(str(maps[0]["metadata"]["name"]), dict(maps[0]["data"]), names)
 
 
-def write_files(place: Place, name: str, files: Mapping[str, str]) -> None:
+def write_files(place: ReleasePlace, name: str, files: Mapping[str, str]) -> None:
     """Write files into the ConfigMap; its other files stay.
 
     Raises:
@@ -131,13 +129,13 @@ def _newest(found: list[dict[str, Any]], component: str) -> str | None:
     return str(newest["name"]) if newest else None
 
 
-INSIDE = f"""\
+APPLY_SCRIPT = f"""\
 cd "$1" 2>/dev/null && test -f {STATE_FILE} || {{
     echo 'error: no link runs here;' >&2; exit 2; }}
 draft=.{HANDED_FILE}.$$
 cat > $draft && test "$(wc -c < $draft)" -eq "$3" && mv $draft {HANDED_FILE} || {{
     rm -f $draft; echo 'error: the change arrived incomplete;' >&2; exit 2; }}
-for _ in $(seq {round(PATIENCE / _LOOK_PERIOD)}); do
+for _ in $(seq {round(APPLY_LIMIT / _LOOK_PERIOD)}); do
     grep -qF "\\"$2\\"" {STATE_FILE} && break
     sleep {_LOOK_PERIOD}
 done
@@ -148,7 +146,7 @@ the document on its standard input. It puts the document where the sidecar reads
 waits until the sidecar has accepted or refused it, and prints the sidecar's state."""
 
 
-def hand_over(place: Place, pod: str, handed: Handed) -> str:
+def send_change(place: ReleasePlace, pod: str, handed: Handed) -> str:
     """Send a change to a pod's link container, and wait until it has accepted or refused it.
 
     Args:
@@ -163,19 +161,19 @@ def hand_over(place: Place, pod: str, handed: Handed) -> str:
         ClusterError: If kubectl or the container refuses.
     """
     document, number = write_handed(handed), read_change(handed.change).number
-    words = ["sh", "-c", INSIDE, "sh", FOLDER, number, str(len(document.encode()))]
+    words = ["sh", "-c", APPLY_SCRIPT, "sh", FOLDER, number, str(len(document.encode()))]
     command = [*place.flags, "exec", "--stdin", pod, "--container=link", "--", *words]
-    return run("kubectl", command, timeout=HAND_LIMIT, given=document)
+    return run("kubectl", command, timeout=SEND_LIMIT, given=document)
 
 
-WAYS = dict(zip(COMPONENTS, DIRECTIONS, strict=True))
+DIRECTION_OF = dict(zip(COMPONENTS, DIRECTIONS, strict=True))
 """Component -> direction that its link container shapes."""
 Answer: TypeAlias = LinkState | CloudrcError
 """State that a link container reports, or the error if it reports none."""
 
 
 @dataclass(frozen=True)
-class Given:
+class SentChange:
     """A change that was sent to both link containers.
 
     Attributes:
@@ -197,11 +195,13 @@ class Given:
         return isinstance(answer, LinkState) and answer.refused == self.change.number
 
 
-class StrangeStateError(ClusterError):
+class UnknownStateError(ClusterError):
     """A link container reports a state in the format of another version."""
 
 
-def hand_to_both(place: Place, link: LinkParts, given: Mapping[str, Handed]) -> dict[str, Answer]:
+def send_to_both(
+    place: ReleasePlace, link: LinkParts, given: Mapping[str, Handed]
+) -> dict[str, Answer]:
     """Send a change to each link container, and wait until both have accepted or refused it.
 
     Args:
@@ -215,17 +215,17 @@ def hand_to_both(place: Place, link: LinkParts, given: Mapping[str, Handed]) -> 
 
     def hand(part: str) -> Answer:
         try:
-            return from_text(hand_over(place, link.pods[part], given[part]))
+            return from_text(send_change(place, link.pods[part], given[part]))
         except CloudrcError as error:
             return error
         except ValueError as error:
-            return StrangeStateError(f"a link container has another version: {error}")
+            return UnknownStateError(f"a link container has another version: {error}")
 
     with ThreadPoolExecutor(len(COMPONENTS)) as pool:
         return dict(zip(COMPONENTS, pool.map(hand, COMPONENTS), strict=True))
 
 
-def needed(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
+def needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
     """Select the profile and the files that it names from a ConfigMap's files.
 
     Args:
@@ -233,11 +233,11 @@ def needed(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str
         files: All files.
     """
     ways = [value for value in values.values() if isinstance(value, dict)]
-    named = {Path(str(way[key])).name for way in ways for key in FILES if way.get(key)}
+    named = {Path(str(way[key])).name for way in ways for key in FILE_READERS if way.get(key)}
     return {name: text for name, text in files.items() if name == PROFILE or name in named}
 
 
-def take_back(place: Place, link: LinkParts, given: Given) -> str:
+def roll_back(place: ReleasePlace, link: LinkParts, given: SentChange) -> str:
     """Send the old files to both link containers again.
 
     Args:
@@ -250,7 +250,7 @@ def take_back(place: Place, link: LinkParts, given: Given) -> str:
     """
     values, _ = parse_yaml(link.files[PROFILE], PROFILE)
     values = values if isinstance(values, dict) else {}
-    files = needed(values, link.files)
+    files = needed_files(values, link.files)
     before = read_change(link.files.get(CHANGE_FILE, "")).number
     number, cause = f"{given.change.number}-back", f"taken back: {given.change.cause}"
     documents = {}
@@ -259,19 +259,23 @@ def take_back(place: Place, link: LinkParts, given: Given) -> str:
         restart = given.change.restart and given.took(part)
         change = {"number": number, "cause": cause, "restart": restart}
         documents[part] = Handed(json.dumps(change) + "\n", before, files)
-    again = Given(Change(number, cause), hand_to_both(place, link, documents))
+    again = SentChange(Change(number, cause), send_to_both(place, link, documents))
     return "; ".join(_words(place, link, values, given, again))
 
 
 def _words(
-    place: Place, link: LinkParts, values: Mapping[str, Any], given: Given, again: Given
+    place: ReleasePlace,
+    link: LinkParts,
+    values: Mapping[str, Any],
+    given: SentChange,
+    again: SentChange,
 ) -> Iterator[str]:
     """Describe the final state of each direction."""
-    for part, way in WAYS.items():
+    for part, way in DIRECTION_OF.items():
         own, answer = values.get(way) or {}, again.answers[part]
         if again.took(part):
             if given.took(part):
-                restarted = given.change.restart and any(own.get(key) for key in TIME_LINES)
+                restarted = given.change.restart and any(own.get(key) for key in TIME_LINE_KEYS)
                 timed = "; its time line starts again" if restarted else ""
                 yield f"the {way} had the change for a moment and has its old profile again{timed}"
         elif isinstance(answer, LinkState) and not again.refused(part):
@@ -287,7 +291,7 @@ def _words(
             )
 
 
-def _command(place: Place, way: str, own: Mapping[str, Any]) -> str:
+def _command(place: ReleasePlace, way: str, own: Mapping[str, Any]) -> str:
     """Return a command that sets a value to its present value, and so sends the whole profile.
 
     The value is `keep_order`, which no time line changes.
@@ -297,7 +301,7 @@ def _command(place: Place, way: str, own: Mapping[str, Any]) -> str:
     return " ".join([*words, *place.flags])
 
 
-class HandedOver(NamedTuple):
+class AppliedEdit(NamedTuple):
     """A change that was sent to both link containers.
 
     Attributes:
@@ -315,13 +319,13 @@ class HandedOver(NamedTuple):
     take_back: Callable[[], str]
 
 
-def hand_profile(
-    place: Place,
+def change_profile(
+    place: ReleasePlace,
     link: LinkParts,
     profile: str | None,
     settings: Sequence[str],
     change: Callable[[Edit], str],
-) -> HandedOver:
+) -> AppliedEdit:
     """Change the profile of a release, and wait until both directions have accepted or refused it.
 
     Args:
@@ -336,17 +340,17 @@ def hand_profile(
     """
     edited, files = with_files(link.files, profile, settings)
     files[CHANGE_FILE] = change(edited)
-    whole = needed(edited.values, {**link.files, **files})
+    whole = needed_files(edited.values, {**link.files, **files})
     before = read_change(link.files.get(CHANGE_FILE, "")).number
     handed = Handed(files[CHANGE_FILE], before, whole)
-    answers = hand_to_both(place, link, dict.fromkeys(COMPONENTS, handed))
-    given = Given(read_change(files[CHANGE_FILE]), answers)
+    answers = send_to_both(place, link, dict.fromkeys(COMPONENTS, handed))
+    given = SentChange(read_change(files[CHANGE_FILE]), answers)
     keep = partial(write_files, place, link.name, files)
-    back = partial(take_back, place, link, given)
+    back = partial(roll_back, place, link, given)
     if failed := [answer for answer in answers.values() if isinstance(answer, CloudrcError)]:
         _keep_or_take_back(failed, given, keep, back)
     told = [answer for answer in answers.values() if isinstance(answer, LinkState)]
-    return HandedOver(edited, told, partial(_keep_applied, keep), back)
+    return AppliedEdit(edited, told, partial(_keep_applied, keep), back)
 
 
 def _keep_applied(keep: Callable[[], None]) -> None:
@@ -359,7 +363,7 @@ def _keep_applied(keep: Callable[[], None]) -> None:
 
 def _keep_or_take_back(
     failed: Sequence[CloudrcError],
-    given: Given,
+    given: SentChange,
     keep: Callable[[], None],
     back: Callable[[], str],
 ) -> NoReturn:
@@ -369,7 +373,7 @@ def _keep_or_take_back(
         ClusterError: Always; it describes the final state.
     """
     error: CloudrcError = failed[0]
-    other_version = any(isinstance(each, StrangeStateError) for each in failed)
+    other_version = any(isinstance(each, UnknownStateError) for each in failed)
     if not other_version and not any(map(given.refused, COMPONENTS)):
         try:
             keep()
@@ -399,10 +403,10 @@ def with_files(
         folder = Path(name).resolve()
         for key, text in files.items():
             (folder / key).write_text(text, encoding="utf-8")
-        edited = edit(read_document(folder / PROFILE, PROFILE), profile, settings)
+        edited = edit_profile(read_document(folder / PROFILE, PROFILE), profile, settings)
         new: dict[str, str] = {}
         for way in DIRECTIONS:
-            for key in FILES:
+            for key in FILE_READERS:
                 path = edited.values.get(way, {}).get(key)
                 if path is not None:
                     edited.values[way][key] = _add_file(Path(path), folder, way, new)

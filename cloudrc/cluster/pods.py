@@ -23,8 +23,8 @@ from typing import IO, Any
 from cloudrc.cluster.client import REQUEST_TIMEOUT, Release, connect
 from cloudrc.cluster.tools import (
     ClusterError,
-    WaitedTooLongError,
-    explained,
+    ExpiredError,
+    explain_errors,
     last_words,
     program,
     run,
@@ -53,7 +53,7 @@ RESTARTS_MAX = 2
 
 def list_pods(release: Release, component: str) -> list[Any]:
     """List the pods of a component that are not being deleted, the newest first."""
-    with explained("list pods", release.where):
+    with explain_errors("list pods", release.where):
         found = release.core.list_namespaced_pod(
             release.namespace,
             label_selector=release.selector(component),
@@ -74,7 +74,7 @@ def find_pod(release: Release, component: str) -> Any:
         if pod.status.phase == "Running":
             return pod
     if pods:
-        why = trouble(pods[0]) or f"it is {pods[0].status.phase}"
+        why = pod_failure(pods[0]) or f"it is {pods[0].status.phase}"
         raise ClusterError(
             f"the {component} pod of release '{release.name}' does not run: {why}; "
             f"see: kubectl {' '.join(release.flags)} describe pod {pods[0].metadata.name}"
@@ -88,7 +88,7 @@ def require_release(release: Release) -> None:
     Raises:
         ClusterError: If it does not exist; says how to install it.
     """
-    with explained("list deployments", release.where):
+    with explain_errors("list deployments", release.where):
         found = release.apps.list_namespaced_deployment(
             release.namespace,
             label_selector=release.selector("cloud"),
@@ -112,7 +112,7 @@ def is_ready(pod: Any) -> bool:
     return any(c.type == "Ready" and c.status == "True" for c in conditions)
 
 
-def trouble(pod: Any) -> str | None:
+def pod_failure(pod: Any) -> str | None:
     """Say in one sentence why a pod will never run; None if it may."""
     for status in _containers(pod):
         why = _container_trouble(status)
@@ -152,7 +152,7 @@ def missing_secret(release: Release, pod: Any) -> str | None:
 
 def _has_secret(release: Release, name: str) -> bool:
     """Whether a Secret exists now: an event may be up to two minutes older than that."""
-    with suppress(ClusterError), explained("get secrets", release.where):
+    with suppress(ClusterError), explain_errors("get secrets", release.where):
         release.core.read_namespaced_secret(
             name, release.namespace, _request_timeout=REQUEST_TIMEOUT
         )
@@ -162,7 +162,7 @@ def _has_secret(release: Release, name: str) -> bool:
 
 def _events(release: Release, kind: str, name: str, reason: str) -> list[str]:
     """List the messages of an object's events with this reason."""
-    with explained("list events", release.where):
+    with explain_errors("list events", release.where):
         events = release.core.list_namespaced_event(
             release.namespace,
             field_selector=f"involvedObject.kind={kind},involvedObject.name={name}",
@@ -236,7 +236,7 @@ def operator_token(release: Release) -> str:
         ClusterError: If it cannot be read; the message never contains a token.
     """
     name = secret_name(release)
-    with explained("get secrets", release.where):
+    with explain_errors("get secrets", release.where):
         secret = release.core.read_namespaced_secret(
             name, release.namespace, _request_timeout=REQUEST_TIMEOUT
         )
@@ -253,7 +253,7 @@ def operator_token(release: Release) -> str:
 
 API_PORT = 8080
 """TCP port of teleop's API in the cloud pod."""
-DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """Opens URLs on this machine, without the proxy of the environment."""
 START_LIMIT = 20.0
 """Time limit for kubectl to forward the ports [s]."""
@@ -326,7 +326,7 @@ def _wait_until_open(
         if process.poll() is not None:
             raise _NotOpenError
         if time.monotonic() > until:
-            raise WaitedTooLongError(
+            raise ExpiredError(
                 f"kubectl port-forward to pod '{pod}' has not started within {START_LIMIT:g} s"
             )
         time.sleep(LOOK_PERIOD)
@@ -376,7 +376,7 @@ def fetch_recording(release: Release, component: str, target: Path) -> None:
     _copy(release, component, find_pod(release, component).metadata.name, "", target)
 
 
-def fetch_before(release: Release, component: str, target: Path) -> bool:
+def fetch_previous_recording(release: Release, component: str, target: Path) -> bool:
     """Copy the recording that the container made before its last restart.
 
     Args:
@@ -424,7 +424,7 @@ def fetch_metrics(release: Release, component: str) -> dict[str, str]:
         for container, port in ports.items():
             url = f"http://127.0.0.1:{local[port]}/metrics"
             try:
-                with DIRECTLY.open(url, timeout=SCRAPE_LIMIT) as answer:
+                with NO_PROXY.open(url, timeout=SCRAPE_LIMIT) as answer:
                     texts[container] = answer.read().decode()
             except (urllib.error.URLError, OSError) as error:
                 raise ClusterError(
@@ -443,7 +443,7 @@ def fetch_logs(release: Release, component: str) -> dict[str, str]:
     names = [c.name for c in [*(pod.spec.init_containers or []), *pod.spec.containers]]
     texts = {}
     for name in names:
-        with explained("get pods/log", release.where):
+        with explain_errors("get pods/log", release.where):
             texts[name] = release.core.read_namespaced_pod_log(
                 pod.metadata.name, release.namespace, container=name, _request_timeout=LOG_LIMIT
             )

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cluster.client import REQUEST_TIMEOUT, Release
-from cloudrc.cluster.pods import is_ready, list_pods, missing_secret, trouble
-from cloudrc.cluster.tools import ClusterError, WaitedTooLongError, explained, insist, run
+from cloudrc.cluster.pods import is_ready, list_pods, missing_secret, pod_failure
+from cloudrc.cluster.tools import ClusterError, ExpiredError, explain_errors, retry, run
 
 COMPONENTS = ("world", "cloud")
 LOOK_PERIOD = 1.0
@@ -26,7 +26,7 @@ HINTS = {
     "already exists": "is it another release's? see: helm list --all-namespaces",
 }
 """Words in an error message of helm -> what to do next."""
-PATIENCE = 5.0
+FAILURE_TIME = 5.0
 """Time for which a failure must last to be reported: a Secret may appear after its pod [s]."""
 
 
@@ -97,18 +97,18 @@ def wait_ready(
     """
     until, failing_since, last = time.monotonic() + timeout, None, ""
     while True:
-        states = insist(lambda: {each: _state(release, each) for each in COMPONENTS}, tell)
+        states = retry(lambda: {each: _state(release, each) for each in COMPONENTS}, tell)
         waiting = {component: why for component, (why, _) in states.items() if why}
         if not waiting:
             return
         now = time.monotonic()
         fatal = [f"the {c} pod cannot run: {w}" for c, (w, bad) in states.items() if bad]
         failing_since = (failing_since or now) if fatal else None
-        if failing_since is not None and now - failing_since >= PATIENCE:
+        if failing_since is not None and now - failing_since >= FAILURE_TIME:
             raise ClusterError(f"{'; '.join(fatal)}; see: {_describe(release)}")
         words = "; ".join(f"{component}: {why}" for component, why in waiting.items())
         if now > until:
-            raise WaitedTooLongError(
+            raise ExpiredError(
                 f"release '{release.name}' is not ready after {timeout:g} s: {words}; "
                 f"see: {_describe(release)}, or wait longer: --timeout"
             )
@@ -131,7 +131,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
         return refused, True
     pods = list_pods(release, component)
     for pod in pods:
-        why = trouble(pod) or missing_secret(release, pod)
+        why = pod_failure(pod) or missing_secret(release, pod)
         if why:
             return why, True
     status = deployment.status
@@ -143,7 +143,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
 
 
 def _deployment(release: Release, component: str) -> Any:
-    with explained("list deployments", release.where):
+    with explain_errors("list deployments", release.where):
         found = release.apps.list_namespaced_deployment(
             release.namespace,
             label_selector=release.selector(component),

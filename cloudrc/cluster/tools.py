@@ -37,18 +37,18 @@ class ClusterError(CloudrcError):
     exit_code = 5
 
 
-class AwayError(ClusterError):
+class UnavailableError(ClusterError):
     """The API server does not answer or is overloaded; a later try may succeed."""
 
 
-class WaitedTooLongError(CloudrcError):
+class ExpiredError(CloudrcError):
     """A timeout expired."""
 
     exit_code = 4
 
 
 @contextmanager
-def explained(doing: str, where: str) -> Iterator[None]:
+def explain_errors(doing: str, where: str) -> Iterator[None]:
     """Convert exceptions of the Kubernetes client to a ClusterError with one sentence.
 
     Args:
@@ -68,10 +68,10 @@ def explained(doing: str, where: str) -> Iterator[None]:
     except ApiException as error:
         status = int(error.status or 0)
         away = status == TOO_MANY_REQUESTS or status >= SERVER_ERROR
-        kind = AwayError if away else ClusterError
+        kind = UnavailableError if away else ClusterError
         raise kind(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
     except (HTTPError, OSError) as error:
-        raise AwayError(
+        raise UnavailableError(
             f"cannot {doing} {where}: the API server does not answer ({_root(error)}); "
             "is the cluster up? ask it: kubectl cluster-info"
         ) from error
@@ -79,7 +79,7 @@ def explained(doing: str, where: str) -> Iterator[None]:
         raise ClusterError(f"cannot {doing} {where}: {_first_line(str(error))}") from error
 
 
-def insist(ask: Callable[[], _Answer], tell: Callable[[str], None]) -> _Answer:
+def retry(ask: Callable[[], _Answer], tell: Callable[[str], None]) -> _Answer:
     """Repeat a request while the API server does not answer, for `OUTAGE_MAX` at most.
 
     Args:
@@ -93,7 +93,7 @@ def insist(ask: Callable[[], _Answer], tell: Callable[[str], None]) -> _Answer:
     while True:
         try:
             return ask()
-        except AwayError as error:
+        except UnavailableError as error:
             if until is None:
                 until = time.monotonic() + OUTAGE_MAX
                 tell(f"{error}; trying again for {OUTAGE_MAX:g} s")
@@ -180,9 +180,7 @@ def run(
             command, input=given.encode(), stdout=target, stderr=subprocess.PIPE, timeout=timeout
         )
     except subprocess.TimeoutExpired as error:
-        raise WaitedTooLongError(
-            f"'{_short(name, arguments)}' took more than {timeout:g} s"
-        ) from error
+        raise ExpiredError(f"'{_short(name, arguments)}' took more than {timeout:g} s") from error
     if done.returncode != 0:
         message = last_words(done.stderr.decode(errors="replace"))
         raise ClusterError(f"'{_short(name, arguments)}' failed: {message}")

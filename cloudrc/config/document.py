@@ -23,7 +23,7 @@ KeyPath = tuple[str, ...]
 
 SIZE_MAX = 8 << 20
 """Largest file that is read [bytes]: four times a mission with MAX_WAYPOINTS waypoints."""
-SETTING = "--set"
+SET_LABEL = "--set"
 """Label of a value that was set on the command line."""
 
 _SCALARS = (
@@ -70,7 +70,7 @@ for _tag, _pattern, _first in _SCALARS:
 _Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
 
 
-def parse(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
+def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
     """Parse one YAML document.
 
     Args:
@@ -97,7 +97,7 @@ def parse(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
         raise BadInputError(f"{name}: not readable as YAML: {reason}") from error
 
 
-def write(value: Any) -> str:
+def write_yaml(value: Any) -> str:
     """Write plain values as YAML; `parse` returns equal values."""
     return yaml.dump(
         value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None,
@@ -197,7 +197,7 @@ class Document:
     def source(self, path: KeyPath) -> Source:
         """Find the place of a value: a `--set` at or below `path`, else the nearest place above."""
         for key, source in self.sources.items():
-            if source.label == SETTING and key[: len(path)] == path:
+            if source.label == SET_LABEL and key[: len(path)] == path:
                 return source
         for length in range(len(path), -1, -1):
             if path[:length] in self.sources:
@@ -213,7 +213,7 @@ class Document:
             value = value.get(key)
         return value
 
-    def graft(self, path: KeyPath, value: Any, origin: Document | Source) -> None:
+    def set_value(self, path: KeyPath, value: Any, origin: Document | Source) -> None:
         """Set the value at `path`; its parents must exist.
 
         Args:
@@ -240,7 +240,7 @@ class Document:
             del self.sources[key]
 
 
-def read(path: Path, name: str) -> Document:
+def read_document(path: Path, name: str) -> Document:
     """Read a YAML file whose top level is a mapping.
 
     Args:
@@ -265,7 +265,7 @@ def read(path: Path, name: str) -> Document:
         raise BadInputError(
             f"{name}: waypoints: {points}: at most {MAX_WAYPOINTS}; split the mission"
         )
-    tree, lines = parse(text, name)
+    tree, lines = parse_yaml(text, name)
     if not isinstance(tree, dict):
         raise BadInputError(f"{name}: must be a mapping of keys to values")
     folder = path.resolve().parent

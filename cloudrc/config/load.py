@@ -20,8 +20,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
 from cloudrc.config import overrides, problems, shipped
-from cloudrc.config.document import Document, KeyPath
-from cloudrc.config.document import write as write_yaml
+from cloudrc.config.document import Document, KeyPath, write_yaml
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import (
@@ -106,7 +105,7 @@ class ResolvedExperiment(Experiment):
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _DIRECTIONS = ("uplink", "downlink")
-FILES: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
+FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
 """Key of a direction whose value is a path -> function that reads the file."""
 
 
@@ -123,7 +122,7 @@ def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedE
     Raises:
         BadInputError: One line, or a summary and one line for each problem.
     """
-    return _load_experiment(str(name), settings, overrides.resolve)
+    return _load_experiment(str(name), settings, overrides.resolve_plugins)
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
@@ -132,7 +131,7 @@ def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedE
     As `load_experiment`, but plug-ins are neither imported nor checked, and have only the
     parameters that the file gives. The config.yaml of a run gives all of them.
     """
-    return _load_experiment(str(name), settings, overrides.leave)
+    return _load_experiment(str(name), settings, overrides.name_plugins)
 
 
 def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
@@ -175,16 +174,16 @@ def _load_experiment(
     name: str, settings: Iterable[str], plug_ins: Callable[[Document], list[Problem]]
 ) -> ResolvedExperiment:
     document = shipped.read("experiment", name, Path())
-    changes = overrides.parse(settings)
+    changes = overrides.parse_settings(settings)
     _default(document, ("name",), Path(name).stem)
     outer = [change for change in changes if not change.inside_name]
     if any(change.path in (("link",), ("link", "profile")) for change in outer):
         _remove_profile_values(document)
-    overrides.apply(document, outer)
+    overrides.apply_overrides(document, outer)
     for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
     found = [*_inline_mission(document), *_inline_profile(document)]
-    overrides.apply(document, [change for change in changes if change.inside_name])
+    overrides.apply_overrides(document, [change for change in changes if change.inside_name])
     for key in overrides.KINDS:
         _default(document, ("cloud", key), Experiment().cloud.model_dump()[key])
     overrides.locate_metrics(document)
@@ -196,7 +195,7 @@ def _load_experiment(
         Problem(("mission", *problem.path), problem.value, problem.reason)
         for problem in check_mission(experiment.mission, scene)
     ]
-    problems.refuse(document, wrong, name)
+    problems.raise_problems(document, wrong, name)
     return experiment
 
 
@@ -220,14 +219,14 @@ def _validate(document: Document, model: type[_Model], name: str, found: list[Pr
             for problem in problems.from_pydantic(error, file_model)
             if problem.path not in known
         ]
-    problems.refuse(document, found, name)
+    problems.raise_problems(document, found, name)
     assert result is not None
     return result
 
 
 def _default(document: Document, path: KeyPath, value: Any) -> None:
     if document.get(*path) is None and isinstance(document.get(*path[:-1]), dict):
-        document.graft(path, value, document.source(path))
+        document.set_value(path, value, document.source(path))
 
 
 def _inline_mission(document: Document) -> list[Problem]:
@@ -243,7 +242,7 @@ def _inline_mission(document: Document) -> list[Problem]:
         _validate(mission, Mission, name, [])
     except BadInputError as error:
         return [Problem(("mission",), "", str(error))]
-    document.graft(("mission",), mission.tree, mission)
+    document.set_value(("mission",), mission.tree, mission)
     return []
 
 
@@ -260,7 +259,7 @@ def _inline_profile(document: Document) -> list[Problem]:
     except BadInputError as error:
         return [Problem(("link", "profile"), "", str(error))]
     if shipped.is_path(name):
-        document.graft(("link", "profile"), str(source.absolute(name)), source)
+        document.set_value(("link", "profile"), str(source.absolute(name)), source)
     for key in _DIRECTIONS:
         if isinstance(given[key], dict | None):
             _fill_from(document, ("link", key), file, key)
@@ -318,15 +317,15 @@ def _remove_profile_values(document: Document) -> None:
 def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
     """Make the paths of traces and tables absolute; check that the files can be read."""
     found = []
-    for path in ((*above, key, name) for key in _DIRECTIONS for name in FILES):
+    for path in ((*above, key, name) for key in _DIRECTIONS for name in FILE_READERS):
         given = document.get(*path)
         if not isinstance(given, str):
             continue
         source = document.source(path)
         absolute = source.absolute(given)
-        document.graft(path, str(absolute), source)
+        document.set_value(path, str(absolute), source)
         try:
-            FILES[path[-1]](absolute)
+            FILE_READERS[path[-1]](absolute)
         except BadInputError as error:
             found.append(Problem(path, "", str(error)))
     return found

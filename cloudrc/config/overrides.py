@@ -22,8 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from cloudrc import plugins
 from cloudrc.config import problems
-from cloudrc.config.document import SETTING, Document, KeyPath, Source
-from cloudrc.config.document import parse as parse_yaml
+from cloudrc.config.document import SET_LABEL, Document, KeyPath, Source, parse_yaml
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Direction, Experiment, PlugIn
 from cloudrc.errors import BadInputError
@@ -54,7 +53,7 @@ class Override:
         return inside_mission or (self.path[:2] in _DIRECTIONS and len(self.path) > 2)
 
 
-def parse(texts: Iterable[str]) -> list[Override]:
+def parse_settings(texts: Iterable[str]) -> list[Override]:
     """Read `key=value` texts, values as YAML; shorter keys come first.
 
     Raises:
@@ -66,13 +65,13 @@ def parse(texts: Iterable[str]) -> list[Override]:
         path = tuple(part.strip() for part in key.split("."))
         if not equals or not all(path):
             raise BadInputError(
-                f"{SETTING} {text}: must be key=value; for example cloud.predictor=last_sample"
+                f"{SET_LABEL} {text}: must be key=value; for example cloud.predictor=last_sample"
             )
-        result.append(Override(path, parse_yaml(value, f"{SETTING} {key}")[0]))
+        result.append(Override(path, parse_yaml(value, f"{SET_LABEL} {key}")[0]))
     return sorted(result, key=lambda override: len(override.path))
 
 
-def apply(document: Document, overrides: Iterable[Override]) -> None:
+def apply_overrides(document: Document, overrides: Iterable[Override]) -> None:
     """Set values in a document.
 
     Args:
@@ -85,7 +84,7 @@ def apply(document: Document, overrides: Iterable[Override]) -> None:
     for override in overrides:
         _make_parents(document, override.path)
         value = copy.deepcopy(override.value)
-        document.graft(override.path, value, Source(SETTING, Path.cwd()))
+        document.set_value(override.path, value, Source(SET_LABEL, Path.cwd()))
 
 
 def is_spelled_out(direction: Any) -> bool:
@@ -109,7 +108,7 @@ def _make_parents(document: Document, path: KeyPath) -> None:
         if not isinstance(child, dict | list):
             child = [] if path[depth + 1] == "0" else {}
             document.forget_sources(path[: depth + 1])
-            document.sources[path[: depth + 1]] = Source(SETTING, Path.cwd())
+            document.sources[path[: depth + 1]] = Source(SET_LABEL, Path.cwd())
         node = _put(node, key, child)
 
 
@@ -121,7 +120,7 @@ def _check_index(node: Any, path: KeyPath, depth: int) -> None:
         parent = ".".join(path[:depth])
         entries = f"entries 0 to {len(node) - 1}" if node else "no entries"
         raise BadInputError(
-            f"{SETTING}: {parent}.{key}: {parent} is a list with {entries}; "
+            f"{SET_LABEL}: {parent}.{key}: {parent} is a list with {entries}; "
             f"use one of these, or {len(node)} to append"
         )
     if int(key) == len(node):
@@ -141,7 +140,7 @@ def _put(node: Any, key: str, child: Any) -> Any:
     return child
 
 
-def resolve(document: Document) -> list[Problem]:
+def resolve_plugins(document: Document) -> list[Problem]:
     """Replace each plug-in of an experiment by a mapping with its name and all its parameters.
 
     Args:
@@ -165,7 +164,7 @@ def resolve(document: Document) -> list[Problem]:
     return found
 
 
-def leave(document: Document) -> list[Problem]:
+def name_plugins(document: Document) -> list[Problem]:
     """Replace each plug-in by a mapping as `resolve` does, with the given parameters only.
 
     Nothing is imported: file and plug-ins may come from somebody else.
@@ -188,7 +187,7 @@ def locate_metrics(document: Document) -> None:
             names[index] = str(source.absolute(name))
 
 
-def build(kind: str, choice: PlugIn) -> Any:
+def build_plugin(kind: str, choice: PlugIn) -> Any:
     """Build a plug-in of a resolved experiment; converts parameters to the types of its `build`.
 
     Args:

@@ -204,7 +204,7 @@ def from_pydantic(
     return [_problem(detail, model, prefix) for detail in details]
 
 
-def refuse(document: Document, problems: Iterable[Problem], name: str) -> None:
+def raise_problems(document: Document, problems: Iterable[Problem], name: str) -> None:
     """Raise a BadInputError that lists all problems with their places; do nothing without any."""
     every = _deepest(problems)
     lines = [f"{document.source(problem.path).label}: {problem}" for problem in every[:_LISTED]]

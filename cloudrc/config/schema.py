@@ -32,12 +32,12 @@ CommandAge = Annotated[
 Speed = Annotated[float, Field(ge=0.01, le=10, allow_inf_nan=False)]
 Acceleration = Annotated[float, Field(ge=0.1, le=100, allow_inf_nan=False)]
 YawRate = Annotated[float, Field(ge=0.01, le=10, allow_inf_nan=False)]
-Patience = Annotated[float, Field(ge=0.1, le=3600, allow_inf_nan=False)]
+HoldTime = Annotated[float, Field(ge=0.1, le=3600, allow_inf_nan=False)]
 DURATION_MAX = 1_000_000
 """Largest value for a time limit or a dwell in a mission [s]: eleven days."""
-Stay = Annotated[float, Field(ge=0, le=DURATION_MAX, allow_inf_nan=False)]
-Limit = Annotated[float, Field(gt=0, le=DURATION_MAX, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Dwell = Annotated[float, Field(ge=0, le=DURATION_MAX, allow_inf_nan=False)]
+TimeLimit = Annotated[float, Field(gt=0, le=DURATION_MAX, allow_inf_nan=False)]
+Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 class Section(BaseModel):
@@ -49,17 +49,17 @@ class Section(BaseModel):
 class GilbertElliott(Section):
     """Loss in bursts: a two-state Markov chain that takes one step per packet."""
 
-    bad_start: Share = Field(
+    bad_start: Probability = Field(
         description="Chance per packet that the good state turns bad, 0 to 1; 0: no burst begins"
     )
-    bad_end: Share = Field(
+    bad_end: Probability = Field(
         description="Chance per packet that the bad state turns good, 0 to 1; a burst has "
         "1 / bad_end packets on average. Must be above 0 if bad_start is"
     )
-    loss_bad: Share = Field(
+    loss_bad: Probability = Field(
         1.0, description="Chance that a packet is lost in the bad state, 0 to 1; 1: all are lost"
     )
-    loss_good: Share = Field(
+    loss_good: Probability = Field(
         0.0, description="Chance that a packet is lost in the good state, 0 to 1; 0: none is lost"
     )
     delay_bad_ms: NotNegative = Field(
@@ -78,7 +78,7 @@ def _loss_tag(value: Any) -> str:
 
 
 Loss = Annotated[
-    Annotated[Share, Tag("<chance>")] | Annotated[GilbertElliott, Tag("<bursts>")],
+    Annotated[Probability, Tag("<chance>")] | Annotated[GilbertElliott, Tag("<bursts>")],
     Discriminator(_loss_tag),
 ]
 
@@ -129,21 +129,21 @@ class Direction(Section):
         description="CSV file as for `trace`; its delays, shifted to mean 0 and scaled to "
         "`jitter_ms`, are the distribution. Needed with distribution: table",
     )
-    correlation: Share = Field(
+    correlation: Probability = Field(
         0.0, description="Correlation of a packet's jitter with the next packet's, 0 to 1"
     )
     loss: Loss = Field(
         0.0, description="Loss: a chance per packet from 0 to 1, or a mapping for loss in bursts"
     )
-    duplicate: Share = Field(
+    duplicate: Probability = Field(
         0.0, description="Chance that a packet arrives twice, 0 to 1; the copy has its own delay"
     )
-    reorder: Share = Field(
+    reorder: Probability = Field(
         0.0,
         description="Chance that a packet has no delay and overtakes others, 0 to 1; "
         "no effect with keep_order",
     )
-    corrupt: Share = Field(
+    corrupt: Probability = Field(
         0.0,
         description="Chance that one bit of a packet is flipped, 0 to 1; the receiver refuses "
         "such a packet",
@@ -245,10 +245,10 @@ class Waypoint(Section):
     tolerance_m: Positive = Field(
         0.10, description="Distance from the point at which it counts as reached [m]"
     )
-    dwell_s: Stay = Field(
+    dwell_s: Dwell = Field(
         0.5, description="Time that the robot must stay within the tolerance [s]; 0: it flies on"
     )
-    time_limit_s: Limit | None = Field(
+    time_limit_s: TimeLimit | None = Field(
         None,
         description="Time limit for the leg to this point [s]; a HOLD does not count. Beyond it "
         "the mission fails. null: 3 times the expected time",
@@ -259,7 +259,7 @@ class Steps(Section):
     """Random setpoints in sequence, drawn from the seed, to compare predictors."""
 
     count: Annotated[int, Field(ge=1, le=1000)] = Field(10, description="Number of setpoints")
-    period_s: Limit = Field(
+    period_s: TimeLimit = Field(
         4.0, description="Time between two setpoints [s], whether or not the first was reached"
     )
     centre_m: tuple[Finite, Finite, Finite] = Field(
@@ -357,7 +357,7 @@ class Guard(Section):
     yaw_rate_max_radps: YawRate = Field(
         1.0, description="Cap on the commanded yaw rate [rad/s]; a faster command is shortened"
     )
-    hold_max_s: Patience = Field(
+    hold_max_s: HoldTime = Field(
         60.0,
         description="Time in HOLD during a mission after which the robot lands [s]. On the ground "
         "the mission ends after the same time without a fresh command, at least 10 s. Below 1 s "
@@ -425,7 +425,7 @@ class Criteria(Section):
     contact_speed_max_mps: Positive = Field(
         0.25, description="Largest speed of the tip at that touch [m/s]; a faster one is a failure"
     )
-    time_limit_s: Limit = Field(
+    time_limit_s: TimeLimit = Field(
         60.0, description="Time limit of the mission [s], counted from its start; then it fails"
     )
 

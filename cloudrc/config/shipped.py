@@ -47,9 +47,9 @@ def read(kind: str, name: str, folder: Path) -> Document:
         path = folder / os.path.expanduser(name)
         if not os.path.exists(path):  # False, not an exception, for an impossible name
             raise BadInputError(f"no such file: {path}; {_shipped_names(kind, path.stem)}")
-        return document.read(path, name)
+        return document.read_document(path, name)
     check_name(kind, name)
-    return document.read(FOLDERS[kind] / f"{name}.yaml", f"{name}.yaml")
+    return document.read_document(FOLDERS[kind] / f"{name}.yaml", f"{name}.yaml")
 
 
 def check_name(kind: str, name: str) -> None:

@@ -31,8 +31,8 @@ from prometheus_client.metrics_core import Metric as Family
 
 from cloudrc import __version__
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.exposition.live import Live
-from cloudrc.exposition.parts import Histogram, Readings, plain
+from cloudrc.exposition.live import LiveMetrics
+from cloudrc.exposition.parts import Histogram, Readings, unlabelled
 from cloudrc.exposition.table import Kind, Labels, Metric, of_role
 from cloudrc.records import Counted, Record
 
@@ -227,7 +227,7 @@ class Exporter:
                 teleop, which exports them.
         """
         self._role, self._metrics = role, of_role(role)
-        self._live = Live(role, missions=missions)
+        self._live = LiveMetrics(role, missions=missions)
         self._sync_age: Callable[[], float | None] = lambda: None
         self._said_ready, self._config = False, ""
         self._seen_at: float | None = None  # None: the loop has not begun, so it is not dead
@@ -324,15 +324,15 @@ class Exporter:
     def _process_readings(self) -> Readings:
         readings: Readings = {
             "cloudrc_build_info": {(__version__, self._role, self._config): 1.0},
-            "cloudrc_ready": plain(self.is_ready),
+            "cloudrc_ready": unlabelled(self.is_ready),
         }
         if (age := self._sync_age()) is not None:
-            readings["cloudrc_recorder_sync_age_seconds"] = plain(age)
+            readings["cloudrc_recorder_sync_age_seconds"] = unlabelled(age)
         throttling = read_throttling()
         if throttling is not None:
-            readings["cloudrc_cpu_periods_total"] = plain(throttling.periods)
-            readings["cloudrc_cpu_throttled_periods_total"] = plain(throttling.throttled)
-            readings["cloudrc_cpu_throttled_seconds_total"] = plain(throttling.seconds)
+            readings["cloudrc_cpu_periods_total"] = unlabelled(throttling.periods)
+            readings["cloudrc_cpu_throttled_periods_total"] = unlabelled(throttling.throttled)
+            readings["cloudrc_cpu_throttled_seconds_total"] = unlabelled(throttling.seconds)
         return readings
 
     def text(self) -> str:

@@ -41,7 +41,7 @@ class KeyFile:
         self._keys = read_keys(path)
         self._due_ns, self._trouble = now_ns, ""
         self.ring = KeyRing(self._keys, now_ns, wall)
-        self._caution = "" if wall is None else self._keys.caution(wall)
+        self._caution = "" if wall is None else self._keys.warning(wall)
 
     def follow(self, now_ns: int) -> list[Fault]:
         """Check the file for changes, if a check is due at `now_ns` [ns, monotonic clock].

@@ -12,14 +12,14 @@ from heapq import heappop, heappush
 from math import isfinite, nan
 
 from cloudrc.exposition.parts import (
+    DatagramTally,
     Handlers,
     Histogram,
     Readings,
-    Stream,
     by_label,
     per_axis,
-    plain,
     select,
+    unlabelled,
     unless_nan,
 )
 from cloudrc.exposition.table import (
@@ -59,7 +59,7 @@ _LEFT_OUT = ("stamp_ns", "uplink")
 """Fields that /link.json leaves out of its rows: the same for all rows, or of no use."""
 
 
-class Check:
+class LinkVerdict:
     """The newest verdict on an end's incoming direction of the link."""
 
     def __init__(self, direction: str) -> None:
@@ -119,8 +119,8 @@ class End:
         others = ONLY_CLOUD if incoming == DIRECTIONS[1] else ONLY_WORLD
         self._outcomes = tuple(name for name in OUTCOMES[1:] if name not in others)
         self._counts: dict[str, int] = {}
-        self._stream = Stream()
-        self.check = Check(incoming)
+        self._stream = DatagramTally()
+        self.check = LinkVerdict(incoming)
         self._one_way, self._age = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
         self._gap = Histogram(GAP_BUCKETS)
         self._period, self._lateness = Histogram(PERIOD_BUCKETS), Histogram(LATENESS_BUCKETS)
@@ -194,8 +194,8 @@ class End:
         datagrams: dict[Labels, float] = {(*incoming, name): n for name, n in received.items()}
         datagrams[self._outgoing, "sent"] = counts.get("sent", 0)
         readings: Readings = self.check.read() | {
-            "cloudrc_session_epoch": plain(self._epoch),
-            "cloudrc_sessions_opened_total": plain(self._sessions),
+            "cloudrc_session_epoch": unlabelled(self._epoch),
+            "cloudrc_sessions_opened_total": unlabelled(self._sessions),
             "cloudrc_datagrams_total": datagrams,
             "cloudrc_datagrams_expected_total": {incoming: stream.expected},
             "cloudrc_datagrams_lost_total": {incoming: stream.lost},
@@ -203,9 +203,9 @@ class End:
             "cloudrc_link_gap_seconds": self._gap,
             "cloudrc_loop_period_seconds": self._period,
             "cloudrc_loop_lateness_seconds": self._lateness,
-            "cloudrc_loop_busy_seconds_total": plain(self._busy),
-            "cloudrc_clock_steps_total": plain(self._clock_steps),
-            "cloudrc_recorder_dropped_records_total": plain(counts.get("recorder_dropped", 0)),
+            "cloudrc_loop_busy_seconds_total": unlabelled(self._busy),
+            "cloudrc_clock_steps_total": unlabelled(self._clock_steps),
+            "cloudrc_recorder_dropped_records_total": unlabelled(counts.get("recorder_dropped", 0)),
         }
         if self._one_way.cumulative()[-1]:  # unknown without a shared clock: absent, never zero
             readings[f"cloudrc_{self._incoming}_delay_seconds"] = self._one_way
@@ -290,26 +290,26 @@ class WorldEnd(End):
         """See `Part`."""
         readings = super().read()
         readings |= {
-            "cloudrc_clouds_admitted_total": plain(self._admitted),
-            "cloudrc_sessions_refused_total": plain(self._counts.get("busy", 0)),
+            "cloudrc_clouds_admitted_total": unlabelled(self._admitted),
+            "cloudrc_sessions_refused_total": unlabelled(self._counts.get("busy", 0)),
             "cloudrc_command_age_seconds": self._command_age,
-            "cloudrc_guard_state": plain(self._guard),
+            "cloudrc_guard_state": unlabelled(self._guard),
             "cloudrc_guard_transitions_total": by_label(self._changes),
             "cloudrc_guard_limited_total": by_label(
                 {limit: self._counts.get(f"limited_{limit}", 0) for limit in LIMITS}
             ),
-            "cloudrc_guard_held_seconds_total": plain(self._counts.get("held_seconds", 0)),
-            "cloudrc_guard_starts_refused_total": plain(self._counts.get("start_refused", 0)),
+            "cloudrc_guard_held_seconds_total": unlabelled(self._counts.get("held_seconds", 0)),
+            "cloudrc_guard_starts_refused_total": unlabelled(self._counts.get("start_refused", 0)),
             "cloudrc_contacts_total": by_label(self._contacts),
-            "cloudrc_world_slip_seconds_total": plain(self._slip_ns * 1e-9),
-            "cloudrc_world_stalls_total": plain(self._counts.get("stalls", 0)),
+            "cloudrc_world_slip_seconds_total": unlabelled(self._slip_ns * 1e-9),
+            "cloudrc_world_stalls_total": unlabelled(self._counts.get("stalls", 0)),
         }
         if self._truth is not None:
             readings["cloudrc_position_meters"] = per_axis(self._truth.odometry.position)
-            readings["cloudrc_tip_force_newtons"] = plain(self._truth.tip_force)
+            readings["cloudrc_tip_force_newtons"] = unlabelled(self._truth.tip_force)
         factor = self._real_time_factor()
         if factor is not None:
-            readings["cloudrc_real_time_factor"] = plain(factor)
+            readings["cloudrc_real_time_factor"] = unlabelled(factor)
         return readings
 
     def _real_time_factor(self) -> float | None:
@@ -462,12 +462,12 @@ class CloudEnd(End):
             "cloudrc_loop_delay_seconds": self._loop,
             "cloudrc_delay_estimate_error_seconds": unless_nan(self._delay.error),
             "cloudrc_prediction_error_meters": per_axis(prediction.error),
-            "cloudrc_prediction_error_square_meters_total": plain(prediction.square),
-            "cloudrc_predictions_judged_total": plain(prediction.judged),
-            "cloudrc_horizon_clamped_total": plain(counts.get("horizon_clamped", 0)),
-            "cloudrc_commands_frozen_total": plain(counts.get("frozen", 0)),
-            "cloudrc_words_dropped_total": plain(counts.get("words_dropped", 0)),
-            "cloudrc_loop_missed_periods_total": plain(counts.get("missed_periods", 0)),
+            "cloudrc_prediction_error_square_meters_total": unlabelled(prediction.square),
+            "cloudrc_predictions_judged_total": unlabelled(prediction.judged),
+            "cloudrc_horizon_clamped_total": unlabelled(counts.get("horizon_clamped", 0)),
+            "cloudrc_commands_frozen_total": unlabelled(counts.get("frozen", 0)),
+            "cloudrc_words_dropped_total": unlabelled(counts.get("words_dropped", 0)),
+            "cloudrc_loop_missed_periods_total": unlabelled(counts.get("missed_periods", 0)),
             "cloudrc_plugin_failures_total": {
                 (plugin,): counts.get(f"{plugin}_failed", 0) for plugin in PLUGINS
             },

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from cloudrc.exposition.ends import CloudEnd, End, WorldEnd
-from cloudrc.exposition.parts import Handlers, Part, Readings, by_label, plain, select
+from cloudrc.exposition.parts import Handlers, Part, Readings, by_label, select, unlabelled
 from cloudrc.exposition.table import (
     API_REFUSALS,
     CLOUD,
@@ -49,14 +49,14 @@ class Api:
         """See `Part`."""
         counts = {name.removeprefix("api_"): count for name, count in self._counts.items()}
         return {
-            "cloudrc_api_requests_total": plain(counts.get("served", 0)),
+            "cloudrc_api_requests_total": unlabelled(counts.get("served", 0)),
             "cloudrc_api_rejected_total": by_label(select(API_REFUSALS, counts)),
             "cloudrc_missions_refused_total": by_label(
                 {reason: counts.get(f"order_{reason}", 0) for reason in ORDER_REFUSALS}
             ),
-            "cloudrc_stream_dropped_events_total": plain(counts.get("events_dropped", 0)),
-            "cloudrc_audit_dropped_total": plain(counts.get("audit_dropped", 0)),
-            "cloudrc_journal_repaired_total": plain(counts.get("journal_repaired", 0)),
+            "cloudrc_stream_dropped_events_total": unlabelled(counts.get("events_dropped", 0)),
+            "cloudrc_audit_dropped_total": unlabelled(counts.get("audit_dropped", 0)),
+            "cloudrc_journal_repaired_total": unlabelled(counts.get("journal_repaired", 0)),
         }
 
 
@@ -112,7 +112,7 @@ class Link:
             "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
             "cloudrc_link_delay_seconds": by_label(dict(self._delays)),
             "cloudrc_link_datagrams_total": by_label(select(LINK_OUTCOMES, self._counts)),
-            "cloudrc_dns_errors_total": plain(self._counts.get("unresolved", 0)),
+            "cloudrc_dns_errors_total": unlabelled(self._counts.get("unresolved", 0)),
             "cloudrc_link_release_error_seconds": self._percentiles(
                 "release_error", RELEASE_PERCENTILES
             ),
@@ -125,7 +125,9 @@ class Link:
         """Read the counts that only the relay or only netem has; absent if never counted."""
         counts = dict(self._counts)  # one atomic copy: the loop's thread may count on
         return {
-            name: plain(counts[one]) for name, one in _SINGLE_SHAPER_COUNTS.items() if one in counts
+            name: unlabelled(counts[one])
+            for name, one in _SINGLE_SHAPER_COUNTS.items()
+            if one in counts
         }
 
     def _percentiles(self, quantity: str, percentiles: Mapping[str, str]) -> dict[Labels, float]:
@@ -186,14 +188,14 @@ class Mission:
         if not self._shown:
             return {}
         return {
-            "cloudrc_mission_state": plain(MISSION_STATES.index(self._state)),
-            "cloudrc_mission_waypoint": plain(self._waypoint),
-            "cloudrc_waypoints_reached_total": plain(self._reached),
+            "cloudrc_mission_state": unlabelled(MISSION_STATES.index(self._state)),
+            "cloudrc_mission_waypoint": unlabelled(self._waypoint),
+            "cloudrc_waypoints_reached_total": unlabelled(self._reached),
             "cloudrc_missions_total": by_label(self._ended),
         }
 
 
-class Live:
+class LiveMetrics:
     """Current values of one role's metrics; one thread feeds it, any other thread may read it.
 
     Attributes:

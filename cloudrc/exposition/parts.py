@@ -60,7 +60,7 @@ class Part(Protocol):
         """Return the current values; unknown values are absent."""
 
 
-def plain(value: float) -> dict[Labels, float]:
+def unlabelled(value: float) -> dict[Labels, float]:
     """Return a reading without labels of `value` [base unit of the metric]."""
     return {(): value}
 
@@ -92,7 +92,7 @@ _MASK = (1 << WINDOW) - 1
 _OLDEST = 1 << (WINDOW - 1)
 
 
-class Stream:
+class DatagramTally:
     """Count lost and reordered datagrams of one direction from their counters, epoch by epoch.
 
     Attributes:

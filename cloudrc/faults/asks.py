@@ -10,7 +10,7 @@ from itertools import pairwise
 from math import dist, hypot, inf, nan
 from typing import Any
 
-from cloudrc.exposition.live import Live
+from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome
@@ -42,7 +42,7 @@ def reading(role: str, records: Iterable[Record], name: str, *labels: str) -> fl
         name: Of the metric, without its prefix.
         labels: Values of its labels.
     """
-    live = Live(role)
+    live = LiveMetrics(role)
     live.see(records)
     shown = live.read().get(f"cloudrc_{name}", {})
     if isinstance(shown, Histogram):
@@ -79,7 +79,7 @@ def above(role: str, records: Iterable[Record], name: str, bound: float) -> int:
 
 def _within(role: str, records: Iterable[Record], name: str, bound: float) -> tuple[int, int]:
     """How many values of a histogram are at most a bound of its buckets, and how many there are."""
-    live = Live(role)
+    live = LiveMetrics(role)
     live.see(records)
     shown = live.read()[f"cloudrc_{name}"]
     assert isinstance(shown, Histogram)
@@ -89,7 +89,7 @@ def _within(role: str, records: Iterable[Record], name: str, bound: float) -> tu
 
 def shown(flight: Flight, role: str) -> dict[str, object]:
     """Read every metric that a process shows at the end of a flight; of a histogram its counts."""
-    live = Live(role)
+    live = LiveMetrics(role)
     live.see(flight.of_world if role == "world" else flight.of_cloud)
     return {
         name: (each.total, each.cumulative()) if isinstance(each, Histogram) else each

@@ -43,7 +43,7 @@ from cloudrc.teleop.bridge import WAITING_MAX, Call
 from cloudrc.teleop.journal import Entry, Journal
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import ConflictError, Mission, Order, UnavailableError
-from cloudrc.teleop.wire import Outcome, Output, Plan, Seen
+from cloudrc.teleop.wire import Outcome, Output, Plan, RobotStatus
 
 FAR_NS = 1 << 62
 CFS_PERIOD = 0.1
@@ -346,7 +346,7 @@ class Desk:
         if self.service is not None:
             self.service.hear(now_ns)
 
-    def see(self, seen: Seen, now_ns: int) -> None:
+    def see(self, seen: RobotStatus, now_ns: int) -> None:
         """See `cloudrc.cloud.operator.Operator`."""
         if self.service is not None:
             self.service.see(seen, now_ns)

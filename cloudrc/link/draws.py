@@ -171,7 +171,7 @@ correlation a lower value is possible, once in about 10^15 packets."""
 _HALF_ROOT = sqrt(0.5)
 
 
-def fates(
+def impairments(
     key: StreamKey, block: int, profile: DirectionProfile, jitter: float, loss: Loss
 ) -> list[Fate]:
     """Draw the impairments of the 256 packets of a block.

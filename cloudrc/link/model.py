@@ -20,7 +20,7 @@ from cloudrc.link.draws import (
     OVERTAKES,
     Fate,
     bit_flips,
-    fates,
+    impairments,
     reach,
     stream_key,
 )
@@ -221,7 +221,7 @@ class LinkDirection:
             (base + fate[0] if base + fate[0] > 0 else 0,)
             if len(fate) == 1
             else tuple([max(0, base + entry) for entry in fate])
-            for fate in fates(key, block, self._profile, constant.jitter, constant.loss)
+            for fate in impairments(key, block, self._profile, constant.jitter, constant.loss)
         ]
         _forget_oldest(self._delays)
         self._delays[epoch, kind, block] = table
@@ -232,7 +232,7 @@ class LinkDirection:
         epoch, kind, block, jitter, loss = key
         stream = stream_key(self._seed, self._uplink, epoch, kind)
         _forget_oldest(self._fates)
-        table = self._fates[key] = fates(stream, block, self._profile, jitter, loss)
+        table = self._fates[key] = impairments(stream, block, self._profile, jitter, loss)
         return table
 
 

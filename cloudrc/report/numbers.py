@@ -70,7 +70,7 @@ def table_rows(numbers: Mapping[str, Number]) -> str:
     return "\n".join(bodies)
 
 
-def handy(name: str, number: Number) -> tuple[str, str]:
+def readable(name: str, number: Number) -> tuple[str, str]:
     """Format a number in a readable unit; return its digits and the unit."""
     value, unit = number.value, number.unit
     if value == 0:
@@ -91,7 +91,7 @@ def _digits(value: float) -> str:
 
 
 def _row(name: str, number: Number) -> str:
-    digits, unit = handy(name, number)
+    digits, unit = readable(name, number)
     return (
         f"<tr><td><code>{escape(name)}</code></td>"
         f'<td class="value">{escape(digits)}</td><td class="unit">{escape(unit)}</td>'

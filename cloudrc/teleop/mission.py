@@ -37,7 +37,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
 from cloudrc.messages import MISSION_OVER, NEVER_NS, GuardState, Request, Setpoint, Start, Vector
 from cloudrc.records import MissionEvent
-from cloudrc.teleop.requests import Repeater
+from cloudrc.teleop.requests import RequestSender
 from cloudrc.teleop.wire import (
     NO_PLAN,
     Acknowledge,
@@ -52,7 +52,7 @@ from cloudrc.teleop.wire import (
     Pause,
     Plan,
     Resume,
-    Seen,
+    RobotStatus,
     StartMission,
     State,
     Verb,
@@ -99,30 +99,30 @@ def check_state(verb: Verb, state: State) -> None:
         raise BadInputError(f"{name}: the mission is {state.name}; {why}")
 
 
-def make_hold_setpoint(seen: Seen, last: Setpoint | None) -> Setpoint:
+def make_hold_setpoint(seen: RobotStatus, last: Setpoint | None) -> Setpoint:
     """Make a setpoint at the robot's position, with the yaw of the last setpoint."""
     x, y, z = seen.position
     yaw = 0.0 if last is None else last.yaw
     return Setpoint((x, y, max(z, HELD_LOWEST)), yaw, NO_WAYPOINT)
 
 
-def reached_on_board(seen: Seen, mission_id: int) -> int:
+def reached_on_board(seen: RobotStatus, mission_id: int) -> int:
     """Return how many waypoints of a mission the robot has stored as reached."""
     return seen.reached if seen.mission_id == mission_id != 0 else 0
 
 
-def is_over(seen: Seen, mission_id: int, over: int) -> bool:
+def is_over(seen: RobotStatus, mission_id: int, over: int) -> bool:
     """Whether the robot has stored that a mission is over: at least `over` waypoints reached."""
     return reached_on_board(seen, mission_id) >= over
 
 
-def may_take_off(seen: Seen) -> bool:
+def may_take_off(seen: RobotStatus) -> bool:
     """Whether the robot stands on the ground and has a mission, for which it may take off."""
     return seen.guard is GuardState.GROUND and seen.mission_id != 0
 
 
 def find_failure(
-    seen: Seen, mission_id: int, world: str, expected: tuple[int, ...], over: int
+    seen: RobotStatus, mission_id: int, world: str, expected: tuple[int, ...], over: int
 ) -> tuple[str, str] | None:
     """Return code and text of a failure that telemetry shows and that ends the mission, if any.
 
@@ -153,7 +153,7 @@ class SetpointSelector:
         is_pending: Whether the mission's first setpoint has still to be sent.
     """
 
-    def __init__(self, requests: Repeater, send: Callable[[Setpoint], None]) -> None:
+    def __init__(self, requests: RequestSender, send: Callable[[Setpoint], None]) -> None:
         """Begin without a mission.
 
         Args:
@@ -164,13 +164,13 @@ class SetpointSelector:
         self.is_pending = False
         self._requests = requests
         self._send = send
-        self._seen: Seen | None = None
+        self._seen: RobotStatus | None = None
         self._plan = NO_PLAN
         self._mission_id = 0
         self._continued = False
         self._stays = False  # whether waypoints are ignored
 
-    def see(self, seen: Seen) -> bool:
+    def see(self, seen: RobotStatus) -> bool:
         """Note the newest telemetry.
 
         Returns:
@@ -286,7 +286,7 @@ class LegWatch:
         """Time for which the leg has been flown [s]."""
         return self._flown_ns * 1e-9
 
-    def is_reached(self, leg: Leg, seen: Seen, now_ns: int) -> bool:
+    def is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
         """Whether the robot has been near the waypoint for the dwell of the leg.
 
         Args:
@@ -358,11 +358,11 @@ class Teleop:
         """Begin without a mission; `ended` tells whether the mission of a number is over."""
         self.state = State.IDLE
         self.outcome: Outcome | None = None
-        self.requests = Repeater()
+        self.requests = RequestSender()
         self.outputs: list[Output] = []
         self.leg = 0
         self._is_ended = ended
-        self._seen: Seen | None = None
+        self._seen: RobotStatus | None = None
         self._plan = NO_PLAN
         self._mission_id = 0
         self._may_be_flown = False  # whether an earlier teleop may have flown this mission
@@ -425,7 +425,7 @@ class Teleop:
                 self.requests.ask(Request.END)
                 self._setpoints.stay()  # cloud keeps this setpoint if the request is lost
 
-    def see(self, seen: Seen, now_ns: int) -> None:
+    def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry at its arrival `now_ns` [ns]."""
         before, self._seen = self._seen, seen
         new_session = self._setpoints.see(seen)
@@ -466,7 +466,7 @@ class Teleop:
         if (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
 
-    def _stop_foreign_mission(self, seen: Seen) -> None:
+    def _stop_foreign_mission(self, seen: RobotStatus) -> None:
         """Hold a robot that flies without a mission here, and keep a standing one on the ground."""
         mission_id = seen.mission_id
         over = self._is_ended(mission_id) or may_take_off(seen)
@@ -513,7 +513,7 @@ class Teleop:
         if self._seen:
             self.see(self._seen, now_ns)  # the mission may be over, or the world another one
 
-    def _begin(self, seen: Seen, now_ns: int) -> None:
+    def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission after telemetry shows its start: start its clock and the leg's."""
         plan, before = self._plan, self._continued
         self.state = FLYING

@@ -19,7 +19,7 @@ from pydantic_core import PydanticCustomError, from_json
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem as ConfigProblem
 from cloudrc.config.problems import from_pydantic
-from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Limit, Mission, Section, Waypoint
+from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Mission, Section, TimeLimit, Waypoint
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.placement import crossed_pipe
 from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH
@@ -57,7 +57,7 @@ class MissionRequest(Section):
     name: Text = Field("", description="For people: one line of printable characters")
     description: str = Field("", description="One line, not kept")
     start: Literal["spawn", "here"] = Field("spawn", description="Where the mission starts")
-    time_limit_s: Limit | None = Field(
+    time_limit_s: TimeLimit | None = Field(
         None, description="For the whole mission, held time counted [s]; default: the experiment's"
     )
     waypoints: tuple[Waypoint, ...] = Field(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
-from cloudrc.teleop.wire import Seen
+from cloudrc.teleop.wire import RobotStatus
 
 REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""
@@ -27,7 +27,7 @@ CLOCK_MAX = 65_536
 suffice for many processes."""
 
 
-class Repeater:
+class RequestSender:
     """Repeat the newest request at 10 Hz until telemetry shows that the robot has acted on it.
 
     A new request replaces the one before, acknowledged or not: its number is higher, and the robot
@@ -39,7 +39,7 @@ class Repeater:
     """
 
     def __init__(self) -> None:
-        self._seen: Seen | None = None
+        self._seen: RobotStatus | None = None
         self._pending: OperatorRequest | None = None
         self._next: OperatorRequest | None = None  # sent after the pending one
         self._progress = OperatorRequest(UNNUMBERED, Request.PROGRESS)
@@ -105,7 +105,7 @@ class Repeater:
         if self._pending is None:
             self._due_ns = 0
 
-    def see(self, seen: Seen, now_ns: int) -> Request | None:
+    def see(self, seen: RobotStatus, now_ns: int) -> Request | None:
         """Process new telemetry at `now_ns` [ns].
 
         Returns:
@@ -126,7 +126,7 @@ class Repeater:
             self._ended = seen.epoch, seen.mission
         return pending.request
 
-    def _repeat_start_if_lost(self, seen: Seen, now_ns: int) -> None:
+    def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
         """Send the start again if an earlier teleop or another cloud has overridden it."""
         ours = self._is_started and seen.mission_id == self._progress.mission_id
         if not ours or seen.guard not in (GuardState.GROUND, GuardState.HOLD):
@@ -154,7 +154,7 @@ class Repeater:
         self._due_ns = now_ns + REPEAT_NS
         return pending._replace(epoch=seen.epoch)
 
-    def _progress_due(self, seen: Seen, now_ns: int) -> OperatorRequest | None:
+    def _progress_due(self, seen: RobotStatus, now_ns: int) -> OperatorRequest | None:
         """Return the mission's progress if the robot flies this mission and has not stored it."""
         progress = self._progress
         same = seen.mission_id == progress.mission_id != 0
@@ -163,7 +163,7 @@ class Repeater:
         self._due_ns = now_ns + REPEAT_NS
         return progress._replace(epoch=seen.epoch)
 
-    def _is_acknowledged(self, pending: OperatorRequest, seen: Seen) -> bool:
+    def _is_acknowledged(self, pending: OperatorRequest, seen: RobotStatus) -> bool:
         if pending.number == UNNUMBERED or seen.mission != pending.number:
             return False
         if pending.request is Request.ESTOP:  # the number alone is not enough

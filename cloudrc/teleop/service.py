@@ -23,8 +23,8 @@ from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
 from cloudrc.teleop.journal import Entry
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.store import ConflictError, Mission, MissionBook, Order, UnavailableError, busy
-from cloudrc.teleop.verdict import Witness
+from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError, busy
+from cloudrc.teleop.verdict import MissionObservations
 from cloudrc.teleop.wire import (
     Acknowledge,
     Cancel,
@@ -37,7 +37,7 @@ from cloudrc.teleop.wire import (
     Pause,
     Plan,
     Resume,
-    Seen,
+    RobotStatus,
     StartMission,
     Verb,
 )
@@ -46,7 +46,7 @@ from cloudrc.teleop.wire import (
 class PersistentStop:
     """Send the emergency stop, also after a restart of teleop, until it is acknowledged."""
 
-    def __init__(self, book: MissionBook, teleop: Teleop) -> None:
+    def __init__(self, book: MissionStore, teleop: Teleop) -> None:
         """Send a stop again that an earlier teleop has sent."""
         self._book, self._teleop = book, teleop
         self._is_released = False
@@ -69,7 +69,7 @@ class PersistentStop:
         self._teleop.operate(Acknowledge(), now_ns)
         self._is_released = True
 
-    def check_first(self, seen: Seen) -> None:
+    def check_first(self, seen: RobotStatus) -> None:
         """Check the first telemetry: withdraw a stop that was meant for another robot or mission.
 
         Call it before teleop gets the telemetry.
@@ -123,7 +123,7 @@ class RobotView:
     """
 
     def __init__(self) -> None:
-        self.seen: Seen | None = None
+        self.seen: RobotStatus | None = None
         self._seen_ns = self._guard_ns = 0
         self._heard_ns: int | None = None
 
@@ -152,7 +152,7 @@ class RobotView:
         """
         return None if self._heard_ns is None else (now_ns - self._heard_ns) * 1e-9
 
-    def see(self, seen: Seen, now_ns: int) -> bool:
+    def see(self, seen: RobotStatus, now_ns: int) -> bool:
         """Note new telemetry at `now_ns` [ns].
 
         Returns:
@@ -250,7 +250,7 @@ class MissionService:
         self._setpoint_ns = 0
         self._current: Mission | None = None
         self._ends = False  # whether this process ends; the next one starts the queued missions
-        self.book = MissionBook(write, entries, salt)
+        self.book = MissionStore(write, entries, salt)
         self._teleop = Teleop(self.book.has_ended)
         self._stop = PersistentStop(self.book, self._teleop)
 
@@ -365,7 +365,7 @@ class MissionService:
         """Note a message from cloud at `now_ns` [ns]."""
         self.sight.hear(now_ns)
 
-    def see(self, seen: Seen, now_ns: int) -> None:
+    def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry at `now_ns` [ns]."""
         mission = self._current
         if self.sight.seen is None:
@@ -454,7 +454,7 @@ class MissionService:
             self._note(mission, "starting", "the robot is asked to start", now_ns)
         self._collect(now_ns)
 
-    def _note_contacts(self, mission: Mission, seen: Seen, now_ns: int) -> None:
+    def _note_contacts(self, mission: Mission, seen: RobotStatus, now_ns: int) -> None:
         """Store new contacts of the robot at once."""
         before = mission.witness
         mission.witness = before.see(seen)
@@ -476,7 +476,7 @@ class MissionService:
         assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
-            changed |= {"world": seen.world, "witness": asdict(Witness.begin(seen))}
+            changed |= {"world": seen.world, "witness": asdict(MissionObservations.begin(seen))}
         outcome = self._teleop.outcome
         if outcome is not None and event.event == outcome.code:
             elapsed = self._teleop.elapsed(now_ns)

@@ -24,7 +24,7 @@ from typing import Any
 from cloudrc.errors import CloudrcError
 from cloudrc.messages import Start
 from cloudrc.teleop.journal import Entry
-from cloudrc.teleop.verdict import Criteria, Failure, Verdict, Witness, judge
+from cloudrc.teleop.verdict import Criteria, Failure, MissionObservations, Verdict, judge
 from cloudrc.teleop.wire import Continue, Leg, Outcome, Plan, StartMission
 
 QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
@@ -100,7 +100,7 @@ class Mission:
     reached: list[dict[str, Any]] = field(default_factory=list)
     events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=SHOWN))
     happened: Counter[str] = field(default_factory=Counter)
-    witness: Witness = field(default_factory=Witness)
+    witness: MissionObservations = field(default_factory=MissionObservations)
     verdict: dict[str, Any] | None = None
 
     @property
@@ -122,7 +122,7 @@ class Mission:
         self.elapsed, self.world = entry["time_s"], entry["world"]
         if self.world and self.state in (QUEUED, STARTING):
             self.state = FLYING  # it was started, though a damaged journal has lost what said so
-        self.witness = Witness(**entry["witness"])
+        self.witness = MissionObservations(**entry["witness"])
         self.verdict = entry.get("verdict", self.verdict)
         # A waypoint is reached once, whatever is told how often.
         if entry["event"] == "reached" and entry["waypoint"] == len(self.reached):
@@ -345,7 +345,7 @@ def busy(mission: Mission, advice: str) -> ConflictError:
     return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)
 
 
-class MissionBook:
+class MissionStore:
     """All missions, oldest first.
 
     Attributes:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from math import isfinite
 from typing import Any, Literal
 
-from cloudrc.teleop.wire import Outcome, Seen
+from cloudrc.teleop.wire import Outcome, RobotStatus
 
 REAL_TIME_FACTOR_MIN = 0.95
 """Least valid real-time factor [1]; below it the simulated robot was slower than its network.
@@ -67,7 +67,7 @@ class Criteria:
 
 
 @dataclass(frozen=True, slots=True)
-class Witness:
+class MissionObservations:
     """Contacts and slip during a mission, computed from telemetry.
 
     Attributes:
@@ -88,12 +88,12 @@ class Witness:
     slip_ns: int = 0
 
     @classmethod
-    def begin(cls, seen: Seen) -> Witness:
+    def begin(cls, seen: RobotStatus) -> MissionObservations:
         """Begin with the telemetry at the start of the mission."""
         before = _known(seen.touch_speed)
         return cls(seen.pipe_contacts, 0, before, None, seen.slip_ns, seen.slip_ns)
 
-    def see(self, seen: Seen) -> Witness:
+    def see(self, seen: RobotStatus) -> MissionObservations:
         """Process new telemetry; return the same object if nothing has changed."""
         touch = _known(seen.touch_speed)
         if self.touch_speed is not None or touch == self.touch_before:
@@ -112,11 +112,11 @@ class Witness:
             slip_ns=seen.slip_ns,
         )
 
-    def after_restart(self) -> Witness:
+    def after_restart(self) -> MissionObservations:
         """Continue after a restart of teleop; the slip in between does not count."""
         return replace(self, slip_began_ns=self.slip_began_ns - self.slip_ns, slip_ns=AWAY)
 
-    def news(self, before: Witness, elapsed: float) -> Iterator[tuple[str, str]]:
+    def news(self, before: MissionObservations, elapsed: float) -> Iterator[tuple[str, str]]:
         """Yield event and text of each new contact at `elapsed` [s]."""
         if self.pipe_touches > before.pipe_touches:
             yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
@@ -126,7 +126,12 @@ class Witness:
 
 
 def judge(
-    outcome: Outcome, witness: Witness, criteria: Criteria, *, waypoints: int, elapsed: float
+    outcome: Outcome,
+    witness: MissionObservations,
+    criteria: Criteria,
+    *,
+    waypoints: int,
+    elapsed: float,
 ) -> Verdict:
     """Judge a mission that has ended.
 
@@ -148,7 +153,7 @@ def judge(
 
 
 def _broken(
-    outcome: Outcome, witness: Witness, criteria: Criteria, waypoints: int
+    outcome: Outcome, witness: MissionObservations, criteria: Criteria, waypoints: int
 ) -> Iterator[Failure]:
     if not outcome.success:
         yield Failure(outcome.code, outcome.text)
@@ -166,13 +171,13 @@ def _broken(
         yield Failure("contact_too_fast", text)
 
 
-def _harm(witness: Witness) -> Iterator[Failure]:
+def _harm(witness: MissionObservations) -> Iterator[Failure]:
     if witness.pipe_touches:
         times = f" ({witness.pipe_touches} times)" if witness.pipe_touches > 1 else ""
         yield Failure("pipe_touched", f"the robot touched a pipe{times}")
 
 
-def _not_real_time(witness: Witness, elapsed: float) -> Iterator[Failure]:
+def _not_real_time(witness: MissionObservations, elapsed: float) -> Iterator[Failure]:
     slipped = (witness.slip_ns - witness.slip_began_ns) * 1e-9
     factor = 1.0 - slipped / elapsed if elapsed > 0 else 1.0
     if factor < REAL_TIME_FACTOR_MIN:

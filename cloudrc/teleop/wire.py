@@ -97,7 +97,7 @@ NO_PLAN = Plan((Leg(ZERO),))
 """Placeholder before the first mission; never flown."""
 
 
-class Seen(NamedTuple):
+class RobotStatus(NamedTuple):
     """The robot's status from the newest telemetry, sent from cloud to teleop.
 
     Attributes:
@@ -266,7 +266,7 @@ class Outcome:
         return self.code == "done"
 
 
-Message: TypeAlias = Seen | Output
+Message: TypeAlias = RobotStatus | Output
 """Messages between the processes: `Seen` to teleop, the others to cloud."""
 
 ALARM = OperatorRequest(0, Request.ESTOP)
@@ -274,7 +274,8 @@ ALARM = OperatorRequest(0, Request.ESTOP)
 
 _INT_MIN, _INT_MAX = -(2**63), 2**63 - 1
 _KINDS: dict[str, TypeAdapter[Any]] = {
-    kind.__name__: TypeAdapter(kind) for kind in (Seen, Setpoint, OperatorRequest, MissionEvent)
+    kind.__name__: TypeAdapter(kind)
+    for kind in (RobotStatus, Setpoint, OperatorRequest, MissionEvent)
 }
 
 

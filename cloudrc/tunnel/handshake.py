@@ -79,7 +79,7 @@ def epochs_after(last: int) -> Iterator[int]:
         yield last
 
 
-class Answer(NamedTuple):
+class HelloAnswer(NamedTuple):
     """World's answer to a hello.
 
     Attributes:
@@ -117,7 +117,7 @@ class Identity(Protocol):
         """Function that returns the next persisted epoch, or None while there is none."""
 
 
-class Door:
+class ServerHandshake:
     """World's side: decide which cloud has authority, and under which epoch."""
 
     def __init__(self, session: Session, identity: Identity, *, age_max_ns: int) -> None:
@@ -160,7 +160,7 @@ class Door:
         self._fresh_until_ns = now_ns + self._age_max_ns
         self._repeated = 0
 
-    def admit(self, kind: int, counter: int, now_ns: int) -> None:
+    def accept_once(self, kind: int, counter: int, now_ns: int) -> None:
         """Accept an ALIVE or OPERATOR datagram of the session once.
 
         Args:
@@ -178,7 +178,7 @@ class Door:
             raise DecodeError(REPEATED)
         self.hear(now_ns)
 
-    def knock(self, hello: Hello, counter: int, now_ns: int) -> Answer:
+    def receive_hello(self, hello: Hello, counter: int, now_ns: int) -> HelloAnswer:
         """Answer the hello that the session has just opened.
 
         Args:
@@ -188,14 +188,14 @@ class Door:
         """
         if not self._has_cookie(hello, now_ns):
             if now_ns - self._challenged_ns < CHALLENGE_NS:
-                return Answer("unanswered", [])
+                return HelloAnswer("unanswered", [])
             self._challenged_ns = now_ns
             return self._answer("hello", CHALLENGE, encode_challenge(self._cookie(now_ns)))
         if counter <= self._counters.get(hello.nonce, -1):
-            return Answer(REPEATED, [])
+            return HelloAnswer(REPEATED, [])
         answered = self._answered_ns
         if len(answered) == ANSWERS_MAX and now_ns - answered[0] < SECOND_NS:
-            return Answer("unanswered", [])
+            return HelloAnswer("unanswered", [])
         answered.append(now_ns)
         self._remember(hello.nonce, counter)
         if hello.nonce == self._incumbent.nonce:
@@ -204,13 +204,15 @@ class Door:
             same_key = session.greeting_key == session.epoch_key
             if self._repeated <= REPEATS_MAX or (same_key and now_ns <= self._fresh_until_ns):
                 # Not the key of this hello: cloud uses the answer's key as the key of the epoch.
-                return Answer("hello", [session.greet(ACCEPT, self._accept(), session.epoch_key)])
+                return HelloAnswer(
+                    "hello", [session.greet(ACCEPT, self._accept(), session.epoch_key)]
+                )
         elif hello.nonce in self._used:
             return self._answer("hello", BUSY, encode_busy(Busy(hello.nonce, used=True)))
         elif now_ns <= self._fresh_until_ns:
             return self._answer("busy", BUSY, encode_busy(Busy(hello.nonce, used=False)))
         if not self.ready:
-            return Answer("unanswered", [])
+            return HelloAnswer("unanswered", [])
         if hello.nonce != self._incumbent.nonce:
             self._used.append(self._incumbent.nonce)
         self._incumbent = hello
@@ -219,7 +221,7 @@ class Door:
         self._begin(agreement, self._session.greeting_key)
         return self._answer("hello", ACCEPT, self._accept(), opened=True)
 
-    def move_on(self, now_ns: int) -> bytes:
+    def begin_next_epoch(self, now_ns: int) -> bytes:
         """Begin the next epoch of the same session and make the datagram that tells cloud.
 
         Call it only if `ready`.
@@ -254,9 +256,9 @@ class Door:
         preferred = (self._incumbent.suite, self._suite)
         return CHACHA20_POLY1305 if CHACHA20_POLY1305 in preferred else AES_256_GCM
 
-    def _answer(self, outcome: str, kind: int, body: bytes, *, opened: bool = False) -> Answer:
+    def _answer(self, outcome: str, kind: int, body: bytes, *, opened: bool = False) -> HelloAnswer:
         session = self._session
-        return Answer(outcome, [session.greet(kind, body, session.greeting_key)], opened)
+        return HelloAnswer(outcome, [session.greet(kind, body, session.greeting_key)], opened)
 
     def _cookie(self, now_ns: int, slots_ago: int = 0) -> bytes:
         slot = now_ns // COOKIE_NS - slots_ago
@@ -378,13 +380,17 @@ class ClientHandshake:
         return encode_hello(Hello(self._nonce, self._clock, self._cookie, self._suite))
 
 
-KEY = "the peer uses another key: give both ends the same key file"
+KEY_TEXT = "the peer uses another key: give both ends the same key file"
 BUSY_TEXT = "another cloud controls the robot: this one waits until the other is silent"
-NO_EPOCH = "no session and no mission from the spawn can begin: the disk delays the file of epochs"
-SILENCE = "world does not answer: is it running, is the link up, do both ends have the same key?"
+NO_EPOCH_TEXT = (
+    "no session and no mission from the spawn can begin: the disk delays the file of epochs"
+)
+SILENCE_TEXT = (
+    "world does not answer: is it running, is the link up, do both ends have the same key?"
+)
 
 
-class Complaints:
+class HandshakeLog:
     """Log each reason why there is no session once, until the next session begins."""
 
     def __init__(self) -> None:
@@ -410,7 +416,7 @@ class Complaints:
             )
             return self.say("version", text, now_ns)
         if outcome == "tag" and peek(data)[0] <= LAST_GREETING:
-            return self.say("key", KEY, now_ns)
+            return self.say("key", KEY_TEXT, now_ns)
         return []
 
     def say(self, code: str, text: str, now_ns: int) -> list[Fault]:

@@ -120,7 +120,7 @@ class KeySet(NamedTuple):
         # A clock that shows a time before the file was written cannot tell the file's age.
         return 0.0 if left > self.overlap + CLOCK_SLACK else min(max(left, 0.0), self.overlap)
 
-    def caution(self, wall: float) -> str:
+    def warning(self, wall: float) -> str:
         """Return a warning about the previous key for a process that starts; "" if none is needed.
 
         Args:

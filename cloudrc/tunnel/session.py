@@ -304,7 +304,7 @@ class Session:
         """Return the counter of the next datagram of this kind."""
         return self._counters[kind]
 
-    def tend(self, now_ns: int) -> list[bytes]:
+    def maintain(self, now_ns: int) -> list[bytes]:
         """Do what is due: rekey, adopt new keys, drop old ones; call it once a second.
 
         Returns:
@@ -442,7 +442,7 @@ class UnsealedSession(Session):
             raise DecodeError("old_epoch")
         return kind, direction, epoch, counter, data[HEADER_SIZE:-TAG_SIZE]
 
-    def tend(self, now_ns: int) -> list[bytes]:
+    def maintain(self, now_ns: int) -> list[bytes]:
         """Do nothing: an unsealed session has no keys to change."""
         return []
 

@@ -37,7 +37,7 @@ from cloudrc.records import (
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
-from cloudrc.tunnel.handshake import NO_EPOCH, Complaints, Door
+from cloudrc.tunnel.handshake import NO_EPOCH_TEXT, HandshakeLog, ServerHandshake
 from cloudrc.tunnel.keys import KeyRing
 from cloudrc.tunnel.session import AES_256_GCM, make_session
 from cloudrc.world.guard.state import Guard
@@ -253,9 +253,9 @@ class WorldEndpoint:
         self.robot, self._sensors, self._identity = robot, sensors, identity
         self._clock, self._pace = SimulationClock(start_ns), PaceMonitor()
         self._session = make_session(Direction.UPLINK, identity.ring, start_ns)
-        self._door = Door(self._session, identity, age_max_ns=command_age_max_ns)
+        self._door = ServerHandshake(self._session, identity, age_max_ns=command_age_max_ns)
         self._channel = Channel(newest_wins)
-        self._complaints = Complaints()
+        self._complaints = HandshakeLog()
         self._command_age_max_ns = command_age_max_ns
         self._clock_is_shared = False
         self._stalled_wake_ns = NEVER_NS
@@ -288,7 +288,7 @@ class WorldEndpoint:
         self._advance(self._follow(now_ns) + 1)
         if now_ns >= self._tend_ns:  # on the machine's clock, because world's may lag
             self._tend_ns = now_ns + TEND_PERIOD_NS
-            self._queue(self._session.tend(now_ns))
+            self._queue(self._session.maintain(now_ns))
 
     def take_datagrams(self) -> list[bytes]:
         """Return the datagrams to send."""
@@ -311,7 +311,7 @@ class WorldEndpoint:
                 self._advance(world_ns)
                 self._receive_hello(codec.decode_hello(body), counter, now_ns)
             else:
-                self._door.admit(kind, counter, now_ns)
+                self._door.accept_once(kind, counter, now_ns)
                 if kind == Kind.OPERATOR:
                     self._advance(world_ns)
                     self._receive_operator(codec.decode_operator(body), now_ns)
@@ -401,7 +401,7 @@ class WorldEndpoint:
         """Answer a hello; one that waited during a stall is stale."""
         if now_ns == self._stalled_wake_ns:
             raise DecodeError("stale")
-        answer = self._door.knock(hello, counter, now_ns)
+        answer = self._door.receive_hello(hello, counter, now_ns)
         self._counts[answer.outcome] += 1
         if not answer.datagrams:
             self._has_epoch()
@@ -415,7 +415,7 @@ class WorldEndpoint:
         """Tell whether an epoch can begin; if not, record a fault."""
         ready = self._door.ready
         if not ready:
-            self._records += self._complaints.say("epochs", NO_EPOCH, self._clock.tick_ns)
+            self._records += self._complaints.say("epochs", NO_EPOCH_TEXT, self._clock.tick_ns)
         return ready
 
     def _begin_epoch(self, cause: str) -> None:
@@ -435,7 +435,7 @@ class WorldEndpoint:
             return
         if request.start is Start.SPAWN:
             self.robot.put_on_ground(tick_ns, "mission starts from spawn")
-            self._queue([self._door.move_on(now_ns)])
+            self._queue([self._door.begin_next_epoch(now_ns)])
             self._begin_epoch("mission starts from spawn")
         self.robot.guard.start_mission(tick_ns)
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from cloudrc.config.load import FILES, dump, load_experiment, load_profile
+from cloudrc.config.load import FILE_READERS, dump, load_experiment, load_profile
 from cloudrc.config.shipped import names
 from tests.chart.conftest import Object, containers, of_kind, pod_specs, render
 
@@ -90,13 +90,13 @@ def test_a_profile_replaces_the_experiments_link(tmp_path: Path) -> None:
     assert (made.uplink.delay_ms, made.downlink.delay_ms) == (0, 5)
 
 
-@pytest.mark.parametrize("key", FILES)
+@pytest.mark.parametrize("key", FILE_READERS)
 def test_a_profiles_file_is_in_its_configmap(key: str, tmp_path: Path) -> None:
     made = profile({"link": {"profile": NAMING[key], "traces": MEASURED}}, tmp_path)
     assert getattr(made.uplink, key) == str(tmp_path / "drive.csv")
 
 
-@pytest.mark.parametrize("key", FILES)
+@pytest.mark.parametrize("key", FILE_READERS)
 def test_an_experiments_file_is_in_its_configmap(key: str, tmp_path: Path) -> None:
     """Every process loads the whole experiment, even if a profile replaces its link."""
     for link in ({"traces": MEASURED}, {"traces": MEASURED, "profile": "wifi"}):
@@ -106,7 +106,7 @@ def test_an_experiments_file_is_in_its_configmap(key: str, tmp_path: Path) -> No
         assert getattr(loaded.uplink, key) == str(tmp_path / "drive.csv")
 
 
-@pytest.mark.parametrize("key", FILES)
+@pytest.mark.parametrize("key", FILE_READERS)
 def test_a_file_of_the_experiments_link_is_in_its_configmap(key: str, tmp_path: Path) -> None:
     made = profile({"experiment": {"link": NAMING[key]}, "link": {"traces": MEASURED}}, tmp_path)
     assert getattr(made.uplink, key) == str(tmp_path / "drive.csv")
@@ -189,14 +189,14 @@ def test_the_profile_is_mounted_as_a_directory() -> None:
                 {"link": {"profile": {"downlink": {key: "t.csv"}}}},
                 f"link.profile: downlink.{key} names 't.csv', but link.traces has no such",
             )
-            for key in FILES
+            for key in FILE_READERS
         ),
         *(
             (
                 {"link": {"profile": over}, "experiment": {"link": {"uplink": {key: "/my/t.csv"}}}},
                 f"experiment.link: uplink.{key} names '/my/t.csv', but link.traces has no",
             )
-            for key in FILES
+            for key in FILE_READERS
             for over in ("wifi", None)
         ),
     ],

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cloudrc.cli.link_verify import ENDS_LIMIT
-from cloudrc.cli.parser import build
+from cloudrc.cli.link_verify import RELEASE_TIMEOUT
+from cloudrc.cli.parser import build_parser
 from tests.chart.conftest import Object, containers, pod_specs, render
 
 HELM_WAITS = 300.0
@@ -29,12 +29,12 @@ def test_it_runs_after_the_flight_and_stays_if_it_fails() -> None:
 
 def test_its_deadline_is_between_the_measurement_and_helms() -> None:
     deadline = link_test()["spec"]["activeDeadlineSeconds"]
-    assert ENDS_LIMIT + 10.0 <= deadline < HELM_WAITS
+    assert RELEASE_TIMEOUT + 10.0 <= deadline < HELM_WAITS
 
 
 def test_its_command_verifies_the_link_of_this_release() -> None:
     (container,) = link_test()["spec"]["containers"]
-    options = build(["link"]).parse_args(container["args"])
+    options = build_parser(["link"]).parse_args(container["args"])
     names = {name.rsplit("-", 1)[-1] for name in options.ends.split(",")}
     assert names == {"world", "cloud"}
     hosts = {thing["metadata"]["name"] for thing in render() if thing["kind"] == "Service"}

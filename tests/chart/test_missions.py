@@ -147,7 +147,7 @@ def test_the_chart_makes_the_same_job_as_mission_run() -> None:
     from cloudrc.cluster import jobs as manifest
     from cloudrc.cluster.client import Release
 
-    follower = manifest.Follower(
+    follower = manifest.JobSettings(
         "cloudrc/cloud:0.1.0",
         "IfNotPresent",
         (),

@@ -32,11 +32,11 @@ def test_the_first_command_waits_for_both_pods() -> None:
 
 
 def test_the_second_command_is_valid() -> None:
-    from cloudrc.cli.parser import build
+    from cloudrc.cli.parser import build_parser
 
     words = commands(notes())[1]
     assert words[0] == "cloudrc"
-    options = build([words[1]]).parse_args(words[1:])
+    options = build_parser([words[1]]).parse_args(words[1:])
     assert (options.namespace, options.release) == ("lab", "demo")
 
 

@@ -195,14 +195,14 @@ def test_no_mount_has_a_sub_path() -> None:
 
 def test_containers_use_valid_arguments() -> None:
     """The parser of the command line accepts every container's arguments."""
-    from cloudrc.cli.parser import build
+    from cloudrc.cli.parser import build_parser
 
     pods = pod_specs(render({"mission": {"enabled": True, "queue": True}}))
     parsed = 0
     for pod in pods.values():
         for container in containers(pod).values():
             arguments = [re.sub(r"\$\((\w+)\)", r"\1", text) for text in container["args"]]
-            options = build([arguments[0]]).parse_args(arguments)
+            options = build_parser([arguments[0]]).parse_args(arguments)
             assert callable(options.execute)
             parsed += 1
     assert parsed == 8

@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from cloudrc.cli import summary
-from cloudrc.cli.link_verify_text import Said, as_text
+from cloudrc.cli.link_verify_text import VerifyReport, as_text
 from cloudrc.cli.main import main
-from cloudrc.cli.output import say, table
+from cloudrc.cli.output import print_line, table
 from cloudrc.cli.progress import FlightView
 from cloudrc.link.verify.causes import Cause, Evidence, Findings
 from cloudrc.link.verify.judge import Row
@@ -100,7 +100,7 @@ def test_the_state_of_a_link_container() -> None:
     cause = Cause("wrong_interface", "uplink", EVIL)
     row = Row("mean", "s", 0.1, 0.1, 0.1, 0.1, 0.1, "ok")
     ways, probes = {"uplink": Findings([row], Evidence("relay"))}, {"uplink": EVIL}
-    text = as_text(Said(EVIL, EVIL, ways, probes, [EVIL], [cause]))
+    text = as_text(VerifyReport(EVIL, EVIL, ways, probes, [EVIL], [cause]))
     assert_harmless(text)
     assert text.count(SHOWN) == 5
 
@@ -108,5 +108,5 @@ def test_the_state_of_a_link_container() -> None:
 def test_a_cell_of_a_table_and_a_line(printed: Printing) -> None:
     print(table([["name", "value"], [EVIL, "1"]]))
     assert printed().count("\n") == 2
-    say(EVIL)
+    print_line(EVIL)
     assert printed() == f"{SHOWN}\n"

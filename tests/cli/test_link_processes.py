@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import link_processes
-from cloudrc.cli.link_processes import LOOPBACK, Place, Shaping, refuse_impossible
+from cloudrc.cli.link_processes import LOOPBACK, ShaperAddresses, ShaperProcess, check_shaper
 from cloudrc.config.load import load_profile
 from cloudrc.drivers.process import PARENT
 from cloudrc.errors import BadInputError, CloudrcError
@@ -37,7 +37,7 @@ def test_an_early_end_has_the_exit_code_of_the_process(
     code: int, words: str, exit_code: int, says: str, tmp_path: Path
 ) -> None:
     process = subprocess.Popen(["sh", "-c", f"exit {code}"])
-    one = Shaping(Place(ANY, ANY, ANY), tmp_path, process)
+    one = ShaperProcess(ShaperAddresses(ANY, ANY, ANY), tmp_path, process)
     one.log.write_text(f"before\n{words}\n" if words else "")
     process.wait()
     with pytest.raises(CloudrcError) as ended:
@@ -48,7 +48,7 @@ def test_an_early_end_has_the_exit_code_of_the_process(
 
 def test_a_profile_that_netem_cannot_do_names_the_flag() -> None:
     with pytest.raises(BadInputError) as refused:
-        refuse_impossible(load_profile("lossy"), "netem")
+        check_shaper(load_profile("lossy"), "netem")
     assert str(refused.value) == (
         "uplink: netem cannot do loss.delay_bad_ms (more delay while a burst of losses lasts); "
         "use --shaper relay, which can, or leave it out"
@@ -57,11 +57,11 @@ def test_a_profile_that_netem_cannot_do_names_the_flag() -> None:
 
 @pytest.mark.parametrize(("name", "mode"), [("lossy", "relay"), ("paper-p3", "netem")])
 def test_a_profile_that_the_shaper_can_do_is_accepted(name: str, mode: str) -> None:
-    refuse_impossible(load_profile(name), mode)
+    check_shaper(load_profile(name), mode)
 
 
 def test_a_links_process_gets_the_id_of_its_parent(tmp_path: Path) -> None:
-    place = Place(ANY, ANY, ANY, inside=("printenv", PARENT))
+    place = ShaperAddresses(ANY, ANY, ANY, inside=("printenv", PARENT))
     one = link_processes._start(tmp_path, "uplink", place, "relay")
     one.process.wait()
     assert one.log.read_text().split() == [str(os.getpid())]

@@ -13,7 +13,7 @@ from cloudrc.cli import link_set, relay
 from cloudrc.cli.main import main
 from cloudrc.cli.relay import RelayControl
 from cloudrc.config.document import Document
-from cloudrc.config.edit import edit
+from cloudrc.config.profile_edit import edit_profile
 from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
 from cloudrc.link.follow import Loaded
@@ -36,7 +36,9 @@ TIMED = {
 
 
 def test_single_values_change_nothing_else() -> None:
-    made = edit(Document(dict(TIMED)), None, ["uplink.loss=0.02", "link.uplink.delay_ms=60"])
+    made = edit_profile(
+        Document(dict(TIMED)), None, ["uplink.loss=0.02", "link.uplink.delay_ms=60"]
+    )
     assert made.values == {**TIMED, "uplink": {"delay_ms": 60.0, "loss": 0.02}}
     assert made.cause == "uplink.loss=0.02, link.uplink.delay_ms=60"
     assert not made.restart
@@ -44,7 +46,7 @@ def test_single_values_change_nothing_else() -> None:
 
 
 def test_the_time_line_no_longer_changes_a_value_set_by_hand() -> None:
-    made = edit(Document(dict(TIMED)), None, ["downlink.delay_ms=120"])
+    made = edit_profile(Document(dict(TIMED)), None, ["downlink.delay_ms=120"])
     assert made.values["downlink"]["delay_ms"] == 120.0
     assert made.values["downlink"]["changes"] == [
         {"at_s": 9.0, "jitter_ms": 20.0},
@@ -58,13 +60,13 @@ def test_a_delay_by_hand_ends_a_trace(tmp_path: Path) -> None:
     trace = tmp_path / "t.csv"
     trace.write_text("time_s,delay_ms\n0,40\n")
     before = Document({"uplink": {"trace": str(trace)}})
-    made = edit(before, None, ["uplink.delay_ms=20"])
+    made = edit_profile(before, None, ["uplink.delay_ms=20"])
     assert made.values == {"uplink": {"delay_ms": 20.0}}
     assert made.notes == ["the uplink no longer follows its trace"]
 
 
 def test_a_profile_replaces_the_old_one_and_starts_anew() -> None:
-    made = edit(Document(dict(TIMED)), "satellite", ["uplink.delay_ms=280"])
+    made = edit_profile(Document(dict(TIMED)), "satellite", ["uplink.delay_ms=280"])
     assert made.values["uplink"]["delay_ms"] == 280.0
     assert made.values["downlink"]["delay_ms"] == 300.0
     assert made.values["downlink"]["queue_packets"] == 100
@@ -85,7 +87,7 @@ def test_a_profile_replaces_the_old_one_and_starts_anew() -> None:
 )
 def test_invalid_settings_are_refused(profile: str | None, settings: list[str], words: str) -> None:
     with pytest.raises(BadInputError) as refused:
-        edit(Document(dict(TIMED)), profile, settings)
+        edit_profile(Document(dict(TIMED)), profile, settings)
     assert words in str(refused.value)
 
 
@@ -161,7 +163,7 @@ def test_a_run_here_is_found_changed_and_read_back(
 def test_a_relay_that_does_not_answer_is_an_error(
     flight: Flight, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link_set, "LOCAL_PATIENCE", 0.0)
+    monkeypatch.setattr(link_set, "LOCAL_TIMEOUT", 0.0)
     monkeypatch.setattr(link_set, "sleep", lambda _: None)
     assert main(["link", "set", "downlink.delay_ms=120"]) == 4
     assert capsys.readouterr().err == (

@@ -11,9 +11,9 @@ import pytest
 
 from cloudrc.cli import link_record
 from cloudrc.cli.link import ACTIONS
-from cloudrc.cli.link_verify import find
+from cloudrc.cli.link_verify import find_experiment
 from cloudrc.cli.main import main
-from cloudrc.cli.relay import show_asked
+from cloudrc.cli.relay import export_requested_delay
 from cloudrc.config.load import load_experiment
 from cloudrc.link.traces import read_table, read_trace
 from tests.record.conftest import world_records, write
@@ -179,9 +179,9 @@ def test_a_wrong_line_is_refused(line: str, says: str, capsys: pytest.CaptureFix
 @pytest.mark.parametrize("key", ["seed: 7", "criteria: {}", "guard: {}", "tunnel: {}"])
 def test_a_file_with_any_key_of_an_experiment_is_verified_as_one(key: str, here: Path) -> None:
     (here / "mine.yaml").write_text(key + "\n")
-    assert find("./mine.yaml", []).uplink == load_experiment("./mine.yaml").uplink
+    assert find_experiment("./mine.yaml", []).uplink == load_experiment("./mine.yaml").uplink
     (here / "mine.yaml").write_text("description: mine\nuplink: {delay_ms: 12}\n")
-    assert find("./mine.yaml", []).uplink.delay_ms == 12.0
+    assert find_experiment("./mine.yaml", []).uplink.delay_ms == 12.0
 
 
 def test_a_relay_exports_the_delay_of_its_trace(here: Path) -> None:
@@ -189,7 +189,7 @@ def test_a_relay_exports_the_delay_of_its_trace(here: Path) -> None:
     (here / "mine.yaml").write_text("link: {uplink: {trace: t.csv}, downlink: {delay_ms: 25}}\n")
     told: dict[str, float] = {}
     exporter = SimpleNamespace(asked=told.__setitem__)
-    show_asked(exporter, load_experiment("./mine.yaml"))  # type: ignore[arg-type]
+    export_requested_delay(exporter, load_experiment("./mine.yaml"))  # type: ignore[arg-type]
     assert told == {"uplink": 0.04, "downlink": 0.025}
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import link_verify_ends
-from cloudrc.cli.link_processes import Place, Shaping
+from cloudrc.cli.link_processes import ShaperAddresses, ShaperProcess
 from cloudrc.cli.link_verify_ends import Pod, verify_ends
 from cloudrc.cli.link_verify_text import as_text
 from cloudrc.drivers.exporter import Exporter
@@ -96,8 +96,8 @@ def test_a_proxy_of_the_environment_is_not_used(
     assert {row.verdict for one in ask(release).findings.values() for row in one.rows} == {"ok"}
     metrics = ("127.0.0.1", int(release.pods["world"].link.rpartition(":")[2]))
     for inside in ((), ("env",)):
-        place = Place(metrics, metrics, metrics, inside)
-        shaping = Shaping(place, tmp_path, subprocess.Popen(["true"]))
+        place = ShaperAddresses(metrics, metrics, metrics, inside)
+        shaping = ShaperProcess(place, tmp_path, subprocess.Popen(["true"]))
         assert "cloudrc_link_info" in shaping.metrics()
         shaping.process.wait()
 
@@ -167,7 +167,7 @@ def test_a_wrong_setting_differs_from_a_wrong_shaper(
 def test_once_one_direction_is_off_the_wait_is_short(
     release: Release, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link_verify_ends, "OTHER_LIMIT", 0.0)
+    monkeypatch.setattr(link_verify_ends, "SECOND_VERDICT_TIMEOUT", 0.0)
     release.hears("world", "off")
     release.hears("cloud", "open")
     assert ask(release, limit=5.0).verdict == "not believed"
@@ -177,7 +177,7 @@ def test_once_one_direction_is_off_the_wait_is_short(
 def test_a_verdict_off_for_a_moment_does_not_end_the_wait(
     release: Release, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link_verify_ends, "OTHER_LIMIT", 0.05)
+    monkeypatch.setattr(link_verify_ends, "SECOND_VERDICT_TIMEOUT", 0.05)
     release.hears("world", "off")
     release.hears("cloud", "open")
     began = time.monotonic()

@@ -10,7 +10,7 @@ import pytest
 
 from cloudrc.cli.faults import SEED_MAX
 from cloudrc.cli.main import INTERNAL, main
-from cloudrc.cli.parser import COMMANDS, build, describe_unknown
+from cloudrc.cli.parser import COMMANDS, build_parser, describe_unknown
 from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError
 
 HEAVY = ("numpy", "mujoco", "matplotlib", "pydantic", "yaml", "kubernetes", "rosbags", "mcap")
@@ -52,7 +52,7 @@ def test_help_fits_80_columns(command: str, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_every_command_has_its_own_execute() -> None:
-    parser = build(COMMANDS)
+    parser = build_parser(COMMANDS)
     with_required = {
         "report",
         "world",

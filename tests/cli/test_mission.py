@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import mission_local
-from cloudrc.cli.client import Api, reader
+from cloudrc.cli.client import Api, token_reader
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
 from tests.teleop.conftest import A, B, Running, running
@@ -34,8 +34,8 @@ def api() -> Iterator[Running]:
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(mission_local, "PERIOD", 0.02)
-    monkeypatch.setattr(mission_local, "PATIENCE", 0.5)
+    monkeypatch.setattr(mission_local, "POLL_PERIOD", 0.02)
+    monkeypatch.setattr(mission_local, "API_TIMEOUT", 0.5)
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "two.yaml").write_text(FILE)
@@ -94,7 +94,7 @@ def test_fly_under_one_key_flies_once_and_leaves_its_verdict(
 ) -> None:
     log = folder / "termination-log"
     log.touch()
-    monkeypatch.setattr(mission_local.leave_message, "__defaults__", (log,))
+    monkeypatch.setattr(mission_local.write_termination_message, "__defaults__", (log,))
     thread = pilot(api, A)
     end = threading.Thread(target=lambda: (thread.join(), api.post("/v1/missions/m1/cancel")))
     end.start()
@@ -112,7 +112,7 @@ def test_a_stopped_job_cancels_its_mission(
     def stopped(self: object, mission_id: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(mission_local.Follower, "follow", stopped)
+    monkeypatch.setattr(mission_local.MissionFollower, "follow", stopped)
     assert mission("fly", "--mission", "two.yaml") == 130
     assert api.state_of("m1") == "cancelled"
 
@@ -288,7 +288,7 @@ def test_a_missing_verb_or_point_is_refused(capsys: pytest.CaptureFixture[str]) 
 
 def test_events_can_be_followed(api: Running) -> None:
     api.post("/v1/missions", {"waypoints": [{"position_m": B}]})
-    stream = Api(api.url, reader(api.token_file)).events()
+    stream = Api(api.url, token_reader(api.token_file)).events()
     assert [next(stream)["event"] for _ in range(2)] == ["starting", "started"]
     stream.close()
 

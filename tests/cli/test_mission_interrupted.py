@@ -30,7 +30,7 @@ def test_the_printed_command_cancels_this_mission(
 ) -> None:
     path = tmp_path / "one.yaml"
     path.write_text(FILE)
-    monkeypatch.setattr(mission_local.Follower, "follow", _interrupted)
+    monkeypatch.setattr(mission_local.MissionFollower, "follow", _interrupted)
     with running(unix=True) as api:
         others = ["m1"] if flags else []
         for _ in others:

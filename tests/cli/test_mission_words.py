@@ -12,7 +12,7 @@ import yaml
 
 from cloudrc.cli import client, mission_cluster, mission_local
 from cloudrc.cli.main import main
-from cloudrc.cli.output import harmless
+from cloudrc.cli.output import escape
 from cloudrc.cluster import jobs
 from cloudrc.cluster.jobs import JobStatus
 from cloudrc.errors import BadInputError
@@ -35,8 +35,8 @@ def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
 
 
 def test_printable_text_stays_unchanged() -> None:
-    assert harmless("Zur Tür, 3 µm - 門") == "Zur Tür, 3 µm - 門"
-    assert harmless("\ud800\u2028\0") == r"\ud800\u2028\x00"
+    assert escape("Zur Tür, 3 µm - 門") == "Zur Tür, 3 µm - 門"
+    assert escape("\ud800\u2028\0") == r"\ud800\u2028\x00"
 
 
 @pytest.mark.parametrize("words", ["list", "status", "status m1", "cancel", "hold"])
@@ -79,7 +79,7 @@ def test_events_and_verdicts_are_shown_without_effect(
 ) -> None:
     log = tmp_path / "termination-log"
     log.touch()
-    monkeypatch.setattr(mission_local.leave_message, "__defaults__", (log,))
+    monkeypatch.setattr(mission_local.write_termination_message, "__defaults__", (log,))
     for module in (mission_local, client):
         monkeypatch.setattr(module, "Api", lambda *_: Hostile())
     assert main(["mission", "fly", "--mission", "pipes", "--api", "unix:there"]) == 1
@@ -126,7 +126,7 @@ def test_an_invalid_id_is_no_mission(
     (line,) = capsys.readouterr().err.splitlines()
     assert line.isprintable()
     shown = {"a/b": "Not Found", "\udcff": "no mission '\ufffd'"}
-    assert shown.get(given, f"no mission '{harmless(given)}'") in line
+    assert shown.get(given, f"no mission '{escape(given)}'") in line
 
 
 @pytest.mark.parametrize("words", ["status m1", "logs m1"])

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.cli.pool import BATCH_MAX, WorkerDiedError, in_order
+from cloudrc.cli.pool import BATCH_MAX, WorkerDiedError, map_in_order
 from cloudrc.faults.document import Result
 from cloudrc.faults.fuzz import Finding
 from cloudrc.faults.scenario import Outcome, find
@@ -44,7 +44,7 @@ def _kill_at_five(number: int) -> int:
 
 
 def test_results_have_the_order_of_the_work() -> None:
-    assert list(in_order(_slow_first, range(6), 2)) == list(range(6))
+    assert list(map_in_order(_slow_first, range(6), 2)) == list(range(6))
 
 
 class _CountingWork(list[int]):
@@ -60,14 +60,14 @@ class _CountingWork(list[int]):
 
 def test_much_work_is_submitted_in_batches() -> None:
     work = _CountingWork(range(3 * BATCH_MAX))
-    done = in_order(_process_id, work, 2)
+    done = map_in_order(_process_id, work, 2)
     next(done)
     assert work.taken == BATCH_MAX
     assert sum(1 for _ in done) == 3 * BATCH_MAX - 1
 
 
 def test_there_are_no_more_processes_than_cores() -> None:
-    done = in_order(_process_id, range(6), 100_000)
+    done = map_in_order(_process_id, range(6), 100_000)
     pids = {next(done)}
     assert len(multiprocessing.active_children()) == 2
     assert os.getpid() not in pids.union(done)
@@ -76,12 +76,12 @@ def test_there_are_no_more_processes_than_cores() -> None:
 
 @pytest.mark.parametrize(("pieces", "jobs"), [(1, 100_000), (6, 1), (0, 2)])
 def test_work_for_one_process_runs_in_this_one(pieces: int, jobs: int) -> None:
-    assert list(in_order(_process_id, range(pieces), jobs)) == [os.getpid()] * pieces
+    assert list(map_in_order(_process_id, range(pieces), jobs)) == [os.getpid()] * pieces
 
 
 def test_a_killed_worker_is_an_error() -> None:
     with pytest.raises(WorkerDiedError, match=r"a worker was killed.*fewer '--jobs'"):
-        list(in_order(_kill_at_five, range(9), 2))
+        list(map_in_order(_kill_at_five, range(9), 2))
     assert multiprocessing.active_children() == []
 
 
@@ -96,7 +96,7 @@ def test_results_before_a_worker_was_killed_are_kept(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("cloudrc.cli.pool.BATCH_MAX", KILLED)
     results: list[int] = []
     with pytest.raises(WorkerDiedError):
-        results.extend(_slowly(in_order(_kill_at_five, range(9), 2)))
+        results.extend(_slowly(map_in_order(_kill_at_five, range(9), 2)))
     assert results[:KILLED] == list(range(KILLED))
 
 
@@ -163,7 +163,7 @@ def test_an_interrupted_fault_run_keeps_its_results(
 
 def test_ctrl_c_ends_the_workers_at_once() -> None:
     started = time.monotonic()
-    done = in_order(time.sleep, [0.0, 60.0, 60.0], 2)
+    done = map_in_order(time.sleep, [0.0, 60.0, 60.0], 2)
     next(done)
     with pytest.raises(KeyboardInterrupt):
         done.throw(KeyboardInterrupt)

@@ -14,7 +14,7 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.cli.main import main
-from cloudrc.cli.runtime import _open_peer, open_exporter, resolve_address, size
+from cloudrc.cli.runtime import _open_peer, open_exporter, read_size, resolve_address
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent
@@ -167,10 +167,10 @@ def test_an_end_stopped_at_its_start_completes_its_recording(
     [("1Gi", 2**30), ("500M", 5e8), ("1.5Ki", 1536), ("4096", 4096), ("2k", 2e3)],
 )
 def test_sizes_are_read_as_in_kubernetes(text: str, bytes_: float) -> None:
-    assert size(text) == bytes_
+    assert read_size(text) == bytes_
 
 
 @pytest.mark.parametrize("text", ["", "1GB", "-1", "1 Gi", "nan"])
 def test_other_sizes_are_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="such as 500M or 1Gi"):
-        size(text)
+        read_size(text)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.cli.pool import _hung_up, end_orderly
+from cloudrc.cli.pool import _hung_up, interrupt_on_signals
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +24,7 @@ def not_ignored() -> None:
 
 
 def test_only_the_first_hang_up_interrupts() -> None:
-    end_orderly()
+    interrupt_on_signals()
     with pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGHUP)
     os.kill(os.getpid(), signal.SIGHUP)
@@ -34,7 +34,7 @@ def test_only_the_first_hang_up_interrupts() -> None:
 
 def test_under_nohup_a_hang_up_is_ignored() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    end_orderly()
+    interrupt_on_signals()
     os.kill(os.getpid(), signal.SIGHUP)
 
 

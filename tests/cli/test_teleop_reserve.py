@@ -17,7 +17,7 @@ from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.teleop.journal import Entry, Journal, parse, to_bytes
-from cloudrc.teleop.store import KEPT, QUEUE_MAX, MissionBook, Order
+from cloudrc.teleop.store import KEPT, QUEUE_MAX, MissionStore, Order
 from tests.cli.conftest import MIB, KilledError, Volume
 
 RESERVE = MIB // 8
@@ -45,7 +45,7 @@ def volume(path: Path, monkeypatch: pytest.MonkeyPatch) -> Volume:
     """The disk of the journal and of the files beside it."""
     disk = Volume(path.parent)
     monkeypatch.setattr(teleop, "RESERVE_SIZE", RESERVE)
-    monkeypatch.setattr(teleop, "room", lambda folder: max(disk.room - disk.used, 0))
+    monkeypatch.setattr(teleop, "free_space", lambda folder: max(disk.room - disk.used, 0))
     monkeypatch.setattr("cloudrc.teleop.journal.Disk", lambda: disk)
     return disk
 
@@ -54,7 +54,7 @@ def volume(path: Path, monkeypatch: pytest.MonkeyPatch) -> Volume:
 def over(count: int) -> list[Entry]:
     """Return entries of missions that were cancelled before they began."""
     entries: list[Entry] = []
-    book, order = MissionBook(entries.append, [], bytes(16)), Order(build_plan(HOVER))
+    book, order = MissionStore(entries.append, [], bytes(16)), Order(build_plan(HOVER))
     for _ in range(count):
         book.cancel(book.add(order))
     return entries
@@ -105,7 +105,7 @@ def test_the_reserve_has_room_for_all_missions_of_the_paper() -> None:
     """Each mission writes entries like these."""
     entries: list[Entry] = []
     plan = build_plan(load_experiment("paper"))
-    book = MissionBook(entries.append, [], bytes(16))
+    book = MissionStore(entries.append, [], bytes(16))
     mission = book.add(Order(plan, "paper", "k" * 36))
     for event in ("starting", "started", *["reached"] * len(plan.legs), "done"):
         book.note(mission, event, "waypoint 7 of 7 reached", world="0" * 32)
@@ -204,7 +204,7 @@ def test_the_reserve_leaves_room_for_entries(path: Path, reserve: Path, volume: 
 
 def test_room_is_the_free_space_of_the_volume(tmp_path: Path) -> None:
     free = shutil.disk_usage(tmp_path).free
-    assert teleop.room(tmp_path) == pytest.approx(free, abs=free / 10)
+    assert teleop.free_space(tmp_path) == pytest.approx(free, abs=free / 10)
 
 
 def test_another_error_keeps_the_reserve(path: Path, reserve: Path, volume: Volume) -> None:

@@ -1,19 +1,19 @@
 """The alarm: cloud repeats an emergency stop until the guard is in ESTOP."""
 
-from cloudrc.cloud.operator import REPEAT_NS, Alarm
+from cloudrc.cloud.operator import REPEAT_NS, EmergencyStopRepeater
 from cloudrc.messages import GuardState, OperatorRequest, Request
 
 ESTOP, TRACK = GuardState.ESTOP, GuardState.TRACK
 
 
 def sounding():
-    alarm = Alarm()
+    alarm = EmergencyStopRepeater()
     alarm.sound()
     return alarm
 
 
 def test_an_alarm_sends_nothing_before_it_starts():
-    assert Alarm().due(3, 10**18) is None
+    assert EmergencyStopRepeater().due(3, 10**18) is None
 
 
 def test_an_alarm_repeats_one_number_until_the_guard_stops():

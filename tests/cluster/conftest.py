@@ -323,7 +323,7 @@ def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeApi]:
     monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
     monkeypatch.setattr(tools, "OUTAGE_PERIOD", 0.01)
     monkeypatch.setattr(deploy, "LOOK_PERIOD", 0.01)
-    monkeypatch.setattr(deploy, "PATIENCE", 0.0)
+    monkeypatch.setattr(deploy, "FAILURE_TIME", 0.0)
     yield server
     server.close()
 

@@ -214,7 +214,7 @@ def test_what_pods_cannot_have_is_refused_before_the_install(
 
 def test_an_upgrade_keeps_the_values_of_a_release() -> None:
     before = {"metrics": {"allowFrom": ["x"]}, "link": {"mode": "relay", "profile": "paper-p1"}}
-    given = run_cluster.values(load_experiment("hover"), before)
+    given = run_cluster.chart_values(load_experiment("hover"), before)
     assert given["metrics"] == before["metrics"]
     assert given["link"] == {"mode": "relay", "profile": ""}
     assert given["experiment"]["name"] == "hover"
@@ -222,5 +222,5 @@ def test_an_upgrade_keeps_the_values_of_a_release() -> None:
 
 def test_a_run_disables_the_charts_own_mission() -> None:
     before = {"mission": {"enabled": True, "queue": True}}
-    given = run_cluster.values(load_experiment("hover"), before)
+    given = run_cluster.chart_values(load_experiment("hover"), before)
     assert given["mission"] == {"enabled": False, "queue": True}

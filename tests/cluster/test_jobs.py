@@ -13,7 +13,7 @@ import pytest
 from cloudrc.cluster import jobs
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.jobs import delete_job, follow, list_jobs, logs, read_job, run_job
-from cloudrc.cluster.tools import ClusterError, WaitedTooLongError
+from cloudrc.cluster.tools import ClusterError, ExpiredError
 from tests.cluster.conftest import FakeApi, pod
 
 MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
@@ -153,7 +153,7 @@ def test_follow_writes_each_line_once_and_returns_the_verdict(
 
 def test_follow_has_a_timeout(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="first")
-    with pytest.raises(WaitedTooLongError, match=r"'first' has not ended within 0\.05 s"):
+    with pytest.raises(ExpiredError, match=r"'first' has not ended within 0\.05 s"):
         follow(release, "first", print, timeout=0.05)
 
 

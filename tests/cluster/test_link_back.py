@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cloudrc.cli.link_run import loader
+from cloudrc.cli.link_run import make_profile_loader
 from cloudrc.cli.main import main
 from cloudrc.link.follow import HANDED_FILE, HandedProfile, ProfileFile, Profiles
 from tests.cluster.conftest import PROFILE, TRACE, Cluster
@@ -53,7 +53,7 @@ def test_a_refusing_container_restarts_with_the_old_profile(
     assert set_link("downlink.corrupt=0.5") == 2
     (tmp_path / "profile.yaml").write_text(PROFILE)
     (tmp_path / HANDED_FILE).write_text(json.dumps(cluster.handed("cloud-1")[-1]))
-    load, said = loader("downlink"), list[str]()
+    load, said = make_profile_loader("downlink"), list[str]()
     file = ProfileFile(tmp_path / "profile.yaml", load, said.append)
     handed = HandedProfile(tmp_path / HANDED_FILE, load, said.append)
     assert "corrupt" not in Profiles(file, handed).first().values["downlink"]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cluster.link import INSIDE, PATIENCE
+from cloudrc.cluster.link import APPLY_LIMIT, APPLY_SCRIPT
 from cloudrc.link.follow import HANDED_FILE, Handed, read_handed, write_handed
 from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
 
@@ -21,7 +21,7 @@ DOCUMENT = write_handed(Handed(NOTE, "", {"profile.yaml": "uplink: {trace: t.csv
 
 
 def start(folder: Path, length: int = len(DOCUMENT.encode())) -> subprocess.Popen[str]:
-    command = ["sh", "-c", INSIDE, "sh", str(folder), "b2", str(length)]
+    command = ["sh", "-c", APPLY_SCRIPT, "sh", str(folder), "b2", str(length)]
     pipe = subprocess.PIPE
     return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
 
@@ -47,7 +47,7 @@ def test_the_script_hands_over_a_change_and_prints_the_state(
 
     thread = threading.Thread(target=sidecar)
     thread.start()
-    out, err = running.communicate(DOCUMENT, timeout=2 * PATIENCE)
+    out, err = running.communicate(DOCUMENT, timeout=2 * APPLY_LIMIT)
     thread.join()
     assert (running.returncode, out, err) == (0, decided[0], "")
     assert read_handed((tmp_path / HANDED_FILE).read_text()).change == NOTE
@@ -57,7 +57,7 @@ def test_the_script_hands_over_a_change_and_prints_the_state(
 @pytest.mark.process
 def test_a_silent_sidecar_leaves_the_old_state(tmp_path: Path) -> None:
     told = tell(tmp_path, change="a1")
-    out, _ = start(tmp_path).communicate(DOCUMENT, timeout=10 * PATIENCE)
+    out, _ = start(tmp_path).communicate(DOCUMENT, timeout=10 * APPLY_LIMIT)
     assert out == told
 
 

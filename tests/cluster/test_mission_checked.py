@@ -14,7 +14,7 @@ from cloudrc.cli import mission_cluster
 from cloudrc.cli.main import main
 from cloudrc.cluster import jobs as following
 from cloudrc.cluster.client import Release
-from cloudrc.cluster.jobs import patience, run_job
+from cloudrc.cluster.jobs import follow_limit, run_job
 from cloudrc.cluster.tools import ClusterError
 from tests.cluster.conftest import FakeApi, labels, pod
 from tests.cluster.test_jobs import MISSION, end, start_pod, terminated
@@ -112,7 +112,7 @@ def test_an_unreadable_experiment_gives_a_long_deadline(lands: FakeApi, folder: 
 
 
 def test_a_huge_limit_is_cut_to_what_kubernetes_accepts() -> None:
-    assert patience(1e300, queue=True) < 2**31 + 100
+    assert follow_limit(1e300, queue=True) < 2**31 + 100
 
 
 def test_run_waits_until_the_release_is_ready(

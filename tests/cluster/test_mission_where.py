@@ -45,7 +45,7 @@ def was_killed(tmp_path: Path) -> None:
 
 @pytest.fixture
 def no_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cloudrc.cli.client.ANSWER_LIMIT", 0.05)
+    monkeypatch.setattr("cloudrc.cli.client.REQUEST_TIMEOUT", 0.05)
 
 
 @pytest.mark.usefixtures("flies_here", "no_patience")

@@ -11,7 +11,7 @@ from cloudrc.cluster import tools
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.release import wait_ready
-from cloudrc.cluster.tools import AwayError, ClusterError
+from cloudrc.cluster.tools import ClusterError, UnavailableError
 from tests.cluster.conftest import FakeApi
 from tests.cluster.test_jobs import MISSION, end, start_pod, terminated
 
@@ -70,6 +70,6 @@ def test_a_long_outage_ends_the_wait(
     monkeypatch.setattr(tools, "OUTAGE_MAX", 0.05)
     run_job(release, MISSION, name="first")
     away(running, "jobs", 500, 1_000_000)
-    with pytest.raises(AwayError, match="leader changed") as caught:
+    with pytest.raises(UnavailableError, match="leader changed") as caught:
         follow(release, "first", lambda line: None, timeout=10.0)
     assert caught.value.exit_code == 5

@@ -13,7 +13,7 @@ import pytest
 from cloudrc.cluster import pods, tools
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.release import install
-from cloudrc.cluster.tools import ClusterError, WaitedTooLongError, chart_folder
+from cloudrc.cluster.tools import ClusterError, ExpiredError, chart_folder
 from cloudrc.errors import MissingPrerequisiteError
 from tests.cluster.conftest import FakeApi, pod
 
@@ -33,7 +33,7 @@ def test_a_missing_program_is_named_with_its_page(
 
 def test_a_hanging_program_is_ended(pretend: Pretend) -> None:
     pretend("helm", "exec sleep 60")
-    with pytest.raises(WaitedTooLongError, match=r"'helm list' took more than 0\.1 s"):
+    with pytest.raises(ExpiredError, match=r"'helm list' took more than 0\.1 s"):
         tools.run("helm", ["list", "--all"], timeout=0.1)
 
 
@@ -124,7 +124,7 @@ def test_a_port_forward_has_a_timeout(
     pretend("kubectl", "exec sleep 60")
     began = time.monotonic()
     with (
-        pytest.raises(WaitedTooLongError, match="has not started within"),
+        pytest.raises(ExpiredError, match="has not started within"),
         pods.forwarded(release, "cloud-1", [8080]),
     ):
         pytest.fail("there is no way")

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from cloudrc.cluster.client import Release
-from cloudrc.cluster.pods import list_pods, trouble
+from cloudrc.cluster.pods import list_pods, pod_failure
 from cloudrc.cluster.release import wait_ready
-from cloudrc.cluster.tools import ClusterError, WaitedTooLongError
+from cloudrc.cluster.tools import ClusterError, ExpiredError
 from tests.cluster.conftest import FakeApi, deployment, pod
 
 
@@ -46,7 +46,7 @@ def test_a_failure_of_a_pod_is_explained(
     api: FakeApi, release: Release, given: dict[str, Any], expected: str
 ) -> None:
     api.put("pods", "demo", pod("cloud-1", "cloud", ready=False, phase="Pending", **given))
-    said = trouble(list_pods(release, "cloud")[0])
+    said = pod_failure(list_pods(release, "cloud")[0])
     assert said is not None
     assert re.search(expected, said)
     assert "\n" not in said
@@ -66,7 +66,7 @@ def test_a_pod_that_may_still_start_has_no_failure(
     api: FakeApi, release: Release, given: dict[str, Any]
 ) -> None:
     api.put("pods", "demo", pod("cloud-1", "cloud", ready=False, **given))
-    assert trouble(list_pods(release, "cloud")[0]) is None
+    assert pod_failure(list_pods(release, "cloud")[0]) is None
 
 
 def test_a_ready_release_needs_no_wait(running: FakeApi, release: Release) -> None:
@@ -82,13 +82,13 @@ def test_a_ready_old_pod_does_not_count(
     running: FakeApi, release: Release, status: dict[str, int]
 ) -> None:
     running.put("deployments", "demo", deployment("cloud", **status))
-    with pytest.raises(WaitedTooLongError, match="its pod is being created"):
+    with pytest.raises(ExpiredError, match="its pod is being created"):
         wait_ready(release, timeout=0.03)
 
 
 def test_a_timeout_names_what_is_not_ready(running: FakeApi, release: Release) -> None:
     running.put("pods", "demo", pod("world-1", "world", ready=False))
-    with pytest.raises(WaitedTooLongError, match="container world is not ready") as caught:
+    with pytest.raises(ExpiredError, match="container world is not ready") as caught:
         wait_ready(release, timeout=0.03)
     assert caught.value.exit_code == 4
 
@@ -130,7 +130,7 @@ def test_a_missing_secret_ends_the_wait_with_a_command(running: FakeApi, release
 
 def test_a_secret_that_exists_by_now_is_not_missing(running: FakeApi, release: Release) -> None:
     wait_for_secret(running, "cloudrc-tokens")
-    with pytest.raises(WaitedTooLongError, match="container world is not ready"):
+    with pytest.raises(ExpiredError, match="container world is not ready"):
         wait_ready(release, timeout=0.03)
 
 
@@ -139,7 +139,7 @@ def test_without_the_right_to_read_events_the_wait_continues(
 ) -> None:
     wait_for_secret(running, "mine")
     running.refuse["GET", "events"] = 403, "events is forbidden"
-    with pytest.raises(WaitedTooLongError, match="container world is not ready"):
+    with pytest.raises(ExpiredError, match="container world is not ready"):
         wait_ready(release, timeout=0.03)
 
 

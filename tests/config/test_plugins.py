@@ -10,7 +10,7 @@ import pytest
 
 from cloudrc import plugins
 from cloudrc.config.load import load_experiment
-from cloudrc.config.overrides import build
+from cloudrc.config.overrides import build_plugin
 from cloudrc.config.schema import PlugIn
 from cloudrc.errors import BadInputError
 
@@ -89,7 +89,7 @@ def test_a_plug_in_is_loaded_by_path(share: Path) -> None:
 def test_an_experiment_has_all_parameters(share: Path) -> None:
     predictor = load_experiment("paper", [f"cloud.predictor={share}"]).cloud.predictor
     assert predictor.model_extra == {"share": 0.5, "axes": [True, True, False]}
-    built = build("predictors", predictor)
+    built = build_plugin("predictors", predictor)
     assert (built.share, built.axes) == (0.5, (True, True, False))
 
 
@@ -108,7 +108,7 @@ def test_parameters_are_checked_against_build(share: Path) -> None:
 
 def test_an_integer_is_accepted_as_a_number(share: Path) -> None:
     choice = PlugIn.model_validate({"name": str(share), "share": 1})
-    assert build("predictors", choice).share == 1.0
+    assert build_plugin("predictors", choice).share == 1.0
 
 
 @pytest.mark.parametrize(

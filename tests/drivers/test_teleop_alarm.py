@@ -13,7 +13,7 @@ import pytest
 
 from cloudrc.cli import teleop
 from cloudrc.cli import teleop as teleop_alarm
-from cloudrc.cli.teleop import Alarm, ServedApi
+from cloudrc.cli.teleop import EmergencyStopSender, ServedApi
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.teleop.bridge import Bridge
 from cloudrc.teleop.service import MissionService
@@ -88,7 +88,7 @@ class _Feed:
 
 def test_one_that_is_taken_at_once_starts_no_thread(peers: Peers) -> None:
     teleop_peer, cloud = peers
-    Alarm(lambda: teleop_peer.send(WORD))()
+    EmergencyStopSender(lambda: teleop_peer.send(WORD))()
     assert threads() == []
     assert heard(cloud) == 1
 
@@ -96,7 +96,7 @@ def test_one_that_is_taken_at_once_starts_no_thread(peers: Peers) -> None:
 def test_a_cloud_that_is_away_hears_it_when_it_is_back(peers: Peers, tmp_path: Path) -> None:
     teleop_peer, cloud = peers
     cloud.close()
-    Alarm(lambda: teleop_peer.send(WORD))()
+    EmergencyStopSender(lambda: teleop_peer.send(WORD))()
     back = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
     until(lambda: heard(back))
     back.close()
@@ -105,7 +105,7 @@ def test_a_cloud_that_is_away_hears_it_when_it_is_back(peers: Peers, tmp_path: P
 def test_however_often_it_is_asked_for_there_is_one_thread(peers: Peers) -> None:
     teleop_peer, cloud = peers
     fill(teleop_peer)
-    alarm = Alarm(lambda: teleop_peer.send(WORD))
+    alarm = EmergencyStopSender(lambda: teleop_peer.send(WORD))
     callers = [threading.Thread(target=alarm) for _ in range(20)]
     for caller in callers:
         caller.start()
@@ -138,7 +138,7 @@ def test_the_last_word_counts_for_how_long_it_is_repeated(
 
     again, asked = threading.Event(), threading.Event()
     monkeypatch.setattr(teleop_alarm, "time", _Clock(clock, sleep))
-    alarm = Alarm(send)
+    alarm = EmergencyStopSender(send)
     alarm()
     again.wait(5.0)
     (repeats,) = threads()
@@ -166,7 +166,7 @@ def test_what_was_taken_meanwhile_is_not_said_again(monkeypatch: pytest.MonkeyPa
 
     asked = threading.Event()
     monkeypatch.setattr(teleop_alarm, "time", _Clock([100.0], lambda seconds: asked.wait(5.0)))
-    alarm = Alarm(send)
+    alarm = EmergencyStopSender(send)
     alarm()
     (repeats,) = threads()
     alarm()
@@ -181,7 +181,7 @@ def test_where_there_can_be_no_thread_the_caller_goes_on(
 ) -> None:
     teleop_peer, cloud = peers
     fill(teleop_peer)
-    alarm = Alarm(lambda: teleop_peer.send(WORD))
+    alarm = EmergencyStopSender(lambda: teleop_peer.send(WORD))
 
     def refuse(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")

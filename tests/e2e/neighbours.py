@@ -10,7 +10,7 @@ from urllib.parse import urlencode
 import yaml
 
 from cloudrc.cluster.client import connect
-from cloudrc.cluster.pods import DIRECTLY, forwarded
+from cloudrc.cluster.pods import NO_PROXY, forwarded
 from tests.e2e.conftest import (
     NAMESPACE,
     CommandFailedError,
@@ -216,7 +216,7 @@ class Prometheus:
     def ask(self, query: str) -> list[dict[str, Any]]:
         """What PromQL answers."""
         url = f"http://127.0.0.1:{self._port}/api/v1/query?{urlencode({'query': query})}"
-        with DIRECTLY.open(url, timeout=10) as answer:
+        with NO_PROXY.open(url, timeout=10) as answer:
             said = json.load(answer)
         assert said["status"] == "success", said
         return list(said["data"]["result"])

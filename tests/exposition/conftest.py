@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from cloudrc.exposition.live import Live
+from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.parts import Histogram, Readings
 from cloudrc.exposition.table import METRICS
 from cloudrc.faults import asks
@@ -69,13 +69,13 @@ def series(flight: Flight) -> list[dict[str, str]]:
 
 def scrapes(flight: Flight, role: str, times: range) -> Iterator[Readings]:
     """Yield the readings of a process at each time [s]."""
-    live, seen, sent = Live(role, missions=role != "cloud"), 0, 0
+    live, seen, sent = LiveMetrics(role, missions=role != "cloud"), 0, 0
     for time in times:
         records = asks.seen_by(flight, role, time)
         for record in records[seen:]:
             if isinstance(record, Counted) and record.name == "sent":
                 if record.total < sent:  # a new process, which counts from 0
-                    live = Live(role, missions=role != "cloud")
+                    live = LiveMetrics(role, missions=role != "cloud")
                 sent = record.total
             live.see([record])
         seen = len(records)

@@ -9,7 +9,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition.ends import DelayJudge, PredictionJudge
-from cloudrc.exposition.live import Live
+from cloudrc.exposition.live import LiveMetrics
 from cloudrc.records import CommandApplied, Control
 from tests.exposition.conftest import MS, period
 from tests.flights.conftest import records
@@ -93,7 +93,7 @@ def test_delay_errors_of_a_flight_match_its_ground_truth(offset_ns: int) -> None
             passed_ns = applied.stamp_ns - applied.basis_stamp_ns
             control = controls[applied.epoch, applied.counter]
             truth.add(round((control.horizon - passed_ns * 1e-9) * 1e6))
-    live, seen = Live("cloud"), set()
+    live, seen = LiveMetrics("cloud"), set()
     for record in cloud:
         live.see([record])
         error = live.read().get("cloudrc_delay_estimate_error_seconds")

@@ -8,7 +8,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
-from cloudrc.exposition.live import Live
+from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.records import (
@@ -29,13 +29,13 @@ from tests.flights.conftest import records
 Flight = tuple[list[Record], list[Record]]
 
 
-def value(live: Live, name: str, *label_values: str) -> float:
+def value(live: LiveMetrics, name: str, *label_values: str) -> float:
     reading = live.read()[name]
     assert isinstance(reading, dict)
     return reading[label_values]
 
 
-def histogram(live: Live, name: str) -> Histogram:
+def histogram(live: LiveMetrics, name: str) -> Histogram:
     reading = live.read()[name]
     assert isinstance(reading, Histogram)
     return reading
@@ -60,7 +60,7 @@ def test_a_bucket_includes_its_upper_bound() -> None:
 
 @pytest.mark.parametrize(("role", "index"), [("world", 0), ("cloud", 1)])
 def test_one_way_delays_include_all_arrivals(flight: Flight, role: str, index: int) -> None:
-    live = Live(role)
+    live = LiveMetrics(role)
     live.see(flight[index])
     delays = [r.delay for r in flight[index] if isinstance(r, Arrival)]
     name = "cloudrc_downlink_delay_seconds" if role == "world" else "cloudrc_uplink_delay_seconds"
@@ -75,7 +75,7 @@ def test_without_a_shared_clock_one_way_delays_are_absent() -> None:
     experiment = load_experiment("hover", ["link.profile=paper-p1"])
     both = records(experiment, offset_ns=7_000_000_000)
     for role, of_end in zip(table.ENDS, both, strict=True):
-        live = Live(role)
+        live = LiveMetrics(role)
         live.see(of_end)
         assert not any("age_of" in name or "link_delay" in name for name in live.read())
     assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] > 100  # needs no shared clock
@@ -94,7 +94,7 @@ def test_command_age_is_that_of_its_odometry_in_track(offset_ns: int) -> None:
             others += not in_use
             ages += [(record.stamp_ns - basis_ns) * 1e-9] if in_use else []
     assert others > 1
-    live = Live("world")
+    live = LiveMetrics("world")
     live.see(of_world)
     age = histogram(live, "cloudrc_command_age_seconds")
     assert age.cumulative()[-1] == len(ages) > 500
@@ -103,7 +103,7 @@ def test_command_age_is_that_of_its_odometry_in_track(offset_ns: int) -> None:
 
 
 def test_a_round_trip_is_counted_once_per_echo() -> None:
-    live = Live("cloud")
+    live = LiveMetrics("cloud")
     for k, rtt in enumerate((math.nan, 0.04, 0.04, 0.04, 0.05)):
         live.see([period(10 * k, 10 * k, rtt=rtt, loop_delay=rtt + 0.005)])
     assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] == 2
@@ -111,7 +111,7 @@ def test_a_round_trip_is_counted_once_per_echo() -> None:
 
 
 def test_errors_and_terms_are_signed_and_by_axis() -> None:
-    live = Live("cloud")
+    live = LiveMetrics("cloud")
     live.see(
         [
             period(
@@ -130,7 +130,7 @@ def test_errors_and_terms_are_signed_and_by_axis() -> None:
 
 
 def test_counts_are_assigned_to_their_direction() -> None:
-    live = Live("world")
+    live = LiveMetrics("world")
     totals = {"sent": 7, "late": 3, "stalls": 1, "held_seconds": 4, "unheard_of": 9}
     for name, total in totals.items():
         live.see([Counted(0, "world", name, total)])
@@ -142,7 +142,7 @@ def test_counts_are_assigned_to_their_direction() -> None:
 
 
 def test_counts_of_one_shaper_are_absent_with_the_other() -> None:
-    relay, netem = Live("link"), Live("link")
+    relay, netem = LiveMetrics("link"), LiveMetrics("link")
     relay.see([Counted(0, "link", "released_early", 3)])
     netem.see([Counted(0, "link", "restored", 2)])
     early, restored = "cloudrc_link_released_early_total", "cloudrc_link_restored_total"
@@ -153,7 +153,7 @@ def test_counts_of_one_shaper_are_absent_with_the_other() -> None:
 
 
 def test_guard_and_contacts_are_counted() -> None:
-    live = Live("world")
+    live = LiveMetrics("world")
     assert value(live, "cloudrc_guard_state") == GuardState.GROUND
     live.see(
         [GuardChange(0, GuardState.TRACK, "mission started"), GuardChange(1, GuardState.HOLD, "")]
@@ -173,7 +173,7 @@ def test_guard_and_contacts_are_counted() -> None:
 
 
 def test_the_real_time_factor_covers_the_last_ten_seconds() -> None:
-    live = Live("world")
+    live = LiveMetrics("world")
     live.see([wake(0)])
     assert "cloudrc_real_time_factor" not in live.read()
     live.see([wake(10 * k) for k in range(1, 500)])
@@ -185,7 +185,7 @@ def test_the_real_time_factor_covers_the_last_ten_seconds() -> None:
 
 
 def test_period_and_lateness_of_the_loop() -> None:
-    live = Live("world")
+    live = LiveMetrics("world")
     live.see([wake(0), wake(10), wake(30, slip_ms=5, lateness=0.01)])
     period_ = histogram(live, "cloudrc_loop_period_seconds")
     assert (period_.total, period_.cumulative()[-1]) == (pytest.approx(0.03), 2)
@@ -194,7 +194,7 @@ def test_period_and_lateness_of_the_loop() -> None:
 
 
 def heard(role: str, *seen: Record) -> bool:
-    live = Live(role)
+    live = LiveMetrics(role)
     live.see(seen)
     assert live.end is not None
     return live.end.has_peer
@@ -227,7 +227,7 @@ def test_a_replayed_datagram_is_no_sign_of_life(role: str, behind: int, hears: b
 
 @pytest.mark.parametrize("role", table.ENDS)
 def test_a_gap_is_between_arrivals_of_a_session_despite_replays(role: str) -> None:
-    live = Live(role)
+    live = LiveMetrics(role)
     live.see([SessionOpened(0, role, 1, "")])
     for at_ms, counter in (
         (500, 0),
@@ -250,14 +250,14 @@ def test_world_has_a_peer_before_its_first_command() -> None:
 
 
 def test_a_start_from_spawn_opens_a_session_but_admits_no_cloud(flight: Flight) -> None:
-    live = Live("world")
+    live = LiveMetrics("world")
     live.see(flight[0])
     assert value(live, "cloudrc_sessions_opened_total") == 2
     assert value(live, "cloudrc_clouds_admitted_total") == 1
 
 
 def test_mission_metrics_follow_the_events() -> None:
-    live = Live("teleop")
+    live = LiveMetrics("teleop")
     seen = []
     for event, waypoint in (
         ("started", 0),
@@ -292,5 +292,5 @@ def test_mission_metrics_follow_the_events() -> None:
 
 
 def test_a_cloud_with_separate_teleop_exposes_no_mission() -> None:
-    assert not any("mission" in name for name in Live("cloud").read())
-    assert "cloudrc_mission_state" in Live("teleop").read()
+    assert not any("mission" in name for name in LiveMetrics("cloud").read())
+    assert "cloudrc_mission_state" in LiveMetrics("teleop").read()

@@ -7,11 +7,11 @@ import random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.exposition.parts import WINDOW, Stream
+from cloudrc.exposition.parts import WINDOW, DatagramTally
 
 
-def taken(*counters: int, epoch: int = 1) -> Stream:
-    stream = Stream()
+def taken(*counters: int, epoch: int = 1) -> DatagramTally:
+    stream = DatagramTally()
     for counter in counters:
         stream.take(epoch, counter)
     return stream

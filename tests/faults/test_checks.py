@@ -10,7 +10,7 @@ import pytest
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.recording import WallClock
 from cloudrc.drivers.teleop import LastWord
-from cloudrc.exposition.live import Live
+from cloudrc.exposition.live import LiveMetrics
 from cloudrc.faults import asks
 from cloudrc.faults.invariants import Watch
 from cloudrc.faults.models import Mortal
@@ -20,8 +20,8 @@ from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Contact, Counted, Fault
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import Mission, MissionBook, Order
-from cloudrc.tunnel.handshake import Complaints
+from cloudrc.teleop.store import Mission, MissionStore, Order
+from cloudrc.tunnel.handshake import HandshakeLog
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.rotors import STOPPED
@@ -43,12 +43,12 @@ def offers_a_point_that_is_not_the_nearest(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def loses_an_event_of_a_reader(monkeypatch: pytest.MonkeyPatch) -> None:
-    after = MissionBook.events_after
+    after = MissionStore.events_after
 
-    def lossy(book: MissionBook, number: int) -> list[dict[str, Any]]:
+    def lossy(book: MissionStore, number: int) -> list[dict[str, Any]]:
         return [event for event in after(book, number) if event["id"] % 777]
 
-    monkeypatch.setattr(MissionBook, "events_after", lossy)
+    monkeypatch.setattr(MissionStore, "events_after", lossy)
 
 
 def takes_a_missing_file_for_a_new_key(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,7 +86,7 @@ def tells_no_cause(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def never_complains(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Complaints, "say", lambda complaints, code, text, now_ns: [])
+    monkeypatch.setattr(HandshakeLog, "say", lambda complaints, code, text, now_ns: [])
 
 
 def catches_up_without_the_guard(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,7 +103,7 @@ def catches_up_without_the_guard(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def forgets_keys(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(MissionBook, "with_key", lambda book, key: None)
+    monkeypatch.setattr(MissionStore, "with_key", lambda book, key: None)
 
 
 def makes_another_mission_of_what_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,12 +164,12 @@ def counts_the_tenth_failure_first(monkeypatch: pytest.MonkeyPatch) -> None:
         peer.failures = -9
 
     monkeypatch.setattr(PeerName, "__init__", late)
-    see = Live.see
+    see = LiveMetrics.see
 
-    def seen(live: Live, records: Any) -> None:
+    def seen(live: LiveMetrics, records: Any) -> None:
         see(live, [r._replace(total=max(0, r.total)) if type(r) is Counted else r for r in records])
 
-    monkeypatch.setattr(Live, "see", seen)
+    monkeypatch.setattr(LiveMetrics, "see", seen)
 
 
 def counts_no_more_than_1000_lost_records(monkeypatch: pytest.MonkeyPatch) -> None:

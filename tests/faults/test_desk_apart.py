@@ -20,7 +20,7 @@ from cloudrc.faults.walls import Wall
 from cloudrc.messages import OperatorRequest, Setpoint
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.wire import Output, Seen
+from cloudrc.teleop.wire import Output, RobotStatus
 
 Patch = pytest.MonkeyPatch
 
@@ -41,12 +41,12 @@ class Story:
         told: dict[str, float] = {}
         see, tell, take = MissionService.see, RemoteTeleop.see, RemoteTeleop.take_outputs
 
-        def look(service: MissionService, seen: Seen, now_ns: int) -> None:
+        def look(service: MissionService, seen: RobotStatus, now_ns: int) -> None:
             now = self.flight.now
             self.looks.append(Look(now, now - told[repr(seen)]))
             see(service, seen, now_ns)
 
-        def say(remote: RemoteTeleop, seen: Seen, now_ns: int) -> None:
+        def say(remote: RemoteTeleop, seen: RobotStatus, now_ns: int) -> None:
             told[repr(seen)] = self.flight.now
             tell(remote, seen, now_ns)
 
@@ -191,7 +191,7 @@ def test_calls_run_before_telemetry_and_die_with_teleop(
     story, order = Story(patch, until=5.0), list[str]()
     see = MissionService.see
 
-    def look(service: MissionService, seen: Seen, now_ns: int) -> None:
+    def look(service: MissionService, seen: RobotStatus, now_ns: int) -> None:
         order.append("sees")
         see(service, seen, now_ns)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cloud.operator import Alarm
+from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.faults import fuzz
 from cloudrc.faults.adversary import choose
 from cloudrc.faults.flight import Flight
@@ -34,7 +34,7 @@ from cloudrc.messages import GuardState
 from cloudrc.record.recover import Recovery, recover
 from cloudrc.teleop.bridge import WAITING_MAX
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.wire import Seen
+from cloudrc.teleop.wire import RobotStatus
 from cloudrc.tunnel.keys import KeyRing, KeySet
 
 Patch = pytest.MonkeyPatch
@@ -196,7 +196,7 @@ def test_a_stop_that_is_not_obeyed_is_found(apart: bool, monkeypatch: Patch) -> 
     assert fly(schedule).kinds == set()
     monkeypatch.setattr(MissionService, "stop_rotors", lambda service, now_ns: None)
     assert fly(schedule).kinds == (set() if apart else {"obeyed"}), "its alarm goes past teleop"
-    monkeypatch.setattr(Alarm, "sound", lambda alarm: None)
+    monkeypatch.setattr(EmergencyStopRepeater, "sound", lambda alarm: None)
     assert fly(schedule).kinds == {"obeyed"}
 
 
@@ -212,7 +212,7 @@ def test_a_teleop_that_stands_still_does_not_see_the_robot(kind: str, monkeypatc
     looks: list[int] = []
     see = MissionService.see
 
-    def look(service: MissionService, seen: Seen, now_ns: int) -> None:
+    def look(service: MissionService, seen: RobotStatus, now_ns: int) -> None:
         looks.append(now_ns)
         see(service, seen, now_ns)
 

@@ -92,14 +92,14 @@ def test_what_was_flown_until_it_is_told_to_stop_is_told(
 
 def test_two_hangups_stop_gently_a_second_signal_at_once() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    with faults_fuzz.stopping() as stop:
+    with faults_fuzz.stop_on_signal() as stop:
         for _ in range(2):
             os.kill(os.getpid(), signal.SIGHUP)
         assert stop()
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # by nohup
-    with faults_fuzz.stopping() as stop:
+    with faults_fuzz.stop_on_signal() as stop:
         os.kill(os.getpid(), signal.SIGHUP)
         assert not stop()
 

@@ -4,7 +4,7 @@ import pytest
 
 from cloudrc.messages import GuardState, Request, Start
 from cloudrc.records import Fault, TelemetrySent
-from cloudrc.tunnel.handshake import NO_EPOCH
+from cloudrc.tunnel.handshake import NO_EPOCH_TEXT
 from tests.flights.conftest import MS, talking
 
 
@@ -37,7 +37,7 @@ def test_a_cloud_gets_a_session_as_soon_as_an_epoch_exists(talk, disk):
     for _ in range(3):
         talk.wait(talk.now_ns + 1_100 * MS)  # the previous cloud is silent by now
         assert talk.hello(b"two") == 0
-    assert told(talk) == [NO_EPOCH]
+    assert told(talk) == [NO_EPOCH_TEXT]
     assert talk.world._session.epoch == 1
     disk.append(2)
     talk.wait(talk.now_ns + 1_100 * MS)
@@ -50,7 +50,7 @@ def test_only_a_start_from_the_spawn_waits_for_an_epoch(talk, disk):
         telemetry = fly(talk)
         assert (telemetry.mission, telemetry.mission_id) == (1, 0)
         assert telemetry.guard is GuardState.TRACK
-    assert told(talk) == [NO_EPOCH]
+    assert told(talk) == [NO_EPOCH_TEXT]
     assert talk.counts()["start_refused"] == 2
     disk.append(2)
     talk.request(3, Request.START, Start.SPAWN, mission_id=7)

@@ -10,7 +10,7 @@ from cloudrc.cloud.operator import Operator
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, GuardChange, Record
-from cloudrc.teleop.wire import ALARM, Output, Seen
+from cloudrc.teleop.wire import ALARM, Output, RobotStatus
 from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
 from cloudrc.world.endpoint import WorldIdentity
 from tests.flights.conftest import SHARED_CLOCK, Ends, join
@@ -102,7 +102,7 @@ class Lagging:
         self.outputs: list[Output | Fault] = []
         self.epochs: dict[int, int] = {}  # epochs seen, and when first [ns]
 
-    def see(self, seen: Seen, now_ns: int) -> None:
+    def see(self, seen: RobotStatus, now_ns: int) -> None:
         self.epochs.setdefault(seen.epoch, now_ns)
         self._teleop.see(seen, now_ns)
 

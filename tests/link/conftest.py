@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cloudrc.cli.link_run import Programs, runner
+from cloudrc.cli.link_run import Programs, make_programs
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
@@ -259,7 +259,7 @@ _programs: dict[Path, Programs] = {}
 def run_near(tables: Path) -> Programs:
     """Run tc and ip in the near namespace."""
     if tables not in _programs:
-        _programs[tables] = runner(str(tables), ("ip", "netns", "exec", NEAR))
+        _programs[tables] = make_programs(str(tables), ("ip", "netns", "exec", NEAR))
     return _programs[tables]
 
 

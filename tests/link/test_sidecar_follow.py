@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.link_run import loader
+from cloudrc.cli.link_run import make_profile_loader
 from cloudrc.errors import BadInputError
 from cloudrc.link.follow import Loaded, PeerName, ProfileFile
 from cloudrc.link.model import LinkDirection
@@ -42,7 +42,7 @@ def config_map(tmp_path: Path) -> ConfigMap:
 
 def follow(config_map: ConfigMap) -> tuple[ProfileFile, list[str]]:
     log: list[str] = []
-    return ProfileFile(config_map.file, loader("uplink"), log.append), log
+    return ProfileFile(config_map.file, make_profile_loader("uplink"), log.append), log
 
 
 def test_a_swapped_config_map_is_read_once(config_map: ConfigMap) -> None:
@@ -105,7 +105,7 @@ def test_a_file_that_is_written_while_it_is_read_is_read_again_and_is_one_change
 ) -> None:
     place, log = tmp_path / "profile.yaml", list[str]()
     halves = ["", "uplink: {delay_ms: 12}\n", "uplink: {delay_ms: 120}\n"]
-    load = loader("uplink")
+    load = make_profile_loader("uplink")
 
     def load_while_written(path: Path) -> Loaded:
         """As an editor does that empties the file first."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.link_run import loader
+from cloudrc.cli.link_run import make_profile_loader
 from cloudrc.link.follow import (
     HANDED_FILE,
     SIZE_MAX,
@@ -41,7 +41,7 @@ class Pod:
         self.start()
 
     def start(self) -> None:
-        load = loader("uplink")
+        load = make_profile_loader("uplink")
         file = ProfileFile(self.map / "profile.yaml", load, self.log.append)
         handed = HandedProfile(self.run / HANDED_FILE, load, self.log.append)
         self.profiles = Profiles(file, handed)

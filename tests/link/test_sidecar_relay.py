@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc.cluster.link import INSIDE
+from cloudrc.cluster.link import APPLY_SCRIPT
 from cloudrc.config.load import load_experiment
 from cloudrc.link.follow import Handed, write_handed
 from cloudrc.link.model import LinkDirection
@@ -160,7 +160,7 @@ def test_what_is_handed_over_inside_is_in_force_when_the_command_ends(
     note = json.dumps({"number": "a1", "cause": "by hand", "restart": True})
     files = {"profile.yaml": "uplink: {delay_ms: 20}\n"}
     document = write_handed(Handed(note, "", files))
-    command = ["sh", "-c", INSIDE, "sh", str(link.route.parent), "a1", str(len(document))]
+    command = ["sh", "-c", APPLY_SCRIPT, "sh", str(link.route.parent), "a1", str(len(document))]
     began = time.monotonic()
     done = subprocess.run(command, input=document, check=True, capture_output=True, text=True)
     print(f"in force after {time.monotonic() - began:.2f} s")

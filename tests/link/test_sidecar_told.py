@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cli.link_run import NOTHING, Teller
+from cloudrc.cli.link_run import EMPTY_STATUS, LinkStatusSource
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 from cloudrc.link.sidecar import Near, Told, look_near, read_told, write_told
 from cloudrc.link.tc import Answer
@@ -151,8 +151,8 @@ def test_tools_are_started_once_a_second_however_often_it_is_asked(tmp_path: Pat
         asked.append(host)
         return Near("eth0", {})
 
-    teller = Teller(bench.sidecar, look, lambda: now[0])
-    assert teller.text() == NOTHING
+    teller = LinkStatusSource(bench.sidecar, look, lambda: now[0])
+    assert teller.text() == EMPTY_STATUS
     bench.run(0.5)
     for now[0] in (1.0, 1.5, 1.9, 2.1):
         assert read_told(teller.text()).near == Near("eth0", {})

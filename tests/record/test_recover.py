@@ -228,7 +228,7 @@ def test_the_command_says_what_is_kept_and_lost(
     assert main(["recover", str(torn), "-t", str(new)]) == 2
     assert "already there; name another file with --to" in capsys.readouterr().err
     assert main(["recover", str(torn), "-t", str(tmp_path / "y.mcap"), "-o", "yaml"]) == 1
-    document, _ = yaml_text.parse(capsys.readouterr().out, "stdout")
+    document, _ = yaml_text.parse_yaml(capsys.readouterr().out, "stdout")
     assert document["bytes_lost"] == account["bytes_lost"]
     nowhere = tmp_path / "none" / "n.mcap"
     assert main(["recover", str(torn), "--to", str(nowhere)]) == 2

@@ -13,7 +13,7 @@ import pytest
 from cloudrc.metrics import Number
 from cloudrc.report.document import Failure, Run, Verdict, environment_document
 from cloudrc.report.figures import NAMES, Picture
-from cloudrc.report.numbers import handy
+from cloudrc.report.numbers import readable
 from cloudrc.report.page import render, summary
 from cloudrc.report.write import assess, write_report
 from tests.metrics.conftest import ONE_PIPE, flown, paper, touch
@@ -148,7 +148,7 @@ def test_foreign_text_is_escaped() -> None:
     ],
 )
 def test_numbers_have_readable_units(name: str, number: Number, expected: tuple[str, str]) -> None:
-    assert handy(name, number) == expected
+    assert readable(name, number) == expected
 
 
 def test_the_summary_of_a_failed_flight() -> None:

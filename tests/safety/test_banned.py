@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cluster.link import INSIDE
+from cloudrc.cluster.link import APPLY_SCRIPT
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = [*sorted((ROOT / "cloudrc").rglob("*.py")), *sorted((ROOT / "tools").rglob("*.py"))]
@@ -130,7 +130,7 @@ def test_a_shell_gets_only_one_fixed_program() -> None:
     """Foreign text comes in as arguments, which the program does not split."""
     given = {text for path in SHIPPED for text in shells(ast.parse(path.read_text()))}
     assert given == {"INSIDE"}
-    quoted = re.sub(r'"(?:\\.|[^"\\])*"', "", INSIDE)
+    quoted = re.sub(r'"(?:\\.|[^"\\])*"', "", APPLY_SCRIPT)
     assert not re.search(r"\$[0-9@*]", quoted), "an argument stays one word"
 
 

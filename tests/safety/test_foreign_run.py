@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import runtime
-from cloudrc.cli.link_verify import find
+from cloudrc.cli.link_verify import find_experiment
 from cloudrc.cli.main import main
 from cloudrc.config.load import dump, load_experiment, read_experiment
 from cloudrc.config.schema import PlugIn
@@ -71,7 +71,7 @@ def test_a_report_executes_nothing_of_the_run(
 
 
 def test_link_verify_executes_nothing_of_the_run(run: Path, trace: Path) -> None:
-    experiment = find(str(run / "config.yaml"), ["link.uplink.delay_ms=200"])
+    experiment = find_experiment(str(run / "config.yaml"), ["link.uplink.delay_ms=200"])
     assert experiment.uplink.delay_ms == 200
     # Its processes get a file that names the same program, and read it in the same way.
     (run / "again.yaml").write_text(dump(experiment))

@@ -33,7 +33,7 @@ from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.server import ApiServer, Gate, Limits
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import Order
-from cloudrc.teleop.wire import Leg, Plan, Seen, StartMission
+from cloudrc.teleop.wire import Leg, Plan, RobotStatus, StartMission
 
 PERIOD_NS = 10_000_000
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
@@ -72,7 +72,7 @@ class Flight:
             self._collect()
 
     def see(self):
-        seen = Seen(
+        seen = RobotStatus(
             self.epoch, self.position, self.guard, self.mission, self.world, **self.progress()
         )
         self.first_shown_ns.setdefault(self.mission, self.now_ns)
@@ -197,7 +197,7 @@ class ServiceFlight(Flight):
 
     @property
     def seen(self):
-        return Seen(
+        return RobotStatus(
             self.epoch,
             self.position,
             self.guard,

@@ -11,7 +11,7 @@ import pytest
 
 from cloudrc.cli.teleop import ServedApi
 from cloudrc.errors import BadInputError
-from cloudrc.exposition.live import Live
+from cloudrc.exposition.live import LiveMetrics
 from cloudrc.teleop import models
 from cloudrc.teleop.server import ApiServer
 from tests.teleop.conftest import DIRECT, A, B, C, running
@@ -77,7 +77,7 @@ def test_a_second_one_is_refused_with_the_id_of_the_first(api):
 
 
 def test_refusals_and_missed_events_are_counted_in_metrics(api, monkeypatch):
-    served, live = ServedApi(api.bridge, api.server, api.audit), Live("teleop")
+    served, live = ServedApi(api.bridge, api.server, api.audit), LiveMetrics("teleop")
     served.open(api.flight.teleop, lambda: None)
     fly(api)
     far = {"position_m": [100.0, 0.0, 1.0]}

@@ -241,10 +241,10 @@ def test_a_bucket_fills_again(monkeypatch):
 
 
 def test_counts_become_metrics():
-    from cloudrc.exposition.live import Live
+    from cloudrc.exposition.live import LiveMetrics
     from cloudrc.records import Counted
 
-    live = Live("teleop")
+    live = LiveMetrics("teleop")
     counts = {"api_served": 7, "api_token": 2, "api_slow": 1, "api_audit_dropped": 3}
     live.see(Counted(0, "teleop", name, total) for name, total in counts.items())
     live.see([Counted(0, "teleop", "journal_repaired", 1)])

@@ -9,7 +9,7 @@ from cloudrc.teleop.store import (
     AT_ONCE,
     PASSING_MAX,
     Backlog,
-    MissionBook,
+    MissionStore,
     UnavailableError,
     first_verb,
 )
@@ -279,7 +279,7 @@ def test_a_mission_that_has_begun_closes_those_before_it():
     flight.step(position=AWAY, seconds=0.2)
     assert flight.view(second)["state"] == "flying"
     damaged = [e for e in flight.kept if (e["mission"], e.get("event")) != (first, "done")]
-    book = MissionBook(lambda entry: None, damaged, b"")
+    book = MissionStore(lambda entry: None, damaged, b"")
     assert [mission.id for mission in book.open()] == [second, third]
     closed = book.find(first)
     assert (closed.state, closed.verdict["exit_code"]) == ("failed", 1)
@@ -290,7 +290,7 @@ def test_a_queued_mission_that_is_cancelled_closes_nothing():
     flight, first = service_flying()
     second = flight.create(queue=True)
     flight.teleop.cancel(second, flight.now_ns)
-    book = MissionBook(lambda entry: None, flight.kept, b"")
+    book = MissionStore(lambda entry: None, flight.kept, b"")
     assert [mission.id for mission in book.open()] == [first]
 
 
@@ -302,6 +302,6 @@ def test_a_held_mission_is_still_held_when_the_robot_knew_more():
     flight.step(seconds=0.2)
     assert flight.view(mission_id)["state"] == "held"
     assert flight.view(mission_id)["waypoint"] == 2
-    verb = first_verb(MissionBook(lambda entry: None, flight.kept, b"").find(mission_id))
+    verb = first_verb(MissionStore(lambda entry: None, flight.kept, b"").find(mission_id))
     assert isinstance(verb, Continue)
     assert (verb.held, verb.leg, len(SERVICE_PLAN.legs)) == (True, 2, 3)

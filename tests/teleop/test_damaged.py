@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cloudrc.teleop.store import MissionBook, first_verb
+from cloudrc.teleop.store import MissionStore, first_verb
 from cloudrc.teleop.wire import Continue, StartMission
 from tests.teleop.conftest import B, service_flying
 
@@ -15,7 +15,7 @@ def test_a_mission_with_a_flight_entry_has_started(lost: tuple[str, ...]) -> Non
     flight, mission_id = service_flying()
     flight.step(position=B, seconds=0.1)
     damaged = [entry for entry in flight.kept if entry.get("event") not in lost]
-    mission = MissionBook(lambda entry: None, damaged, b"").find(mission_id)
+    mission = MissionStore(lambda entry: None, damaged, b"").find(mission_id)
     assert mission.state == "flying"
     assert mission.reached
     assert isinstance(first_verb(mission), Continue)
@@ -24,6 +24,6 @@ def test_a_mission_with_a_flight_entry_has_started(lost: tuple[str, ...]) -> Non
 def test_one_that_was_only_asked_to_start_has_not() -> None:
     flight, mission_id = service_flying()
     asked = [entry for entry in flight.kept if entry.get("event") in (None, "starting")]
-    mission = MissionBook(lambda entry: None, asked, b"").find(mission_id)
+    mission = MissionStore(lambda entry: None, asked, b"").find(mission_id)
     assert mission.state == "starting"
     assert isinstance(first_verb(mission), StartMission)

@@ -6,8 +6,8 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Cause, GuardState, Request, Setpoint, Start
-from cloudrc.teleop.requests import PREDECESSORS, Repeater
-from cloudrc.teleop.wire import Cancel, GoTo, Hold, Leg, Plan, Resume, Seen, StartMission
+from cloudrc.teleop.requests import PREDECESSORS, RequestSender
+from cloudrc.teleop.wire import Cancel, GoTo, Hold, Leg, Plan, Resume, RobotStatus, StartMission
 from tests.teleop.conftest import AWAY, PLAN, A, B, Flight, flying
 
 NAN, INF = float("nan"), float("inf")
@@ -187,7 +187,7 @@ def test_numbers_go_on_well_above_what_the_robot_shows():
 
 def test_a_predecessors_request_does_not_acknowledge_our_start():
     """It asked for the mission's end, was gone at once, and the robot shows that only now."""
-    repeater, seen = Repeater(), Seen(1, A, GuardState.TRACK, 41)
+    repeater, seen = RequestSender(), RobotStatus(1, A, GuardState.TRACK, 41)
     repeater.see(seen, 0)
     repeater.ask(Request.START, Start.HERE)
     own = repeater.due(0).number

@@ -8,9 +8,9 @@ from cloudrc.cli.teleop import _start
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.requests import PREDECESSORS, REPEAT_NS, Repeater
+from cloudrc.teleop.requests import PREDECESSORS, REPEAT_NS, RequestSender
 from cloudrc.teleop.store import ConflictError
-from cloudrc.teleop.wire import EmergencyStop, Leg, Pause, Plan, Seen, StartMission
+from cloudrc.teleop.wire import EmergencyStop, Leg, Pause, Plan, RobotStatus, StartMission
 from cloudrc.tunnel.codec import NUMBER_MAX
 from tests.teleop.conftest import (
     AWAY,
@@ -37,7 +37,7 @@ def test_its_first_number_is_above_that_of_one_that_was_not_seen():
     for now_ns in (REPEAT_NS * 5_000, REPEAT_NS * 5_010, 0):
         flight = Flight()
         flight.see()
-        repeater = Repeater()
+        repeater = RequestSender()
         repeater.see(flight.teleop._seen, now_ns)
         repeater.ask(Request.END)
         numbers.append(repeater.due(now_ns).number)
@@ -153,9 +153,9 @@ def test_a_stop_is_acknowledged_once_the_robot_is_released():
 
 
 def test_request_numbers_last_for_a_thousand_restarts():
-    seen, now_ns = Seen(1, A, GuardState.GROUND, 0), 10 * 365 * 86_400 * 10**9
+    seen, now_ns = RobotStatus(1, A, GuardState.GROUND, 0), 10 * 365 * 86_400 * 10**9
     for _ in range(1_000):
-        repeater = Repeater()
+        repeater = RequestSender()
         repeater.see(seen, now_ns)
         repeater.ask(Request.END)
         seen = seen._replace(mission=repeater.due(now_ns).number)

@@ -4,10 +4,10 @@ import pytest
 
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
 from cloudrc.teleop.journal import Journal
-from cloudrc.teleop.requests import PREDECESSORS, Repeater
+from cloudrc.teleop.requests import PREDECESSORS, RequestSender
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import Order, number_of
-from cloudrc.teleop.wire import Continue, Hold, Seen, StartMission
+from cloudrc.teleop.wire import Continue, Hold, RobotStatus, StartMission
 from tests.teleop.conftest import (
     AWAY,
     ID,
@@ -121,8 +121,8 @@ def test_more_than_there_is_cannot_be_reached():
 
 
 def test_progress_waits_for_what_is_asked():
-    repeater = Repeater()
-    seen = Seen(1, A, GuardState.TRACK, 4, mission_id=ID, reached=0)
+    repeater = RequestSender()
+    seen = RobotStatus(1, A, GuardState.TRACK, 4, mission_id=ID, reached=0)
     repeater.see(seen, 0)
     repeater.report(ID, 2)
     repeater.ask(Request.END)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from cloudrc.messages import MISSION_OVER, GuardState, Request, Start
 from cloudrc.teleop import models
 from cloudrc.teleop.journal import parse, to_record
-from cloudrc.teleop.store import SHOWN, ConflictError, MissionBook
+from cloudrc.teleop.store import SHOWN, ConflictError, MissionStore
 from tests.teleop.conftest import AWAY, A, B, C, ServiceFlight, service_flying
 
 
@@ -244,7 +244,7 @@ def test_the_journal_alone_says_all_that_is_known(actions):
     for action in actions:
         do(flight, action)
     entries = parse(b"".join(to_record(n, e) for n, e in enumerate(flight.kept, 1))).entries
-    book = MissionBook(lambda entry: None, entries, b"")
+    book = MissionStore(lambda entry: None, entries, b"")
     before = [json.dumps(m.as_json()) for m in flight.teleop.book.missions.values()]
     assert [json.dumps(m.as_json()) for m in book.missions.values()] == before
     assert book.events_after(0) == flight.teleop.book.events_after(0)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from cloudrc.messages import MISSION_OVER, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop.wire import Seen, decode, encode
+from cloudrc.teleop.wire import RobotStatus, decode, encode
 from cloudrc.tunnel.codec import NUMBER_MAX, encode_operator
 
 numbers = st.floats(allow_nan=False)
@@ -16,7 +16,7 @@ vectors = st.tuples(numbers, numbers, numbers)
 counts = st.integers(0, 2**62)
 messages = st.one_of(
     st.builds(
-        Seen,
+        RobotStatus,
         epoch=counts,
         position=vectors,
         guard=st.sampled_from(GuardState),
@@ -56,7 +56,7 @@ def test_a_message_comes_back_as_it_was(message):
 
 
 def test_what_is_not_known_comes_back_unknown():
-    back = decode(encode(Seen(1, (0.0, 0.0, 1.0), GuardState.TRACK, 1)))
+    back = decode(encode(RobotStatus(1, (0.0, 0.0, 1.0), GuardState.TRACK, 1)))
     assert math.isnan(back.touch_speed)
     assert math.isnan(back.rtt)
 

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from cloudrc.tunnel.codec import Direction, Hello, Kind, decode_challenge
-from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, NO_COOKIE, Door
+from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, NO_COOKIE, ServerHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import AES_256_GCM, Session
 
@@ -24,21 +24,21 @@ class Doorstep:
             nonce=nonce, clock_id=CLOCK, suite=suite, last_epoch=options.get("last_epoch", 0),
             next_epoch=options.get("next_epoch"),
         )  # fmt: skip
-        self.door = Door(self.world, identity, age_max_ns=250 * MS)
+        self.door = ServerHandshake(self.world, identity, age_max_ns=250 * MS)
         self.now_ns = 10 * COOKIE_NS
         self.counter = 0
 
-    def knock(
+    def receive_hello(
         self, nonce=NONCE, cookie=NO_COOKIE, clock=CLOCK, suite=AES_256_GCM, counter=None
     ):  # fmt: skip
         """Send a hello with this counter, or the next one."""
         self.counter += 1
         counter = self.counter if counter is None else counter
-        return self.door.knock(Hello(nonce, clock, cookie, suite), counter, self.now_ns)
+        return self.door.receive_hello(Hello(nonce, clock, cookie, suite), counter, self.now_ns)
 
     def answer(self, *given, **named):
         """Return kind, epoch and body of the answer to a hello."""
-        (data,) = self.knock(*given, **named).datagrams
+        (data,) = self.receive_hello(*given, **named).datagrams
         kind, _, epoch, _, body = self.cloud.open(data)
         return kind, epoch, body
 

@@ -5,7 +5,7 @@ import pytest
 from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
-from cloudrc.tunnel.handshake import KEY, Complaints
+from cloudrc.tunnel.handshake import KEY_TEXT, HandshakeLog
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from tests.flights.conftest import Bare, BareCloud, ring
 
@@ -46,32 +46,32 @@ def test_within_a_session_garbage_is_only_counted():
 
 @pytest.mark.parametrize("outcome", ["malformed", "direction", "old_epoch"])
 def test_garbage_is_not_logged(outcome):
-    assert Complaints().about(outcome, bytes(16), 0) == []
+    assert HandshakeLog().about(outcome, bytes(16), 0) == []
 
 
 @pytest.mark.parametrize("kind", Kind)
 def test_only_a_wrong_tag_of_a_greeting_is_logged(kind):
     data = codec.encode_header(kind, 1, 1, 1)
-    said = [Fault(7, "key", KEY)] if kind <= Kind.BUSY else []
-    assert Complaints().about("tag", data, 7) == said
+    said = [Fault(7, "key", KEY_TEXT)] if kind <= Kind.BUSY else []
+    assert HandshakeLog().about("tag", data, 7) == said
 
 
 def test_a_version_fault_names_both_versions():
-    complaints = Complaints()
+    complaints = HandshakeLog()
     text = "peer speaks v9, we speak v5: run the same version of cloudrc at both ends"
     assert complaints.about("version", bytes([9, 1, 2]), 7) == [Fault(7, "version", text)]
     assert complaints.about("version", bytes([9, 1, 2]), 8) == []
 
 
 def test_garbage_does_not_hide_the_peers_version():
-    complaints = Complaints()
+    complaints = HandshakeLog()
     assert len(complaints.about("version", bytes(16), 7)) == 1
     (fault,) = complaints.about("version", bytes([4]) + bytes(15), 8)
     assert fault.text.startswith("peer speaks v4, ")
 
 
 def test_after_a_session_the_fault_is_logged_again():
-    complaints = Complaints()
+    complaints = HandshakeLog()
     assert complaints.say("x", "text", 7) == [Fault(7, "x", "text")]
     assert complaints.say("x", "text", 8) == []
     complaints.forget()

@@ -22,10 +22,10 @@ GENERATION = 6  # offset in the header
 def after(rekeys, *, silence_ns=0):
     """Make a session in which cloud has rekeyed and world has heard nothing for `silence_ns`."""
     world, cloud = pair()
-    world.tend(0)
-    world.tend(silence_ns)
+    world.maintain(0)
+    world.maintain(silence_ns)
     for number in range(rekeys + 1):
-        cloud.tend(number * REKEY_NS)
+        cloud.maintain(number * REKEY_NS)
     return world, cloud
 
 
@@ -56,16 +56,16 @@ def test_after_any_sleep_an_end_hears_its_peer_in_seconds(rekeys):
     """Its clock stood still in the meantime; the peer's did not."""
     world, cloud = after(rekeys, silence_ns=SILENCE_NS)
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[4] == BODY
-    cloud.tend((rekeys + 1) * REKEY_NS)
+    cloud.maintain((rekeys + 1) * REKEY_NS)
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[3] == 1
-    world.tend(2 * SILENCE_NS)
+    world.maintain(2 * SILENCE_NS)
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[3] == 2
 
 
 def test_generations_go_on_beyond_the_byte_of_the_header():
     world, cloud = pair()
     for number in range(600):
-        cloud.tend(number * REKEY_NS)
+        cloud.maintain(number * REKEY_NS)
         assert world.open(cloud.seal(Kind.ALIVE, b""))[3] == number
 
 
@@ -74,11 +74,11 @@ def test_repeats_do_not_end_the_silence_of_a_peer():
     old = cloud.seal(Kind.COMMAND, BODY)
     for data in (old, cloud.seal(Kind.COMMAND, BODY)):
         world.open(data)
-    world.tend(SILENCE_NS)
+    world.maintain(SILENCE_NS)
     new = cloud.seal(Kind.COMMAND, BODY)
     for heard, silent in ((new, False), (new, True), (old, True)):
         world.open(heard)
-        world.tend(world._tended_ns + SILENCE_NS)
+        world.maintain(world._tended_ns + SILENCE_NS)
         assert world._openers._is_silent == silent
 
 
@@ -86,7 +86,7 @@ def test_a_peer_that_has_just_been_heard_is_not_far_ahead():
     world, cloud = after(0, silence_ns=SILENCE_NS)
     world.open(cloud.seal(Kind.COMMAND, BODY))
     for number in range(AHEAD_MAX + 1):
-        cloud.tend((number + 1) * REKEY_NS)
+        cloud.maintain((number + 1) * REKEY_NS)
     assert refuses(world, cloud.seal(Kind.COMMAND, BODY))
 
 
@@ -95,19 +95,19 @@ def test_the_step_ahead_counts_from_the_last_generation_heard(rekeys, refused):
     """It does not count from the first generation, which is far away after a month."""
     world, cloud = after(AHEAD_MAX)
     world.open(cloud.seal(Kind.COMMAND, BODY))
-    world.tend(1)
-    world.tend(1 + SILENCE_NS)
+    world.maintain(1)
+    world.maintain(1 + SILENCE_NS)
     for number in range(rekeys + AHEAD_MAX):
-        cloud.tend((AHEAD_MAX + 1 + number) * REKEY_NS)
+        cloud.maintain((AHEAD_MAX + 1 + number) * REKEY_NS)
     assert refuses(world, cloud.seal(Kind.COMMAND, BODY)) == refused
 
 
 def test_late_datagrams_of_the_generations_before_are_opened():
     world, cloud = pair()
-    cloud.tend(0)
+    cloud.maintain(0)
     late = cloud.seal(Kind.COMMAND, BODY)
     for number in range(KEPT):
-        cloud.tend((number + 1) * REKEY_NS)
+        cloud.maintain((number + 1) * REKEY_NS)
     assert not refuses(world, cloud.seal(Kind.COMMAND, BODY))
     assert not refuses(world, late)
 
@@ -117,7 +117,7 @@ def test_a_forged_generation_opens_nothing_and_keeps_little():
     for byte in range(1, 256):
         assert refuses(world, forged(cloud, byte))
     assert len(world._openers._derived) <= AHEAD_MAX
-    world.tend(1)
+    world.maintain(1)
     assert world._openers._derived == {}
 
 
@@ -137,7 +137,7 @@ def test_during_a_silence_few_forged_generations_are_tried(monkeypatch):
         far = len(derived) - AHEAD_MAX
         assert far == FAR_TRIES * FAR_MAX // 256
         derived.clear()
-        world.tend(world._tended_ns + 1)
+        world.maintain(world._tended_ns + 1)
 
 
 def test_an_honest_peer_is_found_behind_forged_datagrams():
@@ -146,5 +146,5 @@ def test_an_honest_peer_is_found_behind_forged_datagrams():
         assert refuses(world, forged(cloud, 200 + byte))
     honest = cloud.seal(Kind.COMMAND, BODY)
     assert refuses(world, honest)
-    world.tend(SILENCE_NS + 1)
+    world.maintain(SILENCE_NS + 1)
     assert not refuses(world, honest)

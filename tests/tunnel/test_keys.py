@@ -237,12 +237,12 @@ def test_a_wrong_clock_cannot_extend_the_overlap():
     ],
 )
 def test_a_doubtful_previous_key_gives_a_warning(keys, wall, said):
-    assert keys.caution(wall) == f"the previous key {A.name} is {said}"
+    assert keys.warning(wall) == f"the previous key {A.name} is {said}"
 
 
 @pytest.mark.parametrize("keys", [KeySet(B), ROTATED])
 def test_a_valid_previous_key_gives_no_warning(keys):
-    assert keys.caution(MADE + 299.0) == ""
+    assert keys.warning(MADE + 299.0) == ""
 
 
 @pytest.mark.promise("old-keys-expire")

@@ -25,7 +25,7 @@ class Ends:
         self.cloud = Session(Direction.DOWNLINK, self.rings["cloud"])
         for end in (self.world, self.cloud):
             end.begin(1, Agreement(b"c" * 16, b"w" * 16))
-            end.tend(0)
+            end.maintain(0)
 
     def rotate(self, end, key=NEW):
         self.rings[end].replace(KeySet(key, None, self.overlap), self.now_ns)
@@ -45,7 +45,7 @@ class Ends:
         for _ in range(seconds):
             self.now_ns += SECOND_NS
             for end, other in ((self.world, self.cloud), (self.cloud, self.world)):
-                for data in [*end.tend(self.now_ns), end.seal(Kind.ALIVE, b"")]:
+                for data in [*end.maintain(self.now_ns), end.seal(Kind.ALIVE, b"")]:
                     if deliver:
                         try:
                             other.open(data)
@@ -71,17 +71,17 @@ def test_a_rekey_after_two_minutes_loses_no_datagram():
 
 def test_counters_go_on_through_a_rekey():
     world, cloud = pair()
-    cloud.tend(0)
+    cloud.maintain(0)
     world.open(cloud.seal(Kind.COMMAND, BODY))
-    cloud.tend(REKEY_NS)
+    cloud.maintain(REKEY_NS)
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[3] == 1
 
 
 def test_the_keys_of_two_generations_differ():
     _, cloud = pair()
     first = cloud.seal(Kind.ALIVE, b"")
-    cloud.tend(0)
-    cloud.tend(REKEY_NS)
+    cloud.maintain(0)
+    cloud.maintain(REKEY_NS)
     cloud._counters[int(Kind.ALIVE)] = 0
     assert cloud.seal(Kind.ALIVE, b"")[16:] != first[16:]
 
@@ -93,30 +93,30 @@ def test_a_rekey_follows_a_number_of_datagrams(monkeypatch, sent, moved):
     _, cloud = pair()
     for _ in range(sent):
         cloud.seal(Kind.COMMAND, BODY)
-    cloud.tend(1)
+    cloud.maintain(1)
     assert generation(cloud.seal(Kind.COMMAND, BODY)) == moved
     for _ in range(8):
         cloud.seal(Kind.COMMAND, BODY)
-    cloud.tend(2)
+    cloud.maintain(2)
     assert generation(cloud.seal(Kind.COMMAND, BODY)) == 1  # the count restarts
 
 
 def test_late_datagrams_of_the_generation_before_are_opened():
     world, cloud = pair()
-    cloud.tend(0)
+    cloud.maintain(0)
     late = cloud.seal(Kind.COMMAND, BODY)
-    cloud.tend(REKEY_NS)
+    cloud.maintain(REKEY_NS)
     world.open(cloud.seal(Kind.COMMAND, BODY))
     assert world.open(late)[3] == 0
 
 
 def test_old_generations_are_forgotten():
     world, cloud = pair()
-    cloud.tend(0)
+    cloud.maintain(0)
     late = cloud.seal(Kind.COMMAND, BODY)
     for number in range(1, KEPT + 1):
         assert len(world._openers._kept) <= KEPT
-        cloud.tend(number * REKEY_NS)
+        cloud.maintain(number * REKEY_NS)
         world.open(cloud.seal(Kind.COMMAND, BODY))
     with pytest.raises(DecodeError, match=r"^tag$"):
         world.open(late)
@@ -150,11 +150,11 @@ def test_a_rotation_and_a_rekey_at_once():
 
 def test_an_announced_generation_is_used_for_nothing_else():
     world, cloud = pair()
-    world.tend(0)
+    world.maintain(0)
     world.ring.replace(KeySet(NEW), 0)
-    announced = [world.tend(second * SECOND_NS) for second in (1, 2)]
+    announced = [world.maintain(second * SECOND_NS) for second in (1, 2)]
     assert [(generation(d), codec.peek(d)[2]) for (d,) in announced] == [(1, 0), (1, 1)]
-    (again,) = world.tend(REKEY_NS)  # the old key gets the generation after the announced one
+    (again,) = world.maintain(REKEY_NS)  # the old key gets the generation after the announced one
     assert generation(world.seal(Kind.ALIVE, b"")) == 2
     assert generation(again) == 3
     assert world.next_counter(Kind.ALIVE) == 4
@@ -163,10 +163,10 @@ def test_an_announced_generation_is_used_for_nothing_else():
 
 def test_late_datagrams_are_opened_without_deriving_keys(monkeypatch):
     world, cloud = pair()
-    cloud.tend(0)
+    cloud.maintain(0)
     late = cloud.seal(Kind.COMMAND, BODY)
     for number in range(1, KEPT):
-        cloud.tend(number * REKEY_NS)
+        cloud.maintain(number * REKEY_NS)
         world.open(cloud.seal(Kind.COMMAND, BODY))
     monkeypatch.setattr(Session, "_derive", lambda *_: pytest.fail("derives a key again"))
     assert world.open(late)[3] == 0
@@ -240,7 +240,7 @@ def test_a_new_epoch_forgets_the_peers_key():
     ends.pass_time(3)
     for end in (ends.world, ends.cloud):
         end.begin(2, key=OLD)
-    ends.world.tend(ends.now_ns)
+    ends.world.maintain(ends.now_ns)
     assert ends.world._key == OLD
     assert ends.pass_time(3) == 0
     assert ends.world._key == ends.cloud._key == NEW

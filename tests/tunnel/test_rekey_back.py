@@ -32,7 +32,7 @@ def look(ends, *, heard):
     """Let world receive this and check its keys a second later."""
     ends.world.open(heard)
     ends.now_ns += SECOND_NS
-    return ends.world.tend(ends.now_ns)
+    return ends.world.maintain(ends.now_ns)
 
 
 @pytest.mark.parametrize("first", ["world", "cloud"])
@@ -55,7 +55,7 @@ def test_a_peer_with_the_older_key_is_given_time():
     (announced,) = look(ends, heard=ends.cloud.seal(Kind.ALIVE, b""))
     assert ends.world._key == OLD
     ends.cloud.ring.replace(KeySet(NEW, OLD, 300.0), ends.now_ns)
-    ends.cloud.tend(ends.now_ns)
+    ends.cloud.maintain(ends.now_ns)
     ends.cloud.open(announced)
     assert look(ends, heard=ends.cloud.seal(Kind.ALIVE, b"")) == []
     assert ends.world._key == ends.cloud._key == NEW
@@ -73,7 +73,7 @@ def test_only_checks_in_a_row_count(between):
     else:
         for end in (ends.world, ends.cloud):
             end.begin(2, key=NEW)
-        ends.cloud.tend(ends.now_ns)
+        ends.cloud.maintain(ends.now_ns)
         go_back(ends)
     for _ in range(LOOKS - 1):
         look(ends, heard=ends.cloud.seal(Kind.ALIVE, b""))
@@ -112,7 +112,7 @@ def test_an_expired_key_is_replaced_by_the_peers_key_at_once():
     ends.world.ring.replace(KeySet(NEW, OLD, 300.0), 0)
     ends.pass_time(1)
     ends.world._key = Key(b"x" * 32)
-    ends.world.tend(ends.now_ns)
+    ends.world.maintain(ends.now_ns)
     assert ends.world._key == OLD
 
 
@@ -121,8 +121,8 @@ def test_a_second_new_key_is_announced_in_place_of_the_first():
     latest = Key(b"m" * 32)
     for key in (NEW, latest):
         ends.world.ring.replace(KeySet(key, OLD, 300.0), ends.now_ns)
-        (announced,) = ends.world.tend(ends.now_ns)
+        (announced,) = ends.world.maintain(ends.now_ns)
     ends.cloud.ring.replace(KeySet(latest, OLD, 300.0), ends.now_ns)
-    ends.cloud.tend(ends.now_ns)
+    ends.cloud.maintain(ends.now_ns)
     ends.cloud.open(announced)
     assert ends.cloud._key == latest

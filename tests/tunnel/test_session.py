@@ -88,7 +88,7 @@ def test_a_malformed_datagram_costs_no_cryptography(monkeypatch):
 def test_an_end_without_keys_is_not_sealed():
     assert not make_session(Direction.UPLINK, None).sealed
     assert make_session(Direction.UPLINK, KeyRing(KeySet(Key(bytes(32))))).sealed
-    assert unsealed()[0].tend(10**12) == []
+    assert unsealed()[0].maintain(10**12) == []
 
 
 @pytest.mark.parametrize("ends", [pair, unsealed])
@@ -112,7 +112,7 @@ def test_without_a_session_only_greetings_are_opened(make):
     cloud, (world, _) = make(), pair(epoch=NO_EPOCH)
     with pytest.raises(DecodeError, match=r"^old_epoch$"):
         cloud.open(world.seal(Kind.TELEMETRY, bytes(codec.BODY_SIZES[Kind.TELEMETRY])))
-    assert cloud.tend(0) == []
+    assert cloud.maintain(0) == []
     challenge = codec.encode_challenge(b"c" * 16)
     assert cloud.open(world.greet(Kind.CHALLENGE, challenge))[4] == challenge
 

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from cloudrc.messages import Command
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Busy, Direction, Hello, Kind
-from cloudrc.tunnel.handshake import ClientHandshake, Door
+from cloudrc.tunnel.handshake import ClientHandshake, ServerHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, REKEY_NS, Session, pair
 
@@ -138,8 +138,8 @@ def test_a_datagram_can_be_made_from_the_description_alone(suite):
     cloud.seal(Kind.COMMAND, BODY)
     sealed = cloud.seal(Kind.COMMAND, BODY)
     assert sealed == by_hand(suite, 1, 0x01020304, 0, 6, 1, BODY)
-    world.tend(0)
-    world.tend(REKEY_NS)
+    world.maintain(0)
+    world.maintain(REKEY_NS)
     assert world.seal(Kind.ALIVE, b"") == by_hand(suite, 0, 0x01020304, 1, 8, 0, b"")
 
 
@@ -156,9 +156,13 @@ def test_a_cookie_can_be_made_from_the_description_alone():
     identity = SimpleNamespace(
         nonce=b"w" * 16, clock_id=bytes(16), suite=1, last_epoch=0, next_epoch=None
     )
-    door = Door(Session(Direction.UPLINK, KeyRing(KeySet(Key(SECRET)))), identity, age_max_ns=1)
+    door = ServerHandshake(
+        Session(Direction.UPLINK, KeyRing(KeySet(Key(SECRET)))), identity, age_max_ns=1
+    )
     cookies = derived(SECRET, b"w" * 16, b"cloudrc 5 cookies")
-    (answer,) = door.knock(Hello(bytes(16), bytes(16), bytes(16), 1), 0, 7_999_999_999).datagrams
+    (answer,) = door.receive_hello(
+        Hello(bytes(16), bytes(16), bytes(16), 1), 0, 7_999_999_999
+    ).datagrams
     cookie = hmac.digest(cookies, b"3", hashlib.sha256)[:16]
     assert answer[16:-16] == cookie + bytes(33)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from cloudrc.cluster.client import DEFAULT_RELEASE, Release, connect
 from cloudrc.cluster.jobs import logs, read_job, run_job
-from cloudrc.cluster.link import PROFILE, Place, read_link
+from cloudrc.cluster.link import PROFILE, ReleasePlace, read_link
 from cloudrc.cluster.pods import fetch_metrics, fetch_recording, find_pod
 from cloudrc.cluster.tools import ClusterError
 from cloudrc.cluster.tools import run as call
@@ -136,7 +136,7 @@ def kubectl(release: Release, *words: str, given: str = "", timeout: float = 60.
 @contextmanager
 def link_as_it_is(release: Release) -> Iterator[Path]:
     """Keep the profile that is in force now, with its traces, in a file."""
-    link = read_link(Place(release.context, release.namespace, release.name))
+    link = read_link(ReleasePlace(release.context, release.namespace, release.name))
     if link is None:
         raise ClusterError(f"release '{release.name}' has no link to change")
     with tempfile.TemporaryDirectory() as folder:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from cloudrc.cluster.pods import DIRECTLY
+from cloudrc.cluster.pods import NO_PROXY
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.drivers.epochs import replace_durably
 from cloudrc.drivers.realtime import free_ports
@@ -187,7 +187,7 @@ class Processes:
             timeout: For the answer [s].
         """
         url = f"http://{LOOPBACK}:{self.metrics[name]}/metrics"
-        with DIRECTLY.open(url, timeout=timeout) as answer:
+        with NO_PROXY.open(url, timeout=timeout) as answer:
             lines = answer.read().decode().splitlines()
         samples = (line.rpartition(" ") for line in lines if not line.startswith("#"))
         return {name: float(value) for name, _, value in samples}

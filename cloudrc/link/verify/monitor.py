@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cloudrc.errors import in_words
-from cloudrc.exposition.parts import Stream as StreamTally
+from cloudrc.exposition.parts import DatagramTally as StreamTally
 from cloudrc.files import TooLongError, read
 from cloudrc.link.profile import DirectionProfile, settled
 from cloudrc.link.state import STATE_MAX, from_text

@@ -39,7 +39,7 @@ DOTS = 6000
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class DirectionSample:
     """One direction of a link: its profile, n packets over time, and m packets for statistics.
 
     Attributes:
@@ -57,11 +57,13 @@ class Way:
     runs: tuple[int, ...]
 
 
-_LabelledWay: TypeAlias = tuple[Way, str, str]
+_LabelledWay: TypeAlias = tuple[DirectionSample, str, str]
 """A direction, its name and its colour."""
 
 
-def picture(title: str, uplink: Way, downlink: Way | None, kind: str) -> bytes:
+def render_link(
+    title: str, uplink: DirectionSample, downlink: DirectionSample | None, kind: str
+) -> bytes:
     """Draw a link as a file.
 
     Args:
@@ -81,7 +83,7 @@ def picture(title: str, uplink: Way, downlink: Way | None, kind: str) -> bytes:
     return target.getvalue()
 
 
-def draw(title: str, uplink: Way, downlink: Way | None) -> Figure:
+def draw(title: str, uplink: DirectionSample, downlink: DirectionSample | None) -> Figure:
     """Draw the panels; the settings `style.RC` must be active."""
     figure = new_figure(PAGE, 4.4)
     figure.suptitle(title, x=0.01, ha="left", fontsize=9.5)
@@ -99,13 +101,13 @@ def draw(title: str, uplink: Way, downlink: Way | None) -> Figure:
     return figure
 
 
-def _top(way: Way) -> float:
+def _top(way: DirectionSample) -> float:
     """Compute the largest delay of a direction [ms], at least 1 ms."""
     shown = way.delays[np.isfinite(way.delays)] * 1e3
     return max(float(shown.max(initial=0.0)), 1.0)
 
 
-def _draw_delay(axes: Axes, way: Way, colour: str, top: float) -> None:
+def _draw_delay(axes: Axes, way: DirectionSample, colour: str, top: float) -> None:
     """Draw the profile as a band, each packet as a dot, lost packets along the lower edge."""
     duration = float(way.sent[-1]) if len(way.sent) else 1.0
     steps = marks.band(way.asked)

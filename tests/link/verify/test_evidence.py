@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cli.link_verify_run import LateWatch
+from cloudrc.cli.link_verify_run import LatenessWatch
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.verify.causes import (
     Evidence,
@@ -114,10 +114,10 @@ class Relay:
 
 
 def test_the_worst_of_all_the_time_is_kept_not_the_last() -> None:
-    watch = LateWatch({"uplink": Relay(0.0001, 0.0300, 0.0001), "downlink": Relay(0.0002)})
+    watch = LatenessWatch({"uplink": Relay(0.0001, 0.0300, 0.0001), "downlink": Relay(0.0002)})
     for _ in range(4):
         watch.look()
     told = Evidence("relay", late=0.0001)
     assert watch.worst("uplink", told).late == pytest.approx(0.030)
     assert watch.worst("downlink", told).late == pytest.approx(0.0002)
-    assert LateWatch({}).worst("uplink", Evidence()).late is None
+    assert LatenessWatch({}).worst("uplink", Evidence()).late is None

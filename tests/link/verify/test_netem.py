@@ -12,10 +12,10 @@ import pytest
 
 from cloudrc.cli import link_processes
 from cloudrc.cli import link_verify_run as run
-from cloudrc.cli.link_processes import WAYS, Shaping, shaping
-from cloudrc.cli.link_verify import find
-from cloudrc.cli.link_verify_run import DEVICE, Asked, Bank, banks
-from cloudrc.cli.link_verify_text import Said, as_text
+from cloudrc.cli.link_processes import DIRECTIONS, ShaperProcess, run_shapers
+from cloudrc.cli.link_verify import find_experiment
+from cloudrc.cli.link_verify_run import DEVICE, DirectionPlan, ProbeEndpoint, open_probe_endpoints
+from cloudrc.cli.link_verify_text import VerifyReport, as_text
 from cloudrc.config.load import dump
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.link.verify.causes import find_causes
@@ -37,13 +37,16 @@ class Link:
     """A link that is up, and is probed as often as wanted."""
 
     def __init__(
-        self, asked: Mapping[str, Asked], ends: Mapping[str, Bank], ways: Mapping[str, Shaping]
+        self,
+        asked: Mapping[str, DirectionPlan],
+        ends: Mapping[str, ProbeEndpoint],
+        ways: Mapping[str, ShaperProcess],
     ) -> None:
         self.asked, self.ends, self.ways = asked, ends, ways
 
-    def verify(self) -> Said:
-        findings = run.probe(self.asked, self.ends, self.ways, lambda line: None)
-        said = Said(
+    def verify(self) -> VerifyReport:
+        findings = run.probe_link(self.asked, self.ends, self.ways, lambda line: None)
+        said = VerifyReport(
             "netem", "netem", findings, dict.fromkeys(findings, ""), [], find_causes(findings)
         )
         print(as_text(said))
@@ -61,17 +64,19 @@ class Link:
 
 
 @pytest.fixture(scope="module")
-def plan() -> dict[str, Asked]:
-    return run.plan(find("ideal", SETTINGS), SECONDS, "netem")
+def plan() -> dict[str, DirectionPlan]:
+    return run.plan(find_experiment("ideal", SETTINGS), SECONDS, "netem")
 
 
 @contextmanager
-def up(plan: dict[str, Asked], profile: str = PROFILE) -> Iterator[Link]:
+def up(plan: dict[str, DirectionPlan], profile: str = PROFILE) -> Iterator[Link]:
     """A link whose processes were told `profile`, whatever was asked for."""
     try:
-        with banks("netem") as ends:
+        with open_probe_endpoints("netem") as ends:
             places = {way: bank.place for way, bank in ends.items()}
-            with shaping(places, dump(find("ideal", SETTINGS)), profile, "netem") as ways:
+            with run_shapers(
+                places, dump(find_experiment("ideal", SETTINGS)), profile, "netem"
+            ) as ways:
                 yield Link(plan, ends, ways)
     except MissingPrerequisiteError as error:
         pytest.exit(f"netem cannot be tested here: {error}", CloudrcError.exit_code + 2)
@@ -82,11 +87,11 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_processes, "START_LIMIT", 300.0)  # emulated processors are slow
 
 
-def codes(said: Said) -> set[str]:
+def codes(said: VerifyReport) -> set[str]:
     return {cause.code for cause in said.causes}
 
 
-def patiently(link: Link) -> Said:
+def patiently(link: Link) -> VerifyReport:
     """A true link is believed, unless an emulated processor has let it wait: three tries."""
     for _ in range(2):
         if (said := link.verify()).verdict == "believed":
@@ -96,7 +101,7 @@ def patiently(link: Link) -> Said:
 
 @pytest.mark.smoke
 def test_a_true_link_is_believed_but_not_without_its_qdisc(
-    plan: dict[str, Asked],
+    plan: dict[str, DirectionPlan],
 ) -> None:
     with up(plan) as link:
         said = patiently(link)
@@ -111,13 +116,13 @@ def test_a_true_link_is_believed_but_not_without_its_qdisc(
 
 
 def test_a_correlation_that_netem_ignores_is_no_fault() -> None:
-    settings = [f"link.{way}.correlation=0.9" for way in WAYS]
-    plan = run.plan(find("ideal", [*SETTINGS, *settings]), SECONDS, "netem")
+    settings = [f"link.{way}.correlation=0.9" for way in DIRECTIONS]
+    plan = run.plan(find_experiment("ideal", [*SETTINGS, *settings]), SECONDS, "netem")
     with up(plan, PROFILE.replace("80}", "80, correlation: 0.9}")) as link:
         assert patiently(link).verdict == "believed"
 
 
-def test_a_doubled_delay_is_named(plan: dict[str, Asked]) -> None:
+def test_a_doubled_delay_is_named(plan: dict[str, DirectionPlan]) -> None:
     with up(plan, PROFILE.replace("400", "800")) as link:
         doubled = link.verify()
         assert codes(doubled) == {"doubled_delay"}
@@ -126,7 +131,7 @@ def test_a_doubled_delay_is_named(plan: dict[str, Asked]) -> None:
             assert found.evidence.applied.delay == pytest.approx(0.800, abs=1e-4)
 
 
-def test_a_link_that_delays_one_direction_only_is_named(plan: dict[str, Asked]) -> None:
+def test_a_link_that_delays_one_direction_only_is_named(plan: dict[str, DirectionPlan]) -> None:
     bare = PROFILE.replace("downlink: *both", "downlink: {}")
     with up(plan, bare) as link:
         assert [(c.code, c.way) for c in link.verify().causes] == [("one_direction", "downlink")]
@@ -161,15 +166,15 @@ QUICK = ("no_qdisc", "wrong_interface", "shaped_twice", "bypassed")
     [pytest.param(name, marks=[] if name in QUICK else pytest.mark.full) for name in FAULTS],
 )
 def test_what_is_wrong_in_the_kernel_is_named(
-    plan: dict[str, Asked], fault: str, figure: Callable[..., None]
+    plan: dict[str, DirectionPlan], fault: str, figure: Callable[..., None]
 ) -> None:
     more, commands = FAULTS[fault]
     if more:
-        settings = [f"link.{way}.{one}" for way in WAYS for one in more]
-        plan = run.plan(find("ideal", [*SETTINGS, *settings]), LOSING_SECONDS, "netem")
+        settings = [f"link.{way}.{one}" for way in DIRECTIONS for one in more]
+        plan = run.plan(find_experiment("ideal", [*SETTINGS, *settings]), LOSING_SECONDS, "netem")
     with up(plan) as link:
         link.stop()
-        for way in WAYS:
+        for way in DIRECTIONS:
             for command in commands:
                 link.tc(way, *command.split())
         found = codes(link.verify())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cloudrc.assembly import link_profile
-from cloudrc.cli.link_verify import find
+from cloudrc.cli.link_verify import find_experiment
 from cloudrc.cli.link_verify_run import _notes, plan
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
@@ -86,7 +86,7 @@ def test_the_kernel_correlates_nothing_and_keeps_the_width() -> None:
 
 def of_netem(name: str, *settings: str) -> dict[str, Asked]:
     """What `link verify --shaper netem` sends and expects."""
-    asked = plan(find(name, list(settings)), None, "netem")
+    asked = plan(find_experiment(name, list(settings)), None, "netem")
     return {way: Asked(one.plan.profile, one.plan, one.trains) for way, one in asked.items()}
 
 
@@ -135,14 +135,14 @@ def test_a_netem_that_is_off_is_not_believed(
     settings = ["delay_ms=80", *settings]
     words = [f"link.{way}.{one}" for way in WAYS for one in settings]
     asked = of_netem("ideal", *words)["uplink"]
-    true = link_profile(find("ideal", words).uplink)
+    true = link_profile(find_experiment("ideal", words).uplink)
     assert doubts(shaped(asked, true, 1)) == []
     for seed in range(5):
         assert f"{row} off" in doubts(shaped(asked, replace(true, **real), seed))
 
 
 def test_a_correlation_that_netem_ignores_is_noted() -> None:
-    experiment = find("satellite", [])
+    experiment = find_experiment("satellite", [])
     said = _notes(experiment, plan(experiment, 60.0, "netem"), "netem")
     assert "uplink: correlation 0.9 NOT JUDGED: netem realises almost none of it" in said
     assert not [one for one in _notes(experiment, plan(experiment, 60.0), "relay") if "corr" in one]

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 
 from cloudrc.assembly import link_profile
-from cloudrc.cli.link_processes import LOOPBACK, Shaping
-from cloudrc.cli.link_verify import find
-from cloudrc.cli.link_verify_run import banks, verify
-from cloudrc.cli.link_verify_text import Said, as_document, as_text, deciding
+from cloudrc.cli.link_processes import LOOPBACK, ShaperProcess
+from cloudrc.cli.link_verify import find_experiment
+from cloudrc.cli.link_verify_run import open_probe_endpoints, verify
+from cloudrc.cli.link_verify_text import VerifyReport, as_document, as_text, deciding
 from cloudrc.cli.main import main
 from cloudrc.config.schema import Profile
 
@@ -29,7 +29,7 @@ LINK += ["link.downlink.jitter_ms=30"]
 
 
 def asked(*settings: str) -> Any:
-    return find("paper-p1", [*LINK, *settings])
+    return find_experiment("paper-p1", [*LINK, *settings])
 
 
 def nobody(line: str) -> None:
@@ -44,7 +44,7 @@ def changed(experiment: Any, **values: Any) -> Profile:
     return Profile(**ways)
 
 
-def steady(make: Callable[[], Said], wanted: set[str] | None = None) -> Said:
+def steady(make: Callable[[], VerifyReport], wanted: set[str] | None = None) -> VerifyReport:
     """Verify until the machine has let the shapers run, three times at most.
 
     It may stand still without a shaper's knowing, when whoever hears is held up: then something
@@ -58,7 +58,7 @@ def steady(make: Callable[[], Said], wanted: set[str] | None = None) -> Said:
     return said
 
 
-def codes(said: Said) -> set[str]:
+def codes(said: VerifyReport) -> set[str]:
     return {cause.code for cause in said.causes}
 
 
@@ -89,7 +89,7 @@ def test_a_doubled_delay_is_named_on_the_command_line(
     )
     from cloudrc.cli import link_verify_run
 
-    def doubled(*given: Any) -> Said:
+    def doubled(*given: Any) -> VerifyReport:
         return steady(lambda: verify(*given, applied=wrong))
 
     monkeypatch.setattr(link_verify_run, "verify", doubled)
@@ -102,7 +102,7 @@ def test_a_doubled_delay_is_named_on_the_command_line(
 
 
 @contextmanager
-def stopped_now_and_then(running: Mapping[str, Shaping]) -> Iterator[None]:
+def stopped_now_and_then(running: Mapping[str, ShaperProcess]) -> Iterator[None]:
     """Hold both shapers up, as a CPU limit does: 60 ms of every 100."""
     over = threading.Event()
 
@@ -126,7 +126,7 @@ def stopped_now_and_then(running: Mapping[str, Shaping]) -> Iterator[None]:
 def test_a_relay_without_its_cpu_is_named() -> None:
     holds: list[Any] = []
 
-    def meddle(running: Mapping[str, Shaping]) -> None:
+    def meddle(running: Mapping[str, ShaperProcess]) -> None:
         holds.append(stopped_now_and_then(running))
         holds[0].__enter__()
 
@@ -142,7 +142,7 @@ def test_a_relay_without_its_cpu_is_named() -> None:
 def test_a_bypass_is_named() -> None:
     direct: dict[str, tuple[str, int]] = {}
 
-    def around(running: Mapping[str, Shaping]) -> None:
+    def around(running: Mapping[str, ShaperProcess]) -> None:
         direct.update({way: one.place.peer for way, one in running.items()})
 
     said = steady(
@@ -227,7 +227,7 @@ def test_bad_input_is_told_in_one_line(
 
 
 def test_nothing_is_left_open() -> None:
-    with banks("relay") as ends:
+    with open_probe_endpoints("relay") as ends:
         address = ends["uplink"].own.getsockname()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
         again.bind((LOOPBACK, address[1]))

@@ -12,7 +12,7 @@ from threading import Event
 
 import pytest
 
-from cloudrc.exposition.ends import Check
+from cloudrc.exposition.ends import LinkVerdict
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import STATE_MAX
 from cloudrc.link.verify.monitor import Basis, StandingCheck, Tally
@@ -233,7 +233,7 @@ def test_a_failed_comparison_is_logged_once_and_checks_go_on(
 
 
 def test_what_is_exposed_is_the_newest_verdict() -> None:
-    check = Check("uplink")
+    check = LinkVerdict("uplink")
     assert check.read() == {}
     check.see(LinkChecked(1, True, "mean", 0.04, nan, 0.03, 0.05, "open", 100))
     assert check.read() == {}

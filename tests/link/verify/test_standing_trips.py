@@ -11,7 +11,7 @@ import pytest
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
-from cloudrc.exposition.ends import Check
+from cloudrc.exposition.ends import LinkVerdict
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.verify.monitor import StandingCheck
 from cloudrc.link.verify.standing import TICK, WINDOW_MAX
@@ -172,7 +172,7 @@ def test_errors_hidden_by_late_ends_are_not_judged(late: float | None, ever: boo
     assert last["round_trip_takes"].asked > WINDOW_MAX
     assert last["datagrams"].asked < WINDOW_MAX
     assert sane(records)
-    check = Check("uplink")
+    check = LinkVerdict("uplink")
     for record in records:
         check.see(record)
     assert json.loads(check.text())["verdict"] == "ok"

@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.config import overrides, shipped
-from cloudrc.config.document import SETTING, Document, Source
-from cloudrc.config.load import FILES, check_profile, load_profile
+from cloudrc.config.document import SET_LABEL, Document, Source
+from cloudrc.config.load import FILE_READERS, check_profile, load_profile
 from cloudrc.config.overrides import Override
 from cloudrc.config.schema import Change
 from cloudrc.errors import BadInputError
 
 DIRECTIONS = ("uplink", "downlink")
-ON_TIME_LINE = Change.model_fields.keys() - {"at_s"}
+CHANGEABLE_KEYS = Change.model_fields.keys() - {"at_s"}
 """Keys of a direction that an entry of `changes` may set."""
-TIME_LINES = ("changes", "trace", "blackouts")
+TIME_LINE_KEYS = ("changes", "trace", "blackouts")
 """Keys of a direction that make its conditions depend on time."""
 _HERE = "link set"
 _EXAMPLE = "for example downlink.delay_ms=120, or --profile handover"
@@ -46,7 +46,7 @@ class Edit:
     notes: list[str] = field(default_factory=list)
 
 
-def edit(before: Document, profile: str | None, settings: Sequence[str]) -> Edit:
+def edit_profile(before: Document, profile: str | None, settings: Sequence[str]) -> Edit:
     """Change a profile.
 
     Args:
@@ -62,13 +62,13 @@ def edit(before: Document, profile: str | None, settings: Sequence[str]) -> Edit
     notes: list[str] = []
     document = before if profile is None else _load(profile, notes)
     restart = profile is not None
-    changes = [_without_prefix(change) for change in overrides.parse(settings)]
+    changes = [_without_prefix(change) for change in overrides.parse_settings(settings)]
     for change in changes:
-        restart |= change.path[1] in TIME_LINES
+        restart |= change.path[1] in TIME_LINE_KEYS
         _drop_from_time_line(document, change, notes)
-    overrides.apply(document, changes)
+    overrides.apply_overrides(document, changes)
     document.sources = {
-        path: Source(_HERE, source.folder) if source.label == SETTING else source
+        path: Source(_HERE, source.folder) if source.label == SET_LABEL else source
         for path, source in document.sources.items()
     }
     values = check_profile(document, _HERE).model_dump(mode="json", exclude_defaults=True)
@@ -76,7 +76,7 @@ def edit(before: Document, profile: str | None, settings: Sequence[str]) -> Edit
     return Edit(values, ", ".join([*words, *settings]), restart, notes)
 
 
-def check(profile: str | None, settings: Sequence[str]) -> None:
+def check_edit(profile: str | None, settings: Sequence[str]) -> None:
     """Refuse a request that is wrong for every present profile.
 
     Raises:
@@ -85,10 +85,10 @@ def check(profile: str | None, settings: Sequence[str]) -> None:
     independent = [
         text
         for text in settings
-        if text.partition("=")[0].rpartition(".")[2] not in ("distribution", *FILES)
+        if text.partition("=")[0].rpartition(".")[2] not in ("distribution", *FILE_READERS)
     ]
     if profile is not None or independent or not settings:
-        edit(Document({}), profile, independent)
+        edit_profile(Document({}), profile, independent)
 
 
 def _load(name: str, notes: list[str]) -> Document:
@@ -116,7 +116,7 @@ def _drop_from_time_line(document: Document, change: Override, notes: list[str])
     """Remove from a direction's time line the key that is set by hand."""
     way, key = change.path[:2]
     direction = document.get(way)
-    if not isinstance(direction, dict) or key not in ON_TIME_LINE:
+    if not isinstance(direction, dict) or key not in CHANGEABLE_KEYS:
         return
     direction = document.tree[way] = copy.deepcopy(direction)
     changes = direction.get("changes") or ()
