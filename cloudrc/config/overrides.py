@@ -159,7 +159,7 @@ def resolve_plugins(document: Document) -> list[Problem]:
         except BadInputError as error:
             found.append(Problem(path, "", str(error)))
         else:
-            # Not by `graft`: the given parameters keep their places in the file.
+            # Not by `set_value`: the given parameters keep their places in the file.
             document.tree["cloud"][key] = {"name": name, **complete}
     return found
 

@@ -141,7 +141,7 @@ def test_after_a_stall_cloud_maintains_its_keys_once(
 ) -> None:
     """Checks must be a second apart, because an end counts those that find another key."""
     looks: list[int] = []
-    monkeypatch.setattr(ends.cloud._session, "tend", lambda now_ns: looks.append(now_ns) or [])
+    monkeypatch.setattr(ends.cloud._session, "maintain", lambda now_ns: looks.append(now_ns) or [])
     woken_ns = ends.run.now_ns + 60 * S
     for late_ns in range(0, S // 2, S // 100):
         ends.cloud.handle_deadline(woken_ns + late_ns)
