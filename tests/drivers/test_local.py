@@ -61,7 +61,7 @@ def alive(pid: int) -> bool:
     return True
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("how", [signal.SIGINT, *nightly(signal.SIGTERM, signal.SIGHUP)])
 def test_ctrl_c_ends_all_processes_within_two_seconds_and_leaves_a_report(tmp_path, how):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
@@ -83,7 +83,7 @@ def test_ctrl_c_ends_all_processes_within_two_seconds_and_leaves_a_report(tmp_pa
     assert (tmp_path / "run" / "mission.mcap").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("victim", ["world", "cloud", "teleop", "relay"])
+@pytest.mark.parametrize("victim", ["cloud", *nightly("world", "teleop", "relay")])
 def test_a_process_that_dies_ends_the_run_and_is_named(tmp_path, victim):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
@@ -162,6 +162,7 @@ PREDICTOR = '''
 """A predictor that {does}."""
 import time
 from cloudrc.cloud.predictors import Predictor
+from tests.conftest import nightly
 class Odd(Predictor):
     def predict(self, odometry, horizon):
         {statement}

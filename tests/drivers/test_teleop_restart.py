@@ -10,6 +10,7 @@ from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.teleop.journal import parse
 from cloudrc.teleop.wire import ALARM, encode
+from tests.conftest import nightly
 from tests.drivers.conftest import LIMIT, TOKEN, Release
 
 pytestmark = pytest.mark.process
@@ -22,7 +23,7 @@ def release(tmp_path):
     one.end()
 
 
-@pytest.mark.parametrize("killed", [("teleop",), ("cloud",), ("cloud", "teleop")])
+@pytest.mark.parametrize("killed", [("cloud", "teleop"), *nightly(("teleop",), ("cloud",))])
 def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
     release.fly()
     release.kill(*killed)
