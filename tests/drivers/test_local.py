@@ -163,6 +163,7 @@ PREDICTOR = '''
 import time
 from cloudrc.cloud.predictors import Predictor
 from tests.conftest import nightly
+from tests.conftest import nightly
 class Odd(Predictor):
     def predict(self, odometry, horizon):
         {statement}
