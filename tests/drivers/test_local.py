@@ -17,6 +17,7 @@ pytestmark = pytest.mark.process
 FLOWN = (0, 6)
 """Done, or done but not in real time: a busy machine is not what is tested here."""
 HOVER = ["hover", "--mode", "local", "--set", "mission.waypoints.0.dwell_s={dwell}"]
+from tests.conftest import nightly
 
 
 def start(folder: Path, *settings: str, dwell: float = 20.0) -> subprocess.Popen[str]:
@@ -162,8 +163,6 @@ PREDICTOR = '''
 """A predictor that {does}."""
 import time
 from cloudrc.cloud.predictors import Predictor
-from tests.conftest import nightly
-from tests.conftest import nightly
 class Odd(Predictor):
     def predict(self, odometry, horizon):
         {statement}
