@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 from cloudrc.drivers import local as flights
+from tests.conftest import nightly
 
 pytestmark = pytest.mark.process
 
 FLOWN = (0, 6)
 """Done, or done but not in real time: a busy machine is not what is tested here."""
 HOVER = ["hover", "--mode", "local", "--set", "mission.waypoints.0.dwell_s={dwell}"]
-from tests.conftest import nightly
 
 
 def start(folder: Path, *settings: str, dwell: float = 20.0) -> subprocess.Popen[str]:
