@@ -148,10 +148,7 @@ class Tree:
             text = self.python("-m", "cloudrc", *verb, "--help").stdout
             usage = text.partition("\n\n")[0]
             yield " ".join(verb), sorted(set(re.findall(r"(?<![\w-])--?[a-z][\w-]*", usage)))
-            below = re.search(
-                r"(?ms)^(?:positional arguments|verbs|commands)?:?\n?\s+\{([^}]*)\}", text
-            )
-            names = below[1].split(",") if below else []
+            names = re.findall(r"(?m)^    ([a-z]+)(?:  |$)", text) if len(verb) == 1 else []
             if not verb:
                 names = re.findall(r"(?m)^  ([a-z]+) {2,}\S", text)
             todo += [(*verb, name) for name in names if len(verb) < 2 and name not in verb]
