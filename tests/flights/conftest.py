@@ -1,12 +1,8 @@
-"""Provide both endpoints, alone or in flights, and the silences and kills of the tests.
+"""Provide endpoints and flights for the tests.
 
-Fly an experiment in virtual time, without files, and judge it.
-
-Flights whose link falls silent: what the robot does by itself, tick by tick.
-
-When the cloud falls silent, or is killed: 200 instants in the pipes, 200 anywhere.
-
-A world, and a cloud of which a test writes every datagram itself.
+There are endpoints without robot and loop; flights in virtual time with a verdict; flights with a
+silent link, recorded tick by tick; the instants of silences and kills (200 in the pipes, 200
+anywhere); and a world with a cloud whose datagrams the test writes itself.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def target() -> Target:
 
 
 def flood(target: Target, count: int, seed: int) -> None:
-    """Try `number` random datagrams."""
+    """Try `count` random datagrams."""
     rng = random.Random(seed)
     for _ in range(count):
         target.try_one(rng.randbytes(rng.choice((6, 8, 12, 40, 200))))
