@@ -1,6 +1,7 @@
 """The records of a run, which world, cloud and the drivers make during a flight.
 
 A record is a named tuple whose first field is `stamp_ns`, on the clock of the end that made it.
+Its docstring begins with who makes it: an end, or the driver that runs the end.
 `record/` turns records into MCAP topics, columns and a hash; `metrics/` turns them into numbers.
 """
 
@@ -12,10 +13,11 @@ from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
 
 
 class LinkChanged(NamedTuple):
-    """Driver, in real time only: the link conditions of this end's direction. Topic /link.
+    """Driver, in real time only: the conditions of the link towards this end. Topic /link.
 
     World records the uplink, cloud the downlink: at the start, after every change, and again when
-    a session or a mission begins. The requested values are those at the start of the time line.
+    a session or a mission begins. A profile may change its values over time, by its time line. The
+    requested values are those at the start of the time line.
 
     Attributes:
         stamp_ns: When this end recorded it [ns], own clock.
@@ -23,7 +25,7 @@ class LinkChanged(NamedTuple):
         shaper: "relay" or "netem".
         cause: Why the link changed, in words; "" at the start.
         age: Time for which these conditions have been in force [s].
-        time_line: Time for which the time line has run [s]; NaN if it continues the last one.
+        time_line: Time since the time line began [s]; NaN if the change did not restart it.
         delay: Requested one-way delay [s].
         jitter: Requested jitter, as in the profile [s].
         loss: Requested long-run loss, in [0, 1].

@@ -67,12 +67,13 @@ cloudrc run ./my_experiment.yaml --mode virtual --set seed=8 --set link.profile=
 - **Names and paths.** `cloudrc run steps` flies a shipped experiment, `cloudrc run ./mine.yaml` a
   file. A mission, a link profile or a plug-in is a shipped name, or a path: a text with a slash or
   with the ending `.yaml` (`.py` for a plug-in). Robots and scenes have shipped names only.
-- **Relative paths** start at the folder of the file that contains them, in `--set` at the working
-  folder.
+- **Relative paths** start at the folder of the file that contains them. In `--set` they start at
+  the working folder.
 - **`--set key=value`** sets one value after the file is read. The key has dots, the value is YAML.
   The option may be repeated in any order. A number selects an entry of a list
-  (`mission.waypoints.0.dwell_s=2`); the number after the last entry appends one. A key below a name
-  opens it: `cloud.controller.speed_max=2` keeps the controller and sets its parameter.
+  (`mission.waypoints.0.dwell_s=2`); the number after the last entry appends one. Where the
+  value is a name, as in `controller: pid`, a longer key keeps the name and sets one of its
+  parameters: `cloud.controller.speed_max=2`.
 - **Precedence.** What stands under `link.uplink` and `link.downlink` replaces the values of the
   profile; `--set` replaces those of every file.
 - **Errors.** An unknown key, a wrong type or a value out of range is refused before anything flies.

@@ -253,7 +253,7 @@ def on_patience(way: str, name: str, needs: float) -> Iterator[str]:
 
 
 def on_deviation(way: str, asked: float) -> Iterator[str]:
-    """Note that the jitter is judged by a standard deviation too small for the usual 10 %.
+    """Note that the requested jitter is too small to be judged within 10 %, as usual.
 
     Args:
         way: The direction.

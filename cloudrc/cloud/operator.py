@@ -11,7 +11,7 @@ from cloudrc.teleop.wire import Outcome, Output, RobotStatus
 from cloudrc.tunnel.session import NO_EPOCH
 
 REPEAT_NS = 100_000_000
-"""Time between two copies of the alarm [ns]."""
+"""Time between two copies of an emergency stop [ns]."""
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
@@ -89,11 +89,11 @@ def make_robot_status(
 class EmergencyStopRepeater:
     """Repeat an emergency stop until telemetry shows that the guard is in ESTOP.
 
-    Cloud repeats the stop itself, because teleop may wait for its disk. The alarm waits for a
-    session and continues in the next one.
+    Cloud repeats the stop itself, because teleop may wait for its disk. Without a session it
+    waits, and it continues in the next one.
 
     Attributes:
-        sounds: Whether the alarm is active.
+        sounds: Whether the stop is being repeated.
     """
 
     def __init__(self) -> None:
@@ -101,7 +101,7 @@ class EmergencyStopRepeater:
         self._number = self._acted_on = self._due_ns = 0
 
     def sound(self) -> None:
-        """Start the alarm unless it is active."""
+        """Start to repeat the stop, unless that is under way."""
         if not self.sounds:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
@@ -118,7 +118,7 @@ class EmergencyStopRepeater:
     def due(self, asked: int, now_ns: int) -> OperatorRequest | None:
         """Return the request if a copy of it is due.
 
-        World acts on rising numbers only, so the alarm needs a number above all others.
+        World acts on rising numbers only, so the stop needs a number above all others.
 
         Args:
             asked: Highest number of a request so far.

@@ -1,8 +1,8 @@
 """Apply `--set key=value` to a document, and complete the parameters of plug-ins.
 
 Shorter keys are set first, so the order of `mission=steps` and `mission.steps.count=3` does not
-matter. A key below a name turns the name into a mapping: `cloud.controller.speed_max=2` turns `pid`
-into `{name: pid, speed_max: 2}`. The index after the last appends to a list.
+matter. Where the value is a name, as in `controller: pid`, a longer key turns the name into a
+mapping: `cloud.controller.speed_max=2` gives `{name: pid, speed_max: 2}`. The index after the last appends to a list.
 
 Parameters of a plug-in are checked against the signature of its `build`, which also gives their
 defaults.

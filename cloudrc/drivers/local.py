@@ -139,7 +139,7 @@ START_LIMIT = 60.0
 STOP_LIMIT = 1.5
 """Longest time for a process to end after it was asked to [s]; then it is killed."""
 TELL_ALWAYS = ("world", "cloud")
-"""Processes that write to their feed continuously."""
+"""Processes that send records to the supervisor continuously (`drivers/feed.py`)."""
 SILENCE_LIMIT = 5.0
 """A process of `TELL_ALWAYS` that writes nothing for this long has hung [s]."""
 LOOPBACK = "127.0.0.1"

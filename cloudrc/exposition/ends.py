@@ -251,7 +251,11 @@ class WorldEnd(End):
 
     @property
     def has_peer(self) -> bool:
-        """As for any end; but a cloud without commands yet is heard only once, at its hello."""
+        """Whether cloud is heard.
+
+        Before its first command in a session, cloud sends nothing that is recorded here. Until
+        then the session itself counts as a peer.
+        """
         return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
 
     def _on_session(self, record: SessionOpened) -> None:

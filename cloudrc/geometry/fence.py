@@ -6,7 +6,7 @@ from cloudrc.messages import Vector
 
 LOW: Vector = (-3.0, -8.5, 0.0)
 HIGH: Vector = (9.2, 5.5, 2.5)
-"""Corners of the box, base position [m], world frame.
+"""Opposite corners of the box in which the robot's base stays [m], world frame.
 Source: docs/reference/plant.md, "Fence of the guard"."""
 FLOOR_MARGIN = 0.35
 """Least height of a hold point above the fence's floor [m]. Below it a tilted robot would touch the

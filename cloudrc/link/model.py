@@ -1,8 +1,9 @@
 """Model a link direction: compute when each packet arrives.
 
 The model has no clock, no socket and no stateful random generator. The virtual driver and the relay
-use the same model, so both get the same delays and losses. `sample` and `numbers` measure a
-profile with the model itself, so their results are those of a flight.
+use the same model, so both get the same delays and losses. The functions `sample` and
+`numbers` send packets through the model and compute statistics of their delays and losses, so a
+profile has the same statistics there as in a flight.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class LinkState:
         change: Number of the last change that took effect; "" if it is unknown.
         cause: Why it changed, in words; "" before the first change.
         asked: Conditions at the start of the time line, as `summary` returns them.
-        origin_ns: Start of the time line on that clock [ns]; None if it continues the last one.
+        origin_ns: Start of the time line on that clock [ns]; None if the change did not restart it.
         refused: Number of the last change that was refused; "" if none was.
         refusal: Why it was refused, in words.
     """

@@ -41,10 +41,10 @@ class Sectors(io.BufferedReader):
         self.bad: set[int] = set()
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read `size` bytes; fewer only at the end of the file.
+        """Read `size` bytes; fewer only at the end of the file. Bad sectors read as zeros.
 
         Raises:
-            OSError: If the error is not that of a bad sector.
+            OSError: If reading fails for another reason than a bad sector.
         """
         at = self.tell()
         try:

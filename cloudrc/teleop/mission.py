@@ -325,7 +325,7 @@ def find_timeout(
         plan: Plan of the mission.
         leg: Index of the current waypoint.
         state: State of the mission, which is under way.
-        elapsed: Time since the mission began, or was asked for [s].
+        elapsed: Time since the mission began [s]; before the robot starts, since it was asked for.
         flown: Time for which the leg has been flown [s].
     """
     limit, leg_limit = plan.time_limit, plan.legs[leg].time_limit

@@ -100,7 +100,12 @@ class RequestSender:
             self._pending, self._next = self._next, None
 
     def report(self, mission_id: int, reached: int) -> None:
-        """Set the mission and the number of its waypoints reached; 0: no mission."""
+        """Set the progress that every request carries.
+
+        Args:
+            mission_id: Number of the mission; 0 if there is none.
+            reached: Number of its waypoints that the robot has reached.
+        """
         self._progress = self._progress._replace(mission_id=mission_id, reached=reached)
         if self._pending is None:
             self._due_ns = 0

@@ -172,7 +172,7 @@ ACCEPT, ALIVE = int(Kind.ACCEPT), int(Kind.ALIVE)  # looking up an enum's member
 NO_EPOCH = 0
 """Epoch of an end without a session, and of every hello, challenge and refusal."""
 TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {ACCEPT}
-"""Kinds that belong to no epoch."""
+"""Kinds of datagram that belong to no epoch: all greetings except ACCEPT."""
 
 AES_256_GCM, CHACHA20_POLY1305 = 1, 2
 REKEY_NS = 120_000_000_000
@@ -240,12 +240,14 @@ class Session:
         self._tended_ns = now_ns
 
     def begin(self, epoch: int, agreement: Agreement | None = None, key: Key | None = None) -> None:
-        """Begin an epoch: derive new keys and restart the counters of the kinds with an epoch.
+        """Begin an epoch: derive new keys and restart the counters.
+
+        Kinds of datagram in TIMELESS belong to no epoch; their counters continue.
 
         Args:
             epoch: Number of the epoch.
-            agreement: Result of the handshake; None for that of the previous epoch.
-            key: Pre-shared key of the handshake; None for the key in use.
+            agreement: Result of the handshake; None keeps that of the previous epoch.
+            key: Pre-shared key of the handshake; None keeps the key in use.
         """
         self.epoch = epoch
         self._counters |= dict.fromkeys(self._counters.keys() - TIMELESS, 0)

@@ -24,10 +24,10 @@ GRAVITY = 9.81
 """Gravity that the controller assumes [m/s^2]; the physics has 9.8066.
 Source: docs/reference/plant.md, "Gravity"."""
 TILT_GAIN, YAW_GAIN = 1.0, 0.035
-"""k_R: torque per attitude error about x and y, about z [N m].
+"""Attitude gains (k_R): torque per attitude error [N m]. TILT_GAIN is for x and y, YAW_GAIN for z.
 Source: docs/reference/plant.md, "Low-level controller"."""
 TILT_RATE_GAIN, YAW_RATE_GAIN = 0.22, 0.01
-"""k_w: torque per angular velocity about x and y, about z [N m s].
+"""Rate gains (k_w): torque per angular velocity [N m s]. The first is for x and y, the second for z.
 Source: docs/reference/plant.md, "Low-level controller"."""
 THRUST_MAX = THRUST_COEFFICIENT * SPEED_MAX**2
 """Largest thrust of one rotor [N]."""

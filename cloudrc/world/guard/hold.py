@@ -191,9 +191,10 @@ class Descent:
 class TakeOff:
     """Detects when the robot has left the ground, and whether it may take off.
 
-    Before that, a HOLD would scrape along the ground, so the rotors stop instead. A robot whose
-    rotors were stopped in the air may still be falling, or lie outside the fence, when it is
-    acknowledged. It may take off once it is at rest inside the fence, by TAKE_OFF_MARGIN.
+    On the ground a HOLD would scrape along it, so the rotors stop instead. A robot whose rotors were
+    stopped in the air may still be falling, or lie outside the fence, when the operator
+    acknowledges. It may take off once it is at rest, inside the fence and at least TAKE_OFF_MARGIN
+    from its walls.
 
     Attributes:
         over: Whether the robot has left the ground.

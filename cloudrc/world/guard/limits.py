@@ -103,7 +103,10 @@ def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
 
 
 def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
-    """Tell whether `limit_to_fence` keeps a velocity within RECHECK_DISTANCE of a position.
+    """Tell whether the fence is too far away to limit a velocity.
+
+    It is if `limit_to_fence` leaves the velocity unchanged at every point that is less than
+    RECHECK_DISTANCE from `position`.
 
     Args:
         velocity: Reference [m/s], world frame, shape (3,).
