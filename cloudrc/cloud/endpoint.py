@@ -313,8 +313,8 @@ class CloudEndpoint:
     def _relay(self, request: OperatorRequest) -> None:
         """Relay a request to world, or drop it; teleop repeats a dropped request.
 
-        An emergency stop without a number is an alarm. Cloud relays nothing without a session,
-        and no start before telemetry has arrived or while an alarm is active.
+        An emergency stop without a number is repeated by cloud itself. Cloud relays nothing without
+        a session, and no start before telemetry has arrived or while it repeats a stop.
         """
         if request.number > codec.NUMBER_MAX:  # somebody with the keys has used up the numbers
             self._counts["words_dropped"] += 1

@@ -2,7 +2,8 @@
 
 Shorter keys are set first, so the order of `mission=steps` and `mission.steps.count=3` does not
 matter. Where the value is a name, as in `controller: pid`, a longer key turns the name into a
-mapping: `cloud.controller.speed_max=2` gives `{name: pid, speed_max: 2}`. The index after the last appends to a list.
+mapping: `cloud.controller.speed_max=2` gives `{name: pid, speed_max: 2}`. The index after the last
+appends to a list.
 
 Parameters of a plug-in are checked against the signature of its `build`, which also gives their
 defaults.

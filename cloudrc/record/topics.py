@@ -77,7 +77,7 @@ LINK_TOPICS = (
             Field("shaper", "string", "", "relay or netem"),
             Field("cause", "string", "", "why it changed; empty before the first change"),
             Field("age", "float", "s", "time since these conditions took effect"),
-            Field("time_line", "float", "s", "since the time line began; NaN: it was not restarted"),
+            Field("time_line", "float", "s", "since the time line began; NaN: not restarted"),
             Field("delay", "float", "s", "profile's delay at the start of the time line, one way"),
             Field("jitter", "float", "s", "profile's jitter at the start of the time line"),
             Field("loss", "float", "1", "profile's mean loss at the start of the time line"),

@@ -27,7 +27,8 @@ TILT_GAIN, YAW_GAIN = 1.0, 0.035
 """Attitude gains (k_R): torque per attitude error [N m]. TILT_GAIN is for x and y, YAW_GAIN for z.
 Source: docs/reference/plant.md, "Low-level controller"."""
 TILT_RATE_GAIN, YAW_RATE_GAIN = 0.22, 0.01
-"""Rate gains (k_w): torque per angular velocity [N m s]. The first is for x and y, the second for z.
+"""Rate gains (k_w): torque per angular velocity [N m s]. TILT_RATE_GAIN is for x and y,
+YAW_RATE_GAIN for z.
 Source: docs/reference/plant.md, "Low-level controller"."""
 THRUST_MAX = THRUST_COEFFICIENT * SPEED_MAX**2
 """Largest thrust of one rotor [N]."""

@@ -191,8 +191,8 @@ class Descent:
 class TakeOff:
     """Detects when the robot has left the ground, and whether it may take off.
 
-    On the ground a HOLD would scrape along it, so the rotors stop instead. A robot whose rotors were
-    stopped in the air may still be falling, or lie outside the fence, when the operator
+    Before take-off a HOLD would scrape along the floor, so the rotors stop instead. A robot whose
+    rotors were stopped in the air may still be falling, or lie outside the fence, when the operator
     acknowledges. It may take off once it is at rest, inside the fence and at least TAKE_OFF_MARGIN
     from its walls.
 
