@@ -50,8 +50,8 @@ SPIN_MAX = 3.0
 TUMBLE_MAX = 7.0
 """Largest rate of roll and pitch without a hit [rad/s]; the worst commands reach 5.4."""
 JOLT_MAX, JOLT_RATE_MAX = 0.8, 40.0e-9
-"""Largest change per axis of the velocity without a hit: JOLT at once [m/s], plus PULL for what the
-rotors add in time [m/s per ns]. A fast touch of the board changes it by 0.5 m/s."""
+"""Largest change per axis of the velocity without a hit: JOLT_MAX at once [m/s], plus JOLT_RATE_MAX
+for the rotors [m/s per ns]. A fast touch of the board changes it by 0.5 m/s."""
 
 
 class Hits:

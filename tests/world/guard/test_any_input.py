@@ -17,7 +17,7 @@ from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard.limits import COMMAND_MAX, growth
 from cloudrc.world.guard.state import JOLT_MAX
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, sensed
-from tests.world.guard.test_rules import ANY, PLACES, SPECIAL, SPECIAL_BAD, SPEEDS, VECTORS
+from tests.world.guard.test_arithmetic import ANY, PLACES, SPECIAL, SPECIAL_BAD, SPEEDS, VECTORS
 
 TAKEN = st.tuples(*[st.floats(-COMMAND_MAX, COMMAND_MAX)] * 3)
 """Values that a command may have without being rejected."""

@@ -23,7 +23,7 @@ from tests.world.guard.conftest import (
     states,
     tracking,
 )
-from tests.world.guard.test_rules import SPECIAL
+from tests.world.guard.test_arithmetic import SPECIAL
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 BEYOND = [value for value in (*SPECIAL, 1e308, -1e308) if abs(value) > COMMAND_MAX]

@@ -6,7 +6,7 @@ import pytest
 
 from cloudrc.world.guard import limits as rules
 from tests.world.guard.conftest import LIMITS
-from tests.world.guard.test_rules import HIGH, LOW
+from tests.world.guard.test_arithmetic import HIGH, LOW
 
 
 def by_the_wall(axis, sign, distance, height):
