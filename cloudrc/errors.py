@@ -46,18 +46,18 @@ class InterruptedRunError(CloudrcError):
     exit_code = 130
 
 
-def in_one_line(text: str) -> str:
+def to_one_line(text: str) -> str:
     """Turn a foreign text into one line that can be printed; lone surrogates are escaped."""
     line = " ".join(text[:TEXT_MAX].split())
     return line.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
-def in_words(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Describe an exception in one line: its type and its message."""
     name = type(error).__name__
     try:
-        return in_one_line(f"{name}: {error}")
+        return to_one_line(f"{name}: {error}")
     except KeyboardInterrupt:
         raise
     except BaseException:  # the exception's __str__ is foreign code, too
-        return in_one_line(name)
+        return to_one_line(name)

@@ -69,7 +69,7 @@ def open_file(path: Path) -> FileIO:
 
 
 @contextmanager
-def draft(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
+def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
     """Write a file under a temporary name and rename it to `path` once it is complete.
 
     Others may write to the folder, too. Therefore a symbolic link at `path` is replaced and not
@@ -94,9 +94,9 @@ def draft(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
         raise
 
 
-def put(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes) -> None:
     """Write a whole file through `draft`."""
-    with draft(path) as file:
+    with atomic_file(path) as file:
         file.write(data)
 
 

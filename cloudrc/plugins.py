@@ -100,7 +100,7 @@ def find(kind: str, name: str) -> Any:
         raise BadInputError(
             f"{_one(kind)} {name!r} cannot be imported: {_reason(error)}"
         ) from error
-    raise BadInputError(unknown(_one(kind), name, names(kind)))
+    raise BadInputError(unknown_name_text(_one(kind), name, names(kind)))
 
 
 def is_path(name: str) -> bool:
@@ -108,13 +108,13 @@ def is_path(name: str) -> bool:
     return name.endswith(".py") or "/" in name or "\\" in name
 
 
-def unknown(what: str, name: str, available: list[str]) -> str:
+def unknown_name_text(what: str, name: str, available: list[str]) -> str:
     """Return the error text for an unknown name, with the known and the nearest names."""
     there = ", ".join(available) or "none"
-    return f"no {what} named {name!r}; available: {there}{meant(name, available)}"
+    return f"no {what} named {name!r}; available: {there}{suggest_name(name, available)}"
 
 
-def meant(name: str, available: list[str]) -> str:
+def suggest_name(name: str, available: list[str]) -> str:
     """Return the end of an error text that suggests the nearest name; "" if none is near."""
     near = difflib.get_close_matches(name, available, n=1)
     return f"; did you mean {near[0]}?" if near else ""
@@ -132,7 +132,7 @@ def _build(kind: str, name: str) -> Callable[..., Any]:
 
 def _shipped(kind: str) -> list[str]:
     if kind not in PACKAGES:
-        raise BadInputError(unknown("kind of plug-in", kind, list(PACKAGES)))
+        raise BadInputError(unknown_name_text("kind of plug-in", kind, list(PACKAGES)))
     if not PACKAGES[kind]:
         return []
     package = importlib.import_module(PACKAGES[kind])

@@ -21,7 +21,7 @@ from math import isfinite, nan
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.errors import in_words
+from cloudrc.errors import describe_error
 from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry, Vector
 from cloudrc.records import Control, Fault
 
@@ -303,7 +303,7 @@ _INSTEAD = {
 
 
 def _explain(kind: str, error: BaseException, instead: str) -> str:
-    what = f"the {kind} failed ({in_words(error)}); {instead or _INSTEAD[kind]}"
+    what = f"the {kind} failed ({describe_error(error)}); {instead or _INSTEAD[kind]}"
     return f"{what}; fix cloud.{kind} or choose another"
 
 

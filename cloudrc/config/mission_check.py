@@ -14,10 +14,10 @@ from cloudrc.config.problems import Problem
 from cloudrc.config.schema import MAX_WAYPOINTS, Mission, Steps
 from cloudrc.geometry import fence
 from cloudrc.geometry.placement import (
-    crossed_pipe,
-    nearest_legal,
+    find_crossed_pipe,
+    find_nearest_legal,
+    find_overlapped_pipe,
     outside_fence,
-    overlapped_pipe,
 )
 from cloudrc.geometry.robot import Array
 from cloudrc.geometry.scene import Scene
@@ -56,7 +56,7 @@ def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
     yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
     outside = outside_fence(positions)
-    hit = overlapped_pipe(scene, positions, yaws)
+    hit = find_overlapped_pipe(scene, positions, yaws)
     wrong = np.flatnonzero(outside | (hit >= 0))
     problems = [
         Problem(("waypoints", str(index), "yaw_deg"), f"{mission.waypoints[index].yaw_deg:g}", _YAW)
@@ -68,7 +68,7 @@ def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
             reason = f"beyond the fence, {_fence_in_words()}"
         else:
             reason = f"base box or arm overlaps the wall of {scene.pipes[hit[index]].name}"
-        near = nearest_legal(scene, point, float(yaws[index]))
+        near = find_nearest_legal(scene, point, float(yaws[index]))
         if near is not None:
             reason += f"; nearest legal point found: {_point(near)}"
         path = ("waypoints", str(index), "position_m")
@@ -81,7 +81,7 @@ def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
 
 def _check_ways(positions: Array, scene: Scene) -> list[Problem]:
     """List the straight ways between waypoints [m], shape (n, 3), that cross a wall."""
-    through = crossed_pipe(scene, positions[:-1], positions[1:])
+    through = find_crossed_pipe(scene, positions[:-1], positions[1:])
     problems = []
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
         x, y, z = positions[index + 1].tolist()
@@ -104,7 +104,7 @@ def _check_steps(steps: Steps, scene: Scene) -> list[Problem]:
     if outside_fence(positions).any():
         reason = f"steps reach beyond the fence, {_fence_in_words()}; choose a smaller range_m"
         return [Problem(("steps",), "", reason)]
-    hit = overlapped_pipe(scene, positions, np.zeros(len(positions)))
+    hit = find_overlapped_pipe(scene, positions, np.zeros(len(positions)))
     if (hit >= 0).any():
         name = scene.pipes[hit.max()].name
         reason = f"steps can end in the wall of {name}; choose another centre_m, range_m or scene"

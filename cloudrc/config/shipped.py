@@ -8,7 +8,7 @@ from pathlib import Path
 from cloudrc.config import document
 from cloudrc.config.document import Document
 from cloudrc.errors import BadInputError
-from cloudrc.plugins import meant, unknown
+from cloudrc.plugins import suggest_name, unknown_name_text
 
 _PACKAGE = Path(__file__).parents[1]
 FOLDERS = {
@@ -56,13 +56,13 @@ def check_name(kind: str, name: str) -> None:
     """Raise a BadInputError if no file of this kind ships under that name."""
     available = names(kind)
     if name not in available:
-        raise BadInputError(unknown(kind, name, available))
+        raise BadInputError(unknown_name_text(kind, name, available))
 
 
 def _shipped_names(kind: str, name: str) -> str:
     """List the shipped files in words, and the one whose name is nearest to `name`."""
     available = names(kind)
-    return f"names of shipped {kind}s: {', '.join(available)}{meant(name, available)}"
+    return f"names of shipped {kind}s: {', '.join(available)}{suggest_name(name, available)}"
 
 
 def is_path(name: str) -> bool:

@@ -16,7 +16,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
 
-from cloudrc.files import draft, read
+from cloudrc.files import atomic_file, read
 from cloudrc.tunnel.handshake import EPOCH_MAX
 
 BLOCK = 4096
@@ -105,7 +105,7 @@ def replace_durably(path: Path, data: bytes, mode: int = 0o600) -> None:
     Raises:
         OSError: If that fails; the old file is unchanged.
     """
-    with draft(path, mode) as file:
+    with atomic_file(path, mode) as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())

@@ -30,7 +30,7 @@ from cloudrc.drivers.feed import READY, from_line
 from cloudrc.drivers.machine import interpreter
 from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.errors import InvalidRunError, TimedOutError, in_one_line
+from cloudrc.errors import InvalidRunError, TimedOutError, to_one_line
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
@@ -377,7 +377,7 @@ def _parse_line(child: Child, line: bytes) -> list[Record]:
         if child.garbled:
             return []
         child.garbled = True
-        reason = in_one_line(str(error))[:120]
+        reason = to_one_line(str(error))[:120]
         return [Fault(0, "feed", f"skipped a line of the {child.name} process: {reason}")]
 
 

@@ -25,7 +25,7 @@ from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.drivers.recording import Recorder, RecordingThread, told
 from cloudrc.endpoint import Endpoint
-from cloudrc.errors import in_one_line
+from cloudrc.errors import to_one_line
 from cloudrc.files import TooLongError, read, version
 from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, LinkState, from_text
 from cloudrc.records import (
@@ -136,8 +136,8 @@ def _note(state: LinkState, uplink: bool, now_ns: int) -> LinkChanged:
     return LinkChanged(
         stamp_ns=now_ns,
         uplink=uplink,
-        shaper=in_one_line(state.shaper),
-        cause=in_one_line(state.cause),
+        shaper=to_one_line(state.shaper),
+        cause=to_one_line(state.cause),
         age=max(0, now_ns - state.since_ns) * 1e-9,
         time_line=time_line,
         delay=asked.get("delay", nan),

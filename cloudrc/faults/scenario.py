@@ -18,7 +18,7 @@ import numpy as np
 
 import cloudrc.faults
 from cloudrc.errors import BadInputError
-from cloudrc.plugins import meant
+from cloudrc.plugins import suggest_name
 
 Mode: TypeAlias = Literal["virtual", "real", "cluster"]
 Relation: TypeAlias = Literal["<=", ">=", "=="]
@@ -188,5 +188,5 @@ def called(name: str, mode: Mode) -> list[Scenario]:
                 f" cloudrc faults run {other.name}{flag}"
             )
     names = ", ".join(f"{each.id} {each.name}" for each in there) or "none"
-    hint = meant(name.lower(), [each.name for each in there])
+    hint = suggest_name(name.lower(), [each.name for each in there])
     raise BadInputError(f"no fault '{name}' in mode {mode}; there are: {names}{hint}")

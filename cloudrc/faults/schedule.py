@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from cloudrc.errors import BadInputError, in_one_line
+from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.faults.scenario import generator
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 
@@ -223,7 +223,7 @@ def load(path: Path) -> Schedule:
         place = ".".join(map(str, first["loc"]))
         raise _none(path, f"{place}: {first['msg']}" if place else first["msg"]) from error
     except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
-        text = getattr(error, "strerror", None) or in_one_line(str(error))
+        text = getattr(error, "strerror", None) or to_one_line(str(error))
         raise _none(path, text) from error
     if problem := _problem(schedule):
         raise _none(path, problem)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cloudrc.geometry.robot import Array, Points, key_points, place
+from cloudrc.geometry.robot import Array, Spheres, key_points, place_points
 from cloudrc.geometry.scene import Pipe, Scene
 
 _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
@@ -47,7 +47,7 @@ def clearance_per_pipe(
     scene: Scene,
     positions: ArrayLike,
     orientations_wxyz: ArrayLike,
-    points: Points | None = None,
+    points: Spheres | None = None,
 ) -> Array:
     """Compute the robot's distance from the wall of each pipe.
 
@@ -66,7 +66,7 @@ def clearance_per_pipe(
     result = np.full((len(at), len(scene.pipes)), np.inf)
     for start in range(0, len(at) if scene.pipes else 0, _CHUNK):
         part = slice(start, start + _CHUNK)
-        placed = place(points, at[part], facing[part])
+        placed = place_points(points, at[part], facing[part])
         for index, pipe in enumerate(scene.pipes):
             distance = distance_to_pipe(pipe, placed) - points.radii
             result[part, index] = distance.min(axis=1)

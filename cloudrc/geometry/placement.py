@@ -20,7 +20,7 @@ def outside_fence(positions: Array) -> NDArray[np.bool_]:
     return outside
 
 
-def overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
+def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
     """Find the pipe whose wall the base's box or the arm would overlap.
 
     The rotors do not count here; the metrics judge how near they come to a wall.
@@ -45,7 +45,7 @@ def overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.i
     return result
 
 
-def crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
+def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
     """Find the pipe whose wall a straight way of the base's centre crosses.
 
     A way that only grazes a wall does not count, because the flight may deviate from the straight
@@ -76,7 +76,7 @@ def crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
     return result
 
 
-def nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | None:
+def find_nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | None:
     """Find a legal point near a position.
 
     The search goes along the axes, and towards and away from the axes of the pipes. Candidates are
@@ -103,7 +103,7 @@ def nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | None:
     around = start + steps[:, None, None] * np.array(directions)
     candidates = np.round(around.reshape(-1, 3), 2)
     legal = ~outside_fence(candidates)
-    legal &= overlapped_pipe(scene, candidates, np.full(len(candidates), yaw)) < 0
+    legal &= find_overlapped_pipe(scene, candidates, np.full(len(candidates), yaw)) < 0
     if not legal.any():
         return None
     candidates = candidates[legal]

@@ -23,7 +23,7 @@ ROD_RADIUS, ROD_BOTTOM, ROD_TOP = 0.05, 0.06, 0.18
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
+class Spheres:
     """Spheres that represent the robot.
 
     Attributes:
@@ -35,7 +35,7 @@ class Points:
     radii: Array
 
 
-def key_points() -> Points:
+def key_points() -> Spheres:
     """Return the 225 points for the clearance: rotors, arm, base box, top rod."""
     rotors = [
         _ring(x, y, height, ROTOR_RADIUS, 24)
@@ -46,7 +46,7 @@ def key_points() -> Points:
     return _points([*rotors, _box(2, 2, 2), *rod], arm=9)
 
 
-def hull_points() -> Points:
+def hull_points() -> Spheres:
     """Return points of the base's box and the arm, dense enough to find every overlap with a wall.
 
     Neighbours are 0.02 m apart in the box and 0.01 m on the arm; a wall is 0.038 m thick.
@@ -54,7 +54,7 @@ def hull_points() -> Points:
     return _points([_box(6, 6, 11)], arm=41)
 
 
-def place(points: Points, positions: Array, orientations_wxyz: Array) -> Array:
+def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) -> Array:
     """Transform the robot's points to the world frame.
 
     Args:
@@ -81,13 +81,13 @@ def place(points: Points, positions: Array, orientations_wxyz: Array) -> Array:
     return placed
 
 
-def _points(parts: list[Array], arm: int) -> Points:
+def _points(parts: list[Array], arm: int) -> Spheres:
     along = np.linspace(0, ARM_LENGTH, arm)
     arm_points = np.stack([along, np.zeros(arm), np.full(arm, ARM_HEIGHT)], axis=1)
     positions = np.concatenate([arm_points, *parts])
     radii = np.zeros(len(positions))
     radii[:arm] = ARM_RADIUS
-    return Points(positions, radii)
+    return Spheres(positions, radii)
 
 
 def _ring(x: float, y: float, z: float, radius: float, count: int) -> Array:

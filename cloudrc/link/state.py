@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from cloudrc.files import put
+from cloudrc.files import write_atomically
 from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
 STATE_FILE = "link.json"
@@ -129,7 +129,7 @@ def publish(path: Path, text: str) -> None:
         path: The file; its folder exists.
         text: New content.
     """
-    put(path, text.encode("utf-8"))
+    write_atomically(path, text.encode("utf-8"))
 
 
 def publish_route(path: Path, route: tuple[str, int]) -> None:

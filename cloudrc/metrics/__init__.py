@@ -76,7 +76,7 @@ def find(choice: str) -> Metric:
     known = [*SHIPPED, *plugins.names("metrics")]
     name, is_path = name_of(choice), plugins.is_path(choice)
     if not is_path and name not in known:
-        raise BadInputError(plugins.unknown("metric", choice, sorted(known)))
+        raise BadInputError(plugins.unknown_name_text("metric", choice, sorted(known)))
     if is_path and name in known:
         raise BadInputError(f"metric {choice!r}: {name} is a metric already; rename the file")
     found = plugins.find("metrics", choice)

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
-from cloudrc.files import draft
+from cloudrc.files import atomic_file
 from cloudrc.record.columns import Recording, Table, merged
 from cloudrc.record.reader import Contents, read_contents
 from cloudrc.record.ros import shifted
@@ -170,7 +170,10 @@ class Mission:
         """
         metadata = self.contents.metadata
         clock, clock_id = metadata["clock"], metadata["clock_id"]
-        with draft(target) as file, McapWriter(file, clock=clock, clock_id=clock_id) as writer:
+        with (
+            atomic_file(target) as file,
+            McapWriter(file, clock=clock, clock_id=clock_id) as writer,
+        ):
             writer.note(metadata)
             for topic, log_time_ns, data in self.contents.messages:
                 writer.write_message(topic, log_time_ns, data)
@@ -250,7 +253,7 @@ def write_mission(
     Raises:
         OSError: If the file cannot be written.
     """
-    with draft(target) as file, McapWriter(file, clock="world") as writer:
+    with atomic_file(target) as file, McapWriter(file, clock="world") as writer:
         writer.note(offset.metadata())
         for log_time_ns, row in merged(world_records, cloud_records, offset.offset_ns):
             writer.write_row(row, log_time_ns)

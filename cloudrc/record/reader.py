@@ -21,7 +21,7 @@ from itertools import chain
 from pathlib import Path
 from typing import IO, Any
 
-from cloudrc.errors import BadInputError, in_one_line
+from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
 from cloudrc.record import missing
 from cloudrc.record.ros import is_known
@@ -559,8 +559,8 @@ class _Collector:
         if scan.checked is False and not scan.dropped:
             notes.append("a byte outside the chunks is wrong")
         if self._foreign:
-            names = in_one_line(", ".join(sorted(self._foreign)))
+            names = to_one_line(", ".join(sorted(self._foreign)))
             notes.append(f"topics of another layout were left out: {names}")
-        notes.append(in_one_line(self.contents.metadata.get(MISSING, "")))
+        notes.append(to_one_line(self.contents.metadata.get(MISSING, "")))
         self.contents.note = "; ".join(filter(None, notes))
         return self.contents

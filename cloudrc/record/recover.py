@@ -15,7 +15,7 @@ from typing import IO, Any
 
 from cloudrc import __version__
 from cloudrc.errors import BadInputError
-from cloudrc.files import draft
+from cloudrc.files import atomic_file
 from cloudrc.record import missing
 from cloudrc.record.reader import Scan, TooMuchError
 from cloudrc.record.writer import METADATA, MISSING
@@ -140,7 +140,7 @@ def recover(source: Path, target: Path) -> Recovery:
         raise BadInputError(
             f"{source}: cannot be read ({error.strerror}); name a recording (.mcap)"
         ) from error
-    with stream, draft(target) as new:
+    with stream, atomic_file(target) as new:
         scan = Scan(stream)
         copy = _Copy(new, scan)
         try:

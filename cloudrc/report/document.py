@@ -24,7 +24,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cloudrc.config.load import ResolvedExperiment, fingerprint
-from cloudrc.files import put
+from cloudrc.files import write_atomically
 from cloudrc.messages import GuardState, Vector
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.mission import first_touch
@@ -304,7 +304,7 @@ def environment_document() -> dict[str, Any]:
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a document as JSON; raise ValueError if a number is not finite."""
     text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False)
-    put(path, f"{text}\n".encode())
+    write_atomically(path, f"{text}\n".encode())
 
 
 def _failure_document(failure: Failure) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from cloudrc.config.load import ResolvedExperiment, read_experiment
-from cloudrc.errors import BadInputError, MissingPrerequisiteError, in_words
-from cloudrc.files import put, read
+from cloudrc.errors import BadInputError, MissingPrerequisiteError, describe_error
+from cloudrc.files import read, write_atomically
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import METRIC_NOTE, Flight, Number, measure_all
 from cloudrc.record.columns import Recording
@@ -206,7 +206,7 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
         pictures = draw_all(subject)
     except ValueError as error:  # from matplotlib, for values that no flight has
         raise BadInputError(
-            f"{folder}: the recorded values cannot be drawn ({in_words(error)}); report.json is "
+            f"{folder}: the recorded values cannot be drawn ({describe_error(error)}); report.json is "
             "written, check the recording"
         ) from error
     figures = folder / "figures"
@@ -214,8 +214,8 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
         raise BadInputError(f"{figures}: is a link; remove it, figures are kept with their run")
     figures.mkdir(exist_ok=True)
     for picture in pictures:
-        put(figures / f"{picture.name}.png", picture.png)
-        put(figures / f"{picture.name}.svg", picture.svg)
+        write_atomically(figures / f"{picture.name}.png", picture.png)
+        write_atomically(figures / f"{picture.name}.svg", picture.svg)
     text = render(
         assessment.run,
         experiment,
@@ -226,4 +226,4 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
         pictures,
         environment,
     )
-    put(folder / "report.html", text.encode("utf-8"))
+    write_atomically(folder / "report.html", text.encode("utf-8"))

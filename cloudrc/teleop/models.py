@@ -21,7 +21,7 @@ from cloudrc.config.problems import Problem as ConfigProblem
 from cloudrc.config.problems import from_pydantic
 from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Mission, Section, TimeLimit, Waypoint
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.placement import crossed_pipe
+from cloudrc.geometry.placement import find_crossed_pipe
 from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Start, Vector
@@ -303,7 +303,7 @@ def check_way(service: MissionService, target: Vector | None, scene: Scene) -> N
         target = legs[count].position if count < len(legs) else None
     if seen is None or target is None or (mission is not None and mission.state != HELD):
         return  # what else is in the way is for others to say
-    through = int(crossed_pipe(scene, np.array([seen.position]), np.array([target]))[0])
+    through = int(find_crossed_pipe(scene, np.array([seen.position]), np.array([target]))[0])
     if through >= 0:
         here, there = (f"[{', '.join(f'{v:.2f}' for v in p)}]" for p in (seen.position, target))
         reason = (

@@ -10,7 +10,7 @@ from cloudrc.faults.fuzz import fly
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.hold import Descent, TakeOff
-from cloudrc.world.guard.state import Hits
+from cloudrc.world.guard.state import HitDetector
 from cloudrc.world.readings import Readings
 from tests.faults.conftest import World
 
@@ -78,13 +78,13 @@ def test_under_an_honest_cloud_no_hit_is_felt_without_a_touch(honest: bool) -> N
 
 
 def _feels(monkeypatch: pytest.MonkeyPatch) -> None:
-    felt = Hits.felt
+    felt = HitDetector.felt
 
-    def imagines(hits: Hits, now_ns: int, readings: Readings) -> Cause | None:
+    def imagines(hits: HitDetector, now_ns: int, readings: Readings) -> Cause | None:
         hit = felt(hits, now_ns, readings)
         return Cause.JOLTED if 6.0e9 < now_ns < 6.05e9 else hit
 
-    monkeypatch.setattr(Hits, "felt", imagines)
+    monkeypatch.setattr(HitDetector, "felt", imagines)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from cloudrc.geometry.clearance import (
     inside_pipe,
     pipe_index,
 )
-from cloudrc.geometry.robot import hull_points, key_points, place
+from cloudrc.geometry.robot import hull_points, key_points, place_points
 from cloudrc.geometry.scene import Pipe, Scene, load_scene
 
 PIPES = load_scene("pipes")
@@ -92,7 +92,7 @@ def test_the_spawn_trap() -> None:
 
 
 def test_the_tip_touches_at_the_contact_pose() -> None:
-    tip = place(key_points(), np.array([[8.135, -6.422, 0.7]]), np.array([LEVEL]))[0, 8]
+    tip = place_points(key_points(), np.array([[8.135, -6.422, 0.7]]), np.array([LEVEL]))[0, 8]
     assert tip == pytest.approx((8.535, -6.422, 0.87))
 
 
@@ -113,7 +113,7 @@ def test_a_batch_gives_the_same_as_single_poses() -> None:
 
 def test_rotation_is_that_of_the_quaternion() -> None:
     # A third of a turn about (1, 1, 1) takes x to y, y to z, z to x.
-    placed = place(key_points(), np.zeros((1, 3)), np.array([[0.5, 0.5, 0.5, 0.5]]))[0]
+    placed = place_points(key_points(), np.zeros((1, 3)), np.array([[0.5, 0.5, 0.5, 0.5]]))[0]
     assert placed == pytest.approx(key_points().positions[:, [2, 0, 1]])
 
 

@@ -13,10 +13,10 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.schema import Mission, Steps, Waypoint
 from cloudrc.geometry.placement import (
-    crossed_pipe,
-    nearest_legal,
+    find_crossed_pipe,
+    find_nearest_legal,
+    find_overlapped_pipe,
     outside_fence,
-    overlapped_pipe,
 )
 from cloudrc.geometry.robot import Array
 from cloudrc.geometry.scene import Pipe, Scene, load_scene
@@ -26,7 +26,7 @@ PIPES = load_scene("pipes")
 
 
 def hit(position: Vector, yaw: float = 0.0) -> int:
-    return int(overlapped_pipe(PIPES, np.array([position]), np.array([yaw]))[0])
+    return int(find_overlapped_pipe(PIPES, np.array([position]), np.array([yaw]))[0])
 
 
 @pytest.mark.parametrize(
@@ -61,14 +61,14 @@ def test_overlaps(position: Vector, yaw: float, pipe: int) -> None:
     st.floats(-math.pi, math.pi),
 )
 def test_the_nearest_legal_point_is_legal(position: Vector, yaw: float) -> None:
-    found = nearest_legal(PIPES, position, yaw)
+    found = find_nearest_legal(PIPES, position, yaw)
     assert found is not None
     assert hit(found, yaw) == -1
     assert not outside_fence(np.array([found]))[0]
 
 
 def test_a_legal_point_is_its_own_nearest() -> None:
-    assert nearest_legal(PIPES, (-1.0, 0.0, 0.7), 0.0) == (-1, 0, 0.7)
+    assert find_nearest_legal(PIPES, (-1.0, 0.0, 0.7), 0.0) == (-1, 0, 0.7)
 
 
 @pytest.mark.parametrize("experiment", ["paper", "steps", "hover"])
@@ -103,7 +103,7 @@ def test_every_bad_waypoint_is_named_up_to_a_number() -> None:
     ],
 )
 def test_a_straight_way_through_a_wall_is_found(start: Vector, end: Vector, pipe: int) -> None:
-    assert crossed_pipe(PIPES, np.array([start]), np.array([end]))[0] == pipe
+    assert find_crossed_pipe(PIPES, np.array([start]), np.array([end]))[0] == pipe
 
 
 def in_pipe(points: Array, pipe: Pipe) -> tuple[Array, Array]:
@@ -118,7 +118,7 @@ def in_pipe(points: Array, pipe: Pipe) -> tuple[Array, Array]:
 def test_a_way_crosses_a_wall_if_it_changes_sides(start: Vector, end: Vector) -> None:
     """Cut the way into short pieces: a piece that changes sides crosses the wall."""
     points = np.linspace(start, end, 2_000)
-    (found,) = crossed_pipe(PIPES, np.array([start]), np.array([end])).tolist()
+    (found,) = find_crossed_pipe(PIPES, np.array([start]), np.array([end])).tolist()
     for pipe in PIPES.pipes:
         depth, radius = in_pipe(points, pipe)
         within = radius < (pipe.inner + pipe.outer) / 2

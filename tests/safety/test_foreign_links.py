@@ -13,7 +13,7 @@ import pytest
 from cloudrc.cli.main import main
 from cloudrc.drivers.epochs import replace_durably
 from cloudrc.errors import BadInputError
-from cloudrc.files import draft, put
+from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.state import publish
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import write_mission
@@ -53,7 +53,7 @@ def recovered(path: Path) -> None:
 
 
 WRITERS: list[Callable[[Path], object]] = [
-    lambda path: put(path, b"new"),
+    lambda path: write_atomically(path, b"new"),
     lambda path: replace_durably(path, b"new"),
     lambda path: publish(path, "new"),
     lambda path: write_json(path, {}),
@@ -89,7 +89,7 @@ def test_a_secret_file_has_its_mode_from_the_start(theirs: Path, mode: int) -> N
     path.with_name(f".key.{os.getpid()}").touch(
         0o666
     )  # the temporary file once took over this mode
-    with draft(path, mode) as file:
+    with atomic_file(path, mode) as file:
         assert stat.S_IMODE(os.fstat(file.fileno()).st_mode) == mode
     assert stat.S_IMODE(path.stat().st_mode) == mode
     assert main(["key", "new", str(theirs / "new")]) == 0
@@ -97,8 +97,8 @@ def test_a_secret_file_has_its_mode_from_the_start(theirs: Path, mode: int) -> N
 
 
 def test_a_failed_write_leaves_no_trace(theirs: Path) -> None:
-    put(theirs / "file", b"old")
-    with suppress(KeyboardInterrupt), draft(theirs / "file") as file:
+    write_atomically(theirs / "file", b"old")
+    with suppress(KeyboardInterrupt), atomic_file(theirs / "file") as file:
         file.write(b"half")
         raise KeyboardInterrupt
     assert os.listdir(theirs) == ["file"]

@@ -20,7 +20,7 @@ from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario, generator
 from cloudrc.faults.scenarios.link import instant
 from cloudrc.geometry import fence
-from cloudrc.geometry.placement import overlapped_pipe
+from cloudrc.geometry.placement import find_overlapped_pipe
 from cloudrc.geometry.scene import Scene, load_scene
 from cloudrc.messages import Command, GuardState, Vector
 from cloudrc.records import Control
@@ -89,7 +89,7 @@ def _judge_way_out(
         around, axis=1, keepdims=True
     )
     points = np.array([fence.clamp((x, y, z)) for x, y, z in (start + around).tolist()])
-    nearer = (overlapped_pipe(scene, points, np.zeros(LOOKED_AT)) < 0) & (reach > 0.0)
+    nearer = (find_overlapped_pipe(scene, points, np.zeros(LOOKED_AT)) < 0) & (reach > 0.0)
     outcome.same(f"{name}: legal points nearer than it by more than 5 cm", int(nearer.sum()), 0)
 
 
@@ -98,7 +98,7 @@ def _wall_of(scene: Scene) -> tuple[float, float, float]:
     for y in np.linspace(-8.0, 5.0, 131):
         for z in np.linspace(0.3, 2.4, 22):
             points = np.array([[x, y, z] for x in np.linspace(-2.5, 9.0, 116)])
-            hits = np.flatnonzero(overlapped_pipe(scene, points, np.zeros(len(points))) >= 0)
+            hits = np.flatnonzero(find_overlapped_pipe(scene, points, np.zeros(len(points))) >= 0)
             if len(hits):
                 x, y, z = points[hits[0]].tolist()
                 return (x, y, z)

@@ -24,7 +24,7 @@ from math import isnan, nan
 from pathlib import Path
 from typing import NamedTuple
 
-from cloudrc.errors import in_words
+from cloudrc.errors import describe_error
 from cloudrc.exposition.parts import DatagramTally as StreamTally
 from cloudrc.files import TooLongError, read
 from cloudrc.link.profile import DirectionProfile, settled
@@ -491,7 +491,9 @@ class StandingCheck:
 
     def fail(self, error: Exception) -> None:
         """Have it told that single datagrams could not be compared."""
-        self._failure = f"the standing check of the link failed ({in_words(error)}); it goes on"
+        self._failure = (
+            f"the standing check of the link failed ({describe_error(error)}); it goes on"
+        )
 
     def _failed(self, now_ns: int) -> list[Record]:
         text, self._failure = self._failure, ""

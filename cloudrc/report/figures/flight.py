@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from cloudrc.geometry.clearance import pipe_index
-from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH, ARM_RADIUS, Points, place
+from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH, ARM_RADIUS, Spheres, place_points
 from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import first_touch
@@ -122,8 +122,8 @@ def _touch_point(subject: Subject) -> Array | None:
     if touch is None or not len(truth["stamp_ns"]):
         return None
     rows = np.searchsorted(truth["stamp_ns"], touch["stamp_ns"], side="right") - 1
-    tip = Points(np.array([[ARM_LENGTH, 0.0, ARM_HEIGHT]]), np.array([ARM_RADIUS]))
-    placed = place(tip, touch["position"][None], truth["orientation_wxyz"][rows][None])
+    tip = Spheres(np.array([[ARM_LENGTH, 0.0, ARM_HEIGHT]]), np.array([ARM_RADIUS]))
+    placed = place_points(tip, touch["position"][None], truth["orientation_wxyz"][rows][None])
     return np.asarray(placed[0, 0])
 
 

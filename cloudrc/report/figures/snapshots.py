@@ -60,8 +60,8 @@ def robot_faces(position: Array, orientation_wxyz: Array) -> list[Face]:
         faces += _box(hub * (0.5, 0.5, 1.0), np.array([*strut, 0.006]), ROD_COLOUR)
         disc = hub + body.ROTOR_RADIUS * _circle(28)
         faces.append(Face(disc, ROTOR_COLOUR, 0.35))
-    points = body.Points(np.concatenate([face.corners for face in faces]), np.zeros(0))
-    placed = body.place(points, position[None], orientation_wxyz[None])[0]
+    points = body.Spheres(np.concatenate([face.corners for face in faces]), np.zeros(0))
+    placed = body.place_points(points, position[None], orientation_wxyz[None])[0]
     splits = np.cumsum([len(face.corners) for face in faces])[:-1]
     return [
         Face(corners, face.colour, face.opacity)

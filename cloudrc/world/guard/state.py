@@ -54,7 +54,7 @@ JOLT_MAX, JOLT_RATE_MAX = 0.8, 40.0e-9
 for the rotors [m/s per ns]. A fast touch of the board changes it by 0.5 m/s."""
 
 
-class Hits:
+class HitDetector:
     """Detects hits from changes of the readings."""
 
     def __init__(self) -> None:
@@ -125,7 +125,7 @@ class Guard:
         self._floor, half = self._low[2], 0.5 * limits.speed_max
         self._position_hold = PositionHold(self._low, self._high, half)
         self._descent = Descent(self._floor, half)
-        self._hits, self._take_off = Hits(), TakeOff(limits.fence_low, limits.fence_high)
+        self._hits, self._take_off = HitDetector(), TakeOff(limits.fence_low, limits.fence_high)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
         self.state, self.cause = GROUND, Cause.SPAWN

@@ -12,7 +12,7 @@ from cloudrc.world.guard.state import (
     OVERTURNED_COSINE,
     SPIN_MAX,
     TUMBLE_MAX,
-    Hits,
+    HitDetector,
 )
 from cloudrc.world.readings import Readings
 from tests.world.guard.conftest import (
@@ -52,13 +52,13 @@ RATES = [
 
 @pytest.mark.parametrize(("rate", "cause"), RATES)
 def test_a_high_rate_is_a_hit(rate, cause):
-    assert Hits().felt(0, felt(rate=rate)) == cause
+    assert HitDetector().felt(0, felt(rate=rate)) == cause
 
 
 @pytest.mark.parametrize(("tilt_deg", "cause"), [(78.0, None), (79.0, OVER), (180.0, OVER)])
 def test_a_robot_on_its_side_has_turned_over(tilt_deg, cause):
     assert cos(radians(78.5)) == pytest.approx(OVERTURNED_COSINE, abs=0.001)
-    assert Hits().felt(0, felt(tilt_deg=tilt_deg)) == cause
+    assert HitDetector().felt(0, felt(tilt_deg=tilt_deg)) == cause
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -67,7 +67,7 @@ def test_a_robot_on_its_side_has_turned_over(tilt_deg, cause):
 def test_a_sudden_change_of_velocity_is_a_hit(axis, sign, after_ns):
     most = JOLT_MAX + JOLT_RATE_MAX * after_ns
     for change, cause in ((most + 0.001, JOLTED), (most - 0.001, None)):
-        hits, velocity = Hits(), [1.0, -2.0, 0.5]
+        hits, velocity = HitDetector(), [1.0, -2.0, 0.5]
         assert hits.felt(SECOND, felt(tuple(velocity))) is None
         velocity[axis] += sign * change
         assert hits.felt(SECOND + after_ns, felt(tuple(velocity))) == cause
@@ -76,7 +76,7 @@ def test_a_sudden_change_of_velocity_is_a_hit(axis, sign, after_ns):
 
 @pytest.mark.parametrize("axis", range(3))
 def test_values_at_the_limits_are_no_hit(axis):
-    hits, velocity = Hits(), [0.0, 0.0, 0.0]
+    hits, velocity = HitDetector(), [0.0, 0.0, 0.0]
     velocity[axis] = JOLT_MAX + JOLT_RATE_MAX * TICK
     at_limit = felt(rate=(TUMBLE_MAX, 0.0, SPIN_MAX))
     at_limit = at_limit._replace(axes=(*at_limit.axes[:8], OVERTURNED_COSINE))
@@ -85,7 +85,7 @@ def test_values_at_the_limits_are_no_hit(axis):
 
 
 def test_the_first_reading_is_no_hit():
-    hits = Hits()
+    hits = HitDetector()
     assert hits.felt(0, felt((5.0, 0.0, 0.0))) is None
     hits.forget()
     assert hits.felt(TICK, felt((-5.0, 0.0, 0.0))) is None
