@@ -206,8 +206,8 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
         pictures = draw_all(subject)
     except ValueError as error:  # from matplotlib, for values that no flight has
         raise BadInputError(
-            f"{folder}: the recorded values cannot be drawn ({describe_error(error)}); report.json is "
-            "written, check the recording"
+            f"{folder}: the recorded values cannot be drawn ({describe_error(error)}); "
+            "report.json is written, check the recording"
         ) from error
     figures = folder / "figures"
     if figures.is_symlink():  # a run from somebody else may contain a link to anywhere
