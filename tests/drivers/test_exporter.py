@@ -135,7 +135,7 @@ def test_a_cloud_whose_missions_are_teleops_tells_of_none(flight: Flight) -> Non
 
 
 @pytest.mark.promise("unknown-is-absent")
-def test_how_old_the_recording_on_the_disk_is_is_absent_until_it_is_known() -> None:
+def test_the_sync_age_is_absent_until_it_is_known() -> None:
     ages: list[float | None] = [None, 0.25]
     world = Exporter("world")
     assert "sync_age" not in world.text()
@@ -144,7 +144,7 @@ def test_how_old_the_recording_on_the_disk_is_is_absent_until_it_is_known() -> N
     assert "cloudrc_recorder_sync_age_seconds 0.25" in world.text()
 
 
-def test_names_that_are_not_resolved_are_counted_and_are_no_sign_of_life() -> None:
+def test_unresolved_names_are_counted_and_are_no_sign_of_life() -> None:
     link = Exporter("link")
     assert "cloudrc_dns_errors_total 0.0" in link.text()
     link.unresolved(7)

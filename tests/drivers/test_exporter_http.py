@@ -51,7 +51,7 @@ def test_metrics_and_probes_are_on_one_port(
     assert get(port, "/readyz")[0] == 503
 
 
-def test_however_often_it_is_scraped_a_page_is_made_four_times_a_second(
+def test_a_page_is_made_at_most_four_times_a_second(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each tells what was known a quarter of a second ago at most."""
@@ -152,7 +152,7 @@ def is_cut(client: socket.socket) -> bool:
         return True
 
 
-def test_connections_that_come_faster_than_they_are_taken_wait_and_are_not_refused(
+def test_a_burst_of_connections_waits_and_is_not_refused(
     served: tuple[Exporter, int],
 ) -> None:
     exporter, port = served

@@ -123,7 +123,7 @@ def pods(tmp_path: Path) -> Iterator[Pods]:
 
 
 @pytest.mark.process
-def test_ends_wait_for_their_route_follow_it_and_lose_readiness_without_a_peer(pods: Pods) -> None:
+def test_ends_follow_their_route_and_are_ready_only_with_a_peer(pods: Pods) -> None:
     for end in pods.processes:
         pods.wait(end, "/healthz")
         assert pods.get(end, "/readyz")[0] == 503
@@ -143,7 +143,7 @@ def test_ends_wait_for_their_route_follow_it_and_lose_readiness_without_a_peer(p
 
 
 @pytest.mark.process
-def test_a_link_counts_that_it_cannot_resolve_its_peer_before_it_shapes(tmp_path: Path) -> None:
+def test_a_link_counts_unresolved_names_before_it_shapes(tmp_path: Path) -> None:
     (tmp_path / "profile.yaml").write_text("uplink: {delay_ms: 1}\n")
     listen, metrics = free_ports(2)
     command = [sys.executable, "-m", "cloudrc", "link", "run", "--config", "hover"]

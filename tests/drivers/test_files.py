@@ -44,7 +44,7 @@ def test_what_is_beyond_the_limit_is_refused_and_not_cut(tmp_path: Path) -> None
         files.read(tmp_path / "a", 100)
 
 
-def test_what_says_that_it_is_empty_and_is_not_is_refused_likewise() -> None:
+def test_a_file_that_claims_to_be_empty_and_is_not_is_refused() -> None:
     """As every file of /proc does, and one that grows while it is read."""
     with pytest.raises(files.TooLongError):
         files.read(Path("/proc/self/status"), 100)

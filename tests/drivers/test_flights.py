@@ -79,7 +79,7 @@ def test_folder_and_files_are_this_users_alone(tmp_path: Path, places: list[Path
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o500])
-def test_where_others_may_write_or_nobody_may_the_second_place_is_taken(
+def test_an_unsafe_or_unwritable_first_folder_gives_the_second(
     tmp_path: Path, places: list[Path], mode: int
 ) -> None:
     if os.getuid() == 0 and mode == 0o500:
@@ -106,7 +106,7 @@ def test_what_somebody_else_could_have_written_is_not_read(
         assert list(local.under_way()) == [tmp_path]
 
 
-def test_what_belongs_to_somebody_else_is_neither_read_nor_written_to(
+def test_another_users_folder_is_neither_read_nor_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with local.announced(tmp_path / "a"):
@@ -128,7 +128,7 @@ def test_where_nothing_can_be_written_it_flies_all_the_same(
 
 
 @pytest.mark.parametrize("api", [True, False])
-def test_a_flight_that_no_command_finds_says_by_which_flag_it_is_commanded(
+def test_an_unannounced_flight_names_the_flag_for_its_commands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, api: bool
 ) -> None:
     monkeypatch.setattr(LocalRun, "_fly", lambda *_: None)

@@ -49,7 +49,7 @@ def test_what_flies_is_waited_for_until_it_is_seen_to_hold() -> None:
     assert cloud.ends()
 
 
-def test_and_no_longer_than_its_limit_counted_from_when_it_was_asked() -> None:
+def test_the_delay_ends_at_its_limit_after_the_request() -> None:
     cloud = Cloud()
     cloud.flies = True
     assert not cloud.ends()

@@ -62,7 +62,7 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_ctrl_c_ends_all_processes_within_two_seconds_and_leaves_a_report(tmp_path, how):
+def test_ctrl_c_ends_all_processes_within_2_s_and_leaves_a_report(tmp_path, how):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
     assert set(pids) == {"relay", "world", "teleop", "cloud"}
@@ -96,7 +96,7 @@ def test_a_process_that_dies_ends_the_run_and_is_named(tmp_path, victim):
     assert report(tmp_path / "run")["verdict"] in ("interrupted", "invalid")
 
 
-def test_the_processes_end_when_the_one_that_started_them_is_killed(tmp_path):
+def test_the_processes_end_when_their_supervisor_is_killed(tmp_path):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
     run.kill()
@@ -178,7 +178,7 @@ def predictor(folder: Path, does: str, statement: str) -> str:
     return f"cloud.predictor={folder}/odd.py"
 
 
-def test_a_slow_predictor_is_counted_and_told_and_the_flight_goes_on(tmp_path):
+def test_a_slow_predictor_is_reported_and_the_flight_continues(tmp_path):
     run = start(tmp_path / "run", predictor(tmp_path, "is slow", "time.sleep(0.05)"), dwell=2.0)
     output, errors = run.communicate(timeout=90)
     document = report(tmp_path / "run")
@@ -206,7 +206,7 @@ def test_a_process_that_hangs_ends_the_run_and_is_named(tmp_path):
     assert not any(alive(pid) for pid in pids.values())
 
 
-def test_a_report_is_written_of_a_run_whose_supervisor_was_killed(tmp_path):
+def test_a_run_whose_supervisor_was_killed_gets_a_report(tmp_path):
     folder = tmp_path / "run"
     run = start(folder)
     pids = wait_until_flying(run)

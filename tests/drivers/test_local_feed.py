@@ -18,7 +18,7 @@ from cloudrc.records import MissionEvent
 EVENT = MissionEvent(5, "reached", 1, "waypoint 2 of 7 reached")
 
 
-def test_a_line_that_is_no_record_is_said_once_and_ends_no_flight(tmp_path: Path) -> None:
+def test_a_bad_feed_line_is_reported_once_and_ends_no_flight(tmp_path: Path) -> None:
     reader, writer = os.pipe()
     run = LocalRun(tmp_path, lambda records: None)
     child = Child("cloud", cast("subprocess.Popen[bytes]", None), tmp_path / "cloud.log")

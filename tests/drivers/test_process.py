@@ -43,7 +43,7 @@ def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(
 
 
 @pytest.mark.process
-def test_it_ends_though_its_supervisor_was_killed_before_it_had_begun(tmp_path: Path) -> None:
+def test_it_ends_if_its_supervisor_was_killed_before_its_start(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(CONFIG.read_text())
     command = [sys.executable, "-c", KILLED_AT_ONCE, str(tmp_path)]
     supervisor = subprocess.run(command, capture_output=True, text=True, timeout=60)

@@ -46,7 +46,7 @@ def test_the_driver_with_a_socket_refuses_an_end_without_keys() -> None:
         run(bare_world())
 
 
-def test_it_runs_one_that_has_keys_and_to_a_stranger_it_says_nothing() -> None:
+def test_a_sealed_end_runs_and_sends_strangers_nothing() -> None:
     assert run(bare_world(ring=ring())) == []
 
 

@@ -72,7 +72,7 @@ def test_what_waited_through_a_stall_is_taken_in_one_wake(late_ns, wakes):
         ((LONG_NS, STALL_AGAIN_NS - 100 * MS, 0), [0, DRAIN_MAX, MANY - DRAIN_MAX]),
     ],
 )
-def test_so_is_what_waited_through_one_that_follows_on_a_late_wake(late_ns, wakes):
+def test_so_is_a_backlog_of_a_stall_after_a_late_wake(late_ns, wakes):
     """As where little of a processor is left, and the process then stands still."""
     with bind(("127.0.0.1", 0)) as udp, socket.socket(type=socket.SOCK_DGRAM) as sender:
         end = Late(*late_ns)

@@ -67,7 +67,7 @@ def remote(peer):
     return RemoteTeleop(peer, encode, decode, 0)
 
 
-def test_cloud_says_once_that_teleop_is_silent_and_again_the_next_time(peers):
+def test_cloud_reports_each_silence_of_teleop_once(peers):
     one, other = peers
     teleop = remote(one)
     for now_ns in range(0, 3 * SECOND, 10_000_000):
@@ -94,7 +94,7 @@ def request(number, what):
 
 
 @pytest.mark.parametrize("stalled", [False, True])
-def test_after_a_stall_cloud_passes_on_what_stops_and_not_what_leads(peers, stalled):
+def test_after_a_stall_cloud_forwards_stops_but_not_waypoints(peers, stalled):
     """What takes it back has found the socket full."""
     one, other = peers
     teleop = RemoteTeleop(one, encode, decode, SECOND)
@@ -238,9 +238,7 @@ def test_of_what_has_arrived_meanwhile_the_newest_counts(peers):
         ("ss", [PAST, "asked"]),
     ],
 )
-def test_after_a_stall_the_past_is_passed_over_and_what_is_asked_is_asked_of_the_present(
-    peers, monkeypatch, wakes, done
-):
+def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, wakes, done):
     """Where the robot is held, for one: its socket has kept the beginning of the stall alone.
 
     At each wake the present has arrived (p), or comes after a stall (s), with the past.
@@ -271,7 +269,7 @@ def test_after_a_stall_the_past_is_passed_over_and_what_is_asked_is_asked_of_the
     assert machine.seen == done
 
 
-def test_events_wait_for_a_cloud_that_is_away_and_keep_their_order(peers, service, tmp_path):
+def test_events_wait_for_an_absent_cloud_and_keep_their_order(peers, service, tmp_path):
     _, cloud = peers
     cloud.close()
     (tmp_path / "b.sock").unlink()

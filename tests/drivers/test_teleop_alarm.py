@@ -52,7 +52,7 @@ def _none_is_left() -> Any:
 
 
 @pytest.mark.promise("emergency-stop-gets-through")
-def test_a_full_socket_delays_an_emergency_stop_until_it_is_drained_whatever_the_loop_waits_for(
+def test_a_full_socket_delays_an_emergency_stop_until_drained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cloud = UnixPeer(tmp_path / "cloud.sock", tmp_path / "teleop.sock")

@@ -47,7 +47,7 @@ def told(cloud: UnixPeer, teleop: UnixPeer, seconds: float, telemetry: float) ->
     return received
 
 
-def test_cloud_says_five_times_a_second_that_it_lives_if_there_is_no_telemetry(
+def test_without_telemetry_cloud_signals_life_five_times_a_second(
     peers: Peers,
 ) -> None:
     assert told(*peers, seconds=1.0, telemetry=0.0) == [b""] * 5
@@ -71,7 +71,7 @@ def test_teleop_hears_of_cloud_whatever_it_says(peers: Peers) -> None:
     assert machine.seen == [POINT]
 
 
-def test_after_a_stall_it_still_waits_for_the_present_and_hears_nothing_of_the_past(
+def test_after_a_stall_teleop_waits_and_ignores_old_signals(
     peers: Peers,
 ) -> None:
     cloud, teleop = peers

@@ -103,5 +103,5 @@ def test_a_slice_of_such_a_flood_does_not_disturb_it(tmp_path, figure):
 
 @pytest.mark.full
 @pytest.mark.promise("api-load-spares-the-loop")
-def test_a_thousand_requests_a_second_do_not_disturb_the_control_loop(tmp_path, figure):
+def test_1000_requests_a_second_do_not_disturb_the_control_loop(tmp_path, figure):
     assert is_undisturbed(tmp_path / "long", 20.0, figure, 1, True)

@@ -39,7 +39,7 @@ def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
     assert ("new_session" in names) == (killed == ("cloud",))  # a new teleop knows no other one
 
 
-def test_a_world_that_is_killed_ends_the_job_with_world_restarted(release):
+def test_a_killed_world_ends_the_job_with_world_restarted(release):
     job = release.fly()
     release.kill("world")
     release.start("world")
@@ -63,7 +63,7 @@ def test_a_second_teleop_waits_for_the_journal_and_takes_over(release):
     release.until(lambda: release.mission()["state"] == "done")
 
 
-def test_asked_to_end_in_flight_teleop_pauses_the_mission_and_a_successor_goes_on(release):
+def test_an_ended_teleop_holds_and_its_successor_resumes(release):
     release.fly()
     teleop = release.running["teleop"]
     began = time.monotonic()
@@ -97,7 +97,7 @@ def test_an_emergency_stop_stops_the_rotors_and_is_audited(release):
     assert TOKEN.encode() not in everything
 
 
-def test_an_emergency_stop_comes_through_while_teleop_waits_for_its_disk(release):
+def test_an_emergency_stop_passes_while_teleop_waits_for_its_disk(release):
     """Its loop hangs in a write: the alarm goes past it to cloud, which gives it its number."""
     release.fly()
     alarm = UnixPeer(release.folder / "mine.sock", release.folder / "cloud.sock")

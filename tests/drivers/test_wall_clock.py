@@ -43,7 +43,7 @@ def test_it_is_told_in_one_line(by: float) -> None:
     assert "\n" not in fault.text
 
 
-def test_the_thread_of_the_recording_notices_it_whether_anybody_scrapes_or_not(wall: Wall) -> None:
+def test_the_recording_thread_detects_steps_without_scrapes(wall: Wall) -> None:
     thread = RecordingThread(Recorder(Path("x"), lambda path: Shelf()))
     thread.start()
     wall.step(-60.0)

@@ -79,7 +79,7 @@ def test_no_datagram_leaves_while_a_row_of_a_trace_may_begin(ways: int) -> None:
         (False, -5.0, {"early"}),
     ],
 )
-def test_release_errors_are_judged_against_the_anchors_of_the_run(
+def test_release_errors_are_judged_against_the_runs_anchors(
     fifo: bool, ours_us: float, missed: set[str]
 ) -> None:
     """Without SCHED_FIFO: the p99 is at most 1.5 times the C relay's, not a waking's."""

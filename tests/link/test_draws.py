@@ -81,7 +81,7 @@ def test_the_chain_turns_where_the_draws_say() -> None:
         assert state[n] == ((draw[n] >= 0.4) if state[n - 1] else (draw[n] < 0.3))
 
 
-def test_a_chain_that_cannot_turn_bad_is_good_and_one_that_cannot_recover_is_bad() -> None:
+def test_a_chain_without_exits_stays_in_its_state() -> None:
     assert not any(bad_states(KEY, 0, 0.0, 0.0))
     assert len(bad_states(KEY, 0, 0.0, 0.0)) == BLOCK
     assert all(bad_states(KEY, 0, 0.1, 0.0))

@@ -166,7 +166,7 @@ def test_a_trace_holds_each_row_until_the_next() -> None:
     assert delays == [10 * MS, 10 * MS, None, 30 * MS, 30 * MS]
 
 
-def test_a_trace_without_loss_leaves_it_alone_and_jitter_comes_on_top() -> None:
+def test_a_trace_without_losses_keeps_loss_and_adds_jitter() -> None:
     fate = flow(DirectionProfile(9.0, 0.005, loss=0.5, trace=Trace((0.0,), (0.030,))), 2000)
     arrived = [copies[0] for copies in fate if copies]
     assert 800 < len(arrived) < 1200

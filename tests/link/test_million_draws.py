@@ -77,7 +77,7 @@ def test_a_million_fates_have_the_bursts_asked_for() -> None:
     assert np.mean(fates < 0) == pytest.approx(share_bad * 0.6 + (1 - share_bad) * 0.005, rel=0.02)
 
 
-def test_two_hundred_thousand_packets_have_the_loss_and_the_burst_length_asked_for(
+def test_200000_packets_have_the_specified_loss_and_burst_length(
     figure: Callable[..., None],
 ) -> None:
     """The chain alone, everything in the bad state lost: 1/11 lost, 5 packets long, to 10 %."""

@@ -114,7 +114,7 @@ def test_on_a_full_disk_the_file_ends_with_a_whole_chunk(tmp_path: Path, room: i
         (errno.EIO, "Input/output error"),
     ],
 )
-def test_whatever_the_disk_refuses_the_user_is_told_and_nothing_raised(
+def test_disk_errors_are_reported_to_the_user_and_never_raised(
     step: str, code: int, words: str
 ) -> None:
     class Refusing(Shelf):

@@ -70,7 +70,7 @@ def test_a_chunk_is_as_long_as_it_says_or_is_none(
         assert [each.channel_id for each in unpack(said)] == read  # type: ignore[attr-defined]
 
 
-def test_of_a_chunk_that_unpacks_to_more_than_it_says_no_more_is_unpacked() -> None:
+def test_a_chunk_never_unpacks_to_more_than_it_states() -> None:
     bomb = Chunk("zstd", zstandard.compress(bytes(64 << 20)), 0, 0, 0, 1_000)
     tracemalloc.start()
     try:
@@ -105,7 +105,7 @@ def defined(topic: str = "/telemetry") -> bytes:
 
 
 @pytest.mark.parametrize("size", [0, 1 << 20])
-def test_a_file_that_unpacks_to_more_than_a_recording_is_not_read(
+def test_a_file_that_unpacks_to_too_much_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:
     """Its chunks are as a writer's own, its topics known; there are many, of few bytes each."""
@@ -183,7 +183,7 @@ def test_what_becomes_many_objects_is_not_read_in_a_chunk(tmp_path: Path, inside
         recover(path, tmp_path / "new.mcap")
 
 
-def test_definitions_beyond_their_room_are_left_out_with_their_messages(
+def test_too_many_definitions_are_left_out_with_their_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cloudrc.record.recover.DEFINITIONS_MAX", 3_500)

@@ -77,9 +77,7 @@ def test_what_was_said_before_a_file_was_torn_is_said_still(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("short", [1, 60, 100])
-def test_without_room_for_the_note_there_is_no_end_that_passes_for_a_whole_file(
-    tmp_path: Path, short: int
-) -> None:
+def test_without_space_for_the_note_the_file_gets_no_end(tmp_path: Path, short: int) -> None:
     size = full(tmp_path / "w.mcap").stat().st_size
     path = full(tmp_path / "v.mcap", size - short)
     assert not recover(path, tmp_path / "new.mcap").complete

@@ -68,7 +68,7 @@ def test_log_times_never_fall_on_a_topic(tmp_path: Path) -> None:
     assert Recording.read(path)["/guard"]["stamp_ns"].tolist() == [5, 9, 7, 8, 12]
 
 
-def test_what_is_older_than_half_a_second_is_with_the_operating_system() -> None:
+def test_data_older_than_half_a_second_is_flushed() -> None:
     stream = io.BytesIO()
     writer = McapWriter(stream, clock="world")
     states = [GuardChange(n * 10 * MS, GuardState.HOLD, str(n)) for n in range(200)]
