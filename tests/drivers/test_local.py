@@ -62,7 +62,7 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_ctrl_c_ends_all_processes_within_2_s_and_leaves_a_report(tmp_path, how):
+def test_ctrl_c_ends_all_processes_in_2_s_and_leaves_a_report(tmp_path, how):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
     assert set(pids) == {"relay", "world", "teleop", "cloud"}

@@ -47,7 +47,7 @@ def told(cloud: UnixPeer, teleop: UnixPeer, seconds: float, telemetry: float) ->
     return received
 
 
-def test_without_telemetry_cloud_signals_life_five_times_a_second(
+def test_without_telemetry_cloud_signals_life_5_times_a_second(
     peers: Peers,
 ) -> None:
     assert told(*peers, seconds=1.0, telemetry=0.0) == [b""] * 5

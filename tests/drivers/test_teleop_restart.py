@@ -97,7 +97,7 @@ def test_an_emergency_stop_stops_the_rotors_and_is_audited(release):
     assert TOKEN.encode() not in everything
 
 
-def test_an_emergency_stop_passes_while_teleop_waits_for_its_disk(release):
+def test_an_emergency_stop_passes_while_teleop_waits_for_disk(release):
     """Its loop hangs in a write: the alarm goes past it to cloud, which gives it its number."""
     release.fly()
     alarm = UnixPeer(release.folder / "mine.sock", release.folder / "cloud.sock")

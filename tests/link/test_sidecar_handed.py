@@ -68,7 +68,7 @@ def pod(tmp_path: Path) -> Pod:
     return Pod(tmp_path)
 
 
-def test_a_handed_change_is_in_force_and_the_config_map_adds_none(pod: Pod) -> None:
+def test_a_handed_change_acts_and_the_config_map_adds_none(pod: Pod) -> None:
     assert pod.first() == 0.04
     pod.hand(120.0, "a1")
     assert pod.poll() == (0.12, "a1")
