@@ -15,11 +15,11 @@ from cloudrc.drivers.epochs import BLOCK, EpochFile, replace_durably
 from cloudrc.tunnel.handshake import EPOCH_MAX
 
 WAIT = 10.0
-"""For what a thread is sure to do [s]."""
+"""Longest wait for a thread [s]."""
 
 
 class Told(deque[range]):
-    """Tells when something is appended."""
+    """A list that signals each append."""
 
     def __init__(self, blocks: Iterable[range]) -> None:
         super().__init__(blocks)
@@ -31,7 +31,7 @@ class Told(deque[range]):
 
 
 class Slow:
-    """An epoch file whose disk takes what it is given when a test lets it, and no sooner."""
+    """An epoch file on a disk that writes only when a test allows it."""
 
     def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.troubles: list[str] = []
@@ -48,13 +48,13 @@ class Slow:
         replace_durably(path, data)
 
     def take(self, count: int) -> list[int]:
-        """So many, all of which there are."""
+        """Take `count` epochs, which must all be available."""
         taken = [self.file.take() for _ in range(count)]
         assert None not in taken
         return [epoch for epoch in taken if epoch is not None]
 
     def go_on(self) -> None:
-        """Have one block written; that is done when this returns."""
+        """Let the disk write one block and wait for it."""
         self._goes_on.put(None)
         self._reserved.appended.get(timeout=WAIT)
 

@@ -1,4 +1,4 @@
-"""Flights say where they are, to their user alone and for as long as they last."""
+"""Flight files tell only their user of a flight, and only during it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from cloudrc.records import Record
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from cloudrc.drivers import flights
-with flights.announced(Path(sys.argv[1])):
-    assert flights.under_way()
+from cloudrc.drivers import local
+with local.announced(Path(sys.argv[1])):
+    assert local.under_way()
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -83,7 +83,9 @@ def test_an_unsafe_or_unwritable_first_folder_gives_the_second(
     tmp_path: Path, places: list[Path], mode: int
 ) -> None:
     if os.getuid() == 0 and mode == 0o500:
-        places[0].parent.parent.joinpath("cloudrc").write_text("in the way")  # root may all
+        places[0].parent.parent.joinpath("cloudrc").write_text(
+            "in the way"
+        )  # root ignores permissions
     else:
         places[0].mkdir(parents=True)
         places[0].chmod(mode)

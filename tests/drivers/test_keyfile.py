@@ -1,4 +1,4 @@
-"""The key file: made by a command, read at the start, followed in flight, shown to nobody."""
+"""The key file is made by a command, followed in flight and never shown."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FIRST, SECOND = b"1" * 32, b"2" * 32
 
 
 def put(path: Path, data: bytes) -> None:
-    """Replace a file as kubelet does: at once, by another one."""
+    """Replace a file atomically, as kubelet does."""
     draft = path.with_name("draft")
     draft.write_bytes(data)
     draft.replace(path)
@@ -44,7 +44,7 @@ def test_a_new_key_is_taken_and_the_old_one_is_valid_beside_it(path: Path) -> No
     keys = KeyFile(path, 0)
     keys.follow(0)
     put(path, SECOND)
-    assert keys.follow(PERIOD_NS - 1) == []  # it is not time to look yet
+    assert keys.follow(PERIOD_NS - 1) == []  # the next check is not due yet
     (said,) = keys.follow(PERIOD_NS)
     assert said.code == "key"
     assert keys.ring.accepted(PERIOD_NS) == (Key(SECOND), Key(FIRST))
@@ -81,7 +81,7 @@ def test_a_file_that_is_wrong_leaves_the_keys_and_is_told_once(path: Path, wrong
 def test_a_file_unreadable_for_a_while_is_read_once_it_can_be(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who may read it changes nothing of what is seen of it from outside."""
+    """A change of permissions does not change a file's version."""
     keys = KeyFile(path, 0)
     put(path, SECOND)
     with monkeypatch.context() as forbidden:
@@ -270,13 +270,13 @@ def test_a_huge_file_is_not_read_whole(tmp_path: Path) -> None:
 
 
 def test_a_pipe_instead_of_the_file_is_not_read_and_keys_stay(path: Path) -> None:
-    """Whoever reads a pipe waits for who writes into it, and the robot with it."""
+    """A reader of a pipe would wait for a writer and stop the loop."""
     keys = KeyFile(path, 0)
     keys.follow(0)
     path.unlink()
     os.mkfifo(path)
     text = write(KeySet(Key(SECOND))).encode().ljust(keyfile.SIZE_MAX, b"\n")
-    pipe = os.open(path, os.O_RDWR)  # so that nobody would wait here
+    pipe = os.open(path, os.O_RDWR)  # a writer, so that the test cannot block
     try:
         os.write(pipe, text)
         (said,) = keys.follow(PERIOD_NS)

@@ -1,4 +1,4 @@
-"""An end records what the link tells: when first seen, when it changes, when a mission begins."""
+"""An end records the link's state at first, at changes and at mission starts."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_a_state_of_which_nothing_can_be_noted_is_no_change(
 
 
 def test_a_too_long_state_is_not_recorded_nor_the_last_one(tmp_path: Path) -> None:
-    """A long time line was put in force: what was noted before holds no more."""
+    """A long time line is in force, so the last note no longer holds."""
     path = tmp_path / "link.json"
     tell(path, STATE)
     notes, began = LinkNotes(path, uplink=False), [SessionOpened(0, "cloud", 1, "")]
@@ -165,7 +165,7 @@ def test_foreign_words_are_noted_in_one_line_that_can_be_written(tmp_path: Path)
 
 
 def test_only_what_a_relay_tells_is_counted(tmp_path: Path) -> None:
-    """Names that come from elsewhere would be kept for ever by whoever counts them."""
+    """Unknown names would fill the tables of counters."""
     path = tmp_path / "link.json"
     errors = ReleaseErrors()
     errors.observe(5)

@@ -1,4 +1,4 @@
-"""Local mode with real processes: what becomes of a run that is not left in peace."""
+"""Local mode with real processes that are interrupted, killed or stopped."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from cloudrc.drivers import local as flights
 pytestmark = pytest.mark.process
 
 FLOWN = (0, 6)
-"""Done, or done but not in real time: a busy machine is not what is tested here."""
+"""Exit codes of a finished run, in real time or not: the machine may be busy."""
 HOVER = ["hover", "--mode", "local", "--set", "mission.waypoints.0.dwell_s={dwell}"]
 
 
@@ -29,7 +29,7 @@ def start(folder: Path, *settings: str, dwell: float = 20.0) -> subprocess.Popen
 
 
 def children(parent: int) -> dict[str, int]:
-    """Process ids by what they are: relay, world, teleop, cloud."""
+    """Return the process ids by role: relay, world, teleop, cloud."""
     found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -118,7 +118,7 @@ def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
     run = start(folder)
     wait_until_flying(run)
     assert json.loads((folder / "api.json").read_text())["url"] == flights.under_way()[folder]
-    assert operate(folder, "run", "hover").returncode == 5  # one flies already
+    assert operate(folder, "run", "hover").returncode == 5  # a mission already flies
     assert "held" in operate(folder, "hold").stdout
     assert operate(folder, "goto", "0", "0", "99").returncode == 2
     assert operate(folder, "goto", "0.3", "0", "0.8").returncode == 0
@@ -173,7 +173,7 @@ def build() -> Predictor:
 
 
 def predictor(folder: Path, does: str, statement: str) -> str:
-    """Write such a plug-in; gives the setting that chooses it."""
+    """Write such a plug-in; return the setting that selects it."""
     (folder / "odd.py").write_text(PREDICTOR.format(does=does, statement=statement))
     return f"cloud.predictor={folder}/odd.py"
 

@@ -1,4 +1,4 @@
-"""The supervisor of a local run: what its processes write, and the key that it makes for them."""
+"""The supervisor of a local run reads feeds and makes the key."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_key_of_a_run_is_for_its_user_alone_and_goes_with_it(
         seen.append((key, key.stat().st_mode, key.parent.stat().st_mode))
 
     monkeypatch.setattr(LocalRun, "_fly", look)
-    before = os.umask(0)  # of a user who shares everything
+    before = os.umask(0)  # a user whose new files are open to all
     try:
         LocalRun(tmp_path, lambda records: None).fly(1.0)
     finally:

@@ -1,4 +1,4 @@
-"""World, cloud and teleop as processes, each of which may be killed in flight."""
+"""World, cloud and teleop as processes that are killed in flight."""
 
 import json
 import signal
@@ -31,12 +31,12 @@ def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
     release.until(lambda: release.mission()["state"] == "done")
     view = release.ask(f"/v1/missions/{release.mission()['id']}")
     assert [reached["waypoint"] for reached in view["reached"]] == [0, 1, 2]
-    # A machine that is busy with other things is no failure of this.
+    # A busy machine is no failure of this test.
     assert {failure["code"] for failure in view["verdict"]["failures"]} <= {"not_real_time"}
     names = [event["event"] for event in view["events"]]
     assert names.count("started") == 1
     assert names.count("resumed") == ("teleop" in killed)
-    assert ("new_session" in names) == (killed == ("cloud",))  # a new teleop knows no other one
+    assert ("new_session" in names) == (killed == ("cloud",))  # a new teleop knows no other session
 
 
 def test_a_killed_world_ends_the_job_with_world_restarted(release):
@@ -98,7 +98,7 @@ def test_an_emergency_stop_stops_the_rotors_and_is_audited(release):
 
 
 def test_an_emergency_stop_passes_while_teleop_waits_for_disk(release):
-    """Its loop hangs in a write: the alarm goes past it to cloud, which gives it its number."""
+    """Teleop's loop hangs in a write; the alarm goes directly to cloud, which numbers it."""
     release.fly()
     alarm = UnixPeer(release.folder / "mine.sock", release.folder / "cloud.sock")
     release.running["teleop"].send_signal(signal.SIGSTOP)
@@ -109,7 +109,7 @@ def test_an_emergency_stop_passes_while_teleop_waits_for_disk(release):
     release.until(lambda: release.mission()["state"] == "failed")
     assert release.ask("/v1/state")["seen"]["guard"] == "ESTOP"
     failures = release.mission()["verdict"]["failures"]
-    assert failures[0]["code"] == "guard_stopped"  # teleop itself was never asked
+    assert failures[0]["code"] == "guard_stopped"  # teleop itself never got the request
 
 
 def test_all_end_within_two_seconds_of_sigterm(release):

@@ -1,4 +1,4 @@
-"""A wall clock that somebody sets is noticed; one that is merely a little fast is not."""
+"""A step of the wall clock is detected, a slight drift is not."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_a_clock_that_drifts_has_not_been_set(monkeypatch: pytest.MonkeyPatch) -
 def test_nor_has_one_whose_looker_was_stopped_in_the_middle(
     stopped_before: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By SIGSTOP or a quota, for a second between one clock and the other."""
+    """A stop of a second between the reads of both clocks, by SIGSTOP or a CPU quota."""
     true = [0.0]
     stops = iter([False, True])
 

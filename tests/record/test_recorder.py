@@ -1,4 +1,4 @@
-"""The recorder takes everything without waiting and survives whatever the disk does."""
+"""The recorder never blocks and survives all disk errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
 
 
 class Disk(io.BytesIO):
-    """A file on a disk that has room for so many bytes."""
+    """A file on a disk with space for `room` bytes."""
 
     def __init__(self, room: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The recorder between its threads: who puts, who writes, and who waits for the disk."""
+"""The recorder with its three threads: one puts, one writes, one syncs."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_hanging_sync_keeps_no_data_from_the_operating_system() -> None:
 
 
 def test_what_a_power_cut_would_take_is_told(tmp_path: Path) -> None:
-    """By a thread whose disk takes two syncs and hangs in the third."""
+    """The disk does two syncs and hangs in the third."""
     begun, release, began = threading.Semaphore(0), threading.Event(), list[float]()
 
     class Hanging(Shelf):
