@@ -41,7 +41,7 @@ flood(("127.0.0.1", {port}), {rate}, {seconds})
 
 
 def garbage(count: int, seed: int) -> list[bytes]:
-    """Make datagrams: noise, valid headers with a wrong length, and valid lengths with a wrong tag."""
+    """Make noise, valid headers with a wrong length, and valid lengths with a wrong tag."""
     rng, made = random.Random(seed), []
     for number in range(count):
         if number % 3 == 0:

@@ -80,7 +80,7 @@ def world_records(count: int, start_ns: int = 0) -> list[Record]:
 
 
 def cloud_records(count: int, start_ns: int = 0, up_ns: int = 40 * MS) -> list[Record]:
-    """Make cloud's records at 100 Hz, with a command 3 ms after each period and telemetry of `up_ns`."""
+    """Make cloud's records at 100 Hz; a command leaves 3 ms after each period."""
     records: list[Record] = [rec.SessionOpened(start_ns, "cloud", 1, "world said yes")]
     v = (0.1, 0.2, 0.3)
     for n in range(count):
