@@ -1,4 +1,4 @@
-"""The judge of `make bench-link`: misses are said, and a missing compiler is exit 3."""
+"""`make bench-link` reports missed targets and exits with 3 without a compiler."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PROFILE = DirectionProfile(0.040, 0.030, loss=0.1)
 
 
 def flow(late_ns: int) -> Flow:
-    """What a relay does that is always so late."""
+    """Make the results of a relay with a constant lateness."""
     made, link = Flow(True), LinkDirection(PROFILE, 1, True, START)
     for number in range(500):
         made.sent[number] = START + number * 10 * MS

@@ -1,4 +1,4 @@
-"""The streams of chance: pure, in range, as distributed as they say."""
+"""The random draws are pure, in range and correctly distributed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def forget() -> None:
 
 
 def test_the_first_draws_of_a_stream_are_these() -> None:
-    """Whoever changes them changes every published flight; say so in the change log."""
+    """A change of the draws changes every published flight; note it in the change log."""
     first = uniforms(KEY, Purpose.DELAY, 0)[:3]
     assert first == pytest.approx(FIRST, abs=1e-12)
 

@@ -1,4 +1,4 @@
-"""Traces: the good are read, the bad are refused with file, line, value and remedy."""
+"""Valid traces are read; bad ones are rejected with file, line, value and remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CSV files: columns that name their units, losses, and what is refused with a hint."""
+"""CSV logs: columns with units, losses, and rejected files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Packets become rows that a stream of the same rate meets one by one; wrong units are refused."""
+"""Packets become rows that a stream of the same rate meets one by one; wrong units are rejected."""
 
 from __future__ import annotations
 
