@@ -1,12 +1,7 @@
-"""The laboratory for real netem, made for each file of tests that asks for it.
+"""Fixtures of the link: packets over a model, a fake tc kernel, a netem laboratory, a fake sidecar.
 
-Packets sent one after the other over one direction of a link: what the tests here share.
-
-A kernel with one interface, as far as tc sees it, and a netem on it whose time is a number.
-
-Two network namespaces joined by a cable, and a flow from one to the other: for real netem.
-
-A sidecar with shapers that only take notes, on a clock that only it moves.
+The laboratory joins two network namespaces by a cable for tests of real netem. The sidecar's
+shapers only store calls, on a clock that a test moves.
 """
 
 from __future__ import annotations
