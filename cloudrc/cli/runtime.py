@@ -95,7 +95,11 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="the tunnel's pre-shared key ('cloudrc key new FILE'); it may change in flight",
     )
-    target = parser.add_mutually_exclusive_group(required=True)
+    _target_arguments(parser.add_mutually_exclusive_group(required=True))
+
+
+def _target_arguments(target: argparse._MutuallyExclusiveGroup) -> None:
+    """Declare where an end sends to: a fixed peer, or a file that names it."""
     target.add_argument(
         "--peer",
         type=read_address,

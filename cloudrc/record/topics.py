@@ -81,7 +81,7 @@ LINK_TOPICS = (
             Field("delay", "float", "s", "profile's delay at the start of the time line, one way"),
             Field("jitter", "float", "s", "profile's jitter at the start of the time line"),
             Field("loss", "float", "1", "profile's mean loss at the start of the time line"),
-            Field("rate", "float", "bit/s", "likewise its rate; NaN without a bottleneck"),
+            Field("rate", "float", "bit/s", "profile's rate at that instant; NaN without one"),
             Field("conditions", "string", "", "the profile as JSON"),
         ),
     ),

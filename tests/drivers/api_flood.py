@@ -1,9 +1,9 @@
-"""A flood on teleop's API, as a process: so many requests a second, and clients that dawdle.
+"""Flood teleop's API with requests and slow clients, as a separate process.
 
     python api_flood.py URL TOKEN SECONDS RATE
 
-Half of the requests look with a token, a quarter has none, a quarter commands what is refused. It
-prints how many were sent and how many answers of each status came, as JSON.
+Half of the requests read with a token, a quarter has none, a quarter sends rejected commands. It
+prints the number of requests and of the answers by status, as JSON.
 """
 
 import json
@@ -25,7 +25,7 @@ def request(method, path, token, body=b""):
 
 
 class Flood:
-    """Connections that are kept, and asked on in turns without waiting for answers."""
+    """Open connections that send in turns without waiting for answers."""
 
     def __init__(self, address, token):
         self.address, self.asked, self.sent, self.answers = address, 0, 0, Counter()
@@ -75,7 +75,7 @@ class Flood:
         self.answers["closed"] += 1
 
     def dawdle(self):
-        """A byte each; who was cut off comes again."""
+        """Send a byte on each; reopen closed connections."""
         for number, dawdler in enumerate(self.dawdlers):
             try:
                 dawdler.sendall(b"G")

@@ -1,9 +1,4 @@
-"""Two Unix sockets that know each other.
-
-How fast an interpreter is at its own work, for the few tests whose number is a time.
-
-World, cloud and teleop as processes, with a journal, tokens and a key, for tests to kill.
-"""
+"""Fixtures: a pair of Unix sockets, this machine's speed, and a release of three processes."""
 
 from __future__ import annotations
 
@@ -28,7 +23,7 @@ from cloudrc.errors import CloudrcError
 
 @pytest.fixture
 def peers(tmp_path: Path) -> Iterator[tuple[UnixPeer, UnixPeer]]:
-    """That of teleop or of cloud first, as a test likes."""
+    """Make teleop's and cloud's socket, in the order that a test chooses."""
     paths = tmp_path / "a.sock", tmp_path / "b.sock"
     pair = UnixPeer(*paths), UnixPeer(*reversed(paths))
     yield pair
@@ -47,17 +42,17 @@ def work():
 print(min(work() for _ in range(5)))
 """
 NOMINAL = 0.100
-"""What WORK takes where a release in flight costs 138m to 148m [s]. Where it took 0.17 to 0.21 s
-the same release cost 228m to 300m, all of its containers alike."""
+"""Time of WORK on a machine where a release in flight costs 138m to 148m of CPU [s]. With 0.17 to
+0.21 s the same release cost 228m to 300m."""
 
 
 def slower(told: str) -> float:
-    """How much slower than nominal an interpreter is that has printed this for WORK; at least 1."""
+    """Return the slowdown against nominal from the time that WORK has printed; at least 1."""
     return max(1.0, float(told) / NOMINAL)
 
 
 def here() -> float:
-    """The same of this machine's, measured now."""
+    """Measure the slowdown of this machine's interpreter."""
     return slower(subprocess.check_output([sys.executable, "-c", WORK], text=True))
 
 
@@ -73,7 +68,7 @@ waypoints:
 
 
 class Release:
-    """What a release has, without its link: three processes, a journal, an API."""
+    """A release without its link: three processes, a journal, an API."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.running, self.all = folder, {}, []
@@ -129,7 +124,7 @@ class Release:
         return Api(url, lambda: TOKEN).post(path)
 
     def mission(self):
-        """The newest one, if there is any."""
+        """Return the newest mission, if there is one."""
         missions = self.ask("/v1/missions")["missions"]
         return missions[-1] if missions else {"state": "away", "reached": []}
 
@@ -140,7 +135,7 @@ class Release:
             time.sleep(0.05)
 
     def fly(self) -> subprocess.Popen[str]:
-        """What a Job runs, once it has reached its first waypoint."""
+        """Start the command of a Job and wait for its first waypoint."""
         url = json.loads((self.folder / "api.json").read_text())["url"]
         flags = ["--token-file", "operator", "--mission", "mission.yaml", "--key", "u"]
         job = self.run("mission", "fly", "--api", url, *flags)

@@ -1,4 +1,4 @@
-"""CPU throttling: both versions of cgroups, read from files as the kernel writes them."""
+"""CPU throttling is read from the kernel's files of both cgroup versions."""
 
 from __future__ import annotations
 

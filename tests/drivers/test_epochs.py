@@ -15,11 +15,11 @@ from cloudrc.drivers.epochs import BLOCK, EpochFile, replace_durably
 from cloudrc.tunnel.handshake import EPOCH_MAX
 
 WAIT = 10.0
-"""For what a thread is sure to do [s]."""
+"""Longest wait for a thread [s]."""
 
 
 class Told(deque[range]):
-    """Tells when something is appended."""
+    """A list that signals each append."""
 
     def __init__(self, blocks: Iterable[range]) -> None:
         super().__init__(blocks)
@@ -31,7 +31,7 @@ class Told(deque[range]):
 
 
 class Slow:
-    """An epoch file whose disk takes what it is given when a test lets it, and no sooner."""
+    """An epoch file on a disk that writes only when a test allows it."""
 
     def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.troubles: list[str] = []
@@ -48,13 +48,13 @@ class Slow:
         replace_durably(path, data)
 
     def take(self, count: int) -> list[int]:
-        """So many, all of which there are."""
+        """Take `count` epochs, which must all be available."""
         taken = [self.file.take() for _ in range(count)]
         assert None not in taken
         return [epoch for epoch in taken if epoch is not None]
 
     def go_on(self) -> None:
-        """Have one block written; that is done when this returns."""
+        """Let the disk write one block and wait for it."""
         self._goes_on.put(None)
         self._reserved.appended.get(timeout=WAIT)
 
@@ -111,7 +111,7 @@ def test_an_epoch_is_on_disk_before_it_is_used(path: Path, slow: Slow) -> None:
         slow.go_on()
 
 
-def test_the_disk_is_asked_at_the_start_and_once_in_a_block_well_before_its_end(
+def test_the_next_block_is_reserved_well_before_the_last_ends(
     slow: Slow,
 ) -> None:
     slow.take(BLOCK // 2 - 1)
@@ -124,7 +124,7 @@ def test_the_disk_is_asked_at_the_start_and_once_in_a_block_well_before_its_end(
         assert slow.asked.empty()
 
 
-def test_nobody_waits_for_a_disk_that_hangs_and_no_epoch_is_given_out_that_is_not_on_it(
+def test_a_hanging_disk_blocks_nobody_and_gives_no_epoch(
     path: Path, slow: Slow, opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert slow.take(BLOCK) == list(range(1, BLOCK + 1))
@@ -136,9 +136,7 @@ def test_nobody_waits_for_a_disk_that_hangs_and_no_epoch_is_given_out_that_is_no
     assert opened(path).take() == 2 * BLOCK + 1
 
 
-def test_a_disk_that_fails_in_flight_is_told_and_epochs_rise_all_the_same(
-    path: Path, slow: Slow
-) -> None:
+def test_a_disk_failure_in_flight_is_reported_and_epochs_rise(path: Path, slow: Slow) -> None:
     path.unlink()
     path.parent.rmdir()
     taken = slow.take(BLOCK)
@@ -180,7 +178,7 @@ def test_a_crash_between_the_steps_leaves_the_old_file_whole(
     [b"", b"12x", b"-4", b"99999999999", b"9" * 5000, b"\xff\xfe"],
     ids=lambda torn: torn[:9],
 )
-def test_a_file_that_holds_no_epoch_is_told_and_epochs_begin_again(
+def test_a_file_without_an_epoch_is_reported_and_epochs_restart(
     path: Path, opened: Opened, troubles: list[str], torn: bytes
 ) -> None:
     path.write_bytes(torn)
@@ -202,7 +200,7 @@ def test_a_pipe_in_the_place_of_the_file_is_not_waited_for(
     assert troubles[0].startswith(f"{path}: holds no epoch and was renamed ")
 
 
-def test_a_file_that_cannot_be_read_is_told_and_epochs_begin_again(
+def test_an_unreadable_file_is_reported_and_epochs_restart(
     path: Path, opened: Opened, troubles: list[str]
 ) -> None:
     path.mkdir()
@@ -211,7 +209,7 @@ def test_a_file_that_cannot_be_read_is_told_and_epochs_begin_again(
     assert "epochs begin again" in troubles[0]
 
 
-def test_a_disk_that_cannot_be_written_is_told_and_epochs_rise_all_the_same(
+def test_a_read_only_disk_is_reported_and_epochs_rise(
     tmp_path: Path, opened: Opened, troubles: list[str]
 ) -> None:
     file = opened(tmp_path / "no" / "epoch")

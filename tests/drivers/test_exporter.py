@@ -1,4 +1,4 @@
-"""What Prometheus scrapes: valid, small, ours alone, and absent where nothing is known."""
+"""The text for Prometheus is valid and small; unknown values are absent."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ PERIODS = (TelemetrySent, Control)
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    """The records of a flight, with wakes as in real time; and what the other roles see."""
+    """The records of a flight with real-time wakes, and those of the other roles."""
     both = records(load_experiment("hover", ["link.profile=paper-p3"]))
     seen: Flight = {}
     for end, of_end in zip(ENDS, both, strict=True):
@@ -103,7 +103,7 @@ def test_promtool_finds_nothing_to_say(role: str, flight: Flight) -> None:
 def test_a_flight_shows_every_metric_of_its_role_and_no_other(role: str, flight: Flight) -> None:
     families = text_string_to_metric_families(exporter(role, flight).text())
     found = {family.name + "_total" * (family.type == "counter") for family in families}
-    optional = {name for name in METRICS if "_cpu_" in name}  # only where the kernel counts it
+    optional = {name for name in METRICS if "_cpu_" in name}  # only if the kernel counts it
     expected = {metric.name for metric in of_role(role)}
     assert {
         name for name in found if not name.startswith("process_")
@@ -123,7 +123,7 @@ def test_labels_keep_to_their_sets(role: str, flight: Flight) -> None:
 
 @pytest.mark.parametrize("pod", [("world", "link"), ("cloud", "teleop", "link")])
 def test_a_pod_has_less_than_200_series(pod: tuple[str, ...], flight: Flight) -> None:
-    """Of its metrics of missions there are one set: teleop's."""
+    """Only teleop exports the metrics of missions."""
     made = [exporter(role, flight, missions=role != "cloud") for role in pod]
     assert sum(len(series(one.text())) for one in made) < 200
 
@@ -135,7 +135,7 @@ def test_a_cloud_whose_missions_are_teleops_tells_of_none(flight: Flight) -> Non
 
 
 @pytest.mark.promise("unknown-is-absent")
-def test_how_old_the_recording_on_the_disk_is_is_absent_until_it_is_known() -> None:
+def test_the_sync_age_is_absent_until_it_is_known() -> None:
     ages: list[float | None] = [None, 0.25]
     world = Exporter("world")
     assert "sync_age" not in world.text()
@@ -144,7 +144,7 @@ def test_how_old_the_recording_on_the_disk_is_is_absent_until_it_is_known() -> N
     assert "cloudrc_recorder_sync_age_seconds 0.25" in world.text()
 
 
-def test_names_that_are_not_resolved_are_counted_and_are_no_sign_of_life() -> None:
+def test_unresolved_names_are_counted_and_are_no_sign_of_life() -> None:
     link = Exporter("link")
     assert "cloudrc_dns_errors_total 0.0" in link.text()
     link.unresolved(7)
@@ -177,7 +177,7 @@ def test_a_shaper_takes_the_place_of_the_one_before() -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("end", ENDS)
 def test_a_record_costs_less_than_a_microsecond(end: str, flight: Flight) -> None:
-    """On the loop's thread, at the machine's pace; the least of some repeats: it may be busy."""
+    """The fastest of several repeats counts, since the machine may be busy."""
     chunks = [flight[end][i : i + 4] for i in range(0, len(flight[end]), 4)]
     least = float("inf")
     for _ in range(15):

@@ -1,4 +1,4 @@
-"""The HTTP side of the exporter: probes, a port that is taken, clients that mean no good."""
+"""The exporter over HTTP: probes, a used port, hostile clients."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ def test_metrics_and_probes_are_on_one_port(
     assert get(port, "/readyz")[0] == 503
 
 
-def test_however_often_it_is_scraped_a_page_is_made_four_times_a_second(
+def test_a_page_is_made_at_most_four_times_a_second(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Each tells what was known a quarter of a second ago at most."""
+    """A page is at most 0.25 s old."""
     now, made = [1000.0], []
     monkeypatch.setattr("cloudrc.drivers.exporter.time", SimpleNamespace(monotonic=lambda: now[0]))
     exporter = Exporter("link")
@@ -80,8 +80,8 @@ def test_scrapers_that_come_at_once_have_one_page_made(
     monkeypatch.setattr(exporter, "text", slowly)
     with ThreadPoolExecutor(8) as scrapers:
         answers = [scrapers.submit(get, port, "/metrics") for _ in range(8)]
-        while threading.active_count() < 16:  # eight ask, eight answer
-            assert get(port, "/healthz")[0] == 200  # probes do not wait with them
+        while threading.active_count() < 16:  # eight clients and eight server threads
+            assert get(port, "/healthz")[0] == 200  # probes do not wait for scrapes
         all_wait.set()
         pages = {each.result() for each in answers}
     assert (len(pages), len(calls)) == (1, 1)
@@ -90,7 +90,7 @@ def test_scrapers_that_come_at_once_have_one_page_made(
 def test_a_loop_that_stands_still_is_not_alive(
     served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is not asked for while it starts, and what the other end does is no part of it."""
+    """Liveness does not depend on the other end, nor on the loop before its start."""
     exporter, port = served
     monkeypatch.setattr("cloudrc.drivers.exporter.STILL_MAX", -1.0)
     assert get(port, "/healthz") == (200, "alive\n")
@@ -136,13 +136,13 @@ def test_it_answers_while_many_clients_hang(
     assert get(served[1], "/healthz")[0] == 200
     gone = [is_cut(client) for client in hanging]
     assert gone == sorted(gone, reverse=True), "the oldest had to go"
-    assert gone.count(False) == probes.CONNECTIONS_MAX - 1  # the probe had the last place
+    assert gone.count(False) == probes.CONNECTIONS_MAX - 1  # the probe took the last place
     for client in hanging:
         client.close()
 
 
 def is_cut(client: socket.socket) -> bool:
-    """Whether a connection on which nothing was answered has been ended."""
+    """Check whether the server has closed a connection without an answer."""
     client.setblocking(False)
     try:
         return client.recv(1) == b""
@@ -152,15 +152,15 @@ def is_cut(client: socket.socket) -> bool:
         return True
 
 
-def test_connections_that_come_faster_than_they_are_taken_wait_and_are_not_refused(
+def test_a_burst_of_connections_waits_and_is_not_refused(
     served: tuple[Exporter, int],
 ) -> None:
     exporter, port = served
     server = exporter._server
     assert server is not None
     waiting = []
-    with server._guard:  # meanwhile none is taken
-        for _ in range(500):  # behind a full queue the kernel would let one try again in a second
+    with server._guard:  # the server accepts no connection meanwhile
+        for _ in range(500):  # with a full queue the kernel would delay a client by a second
             waiting.append(socket.create_connection((HOST, port), timeout=0.9))
     assert get(port, "/healthz")[0] == 200
     for client in waiting:

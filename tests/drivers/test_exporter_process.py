@@ -1,4 +1,4 @@
-"""Metrics and routes of the real processes: contradicting flags, ports taken, a flight watched."""
+"""Metrics and routes of real processes: bad flags, used ports, a whole flight."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_metrics_port_that_is_taken_ends_in_one_sentence(
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports that are free both for UDP and for TCP, on 127.0.0.1."""
+    """Find ports on 127.0.0.1 that are free for both UDP and TCP."""
     ports: list[int] = []
     with ExitStack() as held:
         while len(ports) < count:
@@ -52,14 +52,14 @@ def free_ports(count: int) -> list[int]:
             held.callback(udp.close)
             held.callback(tcp.close)
             udp.bind(("127.0.0.1", 0))
-            with suppress(OSError):  # free for UDP, but somebody's TCP connection has just used it
+            with suppress(OSError):  # free for UDP, but a TCP connection has just used it
                 tcp.bind(udp.getsockname())
                 ports.append(udp.getsockname()[1])
     return ports
 
 
 class Pods:
-    """World and cloud, joined by two route files, each with its metrics."""
+    """World and cloud with metrics, connected by two route files."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -123,7 +123,7 @@ def pods(tmp_path: Path) -> Iterator[Pods]:
 
 
 @pytest.mark.process
-def test_ends_wait_for_their_route_follow_it_and_lose_readiness_without_a_peer(pods: Pods) -> None:
+def test_ends_follow_their_route_and_are_ready_only_with_a_peer(pods: Pods) -> None:
     for end in pods.processes:
         pods.wait(end, "/healthz")
         assert pods.get(end, "/readyz")[0] == 503
@@ -135,7 +135,7 @@ def test_ends_wait_for_their_route_follow_it_and_lose_readiness_without_a_peer(p
     pods.wait("world", "/metrics", "cloudrc_recorder_sync_age_seconds ")
     assert "sync_age" not in pods.get("cloud", "/metrics")[1], "it records nothing"
     pods.wait("cloud", "/metrics", "cloudrc_mission_state 2.0", 'cloudrc_pid_output{axis="x"')
-    pods.route("world", 9)  # discard: cloud hears nothing any more, world still does
+    pods.route("world", 9)  # discard port: cloud receives nothing more, world still does
     pods.wait("cloud", "/readyz", status=503)
     assert pods.get("cloud", "/healthz")[0] == 200
     pods.route("world", pods.tunnel["cloud"])
@@ -143,7 +143,7 @@ def test_ends_wait_for_their_route_follow_it_and_lose_readiness_without_a_peer(p
 
 
 @pytest.mark.process
-def test_a_link_counts_that_it_cannot_resolve_its_peer_before_it_shapes(tmp_path: Path) -> None:
+def test_a_link_counts_unresolved_names_before_it_shapes(tmp_path: Path) -> None:
     (tmp_path / "profile.yaml").write_text("uplink: {delay_ms: 1}\n")
     listen, metrics = free_ports(2)
     command = [sys.executable, "-m", "cloudrc", "link", "run", "--config", "hover"]

@@ -1,4 +1,4 @@
-"""What processes tell: records become lines and records again, and telling never blocks."""
+"""The feed turns records into lines and back, and never blocks."""
 
 import os
 
@@ -44,7 +44,7 @@ def test_events_are_all_told_and_samples_ten_times_a_second():
     told = [type(from_line(line)) for line in lines[1:]]
     assert (told.count(MissionEvent), told.count(TelemetrySent)) == (20, 5)
     os.close(reader)
-    feed.tell([EVENT])  # nobody reads any more: not a word
+    feed.tell([EVENT])  # nobody reads any more: no error
     os.close(writer)
 
 
@@ -67,7 +67,7 @@ def test_a_full_pipe_does_not_block():
 
 
 def test_a_line_is_told_whole_however_long_and_in_any_characters():
-    """A pipe has room for 64 KiB; the rest of a longer line goes before the next, or instead."""
+    """A pipe holds 64 KiB; the rest of a longer line is written before the next line."""
     reader, writer = os.pipe()
     os.set_blocking(reader, False)
     feed, data = Feed(writer), b""

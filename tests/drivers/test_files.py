@@ -1,4 +1,4 @@
-"""Files that somebody else has written: read whole or not at all, and never waited for."""
+"""Foreign files are read completely or not at all, and never block."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 from cloudrc import files
 
 LIMIT = 10.0
-"""For what takes no time [s]."""
+"""Longest time for what should be immediate [s]."""
 
 
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
-    """On a thread: a reader that waits for a writer does so for ever, and this test shall fail."""
+    """Read on a thread, so that a reader that blocks without end fails the test."""
     pipe, refused = tmp_path / "pipe", threading.Event()
     os.mkfifo(pipe)
 
@@ -27,7 +27,7 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     thread = threading.Thread(target=read, daemon=True)
     thread.start()
     in_time = refused.wait(LIMIT)
-    os.close(os.open(pipe, os.O_RDWR | os.O_NONBLOCK))  # whoever waits has a writer now
+    os.close(os.open(pipe, os.O_RDWR | os.O_NONBLOCK))  # a blocked reader now gets a writer
     thread.join(LIMIT)
     assert in_time
 
@@ -44,7 +44,7 @@ def test_what_is_beyond_the_limit_is_refused_and_not_cut(tmp_path: Path) -> None
         files.read(tmp_path / "a", 100)
 
 
-def test_what_says_that_it_is_empty_and_is_not_is_refused_likewise() -> None:
-    """As every file of /proc does, and one that grows while it is read."""
+def test_a_file_that_claims_to_be_empty_and_is_not_is_refused() -> None:
+    """Files of /proc claim to be empty, and so does a file that grows during the read."""
     with pytest.raises(files.TooLongError):
         files.read(Path("/proc/self/status"), 100)

@@ -1,4 +1,4 @@
-"""Flights say where they are, to their user alone and for as long as they last."""
+"""Flight files tell only their user of a flight, and only during it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from cloudrc.records import Record
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from cloudrc.drivers import local as flights
-with flights.announced(Path(sys.argv[1])):
-    assert flights.under_way()
+from cloudrc.drivers import local
+with local.announced(Path(sys.argv[1])):
+    assert local.under_way()
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -79,11 +79,13 @@ def test_folder_and_files_are_this_users_alone(tmp_path: Path, places: list[Path
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o500])
-def test_where_others_may_write_or_nobody_may_the_second_place_is_taken(
+def test_an_unsafe_or_unwritable_first_folder_gives_the_second(
     tmp_path: Path, places: list[Path], mode: int
 ) -> None:
     if os.getuid() == 0 and mode == 0o500:
-        places[0].parent.parent.joinpath("cloudrc").write_text("in the way")  # root may all
+        places[0].parent.parent.joinpath("cloudrc").write_text(
+            "in the way"
+        )  # root ignores permissions
     else:
         places[0].mkdir(parents=True)
         places[0].chmod(mode)
@@ -106,7 +108,7 @@ def test_what_somebody_else_could_have_written_is_not_read(
         assert list(local.under_way()) == [tmp_path]
 
 
-def test_what_belongs_to_somebody_else_is_neither_read_nor_written_to(
+def test_another_users_folder_is_neither_read_nor_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with local.announced(tmp_path / "a"):
@@ -128,7 +130,7 @@ def test_where_nothing_can_be_written_it_flies_all_the_same(
 
 
 @pytest.mark.parametrize("api", [True, False])
-def test_a_flight_that_no_command_finds_says_by_which_flag_it_is_commanded(
+def test_an_unannounced_flight_names_the_flag_for_its_commands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, api: bool
 ) -> None:
     monkeypatch.setattr(LocalRun, "_fly", lambda *_: None)

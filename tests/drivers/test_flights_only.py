@@ -1,4 +1,4 @@
-"""What a pod records: flights as a whole, and of the time between them only what happens."""
+"""A pod records whole flights, and only events between them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PERIOD_NS = 10_000_000
 
 
 def second(index: int) -> list[Record]:
-    """One second of a world: a hundred wakes, and one change of its guard."""
+    """One second of world: a hundred wakes and one guard change."""
     start_ns = index * 1_000_000_000
     wakes = [Lateness(start_ns + n * PERIOD_NS, "world", 0.0, 0.0, 0) for n in range(100)]
     return [*wakes, GuardChange(start_ns + 990_000_000, GuardState.HOLD, "told")]

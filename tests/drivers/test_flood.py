@@ -1,4 +1,4 @@
-"""A flood of garbage on world's real port: no honest datagram is lost, the guard's ticks keep."""
+"""A flood on world's port loses no valid datagram and does not delay the guard."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = [pytest.mark.process, pytest.mark.full]
 
 RATE, SECONDS = 10_000, 20
 PAIRS = 3
-"""Of a calm flight and one under the flood; the median of the differences counts."""
+"""Pairs of a calm and a flooded flight; the median of their differences counts."""
 FLOODER = """
 import sys
 sys.path[:0] = {path!r}
@@ -41,7 +41,7 @@ flood(("127.0.0.1", {port}), {rate}, {seconds})
 
 
 def garbage(count: int, seed: int) -> list[bytes]:
-    """A third noise, a third with our header but not our length, a third that needs its tag."""
+    """Make noise, valid headers with a wrong length, and valid lengths with a wrong tag."""
     rng, made = random.Random(seed), []
     for number in range(count):
         if number % 3 == 0:
@@ -55,7 +55,7 @@ def garbage(count: int, seed: int) -> list[bytes]:
 
 
 def flood(target: tuple[str, int], rate: int, seconds: float) -> None:
-    """Send `rate` a second, in bursts of one millisecond."""
+    """Send `rate` datagrams a second, in bursts of one millisecond."""
     made, sent, start = garbage(5000, 1), 0, time.monotonic()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         while (passed := time.monotonic() - start) < seconds:
@@ -70,10 +70,10 @@ class Hover(NamedTuple):
     """A flight of 25 s over an ideal link.
 
     Attributes:
-        flight: As recorded.
-        began_ns: When the flood began, or where it would have [ns], world's clock.
-        ended_ns: Likewise its end.
-        sent: How much garbage was sent.
+        flight: Its recording.
+        began_ns: Start of the flood, or of the same window of a calm flight [ns], world's clock.
+        ended_ns: End of that window [ns], world's clock.
+        sent: Number of hostile datagrams.
     """
 
     flight: Flight
@@ -83,7 +83,7 @@ class Hover(NamedTuple):
 
 
 def fly(folder: Path, *, flooded: bool) -> Hover:
-    """Hover, under a flood or not."""
+    """Fly a hover, with or without a flood."""
     command = [sys.executable, "-m", "cloudrc", "run", "hover", "--mode", "local"]
     for setting in ("mission.waypoints.0.dwell_s=23", "link.profile=ideal"):
         command += ["--set", setting]
@@ -120,7 +120,7 @@ def port_of_world(parent: int) -> int:
 
 
 def done_p99(hover: Hover) -> float:
-    """How long after its deadline world was done with a tick, whatever it drained before [s]."""
+    """Return the time from each deadline to the end of its handling [s]."""
     woken = wakes(hover.flight, "world")
     stamps = woken["stamp_ns"]
     meanwhile = (stamps >= hover.began_ns) & (stamps < hover.ended_ns)
@@ -129,7 +129,7 @@ def done_p99(hover: Hover) -> float:
 
 
 def refused(flight: Flight) -> int:
-    """How many datagrams world has counted as refused."""
+    """Return the number of datagrams that world has rejected."""
     counts = flight.recording["/count"]
     rows = zip(counts["end"], counts["name"], counts["total"], strict=True)
     last = {name: int(total) for end, name, total in rows if end == "world"}
@@ -137,14 +137,14 @@ def refused(flight: Flight) -> int:
 
 
 def honest(flight: Flight) -> int:
-    """How many datagrams the shares that were lost are shares of, both ways together."""
+    """Return the number of datagrams sent in both directions."""
     settled_ns = flight.recording["/telemetry"]["stamp_ns"][-1] - SETTLING_NS
     stamps = [flight.during(topic)["stamp_ns"] for topic in SENT.values()]
     return sum(int((one <= settled_ns).sum()) for one in stamps)
 
 
 def check_flood(folder: Path, figure: Callable[..., None]) -> float:
-    """One pair: nothing is lost; by how much the flood makes the 99th percentile grow [s]."""
+    """Fly one pair; check the losses; return the growth of the 99th percentile [s]."""
     calm, stormy = fly(folder / "calm", flooded=False), fly(folder / "stormy", flooded=True)
     flight, sent = stormy.flight, stormy.sent
     counted = refused(flight) / sent

@@ -1,4 +1,4 @@
-"""The key file: made by a command, read at the start, followed in flight, shown to nobody."""
+"""The key file is made by a command, followed in flight and never shown."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FIRST, SECOND = b"1" * 32, b"2" * 32
 
 
 def put(path: Path, data: bytes) -> None:
-    """Replace a file as kubelet does: at once, by another one."""
+    """Replace a file atomically, as kubelet does."""
     draft = path.with_name("draft")
     draft.write_bytes(data)
     draft.replace(path)
@@ -44,13 +44,13 @@ def test_a_new_key_is_taken_and_the_old_one_is_valid_beside_it(path: Path) -> No
     keys = KeyFile(path, 0)
     keys.follow(0)
     put(path, SECOND)
-    assert keys.follow(PERIOD_NS - 1) == []  # it is not time to look yet
+    assert keys.follow(PERIOD_NS - 1) == []  # the next check is not due yet
     (said,) = keys.follow(PERIOD_NS)
     assert said.code == "key"
     assert keys.ring.accepted(PERIOD_NS) == (Key(SECOND), Key(FIRST))
 
 
-def test_the_overlap_is_that_of_the_file_and_counts_from_reading_it(path: Path) -> None:
+def test_the_overlap_of_the_file_counts_from_its_reading(path: Path) -> None:
     keys = KeyFile(path, 0)
     put(path, write(KeySet(Key(SECOND), Key(FIRST), 10.0)).encode())
     read_ns = 77_000_000_000
@@ -78,10 +78,10 @@ def test_a_file_that_is_wrong_leaves_the_keys_and_is_told_once(path: Path, wrong
     assert keys.ring.current == Key(SECOND)
 
 
-def test_a_file_that_cannot_be_read_for_a_while_is_taken_as_soon_as_it_can(
+def test_a_file_unreadable_for_a_while_is_read_once_it_can_be(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who may read it changes nothing of what is seen of it from outside."""
+    """A change of permissions does not change a file's version."""
     keys = KeyFile(path, 0)
     put(path, SECOND)
     with monkeypatch.context() as forbidden:
@@ -196,9 +196,7 @@ def test_a_rotation_says_until_when_the_key_before_is_valid(path: Path) -> None:
 
 @pytest.mark.promise("old-keys-expire")
 @pytest.mark.parametrize("later", [60.0, 61.0, 1e6])
-def test_a_process_that_starts_after_the_overlap_refuses_the_key_before_and_says_so(
-    path: Path, later: float
-) -> None:
+def test_a_start_after_the_overlap_refuses_the_previous_key(path: Path, later: float) -> None:
     assert main(["key", "new", str(path), "--overlap", "60"]) == 0
     keys = read_keys(path)
     assert keys.until is not None
@@ -236,7 +234,7 @@ def test_an_end_asks_the_wall_clock_as_it_reads_its_key(
     assert len(_open_keys(options).ring.accepted(time.monotonic_ns())) == 1
 
 
-def test_a_key_that_is_retired_is_gone_from_the_file_and_from_who_follows_it(
+def test_a_retired_key_is_gone_from_the_file_and_its_readers(
     path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["key", "retire", str(path)]) == 0
@@ -271,14 +269,14 @@ def test_a_huge_file_is_not_read_whole(tmp_path: Path) -> None:
         read_keys(tmp_path / "key")
 
 
-def test_a_pipe_in_the_place_of_the_file_leaves_the_keys_and_is_not_read(path: Path) -> None:
-    """Whoever reads a pipe waits for who writes into it, and the robot with it."""
+def test_a_pipe_instead_of_the_file_is_not_read_and_keys_stay(path: Path) -> None:
+    """A reader of a pipe would wait for a writer and stop the loop."""
     keys = KeyFile(path, 0)
     keys.follow(0)
     path.unlink()
     os.mkfifo(path)
     text = write(KeySet(Key(SECOND))).encode().ljust(keyfile.SIZE_MAX, b"\n")
-    pipe = os.open(path, os.O_RDWR)  # so that nobody would wait here
+    pipe = os.open(path, os.O_RDWR)  # a writer, so that the test cannot block
     try:
         os.write(pipe, text)
         (said,) = keys.follow(PERIOD_NS)
@@ -289,7 +287,7 @@ def test_a_pipe_in_the_place_of_the_file_leaves_the_keys_and_is_not_read(path: P
     assert keys.ring.current == Key(FIRST)
 
 
-def test_a_key_that_cannot_be_written_names_the_file_that_was_asked_for(
+def test_a_key_that_cannot_be_written_names_the_requested_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "no" / "folder" / "k"

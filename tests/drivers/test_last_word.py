@@ -1,4 +1,4 @@
-"""Teleop and cloud are asked to end at once, and teleop's last word still reaches the robot."""
+"""Teleop and cloud end at the same time, and teleop's hold still reaches the robot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SECOND = 1_000_000_000
 
 
 class Cloud:
-    """What the word asks, on a clock that stands still unless it is told."""
+    """The inputs of `LastWord`, with a clock that a test moves."""
 
     def __init__(self) -> None:
         self.asked = self.flies = False
@@ -49,7 +49,7 @@ def test_what_flies_is_waited_for_until_it_is_seen_to_hold() -> None:
     assert cloud.ends()
 
 
-def test_and_no_longer_than_its_limit_counted_from_when_it_was_asked() -> None:
+def test_the_delay_ends_at_its_limit_after_the_request() -> None:
     cloud = Cloud()
     cloud.flies = True
     assert not cloud.ends()
@@ -69,7 +69,7 @@ def release(tmp_path: Path) -> Iterator[Release]:
 
 @pytest.mark.process
 def test_a_pod_that_ends_in_flight_holds_the_robot_by_its_word(release: Release) -> None:
-    """Cloud is asked first: it ended before teleop had said anything."""
+    """Cloud gets the signal first, when teleop has not sent its hold yet."""
     release.fly()
     pod, began = ("cloud", "teleop"), time.monotonic()
     for name in pod:
@@ -78,7 +78,7 @@ def test_a_pod_that_ends_in_flight_holds_the_robot_by_its_word(release: Release)
         release.running[name].communicate(timeout=10)
     assert time.monotonic() - began < 2.0
     assert [release.running[name].returncode for name in pod] == [0, 0]
-    time.sleep(0.5)  # for want of a word it holds, too, after 0.25 s
+    time.sleep(0.5)  # without commands the robot also holds, after 0.25 s
     world = release.running["world"]
     world.send_signal(signal.SIGTERM)
     said, _ = world.communicate(timeout=10)

@@ -1,4 +1,4 @@
-"""An end records what the link tells: when first seen, when it changes, when a mission begins."""
+"""An end records the link's state at first, at changes and at mission starts."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def tell(path: Path, state: LinkState) -> None:
     publish(path, to_text(state))
 
 
-def test_a_change_is_noted_once_and_again_when_a_mission_may_begin(tmp_path: Path) -> None:
+def test_a_change_is_recorded_once_and_again_at_a_mission_start(tmp_path: Path) -> None:
     path = tmp_path / "link.json"
     notes = LinkNotes(path, uplink=False)
     assert notes.after([], 0) == []
@@ -128,8 +128,8 @@ def test_a_state_of_which_nothing_can_be_noted_is_no_change(
     )
 
 
-def test_of_a_state_that_is_too_long_nothing_is_noted_nor_of_the_one_before(tmp_path: Path) -> None:
-    """A long time line was put in force: what was noted before holds no more."""
+def test_a_too_long_state_is_not_recorded_nor_the_last_one(tmp_path: Path) -> None:
+    """A long time line is in force, so the last note no longer holds."""
     path = tmp_path / "link.json"
     tell(path, STATE)
     notes, began = LinkNotes(path, uplink=False), [SessionOpened(0, "cloud", 1, "")]
@@ -165,7 +165,7 @@ def test_foreign_words_are_noted_in_one_line_that_can_be_written(tmp_path: Path)
 
 
 def test_only_what_a_relay_tells_is_counted(tmp_path: Path) -> None:
-    """Names that come from elsewhere would be kept for ever by whoever counts them."""
+    """Unknown names would fill the tables of counters."""
     path = tmp_path / "link.json"
     errors = ReleaseErrors()
     errors.observe(5)
@@ -185,7 +185,7 @@ def test_it_is_told_in_words(tmp_path: Path) -> None:
     assert in_words(changed) == "link: downlink 120 ± 5 ms, loss 2 % (downlink.delay_ms=120)"
 
 
-def test_a_change_that_leaves_this_direction_as_it_was_is_recorded_and_not_said(
+def test_a_change_of_the_other_direction_is_recorded_but_not_fed(
     tmp_path: Path,
 ) -> None:
     path, began = tmp_path / "link.json", [GuardChange(0, GuardState.TRACK, "fresh command")]

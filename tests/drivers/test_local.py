@@ -1,4 +1,4 @@
-"""Local mode with real processes: what becomes of a run that is not left in peace."""
+"""Local mode with real processes that are interrupted, killed or stopped."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from tests.conftest import nightly
 pytestmark = pytest.mark.process
 
 FLOWN = (0, 6)
-"""Done, or done but not in real time: a busy machine is not what is tested here."""
+"""Exit codes of a finished run, in real time or not: the machine may be busy."""
 HOVER = ["hover", "--mode", "local", "--set", "mission.waypoints.0.dwell_s={dwell}"]
 
 
@@ -30,7 +30,7 @@ def start(folder: Path, *settings: str, dwell: float = 20.0) -> subprocess.Popen
 
 
 def children(parent: int) -> dict[str, int]:
-    """Process ids by what they are: relay, world, teleop, cloud."""
+    """Return the process ids by role: relay, world, teleop, cloud."""
     found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -63,7 +63,7 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, *nightly(signal.SIGTERM, signal.SIGHUP)])
-def test_ctrl_c_ends_all_processes_within_two_seconds_and_leaves_a_report(tmp_path, how):
+def test_ctrl_c_ends_all_processes_in_2_s_and_leaves_a_report(tmp_path, how):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
     assert set(pids) == {"relay", "world", "teleop", "cloud"}
@@ -97,7 +97,7 @@ def test_a_process_that_dies_ends_the_run_and_is_named(tmp_path, victim):
     assert report(tmp_path / "run")["verdict"] in ("interrupted", "invalid")
 
 
-def test_the_processes_end_when_the_one_that_started_them_is_killed(tmp_path):
+def test_the_processes_end_when_their_supervisor_is_killed(tmp_path):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
     run.kill()
@@ -119,7 +119,7 @@ def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
     run = start(folder)
     wait_until_flying(run)
     assert json.loads((folder / "api.json").read_text())["url"] == flights.under_way()[folder]
-    assert operate(folder, "run", "hover").returncode == 5  # one flies already
+    assert operate(folder, "run", "hover").returncode == 5  # a mission already flies
     assert "held" in operate(folder, "hold").stdout
     assert operate(folder, "goto", "0", "0", "99").returncode == 2
     assert operate(folder, "goto", "0.3", "0", "0.8").returncode == 0
@@ -174,12 +174,12 @@ def build() -> Predictor:
 
 
 def predictor(folder: Path, does: str, statement: str) -> str:
-    """Write such a plug-in; gives the setting that chooses it."""
+    """Write such a plug-in; return the setting that selects it."""
     (folder / "odd.py").write_text(PREDICTOR.format(does=does, statement=statement))
     return f"cloud.predictor={folder}/odd.py"
 
 
-def test_a_slow_predictor_is_counted_and_told_and_the_flight_goes_on(tmp_path):
+def test_a_slow_predictor_is_reported_and_the_flight_continues(tmp_path):
     run = start(tmp_path / "run", predictor(tmp_path, "is slow", "time.sleep(0.05)"), dwell=2.0)
     output, errors = run.communicate(timeout=90)
     document = report(tmp_path / "run")
@@ -207,7 +207,7 @@ def test_a_process_that_hangs_ends_the_run_and_is_named(tmp_path):
     assert not any(alive(pid) for pid in pids.values())
 
 
-def test_a_report_is_written_of_a_run_whose_supervisor_was_killed(tmp_path):
+def test_a_run_whose_supervisor_was_killed_gets_a_report(tmp_path):
     folder = tmp_path / "run"
     run = start(folder)
     pids = wait_until_flying(run)

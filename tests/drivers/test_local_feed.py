@@ -1,4 +1,4 @@
-"""The supervisor of a local run: what its processes write, and the key that it makes for them."""
+"""The supervisor of a local run reads feeds and makes the key."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cloudrc.records import MissionEvent
 EVENT = MissionEvent(5, "reached", 1, "waypoint 2 of 7 reached")
 
 
-def test_a_line_that_is_no_record_is_said_once_and_ends_no_flight(tmp_path: Path) -> None:
+def test_a_bad_feed_line_is_reported_once_and_ends_no_flight(tmp_path: Path) -> None:
     reader, writer = os.pipe()
     run = LocalRun(tmp_path, lambda records: None)
     child = Child("cloud", cast("subprocess.Popen[bytes]", None), tmp_path / "cloud.log")
@@ -45,7 +45,7 @@ def test_the_key_of_a_run_is_for_its_user_alone_and_goes_with_it(
         seen.append((key, key.stat().st_mode, key.parent.stat().st_mode))
 
     monkeypatch.setattr(LocalRun, "_fly", look)
-    before = os.umask(0)  # of a user who shares everything
+    before = os.umask(0)  # a user whose new files are open to all
     try:
         LocalRun(tmp_path, lambda records: None).fly(1.0)
     finally:

@@ -1,4 +1,4 @@
-"""A local run's link is set in flight: in force within a second, measured, recorded, drawn."""
+"""A change of a local run's link acts within a second and is recorded and drawn."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from cloudrc.record.columns import Recording
 
 pytestmark = pytest.mark.process
 WITHIN = 0.005
-"""Of a median one-way delay, where other tests run beside this one [s]."""
+"""Tolerance of a median one-way delay beside other tests [s]."""
 LEGS = (0.5, 8.9), (9.2, 9.95), (10.2, 12.0)
-"""Of the profile `handover`: before its first cell fades, meanwhile, and in the next one [s]."""
+"""Intervals of the profile `handover`: before the fading, during it, and in the next cell [s]."""
 EDGE = 0.01
-"""A time line counts from the next datagram, and its instant is known about so well [s]."""
+"""Uncertainty of the start of a time line, which is the next datagram [s]."""
 Floats: TypeAlias = NDArray[np.float64]
 
 
@@ -84,7 +84,7 @@ def test_link_set_acts_within_a_second_and_is_in_the_recording(
 
 
 def follows_handover(sent: Floats, delays: Floats) -> None:
-    """Say whether delays [s] are on the time line that began when the profile took force."""
+    """Check that delays [s] follow the time line from the change of the profile on."""
 
     def median(begin: float, end: float) -> float:
         return float(np.median(delays[(sent > begin) & (sent < end)]))

@@ -1,4 +1,4 @@
-"""An end's own socket: what is longer than a datagram of the tunnel is known to be."""
+"""An end's socket marks datagrams that are too long for the tunnel."""
 
 from __future__ import annotations
 

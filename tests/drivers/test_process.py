@@ -1,4 +1,4 @@
-"""A process that was started to fly ends when nobody is left who would end it."""
+"""A process of a run ends when its supervisor is gone."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CONFIG = Path(__file__).parents[2] / "cloudrc" / "experiments" / "hover.yaml"
 @pytest.mark.parametrize(
     ("told", "ends"),
     [(None, False), (str(os.getppid()), False), (str(os.getpid()), True), ("nobody", False)],
-    ids=["untold", "parent", "stranger", "nonsense"],  # a process number is another one each time
+    ids=["untold", "parent", "stranger", "nonsense"],  # process ids differ each time
 )
 def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(
     told: str | None, ends: bool, monkeypatch: pytest.MonkeyPatch
@@ -39,11 +39,11 @@ def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(
     if told is not None:
         monkeypatch.setenv(PARENT, told)
     assert StopSignal()() is ends
-    assert PARENT not in os.environ  # it does not concern what this process starts
+    assert PARENT not in os.environ  # children must not inherit it
 
 
 @pytest.mark.process
-def test_it_ends_though_its_supervisor_was_killed_before_it_had_begun(tmp_path: Path) -> None:
+def test_it_ends_if_its_supervisor_was_killed_before_its_start(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(CONFIG.read_text())
     command = [sys.executable, "-c", KILLED_AT_ONCE, str(tmp_path)]
     supervisor = subprocess.run(command, capture_output=True, text=True, timeout=60)
@@ -51,10 +51,10 @@ def test_it_ends_though_its_supervisor_was_killed_before_it_had_begun(tmp_path: 
     try:
         orphan = os.pidfd_open(int(supervisor.stdout))
     except ProcessLookupError:
-        return  # it has ended already
+        return  # it has already ended
     ended, _, _ = select.select([orphan], [], [], 30.0)
     if not ended:
         signal.pidfd_send_signal(orphan, signal.SIGKILL)
     os.close(orphan)
     assert ended
-    assert (tmp_path / "relay.log").read_text().startswith("cloudrc relay: ")  # as if asked to
+    assert (tmp_path / "relay.log").read_text().startswith("cloudrc relay: ")  # as after a signal

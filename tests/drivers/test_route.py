@@ -1,4 +1,4 @@
-"""The route file: waited for, followed, never trusted further than an address in numbers."""
+"""The route file is awaited, followed and accepted only with a numeric address."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_one_that_does_not_change_is_not_read_again(tmp_path: Path) -> None:
     route = Route(path)
     route.look()
     node = path.stat().st_ino
-    with path.open("r+") as file:  # the same file, as long and as old as before
+    with path.open("r+") as file:  # the same file, with the same size and time
         file.write("127.0.0.1:7499\n")
     os.utime(path, ns=(1, 1))
     assert path.stat().st_ino == node

@@ -1,4 +1,4 @@
-"""No wire without a seal: an end without keys is refused wherever there is a socket."""
+"""An end without keys never gets a socket."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).parents[2] / "cloudrc"
 
 
 def run(endpoint: object) -> list[bytes]:
-    """What such an end says to a socket within 60 ms."""
+    """Return what such an end sends within 60 ms."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         other.settimeout(0.01)
@@ -46,7 +46,7 @@ def test_the_driver_with_a_socket_refuses_an_end_without_keys() -> None:
         run(bare_world())
 
 
-def test_it_runs_one_that_has_keys_and_to_a_stranger_it_says_nothing() -> None:
+def test_a_sealed_end_runs_and_sends_strangers_nothing() -> None:
     assert run(bare_world(ring=ring())) == []
 
 
@@ -57,7 +57,7 @@ def test_what_has_keys_is_always_sealed() -> None:
 
 
 def calls(name: str) -> set[str]:
-    """Files of the package that mention a name."""
+    """Find the package's files that use a name."""
     found = set()
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -68,7 +68,7 @@ def calls(name: str) -> set[str]:
 
 
 def test_only_the_drivers_that_ask_send_what_an_end_says() -> None:
-    """Datagrams leave an end by `take_datagrams`; whoever takes them has no socket, or asks."""
+    """Each caller of `take_datagrams` has no socket or checks for the seal."""
     takers = {name for name in calls("take_datagrams") if not name.startswith("faults/")}
     assert takers == {"drivers/realtime.py", "drivers/virtual.py"}
     assert "sealed" in (PACKAGE / "drivers" / "realtime.py").read_text()

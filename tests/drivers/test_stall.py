@@ -1,4 +1,4 @@
-"""A process that stood still: all that came meanwhile is taken as what came before its wake."""
+"""After a stall all waiting datagrams count as received before the wake."""
 
 import socket
 import time
@@ -21,7 +21,7 @@ LONG_NS = 10 * STALL_NS
 
 
 class Late:
-    """An end that is late by so much [ns] at each of its wakes."""
+    """An end with a given lateness at each wake [ns]."""
 
     sealed = True
 
@@ -72,8 +72,8 @@ def test_what_waited_through_a_stall_is_taken_in_one_wake(late_ns, wakes):
         ((LONG_NS, STALL_AGAIN_NS - 100 * MS, 0), [0, DRAIN_MAX, MANY - DRAIN_MAX]),
     ],
 )
-def test_so_is_what_waited_through_one_that_follows_on_a_late_wake(late_ns, wakes):
-    """As where little of a processor is left, and the process then stands still."""
+def test_so_is_a_backlog_of_a_stall_after_a_late_wake(late_ns, wakes):
+    """As on a busy processor, followed by a stall."""
     with bind(("127.0.0.1", 0)) as udp, socket.socket(type=socket.SOCK_DGRAM) as sender:
         end = Late(*late_ns)
 
@@ -88,7 +88,7 @@ def test_so_is_what_waited_through_one_that_follows_on_a_late_wake(late_ns, wake
 
 
 class Flooded(Peer):
-    """More waits than can be taken."""
+    """More datagrams wait than one wake takes."""
 
     def receive(self, most=DRAIN_MAX):
         return [b"flood"] * most

@@ -1,4 +1,4 @@
-"""Teleop beside cloud: Unix sockets that never block, and neighbours that come and go."""
+"""Teleop and cloud over Unix sockets: nothing blocks, and either may restart."""
 
 import threading
 import time
@@ -67,7 +67,7 @@ def remote(peer):
     return RemoteTeleop(peer, encode, decode, 0)
 
 
-def test_cloud_says_once_that_teleop_is_silent_and_again_the_next_time(peers):
+def test_cloud_reports_each_silence_of_teleop_once(peers):
     one, other = peers
     teleop = remote(one)
     for now_ns in range(0, 3 * SECOND, 10_000_000):
@@ -94,8 +94,8 @@ def request(number, what):
 
 
 @pytest.mark.parametrize("stalled", [False, True])
-def test_after_a_stall_cloud_passes_on_what_stops_and_not_what_leads(peers, stalled):
-    """What takes it back has found the socket full."""
+def test_after_a_stall_cloud_forwards_stops_but_not_waypoints(peers, stalled):
+    """The withdrawal was lost at a full socket."""
     one, other = peers
     teleop = RemoteTeleop(one, encode, decode, SECOND)
     words = [request(n, each) for n, each in enumerate(Request, 1)]
@@ -105,7 +105,7 @@ def test_after_a_stall_cloud_passes_on_what_stops_and_not_what_leads(peers, stal
     teleop.handle_deadline(SECOND + STALL_NS + stalled)
     leads = [words[0], words[-2]] if stalled else []
     assert teleop.take_outputs() == [said for said in words if said not in leads]
-    other.send(encode(words[0]))  # it says it again, to a cloud that is always late, too
+    other.send(encode(words[0]))  # the repeat must pass, even to a cloud that is always late
     teleop.handle_deadline(3 * SECOND if stalled else SECOND + STALL_NS + 10_000_000)
     assert teleop.take_outputs() == words[:1]
 
@@ -121,7 +121,7 @@ def test_what_is_no_message_is_counted(peers):
 
 
 class Machine:
-    """Says what it is given, and remembers what it sees."""
+    """A machine with given outputs that stores the states it sees."""
 
     def __init__(self):
         self.outputs, self.seen, self.deadlines = [], [], 0
@@ -141,7 +141,7 @@ class Machine:
 
 
 class Service:
-    """`serve_teleop` on a thread."""
+    """Run `serve_teleop` on a thread."""
 
     def __init__(self, peer):
         self.machine, self.told, self.calls = Machine(), [], []
@@ -194,7 +194,7 @@ def test_deadlines_calls_and_messages_meet_in_one_loop(peers, service):
 
 
 def test_what_is_asked_for_comes_before_what_has_arrived(peers):
-    """An emergency stop is asked for before the robot is seen to have stopped."""
+    """The emergency stop is made before the state that shows its effect."""
     machine, stops = Machine(), iter([False, True])
     calls = [lambda now_ns: machine.seen.append("asked")]
     peers[1].send(encode(POINT))
@@ -238,12 +238,10 @@ def test_of_what_has_arrived_meanwhile_the_newest_counts(peers):
         ("ss", [PAST, "asked"]),
     ],
 )
-def test_after_a_stall_the_past_is_passed_over_and_what_is_asked_is_asked_of_the_present(
-    peers, monkeypatch, wakes, done
-):
-    """Where the robot is held, for one: its socket has kept the beginning of the stall alone.
+def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, wakes, done):
+    """A call may depend on the robot's place, and the socket has only old states.
 
-    At each wake the present has arrived (p), or comes after a stall (s), with the past.
+    At each wake a new state has arrived (p), or the wake follows a stall (s) with an old one.
     """
     machine, clock = Machine(), [SECOND]
     coming, stops = iter(wakes), iter([False] * len(wakes) + [True])
@@ -271,7 +269,7 @@ def test_after_a_stall_the_past_is_passed_over_and_what_is_asked_is_asked_of_the
     assert machine.seen == done
 
 
-def test_events_wait_for_a_cloud_that_is_away_and_keep_their_order(peers, service, tmp_path):
+def test_events_wait_for_an_absent_cloud_and_keep_their_order(peers, service, tmp_path):
     _, cloud = peers
     cloud.close()
     (tmp_path / "b.sock").unlink()
@@ -281,7 +279,7 @@ def test_events_wait_for_a_cloud_that_is_away_and_keep_their_order(peers, servic
     back = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
     received = []
     until(lambda: received.extend(map(decode, back.receive())) or len(received) >= 3)
-    assert received == events  # a setpoint is repeated anyway, a fault is not cloud's
+    assert received == events  # setpoints are repeated anyway; faults are not for cloud
     back.close()
 
 

@@ -1,4 +1,4 @@
-"""An emergency stop that cloud's socket has no room for, while teleop's loop waits for its disk."""
+"""An emergency stop while cloud's socket is full and teleop's loop waits for its disk."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ WORD = encode(ALARM)
 
 
 def fill(peer: UnixPeer) -> None:
-    """Say what a cloud that stands still does not take, until its socket is full."""
+    """Fill the socket of a stalled cloud."""
     while peer.send(b"setpoint"):
         pass
 
 
 def until(condition: Callable[[], object], limit: float = 5.0) -> None:
-    """Wait for it [s]."""
+    """Wait at most `limit` [s] for a condition."""
     ends = time.monotonic() + limit
     while not condition():
         assert time.monotonic() < ends
@@ -52,20 +52,20 @@ def _none_is_left() -> Any:
 
 
 @pytest.mark.promise("emergency-stop-gets-through")
-def test_a_full_socket_delays_an_emergency_stop_until_it_is_drained_whatever_the_loop_waits_for(
+def test_a_full_socket_delays_an_emergency_stop_until_drained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cloud = UnixPeer(tmp_path / "cloud.sock", tmp_path / "teleop.sock")
     bridge = Bridge()
-    told: list[int] = []  # how often it was heard at each look
+    told: list[int] = []  # number of stops received at each check
 
     def hangs(service: MissionService, peer: UnixPeer, *codec: Any, **rest: Any) -> None:
-        """In place of the loop: it waits for its disk, and asks nobody."""
+        """A loop that waits for its disk."""
         fill(peer)
         began = time.monotonic()
         bridge.alarm()
-        assert time.monotonic() - began < 0.5  # the API's thread goes on
-        until(lambda: told.append(heard(cloud)) or any(told), 1.0)  # cloud is back
+        assert time.monotonic() - began < 0.5  # the API's thread continues
+        until(lambda: told.append(heard(cloud)) or any(told), 1.0)  # cloud reads again
         until(lambda: not threads())
         told.append(heard(cloud))
         peer.close()
@@ -80,7 +80,7 @@ def test_a_full_socket_delays_an_emergency_stop_until_it_is_drained_whatever_the
 
 
 class _Feed:
-    """Tells nobody."""
+    """A thread pool without threads."""
 
     def ready(self) -> None:
         """It is."""
@@ -114,7 +114,7 @@ def test_however_often_it_is_asked_for_there_is_one_thread(peers: Peers) -> None
     assert len(threads()) == 1
     until(lambda: heard(cloud))
     until(lambda: not threads())
-    fill(teleop_peer)  # and again, by another one
+    fill(teleop_peer)  # and fill it again
     alarm()
     assert len(threads()) == 1
     until(lambda: heard(cloud))
@@ -132,7 +132,7 @@ def test_the_last_word_counts_for_how_long_it_is_repeated(
 
     def sleep(seconds: float) -> None:
         clock[0] += seconds
-        if len(tries) == 51:  # half of the time is over
+        if len(tries) == 51:  # half of the time has passed
             again.set()
             asked.wait()
 
@@ -151,7 +151,7 @@ def test_the_last_word_counts_for_how_long_it_is_repeated(
 
 
 class _Clock:
-    """Stands for the module `time`."""
+    """Replaces the module `time`."""
 
     def __init__(self, now: list[float], sleep: Callable[[float], None]) -> None:
         self.monotonic, self.sleep = (lambda: now[0]), sleep
@@ -161,7 +161,7 @@ def test_what_was_taken_meanwhile_is_not_said_again(monkeypatch: pytest.MonkeyPa
     tries: list[bool] = []
 
     def send() -> bool:
-        tries.append(bool(tries))  # the first one is refused
+        tries.append(bool(tries))  # the first attempt fails
         return tries[-1]
 
     asked = threading.Event()
@@ -189,5 +189,5 @@ def test_where_there_can_be_no_thread_the_caller_goes_on(
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, "start", refuse)
         alarm()
-    alarm()  # there can be one now
+    alarm()  # now it is possible
     until(lambda: heard(cloud))

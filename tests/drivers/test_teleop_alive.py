@@ -1,4 +1,4 @@
-"""Teleop knows a silent robot from a silent cloud, which says that it lives without any news."""
+"""Teleop distinguishes a silent robot from a silent cloud by cloud's empty datagrams."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Peers = tuple[UnixPeer, UnixPeer]
 
 
 class Machine:
-    """Remembers when it has heard of cloud, and what it has seen."""
+    """Stores when cloud was heard and which states were seen."""
 
     def __init__(self) -> None:
         self.heard: list[int] = []
@@ -37,7 +37,7 @@ def wake(machine: Machine, peer: UnixPeer, now_ns: int, *, blind: int = 0, late_
 
 
 def told(cloud: UnixPeer, teleop: UnixPeer, seconds: float, telemetry: float) -> list[bytes]:
-    """What cloud has told teleop in so long, its telemetry having ended then [s]."""
+    """Return what cloud sends in `seconds` [s] after the end of its telemetry."""
     remote, received = RemoteTeleop(cloud, encode, decode, 0), list[bytes]()
     for now_ns in range(0, round(seconds * 1e9), PERIOD_NS):
         if now_ns < telemetry * 1e9:
@@ -47,7 +47,7 @@ def told(cloud: UnixPeer, teleop: UnixPeer, seconds: float, telemetry: float) ->
     return received
 
 
-def test_cloud_says_five_times_a_second_that_it_lives_if_there_is_no_telemetry(
+def test_without_telemetry_cloud_signals_life_5_times_a_second(
     peers: Peers,
 ) -> None:
     assert told(*peers, seconds=1.0, telemetry=0.0) == [b""] * 5
@@ -71,7 +71,7 @@ def test_teleop_hears_of_cloud_whatever_it_says(peers: Peers) -> None:
     assert machine.seen == [POINT]
 
 
-def test_after_a_stall_it_still_waits_for_the_present_and_hears_nothing_of_the_past(
+def test_after_a_stall_teleop_waits_and_ignores_old_signals(
     peers: Peers,
 ) -> None:
     cloud, teleop = peers

@@ -1,4 +1,4 @@
-"""The API under load beside the control loop, which is in another process and must not notice."""
+"""The API under load does not disturb the control loop in another process."""
 
 import json
 import os
@@ -22,15 +22,15 @@ waypoints:
 """
 RATE = 1000.0
 TRIES = 3
-"""The best of so many counts: a machine that does something else, too, is late by itself."""
+"""Number of attempts, of which the best counts: the machine may be busy."""
 DAWDLERS, DAWDLED = 50, 15.0
-"""So many clients send a byte now and then, and are cut off before so long [s]."""
+"""Number of slow clients, and the time after which they must be disconnected [s]."""
 COMMAND = "/cmd_vel"
 PERIOD = 0.010
 
 
 class Recorded(Release):
-    """As the release, and cloud is recorded."""
+    """A release that also records cloud."""
 
     def run(self, *words):
         words = (*words, "--record", "cloud.mcap") if words[0] == "cloud" else words
@@ -38,7 +38,7 @@ class Recorded(Release):
 
 
 def errors(folder: Path, began_ns: int, ended_ns: int):
-    """How far each period of the control loop was from 10 ms [s]."""
+    """Return the deviation of each period of the control loop from 10 ms [s]."""
     messages = read_contents(folder / "cloud.mcap").messages
     stamps = np.array([stamp for topic, stamp, _ in messages if topic == COMMAND])
     stamps = stamps[(stamps >= began_ns) & (stamps < ended_ns)]
@@ -47,7 +47,7 @@ def errors(folder: Path, began_ns: int, ended_ns: int):
 
 
 def flood(folder: Path, seconds: float):
-    """Calm, then a flood, each so long [s]: what the API answered, the loop's errors in each."""
+    """Run a calm and a flooded interval [s]; return the API's answers and the loop's errors."""
     folder.mkdir()
     release = Recorded(folder)
     try:
@@ -73,7 +73,7 @@ def flood(folder: Path, seconds: float):
 
 
 def is_undisturbed(folder: Path, seconds: float, figure, tries: int, is_last: bool):
-    """Whether the loop noticed nothing of a flood; the answers are as promised anyway."""
+    """Check that a flood does not disturb the loop and the answers are correct."""
     answers, quiet, loud = flood(folder, seconds)
     assert answers.get("429", 0) > 0
     assert seconds < DAWDLED or answers.get("cut off", 0) >= DAWDLERS
@@ -103,5 +103,5 @@ def test_a_slice_of_such_a_flood_does_not_disturb_it(tmp_path, figure):
 
 @pytest.mark.full
 @pytest.mark.promise("api-load-spares-the-loop")
-def test_a_thousand_requests_a_second_do_not_disturb_the_control_loop(tmp_path, figure):
+def test_1000_requests_a_second_do_not_disturb_the_control_loop(tmp_path, figure):
     assert is_undisturbed(tmp_path / "long", 20.0, figure, 1, True)

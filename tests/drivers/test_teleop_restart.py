@@ -1,4 +1,4 @@
-"""World, cloud and teleop as processes, each of which may be killed in flight."""
+"""World, cloud and teleop as processes that are killed in flight."""
 
 import json
 import signal
@@ -32,15 +32,15 @@ def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
     release.until(lambda: release.mission()["state"] == "done")
     view = release.ask(f"/v1/missions/{release.mission()['id']}")
     assert [reached["waypoint"] for reached in view["reached"]] == [0, 1, 2]
-    # A machine that is busy with other things is no failure of this.
+    # A busy machine is no failure of this test.
     assert {failure["code"] for failure in view["verdict"]["failures"]} <= {"not_real_time"}
     names = [event["event"] for event in view["events"]]
     assert names.count("started") == 1
     assert names.count("resumed") == ("teleop" in killed)
-    assert ("new_session" in names) == (killed == ("cloud",))  # a new teleop knows no other one
+    assert ("new_session" in names) == (killed == ("cloud",))  # a new teleop knows no other session
 
 
-def test_a_world_that_is_killed_ends_the_job_with_world_restarted(release):
+def test_a_killed_world_ends_the_job_with_world_restarted(release):
     job = release.fly()
     release.kill("world")
     release.start("world")
@@ -64,7 +64,7 @@ def test_a_second_teleop_waits_for_the_journal_and_takes_over(release):
     release.until(lambda: release.mission()["state"] == "done")
 
 
-def test_asked_to_end_in_flight_teleop_pauses_the_mission_and_a_successor_goes_on(release):
+def test_an_ended_teleop_holds_and_its_successor_resumes(release):
     release.fly()
     teleop = release.running["teleop"]
     began = time.monotonic()
@@ -98,8 +98,8 @@ def test_an_emergency_stop_stops_the_rotors_and_is_audited(release):
     assert TOKEN.encode() not in everything
 
 
-def test_an_emergency_stop_comes_through_while_teleop_waits_for_its_disk(release):
-    """Its loop hangs in a write: the alarm goes past it to cloud, which gives it its number."""
+def test_an_emergency_stop_passes_while_teleop_waits_for_disk(release):
+    """Teleop's loop hangs in a write; the alarm goes directly to cloud, which numbers it."""
     release.fly()
     alarm = UnixPeer(release.folder / "mine.sock", release.folder / "cloud.sock")
     release.running["teleop"].send_signal(signal.SIGSTOP)
@@ -110,7 +110,7 @@ def test_an_emergency_stop_comes_through_while_teleop_waits_for_its_disk(release
     release.until(lambda: release.mission()["state"] == "failed")
     assert release.ask("/v1/state")["seen"]["guard"] == "ESTOP"
     failures = release.mission()["verdict"]["failures"]
-    assert failures[0]["code"] == "guard_stopped"  # teleop itself was never asked
+    assert failures[0]["code"] == "guard_stopped"  # teleop itself never got the request
 
 
 def test_all_end_within_two_seconds_of_sigterm(release):

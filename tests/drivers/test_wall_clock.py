@@ -1,4 +1,4 @@
-"""A wall clock that somebody sets is noticed; one that is merely a little fast is not."""
+"""A step of the wall clock is detected, a slight drift is not."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_it_is_told_in_one_line(by: float) -> None:
     assert "\n" not in fault.text
 
 
-def test_the_thread_of_the_recording_notices_it_whether_anybody_scrapes_or_not(wall: Wall) -> None:
+def test_the_recording_thread_detects_steps_without_scrapes(wall: Wall) -> None:
     thread = RecordingThread(Recorder(Path("x"), lambda path: Shelf()))
     thread.start()
     wall.step(-60.0)
@@ -83,7 +83,7 @@ def test_a_clock_that_drifts_has_not_been_set(monkeypatch: pytest.MonkeyPatch) -
 def test_nor_has_one_whose_looker_was_stopped_in_the_middle(
     stopped_before: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By SIGSTOP or a quota, for a second between one clock and the other."""
+    """A stop of a second between the reads of both clocks, by SIGSTOP or a CPU quota."""
     true = [0.0]
     stops = iter([False, True])
 

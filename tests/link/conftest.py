@@ -1,12 +1,7 @@
-"""The laboratory for real netem, made for each file of tests that asks for it.
+"""Fixtures of the link: packets over a model, a fake tc kernel, a netem laboratory, a fake sidecar.
 
-Packets sent one after the other over one direction of a link: what the tests here share.
-
-A kernel with one interface, as far as tc sees it, and a netem on it whose time is a number.
-
-Two network namespaces joined by a cable, and a flow from one to the other: for real netem.
-
-A sidecar with shapers that only take notes, on a clock that only it moves.
+The laboratory joins two network namespaces by a cable for tests of real netem. The sidecar's
+shapers only store calls, on a clock that a test moves.
 """
 
 from __future__ import annotations
@@ -40,7 +35,7 @@ from cloudrc.link.tc import Answer, write_tables
 
 @pytest.fixture(scope="module")
 def tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The laboratory; the value is the folder of tc's distributions."""
+    """Make the laboratory; the value is the folder of tc's distributions."""
     folder = tmp_path_factory.mktemp("tc")
     write_tables(folder)
     try:
@@ -52,7 +47,7 @@ def tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture
 def shaped(tables: Path) -> Iterator[Netem]:
-    """netem without conditions, in force."""
+    """Install netem without conditions."""
     netem = real_netem(tables, DirectionProfile())
     assert netem.follow_peer(FAR_PEER) == FAR_PEER
     yield netem
@@ -72,7 +67,7 @@ def link(profile: DirectionProfile, seed: int = 1, uplink: bool = True) -> LinkD
 def flow(
     profile: DirectionProfile, count: int, seed: int = 1, period_ns: int = PERIOD_NS
 ) -> list[tuple[int, ...]]:
-    """Delays [ns] of each packet's copies, one packet per period."""
+    """Return the delays [ns] of each packet's copies, one packet per period."""
     direction = link(profile, seed)
     return [
         tuple(release - n * period_ns for release in releases)
@@ -82,17 +77,17 @@ def flow(
 
 
 def delays(profile: DirectionProfile, count: int, seed: int = 1) -> NDArray[np.float64]:
-    """Delays [s] of `count` packets of which none is lost or duplicated."""
+    """Return the delays [s] of `count` packets, none lost or duplicated."""
     return np.array([delay * 1e-9 for (delay,) in flow(profile, count, seed)])
 
 
 def losses(profile: DirectionProfile, count: int, seed: int = 1) -> NDArray[np.bool_]:
-    """True where a packet is lost."""
+    """Return True for each lost packet."""
     return np.array([not copies for copies in flow(profile, count, seed)])
 
 
 def bursts(lost: NDArray[np.bool_]) -> list[int]:
-    """Lengths of the runs of True."""
+    """Return the lengths of the runs of True."""
     runs, length = [], 0
     for one in [*lost.tolist(), False]:
         if one:
@@ -112,7 +107,7 @@ NO_CLASSIFIER = Answer(
 
 
 class Kernel:
-    """One interface, and the qdiscs and filters on it."""
+    """An interface with its qdiscs and filters."""
 
     def __init__(self, *lacks: str) -> None:
         self.lacks = lacks
@@ -168,7 +163,7 @@ class Kernel:
 
 
 def listing(words: Sequence[str]) -> dict[str, object]:
-    """The "options" that `tc -j qdisc show` prints for words that netem was given."""
+    """Return the "options" that `tc -j qdisc show` prints for the words of a netem command."""
     text = " ".join(words)
     found: dict[str, object] = {"limit": int(words[words.index("limit") + 1]) if words else 1000}
     for name, key, unit in (("delay", "delay", 1e-6), ("duplicate", "duplicate", 0.01),
@@ -201,7 +196,7 @@ NEAR_HOST, FAR_HOST = "10.79.0.1", "10.79.0.2"
 DEVICE = "wire"
 FAR_PEER = (FAR_HOST, 7400)
 WITHIN = 0.002
-"""Of medians: a slow virtual machine now and then stands still, which means would show [s]."""
+"""Tolerance of medians [s]; means would show the stalls of a slow virtual machine."""
 _CLONE_NEWNET = 0x40000000
 _SO_TIMESTAMPNS = 35  # include/uapi/asm-generic/socket.h
 
@@ -219,7 +214,7 @@ def sh(*words: str) -> str:
 
 @contextmanager
 def laboratory() -> Iterator[None]:
-    """Make the namespaces and the cable; raises UnableError if that or netem is impossible here."""
+    """Make the namespaces and the cable; raise UnableError if that or netem is impossible here."""
     if os.geteuid() != 0:
         raise UnableError("the tests of netem need root")
     try:
@@ -243,7 +238,7 @@ def laboratory() -> Iterator[None]:
 
 @contextmanager
 def inside(name: str) -> Iterator[None]:
-    """Be in a namespace with this thread; sockets opened there stay there."""
+    """Move this thread to a namespace; sockets opened in it stay there."""
     library = ctypes.CDLL(None, use_errno=True)
     with open("/proc/thread-self/ns/net") as home, open(f"/run/netns/{name}") as there:
         assert library.setns(there.fileno(), _CLONE_NEWNET) == 0, os.strerror(ctypes.get_errno())
@@ -279,7 +274,7 @@ def qdiscs() -> str:
 
 
 class Flow:
-    """Numbered datagrams from near to a port of far, and when each copy arrived."""
+    """Numbered datagrams from near to a port of far, with the arrival of each copy."""
 
     def __init__(self, port: int = 7400) -> None:
         self.port = port
@@ -291,13 +286,13 @@ class Flow:
             self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._in.bind((FAR_HOST, port))
         self._in.settimeout(0.1)
-        self._in.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)  # when the kernel got it
+        self._in.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)  # the kernel's time of arrival
         self._open = True
         self._thread = threading.Thread(target=self._receive, daemon=True)
         self._thread.start()
 
     def send(self, count: int, period: float = 0.01, meanwhile: Callable[[], None] = int) -> None:
-        """Send so many, one per period; call `meanwhile` after each."""
+        """Send `count` datagrams, one per period; call `meanwhile` after each."""
         begin = time.monotonic()
         for index in range(count):
             number = len(self.sent_ns)
@@ -307,7 +302,7 @@ class Flow:
             time.sleep(max(0.0, begin + (index + 1) * period - time.monotonic()))
 
     def settle(self, quiet: float = 0.5) -> Flow:
-        """Wait until nothing has arrived for so long, then close."""
+        """Wait until nothing arrives any more, then close."""
         count = -1
         while count != len(self.arrived):
             count = len(self.arrived)
@@ -319,7 +314,7 @@ class Flow:
         return self
 
     def delays(self) -> NDArray[np.float64]:
-        """One way, of each copy that arrived [s]."""
+        """Return the one-way delay of each copy that arrived [s]."""
         return np.array([(at_ns - self.sent_ns[n]) * 1e-9 for n, at_ns in self.arrived])
 
     def numbers(self) -> list[int]:
@@ -342,12 +337,12 @@ def measure(count: int, period: float = 0.01) -> Flow:
 
 
 def show(words: str, **values: float) -> None:
-    """Print a number for those who watch with -s."""
+    """Print a number, which pytest shows with -s."""
     print(words, {name: round(float(value), 5) for name, value in values.items()})
 
 
 def least(error: Callable[[], float], enough: float) -> float:
-    """The least of up to three errors: a machine that stands still for a while spoils one."""
+    """Return the smallest of up to three errors, since a stall of the machine spoils one."""
     found = error()
     for _ in range(2):
         found = found if found < enough else min(found, error())
@@ -355,7 +350,7 @@ def least(error: Callable[[], float], enough: float) -> float:
 
 
 def ping() -> float:
-    """Round-trip time of one ICMP echo from near to far [s]."""
+    """Measure the round-trip time of an ICMP echo from near to far [s]."""
     body = b"\x08\x00" + b"\x00\x00" + b"\x12\x34\x00\x01"
     total = sum(int.from_bytes(body[i : i + 2], "big") for i in range(0, len(body), 2))
     total = (total & 0xFFFF) + (total >> 16)
@@ -406,7 +401,7 @@ class Shaper:
 
 
 class Bench:
-    """A sidecar whose time passes in `wait`, where what is planned happens."""
+    """A sidecar whose time passes in `wait`, which runs the planned events."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""The judge of `make bench-link`: misses are said, and a missing compiler is exit 3."""
+"""`make bench-link` reports missed targets and exits with 3 without a compiler."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PROFILE = DirectionProfile(0.040, 0.030, loss=0.1)
 
 
 def flow(late_ns: int) -> Flow:
-    """What a relay does that is always so late."""
+    """Make the results of a relay with a constant lateness."""
     made, link = Flow(True), LinkDirection(PROFILE, 1, True, START)
     for number in range(500):
         made.sent[number] = START + number * 10 * MS
@@ -79,7 +79,7 @@ def test_no_datagram_leaves_while_a_row_of_a_trace_may_begin(ways: int) -> None:
         (False, -5.0, {"early"}),
     ],
 )
-def test_release_errors_are_judged_against_the_anchors_of_the_run(
+def test_release_errors_are_judged_against_the_runs_anchors(
     fifo: bool, ours_us: float, missed: set[str]
 ) -> None:
     """Without SCHED_FIFO: the p99 is at most 1.5 times the C relay's, not a waking's."""

@@ -1,4 +1,4 @@
-"""Corruption flips one bit of a datagram, by the counter like everything else."""
+"""Corruption flips one bit of a datagram, chosen by its counter."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def link(profile: DirectionProfile = PROFILE) -> LinkDirection:
 
 
 def flipped(data: bytes) -> list[int]:
-    """Numbers of the bits that are set."""
+    """Return the numbers of the bits that are set."""
     return [
         8 * byte + bit for byte, value in enumerate(data) for bit in range(8) if value >> bit & 1
     ]

@@ -1,4 +1,4 @@
-"""The streams of chance: pure, in range, as distributed as they say."""
+"""The random draws are pure, in range and correctly distributed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def forget() -> None:
 
 
 def test_the_first_draws_of_a_stream_are_these() -> None:
-    """Whoever changes them changes every published flight; say so in the change log."""
+    """A change of the draws changes every published flight; note it in the change log."""
     first = uniforms(KEY, Purpose.DELAY, 0)[:3]
     assert first == pytest.approx(FIRST, abs=1e-12)
 
@@ -81,7 +81,7 @@ def test_the_chain_turns_where_the_draws_say() -> None:
         assert state[n] == ((draw[n] >= 0.4) if state[n - 1] else (draw[n] < 0.3))
 
 
-def test_a_chain_that_cannot_turn_bad_is_good_and_one_that_cannot_recover_is_bad() -> None:
+def test_a_chain_without_exits_stays_in_its_state() -> None:
     assert not any(bad_states(KEY, 0, 0.0, 0.0))
     assert len(bad_states(KEY, 0, 0.0, 0.0)) == BLOCK
     assert all(bad_states(KEY, 0, 0.1, 0.0))

@@ -1,4 +1,4 @@
-"""Delay, loss, duplication and reordering come out as distributed as they were asked for."""
+"""Delay, loss, duplication and reordering have the specified distributions."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_independent_loss_has_its_rate_and_no_bursts(seed: int) -> None:
 
 
 def test_burst_loss_has_its_share_and_length() -> None:
-    """2e5 packets: loss 0.02 / (0.02 + 0.2) = 1/11 in the mean, 1 / 0.2 = 5 packets long."""
+    """2e5 packets: mean loss 0.02 / (0.02 + 0.2) = 1/11, mean burst 1 / 0.2 = 5 packets."""
     lost = losses(DirectionProfile(loss=GilbertElliott(0.02, 0.2)), 200_000)
     assert lost.mean() == pytest.approx(1 / 11, rel=0.05)
     assert np.mean(bursts(lost)) == pytest.approx(5.0, rel=0.05)
@@ -105,7 +105,7 @@ def test_certain_loss_loses_everything(certain: dict[str, float | GilbertElliott
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
 def test_a_table_is_drawn_from_about_its_mean(correlation: float) -> None:
-    """A quarter of the packets is late by 1.73 jitters, the others are early by 0.58."""
+    """A quarter of the packets is late by 1.73 jitters; the others are early by 0.58."""
     table = (-1 / sqrt(3),) * 3 + (sqrt(3),)
     profile = DirectionProfile(0.045, 0.005, "table", correlation, table=table)
     sample = delays(profile, COUNT)

@@ -1,4 +1,4 @@
-"""One direction of the link: purity, queue, order, time."""
+"""One direction of the link: pure draws, queue, order, time line."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_directions_and_seeds_differ() -> None:
 
 
 def test_conditions_that_change_nothing_change_nothing() -> None:
-    """Also holds the fast path and the other to the same fates."""
+    """The fast and the general path also give the same impairments."""
     pointless = (Change(1.0, delay=0.045), Change(1000.0, delay=9.0))
     for loss in (0.1, LIVELY.loss):
         steady = DirectionProfile(0.045, 0.06, loss=loss, duplicate=0.1, reorder=0.1)
@@ -166,7 +166,7 @@ def test_a_trace_holds_each_row_until_the_next() -> None:
     assert delays == [10 * MS, 10 * MS, None, 30 * MS, 30 * MS]
 
 
-def test_a_trace_without_loss_leaves_it_alone_and_jitter_comes_on_top() -> None:
+def test_a_trace_without_losses_keeps_loss_and_adds_jitter() -> None:
     fate = flow(DirectionProfile(9.0, 0.005, loss=0.5, trace=Trace((0.0,), (0.030,))), 2000)
     arrived = [copies[0] for copies in fate if copies]
     assert 800 < len(arrived) < 1200

@@ -1,4 +1,4 @@
-"""The profiles that ship: each loads, says what it is and where its numbers are from."""
+"""Each shipped profile loads and names its description and sources."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_profile_loads_and_says_where_it_is_from(name: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(TEXTS))
 def test_a_profile_leaves_time_for_a_command_to_come_back(name: str) -> None:
-    """Mean round trip and a period of odometry and of commands stay below the command age limit."""
+    """Mean round trip plus a period of odometry and of commands is below the command age limit."""
     profile = load(name)
     round_trip = profile.uplink.delay_ms + profile.downlink.delay_ms
     assert round_trip + 20 < (profile.command_age_max_ms or 250)

@@ -1,4 +1,4 @@
-"""What a packet costs; timing, so not part of the default run."""
+"""The time that the model needs per packet; not part of the default run."""
 
 from __future__ import annotations
 

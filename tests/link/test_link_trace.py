@@ -1,4 +1,4 @@
-"""Traces: the good are read, the bad are refused with file, line, value and remedy."""
+"""Valid traces are read; bad ones are rejected with file, line, value and remedy."""
 
 from __future__ import annotations
 
@@ -77,12 +77,12 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
         read_trace(tmp_path / "binary.csv")
 
 
-def test_short_delays_are_given_in_microseconds_and_none_at_all_in_any_unit() -> None:
+def test_short_delays_need_microseconds_and_zero_any_unit() -> None:
     assert parse_trace(["time_s,delay_us", "0,45"], "x").delays == pytest.approx((45e-6,))
     assert parse_trace(["time_s,delay_ms", "0,0", "1,0"], "x").delays == (0.0, 0.0)
 
 
-def test_a_table_is_what_arrived_scaled_to_mean_0_and_deviation_1(tmp_path: Path) -> None:
+def test_a_table_is_the_arrived_delays_with_mean_0_deviation_1(tmp_path: Path) -> None:
     path = tmp_path / "trace.csv"
     path.write_text("time_s,delay_ms,loss\n0,60,0\n1,40,0.5\n2,900,1\n3,40,0\n4,60,0\n")
     assert read_table(path) == pytest.approx((-1.0, -1.0, 1.0, 1.0))

@@ -1,4 +1,4 @@
-"""A million draws of a seed follow the distribution that they were asked for."""
+"""A million draws of a seed follow the specified distribution."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def pareto(z: Array) -> Array:
 
 
 def drawn(profile: DirectionProfile, count: int = COUNT) -> list[int]:
-    """Delay of each packet [ns]; -1 if it is lost."""
+    """Return the delay of each packet [ns]; -1 for a lost one."""
     send = link(profile).send
     fates = (send(1, TELEMETRY, n, SIZE, 0) for n in range(count))
     return [fate[0] if fate else -1 for fate in fates]
@@ -65,7 +65,7 @@ def test_a_million_draws_match_their_distribution(
     assert sample.std() == pytest.approx(deviation, rel=0.01)
     some = sample[:: COUNT // 2000]
     share = np.linspace(0, 1, sample.size)[:: COUNT // 2000]
-    # Kolmogorov and Smirnov's distance; by chance above it once in a thousand seeds.
+    # Kolmogorov-Smirnov distance that one in a thousand seeds exceeds by chance.
     distance = np.abs(cumulative(some) - share).max()
     figure("a million draws: from their distribution", distance, "<=", 1.97e-3, count=COUNT)
     assert distance < 1.95 / sqrt(sample.size)
@@ -77,10 +77,10 @@ def test_a_million_fates_have_the_bursts_asked_for() -> None:
     assert np.mean(fates < 0) == pytest.approx(share_bad * 0.6 + (1 - share_bad) * 0.005, rel=0.02)
 
 
-def test_two_hundred_thousand_packets_have_the_loss_and_the_burst_length_asked_for(
+def test_200000_packets_have_the_specified_loss_and_burst_length(
     figure: Callable[..., None],
 ) -> None:
-    """The chain alone, everything in the bad state lost: 1/11 lost, 5 packets long, to 10 %."""
+    """All packets in the bad state are lost: loss 1/11, bursts of 5 packets, to 10 %."""
     lost = np.array(drawn(DirectionProfile(loss=GilbertElliott(0.02, 0.2)), 200_000)) < 0
     edges = np.flatnonzero(np.diff(np.concatenate(([0], lost, [0]))))
     lengths = edges[1::2] - edges[::2]

@@ -123,7 +123,7 @@ def test_a_time_line_goes_on_over_a_qdisc_that_was_removed() -> None:
 
 @pytest.mark.parametrize("damage", [remove_all, remove_leaf])
 @pytest.mark.parametrize("profile", [PROFILE, DirectionProfile(0.07)])
-def test_a_profile_that_comes_after_it_was_removed_is_in_force_at_once(
+def test_a_profile_after_a_removal_is_in_force_at_once(
     damage: Callable[[Kernel], None], profile: DirectionProfile
 ) -> None:
     bench = Bench()
@@ -134,7 +134,7 @@ def test_a_profile_that_comes_after_it_was_removed_is_in_force_at_once(
     assert bench.restored == 1
 
 
-def test_a_profile_is_refused_in_words_where_the_qdisc_goes_while_it_is_read_back() -> None:
+def test_a_profile_is_refused_if_the_qdisc_goes_during_the_check() -> None:
     bench = Bench()
     run = bench.kernel.run
 

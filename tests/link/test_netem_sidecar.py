@@ -116,7 +116,7 @@ def test_it_takes_netem_follows_the_profile_and_leaves_nothing(pod: Callable[...
     assert not link.route.exists()
 
 
-def test_a_qdisc_that_is_deleted_in_flight_is_put_back_and_logged(pod: Callable[..., Pod]) -> None:
+def test_a_qdisc_deleted_in_flight_is_restored_and_logged(pod: Callable[..., Pod]) -> None:
     link = pod("uplink: {delay_ms: 60}\n", "netem")
     link.ready()
     lab.sh("tc", "-n", lab.NEAR, "qdisc", "del", "dev", lab.DEVICE, "root")
@@ -140,7 +140,7 @@ def test_a_profile_that_netem_cannot_do_takes_the_relay(pod: Callable[..., Pod])
     link.end()
 
 
-def test_without_the_capability_auto_takes_the_relay_and_netem_refuses(
+def test_without_the_capability_auto_uses_relay_and_netem_fails(
     pod: Callable[..., Pod],
 ) -> None:
     drop = ("setpriv", "--bounding-set", "-net_admin", "--inh-caps", "-net_admin")
@@ -156,7 +156,7 @@ def test_without_the_capability_auto_takes_the_relay_and_netem_refuses(
     assert "needs uid 0 and NET_ADMIN" in strict.log.read_text()
 
 
-def test_strict_netem_refuses_a_profile_by_name_and_waits_for_nobody(
+def test_strict_netem_refuses_a_profile_by_name_at_once(
     pod: Callable[..., Pod],
 ) -> None:
     link = pod("uplink: {rate_kbit: 100, jitter_ms: 3}\n", "netem", peer="nobody.invalid")

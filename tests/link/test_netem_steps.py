@@ -59,7 +59,7 @@ def test_a_trace_is_stepped_at_each_of_its_rows() -> None:
     assert steps.applied == 99
 
 
-def test_what_changes_faster_than_the_step_is_passed_over_and_counted() -> None:
+def test_changes_faster_than_the_step_are_skipped_and_counted() -> None:
     times = tuple(0.001 * n for n in range(1000))
     trace = Trace(times, tuple(0.03 + 1e-5 * n for n in range(1000)))
     kernel, steps = follow(DirectionProfile(trace=trace), 1.2)

@@ -46,7 +46,7 @@ def test_what_is_sent_in_one_call_arrives_as_it_was(pair: Pair) -> None:
     assert receiver.receive() == []
 
 
-def test_more_than_there_is_room_for_waits_and_too_long_ones_are_named(pair: Pair) -> None:
+def test_excess_datagrams_wait_and_too_long_ones_are_named(pair: Pair) -> None:
     receiver = Receiver(pair[1], 3, 16)
     for n in range(5):
         pair[0].sendto(bytes([n] * (17 if n == 1 else 16)), pair[1].getsockname())

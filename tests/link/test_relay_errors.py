@@ -112,7 +112,7 @@ def test_a_stamp_becomes_an_age() -> None:
         assert now_ns - instant_ns(came_ns, offset_ns, now_ns) == counted_ns
 
 
-def test_without_a_stamp_or_after_the_wall_clock_was_set_it_came_when_it_was_read() -> None:
+def test_without_a_valid_stamp_arrival_is_the_time_of_reading() -> None:
     assert Stamps().wall_ns([]) is None
     assert instant_ns(None, 0, 9 * SECOND) == 9 * SECOND
     assert instant_ns(9 * SECOND - MS, None, 9 * SECOND) == 9 * SECOND

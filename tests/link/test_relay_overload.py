@@ -73,7 +73,7 @@ def test_a_flood_one_way_leaves_the_other_way_its_turn() -> None:
         other.close()
 
 
-def test_what_leaves_in_batches_leaves_in_order_and_is_all_counted() -> None:
+def test_batches_leave_in_order_and_are_all_counted() -> None:
     """Far more than one batch at once, the end of it to a peer that the kernel refuses."""
     with bind_loopback() as source, bind_loopback() as target, bind_loopback() as sink:
         direction = LinkDirection(DirectionProfile(), 1, True)

@@ -35,7 +35,7 @@ def test_the_slack_of_the_thread_that_asks_is_a_nanosecond() -> None:
 
 
 @linux
-def test_a_thread_that_may_runs_first_and_what_it_starts_does_not() -> None:
+def test_a_permitted_thread_has_priority_and_its_children_do_not() -> None:
     def ask() -> object:
         refused = ask_for_fifo()
         return not refused, runs_first(), in_a_thread(runs_first) == [True]

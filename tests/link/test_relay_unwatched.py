@@ -100,7 +100,7 @@ def forward(
     return lane, wait
 
 
-def test_what_comes_a_hundred_times_a_second_wakes_it_for_releases_alone(
+def test_100_datagrams_a_second_wake_it_only_for_releases(
     clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lane, wait = forward(clock, monkeypatch, 10 * MS, 20 * MS, 70 * MS, 3000)

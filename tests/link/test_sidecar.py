@@ -126,7 +126,7 @@ def test_a_new_profile_is_followed_within_a_step(tmp_path: Path) -> None:
     assert bench.delays == [0.0, 0.5]
 
 
-def test_who_changed_the_profile_is_told_once_and_may_let_its_time_line_go_on(
+def test_a_change_is_told_once_and_may_continue_the_time_line(
     tmp_path: Path,
 ) -> None:
     bench = Bench(tmp_path, "relay")
@@ -172,7 +172,7 @@ def test_the_time_line_counts_from_when_the_link_came_up(tmp_path: Path) -> None
     assert 2.0e9 <= bench.origins_ns[0] < 2.2e9
 
 
-def test_a_profile_that_netem_cannot_do_is_refused_or_takes_the_relay(tmp_path: Path) -> None:
+def test_a_profile_netem_cannot_do_is_refused_or_uses_the_relay(tmp_path: Path) -> None:
     for mode, did in (("netem", "netem closes"), ("auto", "relay closes")):
         bench = Bench(tmp_path, mode)  # type: ignore[arg-type]
         bench.at(1.0, lambda bench=bench: bench.replace(9.0))  # type: ignore[misc]
@@ -182,9 +182,7 @@ def test_a_profile_that_netem_cannot_do_is_refused_or_takes_the_relay(tmp_path: 
 
 
 @pytest.mark.parametrize("mode", ["netem", "relay"])
-def test_what_netem_does_otherwise_is_said_of_every_profile_it_shapes_by(
-    tmp_path: Path, mode: Mode
-) -> None:
+def test_netems_deviations_are_reported_for_each_profile(tmp_path: Path, mode: Mode) -> None:
     first, later = DirectionProfile(corrupt=0.1), DirectionProfile(corrupt=0.2)
     bench = Bench(tmp_path, mode, profile=first)
     bench.at(1.0, lambda: setattr(bench.sidecar, "profile", Loaded(later, {})))
@@ -193,7 +191,7 @@ def test_what_netem_does_otherwise_is_said_of_every_profile_it_shapes_by(
     assert said == (notes(first) + notes(later) if mode == "netem" else [])
 
 
-def test_a_full_disk_ends_nothing_and_the_state_is_told_once_it_has_room(
+def test_a_full_disk_ends_nothing_and_delays_the_state(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = Bench(tmp_path, "netem")

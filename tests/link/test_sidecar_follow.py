@@ -75,7 +75,7 @@ def test_the_note_beside_the_profile_says_who_changed_it(config_map: ConfigMap) 
         assert loaded.change == change
 
 
-def test_what_is_invalid_is_refused_in_one_line_until_it_is_mended(config_map: ConfigMap) -> None:
+def test_an_invalid_file_is_refused_in_one_line_until_fixed(config_map: ConfigMap) -> None:
     config_map.put("uplink: {delay_ms: 40}\n")
     file, log = follow(config_map)
     file.first()
@@ -100,7 +100,7 @@ def test_a_file_that_goes_and_comes_back(config_map: ConfigMap) -> None:
     assert len(log) == 1
 
 
-def test_a_file_that_is_written_while_it_is_read_is_read_again_and_is_one_change(
+def test_a_file_written_during_a_read_is_read_again(
     tmp_path: Path,
 ) -> None:
     place, log = tmp_path / "profile.yaml", list[str]()

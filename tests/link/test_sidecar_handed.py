@@ -68,7 +68,7 @@ def pod(tmp_path: Path) -> Pod:
     return Pod(tmp_path)
 
 
-def test_what_is_handed_over_takes_force_and_the_config_map_brings_nothing_new(pod: Pod) -> None:
+def test_a_handed_change_acts_and_the_config_map_adds_none(pod: Pod) -> None:
     assert pod.first() == 0.04
     pod.hand(120.0, "a1")
     assert pod.poll() == (0.12, "a1")
@@ -78,7 +78,7 @@ def test_what_is_handed_over_takes_force_and_the_config_map_brings_nothing_new(p
     assert os.listdir(pod.run) == [HANDED_FILE], "nothing is left behind"
 
 
-def test_a_config_map_that_is_faster_is_not_followed_by_the_same_again(pod: Pod) -> None:
+def test_a_faster_config_map_is_not_applied_twice(pod: Pod) -> None:
     pod.first()
     pod.put(120.0, "a1")
     assert pod.poll() == (0.12, "a1")

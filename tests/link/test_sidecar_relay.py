@@ -133,7 +133,7 @@ def test_it_draws_the_models_delays_in_the_direction_asked(pod: Callable[..., Po
 
 
 @pytest.mark.promise("link-changes-in-flight")
-def test_a_change_in_flight_acts_within_a_second_and_loses_nothing(
+def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(
     pod: Callable[..., Pod],
 ) -> None:
     link = pod("uplink: {delay_ms: 300}\n").ready()
@@ -153,7 +153,7 @@ def test_a_change_in_flight_acts_within_a_second_and_loses_nothing(
     assert state["profile"]["description"] == "quick"
 
 
-def test_what_is_handed_over_inside_is_in_force_when_the_command_ends(
+def test_a_change_handed_inside_is_in_force_at_the_commands_end(
     pod: Callable[..., Pod],
 ) -> None:
     link = pod("uplink: {delay_ms: 300}\n").ready()

@@ -144,7 +144,7 @@ def test_while_a_time_line_runs_nothing_is_said_to_be_applied(tmp_path: Path) ->
     assert over.applied == DirectionProfile(0.08, 0.01)
 
 
-def test_tools_are_started_once_a_second_however_often_it_is_asked(tmp_path: Path) -> None:
+def test_tools_are_started_at_most_once_a_second(tmp_path: Path) -> None:
     bench, asked, now = Bench(tmp_path, "relay"), list[str](), [0.0]
 
     def look(host: str) -> Near:

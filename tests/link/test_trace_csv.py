@@ -1,4 +1,4 @@
-"""CSV files: columns that name their units, losses, and what is refused with a hint."""
+"""CSV logs: columns with units, losses, and rejected files."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ def test_one_way_delays_are_not_halved() -> None:
         ("time_s,latency\n0,45", "no column delay, found time_s,latency; name them time_s"),
         ("delay_ms\n45", "no column time"),
         ("", "no column time, found nothing"),
-        ("time_s,delay_ms,rtt_ms\n0,45,90", "has delay_ms and rtt_ms; leave one"),
+        ("time_s,delay_ms,rtt_ms\n0,45,90", "has delay_ms and rtt_ms; keep only one"),
         ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a number"),
         ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a number"),
         ("time_s,delay_ms\ninf,45", "line 2: time_s is inf; give a number"),
         ("time_s,delay_ms,loss\n0,45,0.5", "line 2: loss is 0.5; give 0 or 1"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent"),
-        ("time_s,delay_ms", "no packet in it arrived"),
+        ("time_s,delay_ms", "no packet arrived"),
         ("time_s,delay_ms\n0," + "9" * 200_000, "field larger than field limit"),
     ],
 )

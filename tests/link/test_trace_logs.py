@@ -1,4 +1,4 @@
-"""Logs of ping and irtt: replies, losses, both directions, and what they do not say."""
+"""Logs of ping and irtt: replies, losses, directions and missing data."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def reply(sequence: int, stamp: float) -> str:
 
 
 def test_ping_gives_halves_sent_when_the_request_left() -> None:
-    """Lost is what has a number but no reply; after the last reply nothing is known."""
+    """A number without a reply is lost; after the last reply nothing is known."""
     packets = read_ping(PING, "x", halve=True)
     assert packets.sent == pytest.approx((100.0, 100.2, 100.4, 100.6))
     assert packets.delays == pytest.approx((0.020, 0.015, None, 0.050))
@@ -42,7 +42,7 @@ def test_ping_is_not_halved_unasked() -> None:
 
 
 def test_ping_counts_on_after_65535() -> None:
-    """A late reply from before the turn stays before it."""
+    """A late reply from before the wrap keeps its place."""
     lines = [reply(65534, 1.0), reply(0, 3.0), reply(65535, 2.0), reply(1, 4.0)]
     packets = read_ping(lines, "x", halve=True)
     assert packets.sent == pytest.approx((0.98, 1.98, 2.98, 3.98))
@@ -68,7 +68,7 @@ def test_forged_numbers_of_ping_fill_no_memory() -> None:
 
 
 def trip(number: int, lost: Any = False, send: int = 30, receive: int = 20) -> dict[str, Any]:
-    """One round trip as irtt 0.9 writes it; delays in [ms], one packet every 10 ms."""
+    """Make a round trip as irtt 0.9 writes it; delays in [ms], one packet every 10 ms."""
     sent = 1_700_000_000_000_000_000 + number * 10_000_000
     send, receive = send * 1_000_000, receive * 1_000_000
     if lost:
@@ -101,7 +101,7 @@ IRTT = json.dumps(
 def test_irtt_knows_both_ways(
     direction: Direction, sent: tuple[float, ...], delays: tuple[float | None, ...]
 ) -> None:
-    """What was lost upward was never on its way down, and the other way round."""
+    """Packets lost on the uplink were never on the downlink, and vice versa."""
     packets = read_irtt(IRTT, "x", direction, halve=False)
     assert packets.sent == pytest.approx(sent)
     assert packets.delays == pytest.approx(delays)

@@ -1,4 +1,4 @@
-"""Packets become rows that a stream of the same rate meets one by one; wrong units are refused."""
+"""Packets become rows that a stream of the same rate meets one by one; wrong units are rejected."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cloudrc.link.traces import Packets, check_unit, in_order, parse_trace, trac
 STREAM = Packets((5.0, 5.01, 5.02, 5.03), (0.040, None, 0.060, 0.045))
 
 
-def test_a_row_begins_halfway_between_two_packets_and_time_with_the_first() -> None:
+def test_a_row_begins_halfway_between_two_packets() -> None:
     trace = trace_of(STREAM)
     assert trace.times == pytest.approx((0.0, 0.005, 0.015, 0.025))
     assert trace.delays == (0.040, 0.040, 0.060, 0.045)
@@ -40,7 +40,7 @@ def test_packets_are_put_in_the_order_of_sending() -> None:
 
 
 def test_nothing_arrived_or_arrived_before_it_was_sent() -> None:
-    with pytest.raises(BadInputError, match="no packet in it arrived"):
+    with pytest.raises(BadInputError, match="no packet arrived"):
         in_order([(0.0, None)], "x")
     with pytest.raises(BadInputError, match=r"arrived 3 ms before it was sent.*--halve-rtt"):
         in_order([(0.0, -0.003), (1.0, 0.01)], "x")

@@ -1,4 +1,4 @@
-"""What is said of a stream is what its profile does to it."""
+"""The statistics of a stream agree with its profile."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def measured(profile: DirectionProfile, count: int = 20_000) -> Numbers:
 
 
 def test_uniform_jitter_larger_than_the_gap_reorders() -> None:
-    """Two packets 10 ms apart with 45±25 ms each; the later one overtakes in 0.32 of the cases.
+    """Two packets 10 ms apart with 45±25 ms each are reordered in 0.32 of the cases.
 
     The difference of two uniform delays is triangular on (-50, 50) ms: above 10 ms with chance
     (1 - 10/50)^2 / 2 = 0.32; with the ones after it the share is larger.

@@ -1,4 +1,4 @@
-"""Records to test with: any record (hypothesis), and a short flight of both ends."""
+"""Fixtures: random records (hypothesis) and a short flight of both ends."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _strategy(name: str, kind: Any) -> st.SearchStrategy[Any]:
 
 
 def instances(cls: type[Any]) -> st.SearchStrategy[Any]:
-    """Any instance of a record of the loop."""
+    """Generate records of the loop."""
     hints = get_type_hints(cls)
     return st.builds(cls, **{name: _strategy(name, kind) for name, kind in hints.items()})
 
@@ -55,7 +55,7 @@ def any_record() -> st.SearchStrategy[Record]:
 
 
 def world_records(count: int, start_ns: int = 0) -> list[Record]:
-    """World at 100 Hz: the command of each period was sent 30 ms before it arrived."""
+    """Make world's records at 100 Hz; each command took 30 ms."""
     records: list[Record] = [
         rec.SessionOpened(start_ns, "world", 1, "cloud said hello"),
         rec.GuardChange(start_ns, GuardState.TRACK, "mission started"),
@@ -80,7 +80,7 @@ def world_records(count: int, start_ns: int = 0) -> list[Record]:
 
 
 def cloud_records(count: int, start_ns: int = 0, up_ns: int = 40 * MS) -> list[Record]:
-    """Cloud at 100 Hz, a command 3 ms after each period; telemetry was `up_ns` under way."""
+    """Make cloud's records at 100 Hz; a command leaves 3 ms after each period."""
     records: list[Record] = [rec.SessionOpened(start_ns, "cloud", 1, "world said yes")]
     v = (0.1, 0.2, 0.3)
     for n in range(count):
@@ -104,7 +104,7 @@ def write(path: Path, records: list[Record], clock: str = "world", clock_id: str
 
 
 def assert_equal(one: Recording, other: Recording) -> None:
-    """Every column of every topic equal; turning a velocity twice costs its last digits."""
+    """Check that all columns are equal; two rotations of a velocity change its last digits."""
     for topic in TOPICS:
         assert one[topic].names == other[topic].names
         for name in one[topic].names:
@@ -118,7 +118,7 @@ def assert_equal(one: Recording, other: Recording) -> None:
 
 
 def counted(count: int) -> list[Record]:
-    """So many records of one count, 10 ms apart."""
+    """Make `count` records of a counter, 10 ms apart."""
     return [rec.Counted(n * 10 * MS, "world", "sent", n) for n in range(count)]
 
 
@@ -127,7 +127,7 @@ def open_mcap(path: Path) -> McapWriter:
 
 
 class Shelf:
-    """A sink that keeps what it is given."""
+    """A sink that stores its records."""
 
     def __init__(self) -> None:
         self.records: list[Record] = []

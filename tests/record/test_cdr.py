@@ -1,4 +1,4 @@
-"""ROS messages say the same as the rows, in ROS's own conventions."""
+"""ROS messages hold the same values as the rows, in ROS's conventions."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ TYPES = sorted({topic.ros_type for topic in TOPICS.values()})
 
 
 def standard(ros_type: str, data: bytes) -> Any:
-    """A message as any ROS 2 tool sees it that knows only the standard types."""
+    """Decode a message as a ROS 2 tool that knows only the standard types."""
     return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, ros_type)
 
 
 def test_an_odometry_is_converted_at_the_edge() -> None:
     half = math.sqrt(0.5)
-    # A quarter turn to the left: forward along the world's y, what moves along x drifts right.
+    # A quarter turn to the left: forward is the world's y, so a motion along x is to the right.
     odometry = Odometry(
         2_500_000_000, (1.0, 2.0, 3.0), (half, 0.0, 0.0, half), (4.0, 1.0, 0.5), (0.1, 0.2, 0.3)
     )

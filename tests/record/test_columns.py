@@ -1,4 +1,4 @@
-"""Columns are the records' values, whether they come from memory or from a file."""
+"""Columns hold the records' values, from memory and from a file."""
 
 from __future__ import annotations
 

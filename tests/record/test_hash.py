@@ -1,4 +1,4 @@
-"""The hash is of what the records say and of nothing else."""
+"""The hash depends on the records' values and on nothing else."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_batches_do_not_matter(records: list[Any], cut: int) -> None:
 
 
 def changed(value: Any) -> Any:
-    """Something of the same type that is not equal."""
+    """Return a different value of the same type."""
     if isinstance(value, bool):
         return not value
     if isinstance(value, GuardState):
@@ -57,7 +57,7 @@ def changed(value: Any) -> Any:
 
 
 def variants(instance: Any) -> list[Any]:
-    """The instance with each of its values changed in turn."""
+    """Yield the record with each of its values changed in turn."""
     found = []
     for name in instance._fields:
         value = getattr(instance, name)
@@ -77,7 +77,7 @@ def test_every_value_counts(cls: type[Any]) -> None:
     ]
     record = next(each for each in every if type(each) is cls)
     if cls is rec.Control:
-        record = record._replace(loop_delay=0.1)  # in place of NaN, which no change changes
+        record = record._replace(loop_delay=0.1)  # NaN would not change
     if cls is rec.TelemetrySent:
         record = record._replace(telemetry=record.telemetry._replace(touch_speed=0.1))
     if cls is rec.Arrival:

@@ -55,7 +55,7 @@ def test_so_it_does_while_the_disk_is_slow(tmp_path: Path, sync: float) -> None:
 @pytest.mark.process
 @pytest.mark.full
 @pytest.mark.parametrize("part", range(10))
-def test_sigkill_at_any_of_fifty_instants_loses_at_most_half_a_second(
+def test_sigkill_at_50_instants_loses_at_most_half_a_second(
     tmp_path: Path, part: int, figure: Callable[..., None]
 ) -> None:
     losses = []

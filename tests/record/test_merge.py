@@ -1,4 +1,4 @@
-"""Both ends' recordings become one on world's clock, and say how well the clocks are known."""
+"""Both ends' recordings are merged on world's clock, with the offset's uncertainty."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_two_clocks_are_related_by_the_packets(tmp_path: Path, start: int, ahead
 def test_the_true_offset_is_within_the_uncertainty(
     ahead: int, delays: list[tuple[int, int]]
 ) -> None:
-    """World's clock is `ahead` of cloud's; the quickest packet need not be the first."""
+    """World's clock is `ahead` of cloud's; the fastest packet may come later."""
     v = (0.0, 0.0, 0.0)
     world: list[Record] = []
     cloud: list[Record] = []

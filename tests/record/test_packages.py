@@ -1,4 +1,4 @@
-"""What recording needs is asked for by name, and only where it is needed."""
+"""Missing packages are named, and only recording needs them."""
 
 from __future__ import annotations
 

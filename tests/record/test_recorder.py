@@ -1,4 +1,4 @@
-"""The recorder takes everything without waiting and survives whatever the disk does."""
+"""The recorder never blocks and survives all disk errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
 
 
 class Disk(io.BytesIO):
-    """A file on a disk that has room for so many bytes."""
+    """A file on a disk with space for `room` bytes."""
 
     def __init__(self, room: int) -> None:
         super().__init__()
@@ -114,7 +114,7 @@ def test_on_a_full_disk_the_file_ends_with_a_whole_chunk(tmp_path: Path, room: i
         (errno.EIO, "Input/output error"),
     ],
 )
-def test_whatever_the_disk_refuses_the_user_is_told_and_nothing_raised(
+def test_disk_errors_are_reported_to_the_user_and_never_raised(
     step: str, code: int, words: str
 ) -> None:
     class Refusing(Shelf):

@@ -1,4 +1,4 @@
-"""The recorder between its threads: who puts, who writes, and who waits for the disk."""
+"""The recorder with its three threads: one puts, one writes, one syncs."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_an_fsync_that_takes_long_keeps_nobody_waiting() -> None:
     assert len(shelf.records) == 501
 
 
-def test_a_disk_that_hangs_in_a_sync_keeps_nothing_from_the_operating_system() -> None:
+def test_a_hanging_sync_keeps_no_data_from_the_operating_system() -> None:
     release, flushed = threading.Event(), threading.Semaphore(0)
 
     class Slow(Shelf):
@@ -77,7 +77,7 @@ def test_a_disk_that_hangs_in_a_sync_keeps_nothing_from_the_operating_system() -
 
 
 def test_what_a_power_cut_would_take_is_told(tmp_path: Path) -> None:
-    """By a thread whose disk takes two syncs and hangs in the third."""
+    """The disk does two syncs and hangs in the third."""
     begun, release, began = threading.Semaphore(0), threading.Event(), list[float]()
 
     class Hanging(Shelf):
@@ -117,7 +117,7 @@ def test_what_is_in_no_file_is_never_safe(tmp_path: Path, name: str) -> None:
     assert recorder.sync() is (name == "gone.mcap")
 
 
-def test_what_a_sync_in_the_background_refuses_stops_the_recording() -> None:
+def test_an_error_of_a_background_sync_stops_the_recording() -> None:
     class Refusing(Shelf):
         def sync(self) -> None:
             raise OSError(errno.EIO, "Input/output error")

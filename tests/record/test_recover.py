@@ -1,4 +1,4 @@
-"""What a recovery keeps, what it counts as lost, and that no damaged byte passes for a good one."""
+"""A recovery keeps all intact data, counts the losses and never passes a wrong byte."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NOISE = random.Random(1).randbytes(80_000)
 
 
 def recording(records: int = 80) -> bytes:
-    """A whole file of some 100 kB, most of it an attachment that cannot be compressed."""
+    """Make a complete file of about 100 kB, mostly an incompressible attachment."""
     stream = io.BytesIO()
     writer = McapWriter(stream, clock="world", clock_id="ab")
     writer.write(world_records(records))
@@ -44,7 +44,7 @@ WHOLE = recording()
 
 
 def spans(data: bytes) -> list[tuple[int, int, int]]:
-    """Opcode, first byte and the byte after the last of each record."""
+    """Yield the opcode, start and end of each record."""
     found, start = [], 8
     while start < len(data) - 8:
         end = start + 9 + int.from_bytes(data[start + 1 : start + 9], "little")
@@ -58,7 +58,7 @@ def of(opcode: int) -> tuple[int, int]:
 
 
 def contents(data: bytes) -> list[object]:
-    """All that a file says to its reader, whatever its layout; its header's library aside."""
+    """Return the contents of a file, without its layout and its library's name."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     found: list[object] = []
@@ -81,7 +81,7 @@ def contents(data: bytes) -> list[object]:
 
 
 def rescue(folder: Path, data: bytes) -> tuple[int, dict[str, object], bytes]:
-    """Exit code, the account and the new file."""
+    """Run the command; return its exit code, its output and the new file."""
     source, target = folder / "f.mcap", folder / "new.mcap"
     target.unlink(missing_ok=True)
     source.write_bytes(data)
@@ -127,7 +127,7 @@ def test_a_damaged_chunk_costs_only_itself_and_is_counted(tmp_path: Path) -> Non
     start, end = of(Opcode.CHUNK)
     data = flipped(WHOLE, (start + end) // 2, 255)
     code, account, new = rescue(tmp_path, data)
-    lost = len(contents(WHOLE)) - (len(contents(new)) - 1)  # the note is one more
+    lost = len(contents(WHOLE)) - (len(contents(new)) - 1)  # the new note is one more
     assert code == 1
     assert account["dropped"] == {"chunks": 1, "messages": lost}
 
@@ -155,7 +155,7 @@ EXPECTED = contents(WHOLE)
 
 
 def check_flips(folder: Path, places: Iterable[int]) -> None:
-    """Every flip is told of, or what comes out is what it was."""
+    """Each flip is reported, or the result is unchanged."""
     for at in places:
         code, _, new = rescue(folder, flipped(WHOLE, at, 1 << at % 8))
         assert code or contents(new) == EXPECTED, f"byte {at}"
@@ -189,7 +189,7 @@ def test_lengths_that_lie_take_no_memory(tmp_path: Path) -> None:
 
 
 def bomb(claimed: int) -> bytes:
-    """A file whose one chunk is short and unpacks to very much more than it says."""
+    """Make a file with a short chunk that unpacks to far more than it states."""
     stream = io.BytesIO()
     writer = Writer(stream, compression=CompressionType.ZSTD, chunk_size=1 << 40)
     writer.start()

@@ -1,4 +1,4 @@
-"""What a few kilobytes that unpack to very much cost: a chunk at most; all of it is counted."""
+"""Small files that unpack to very much cost one chunk of memory; all losses are counted."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def file(*chunks: bytes) -> bytes:
 def test_a_chunk_is_as_long_as_it_says_or_is_none(
     compression: str, beyond: int, read: list[int] | None
 ) -> None:
-    """One that holds more is no full one, though what it says is there."""
+    """A chunk that holds more than it states is damaged."""
     whole = message(1) * 2
     held = (whole + message(1))[: len(whole) + beyond]
     data = zstandard.compress(held) if compression else held
@@ -70,7 +70,7 @@ def test_a_chunk_is_as_long_as_it_says_or_is_none(
         assert [each.channel_id for each in unpack(said)] == read  # type: ignore[attr-defined]
 
 
-def test_of_a_chunk_that_unpacks_to_more_than_it_says_no_more_is_unpacked() -> None:
+def test_a_chunk_never_unpacks_to_more_than_it_states() -> None:
     bomb = Chunk("zstd", zstandard.compress(bytes(64 << 20)), 0, 0, 0, 1_000)
     tracemalloc.start()
     try:
@@ -96,7 +96,7 @@ def test_of_a_chunk_of_many_messages_one_is_held_at_a_time() -> None:
 
 
 def defined(topic: str = "/telemetry") -> bytes:
-    """A topic of ours, as its own writer defines it."""
+    """Define one of our topics as its writer does."""
     name = TOPICS[topic].ros_type
     schema = struct.pack("<H", 1) + text(name.encode()) + text(b"ros2msg")
     schema += text(definition(name).encode())
@@ -105,10 +105,10 @@ def defined(topic: str = "/telemetry") -> bytes:
 
 
 @pytest.mark.parametrize("size", [0, 1 << 20])
-def test_a_file_that_unpacks_to_more_than_a_recording_is_not_read(
+def test_a_file_that_unpacks_to_too_much_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:
-    """Its chunks are as a writer's own, its topics known; there are many, of few bytes each."""
+    """Make many small chunks with known topics, as from a writer."""
     monkeypatch.setattr("cloudrc.record.reader.ROOM_MIN", room := 3 << 20)
     one = record(Opcode.MESSAGE, struct.pack("<H", 1) + bytes(20 + size))
     path, new = tmp_path / "w.mcap", tmp_path / "new.mcap"
@@ -142,14 +142,14 @@ def test_messages_of_topics_that_nobody_asked_for_are_not_kept(tmp_path: Path) -
 
 
 def test_a_topic_that_is_defined_behind_its_messages_is_read(tmp_path: Path) -> None:
-    """As behind a chunk that is damaged."""
+    """As after a damaged chunk."""
     path = tmp_path / "w.mcap"
     path.write_bytes(file(chunk(message(1) * 3), chunk(defined(), message(1))))
     assert len(read_contents(path).messages) == 4
 
 
 def test_an_idle_recording_is_far_from_what_is_too_much(tmp_path: Path) -> None:
-    """Where nothing changes but the time it is packed as tightly as it gets."""
+    """Messages that differ only in time compress best."""
     (telemetry,) = [r for r in world_records(1) if isinstance(r, TelemetrySent)]
     path = tmp_path / "idle.mcap"
     with McapWriter(path, clock="world") as writer:
@@ -183,7 +183,7 @@ def test_what_becomes_many_objects_is_not_read_in_a_chunk(tmp_path: Path, inside
         recover(path, tmp_path / "new.mcap")
 
 
-def test_definitions_beyond_their_room_are_left_out_with_their_messages(
+def test_too_many_definitions_are_left_out_with_their_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cloudrc.record.recover.DEFINITIONS_MAX", 3_500)

@@ -1,4 +1,4 @@
-"""What says itself that something is missing is never called complete, however whole it is."""
+"""A recording whose note says that data is missing is never called complete."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def drained(recorder: Recorder) -> Recorder:
 
 
 def full(path: Path, room: int = 60_000) -> Path:
-    """What is left of a recording whose disk fills up."""
+    """Make a recording whose disk fills up."""
     disk = FullDisk(room)
     drained(Recorder(path, lambda _: McapWriter(disk, clock="world")))
     path.write_bytes(disk.getvalue())
@@ -37,13 +37,13 @@ def full(path: Path, room: int = 60_000) -> Path:
 
 
 def ended(path: Path) -> Path:
-    """A recording that has grown to its limit."""
+    """Make a recording that reaches its size limit."""
     drained(Recorder(path, open_mcap, size_max=50_000))
     return path
 
 
 def recovered(path: Path) -> Path:
-    """What was recovered of a torn one."""
+    """Make the recovery of a torn recording."""
     torn = write(path.with_name("torn.mcap"), world_records(500))
     torn.write_bytes(torn.read_bytes()[:20_000])
     assert not recover(torn, path).complete
@@ -77,9 +77,7 @@ def test_what_was_said_before_a_file_was_torn_is_said_still(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("short", [1, 60, 100])
-def test_without_room_for_the_note_there_is_no_end_that_passes_for_a_whole_file(
-    tmp_path: Path, short: int
-) -> None:
+def test_without_space_for_the_note_the_file_gets_no_end(tmp_path: Path, short: int) -> None:
     size = full(tmp_path / "w.mcap").stat().st_size
     path = full(tmp_path / "v.mcap", size - short)
     assert not recover(path, tmp_path / "new.mcap").complete
@@ -129,7 +127,7 @@ def test_what_a_recording_says_does_not_steer_a_terminal(
 
 
 def hostile(count: int, *, schemas: bool) -> bytes:
-    """Messages of which each has a channel of its own, under one number, and maybe a schema."""
+    """Make messages that each redefine the same channel, perhaps with a schema."""
     parts = [MAGIC]
     for n in range(count):
         name, number = b"t%07d" % n, struct.pack("<H", 1)

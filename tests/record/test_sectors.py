@@ -1,4 +1,4 @@
-"""A sector that cannot be read costs what lies there, and no more."""
+"""An unreadable sector costs only its own data."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.record.conftest import world_records, write
 
 
 class Failing(io.FileIO):
-    """A file of which some sectors cannot be read; what lies before them can."""
+    """A file with some unreadable sectors."""
 
     bad: frozenset[int] = frozenset()
     code = errno.EIO

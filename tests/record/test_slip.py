@@ -1,4 +1,4 @@
-"""World's clock slips after a stall: cloud's records find their place on it all the same."""
+"""Cloud's records are converted correctly to world's clock after its lags."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.record.conftest import MS, SECOND, cloud_records, world_records, writ
 
 
 def slipping(records: list[Record], slips_ns: list[int]) -> list[Record]:
-    """World's records; the n-th telemetry says the n-th slip, the last one goes on."""
+    """Make world's records; the n-th telemetry has the n-th slip, later ones the last slip."""
     slips, found = iter(slips_ns), []
     slip = 0
     for record in records:

@@ -1,4 +1,4 @@
-"""The table of topics says all that the records hold, under their names, with units."""
+"""The topics contain all values of the records, with their names and units."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_nothing_that_a_record_holds_is_left_out(cls: type[Any]) -> None:
 def test_the_record_s_docstring_names_its_topics(cls: type[Any]) -> None:
     named = set(re.findall(r"(?<!\w)/[a-z_]+", (cls.__doc__ or "").partition("Attributes:")[0]))
     topics = {name for name, topic in TOPICS.items() if topic.source is cls}
-    # The docstring of GroundTruth tells of its force among the attributes.
+    # The docstring of GroundTruth has its force among the attributes.
     assert named == topics - {"/contact_force"}
 
 

@@ -1,4 +1,4 @@
-"""A file that a killed process left, or that something damaged, is read as far as it goes."""
+"""A torn or damaged file is read as far as it is readable."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WHOLE = whole_file()
 
 
 def chunk_spans() -> list[tuple[int, int]]:
-    """First byte of each chunk record and the one after its last."""
+    """Return the start and end of each chunk."""
     spans, start = [], 8
     while WHOLE[start] != Opcode.FOOTER:
         end = start + 9 + int.from_bytes(WHOLE[start + 1 : start + 9], "little")
@@ -51,7 +51,7 @@ CHUNKS = chunk_spans()
 
 
 def messages_until(cut: int) -> int:
-    """Number of messages in the chunks that are whole when the file ends at `cut`."""
+    """Count the messages in the chunks that end before `cut`."""
     records = StreamReader(io.BytesIO(WHOLE), emit_chunks=True).records
     chunks = [record for record in records if isinstance(record, Chunk)]
     whole = [chunk for chunk, (_, end) in zip(chunks, CHUNKS, strict=True) if end <= cut]
@@ -86,7 +86,7 @@ def test_all_whole_chunks_are_read(tmp_path: Path, cut: int) -> None:
 
 
 def note_or_refusal(path: Path) -> str:
-    """What reading says is missing; any other error than the one for users goes through."""
+    """Return the note or error of a read; other exceptions pass."""
     try:
         return Recording.read(path).note
     except BadInputError as error:

@@ -1,4 +1,4 @@
-"""The file is an MCAP that others can read, and is never more than half a second behind."""
+"""The file is a valid MCAP and at most half a second behind."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_log_times_never_fall_on_a_topic(tmp_path: Path) -> None:
     assert Recording.read(path)["/guard"]["stamp_ns"].tolist() == [5, 9, 7, 8, 12]
 
 
-def test_what_is_older_than_half_a_second_is_with_the_operating_system() -> None:
+def test_data_older_than_half_a_second_is_flushed() -> None:
     stream = io.BytesIO()
     writer = McapWriter(stream, clock="world")
     states = [GuardChange(n * 10 * MS, GuardState.HOLD, str(n)) for n in range(200)]
@@ -80,12 +80,12 @@ def test_what_is_older_than_half_a_second_is_with_the_operating_system() -> None
 
 
 def newest(data: bytes) -> int:
-    """Log time [ns] of the last whole chunk's last message."""
+    """Return the log time of the last message in a complete chunk [ns]."""
     end = 0
     try:
         for record in StreamReader(io.BytesIO(data), emit_chunks=True).records:
             end = record.message_end_time if isinstance(record, Chunk) else end
-    except Exception:  # it has no end yet
+    except Exception:  # the file has no end yet
         return end
     raise AssertionError("the file is not yet ended")
 
@@ -117,7 +117,7 @@ def test_rosbags_own_reader_agrees(flight: Path) -> None:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Compare messages of two decoders, field by field."""
+    """Compare the messages of two decoders field by field."""
     if hasattr(one, "__dataclass_fields__"):
         names = one.__dataclass_fields__
         return all(same(getattr(one, n), getattr(other, n)) for n in names if n != "__msgtype__")
