@@ -203,7 +203,7 @@ def test_a_process_that_hangs_ends_the_run_and_is_named(tmp_path):
     os.kill(pids["world"], signal.SIGSTOP)
     _, errors = run.communicate(timeout=60)
     assert run.returncode == 4
-    assert "the world process has been silent" in errors
+    assert "the world process was silent" in errors
     assert not any(alive(pid) for pid in pids.values())
 
 
