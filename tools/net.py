@@ -30,7 +30,7 @@ SEEDS = (1, 2)
 
 # Runs inside of each tree: the recorded columns of a file, each as a hash of its bytes.
 COLUMNS = """
-import hashlib, json, sys
+import hashlib, json, re, sys
 from pathlib import Path
 from cloudrc.record.columns import Recording
 from mcap.reader import make_reader
@@ -46,7 +46,8 @@ for channel in summary.channels.values():
         if column.dtype != object:
             digest = hashlib.sha256(column.tobytes()).hexdigest()[:16]
             found[f"{channel.topic} {name} {column.dtype} {column.shape}"] = digest
-kinds = {schema.name: schema.data.decode() for schema in summary.schemas.values()}
+bare = lambda text: re.sub(r"[ \\t]*#.*", "", text)  # a definition's comments are prose
+kinds = {schema.name: bare(schema.data.decode()) for schema in summary.schemas.values()}
 topics = {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values()}
 print(json.dumps({"columns": found, "topics": topics, "definitions": kinds}))
 """
