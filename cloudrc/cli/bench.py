@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 CALLS = 400
 """Number of calls that are timed together."""
 REFERENCE_CALLS = 40
-"""Likewise for the reference: both take about 1 ms, so a busy machine rarely interrupts them."""
+"""Number of calls of the reference that are timed together. These calls and `CALLS` both take about
+1 ms, so a busy machine rarely interrupts them."""
 ROUNDS = 60
 """Number of timings of each part."""
 
@@ -151,9 +152,9 @@ LIMIT_NS = 120_000_000_000
 CLOCK = bytes(16)
 
 Play = Callable[[], int]
-"""Does the work of a part and gives its number of physics steps."""
+"""Function that does the work of a part and returns its number of physics steps."""
 Keep = Callable[["list[Record]"], object]
-"""Stores records."""
+"""Function that stores records."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

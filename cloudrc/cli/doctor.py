@@ -58,7 +58,8 @@ HELPFUL = {
     "docker": "https://docs.docker.com/engine/install",
     "kind": "https://kind.sigs.k8s.io",
 }
-"""Programs that make a cluster on this machine -> likewise; a remote cluster needs neither."""
+"""Programs that make a cluster on this machine -> their installation pages; a remote cluster needs
+none of these programs."""
 MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
 DOCKER_LIMIT = 5.0
 """Time for Docker's daemon to answer [s]."""
@@ -133,7 +134,7 @@ def _short(text: str) -> str:
 
 
 LATE_SLEEP = 2e-3
-"""Lateness that a control loop of 10 ms tolerates; an idle desktop stays far below [s]."""
+"""Lateness that a control loop of 10 ms tolerates [s]; an idle desktop stays far below it."""
 
 MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "

@@ -24,7 +24,8 @@ KUBECTL_PLUGIN = "kubectl-cloudrc"
 CONNECT_LIMIT = 1.0
 """Time for the API of a local run to accept a connection [s]."""
 QUIET_LIMIT = 5.0
-"""Time without writing after which the relay of an unannounced run counts as gone [s]."""
+"""Time since its last write after which a relay counts as gone [s], if its run is not among the
+runs that are under way."""
 
 
 def run_argument(parser: argparse.ArgumentParser) -> None:

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from cloudrc.report.document import Run
 
 GRACE = 30.0
-"""Time after the mission's limit at which a flight is ended in any case [s]."""
+"""Time after the mission's time limit at which the program ends a flight in any case [s]."""
 
 See = Callable[["list[Record]"], None]
-"""Shows records of a flight while it flies."""
+"""Function that shows records of a flight during the flight."""
 
 
 def fly(

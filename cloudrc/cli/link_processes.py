@@ -45,9 +45,10 @@ STOP_LIMIT = 2.0
 _POLL_PERIOD = 0.02
 _METRICS_TIMEOUT = 3.0
 _KINDS = {kind.exit_code: kind for kind in (BadInputError, MissingPrerequisiteError, TimedOutError)}
-"""Exit codes of a link's process that stand for an error of their own."""
+"""Exit code of a link's process -> class of the error that the code stands for."""
 _CHART_ADVICE, _ADVICE = "set link.mode=relay", "use --shaper relay"
-"""A link's process advises a value of the chart; this command has a flag instead."""
+"""Advice of a link's process, which names a value of the chart, and the advice that this command
+gives instead: a flag."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -103,7 +103,8 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 UNPACKED_MAX = 64 << 20
 """Longest log that is unpacked [bytes]: 10 min of irtt at 100 Hz."""
 SETTLING_NS = 2_000_000_000
-"""Time before a session's last datagram [ns]; a datagram sent later may still be under way."""
+"""Time before a session's last datagram in which no datagram counts as lost [ns]: it may still be
+under way."""
 TOPICS = {
     "uplink": ("/telemetry", "/uplink_delay"),
     "downlink": ("/delay_estimate", "/downlink_delay"),

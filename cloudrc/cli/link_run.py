@@ -329,7 +329,7 @@ def _for_batch(words: Sequence[str]) -> str | None:
 
 
 STATUS_PERIOD = 1.0
-"""How long an answer of /link.json stays valid [s]."""
+"""Time for which an answer of /link.json stays valid [s]."""
 EMPTY_STATUS = "{}\n"
 """Answer of /link.json before anything is shaped."""
 

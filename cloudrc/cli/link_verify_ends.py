@@ -44,7 +44,8 @@ END_PORT, LINK_PORT = METRICS["world"]["world"], METRICS["world"]["link"]
 POLL_PERIOD = 2.0
 """Pause between two polls of the ends [s]."""
 SECOND_VERDICT_TIMEOUT = 30.0
-"""Longest wait for the second verdict once the first is "off" [s]; both help to find the cause."""
+"""Longest wait for the second verdict once the first is "off" [s]; the two verdicts together help
+to find the cause."""
 _HTTP_TIMEOUT = 3.0
 _SENT_MIN = 1500  # counts of fewer datagrams are too inexact to compare
 _SHARES = ("loss", "reordered", "duplicated")
@@ -238,7 +239,8 @@ def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> list[str]:
 
 _NO_ROW: Mapping[str, str] = {"verdict": "told"}
 _MEASURED_MIN = 0.85
-"""Share of a time line that counts as all of it [1]: a session needs 2 s to settle."""
+"""Share of a time line above which the whole time line counts as measured [1]: a session needs 2 s
+to settle."""
 
 
 def _progress(way: str, found: Mapping[str, Any]) -> str:

@@ -433,7 +433,7 @@ def _progress(tell: Tell, what: str) -> Callable[[float], None]:
 DEVICE = "tunnel"
 PORT, METRICS_PORT = 7400, 9102
 HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}
-"""Addresses of the ends, by the direction in which they send."""
+"""Direction -> address of the end that sends in this direction."""
 _CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
 
 

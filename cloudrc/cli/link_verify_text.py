@@ -31,7 +31,7 @@ HEADINGS = ("", "asked", "applied", "measured", "allowed", "verdict")
 _SCALES = {"s": (1e3, "ms"), "1": (1e2, "%"), "bit/s": (1e-3, "kbit/s")}
 DIGITS = 2
 NOT_JUDGED = "NOT JUDGED"
-"""Mark in a note: the profile asks for something that was not verified."""
+"""Mark in a note: something that the profile asks for was not verified."""
 
 
 @dataclass(frozen=True, slots=True)

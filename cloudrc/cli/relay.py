@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 COUNT_PERIOD_NS = 1_000_000_000
-"""Period in which the exporter gets the relay's counts [ns]."""
+"""Time between two updates of the relay's counts in the exporter [ns]."""
 WAYS = ("uplink", "downlink")
 
 ADDRESSES = {
@@ -173,7 +173,7 @@ def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Cal
 
 PROFILE_FILE = "profile.json"
 RELEASED_PERIOD = 2.0
-"""Period in which the lateness of datagrams is published; an end reads it as often [s]."""
+"""Time between two publications of the lateness of datagrams [s]; an end reads it as often."""
 
 
 def follow_folder(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from cloudrc.records import Record
 
 Flight = Callable[[Path, TextIO, int], dict[str, Any]]
-"""A flight: (folder to fill, stream for its progress, number of waypoints) -> report."""
+"""Function that flies: (folder to fill, stream for its progress, number of waypoints) -> report."""
 
 MODES = ("local", "virtual", "cluster")
 EXTRAS = {

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 Tell = Callable[[str], None]
 
 FLUSH = 1.0
-"""Time in which a recorder surely flushes its buffer of half a second [s]."""
+"""Time after which a recorder has surely flushed its buffer [s]; the buffer holds at most half a
+second of records."""
 FETCHES = 4
 """Maximum number of attempts to fetch recordings that contain the mission's end."""
 FLOWN = (0, 1, 6, 130)

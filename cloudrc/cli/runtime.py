@@ -196,8 +196,8 @@ def listening(flag: str, listen: Address) -> Iterator[None]:
 
 
 TRACE_MAX = 2 << 20
-"""Maximum size of a trace that the link's container names [bytes]. Its own traces come from a
-ConfigMap, which holds at most 1 MiB."""
+"""Maximum size of a trace file that the link's container names [bytes]. The container's own traces
+come from a ConfigMap, which holds at most 1 MiB."""
 
 
 class EndRuntime(NamedTuple):

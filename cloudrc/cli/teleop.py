@@ -46,7 +46,8 @@ if TYPE_CHECKING:
 REPEAT_PERIOD = 0.02
 """Pause between two attempts to send an emergency stop [s]."""
 REPEAT_LIMIT = 2.0
-"""How long to repeat an emergency stop [s]. If cloud is blocked for that long, the robot holds."""
+"""Time for which an emergency stop is repeated [s]. If cloud is blocked for that long, the robot
+holds."""
 
 
 class EmergencyStopSender:
@@ -96,7 +97,7 @@ class EmergencyStopSender:
 
 LOOPBACK = "127.0.0.1"
 COUNT_PERIOD_NS = 1_000_000_000
-"""Period at which the API's counts become metrics [ns]."""
+"""Time between two updates of the metrics from the API's counts [ns]."""
 
 
 class ServedApi:

@@ -43,7 +43,8 @@ class CloudIdentity:
 
 
 MISSED_MAX = 50
-"""Number of missed periods at a time that makes a fault; a few happen on any machine [periods]."""
+"""Number of missed periods, not yet forgiven, at which cloud reports a fault [periods]; any machine
+misses a few."""
 FORGIVEN_NS = 200_000_000
 """Time after which one missed period no longer counts [ns]: 5 % of all periods may be missed."""
 

@@ -299,7 +299,7 @@ _INSTEAD = {
     "predictor": "cloud uses the last sample without a prediction",
     "controller": "cloud commands zero velocity",
 }
-"""What cloud does instead of using the plug-in, by its kind."""
+"""Kind of plug-in -> what cloud does instead when the plug-in fails."""
 
 
 def _explain(kind: str, error: BaseException, instead: str) -> str:

@@ -32,7 +32,7 @@ from cloudrc.link.state import CHANGE_FILE, STATE_FILE, Change, LinkState, from_
 PROFILE = "profile.yaml"
 """Key of the profile in the ConfigMap."""
 COMPONENTS = ("world", "cloud")
-"""Components whose link containers shape uplink and downlink, in this order."""
+"""Components whose link containers shape the uplink and the downlink, in this order."""
 READ_LIMIT = 15.0
 """Time limit for the API server to answer [s]."""
 FOLDER = "/run/cloudrc"
@@ -47,7 +47,7 @@ _COMPONENT = "app.kubernetes.io/component"
 _LOOK_PERIOD = 0.02
 """Time between two looks at the sidecar's state [s]."""
 _KEY = re.compile(r"[^-._a-zA-Z0-9]")
-"""A character that no key of a ConfigMap may have."""
+"""Pattern of a character that no key of a ConfigMap may have."""
 
 
 @dataclass(frozen=True)

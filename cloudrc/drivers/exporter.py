@@ -204,7 +204,7 @@ TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 """Content type of what `generate_latest` writes."""
 JSON = "application/json"
 KEPT = 0.25
-"""Time for which a page is reused [s]; to make one takes 1.4 ms and may delay the loop."""
+"""Time for which a page is reused [s]; making a page takes 1.4 ms and may delay the loop."""
 CONFIG_DIGITS = 12
 """Length of the shortened hash of the process's configuration [hexadecimal digits].
 
@@ -212,7 +212,8 @@ In local mode it is the start of the hash in report.json. In a cluster the hashe
 there plug-ins fill in their defaults later.
 """
 STILL_MAX = 5.0
-"""A loop without a record for this long stands still [s]; a healthy one makes one every second."""
+"""Time without a record after which a loop counts as standing still [s]; a healthy loop makes a
+record every second."""
 
 
 class Exporter:

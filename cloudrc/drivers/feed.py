@@ -28,9 +28,9 @@ READY = "ready"
 PERIOD_NS = 100_000_000
 """Time between two records of a type in `SAMPLED` [ns]."""
 EVENTS = (GuardChange, MissionEvent, Fault, LinkChanged)
-"""Record types that are all sent."""
+"""Record types of which every record is sent."""
 SAMPLED = (TelemetrySent, Control)
-"""Record types of which one is sent every `PERIOD_NS`."""
+"""Record types of which only one record is sent every `PERIOD_NS`."""
 
 
 class Feed:

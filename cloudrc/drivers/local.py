@@ -141,7 +141,7 @@ STOP_LIMIT = 1.5
 TELL_ALWAYS = ("world", "cloud")
 """Processes that send records to the supervisor continuously (`drivers/feed.py`)."""
 SILENCE_LIMIT = 5.0
-"""A process of `TELL_ALWAYS` that writes nothing for this long has hung [s]."""
+"""Time without output after which a process of `TELL_ALWAYS` counts as hung [s]."""
 LOOPBACK = "127.0.0.1"
 API_FILE = "api.json"
 """File in a run's folder with the address of its API during the flight, for other programs.
@@ -149,7 +149,8 @@ API_FILE = "api.json"
 cloudrc itself reads the address from the flight file, since a run's folder is not trusted.
 """
 AUDIT_FILE = "audit.jsonl"
-"""File in a run's folder that logs who sent which command over the API; it stays afterwards."""
+"""File in a run's folder that logs who sent which command over the API; it is kept after the
+flight."""
 UNANNOUNCED = (
     "'cloudrc mission' cannot find this run: no folder for its flight file (XDG_STATE_HOME); give "
     "it --api {}"

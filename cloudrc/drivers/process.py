@@ -48,7 +48,8 @@ PERIOD_NS = 100_000_000
 RELEASED_PERIOD_NS = 2_000_000_000
 """Time between two records of how late datagrams left [ns]."""
 BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
-"""Records that may begin a mission: a recording cut there must contain the link's state."""
+"""Types of records at which a mission may begin. A recording may be cut there, so that it must
+contain the link's state from there on."""
 NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 """Errors that an unreadable or malformed file can raise."""
 

@@ -75,11 +75,11 @@ BACKLOG_MAX = 2 * RECEIVE_BUFFER // 512
 """Limit of datagrams after a stall, above what can wait in the socket: Linux doubles the buffer,
 and a datagram takes at least 768 bytes of it."""
 STALL_NS = 50_000_000
-"""After a wake later than this the loop takes all waiting datagrams at once: they arrived before
-the wake [ns]."""
+"""Lateness of a wake above which the loop takes all waiting datagrams at once [ns]: they arrived
+before the wake."""
 STALL_AGAIN_NS = 1_000_000_000
-"""As `STALL_NS`, after a wake that followed a stall [ns]. It is longer, so that a flood, which
-takes long to receive, cannot look like a stall again and again."""
+"""Limit in place of `STALL_NS` for the wake after a stall [ns]. It is longer, so that a flood,
+which takes long to receive, cannot look like a stall again and again."""
 SINK_PERIOD_NS = 20_000_000
 """Longest time between two hand-overs of records [ns]."""
 WAIT_MAX_NS = 100_000_000

@@ -30,7 +30,7 @@ from cloudrc.records import (
 )
 
 STEP = 0.1
-"""Smallest difference between two checks that counts as a step [s]."""
+"""Smallest change between two checks that counts as a step of the wall clock [s]."""
 DRIFT_MAX = 1e-3
 """Largest relative drift of the two clocks [1]; kernels slew by at most half of it."""
 _SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # the former: Linux
@@ -76,8 +76,8 @@ def _now() -> tuple[float, float]:
 
 
 AFTERWARDS_NS = 90_000_000_000
-"""Time after the robot last followed the cloud in which all is still recorded [ns]; it covers the
-landing after a loss of the link."""
+"""Time for which all records are still kept after the robot last followed the cloud [ns]; it covers
+the landing after a loss of the link."""
 PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
 """Record types that are made all the time, with or without a flight."""
 BATCH = 16

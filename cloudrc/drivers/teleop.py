@@ -84,28 +84,31 @@ class UnixPeer:
 PERIOD_NS = 20_000_000
 """Time between two deadlines of teleop's machine [ns]."""
 TELL_NS = PERIOD_NS - 5_000_000
-"""Shortest time between two robot states sent to teleop [ns]; that is every second telemetry."""
+"""Shortest time between two robot states sent to teleop [ns]; so teleop gets every second
+telemetry."""
 ALIVE_NS = 200_000_000
-"""Time between two empty datagrams that tell teleop, without telemetry, that cloud runs [ns]."""
+"""Time between two empty datagrams to teleop while there is no telemetry [ns]; they tell teleop
+that cloud runs."""
 STALL_NS = 100_000_000
-"""After a wake later than this the socket holds only old datagrams: its queue was full from the
-start of the stall. New ones arrive within the next wakes [ns]."""
+"""Lateness of a wake above which the socket holds only old datagrams [ns]: its queue was full from
+the start of the stall. New datagrams arrive within the next wakes."""
 BLIND_WAKES = 5
 """Limit of wakes that wait for a new datagram after a stall; then teleop continues without one."""
 SILENCE_NS = 1_000_000_000
-"""Without a datagram from teleop, which sends at 10 Hz, for this long it counts as away [ns]."""
+"""Time without a datagram from teleop after which teleop counts as away [ns]; teleop sends at 10
+Hz."""
 EVENTS_KEPT = 256
 """Limit of the events that wait while cloud is away."""
 LAST_WORD_NS = 800_000_000
-"""Time that an ending cloud still forwards teleop's last hold request [ns]: longer than teleop
-repeats the request, shorter than the 1.5 s that a process has to end."""
+"""Time for which cloud, while it ends, still forwards teleop's last hold request [ns]. It is longer
+than teleop repeats the request, and shorter than the 1.5 s that a process has to end."""
 
 Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
-"""Raises a ValueError if the bytes are no message."""
+"""Function that decodes a message, and raises a ValueError if the bytes are no message."""
 Calls = Callable[[], Iterable[Callable[[int], None]]]
-"""Returns the calls that other threads have queued, each to be called with now [ns]; must not
-block."""
+"""Function that returns the calls that other threads have queued. Each call takes the current time
+[ns] and must not block."""
 
 
 class Machine(Protocol):

@@ -16,7 +16,7 @@ from cloudrc.records import Record
 from cloudrc.tunnel.codec import peek
 
 Sink = Callable[[list[Record], list[Record]], None]
-"""Takes the records of world and of cloud since the last call."""
+"""Function that takes the records of world and of cloud since its last call."""
 PERIOD_NS = 100_000_000
 """Virtual time between two calls of the sink and of `until` [ns]."""
 

@@ -103,7 +103,7 @@ class LinkVerdict:
 CLOCK_SET = "wall_clock"
 """Fault code of a step of the wall clock; `cloudrc.drivers.recording` detects steps."""
 SILENCE_NS = 2_000_000_000
-"""An end has no peer after this time without a new datagram [ns]."""
+"""Time without a new datagram after which an end has no peer [ns]."""
 
 
 class End:
@@ -216,7 +216,7 @@ class End:
 STEP_NS = 1_000_000_000
 """Time between two samples of the real-time factor [ns]."""
 STEPS = 10
-"""Steps over which the real-time factor is computed [1]: 10 s."""
+"""Number of steps over which the real-time factor is computed [1]; together they last 10 s."""
 ADMITTED = "cloud said hello"
 """Cause of a session that world opens for a newly connected cloud; see `SessionOpened`."""
 
@@ -327,7 +327,7 @@ class WorldEnd(End):
 GAP_MAX_NS = 50_000_000
 """Largest gap between two measurements over which positions are interpolated [ns]."""
 WAITING_MAX = 256
-"""Most predictions that wait for their measurement [1]; a horizon of 1 s needs 100."""
+"""Largest number of predictions that wait for their measurement [1]; a horizon of 1 s needs 100."""
 
 
 class PredictionJudge:

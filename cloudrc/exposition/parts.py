@@ -87,7 +87,7 @@ def select(names: Iterable[str], counts: Mapping[str, float]) -> dict[str, float
 
 
 WINDOW = 128
-"""A missing datagram counts as lost after this many newer ones [1]: 1.28 s at 100 Hz."""
+"""Number of newer datagrams after which a missing datagram counts as lost [1]: 1.28 s at 100 Hz."""
 _MASK = (1 << WINDOW) - 1
 _OLDEST = 1 << (WINDOW - 1)
 

@@ -62,10 +62,10 @@ MISSION_OUTCOMES = (
     "other",
 )
 API_REFUSALS = ("token", "role", "busy", "slow")
-"""Why the API rejects a request: no valid token; a reader's token for an operator's request; too
-many requests or connections; a client that sends too slowly."""
+"""Reasons for which the API rejects a request: no valid token; a reader's token for an operator's
+request; too many requests or connections; a client that sends too slowly."""
 ORDER_REFUSALS = ("invalid", "conflict")
-"""Why the API refuses an order: an invalid value; another mission is active."""
+"""Reasons for which the API refuses an order: an invalid value; another mission is active."""
 BODIES = ("pipe", "board", "floor", "other")
 """Kinds of bodies: `pipe_2` is a "pipe"; a body of any other kind counts as "other"."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
@@ -76,8 +76,8 @@ LINK_MODES = ("auto", "relay", "netem")
 DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
 """Upper bounds for delays and ages [s]."""
 GAP_BUCKETS = (0.05, 0.25)
-"""Upper bounds for gaps between arrivals [s]: more than jitter explains, and the age at which the
-guard holds. Only two, to stay below 200 series per pod."""
+"""Upper bounds for gaps between arrivals [s]: a gap longer than jitter explains, and the age at
+which the guard holds. There are only two, to stay below 200 series per pod."""
 PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
 """Upper bounds for loop periods [s], around the 10 ms of both loops."""
 LATENESS_BUCKETS = (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1)
@@ -148,7 +148,7 @@ CHECK = (
         direction=DIRECTIONS,
     ),
 )
-"""The check of the link in flight."""
+"""Metrics of the check of the link in flight."""
 
 
 LINKS = (
@@ -201,7 +201,7 @@ LINKS = (
         (LINK,),
     ),
 )
-"""The emulated link."""
+"""Metrics of the emulated link."""
 
 
 MISSIONS = (
@@ -242,7 +242,7 @@ MISSIONS = (
         (TELEOP,),
     ),
 )
-"""Missions, the API that accepts them, and the journal that stores them."""
+"""Metrics of missions, of the API that accepts them, and of the journal that stores them."""
 
 
 _ENTRIES = (

@@ -20,7 +20,7 @@ SETTLING_NS = 10_000_000_000
 docs/reference/control.md, "Steady state": the slowest variant that settles needs 8 to 15 s to
 stay within 1 cm."""
 FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "horizon_clamped")
-"""Counts of cloud that count as faults."""
+"""Names of cloud's counts that count as faults."""
 
 
 def _waypoints_reached(flight: Flight) -> float | None:

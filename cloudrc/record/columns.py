@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 FIRST_NS = -(2**63)
-"""Earlier than every log time [ns]."""
+"""Time earlier than every log time [ns]."""
 
 
 def logged(records: Iterable[Record], offset_ns: int = 0) -> Iterator[tuple[int, Row]]:

@@ -269,9 +269,10 @@ def _attach(writer: McapWriter, attachments: Mapping[str, bytes]) -> None:
 UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
 """Events of a mission that continues; every other event ends it."""
 BEFORE_NS = 1_000_000_000
-"""Time kept before a mission starts [ns]; it holds the session and the guard's first change."""
+"""Time before a mission's start that is kept [ns]; the session and the guard's first change are in
+it."""
 AFTER_NS = 2_000_000_000
-"""Time kept after a mission's end [ns]."""
+"""Time after a mission's end that is kept [ns]."""
 CUT_SHORT = "cut short"
 """Start of the reader's note about a file without an end."""
 

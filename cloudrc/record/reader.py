@@ -76,7 +76,8 @@ _MARK = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
 _MARK_MAX = 8
 _MARK_OFFSET = 37  # from a chunk's first byte to the name of its compression
 _BLOCK_MIN, _BLOCK_MAX = 1 << 12, 1 << 20
-"""Size of a searched block [bytes]; the first is small, since each chunk may be damaged."""
+"""Smallest and largest block of a search for chunks [bytes]. The first block is small, since each
+chunk may be damaged; each further one is twice as large."""
 
 
 class DamagedError(ValueError):

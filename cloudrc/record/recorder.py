@@ -21,7 +21,7 @@ TROUBLE = {
     errno.EROFS: "disk is read-only",
 }
 CAPACITY = 20_000
-"""Number of records that the queue holds, about 30 s of either end."""
+"""Number of records that the queue holds; world or cloud makes that many in about 30 s."""
 
 
 class Sink(Protocol):

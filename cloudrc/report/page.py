@@ -111,7 +111,7 @@ def _guard(known: Mapping[str, float]) -> str:
 
 
 _UNIT = re.compile(r"(\d) (s|m|mm|ms|N|m/s)\b")
-"""A number and its unit, between which a line must not break."""
+"""Pattern of a number and its unit, between which a line must not break."""
 ACCENTS = {
     "success": "#00694b",
     "failure": "#a33a00",

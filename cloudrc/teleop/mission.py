@@ -59,9 +59,9 @@ from cloudrc.teleop.wire import (
 )
 
 WORST_GUARD = GuardState.HOLD
-"""Highest state of the guard in which a mission goes on."""
+"""Last state of the guard, in the order of `GuardState`, in which a mission goes on."""
 ANY_WORLD = ""
-"""World of a mission that has not started: any."""
+"""Value for the world of a mission that has not started: it may start in any world."""
 HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
 """Lowest height of a hold setpoint [m]: below it the robot would scrape along the floor.
 Source: docs/safety.md, "The guard"."""
@@ -70,7 +70,7 @@ NO_WAYPOINT = -1
 UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
 """States of a mission that has begun and not ended."""
 ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
-"""State after a mission by the code of its outcome; all other codes are failures."""
+"""Code of an outcome -> state of the mission after it; all other codes are failures."""
 END_LOST = "end_lost", "the robot reports that the mission is over, but its outcome is lost;"
 INACTIVE = tuple(state for state in State if state not in UNDER_WAY)
 
@@ -260,9 +260,10 @@ class SetpointSelector:
 
 
 GAP_MAX_NS = 500_000_000
-"""Largest part of a gap between two telemetries that counts as flown [ns]."""
+"""Largest part of the time between two telemetries that counts as time of flight [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
-"""Longest gap between two telemetries over which the robot counts as near the waypoint [ns]."""
+"""Longest time between two telemetries for which the robot still counts as near the waypoint
+[ns]."""
 GROUND, HOLD = GuardState.GROUND, GuardState.HOLD  # looked up with every telemetry
 
 

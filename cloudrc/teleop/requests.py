@@ -10,18 +10,17 @@ REPEAT_NS = 100_000_000
 UNNUMBERED = 0
 """Number of a request that has not got one yet."""
 NOT_ENDED = (-1, 0)
-"""Epoch and number while no end of a mission has been acted on."""
+"""Epoch and number that mean: the robot has acted on no request that ends a mission."""
 IDLE_NS = 3_000_000_000
-"""Time for which a started robot may hold or stand although it is heard [ns].
+"""Time for which a started robot may hold or stand although its telemetry arrives [ns].
 
-After that another sender has told it something else, and teleop sends the start again.
+After that time another sender must have given the robot another request, and teleop sends the start
+again.
 """
 PREDECESSORS = 1_000
-"""Count of numbers reserved for an earlier teleop process.
-
-Its last requests may not show in telemetry yet, and must not be confused with ours. Because it
-chose its first number in the same way, the first number also rises with the machine's clock.
-"""
+"""Count of numbers reserved for an earlier teleop process. The last requests of that process may
+not show in telemetry yet, and must not be confused with ours. Every process chooses its first
+number in the same way; therefore the first number also rises with the machine's clock."""
 CLOCK_MAX = 65_536
 """Largest part of the first number that comes from the clock, so that the numbers of a session
 suffice for many processes."""

@@ -19,7 +19,7 @@ Source: docs/reference/control.md, "Real-time factor"."""
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 """Exit code of each outcome. Source: docs/reference/control.md, "Exit codes"."""
 AWAY = -1
-"""Value in place of a slip [ns] before this process has seen world."""
+"""Value that replaces a slip [ns] until this teleop process has received telemetry from world."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -94,7 +94,7 @@ class Plan:
 
 
 NO_PLAN = Plan((Leg(ZERO),))
-"""Placeholder before the first mission; never flown."""
+"""Placeholder for the plan before the first mission; it is never flown."""
 
 
 class RobotStatus(NamedTuple):

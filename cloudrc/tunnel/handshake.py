@@ -55,7 +55,7 @@ EPOCH_MAX = 2**32 - 1
 """Last epoch that the header can hold."""
 ANSWERS_MAX = 10
 """Largest number of answers per second to hellos with a cookie; challenges have the same limit.
-Source: WireGuard, 20 handshakes per second and address: both limits together."""
+Source: WireGuard, 20 handshakes per second and address; here both limits together give 20."""
 SECOND_NS = 1_000_000_000
 CHALLENGE_NS = SECOND_NS // 10
 """Least time between two challenges [ns]."""
@@ -276,9 +276,10 @@ NO_COOKIE = bytes(16)
 REPLIES_MAX = 3
 """Largest number of challenges that cloud answers between two periodic hellos."""
 COOKIES_MAX = 4096
-"""Number of cookies that cloud remembers, one per time slot: over two hours."""
+"""Number of cookies that cloud remembers, one per time slot; together they cover over two hours."""
 EPOCHS = 2**32
-"""Number of epochs; one that is less than half of them ahead is newer."""
+"""Number of different epochs. An epoch is newer than another one if it is ahead by less than half
+of this number."""
 LEFT_MAX = 64
 """Number of earlier world processes that cloud remembers."""
 

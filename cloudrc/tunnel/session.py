@@ -46,12 +46,13 @@ from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 GENERATIONS = 256
 """Number of generations that the header's byte can tell apart."""
 AHEAD_MAX = 127
-"""Largest step ahead of an active peer [generations]."""
+"""Largest number of generations by which an active peer may be ahead of this end [generations]."""
 FAR_MAX = 64 * GENERATIONS
-"""Additional step ahead of a silent peer [generations]: over a week, even at twice the usual rate
-of rekeys."""
+"""Number of generations by which a silent peer may be ahead in addition to `AHEAD_MAX`
+[generations]. It covers over a week, even at twice the usual rate of rekeys."""
 FAR_TRIES = 8
-"""Number of datagrams per second for which `FAR_MAX` is searched; each takes 0.5 ms."""
+"""Number of datagrams per second for which this end also searches the generations of `FAR_MAX`; one
+search takes 0.5 ms."""
 SILENCE_NS = 5_000_000_000
 """Time without a new datagram after which a peer is silent [ns]."""
 KEPT = 3
@@ -181,8 +182,8 @@ REKEY_DATAGRAMS = 2**32
 """Number of datagrams of all kinds after which a sender changes its key.
 Deviation: WireGuard allows 2^60."""
 LOOKS = 3
-"""Number of checks in a row that find the peer using the older key, before this end returns to
-it."""
+"""Number of checks in a row that must find the peer with the older key before this end returns to
+that key."""
 
 
 class Agreement(NamedTuple):

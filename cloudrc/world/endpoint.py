@@ -67,7 +67,8 @@ class MissionContacts:
 
 
 START_AGE_MAX_NS = 1_000_000_000
-"""Largest age of the basis of a start request [ns], unless a command may be older."""
+"""Largest age of the telemetry on which a start request is based [ns]. If the experiment allows a
+larger age for commands, that age is the limit."""
 
 
 class Orders:
@@ -161,7 +162,7 @@ class Orders:
 
 
 REPORT_AGAIN_NS = 10_000_000_000
-"""Time of keeping up with real time after which a new delay is reported again [ns]."""
+"""Time without a slowdown after which world reports the next slowdown as a new fault [ns]."""
 
 
 class PaceMonitor:

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 from cloudrc.messages import Quaternion, Vector
 
 RotorSpeeds: TypeAlias = tuple[float, float, float, float]
-"""Front, left, back, right [rad/s], >= 0."""
+"""Speeds of the front, left, back and right rotor [rad/s], >= 0."""
 Axes: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 _new = tuple.__new__
 

@@ -22,7 +22,7 @@ Source: docs/reference/plant.md, "Physics step"."""
 STEP = STEP_NS * 1e-9
 """Duration of a tick [s]."""
 CATCH_UP_NS = 50_000_000
-"""Longest simulated time that a wake catches up [ns]."""
+"""Longest simulated time that world catches up in one wake of its loop [ns]."""
 
 
 class SimulationClock:

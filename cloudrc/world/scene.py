@@ -16,7 +16,7 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 ROBOT_PREFIX = "robot/"
 """Prefix of all names that belong to the robot in a compiled model."""
 ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
-"""Names of a robot's actuators, in the order of every tuple of four."""
+"""Names of a robot's actuators. Every tuple of four rotor values has the same order."""
 TIMESTEP = 0.002
 """Step of the physics and of the onboard part [s].
 Source: docs/reference/plant.md, "Physics step"."""

@@ -30,7 +30,7 @@ CAPTION = (
     "are over the whole flight."
 )
 SPAN = 0.5
-"""Window of the moving RMS [s]."""
+"""Length of the window of the moving RMS [s]."""
 
 
 def caption(subject: Subject) -> str:

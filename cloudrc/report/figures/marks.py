@@ -79,7 +79,7 @@ def _trace_delays(path: Path) -> list[tuple[float, float]]:
 
 
 SAME_CHANGE = 0.05
-"""Two records less than this apart describe the same change [s]."""
+"""Time between two records below which both describe the same change [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ LABEL_WIDTH = 0.05
 ROW_HEIGHT = 8
 """Distance of two rows of numbers [points]."""
 ROWS = 8
-"""Rows of numbers for which a panel has room [1]."""
+"""Number of rows of numbers for which a panel has room [1]."""
 LEGEND = (
     " Behind the curves: red, the guard was in HOLD; hatched, a blackout of the link; dotted, a "
     "change of the link by its profile."

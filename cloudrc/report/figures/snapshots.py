@@ -159,9 +159,10 @@ CAPTION = (
     "floor tiles are 0.5 m wide. The line is the path flown."
 )
 COUNT = 6
-"""Number of panels [1]."""
+"""Number of panels in the figure [1]."""
 MOVING = 0.05
-"""Smallest distance in a second [m] that defines a direction of flight; below it is a hover."""
+"""Smallest distance in a second [m] that defines a direction of flight; a robot that moves less
+hovers."""
 REACH = 1.0
 """Distance that a panel shows on either side of the robot [m]."""
 ELEVATION, AZIMUTH = np.radians(28.0), np.radians(118.0)

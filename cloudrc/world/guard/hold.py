@@ -18,7 +18,7 @@ BRAKE_MAX, BRAKE_MIN = 5.5, 1.0
 BRAKE_TIME_CONSTANT = 0.25
 """Time constant of the exponential end of braking [s]."""
 BRAKE_LEAD, BRAKE_SHARE_MIN = 1.0, 0.2
-"""Braking starts with a reference below the robot's speed by BRAKE_LEAD [m/s], but not below
+"""When braking starts, the reference is BRAKE_LEAD [m/s] below the robot's speed, but at least
 BRAKE_SHARE_MIN of that speed [1]."""
 STILL_SPEED = 0.1
 """Speed below which the robot is at rest [m/s]."""
@@ -30,14 +30,14 @@ speed cap, where every descent is slower than STILL_SPEED and would count as tou
 TOUCH_DOWN_NS = 400_000_000
 """Time without motion after which a descent has touched down [ns]."""
 STILL_TICKS = 200
-"""Number of ticks at rest after which the robot lies still, 0.4 s. At the top of a throw it rests
-for less than that."""
+"""Number of ticks at rest after which the robot lies still (0.4 s). A robot that was thrown up
+rests at its highest point, too, but for less time."""
 POSITION_GAIN = 0.8
-"""Position hold: velocity per distance [1/s]."""
+"""Gain of the position hold: velocity towards the hold point per distance from it [1/s]."""
 DAMPING_GAIN = 1.6
-"""Position hold: velocity subtracted per velocity of the robot [1]."""
+"""Damping of the position hold: share of the robot's velocity that is subtracted [1]."""
 HOLD_SPEED_MAX = 0.5
-"""Position hold: largest speed [m/s]."""
+"""Largest speed that the position hold asks for [m/s]."""
 INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1
 """Position hold: integral gain [1/s^2], largest integral term per axis [m/s], and largest distance
 from the hold point at which it integrates [m]. The arm makes the robot lopsided, and the low-level
@@ -46,8 +46,9 @@ TAKE_OFF_MARGIN = 0.5
 """Distance from the walls that a stopped robot needs to take off [m]. A tilted robot scrapes along
 the floor before it rises, by 0.35 m at most: `pytest -m "" -k scrapes tests/world`."""
 LIFT_OFF_HEIGHT, GROUND_SPEED_MAX = 0.02, 0.2
-"""Change of height after which the robot has left the ground [m]. Below it, and below
-GROUND_SPEED_MAX [m/s], its rotors may stop: it drops from no higher and hits nothing at speed."""
+"""Change of height after which the robot has left the ground [m]. The rotors may stop while the
+change is smaller and the robot is slower than GROUND_SPEED_MAX [m/s]: it then falls from a small
+height and hits nothing at speed."""
 
 
 class PositionHold:

@@ -33,8 +33,9 @@ moves the robot 0.3 m beyond the fence, because the low-level controller follows
 FAR = 1e6
 """Distance beyond which a face of the fence limits nothing [m]."""
 RECHECK_DISTANCE, RECHECK_NS = 0.25, 10_000_000
-"""The robot moves by less than RECHECK_DISTANCE [m] within RECHECK_NS [ns], since it is never
-faster than 25 m/s. So far from the fence the guard checks only once per RECHECK_NS."""
+"""Where the fence limits nothing within RECHECK_DISTANCE [m] of the robot, the guard checks the
+fence only once per RECHECK_NS [ns]. In that time the robot moves by less than this distance, since
+it is never faster than 25 m/s."""
 RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
 """Return to the fence from beyond its margin: velocity per distance [1/s], largest speed [m/s]."""
 DEFLECTION = 0.44

@@ -50,8 +50,9 @@ SPIN_MAX = 3.0
 TUMBLE_MAX = 7.0
 """Largest rate of roll and pitch without a hit [rad/s]; the worst commands reach 5.4."""
 JOLT_MAX, JOLT_RATE_MAX = 0.8, 40.0e-9
-"""Largest change per axis of the velocity without a hit: JOLT_MAX at once [m/s], plus JOLT_RATE_MAX
-for the rotors [m/s per ns]. A fast touch of the board changes it by 0.5 m/s."""
+"""Largest change of the velocity per axis without a hit: JOLT_MAX [m/s], plus JOLT_RATE_MAX [m/s
+per ns] times the time since the last measurement, for the rotors. A fast touch of the board changes
+the velocity by 0.5 m/s."""
 
 
 class HitDetector:
