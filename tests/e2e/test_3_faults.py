@@ -98,6 +98,7 @@ def lingering() -> Iterator[None]:
     wait_ready(place(), timeout=90.0)
 
 
+@pytest.mark.full
 def test_an_old_cloud_beside_the_new_one_does_no_harm(installed: None, lingering: None) -> None:
     fly_until("haunted", "waypoint 1 of 7 reached")
     old = delete("cloud")

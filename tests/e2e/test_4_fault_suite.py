@@ -34,6 +34,7 @@ def survived(note: Callable[[str], None], *words: str, timeout: float) -> set[st
     return {result["name"] for result in results}
 
 
+@pytest.mark.full
 def test_a_partition_is_survived(installed: None, note: Callable[[str], None]) -> None:
     assert survived(note, "partition", timeout=300.0) == {"partition"}
 

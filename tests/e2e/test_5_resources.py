@@ -89,6 +89,7 @@ def test_a_constrained_part_is_throttled_yet_keeps_real_time(
     assert numbers["real_time_factor"] >= 0.95
 
 
+@pytest.mark.full
 def test_a_world_that_cannot_keep_up_says_invalid(
     with_values: Callable[..., None], tmp_path: Path
 ) -> None:
