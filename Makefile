@@ -73,8 +73,8 @@ faults: $(VENV)/dev ## inject every fault, then fly 2 x SEEDS (200) random sched
 	$(FUZZ) --seeds $(SEEDS)
 	$(FUZZ) --adversarial --seeds $(SEEDS)
 
-coverage: $(VENV)/dev ## make test, and fail unless every branch of guard, tunnel and journal is tested
-	$(bin)/pytest -n auto --hypothesis-seed=0 --cov --cov-report=term
+coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and journal is tested
+	$(bin)/pytest -n auto --hypothesis-seed=0 --cov --cov-report=term $(CORE)
 
 # mutmut writes into its working folder. `mutmut show NAME` in build/mutants shows a mutant.
 mutants: $(VENV)/dev ## mutate guard, tunnel and journal, list the mutants that tests find
