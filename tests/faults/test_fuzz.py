@@ -54,6 +54,13 @@ def test_a_hostile_cloud_causes_no_breach(policy: str) -> None:
     assert fly(replace(choose(seeds[0]), duration=12.0)).breaches == ()
 
 
+@pytest.mark.full
+@pytest.mark.parametrize("first", range(1, 201, 25))
+def test_two_hundred_hostile_clouds_cause_no_breach(first: int) -> None:
+    findings = [fly(choose(seed)) for seed in range(first, first + 25)]
+    assert [each.schedule.seed for each in findings if each.breaches or each.thrown] == []
+
+
 def test_an_adversary_flies_alone_or_amid_every_kind_of_fault() -> None:
     chosen = [choose(seed) for seed in range(400)]
     alone = [schedule for schedule in chosen if not schedule.events]
