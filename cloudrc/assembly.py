@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity, Operator
+from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
 from cloudrc.cloud.loop import ControlLoop
+from cloudrc.cloud.operator import Operator
 from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import build_plugin

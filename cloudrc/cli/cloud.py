@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.runtime import end_arguments, fast_suite, open_end
 
 if TYPE_CHECKING:
-    from cloudrc.cloud.endpoint import Operator
+    from cloudrc.cloud.operator import Operator
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -235,9 +235,10 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
 
 
 def _halves(recording: Recording, path: Path) -> Packets:
-    """Take half of each round trip, at the time its command was sent; losses are unknown.
+    """Estimate each packet's delay as half of a round trip, at the time the command was sent.
 
-    Telemetry repeats the echo of a command until the next one: count each once.
+    Lost packets do not show. Telemetry repeats the same echo until the next command arrives;
+    such repeats count once.
     """
     from math import isnan
 

@@ -253,7 +253,7 @@ def on_patience(way: str, name: str, needs: float) -> Iterator[str]:
 
 
 def on_deviation(way: str, asked: float) -> Iterator[str]:
-    """Note that the requested jitter is too small to be judged within 10 %, as usual.
+    """Note that the requested jitter is too small for the usual margin of 10 %.
 
     Args:
         way: The direction.

@@ -211,7 +211,7 @@ def follow_folder(
 
 
 class RelayControl:
-    """Apply the changes that a folder requests to both directions of a relay."""
+    """Apply the changes of the profile file in a folder to both directions of a relay."""
 
     def __init__(
         self,

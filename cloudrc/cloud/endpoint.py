@@ -13,8 +13,12 @@ from dataclasses import dataclass
 from math import nan
 
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.cloud.operator import EmergencyStopRepeater, is_for_session, make_robot_status
-from cloudrc.cloud.operator import Operator as Operator
+from cloudrc.cloud.operator import (
+    EmergencyStopRepeater,
+    Operator,
+    is_for_session,
+    make_robot_status,
+)
 from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
 from cloudrc.tunnel import codec

@@ -106,7 +106,7 @@ class EmergencyStopRepeater:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
     def restart_numbers(self) -> None:
-        """Restart the numbers for a new session."""
+        """Forget the number of the stop and the number that world acted on."""
         self._number = self._acted_on = self._due_ns = 0
 
     def see(self, guard: GuardState, acted_on: int) -> None:

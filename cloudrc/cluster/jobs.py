@@ -50,7 +50,7 @@ UID_LABEL = "batch.kubernetes.io/controller-uid"
 START_ALLOWANCE = 120
 """Time to start the pod and to see the robot, added to the mission's time limit [s]."""
 QUEUE_ALLOWANCE = 3600
-"""Time for earlier missions to end, added for a queued mission [s]."""
+"""Time for earlier missions to end, added to the deadline of a Job that may queue [s]."""
 DEADLINE_MAX = 2**31 - 1
 """Largest deadline that Kubernetes accepts [s]."""
 KEEP_FINISHED = 3600
@@ -253,7 +253,7 @@ def run_job(
     limit: float = 60.0,
     queue: bool = False,
 ) -> JobStatus:
-    """Create the Job of a mission; it needs nobody to follow it.
+    """Create the Job of a mission; the Job runs to its end even if no client watches it.
 
     Args:
         release: Release that flies it.

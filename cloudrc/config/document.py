@@ -248,7 +248,8 @@ def read_document(path: Path, name: str) -> Document:
         name: Its name in messages.
 
     Raises:
-        BadInputError: If the file cannot be read, is not such YAML, or is too large.
+        BadInputError: If the file cannot be read, is too large, is not YAML, or has no mapping at
+            its top level.
     """
     try:
         text = files.read(path, SIZE_MAX).decode("utf-8")

@@ -60,7 +60,7 @@ def check_name(kind: str, name: str) -> None:
 
 
 def _shipped_names(kind: str, name: str) -> str:
-    """List the shipped files in words, and the one whose name is nearest to `name`."""
+    """Return a text that lists the shipped files and suggests the name most similar to `name`."""
     available = names(kind)
     return f"names of shipped {kind}s: {', '.join(available)}{suggest_name(name, available)}"
 

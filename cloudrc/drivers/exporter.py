@@ -270,7 +270,7 @@ class Exporter:
         self._live.link.asked(direction, delay)
 
     def unresolved(self, count: int) -> None:
-        """Set how often the peer's name could not be resolved so far; from any thread."""
+        """Set how many times the peer's name could not be resolved. Any thread may call it."""
         self._live.see([Counted(0, "link", "unresolved", count)])
 
     def recording(self, sync_age: Callable[[], float | None]) -> None:

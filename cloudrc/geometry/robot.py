@@ -15,11 +15,12 @@ Array = NDArray[np.float64]
 BASE_HALF = (0.05, 0.05, 0.10)
 """Half sizes of the base's box [m], body frame."""
 ARM_LENGTH, ARM_HEIGHT, ARM_RADIUS = 0.40, 0.17, 0.01
-"""The arm along +x of the body: length from the z axis to the tip, height, radius [m]."""
+"""The arm along +x: length from the z axis to the tip, height (z), radius [m], body frame."""
 ROTOR_ARM, ROTOR_HEIGHT, ROTOR_RADIUS, ROTOR_HALF_THICKNESS = 0.21, 0.05, 0.128, 0.0025
-"""The rotors: distance of a centre from the body's z axis, height, radius, half thickness [m]."""
+"""The rotors: distance of a centre from the z axis, height (z), radius, half thickness [m], body
+frame."""
 ROD_RADIUS, ROD_BOTTOM, ROD_TOP = 0.05, 0.06, 0.18
-"""The top rod: radius, heights of both ends [m]."""
+"""The top rod: radius, heights (z) of its lower and upper end [m], body frame."""
 
 
 @dataclass(frozen=True, slots=True)

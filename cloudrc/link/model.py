@@ -83,7 +83,8 @@ class LinkDirection:
 
         Args:
             profile: New conditions.
-            restart: Whether their time line begins at the next packet; otherwise at the origin.
+            restart: Whether their time line begins at the next packet; otherwise it keeps the start
+                of the present time line.
         """
         if restart:
             self._origin_ns = None

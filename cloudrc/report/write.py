@@ -177,11 +177,13 @@ def _read_recording(folder: Path) -> Recording:
 
 
 def _read_run(folder: Path, recording: Recording) -> Run:
-    """Read facts that are not in the recording from an earlier report.json, else guess them."""
+    """Read mode, shaper, checksum, interruption and notes from an earlier report.json.
+
+    Without one, guess mode and shaper: a run that recorded lateness was in real time.
+    """
     try:
         earlier = _EarlierReport.model_validate_json(read(folder / "report.json", REPORT_BYTES_MAX))
     except (OSError, ValueError):
-        # Only real-time runs record lateness.
         real_time = len(recording["/lateness"]) > 0
         return Run("local", "relay") if real_time else Run("virtual", "virtual")
     # Metrics are measured again and write their notes anew.

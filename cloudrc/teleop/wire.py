@@ -104,15 +104,17 @@ class RobotStatus(NamedTuple):
         epoch: Epoch of the session.
         position: Measured position of the base [m], world frame, shape (3,).
         guard: State of the guard.
-        mission: Number of the last operator request that world has acted on; 0 if none.
+        mission: Number of the last operator request that world has acted on; 0 if none. The
+            mission's own number is `mission_id`.
         world: Text that identifies world's process; it changes when world restarts. A restart of
             cloud changes only the epoch.
         pipe_contacts: Number of contacts with pipes so far.
         touch_speed: Speed of the arm's tip when it touched the board [m/s]; NaN before that.
         slip_ns: Lag of world's clock behind its machine's clock [ns].
         horizon: Prediction horizon of cloud [s]; NaN before its first command.
-        rtt: Last round trip without the hold [s]; NaN before the first.
-        loop_delay: Last `now - echo_stamp`, with the hold [s]; NaN before the first.
+        rtt: Last round trip, without the time that world held the command's stamp before it sent
+            the echo [s]; NaN before the first.
+        loop_delay: Last `now - echo_stamp`, with that time [s]; NaN before the first.
         mission_id: Number of the mission that world was last told to start; 0 if none.
         reached: Number of its waypoints stored as reached by world, or `MISSION_OVER`.
         cause: Cause of the guard's state.

@@ -64,9 +64,10 @@ COOKIE_NS = 2_000_000_000
 GRACE_NS = 1_000_000_000
 """Time for which a cloud keeps a new session before it is heard for the first time [ns]."""
 REPEATS_MAX = 3
-"""Number of repeated acceptances after which the same cloud gets a new epoch under its own key.
+"""Number of times that world repeats its acceptance to the same cloud.
 
-It needs one if it is not heard, or if it no longer has the key with which the epoch began.
+After that a new epoch begins under the key of the cloud's greeting, unless that is the key of the
+present epoch and the cloud is still heard.
 """
 USED_MAX = 64
 """Number of old nonces remembered; none is forgotten while its cookie is valid."""
@@ -126,7 +127,8 @@ class ServerHandshake:
         Args:
             session: World's session; this class begins its epochs.
             identity: World's identity.
-            age_max_ns: Longest silence of the cloud with the session before it loses it [ns].
+            age_max_ns: Longest silence of the cloud that has the session; after it, another cloud
+                may take the session [ns].
         """
         self._session = session
         self._nonce, self._clock, self._suite = identity.nonce, identity.clock_id, identity.suite

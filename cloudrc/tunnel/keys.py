@@ -169,7 +169,8 @@ class KeyRing:
     def replace(self, keys: KeySet, now_ns: int) -> None:
         """Replace the keys; the key used until now stays valid for the overlap.
 
-        If the previous key stays the same, its validity can become shorter but never longer.
+        If `keys` names the same previous key as before, the end of that key's validity can move
+        earlier, never later.
         """
         previous, until_ns = keys.previous, now_ns + round(keys.overlap * 1e9)
         if previous is None and keys.current != self.current:

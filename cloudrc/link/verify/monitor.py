@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cloudrc.errors import describe_error
-from cloudrc.exposition.parts import DatagramTally as StreamTally
+from cloudrc.exposition.parts import DatagramTally
 from cloudrc.files import TooLongError, read
 from cloudrc.link.profile import DirectionProfile, settled
 from cloudrc.link.state import STATE_MAX, from_text
@@ -261,7 +261,7 @@ class Tally:
         self.epoch = -1
         self.place: Callable[[float], float] = _nowhere
         self._channel = Channel(newest_wins=True)
-        self._stream = StreamTally()
+        self._stream = DatagramTally()
         self._told = (0, 0)
         self._delays: list[tuple[int, float]] = [(-1, 0.0)] * _RING
 

@@ -123,6 +123,6 @@ class Subject:
 
     @cached_property
     def link_start(self) -> float:
-        """Start of the link, at the first datagram, since the start of the mission [s]."""
+        """Time of the first datagram on the link, counted from the start of the mission [s]."""
         stamps = self.flight.recording["/telemetry"]["stamp_ns"]
         return float(self.flight.seconds(stamps[0])) if len(stamps) else 0.0
