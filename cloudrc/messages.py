@@ -58,8 +58,6 @@ class Cause(IntEnum):
     IMPOSSIBLE = 7, "impossible commands"
     STOPPED = 8, "emergency stop"
     OVERTURNED = 9, "turned over"
-    SPUN = 10, "spun round by a hit"
-    JOLTED = 11, "jolted by a hit"
     ACKNOWLEDGED = 12, "acknowledged"
     STILL_FIRST = 13, "acknowledged, takes off once it has been still, 0.5 m inside the fence"
     NOT_DOWN = 14, "acknowledged before touch-down"

@@ -38,26 +38,6 @@ fence only once per RECHECK_NS [ns]. In that time the robot moves by less than t
 it is never faster than 25 m/s."""
 RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
 """Return to the fence from beyond its margin: velocity per distance [1/s], largest speed [m/s]."""
-DEFLECTION = 0.44
-"""Share of the speed [1] that an obstacle may turn towards a wall. Example: a robot that hits the
-edge of the board at 2.7 m/s leaves it sideways at 1.2 m/s."""
-ROLL_OFF_HEIGHT, ROLL_OFF_GAIN = 0.55, 0.6
-"""Above ROLL_OFF_HEIGHT [m] over the floor's margin the robot may roll off the top of a pipe, and
-its fall becomes speed towards a wall, too. For that, DEFLECTION grows by ROLL_OFF_GAIN per height
-[1/m], over at most 1 m."""
-SLIDE_TIME, TUMBLE_DISTANCE = 0.4, 0.3
-"""After a hit the rotors stop and the robot falls. It then slides along the floor for SLIDE_TIME
-[s] and tumbles on by TUMBLE_DISTANCE [m]. Few falls end farther away:
-`pytest -m "" -k after_a_fall tests/world`."""
-BOUNCE_TIME = 0.2
-"""Extra slide after a fall straight ahead [s]: the robot reaches the floor spinning and may leave
-it faster than it came, for example at 2.6 m/s after 1.9 m/s."""
-FOLLOW_DELAY = 0.3
-"""Delay with which the robot follows a braking reference [s]."""
-CREEP_SPEED = 0.5
-"""Speed up to which a hit is harmless, so that the robot may fly anywhere [m/s]."""
-HEIGHT_MAX, GRAVITY = 5.0, 9.81
-"""Greatest height of a fall that counts [m]; gravity [m/s^2]."""
 LOW_HEIGHT, LOW_SPEED = 0.25, 1.0
 """Below LOW_HEIGHT [m] the robot flies sideways at most at LOW_SPEED [m/s]."""
 SINK_LEAD_MAX = 0.5
@@ -116,14 +96,6 @@ def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vec
         high: Upper corner, margins taken off [m], shape (3,).
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
-    speed = sqrt(vx * vx + vy * vy + vz * vz)
-    if speed > CREEP_SPEED:
-        aside, straight = throw_distance(speed, z + RECHECK_DISTANCE - az)
-        spare = FENCE_MARGIN - TUMBLE_DISTANCE - RECHECK_DISTANCE
-        dx = max(aside, abs(vx) * straight) - spare
-        dy = max(aside, abs(vy) * straight) - spare
-        if not (ax + dx <= x <= bx - dx and ay + dy <= y <= by - dy):
-            return False
     if vx > 0.0:
         bx -= vx * (FENCE_REACTION + vx * STOP_COEFFICIENT)
     else:
@@ -147,8 +119,7 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
     """Slow a reference, axis by axis, so that the robot can stop before the faces of the fence.
 
     Near the floor the reference is also slowed sideways, because a rotor that touches the floor at
-    speed turns the robot over. Near the walls it is slowed in every direction: after a hit nothing
-    steers the robot any more, and it must still come to lie inside the fence.
+    speed turns the robot over.
 
     Args:
         velocity: Finite reference [m/s], world frame, shape (3,).
@@ -159,63 +130,12 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if not z >= az - FLOOR_MARGIN + LOW_HEIGHT:
         vx, vy, _ = limit_length((vx, vy, 0.0), LOW_SPEED)
-    inside = (
+    return (
         clamp(vx, -approach_speed(x - ax), approach_speed(bx - x)),
         clamp(vy, -approach_speed(y - ay), approach_speed(by - y)),
         # A robot that stands on the floor is not told to climb.
         clamp(vz, min(0.0, -approach_speed(z - az, REACTION)), approach_speed(bz - z)),
     )
-    return limit_length(inside, max(hit_speed_max(inside, position, low, high), CREEP_SPEED))
-
-
-def hit_speed_max(velocity: Vector, position: Vector, low: Vector, high: Vector) -> float:
-    """Return the largest speed in this direction from which a robot that is hit stays inside [m/s].
-
-    Args:
-        velocity: Finite reference [m/s], world frame, shape (3,).
-        position: Position of the base [m], world frame, shape (3,).
-        low: Lower corner of the fence, margins taken off [m], shape (3,).
-        high: Upper corner, margins taken off [m], shape (3,).
-    """
-    (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, _) = velocity, position, low, high
-    speed = sqrt(vx * vx + vy * vy + vz * vz)
-    if speed <= CREEP_SPEED:
-        return CREEP_SPEED
-    aside, straight = throw_distance(speed, z - az)
-    spare = FENCE_MARGIN - TUMBLE_DISTANCE
-    share = min(
-        (x - ax + spare) / max(aside, -vx * straight),
-        (bx - x + spare) / max(aside, vx * straight),
-        (y - ay + spare) / max(aside, -vy * straight),
-        (by - y + spare) / max(aside, vy * straight),
-    )
-    return speed * share
-
-
-def throw_distance(speed: float, height: float) -> tuple[float, float]:
-    """Return how far a robot moves after a hit, without TUMBLE_DISTANCE.
-
-    Args:
-        speed: Speed at the hit [m/s].
-        height: Height above the floor's margin [m].
-
-    Returns:
-        The distance to any side [m], and the time for which it moves straight ahead [s].
-    """
-    fall = fall_time(height) + SLIDE_TIME
-    share = DEFLECTION + ROLL_OFF_GAIN * clamp(height - ROLL_OFF_HEIGHT, 0.0, 1.0)
-    return share * speed * fall, fall + BOUNCE_TIME + FOLLOW_DELAY
-
-
-def fall_time(height: float) -> float:
-    """Return the time of a fall [s] from a `height` above the floor's margin [m].
-
-    In LAND the fence has no floor, the height is infinite, and HEIGHT_MAX counts.
-    """
-    height += FLOOR_MARGIN
-    if not height < HEIGHT_MAX:
-        height = HEIGHT_MAX
-    return sqrt(2.0 / GRAVITY * max(height, 0.0))
 
 
 def limit_length(a: Vector, length_max: float) -> Vector:

@@ -16,9 +16,8 @@ It uses only its own clock and the onboard sensors, and it assumes that the clou
 A command is fresh while its *basis*, the odometry that it was computed from, is at most
 `command_age_max` old.
 
-- ESTOP: entered from every state by the operator's request or after a hit. With its rotors on, a
-  robot that was hit would fly off in any direction; without them it falls within a known distance.
-  An acknowledgement leads to GROUND.
+- ESTOP: entered from every state by the operator's request, or when the robot has turned over: its
+  rotors would push it in any direction. An acknowledgement leads to GROUND.
 - LAND: an acknowledgement in the air leads to HOLD; low above the ground or on an obstacle it leads
   to GROUND at touch-down. LAND and ESTOP end the mission: only a start arms again.
 - HOLD before the robot has left the ground becomes GROUND. The rotors stop and the mission
@@ -26,8 +25,7 @@ A command is fresh while its *basis*, the odometry that it was computed from, is
 - HOLD after the end of a mission has no time limit: the robot waits for the next mission. HOLD
   within a mission has one, because the operator may be gone.
 
-A robot that touches nothing is never taken for one that was hit: the limits of the hit detector are
-beyond the effect of any command.
+A robot that touches nothing never turns over: no command tilts it as far as OVERTURNED_COSINE.
 """
 
 from __future__ import annotations
@@ -43,50 +41,8 @@ from cloudrc.world.guard.limits import COMMAND_MAX, Limits
 from cloudrc.world.readings import Readings
 
 OVERTURNED_COSINE = 0.2
-"""Cosine of the tilt below which the robot has turned over [1]. Without a hit, the worst commands
-reach 0.4."""
-SPIN_MAX = 3.0
-"""Largest yaw rate without a hit [rad/s]; no command asks for more."""
-TUMBLE_MAX = 7.0
-"""Largest rate of roll and pitch without a hit [rad/s]; the worst commands reach 5.4."""
-JOLT_MAX, JOLT_RATE_MAX = 0.8, 40.0e-9
-"""Largest change of the velocity per axis without a hit: JOLT_MAX [m/s], plus JOLT_RATE_MAX [m/s
-per ns] times the time since the last measurement, for the rotors. A fast touch of the board changes
-the velocity by 0.5 m/s."""
-
-
-class HitDetector:
-    """Detects hits from changes of the readings."""
-
-    def __init__(self) -> None:
-        """Start without a previous reading."""
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget the last reading: a new flight begins."""
-        self._velocity, self._seen_ns = ZERO, NEVER_NS
-
-    def felt(self, now_ns: int, readings: Readings) -> Cause | None:
-        """Return the kind of hit since the last call; None if there was none.
-
-        Args:
-            now_ns: World's clock [ns].
-            readings: Readings of the onboard sensors.
-        """
-        _, _, (vx, vy, vz), (p, q, r), axes = readings
-        (ux, uy, uz), seen_ns = self._velocity, self._seen_ns
-        self._velocity, self._seen_ns = readings.velocity, now_ns
-        if axes[8] < OVERTURNED_COSINE:
-            return Cause.OVERTURNED
-        if abs(r) > SPIN_MAX or p * p + q * q > TUMBLE_MAX * TUMBLE_MAX:
-            return Cause.SPUN
-        most = JOLT_MAX + JOLT_RATE_MAX * (now_ns - seen_ns)
-        if seen_ns != NEVER_NS and (
-            abs(vx - ux) > most or abs(vy - uy) > most or abs(vz - uz) > most
-        ):
-            return Cause.JOLTED
-        return None
-
+"""Cosine of the tilt below which the robot has turned over [1], and its rotors stop. Without a hit,
+the worst commands reach 0.4."""
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # looking up a member of an enum is slow
 
@@ -126,7 +82,7 @@ class Guard:
         self._floor, half = self._low[2], 0.5 * limits.speed_max
         self._position_hold = PositionHold(self._low, self._high, half)
         self._descent = Descent(self._floor, half)
-        self._hits, self._take_off = HitDetector(), TakeOff(limits.fence_low, limits.fence_high)
+        self._take_off = TakeOff(limits.fence_low, limits.fence_high)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
         self.state, self.cause = GROUND, Cause.SPAWN
@@ -279,8 +235,8 @@ class Guard:
         # The usual case: the same command as in the last tick, far from the fence.
         if now_ns <= self._steady_until_ns and self.reference is self._wanted:
             return self.reference
-        if self._flies and (hit := self._hits.felt(now_ns, readings)):
-            self._enter(ESTOP, now_ns, hit)
+        if self._flies and readings.axes[8] < OVERTURNED_COSINE:
+            self._enter(ESTOP, now_ns, Cause.OVERTURNED)
         elif not self._take_off.over:
             self._take_off.look(readings, self._flies)
         if now_ns <= self._track_until_ns:
@@ -354,6 +310,5 @@ class Guard:
             self._descent.begin(now_ns)
             if state is not LAND:
                 self.reference = ZERO
-                self._hits.forget()
                 self._take_off.forget(stopped=state is ESTOP)
         self.changes.append(GuardChange(now_ns, state, text or cause.words))

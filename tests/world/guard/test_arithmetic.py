@@ -239,3 +239,20 @@ def test_the_cap_holds_to_the_last_bit():
         v = nextafter(6.0, 0.0) / sqrt(1 + k * k * 1e-6)
         w = rules.limit_length((v, v * k * 1e-3, 0.0), 6.0 * rules.ROUNDING_FACTOR)
         assert hypot(*w) <= 6.0
+
+
+def test_the_papers_flight_is_not_slowed_by_its_walls():
+    """The paper's flight asks for 4.83 m/s at 2.07 m from the wall, and presses on the board."""
+    for velocity, position in (
+        ((-0.05, -4.83, -0.06), (-0.93, 3.4, 0.74)),
+        ((0.59, 0.0, 0.0), (7.5, -6.42, 0.7)),
+        ((0.08, 0.0, 0.0), (8.135, -6.42, 0.7)),
+        ((2.0, -2.0, 0.0), (0.9, -4.6, 0.7)),
+    ):
+        assert rules.limit_to_fence(velocity, position, LOW, HIGH) == velocity
+
+
+@pytest.mark.parametrize(("y", "velocity"), [(-5.0, (0.0, 6.0, 0.0)), (3.0, (0.0, -6.0, 0.0))])
+def test_a_wall_does_not_slow_a_robot_that_flies_past_it(y, velocity):
+    place = (LIMITS.fence_low[0] + 0.5, y, 2.2)
+    assert rules.limit_to_fence(velocity, place, LOW, HIGH) == velocity

@@ -5,16 +5,8 @@ from random import Random
 
 import pytest
 
-from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.hold import TAKE_OFF_MARGIN
-from cloudrc.world.guard.limits import (
-    BOUNCE_TIME,
-    CREEP_SPEED,
-    SLIDE_TIME,
-    TUMBLE_DISTANCE,
-    fall_time,
-)
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.simulator import Simulator
 from tests.world.guard.conftest import LIMITS, UP, Flight, hostile
@@ -45,52 +37,6 @@ def test_a_stopped_robot_lies_within_the_documented_distance(simulator, seed, fi
 @pytest.mark.parametrize("seed", range(5, 400))
 def test_a_stopped_robot_lies_as_documented_in_400_falls(simulator, seed, figure):
     check_stopped(simulator, seed, figure)
-
-
-# The distance that `hit_speed_max` assumes for a hit.
-
-
-def beyond(simulator, seed):
-    """Return by how much a stopped robot exceeds the assumed distance, towards each side [m].
-
-    Only sides count that it flies towards faster than CREEP_SPEED.
-    """
-    flight = Flight(simulator)
-    flight.fly(1.0, UP)
-    flight.fly(Random(seed).uniform(0.3, 5.0), hostile(seed))
-    (x, y, z), (vx, vy, _) = flight.readings.position, flight.readings.velocity
-    flight.guard.stop(flight.now_ns)
-    falls = fall_time(z - FLOOR_MARGIN) + SLIDE_TIME + BOUNCE_TIME
-    speeds = (vx, -vx, vy, -vy)
-    ways = [0.0] * 4
-    for _ in range(30):
-        flight.fly(0.1)
-        xn, yn, _ = flight.readings.position
-        ways = list(map(max, ways, (xn - x, x - xn, yn - y, y - yn)))
-    return [
-        way - speed * falls - TUMBLE_DISTANCE
-        for way, speed in zip(ways, speeds, strict=True)
-        if speed > CREEP_SPEED
-    ]
-
-
-def check_falls(simulator, seeds, figure, share_max, farthest_max):
-    excess = [side for seed in seeds for side in beyond(simulator, seed)]
-    share = sum(side > 0.0 for side in excess) / len(excess)
-    kind, count = f"after one of {len(seeds):,} falls", len(excess)
-    figure(f"{kind}: share beyond what the fence counts on", share, "<=", share_max, count=count)
-    figure(f"{kind}: farther than that by", max(excess), "<=", farthest_max, "m", count=count)
-    assert share <= share_max
-    assert max(excess) <= farthest_max
-
-
-def test_after_a_fall_it_seldom_lies_beyond_the_margin(simulator, figure):
-    check_falls(simulator, range(40), figure, 0.10, 1.5)
-
-
-@pytest.mark.full
-def test_after_a_fall_it_seldom_lies_beyond_it_in_2000_falls(simulator, figure):
-    check_falls(simulator, range(2000), figure, 0.05, 1.5)
 
 
 # A tilted robot scrapes along the floor before it rises.

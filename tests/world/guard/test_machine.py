@@ -8,7 +8,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.limits import RECHECK_NS, Limits
-from cloudrc.world.guard.state import JOLT_MAX, Guard
+from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, command, sensed
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -27,7 +27,7 @@ ALLOWED = {
     "stale": set(),
     "impossible": {(TRACK, LAND), (HOLD, LAND)},
     "session": set(),
-    "hit": {(state, ESTOP) for state in (TRACK, HOLD, LAND)},
+    "turn_over": {(state, ESTOP) for state in (TRACK, HOLD, LAND)},
     "time": {
         (TRACK, HOLD),
         (GROUND, LAND),
@@ -143,14 +143,14 @@ class GuardMachine(RuleBasedStateMachine):
         self.pass_time(seconds)
 
     @rule()
-    def hit(self):
+    def turn_over(self):
         calm = sensed((1.0, 1.0, self.height), (0.0, 0.0, self.climb))
         flew = self.guard.tick(self.now_ns, calm, DT) is not None
         self.noted("time")
         self.now_ns += RECHECK_NS + TICK  # the guard checks at the latest then
-        spun = calm._replace(angular_velocity_body=(0.0, 0.0, 9.0))
-        self.flown = self.guard.tick(self.now_ns, spun, DT)
-        self.noted("hit")
+        over = calm._replace(axes=(*calm.axes[:8], -1.0))
+        self.flown = self.guard.tick(self.now_ns, over, DT)
+        self.noted("turn_over")
         assert self.flown is None
         assert (self.state is ESTOP) >= flew
         self.started &= not flew
@@ -164,9 +164,7 @@ class GuardMachine(RuleBasedStateMachine):
         for _ in range(round(seconds / DT)):
             standing = self.height < 0.2 or self.flown is None
             sinking = 0.0 if standing else self.flown[2]
-            self.climb += min(
-                max(sinking - self.climb, -JOLT_MAX / 2), JOLT_MAX / 2
-            )  # less than a hit
+            self.climb += min(max(sinking - self.climb, -0.4), 0.4)
             readings = sensed((1.0, 1.0, self.height), (0.0, 0.0, self.climb))
             self.flown = self.guard.tick(self.now_ns, readings, DT)
             self.noted("time")
