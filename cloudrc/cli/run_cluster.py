@@ -244,7 +244,7 @@ def _shaper(folder: Path) -> str:
 def _report(
     experiment: ResolvedExperiment, folder: Path, mission: Mission, interrupted: bool
 ) -> dict[str, Any]:
-    from cloudrc.cli.flight import attachments
+    from cloudrc.cli.run import attachments
     from cloudrc.record.hash import messages_sha256
     from cloudrc.report.document import Run
     from cloudrc.report.write import write_report
