@@ -198,7 +198,7 @@ def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
 
 def _in_cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> Flight:
     """Prepare a flight in the cluster that the flags name."""
-    from cloudrc.cli.run_cluster import fly_in_cluster, refuse_local_files
+    from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files
     from cloudrc.cluster.tools import program
 
     refuse_local_files(experiment)
@@ -263,6 +263,7 @@ def _fly_virtual(
     from cloudrc.record.hash import RecordHash
     from cloudrc.record.writer import McapWriter
     from cloudrc.report.document import Run
+    from cloudrc.report.write import attachments
 
     world: list[Record] = []
     cloud: list[Record] = []
@@ -348,6 +349,7 @@ def _report_ends(
     """
     from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge
+    from cloudrc.report.write import attachments
 
     try:
         mission = merge(folder / "world.mcap", folder / "cloud.mcap")
@@ -373,12 +375,6 @@ def _report(
             f"interrupted; the recording is kept but the report is not written: "
             f"run 'cloudrc report {folder}'"
         ) from None
-
-
-def attachments(folder: Path) -> dict[str, bytes]:
-    """Read the attachments of the recording: the configuration and the report."""
-    paths = (folder / "config.yaml", folder / "report.json")
-    return {path.name: path.read_bytes() for path in paths if path.exists()}
 
 
 def exit_code(report: Mapping[str, Any]) -> int:
