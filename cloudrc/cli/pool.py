@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -67,7 +67,7 @@ class WorkerDiedError(InvalidRunError):
 
 def map_in_order(
     function: Callable[[Work], Result], work: Sequence[Work], jobs: int
-) -> Iterator[Result]:
+) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
     Ctrl-C, and closing the generator, end the calls that are running and drop the others.
