@@ -101,7 +101,7 @@ def console(stream: TextIO) -> Console:
 
 
 def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
-    """Align rows in columns; on a narrow terminal, wrap the cells.
+    """Align rows in columns, one line per row.
 
     Args:
         rows: Cells, escaped here; all rows have the same length.
@@ -118,11 +118,9 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
         grid.add_column(justify="right" if i in right else "left")
     for row in rows:
         grid.add_row(*(Text(escape(cell)) for cell in row))
-    width = terminal_columns(sys.stdout) if is_live(sys.stdout) else UNLIMITED
-    plain = console(io.StringIO())
-    with plain.capture() as drawn:
-        plain.print(grid, width=width)
-    return "\n".join(line.rstrip() for line in drawn.get().splitlines())
+    drawn = io.StringIO()
+    console(drawn).print(grid)
+    return "\n".join(line.rstrip() for line in drawn.getvalue().splitlines())
 
 
 def escape(text: str) -> str:
