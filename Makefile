@@ -10,7 +10,7 @@ REGISTRY ?=
 BASE :=
 CLUSTER ?= cloudrc
 IMAGES := world cloud
-SCRIPTS := .ci/run
+SCRIPTS := .ci/run .ci/once_more
 # Number of flights at once in the search for faults.
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 # Folder for the results of `make faults`, `make mutants` and `make nightly`.
@@ -36,7 +36,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio websockets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults coverage mutants nightly lint types bench bench-link pictures docs images kind-load lock clean
+.PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults coverage mutants nightly lint types audit bench bench-link pictures docs images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -139,6 +139,15 @@ lint: $(VENV)/dev ## check format and rules
 	$(bin)/shellcheck $(SCRIPTS)
 	@if command -v helm >/dev/null; then helm lint --quiet --strict charts/cloudrc; \
 		else echo "no helm here: the chart is checked by 'make test' alone"; fi
+
+AUDIT := $(bin)/pip-audit --require-hashes --disable-pip --progress-spinner off
+audit: $(VENV)/dev ## look up the images' packages in the advisories; write an SBOM of each to build/sbom
+	$(bin)/python -m pip install --quiet 'pip-audit>=2.9'
+	mkdir -p build/sbom
+	for role in $(IMAGES); do \
+		$(AUDIT) --requirement images/$$role/requirements.txt \
+			--format cyclonedx-json --output build/sbom/$$role.json || exit 1; \
+	done
 
 types: $(VENV)/dev ## check types
 	$(bin)/mypy

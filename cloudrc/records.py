@@ -255,14 +255,19 @@ class Control(NamedTuple):
     derivative: Vector
 
 
+UNDER_WAY = ("started", "reached", "held", "resumed", "goto", "paused")
+"""Events after which a mission continues; every other event ends it. "paused": its process ends,
+and the next one continues it."""
+
+
 class MissionEvent(NamedTuple):
     """Cloud: an event of the mission. Topic /mission.
 
     Attributes:
         stamp_ns: Time of the event [ns], cloud's clock.
-        event: "started", "reached", "held", "resumed", "goto"; at the end its outcome: "done",
-            "cancelled", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped",
-            "emergency_stopped", "taken_over", "end_lost".
+        event: One of `UNDER_WAY`; at the end its outcome: "done", "cancelled", "timed_out",
+            "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped", "taken_over",
+            "end_lost".
         waypoint: Index of the waypoint concerned; -1 if none.
         text: The same in words.
     """

@@ -37,7 +37,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "record": {"endpoint", "files"},
     "metrics": {"record", "config", "geometry", "plugins"},
     "report": {"record", "metrics", "config", "geometry", "link", "files"},
-    "cluster": {"config", "link"},
+    "cluster": {"config", "link", "record", "report"},
     "assembly": EVERYTHING,
     "faults": EVERYTHING,
     "cli": EVERYTHING,

@@ -1,9 +1,14 @@
-"""`cloudrc completion SHELL`: print a static script, so that Tab starts no Python."""
+"""`cloudrc completion SHELL`: print a static script, so that Tab starts no Python.
+
+The script knows the commands, their options, and the names that this installation ships.
+"""
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
+from collections.abc import Iterator
+from typing import Any
 
 from cloudrc.errors import MissingPrerequisiteError
 
@@ -13,6 +18,26 @@ installation:
   cloudrc completion bash > ~/.local/share/bash-completion/completions/cloudrc
   cloudrc completion zsh > ~/.zfunc/_cloudrc     (~/.zfunc must be in $fpath)
   cloudrc completion fish > ~/.config/fish/completions/cloudrc.fish"""
+
+JOINED = """\
+# Bash splits words at "=": join KEY=VALUE again before completing, and return what follows "=".
+_cloudrc_joined() {
+  local word joined=()
+  for word in "${COMP_WORDS[@]:0:COMP_CWORD+1}"; do
+    if [[ ${#joined[@]} -gt 0 && ( $word == "=" || ${joined[-1]} == *= ) ]]; then
+      joined[-1]+=$word
+    else
+      joined+=("$word")
+    fi
+  done
+  local COMP_WORDS=("${joined[@]}") COMP_CWORD=$(( ${#joined[@]} - 1 ))
+  word=${joined[-1]}
+  _shtab_cloudrc "$1" "$word" "$3"
+  [[ $word == *=* ]] && COMPREPLY=("${COMPREPLY[@]#*=}")
+  [[ ${COMPREPLY[0]-} == *= ]] && compopt -o nospace 2>/dev/null
+}
+complete -o bashdefault -F _cloudrc_joined cloudrc
+"""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,6 +54,72 @@ def execute(options: argparse.Namespace) -> int:
     import shtab
 
     from cloudrc.cli.parser import COMMANDS, build_parser
+    from cloudrc.config import shipped
 
-    print(shtab.complete(build_parser(COMMANDS, for_completion=True), options.shell))
+    parser = build_parser(COMMANDS, for_completion=True)
+    names = {
+        "EXPERIMENT": (shipped.names("experiment"), True),
+        "PROFILE": (shipped.names("profile"), True),
+        "KEY=VALUE": (settings(), False),
+    }
+    link = [word.removeprefix("link.") for word in names["KEY=VALUE"][0] if word[:5] == "link."]
+    for action in _actions(parser):
+        if action.metavar in names:
+            words, files = names[str(action.metavar)]
+            if action.metavar == "KEY=VALUE" and not action.option_strings:  # of `link set`
+                candidates = _candidates("link", link, files)
+            else:
+                candidates = _candidates(str(action.metavar), words, files)
+            action.complete = candidates  # type: ignore[attr-defined]
+    print(shtab.complete(parser, options.shell))
+    if options.shell == "bash":
+        print(JOINED)
     return 0
+
+
+def settings() -> list[str]:
+    """List the completions of `--set`: every key, and the names where a key takes one."""
+    from cloudrc import plugins
+    from cloudrc.config import problems, shipped
+    from cloudrc.config.overrides import KINDS
+    from cloudrc.config.schema import Experiment
+
+    keys = {".".join(path) for path, _ in problems.leaves(Experiment) if "0" not in path}
+    keys |= {
+        f"cloud.{key}.{parameter}"
+        for key, kind in KINDS.items()
+        for name in plugins.names(kind)
+        for parameter in plugins.signature(kind, name).parameters
+    }
+    named = {f"cloud.{key}": plugins.names(kind) for key, kind in KINDS.items()}
+    named |= {"link.profile": shipped.names("profile"), "mission": shipped.names("mission")}
+    named |= {f"world.{kind}": shipped.names(kind) for kind in ("robot", "scene")}
+    values = [f"{key}={name}" for key, found in named.items() for name in found]
+    return sorted(f"{key}=" for key in keys - set(named) if not key.endswith(".name")) + sorted(
+        values
+    )
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Yield the actions of a parser and of its commands."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from _actions(command)
+
+
+def _candidates(metavar: str, words: list[str], files: bool) -> dict[str, Any]:
+    """Describe candidates for shtab, in the language of each shell."""
+    function, joined = f"_cloudrc_{metavar.partition('=')[0].lower()}", " ".join(words)
+    bash = "; compgen -f -- $1" if files else ""
+    zsh = "; _files -g '*.yaml'" if files else ""
+    return {
+        "bash": function,
+        "zsh": function,
+        "fish": f"{joined} (__fish_complete_suffix .yaml)" if files else joined,
+        "preamble": {
+            "bash": f"{function}() {{ compgen -W '{joined}' -- $1{bash}; }}\n",
+            "zsh": f"{function}() {{ compadd -S '' -- {joined}{zsh} }}\n",
+        },
+    }

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import json
 import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 FORMATS = ("table", "json", "yaml")
+UNLIMITED = 10_000
+"""Width of output that is not for a terminal [columns]."""
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1", "dim": "2"}
 
 
@@ -72,8 +78,30 @@ def paint(text: str, colour: str, stream: TextIO | None = None) -> str:
     return f"\x1b[{_CODES[colour]}m{text}\x1b[0m"
 
 
+def console(stream: TextIO) -> Console:
+    """Make a console of rich that writes to a stream; elsewhere than on a terminal it is plain."""
+    from rich.console import Console as RichConsole
+
+    class Quiet(RichConsole):
+        """A console that goes on if its reader, such as `head`, has closed the pipe."""
+
+        def on_broken_pipe(self) -> None:
+            discard_output(stream)
+
+    live = is_live(stream)
+    return Quiet(
+        file=stream,
+        force_terminal=live,
+        color_system="standard" if live else None,
+        width=terminal_columns(stream) if live else UNLIMITED,
+        highlight=False,
+        markup=False,
+        emoji=False,
+    )
+
+
 def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
-    """Align rows in columns.
+    """Align rows in columns, one line per row.
 
     Args:
         rows: Cells, escaped here; all rows have the same length.
@@ -82,16 +110,17 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     Returns:
         Lines without trailing blanks, joined by newlines.
     """
-    rows = [[escape(cell) for cell in row] for row in rows]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = []
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    for i in range(len(rows[0])):
+        grid.add_column(justify="right" if i in right else "left")
     for row in rows:
-        cells = [
-            cell.rjust(width) if i in right else cell.ljust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)
+        grid.add_row(*(Text(escape(cell)) for cell in row))
+    drawn = io.StringIO()
+    console(drawn).print(grid)
+    return "\n".join(line.rstrip() for line in drawn.getvalue().splitlines())
 
 
 def escape(text: str) -> str:

@@ -8,9 +8,10 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from itertools import islice
 from types import FrameType
 from typing import TypeVar
@@ -66,13 +67,13 @@ class WorkerDiedError(InvalidRunError):
 
 def map_in_order(
     function: Callable[[Work], Result], work: Sequence[Work], jobs: int
-) -> Iterator[Result]:
+) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    Closing the generator waits for the calls that are running and drops the others.
+    Ctrl-C, and closing the generator, end the calls that are running and drop the others.
 
     Args:
-        function: A module's function: other processes call it.
+        function: A module's function: other processes call it. With one process, this one does.
         work: Its arguments, one for each call.
         jobs: Number of processes, at most one per core and per piece of work.
 
@@ -86,28 +87,49 @@ def map_in_order(
     if workers <= 1:
         yield from map(function, work)
         return
-    fork = multiprocessing.get_context("fork")  # so that workers are children of this process
-    pool = ProcessPoolExecutor(workers, fork, _begin, (os.getpid(),))
+    # Spawn, do not fork: libraries may have started threads in this process.
+    context = multiprocessing.get_context("spawn")
+    with _isolated_start():  # the pool starts multiprocessing's resource tracker
+        pool = ProcessPoolExecutor(workers, context, exit_with_parent, (os.getpid(),))
     try:
-        # No `pool.map`: if a worker dies, it races with the pool over failed calls.
         waiting = iter(work)
-        # In batches: a broken pool accepts no more work, and its finished results come first.
-        while futures := deque(pool.submit(function, each) for each in islice(waiting, BATCH_MAX)):
+        while (
+            True
+        ):  # in batches: a broken pool accepts no work, and its finished results come first
+            with _isolated_start():
+                futures = deque(pool.submit(function, each) for each in islice(waiting, BATCH_MAX))
+            if not futures:
+                return
             while futures:
                 yield futures.popleft().result()
-    except KeyboardInterrupt:  # Ctrl-C ends everything at once
-        for worker in multiprocessing.active_children():
-            worker.kill()  # a worker that just starts may lose a SIGTERM
-        raise
     except BrokenProcessPool as error:
         raise WorkerDiedError(f"{WORKER_KILLED}: try fewer '--jobs'") from error
+    except BaseException:  # Ctrl-C, or the caller wants no more results
+        for worker in multiprocessing.active_children():
+            worker.kill()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _begin(parent: int) -> None:
-    """Prepare a worker: it ignores the terminal's signals and ends with its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    exit_with_parent(parent)
+@contextmanager
+def _isolated_start() -> Iterator[None]:
+    """Isolate processes that start inside from the terminal and from the working folder.
+
+    They ignore a terminal's signals to the process group, since ignored signals stay ignored in a
+    new program; the parent ends them. They import no Python from the working folder, which may
+    come from somebody else.
+    """
+    numbers = (signal.SIGINT, signal.SIGHUP)
+    before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
+    safe_path = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if safe_path is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = safe_path
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)

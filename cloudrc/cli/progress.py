@@ -8,7 +8,10 @@ import time
 from collections.abc import Callable, Iterable
 from typing import TextIO
 
-from cloudrc.cli.output import escape, ignore_closed_pipe, is_live, paint, terminal_columns
+from rich.live import Live
+from rich.text import Text
+
+from cloudrc.cli.output import console, escape, is_live
 from cloudrc.drivers.feed import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import (
@@ -43,8 +46,11 @@ class FlightView:
             waypoints: Number of the mission's waypoints.
             clock: Monotonic time, for the real-time factor and the redrawing [s].
         """
-        self._stream, self._waypoints, self._clock = stream, waypoints, clock
-        self._live = is_live(stream)
+        self._waypoints, self._clock = waypoints, clock
+        self._console = console(stream)
+        self._status: Live | None = None
+        if is_live(stream):
+            self._status = Live(console=self._console, transient=True, auto_refresh=False)
         self._first_ns = self._now_ns = NEVER_NS
         self._began = self._drawn = clock()
         self._position: Vector = (math.nan, math.nan, math.nan)
@@ -73,10 +79,11 @@ class FlightView:
                 case MissionEvent():
                     self._ended = record.event in ENDINGS
                     self._event(record.text)
-        if self._live and self._clock() - self._drawn >= REDRAW_PERIOD:
+        if self._status and self._clock() - self._drawn >= REDRAW_PERIOD:
             self._drawn = self._clock()
+            self._status.start()
             # Leave one column free: some terminals wrap after the last one.
-            self._write("\r\x1b[2K" + self.line(terminal_columns(self._stream) - 1))
+            self._status.update(self.line(self._console.width - 1), refresh=True)
 
     def _see_telemetry(self, record: TelemetrySent) -> None:
         if self._first_ns == NEVER_NS:
@@ -89,7 +96,7 @@ class FlightView:
         """Give the time since the first telemetry, on world's clock [s]."""
         return (self._now_ns - self._first_ns) * 1e-9
 
-    def line(self, width: int = 80) -> str:
+    def line(self, width: int = 80) -> Text:
         """Give the status line, at most `width` columns wide."""
         elapsed = self._clock() - self._began
         moving = elapsed > 0 and self.flown > 0
@@ -105,10 +112,10 @@ class FlightView:
         for name in DROPPED:
             if len(_joined(cells.values())) > width:
                 cells[name] = ""
-        fitting = _joined(cells.values())[:width]
+        line = Text(_joined(cells.values())[:width])
         colour = "green" if self._guard == GuardState.TRACK else "yellow"
-        guard = paint(self._guard.name, colour, self._stream)
-        return fitting.replace(self._guard.name, guard)
+        line.highlight_words([self._guard.name], colour)
+        return line
 
     def _position_text(self) -> str:
         """Give the robot's position [m]."""
@@ -122,26 +129,18 @@ class FlightView:
     def _event(self, text: str) -> None:
         """Write an event's line, with position and delay if they fit."""
         text = escape(text)
-        width = terminal_columns(self._stream) if self._live else FILE_COLUMNS
+        width = self._console.width if self._status else FILE_COLUMNS
         delays = (self._delay_text(), "")
         lines = [_joined((f"  {text:<44}", self._position_text(), delay)) for delay in delays]
-        fitting = [line for line in lines if len(line) <= width]
-        if not self._live:
-            self._write(f"{fitting[0] if fitting else f'  {text}'}\n")
-            return
-        wrap = textwrap.TextWrapper(width, subsequent_indent="    ", break_on_hyphens=False)
-        self._write(f"\r\x1b[2K{fitting[0] if fitting else wrap.fill(f'  {text}')}\n")
+        line = next((line for line in lines if len(line) <= width), f"  {text}")
+        if self._status and len(line) > width:
+            line = textwrap.fill(line, width, subsequent_indent="    ", break_on_hyphens=False)
+        self._console.print(Text(line), soft_wrap=True)
 
     def close(self) -> None:
         """Erase the status line."""
-        if self._live:
-            self._write("\r\x1b[2K")
-
-    def _write(self, text: str) -> None:
-        """Write at once; a flight goes on if the reader has closed the pipe."""
-        with ignore_closed_pipe(self._stream):
-            self._stream.write(text)
-            self._stream.flush()
+        if self._status:
+            self._status.stop()
 
 
 def _joined(cells: Iterable[str]) -> str:

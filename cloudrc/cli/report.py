@@ -37,7 +37,7 @@ def execute(options: argparse.Namespace) -> int:
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
-    from cloudrc.cli.summary import exit_code, show
+    from cloudrc.cli.run import exit_code, show
     from cloudrc.report.write import read_run, write_report
 
     metrics.check(options.metric)

@@ -5,26 +5,32 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
-from cloudrc.cli.extras import require
+from cloudrc.cli.extras import missing, require
 from cloudrc.cli.output import (
+    escape,
     format_document,
     ignore_closed_pipe,
     is_live,
     output_argument,
+    paint,
     print_line,
+    table,
 )
 from cloudrc.cli.parser import read_count
 from cloudrc.cli.pool import interrupt_on_signals
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.record.columns import Recording
     from cloudrc.records import Record
+    from cloudrc.report.document import Run
 
 Flight = Callable[[Path, TextIO, int], dict[str, Any]]
 """Function that flies: (folder to fill, stream for its progress, number of waypoints) -> report."""
@@ -36,6 +42,26 @@ EXTRAS = {
     "cluster": ("kube", "record", "report"),
 }
 """The extras that each mode needs."""
+GRACE = 30.0
+"""Time after the mission's time limit at which the program ends a flight in any case [s]."""
+
+See = Callable[["list[Record]"], None]
+"""Function that shows records of a flight during the flight."""
+EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
+COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
+
+# The most important numbers -> their labels; report.html and report.json show all numbers.
+MAIN = {
+    "duration": "mission took",
+    "contact_time": "arm touches the board at",
+    "tip_speed": "with the tip at",
+    "steady_contact_force": "and then presses with",
+    "min_clearance": "least clearance in the pipes",
+    "rtt_mean": "round trip, mean",
+    "prediction_error_rms": "prediction error, RMS",
+    "hold_count": "times in HOLD",
+    "real_time_factor": "real-time factor",
+}
 EPILOG = """\
 modes:
   local    real time: four processes, UDP on 127.0.0.1
@@ -114,7 +140,6 @@ def execute(options: argparse.Namespace) -> int:
 def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> int:
     from cloudrc import metrics
     from cloudrc.cli.find_run import discard, new_folder, point_latest_to
-    from cloudrc.cli.summary import exit_code, show
     from cloudrc.config.load import load_experiment
 
     experiment = load_experiment(options.experiment, overrides)
@@ -158,7 +183,6 @@ def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
     """Prepare a flight on this machine."""
 
     def flight(folder: Path, stream: TextIO, waypoints: int) -> dict[str, Any]:
-        from cloudrc.cli.flight import fly
         from cloudrc.cli.progress import FlightView
 
         quiet = stream is sys.stderr and not is_live(stream)
@@ -174,7 +198,7 @@ def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
 
 def _in_cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> Flight:
     """Prepare a flight in the cluster that the flags name."""
-    from cloudrc.cli.run_cluster import fly_in_cluster, refuse_local_files
+    from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files
     from cloudrc.cluster.tools import program
 
     refuse_local_files(experiment)
@@ -199,3 +223,208 @@ def _seed(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number >= 0")
     return int(text)
+
+
+def fly(
+    experiment: ResolvedExperiment, mode: str, folder: Path, see: See, *, page: bool = True
+) -> dict[str, Any]:
+    """Fly one experiment and fill its run folder.
+
+    Args:
+        experiment: Complete and checked.
+        mode: "virtual" or "local".
+        folder: Empty; gets configuration, recording and report.
+        see: Called with records during the flight: all in virtual mode, else a selection.
+        page: Whether to write the HTML page with figures; the numbers are always written.
+
+    Returns:
+        The content of report.json.
+
+    Raises:
+        CloudrcError: If the flight broke off; its recording is kept and reported as interrupted.
+    """
+    from cloudrc.config.load import dump
+
+    fly_mode = _fly_virtual if mode == "virtual" else _fly_local
+    try:
+        (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+        return fly_mode(experiment, folder, see, page)
+    except OSError as error:
+        where = error.filename or folder
+        raise CloudrcError(
+            f"{where}: {error.strerror or error}; free some space or choose another folder: --out"
+        ) from error
+
+
+def _fly_virtual(
+    experiment: ResolvedExperiment, folder: Path, see: See, page: bool
+) -> dict[str, Any]:
+    from cloudrc.record.columns import Recording, merged
+    from cloudrc.record.hash import RecordHash
+    from cloudrc.record.writer import McapWriter
+    from cloudrc.report.document import Run
+    from cloudrc.report.write import attachments
+
+    world: list[Record] = []
+    cloud: list[Record] = []
+    digest = RecordHash()
+    # Record during the flight, so that the recording is kept if the run or its report fails.
+    with McapWriter(folder / "mission.mcap", clock="world") as writer:
+
+        def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+            for log_time_ns, row in merged(from_world, from_cloud):
+                writer.write_row(row, log_time_ns)
+            for kept, new in ((cloud, from_cloud), (world, from_world)):
+                kept.extend(new)
+                digest.update(new)
+                see(new)
+
+        interrupted = False
+        try:
+            _virtual_run(experiment, sink)
+        except KeyboardInterrupt:
+            interrupted = True
+        run = Run("virtual", "virtual", digest.hexdigest(), interrupted)
+        recording = Recording.from_records(world, cloud)
+        try:
+            return _report(folder, recording, experiment, run, page=page)
+        finally:
+            for name, data in attachments(folder).items():
+                writer.attach(name, data)
+
+
+def _virtual_run(
+    experiment: ResolvedExperiment, sink: Callable[[list[Record], list[Record]], None]
+) -> None:
+    from cloudrc import assembly
+    from cloudrc.cloud.endpoint import CloudIdentity
+    from cloudrc.drivers.virtual import VirtualRun
+    from cloudrc.world.endpoint import WorldIdentity
+
+    clock = bytes(16)  # both ends share one clock
+    world = assembly.build_world(experiment, WorldIdentity(clock, b"world".ljust(16)))
+    cloud = assembly.build_cloud(experiment, CloudIdentity(clock, b"cloud".ljust(16)))
+    limit_ns = round((experiment.criteria.time_limit_s + GRACE) * 1e9)
+    run = VirtualRun(world, cloud, *assembly.build_links(experiment))
+    run.fly(lambda: cloud.mission_over, limit_ns, sink)
+
+
+def _fly_local(
+    experiment: ResolvedExperiment, folder: Path, see: See, page: bool
+) -> dict[str, Any]:
+    from cloudrc.drivers.local import LocalRun
+    from cloudrc.report.document import Run
+
+    run, failure = Run("local", "relay"), None
+    nothing_recorded = InterruptedRunError("interrupted before anything was recorded")
+    absent = missing("api")
+    if absent:
+        print(
+            f"cloudrc: no operator's API in this run: {', '.join(absent)} not installed; "
+            "run: pip install 'cloudrc[api]'",
+            file=sys.stderr,
+        )
+    try:
+        LocalRun(folder, see, api=not absent).fly(experiment.criteria.time_limit_s + GRACE)
+    except KeyboardInterrupt:
+        run = replace(run, interrupted=True)
+    except CloudrcError as error:
+        run, failure = replace(run, interrupted=True, notes=(str(error),)), error
+    document = _report_ends(folder, experiment, run, page, failure or nothing_recorded)
+    if failure is not None:
+        raise failure
+    return document
+
+
+def _report_ends(
+    folder: Path,
+    experiment: ResolvedExperiment,
+    run: Run,
+    page: bool,
+    failure: CloudrcError,
+) -> dict[str, Any]:
+    """Merge the recordings of both ends and write the report.
+
+    If an interrupted run has recorded nothing, raise `failure`.
+    """
+    from cloudrc.record.hash import messages_sha256
+    from cloudrc.record.merge import merge
+    from cloudrc.report.write import attachments
+
+    try:
+        mission = merge(folder / "world.mcap", folder / "cloud.mcap")
+    except CloudrcError as error:  # nothing was recorded
+        raise failure if run.interrupted else error from None
+    run = replace(run, records_sha256=messages_sha256(mission.contents.messages))
+    try:
+        return _report(folder, mission.recording(), experiment, run, page=page)
+    finally:
+        mission.write(folder / "mission.mcap", attachments(folder))
+
+
+def _report(
+    folder: Path, recording: Recording, experiment: ResolvedExperiment, run: Run, *, page: bool
+) -> dict[str, Any]:
+    from cloudrc.report.write import write_report
+
+    try:
+        own = experiment.report.metrics
+        return write_report(folder, recording, experiment, run, own=own, page=page)
+    except KeyboardInterrupt:
+        raise InterruptedRunError(
+            f"interrupted; the recording is kept but the report is not written: "
+            f"run 'cloudrc report {folder}'"
+        ) from None
+
+
+def exit_code(report: Mapping[str, Any]) -> int:
+    """Give the exit code of a report's verdict."""
+    return EXIT_CODES[report["verdict"]]
+
+
+def show(report: Mapping[str, Any], folder: Path) -> None:
+    """Print the verdict, the main numbers and, on the last line, the report's path."""
+    print()
+    print(verdict(report))
+    print()
+    print(main_numbers(report))
+    faults = report["numbers"].get("fault_count", {"value": 0})["value"]
+    if faults:
+        print(paint(f"  faults noted in flight: {faults:.0f}, see the report", "yellow"))
+    print()
+    print_line(str(folder / "report.html"))
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """Give the verdict with the first failure; further failures follow, one a line."""
+    outcome = report["verdict"]
+    word = paint(outcome.upper(), COLOURS[outcome])
+    failures = report["failures"]
+    if not failures:
+        return f"{word}: every waypoint reached, every criterion met"
+    first, *others = failures
+    return "\n".join([f"{word}: {escape(first['text'])}", *map(_further_failure, others)])
+
+
+def _further_failure(failure: Mapping[str, Any]) -> str:
+    time = failure.get("time")
+    when = f" (at {time:.2f} s)" if time is not None else ""
+    return escape(f"  also: {failure['text']}{when}")
+
+
+def main_numbers(report: Mapping[str, Any]) -> str:
+    """Lay out the main numbers as a table, without those that are unknown."""
+    numbers = report["numbers"]
+    rows = [
+        (f"  {label}", *_cells(name, numbers[name]))
+        for name, label in MAIN.items()
+        if name in numbers
+    ]
+    return table(rows, right=[1]) if rows else "  no numbers: nothing was flown"
+
+
+def _cells(name: str, entry: Mapping[str, Any]) -> tuple[str, str]:
+    from cloudrc.metrics import Number
+    from cloudrc.report.numbers import readable
+
+    return readable(name, Number(entry["value"], entry["unit"], ""))

@@ -7,23 +7,17 @@ import csv
 import io
 import json
 import math
-import multiprocessing
-import os
-import signal
 import statistics
 import sys
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
-from itertools import islice
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.find_run import new_folder
 from cloudrc.cli.output import format_document, format_number, ignore_closed_pipe, print_line, table
-from cloudrc.cli.pool import BATCH_MAX, WORKER_KILLED, WorkerDiedError, exit_with_parent
-from cloudrc.cli.summary import EXIT_CODES
+from cloudrc.cli.pool import WORKER_KILLED, WorkerDiedError, map_in_order
+from cloudrc.cli.run import EXIT_CODES
 
 Report: TypeAlias = Mapping[str, Any]
 """The content of a `report.json`."""
@@ -119,20 +113,22 @@ def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
     seeds = range(1, options.seeds + 1)
     reports: list[dict[str, Any]] = []
     code = 0
+    work = [(options.experiment, overrides, folder, seed) for seed in seeds]
     try:
-        with closing(_reports(options.experiment, overrides, folder, seeds)) as finished:
+        with closing(map_in_order(_fly_one, work, len(seeds))) as finished:
             for report in finished:
                 reports.append(report)
                 _show_run(options, report, f"{len(reports)}/{len(seeds)}")
-    except (KeyboardInterrupt, BrokenProcessPool) as error:
-        killed = isinstance(error, BrokenProcessPool)
+                if report["verdict"] == "interrupted":  # with one core, this process flies
+                    raise KeyboardInterrupt
+    except (KeyboardInterrupt, WorkerDiedError) as error:
+        killed = isinstance(error, WorkerDiedError)
         code = WorkerDiedError.exit_code if killed else EXIT_CODES["interrupted"]
         reason = (
             f"{WORKER_KILLED if killed else 'interrupted'}: {len(reports)} of {len(seeds)} seeds"
         )
         with ignore_closed_pipe(sys.stderr):
             print(f"\ncloudrc: {reason} are finished", file=sys.stderr, flush=True)
-    reports.sort(key=lambda report: int(report["seed"]))
     summary = _write(folder, name, reports, bool(code))
     with ignore_closed_pipe(sys.stdout):
         if options.output != "table":
@@ -153,60 +149,12 @@ def _show_run(options: argparse.Namespace, report: dict[str, Any], progress: str
             )
 
 
-def _reports(
-    experiment: str, overrides: list[str], folder: Path, seeds: range
-) -> Generator[dict[str, Any]]:
-    """Fly every seed and yield reports as they finish; closing the generator ends the flights."""
-    # Spawn, do not fork: libraries may have started threads in this process.
-    context = multiprocessing.get_context("spawn")
-    workers = min(os.cpu_count() or 1, len(seeds))
-    with _isolated_start():  # the pool starts multiprocessing's resource tracker
-        pool = ProcessPoolExecutor(workers, context, exit_with_parent, (os.getpid(),))
-    with pool:
-        try:
-            waiting = (pool.submit(_fly_one, experiment, overrides, folder, seed) for seed in seeds)
-            while True:
-                with _isolated_start():
-                    flying = list(islice(waiting, BATCH_MAX))
-                if not flying:
-                    break
-                for future in as_completed(flying):
-                    yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            # Leaving `with` would wait until all workers have finished their flights.
-            for worker in multiprocessing.active_children():
-                worker.terminate()
-            raise
-
-
-@contextmanager
-def _isolated_start() -> Iterator[None]:
-    """Isolate processes that start inside from the terminal and from the working folder.
-
-    They ignore a terminal's signals to the process group, since ignored signals stay ignored in a
-    new program; the parent ends them. They import no Python from the working folder, which may
-    come from somebody else.
-    """
-    numbers = (signal.SIGINT, signal.SIGHUP)
-    before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
-    safe_path = os.environ.get("PYTHONSAFEPATH")
-    os.environ["PYTHONSAFEPATH"] = "1"
-    try:
-        yield
-    finally:
-        if safe_path is None:
-            del os.environ["PYTHONSAFEPATH"]
-        else:
-            os.environ["PYTHONSAFEPATH"] = safe_path
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-
-
-def _fly_one(experiment: str, overrides: list[str], folder: Path, seed: int) -> dict[str, Any]:
-    from cloudrc.cli.flight import fly
+def _fly_one(which: tuple[str, list[str], Path, int]) -> dict[str, Any]:
+    """Fly one seed, in a worker: experiment, overrides, folder of the sweep, seed."""
+    from cloudrc.cli.run import fly
     from cloudrc.config.load import load_experiment
 
+    experiment, overrides, folder, seed = which
     loaded = load_experiment(experiment, [*overrides, f"seed={seed}"])
     run_folder = folder / f"seed-{seed}"
     run_folder.mkdir()

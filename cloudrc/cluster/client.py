@@ -23,7 +23,7 @@ ANSWER_LIMIT = 5.0
 COMPONENT = "experiment"
 """Label `component` of the experiment's ConfigMap."""
 FILE = "experiment.yaml"
-"""Key of the experiment in that ConfigMap."""
+"""Key of the experiment in the ConfigMap of a release."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ OPEN = {
 
 
 def page() -> str:
-    """Write the whole page, in Markdown."""
+    """Write docs/metrics.md."""
     blocks = [HEAD, "## Queries\n"]
     blocks += [f"{title}:\n\n```promql\n{query}\n```\n" for title, query in QUERIES.items()]
     blocks += ["## All metrics\n", _table(METRICS.values())]

@@ -28,7 +28,7 @@ from cloudrc.exposition.table import (
     WORLD,
     Labels,
 )
-from cloudrc.records import Counted, MissionEvent, Record
+from cloudrc.records import UNDER_WAY, Counted, MissionEvent, Record
 
 
 class Api:
@@ -139,8 +139,6 @@ class Link:
         )
 
 
-UNDER_WAY = ("started", "reached", "held", "resumed", "goto", "paused")
-"""Events after which a mission continues; every other event ends it."""
 NO_WAYPOINT = -1
 """Waypoint index while no mission is active."""
 

@@ -50,8 +50,8 @@ class Board:
 
     Attributes:
         x: Position of the front face [m], world frame.
-        y: Extent from, to [m].
-        z: Extent from, to [m].
+        y: Smallest and largest y [m], world frame.
+        z: Smallest and largest z [m], world frame.
     """
 
     x: float

@@ -229,3 +229,9 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
         environment,
     )
     write_atomically(folder / "report.html", text.encode("utf-8"))
+
+
+def attachments(folder: Path) -> dict[str, bytes]:
+    """Read the attachments of the recording: the configuration and the report."""
+    paths = (folder / "config.yaml", folder / "report.json")
+    return {path.name: path.read_bytes() for path in paths if path.exists()}

@@ -16,7 +16,7 @@ from cloudrc.world.readings import Readings, RotorSpeeds
 THRUST_COEFFICIENT = 9.9865e-6
 """kf: thrust per speed squared [N s^2]."""
 TORQUE_RATIO = 0.016
-"""km: reaction torque about the rotor's axis per thrust [m]."""
+"""Reaction torque about the rotor's axis per thrust [m]; km in the published model."""
 SPEED_MAX = 1838.0
 """Largest rotor speed [rad/s]."""
 TIME_CONSTANT_UP = 0.0125

@@ -1,4 +1,4 @@
-"""Completion: a script for each shell, and an error if shtab is missing."""
+"""Completion: a script for each shell that knows commands, options and shipped names."""
 
 from __future__ import annotations
 
@@ -10,33 +10,46 @@ import pytest
 
 from cloudrc.cli.main import main
 
+Printed = pytest.CaptureFixture[str]
+
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_script_knows_commands_and_options(
-    shell: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_script_knows_commands_and_options(shell: str, capsys: Printed) -> None:
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
-    assert "doctor" in script
-    assert "seeds" in script
+    for word in ("doctor", "seeds", "paper-verbatim", "satellite", "link.profile=lte"):
+        assert word in script
     if shutil.which(shell):
         subprocess.run([shell, "-n"], input=script, text=True, check=True)
 
 
-def test_bash_completes_a_command(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["do"], ["doctor"]),
+        (["run", "paper-"], ["paper-verbatim"]),
+        (["link", "show", "satel"], ["satellite"]),
+        (["run", "--set", "guard.speed"], ["guard.speed_max_mps="]),
+        (["run", "--set", "cloud.controller.gain_p"], ["cloud.controller.gain_p="]),
+        (["link", "set", "uplink.dela"], ["uplink.delay_ms="]),
+        # Bash splits at "=", and replaces only what follows it.
+        (["run", "--set", "cloud.predictor", "=", "last"], ["last_sample"]),
+    ],
+)
+def test_bash_completes_names(words: list[str], found: list[str], capsys: Printed) -> None:
     main(["completion", "bash"])
     script = capsys.readouterr().out
+    line = " ".join(["cloudrc", *words])
     probe = (
-        "\nCOMP_WORDS=(cloudrc do); COMP_CWORD=1; COMP_LINE='cloudrc do'; COMP_POINT=10"
-        '\n_shtab_cloudrc cloudrc do cloudrc; echo "${COMPREPLY[@]}"\n'
+        f"\nCOMP_WORDS=({line}); COMP_CWORD={len(words)}; COMP_LINE='{line}'"
+        f"; COMP_POINT={len(line)}\n_cloudrc_joined cloudrc x x"
+        '\nprintf "%s\\n" "${COMPREPLY[@]}"\n'
     )
     done = subprocess.run(["bash"], input=script + probe, text=True, capture_output=True)
-    assert done.stdout.strip() == "doctor"
+    assert done.stdout.split() == found, done.stderr
 
 
-def test_an_error_names_the_missing_shtab(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_names_the_missing_shtab(monkeypatch: pytest.MonkeyPatch, capsys: Printed) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert main(["completion", "bash"]) == 3
     assert "pip install shtab" in capsys.readouterr().err

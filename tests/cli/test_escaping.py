@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cloudrc.cli import summary
+from cloudrc.cli import run
 from cloudrc.cli.link_verify_text import VerifyReport, as_text
 from cloudrc.cli.main import main
 from cloudrc.cli.output import print_line, table
@@ -86,7 +86,7 @@ def test_the_description_of_a_profile(here: Path, printed: Printing) -> None:
 def test_the_failures_of_a_run(printed: Printing) -> None:
     failures = [{"code": "x", "text": EVIL}] * 2
     report = {"verdict": "failure", "failures": failures, "numbers": {}}
-    summary.show(report, Path(EVIL))
+    run.show(report, Path(EVIL))
     assert printed().count(SHOWN) == 3
 
 

@@ -171,15 +171,6 @@ def test_ctrl_c_ends_the_workers_at_once() -> None:
     assert multiprocessing.active_children() == []
 
 
-def test_ctrl_c_ends_a_worker_that_ignores_sigterm(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A worker has its parent's handlers at first and may lose their interrupt."""
-    ignore_sigterm = lambda parent: signal.signal(signal.SIGTERM, signal.SIG_IGN)  # noqa: E731
-    monkeypatch.setattr("cloudrc.cli.pool._begin", ignore_sigterm)
-    test_ctrl_c_ends_the_workers_at_once()
-
-
 def test_a_store_that_is_not_a_folder_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

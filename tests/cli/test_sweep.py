@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import pytest
 
 from cloudrc.cli import sweep
 from cloudrc.cli.main import main
+from cloudrc.cli.pool import WorkerDiedError
 from tests.conftest import nightly
 
 SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
@@ -41,22 +41,16 @@ def test_many_seeds_become_one_table(folder: Path, capsys: pytest.CaptureFixture
     assert len((folder / "sweep/sweep.csv").read_text().splitlines()) == 3
 
 
-def test_seeds_beyond_the_first_batch_are_flown_too(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sweep, "BATCH_MAX", 2)
-    assert main(["run", "steps", "--seeds", "5", *SHORT, "--out", "sweep"]) == 0
-    document = json.loads((folder / "sweep/sweep.json").read_text())
-    assert [run["seed"] for run in document["runs"]] == [1, 2, 3, 4, 5]
-
-
 @pytest.mark.parametrize("finished", [0, 2])
 @pytest.mark.parametrize(
     ("error", "code", "word"),
-    [(KeyboardInterrupt, 130, "interrupted"), (BrokenProcessPool, 6, "a worker was killed")],
+    [
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (WorkerDiedError("killed"), 6, "a worker was killed"),
+    ],
 )
 def test_an_interrupted_sweep_keeps_what_is_finished(
-    error: type[BaseException],
+    error: BaseException,
     code: int,
     word: str,
     finished: int,
@@ -70,7 +64,7 @@ def test_an_interrupted_sweep_keeps_what_is_finished(
             yield {"seed": seed, "verdict": "success", "failures": [], "numbers": numbers}
         raise error
 
-    monkeypatch.setattr(sweep, "_reports", reports)
+    monkeypatch.setattr(sweep, "map_in_order", reports)
     assert main(["run", "steps", "--seeds", "9", "--out", "sweep"]) == code
     captured = capsys.readouterr()
     assert f"cloudrc: {word}" in captured.err

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import run_cluster
 from cloudrc.cli.main import main
+from cloudrc.cluster import flight
 from cloudrc.cluster import pods as fetch
 from cloudrc.cluster.client import Release, connect
 from cloudrc.cluster.jobs import run_job
@@ -31,7 +31,7 @@ LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(run_cluster, "FLUSH", 0.0)
+    monkeypatch.setattr(flight, "FLUSH", 0.0)
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
     monkeypatch.chdir(tmp_path)
 
@@ -214,7 +214,7 @@ def test_what_pods_cannot_have_is_refused_before_the_install(
 
 def test_an_upgrade_keeps_the_values_of_a_release() -> None:
     before = {"metrics": {"allowFrom": ["x"]}, "link": {"mode": "relay", "profile": "paper-p1"}}
-    given = run_cluster.chart_values(load_experiment("hover"), before)
+    given = flight.chart_values(load_experiment("hover"), before)
     assert given["metrics"] == before["metrics"]
     assert given["link"] == {"mode": "relay", "profile": ""}
     assert given["experiment"]["name"] == "hover"
@@ -222,5 +222,5 @@ def test_an_upgrade_keeps_the_values_of_a_release() -> None:
 
 def test_a_run_disables_the_charts_own_mission() -> None:
     before = {"mission": {"enabled": True, "queue": True}}
-    given = run_cluster.chart_values(load_experiment("hover"), before)
+    given = flight.chart_values(load_experiment("hover"), before)
     assert given["mission"] == {"enabled": False, "queue": True}

@@ -10,6 +10,7 @@ from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Flight
 from cloudrc.records import Arrival, Control, Counted, Fault, GuardChange, Lateness, MissionEvent
 from tests.metrics.conftest import (
+    DONE,
     ONE_PIPE,
     PERIOD,
     SECOND,
@@ -128,6 +129,13 @@ def test_a_waypoint_counts_once() -> None:
     log = flown()
     log.cloud += [MissionEvent(at(1 + n), "reached", w, "") for n, w in enumerate((0, 1, 1))]
     assert measured("waypoints_reached", log.flight(waypoints=2)) == 2.0
+
+
+def test_a_pause_does_not_end_the_flight() -> None:
+    """A new process of teleop continues a mission that the old one has paused."""
+    log = flown()
+    log.cloud.append(MissionEvent(at(3), "paused", 0, "paused by shutdown"))
+    assert log.flight().end_ns == DONE
 
 
 def test_a_repeated_echo_counts_once() -> None:

@@ -10,7 +10,7 @@ from cloudrc.messages import Odometry
 
 
 class ConstantVelocity(Predictor):
-    """Measured velocity times horizon; the orientation turns on at the measured rate."""
+    """Predict with the measured velocity; the orientation keeps turning at the measured rate."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Extrapolate a sample: p + v tau, v + a tau with a = 0.

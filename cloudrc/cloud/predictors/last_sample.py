@@ -10,7 +10,7 @@ from cloudrc.messages import Odometry
 
 
 class LastSample(Predictor):
-    """No prediction: pose and twist stay as measured."""
+    """Predict nothing: pose and twist stay as measured."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Return the sample with a stamp that is later by `horizon` [s]."""

@@ -35,7 +35,7 @@ RUNS_SHOWN = 20
 BLACKOUT = "#f7dccb"
 """Colour of blackouts, a light variant of the colour of losses."""
 DOTS = 6000
-"""Most dots in one panel [1]; more would hide each other."""
+"""Largest number of dots in one panel [1]; more would hide each other."""
 
 
 @dataclass(frozen=True, slots=True)

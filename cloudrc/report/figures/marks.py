@@ -102,7 +102,7 @@ class Span:
 
 
 def spans(subject: Subject, *, uplink: bool) -> list[Span]:
-    """List the spans of a direction, in order."""
+    """List the times with one link profile of a direction, in order."""
     configured = subject.uplink if uplink else subject.downlink
     found = [Span(-inf, inf, subject.link_start, configured, "")]
     for begin, origin, direction, cause in _changes(subject, uplink):

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cli.summary import exit_code, main_numbers, show, verdict
+from cloudrc.cli.run import exit_code, main_numbers, show, verdict
 
 
 def report(outcome: str, *failures: str, **numbers: tuple[float, str]) -> dict[str, Any]:

@@ -244,10 +244,9 @@ def _shaper(folder: Path) -> str:
 def _report(
     experiment: ResolvedExperiment, folder: Path, mission: Mission, interrupted: bool
 ) -> dict[str, Any]:
-    from cloudrc.cli.flight import attachments
     from cloudrc.record.hash import messages_sha256
     from cloudrc.report.document import Run
-    from cloudrc.report.write import write_report
+    from cloudrc.report.write import attachments, write_report
 
     digest = messages_sha256(mission.contents.messages)
     run = replace(Run("cluster", _shaper(folder), digest), interrupted=interrupted)
