@@ -14,10 +14,11 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cli.pool import BATCH_MAX, WorkerDiedError, map_in_order
-from cloudrc.faults.document import Result
-from cloudrc.faults.fuzz import Finding
-from cloudrc.faults.scenario import Outcome, find
+from cloudrc.faults.report import Result
+from cloudrc.faults.scenario import Outcome
+from cloudrc.faults.scenarios import find
 from cloudrc.faults.schedule import Schedule
+from cloudrc.faults.trial import Finding
 
 KILLED = 5
 """The piece of work, or seed, that kills its process."""
@@ -104,32 +105,29 @@ def _fly(schedule: Schedule, keep: bool = False) -> Finding:
     if schedule.seed == KILLED:
         time.sleep(0.5)  # until earlier results are delivered
     _kill_at_five(schedule.seed)
-    return Finding(schedule, (), "", 1.0, 1.0, 0, 0, 0.0)
+    return Finding(schedule, ())
 
 
 def test_a_fault_search_with_a_killed_worker_keeps_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cloudrc.faults.fuzz.fly", _fly)
-    assert main("faults fuzz --seeds 9 --jobs 2 -o json".split()) == 6
+    monkeypatch.setattr("cloudrc.faults.search.fly", _fly)
+    assert main("faults search --jobs 2 -o json".split()) == 6
     out, error = capsys.readouterr()
     assert error.count("\n") == 1
     assert error.startswith("cloudrc: a worker was killed")
     count = json.loads(out)["count"]
     assert 1 <= count < KILLED
-    assert f"; {count} of 9 were flown" in error
-    assert f"continue with 'cloudrc faults fuzz --first {count + 1} --seeds {9 - count}'" in error
-    assert main(f"faults fuzz --first {KILLED} --seeds 2 --jobs 2".split()) == 6
-    assert "; no schedule was flown" in capsys.readouterr().err
+    assert f"continue with 'cloudrc faults search --first {count + 1}'" in error
 
 
-def _kill(which: tuple[str, str, int]) -> None:
+def _kill(which: tuple[str, int]) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _interrupt(which: tuple[str, str, int]) -> Result:
-    scenario = find(which[0], "virtual")
+def _interrupt(which: tuple[str, int]) -> Result:
+    scenario = find(which[0])
     if scenario.number > 1:
         raise KeyboardInterrupt
     return Result(scenario, Outcome(), 0.0)
@@ -151,14 +149,13 @@ def test_an_interrupted_fault_run_keeps_its_results(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cloudrc.cli.faults._run", how)
-    line = f"faults run --all --jobs {jobs} --junit f.xml --document f.md -o json"
+    line = f"faults run --all --jobs {jobs} --junit f.xml -o json"
     assert main(line.split()) == code
     captured = capsys.readouterr()
     assert captured.err.startswith(f"cloudrc: {word}")
     assert f"; {flown} of " in captured.err
     assert len(json.loads(captured.out)["faults"]) == flown
     assert Path("f.xml").read_text().count("<testcase") == flown
-    assert not Path("f.md").exists(), "a page needs all results"
 
 
 def test_ctrl_c_ends_the_workers_at_once() -> None:
@@ -178,12 +175,3 @@ def test_ctrl_c_ends_a_worker_that_ignores_sigterm(
     ignore_sigterm = lambda parent: signal.signal(signal.SIGTERM, signal.SIG_IGN)  # noqa: E731
     monkeypatch.setattr("cloudrc.cli.pool._begin", ignore_sigterm)
     test_ctrl_c_ends_the_workers_at_once()
-
-
-def test_a_store_that_is_not_a_folder_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("a.json").touch()
-    assert main("faults fuzz --seeds 1 --store a.json/found".split()) == 2
-    assert "this folder cannot be made" in capsys.readouterr().err

@@ -1,21 +1,19 @@
-"""Faults of the link's timing: disorder, copies, a step of the delay, asymmetry, jitter."""
+"""Faults F6, F7 and F9 to F12: disorder, copies, clocks, steps of the delay, asymmetry, jitter."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from math import isnan, sqrt
 
-from cloudrc.faults import asks
-from cloudrc.faults import asks as meters
-from cloudrc.faults.adversary import tempting
+from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight, Shape
 from cloudrc.faults.models import Clock
 from cloudrc.faults.scenario import Outcome, Scenario
-from cloudrc.faults.scenarios.link import HOUR_NS, instant
 from cloudrc.link.profile import Change
 from cloudrc.messages import Command
 from cloudrc.records import Arrival, Control
 
+HOUR_NS = 3_600_000_000_000
 AGE = "command_age_seconds"
 """How old the command in use is, by world's own clock."""
 
@@ -26,11 +24,11 @@ def _disorder(seed: int) -> Outcome:
         profile, delay=0.05, jitter=0.0, reorder=0.25
     )
     flight = Flight(seed=seed, uplink=shape, downlink=shape).fly_mission()
-    asks.safe(outcome, flight)
-    asks.done(outcome, flight)
-    outcome.true("commands applied in order, none twice", asks.applied_in_order(flight))
+    measures.safe(outcome, flight)
+    measures.done(outcome, flight)
+    outcome.true("commands applied in order, none twice", measures.applied_in_order(flight))
     for name, labels in (("datagrams_reordered_total", ()), ("datagrams_total", ("late",))):
-        meters.moves(outcome, flight, "world", name, "downlink", *labels, since=0.0)
+        measures.moves(outcome, flight, "world", name, "downlink", *labels, since=0.0)
     outcome.least("late commands dropped", flight.count("late"), 100)
     return outcome
 
@@ -41,35 +39,52 @@ def _copies(seed: int) -> Outcome:
     twice: Shape = lambda profile: replace(profile, jitter=0.0, duplicate=1.0)  # noqa: E731
     clean = Flight(seed=seed, uplink=steady, downlink=steady).fly_mission()
     flight = Flight(seed=seed, uplink=twice, downlink=twice).fly_mission()
-    asks.safe(outcome, flight)
-    asks.done(outcome, flight)
-    outcome.true("the same path, bit by bit", asks.same_path(clean, flight))
-    meters.moves(outcome, flight, "world", "datagrams_total", "downlink", "repeated", since=0.0)
+    measures.safe(outcome, flight)
+    measures.done(outcome, flight)
+    outcome.true("the same path, bit by bit", measures.same_path(clean, flight))
+    measures.moves(outcome, flight, "world", "datagrams_total", "downlink", "repeated", since=0.0)
     outcome.least("copies dropped", flight.count("repeated"), 1000)
+    return outcome
+
+
+def _clocks(seed: int) -> Outcome:
+    outcome = Outcome()
+    clean = Flight(seed=seed).fly_mission()
+    for hours in (-1, 1):
+        apart = Flight(seed=seed, cloud_clock=Clock((48 + hours) * HOUR_NS)).fly_mission()
+        text = f"cloud's clock {48 + hours} h ahead: the same path, bit by bit"
+        outcome.true(text, measures.same_path(clean, apart))
+    for ppm in (-500, 500):
+        drifting = Flight(seed=seed, cloud_clock=Clock(HOUR_NS, ppm)).fly_mission()
+        measures.safe(outcome, drifting)
+        measures.done(outcome, drifting)
+        outcome.same(f"drift of {ppm} ppm: HOLDs", len(measures.held(drifting)), 0)
     return outcome
 
 
 def _delay_step(seed: int) -> Outcome:
     """With a jitter of 1 ms: of round trips that are the same bit by bit the metric shows one."""
-    outcome, at = Outcome(), instant(seed)
+    outcome, at = Outcome(), measures.instant(seed)
     shape: Shape = lambda profile: replace(  # noqa: E731
         profile, delay=0.01, jitter=0.001, changes=(Change(at, delay=0.1),)
     )
     flight = Flight("cloud.estimator=split", seed=seed, uplink=shape, downlink=shape).fly_mission()
-    asks.safe(outcome, flight)
-    asks.done(outcome, flight)
+    measures.safe(outcome, flight)
+    measures.done(outcome, flight)
     late = [
         abs(r.horizon - r.loop_delay) / r.loop_delay
         for r in flight.of_cloud
         if isinstance(r, Control) and at + 0.5 <= r.stamp_ns * 1e-9 < at + 2.0
     ]
     outcome.most("delay estimate off after 0.5 s, share", max(late, default=float("nan")), 0.2)
-    outcome.same("HOLDs", len(asks.held(flight)), 0)
-    meters.moves(outcome, flight, "cloud", "delay_estimate_seconds", since=at)
-    before, after = (meters.seen_by(flight, "cloud", at + later) for later in (0.0, meters.SOON))
-    shown = meters.reading("cloud", after, "delay_estimate_seconds")
+    outcome.same("HOLDs", len(measures.held(flight)), 0)
+    measures.moves(outcome, flight, "cloud", "delay_estimate_seconds", since=at)
+    before, after = (
+        measures.seen_by(flight, "cloud", at + later) for later in (0.0, measures.SOON)
+    )
+    shown = measures.reading("cloud", after, "delay_estimate_seconds")
     outcome.least("metric delay_estimate_seconds", shown, 0.15, "s")
-    long, longer = (meters.above("cloud", seen, "rtt_seconds", 0.15) for seen in (before, after))
+    long, longer = (measures.above("cloud", seen, "rtt_seconds", 0.15) for seen in (before, after))
     outcome.same("metric rtt_seconds: round trips above 0.15 s before the step", long, 0)
     outcome.least("metric rtt_seconds: round trips above 0.15 s within 5 s of it", longer, 200)
     for age_max, least in ((0.25, 5.0), (1.0, 3.5)):
@@ -90,9 +105,9 @@ def _hasty(outcome: Outcome, seed: int, shape: Shape, age_max: float, least: flo
         uplink=shape,
         downlink=shape,
         honest=False,
-        tempt=tempting(_to_and_fro),
+        lies=[_to_and_fro],
     ).fly(40.0)
-    asks.safe(outcome, flight)
+    measures.safe(outcome, flight)
     # Source: docs/reference/plant.md, "Speed cap": v (command_age_max + 0.2) + v^2/6 = 8.7 m.
     reaction = age_max + 0.2
     cap = 3.0 * (sqrt(reaction * reaction + 2.0 * 8.7 / 3.0) - reaction)
@@ -117,10 +132,10 @@ def _asymmetry(seed: int) -> Outcome:
         seed=seed,
         cloud_clock=Clock(offset_ns=HOUR_NS),
     ).fly_mission()
-    asks.safe(outcome, flight)
-    asks.done(outcome, flight)
-    outcome.same("HOLDs", len(asks.held(flight)), 0)
-    rtt = meters.reading("cloud", flight.of_cloud, "rtt_seconds")
+    measures.safe(outcome, flight)
+    measures.done(outcome, flight)
+    outcome.same("HOLDs", len(measures.held(flight)), 0)
+    rtt = measures.reading("cloud", flight.of_cloud, "rtt_seconds")
     outcome.most("metric rtt_seconds, its mean is off 0.2 s by", abs(rtt - 0.2), 0.01, "s")
     arrivals = [r for r in (*flight.of_world, *flight.of_cloud) if isinstance(r, Arrival)]
     outcome.true("no one-way delay is claimed", all(isnan(r.delay) for r in arrivals))
@@ -133,30 +148,32 @@ def _jitter(seed: int) -> Outcome:
     wild: Shape = lambda profile: replace(profile, delay=0.15, jitter=0.15)  # noqa: E731
     without = Flight("link.profile=paper-p3", seed=seed, uplink=steady, downlink=steady)
     flight = Flight("link.profile=paper-p3", seed=seed).fly_mission()
-    asks.safe(outcome, flight)
-    asks.done(outcome, flight)
-    outcome.same("jitter 40 ms: HOLDs", len(asks.held(flight)), 0)
+    measures.safe(outcome, flight)
+    measures.done(outcome, flight)
+    outcome.same("jitter 40 ms: HOLDs", len(measures.held(flight)), 0)
     young, old = _ages(without.fly_mission())
     outcome.most(f"without jitter: metric {AGE}: outside 0.1 to 0.15 s", young + old, 0.01)
     young, old = _ages(flight)
     outcome.least(f"jitter 40 ms: metric {AGE}: share that is at most 0.1 s", young, 0.05)
     outcome.least(f"jitter 40 ms: metric {AGE}: share above 0.15 s", old, 0.05)
     flight = Flight(seed=seed, uplink=wild, downlink=wild).fly(60.0)
-    asks.safe(outcome, flight)
-    meters.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=0.0)
+    measures.safe(outcome, flight)
+    measures.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=0.0)
     _, old = _ages(flight)
     outcome.least(f"jitter 150 ms: metric {AGE}: share above 0.15 s", old, 0.25)
-    flown = meters.share_within("world", flight.of_world, AGE, 0.25)
+    flown = measures.share_within("world", flight.of_world, AGE, 0.25)
     outcome.same(f"jitter 150 ms: metric {AGE}: share that is at most 0.25 s", flown, 1.0)
     outcome.most(
-        "jitter 150 ms: changes of the guard in any second", asks.busiest_second(flight), 2
+        "jitter 150 ms: changes of the guard in any second",
+        measures.busiest_second(flight.changes),
+        2,
     )
     return outcome
 
 
 def _ages(flight: Flight) -> tuple[float, float]:
     """Which share [1] of the commands flown was at most 0.1 s old, and which above 0.15 s."""
-    within = [meters.share_within("world", flight.of_world, AGE, each) for each in (0.1, 0.15)]
+    within = [measures.share_within("world", flight.of_world, AGE, each) for each in (0.1, 0.15)]
     return within[0], 1.0 - within[1]
 
 
@@ -178,6 +195,15 @@ SCENARIOS = (
         "none",
         "cloudrc_datagrams_total{outcome=repeated}",
         _copies,
+    ),
+    Scenario(
+        9,
+        "clock-steps",
+        "the clocks of the two ends lie two days and an hour apart; one drifts by 500 ppm",
+        "the same flight, bit by bit; drift is flown in TRACK",
+        "none",
+        "nothing: no metric (a step of the wall clock: fault 'wall_clock')",
+        _clocks,
     ),
     Scenario(
         10,
