@@ -6,10 +6,10 @@ teleop, the invariants, and helpers that inject faults and find out what happene
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TypeAlias, TypedDict, Unpack
+from typing import TypeAlias
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
@@ -31,9 +31,9 @@ from cloudrc.faults.models import (
 from cloudrc.faults.scenario import generator
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, DirectionProfile
-from cloudrc.messages import Cause, GuardState
+from cloudrc.messages import GuardState
 from cloudrc.record.hash import RecordHash
-from cloudrc.records import Contact, Counted, GroundTruth, GuardChange, MissionEvent, Record
+from cloudrc.records import Counted, GroundTruth, GuardChange, MissionEvent, Record
 from cloudrc.teleop.store import Mission, Order
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
@@ -41,48 +41,8 @@ from cloudrc.world.robot import Robot
 
 Shape: TypeAlias = Callable[[DirectionProfile], DirectionProfile]
 """Changes the conditions of one direction of the link."""
-GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 SECRET = KeySet(Key(b"a key of the fault suite, 32 b.."))
-ODOMETRY_NS = 10_000_000
-"""Period of odometry [ns]; a contact began at most this long before its stamp."""
-BRAKE_NS = 200_000_000
-"""Time in which a descent that the operator has acknowledged is stopped [ns].
-Source: docs/reference/plant.md, "Stop rule"."""
 SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
-
-
-class Options(TypedDict, total=False):
-    """How a flight differs from the plain one.
-
-    Attributes:
-        seed: Seed of everything random; 1 by default.
-        cloud_clock: Cloud's clock; by default the two ends share a clock.
-        uplink: Changes the link from world to cloud.
-        downlink: Changes the link from cloud to world.
-        honest: Whether a contact is a breach; it is by default.
-        keep: Whether all records are kept and hashed; they are by default.
-        start: Whether the experiment's mission is ordered at once; it is by default.
-        life: Distinguishes the processes of one flight from those of another, as nonces do.
-        lies: Change cloud's commands, one after the other.
-        words: Takes the operator's place in cloud.
-        secrets: Key files by end; by default both ends have the same.
-        second: When another cloud asks for the robot [s]; never by default.
-        separate: Whether teleop is a process of its own; by default it is in cloud's.
-    """
-
-    seed: int
-    cloud_clock: Clock | None
-    uplink: Shape | None
-    downlink: Shape | None
-    honest: bool
-    keep: bool
-    start: bool
-    life: int
-    lies: Sequence[Lie]
-    words: Words | None
-    secrets: dict[str, KeySet]
-    second: float | None
-    separate: bool
 
 
 def blackouts(*spans: tuple[float, float]) -> Shape:
@@ -114,21 +74,45 @@ class Flight:
         listeners: Get world's new records and the time [ns] every 100 ms.
     """
 
-    def __init__(self, *settings: str, **options: Unpack[Options]) -> None:
+    def __init__(
+        self,
+        *settings: str,
+        seed: int = 1,
+        cloud_clock: Clock | None = None,
+        uplink: Shape | None = None,
+        downlink: Shape | None = None,
+        honest: bool = True,
+        keep: bool = True,
+        start: bool = True,
+        life: int = 1,
+        lies: Sequence[Lie] = (),
+        words: Words | None = None,
+        second: float | None = None,
+        separate: bool = False,
+    ) -> None:
         """Prepare a flight.
 
         Args:
             settings: Changes of the experiment `paper`, as `--set` takes them.
-            options: See `Options`.
+            seed: Seed of everything random.
+            cloud_clock: Cloud's clock; None if the two ends share a clock.
+            uplink: Changes the link from world to cloud.
+            downlink: Changes the link from cloud to world.
+            honest: Whether a contact is a breach.
+            keep: Whether all records are kept and hashed.
+            start: Whether the experiment's mission is ordered at once.
+            life: Distinguishes the processes of one flight from those of another, as nonces do.
+            lies: Change cloud's commands, one after the other.
+            words: Takes the operator's place in cloud.
+            second: When another cloud asks for the robot [s]; None for never.
+            separate: Whether teleop is a process of its own, not in cloud's.
         """
-        seed = options.get("seed", 1)
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
-        self.honest, self._keep = options.get("honest", True), options.get("keep", True)
-        self._life, self._second = options.get("life", 1), options.get("second")
-        self._lies, self._words = options.get("lies", ()), options.get("words")
-        clock = options.get("cloud_clock")
-        self._clock, self._clock_id = clock or Clock(), SHARED if clock is None else OTHER
-        self.secrets = {"world": SECRET, "cloud": SECRET} | (options.get("secrets") or {})
+        self.honest, self._keep = honest, keep
+        self._life, self._second, self._lies, self._words = life, second, lies, words
+        self._clock_id = SHARED if cloud_clock is None else OTHER
+        self._clock = cloud_clock or Clock()
+        self.secrets = {"world": SECRET, "cloud": SECRET}
         self.rings: dict[str, KeyRing] = {}
         self.rival: InProcessTeleop | None = None
         self.listeners: list[Callable[[list[Record], int], None]] = []
@@ -140,15 +124,15 @@ class Flight:
         self.watch = Watch(Limits.of(self.experiment.guard))
         limit = self.experiment.criteria.contact_speed_max_mps
         self.teleop = InProcessTeleop(limit)
-        if options.get("separate", False):
+        if separate:
             self.teleop = SeparateTeleop(limit, phase_ns=int(generator(seed, 45).integers(WAKE_NS)))
-        if options.get("start", True):
+        if start:
             self.order(0)
         self.world = RestartableEndpoint(self._build_world, Clock())
         self.cloud = RestartableEndpoint(self._build_cloud, self._clock, "cloud")
         self.teleop.run_on(self.cloud)
-        self.uplink = _link(self.experiment, options.get("uplink"), up=True)
-        self.downlink = _link(self.experiment, options.get("downlink"), up=False)
+        self.uplink = _link(self.experiment, uplink, up=True)
+        self.downlink = _link(self.experiment, downlink, up=False)
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
 
     @property
@@ -244,12 +228,8 @@ class Flight:
         A new guard records no change at its start, so the last change may be another guard's.
         """
         if self.world.inner is None:
-            return GROUND, "the world is down"
+            return GuardState.GROUND, "the world is down"
         return self.robot.guard.state, self.robot.guard.cause.words
-
-    def state_at(self, stamp_ns: int) -> GuardState:
-        """Return the guard's state at an instant [ns, world's clock]."""
-        return state_at(self.changes, stamp_ns, self._born_ns)
 
     def _build_world(self, start_ns: int) -> WorldEndpoint:
         identity = WorldIdentity(
@@ -259,7 +239,6 @@ class Flight:
             next_epoch=self._next_epoch,
         )
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
-        self._born_ns = start_ns
         self.watch.attach(world.robot, start_ns, honest=self.honest)
         return world
 
@@ -310,58 +289,9 @@ class Flight:
             self.of_cloud += of_cloud
             self._hash.update(of_world)
             self._hash.update(of_cloud)
-        self.note(of_world)
+        self.changes += [record for record in of_world if isinstance(record, GuardChange)]
         for listen in self.listeners:
             listen(of_world, self.run.now_ns)
-
-    def note(self, records: Iterable[Record]) -> None:
-        """Note changes of the guard, and check contacts, among world's new records."""
-        for record in records:
-            if isinstance(record, GuardChange):
-                self.changes.append(record)
-            elif isinstance(record, Contact):
-                state = state_before(self.changes, record.stamp_ns, self._born_ns)
-                self.watch.see_contact(record, state, honest=self.honest)
-
-
-def state_at(changes: Sequence[GuardChange], stamp_ns: int, born_ns: int) -> GuardState:
-    """Return the guard's state at an instant.
-
-    Args:
-        changes: Changes of the guards of all worlds, in order.
-        stamp_ns: The instant [ns, world's clock].
-        born_ns: When the newest world started [ns].
-    """
-    change = _last(changes, stamp_ns, born_ns)
-    return GROUND if change is None else change.state
-
-
-def state_before(changes: Sequence[GuardChange], stamp_ns: int, born_ns: int) -> GuardState:
-    """Return the guard's state when a contact began, which may have stopped the rotors since.
-
-    Args:
-        changes: Changes of the guards of all worlds, in order.
-        stamp_ns: Stamp of the contact [ns, world's clock].
-        born_ns: When the newest world started [ns].
-    """
-    change = _last(changes, stamp_ns, born_ns)
-    if change is None:
-        return GROUND
-    state = change.state
-    if state is ESTOP and change.cause != Cause.STOPPED.words:
-        if change.stamp_ns > stamp_ns - ODOMETRY_NS:  # the contact has caused this change
-            state = state_at(changes, change.stamp_ns - 1, born_ns)
-    if state is HOLD and state_at(changes, stamp_ns - BRAKE_NS, born_ns) is LAND:
-        state = LAND  # acknowledged right above a pipe on which it was about to land
-    return state
-
-
-def _last(changes: Sequence[GuardChange], stamp_ns: int, born_ns: int) -> GuardChange | None:
-    """Return the last change up to an instant, in the world that ran then."""
-    for change in reversed(changes):
-        if change.stamp_ns <= stamp_ns:
-            return None if change.stamp_ns < born_ns <= stamp_ns else change
-    return None
 
 
 def _link(experiment: ResolvedExperiment, shape: Shape | None, *, up: bool) -> LinkDirection:

@@ -36,14 +36,12 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
-from cloudrc.records import Contact
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.rotors import STOPPED
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 FLOWN = (TRACK, HOLD, LAND)
-ABOVE_GROUND = (TRACK, HOLD)
 SLACK = 1e-9
 """Tolerance for rounding [m/s]."""
 REPORTED = 5
@@ -60,6 +58,9 @@ REST = 0.5
 flights of the search, half of them with a hostile cloud, at most 0.20 was used."""
 FALL_MAX = 1.5
 """Distance from the fence at which people are safe [m]. Source: docs/safety.md, "The guard"."""
+BRAKE_NS = 200_000_000
+"""Time in which a descent that the operator has acknowledged is stopped [ns].
+Source: docs/reference/plant.md, "Stop rule"."""
 REELS_NS = 1_000_000_000
 """Time after a hit in which the hit explains the robot's motion [ns]."""
 
@@ -127,7 +128,6 @@ class Watch:
         self.counts: Counter[str] = Counter()
         self.margin, self.speed = 9.0, 0.0
         self.landed_on: set[str] = set()
-        self._motion: MotionInvariants | None = None
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
         """Check every step of a robot from now on.
@@ -137,25 +137,7 @@ class Watch:
             start_ns: Time of its first step [ns].
             honest: Whether its cloud is honest; then a hit is a breach.
         """
-        self._motion = MotionInvariants(robot, self, start_ns)
-        robot.observers.append(RobotInvariants(robot, self, self._motion, start_ns, honest))
-
-    def see_contact(self, contact: Contact, guard: GuardState, *, honest: bool) -> None:
-        """Check a contact that began in a state of the guard.
-
-        With a dishonest cloud, a contact only explains what follows.
-        """
-        motion = self._motion
-        if motion is not None:
-            motion.forgive(contact)
-        body, low = contact.body, guard not in ABOVE_GROUND
-        if not honest or (body == "board" and contact.tip) or (low and body == "floor"):
-            return
-        if low and (guard is LAND or (motion is not None and motion.comes_down)):
-            self.landed_on.add(body)
-        else:
-            part = "tip" if contact.tip else "body"
-            self.note(contact.stamp_ns, "collision", f"{part} touched {body} in {guard.name}")
+        robot.observers.append(RobotInvariants(robot, self, start_ns, honest))
 
     def note(self, now_ns: int, kind: str, text: str) -> None:
         """Note a breach at `now_ns` [ns]."""
@@ -167,12 +149,10 @@ class Watch:
 class RobotInvariants:
     """Distributes what one robot does to the checks; an `Observer`."""
 
-    def __init__(
-        self, robot: Robot, watch: Watch, motion: MotionInvariants, start_ns: int, honest: bool
-    ) -> None:
+    def __init__(self, robot: Robot, watch: Watch, start_ns: int, honest: bool) -> None:
         limits = watch.limits
         self._robot, self._guard, self._note = robot, robot.guard, watch.note
-        self._motion = motion
+        self._motion = MotionInvariants(robot, watch, honest)
         self._rotors = RotorInvariants(robot, watch.note, honest)
         self._operator = OperatorInvariants(watch.note)
         self._hold = HoldInvariants(watch.note, self._operator, limits.speed, limits.hold_ns)
@@ -221,25 +201,20 @@ class RobotInvariants:
 
 
 class MotionInvariants:
-    """Checks where the robot is, and the reference that it flies.
+    """Checks where the robot is, what it touches, and the reference that it flies."""
 
-    Attributes:
-        comes_down: Whether the robot lands, or fell after an emergency stop.
-    """
-
-    def __init__(self, robot: Robot, watch: Watch, start_ns: int) -> None:
-        self._guard, self._watch, self._note = robot.guard, watch, watch.note
+    def __init__(self, robot: Robot, watch: Watch, honest: bool) -> None:
+        self._robot, self._guard, self._honest = robot, robot.guard, honest
+        self._watch, self._note = watch, watch.note
         self._speed_max = watch.limits.speed + SLACK
         self._step_max = watch.limits.acceleration * STEP_NS * 1e-9 + SLACK
-        self.comes_down = False
+        self._comes_down = False  # whether it lands, or fell after an emergency stop
         self._falls = self._hit = False  # outside of flight: after a stop; after a hit
         self._basis_ns, self._before = -1, ZERO
+        self._landed_ns = -2 * BRAKE_NS
+        self._touches, self._seen = robot.simulator.touches, 0
         self._touched: tuple[int, str] | None = None
         self._left, self._way = ZERO, inf  # where TRACK ended, and how far the robot may go
-
-    def forgive(self, contact: Contact) -> None:
-        """Note a contact, which explains the motion that follows."""
-        self._touched, self._way = (contact.stamp_ns, contact.body), inf
 
     def see_command(self, command: Command, rejection: str | None) -> None:
         """Note the basis of an accepted command."""
@@ -249,7 +224,7 @@ class MotionInvariants:
     def see_stop(self, state: GuardState) -> None:
         """Note an emergency stop in a state."""
         self._falls = self._falls or state in FLOWN
-        self.comes_down = self.comes_down or self._falls
+        self._comes_down = self._comes_down or self._falls
 
     def see_step(
         self,
@@ -269,7 +244,7 @@ class MotionInvariants:
         if was is TRACK and state is not TRACK:
             self._leave_track(readings, now_ns)
         if flies:
-            self.comes_down = state is LAND
+            self._comes_down = state is LAND
             self._check_stop(position, reference, state is LAND, now_ns)
             if not abs(self._guard.yaw_rate) <= self._watch.limits.yaw_rate:  # or it is NaN
                 self._note(now_ns, "cap", f"reference turns by {self._guard.yaw_rate:.3f} rad/s")
@@ -283,7 +258,32 @@ class MotionInvariants:
                 self._note(now_ns, "stale", f"TRACK on a command {age:.3f} s old")
         elif any(rotor_speeds):
             self._note(now_ns, "latch", f"rotors turn in {state.name}")
+        if state is LAND:
+            self._landed_ns = now_ns
         self._before = reference
+        self._check_touches(state, now_ns)
+
+    def _check_touches(self, state: GuardState, now_ns: int) -> None:
+        """Check the contacts that began in this step.
+
+        With a dishonest cloud, a contact only explains what follows.
+        """
+        touches = self._robot.simulator.touches
+        if touches is not self._touches:
+            self._touches, self._seen = touches, 0
+        for body, tip, *_ in touches[self._seen :]:
+            self._touched, self._way = (now_ns, body), inf
+            # Acknowledged right above a pipe, a robot that lands cannot stop in time.
+            lands = state is LAND or (state is HOLD and now_ns - self._landed_ns <= BRAKE_NS)
+            low = lands or state not in FLOWN
+            if not self._honest or (body == "board" and tip) or (low and body == "floor"):
+                continue
+            if low and (lands or self._comes_down):
+                self._watch.landed_on.add(body)
+            else:
+                part = "tip" if tip else "body"
+                self._note(now_ns, "collision", f"{part} touched {body} in {state.name}")
+        self._seen = len(touches)
 
     def _leave_track(self, readings: Readings, now_ns: int) -> None:
         """From now on the robot may move only as far as it needs to stop."""

@@ -15,7 +15,6 @@ from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.record.columns import Recording
 from cloudrc.records import (
     CommandApplied,
-    Counted,
     Fault,
     GuardChange,
     Record,
@@ -74,8 +73,8 @@ def reading(role: str, records: Iterable[Record], name: str, *labels: str) -> fl
     return float(shown.get(labels, nan))
 
 
-def within(role: str, records: Iterable[Record], name: str, bound: float) -> tuple[int, int]:
-    """Return how many values of a histogram are at most a bound, and how many there are.
+def above(role: str, records: Iterable[Record], name: str, bound: float) -> tuple[int, float]:
+    """Return how many values of a histogram are above a bound, and their share [1].
 
     Args:
         role: Role of the process.
@@ -88,19 +87,8 @@ def within(role: str, records: Iterable[Record], name: str, bound: float) -> tup
     shown = live.read()[f"cloudrc_{name}"]
     assert isinstance(shown, Histogram)
     counts = shown.cumulative()
-    return counts[shown.bounds.index(bound)], counts[-1]
-
-
-def share_within(role: str, records: Iterable[Record], name: str, bound: float) -> float:
-    """Return the share of a histogram's values that are at most a bound; see `within`."""
-    count, total = within(role, records, name, bound)
-    return count / total if total else nan
-
-
-def above(role: str, records: Iterable[Record], name: str, bound: float) -> int:
-    """Return how many values of a histogram are above a bound; see `within`."""
-    count, total = within(role, records, name, bound)
-    return total - count
+    count = counts[-1] - counts[shown.bounds.index(bound)]
+    return count, count / counts[-1] if counts[-1] else nan
 
 
 def seen_by(flight: Flight, role: str, until: float) -> list[Record]:
@@ -148,23 +136,6 @@ def moves(
     moved = after == after and before != after  # absent before is as good as another value
     end = "" if over is None else " of its end"
     outcome.true(f"metric {' '.join((name, *labels))} moves within {SOON:g} s{end}", moved)
-
-
-def counts(outcome: Outcome, role: str, counted: str, total: int, name: str, *labels: str) -> None:
-    """Check that a metric shows what a process has counted, and that this is not zero.
-
-    Args:
-        outcome: Takes the check.
-        role: Role of the process.
-        counted: The process's own name of the count.
-        total: The count.
-        name: Name of the metric, without its prefix.
-        labels: Values of its labels.
-    """
-    value = reading(role, [Counted(0, role, counted, total)], name, *labels)
-    text = f"metric {' '.join((name, *labels))}"
-    outcome.least(f"{text} shows what was counted", value, 1)
-    outcome.same(f"{text}: shown too many or too few", value - total, 0)
 
 
 # The guard.

@@ -7,58 +7,79 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import yaml
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.faults.scenario import generator
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 
-KINDS: dict[str, str] = {
-    "blackout": "no datagram passes",
-    "delay": "one-way delay rises by value [s]",
-    "jitter": "jitter rises to value [s]",
-    "loss": "a share of value is lost",
-    "bursts": "loss in bursts of value packets",
-    "corruption": "a share of value has a bit turned over",
-    "garbage": "value datagrams of garbage before every honest one",
-    "replay": "value captured datagrams before every honest one",
-    "cloud_killed": "the cloud process is away",
-    "pod_killed": "the cloud pod, teleop with it, is away",
-    "teleop_killed": "teleop is away",
-    "teleop_shut_down": "teleop is asked to end, and away after a share of value of the duration",
-    "pod_shut_down": "the cloud pod is asked to end, and away after a share of value",
-    "cloud_paused": "the cloud process stands still",
-    "cloud_throttled": "the cloud process runs for a share of value of each 100 ms",
-    "world_paused": "the world process stands still",
-    "world_killed": "the world restarts",
-    "world_throttled": "the world process runs for a share of value of each 100 ms",
-    "teleop_paused": "the teleop process stands still",
-    "second_cloud": "another cloud with the same key joins",
-    "key_rotated": "world reads a new key, cloud after the duration",
-    "key_wrong": "cloud has a wrong key",
-    "values_invalid": "value commands a second of an honest cloud hold NaN or infinity",
-    "values_huge": "value commands a second of an honest cloud are 1e308 m/s",
-    "second_order": "another mission is ordered",
-    "stopped": "the operator stops the rotors, and acknowledges that some time after",
-    "held": "the operator holds the mission, resumes it after the duration",
+
+class Kind(NamedTuple):
+    """A kind of fault.
+
+    Attributes:
+        text: What happens; `value` is the event's.
+        longest: Longest duration that is drawn [s]; 0 for an instant.
+        low: Lowest value that is drawn [any unit].
+        high: Highest value that is drawn [any unit].
+    """
+
+    text: str
+    longest: float = 0.0
+    low: float = 0.0
+    high: float = 0.0
+
+
+KINDS = {
+    "blackout": Kind("no datagram passes", 8.0),
+    "delay": Kind("one-way delay rises by value [s]", 10.0, 0.01, 0.3),
+    "jitter": Kind("jitter rises to value [s]", 10.0, 0.01, 0.15),
+    "loss": Kind("a share of value is lost", 10.0, 0.05, 0.9),
+    "bursts": Kind("loss in bursts of value packets", 15.0, 3.0, 60.0),
+    "corruption": Kind("a share of value has a bit turned over", 10.0, 0.01, 1.0),
+    "garbage": Kind("value datagrams of garbage before every honest one", 5.0, 1.0, 20.0),
+    "replay": Kind("value captured datagrams before every honest one", 5.0, 1.0, 20.0),
+    "cloud_killed": Kind("the cloud process is away", 5.0),
+    "pod_killed": Kind("the cloud pod, teleop with it, is away", 8.0),
+    "teleop_killed": Kind("teleop is away", 6.0),
+    "teleop_shut_down": Kind("teleop is asked to end, away after a share of value", 6.0, 0.0, 1.0),
+    "pod_shut_down": Kind(
+        "the cloud pod is asked to end, away after a share of value", 8.0, 0.0, 1.0
+    ),
+    "cloud_paused": Kind("the cloud process stands still", 5.0),
+    "cloud_throttled": Kind("the cloud process runs for a share of value", 8.0, 0.05, 0.9),
+    "world_paused": Kind("the world process stands still", 1.0),
+    "world_killed": Kind("the world restarts", 3.0),
+    "world_throttled": Kind("the world process runs for a share of value", 8.0, 0.1, 0.95),
+    "teleop_paused": Kind("the teleop process stands still", 5.0),
+    "second_cloud": Kind("another cloud with the same key joins", 15.0),
+    "key_rotated": Kind("world reads a new key, cloud after the duration", 10.0),
+    "key_wrong": Kind("cloud has a wrong key", 10.0),
+    "values_invalid": Kind(
+        "value commands a second of an honest cloud hold NaN or infinity", 10.0, 1.0, 12.0
+    ),
+    "values_huge": Kind("value commands a second of an honest cloud are 1e308 m/s", 10.0, 1.0, 4.0),
+    "second_order": Kind("another mission is ordered"),
+    "stopped": Kind("the operator stops the rotors, and acknowledges later"),
+    "held": Kind("the operator holds the mission, resumes it after the duration", 5.0),
 }
 """Every kind of fault."""
-WAYS = ("both", "up", "down")
-SHARES = (
-    *("loss", "corruption", "cloud_throttled", "world_throttled"),
-    *("teleop_shut_down", "pod_shut_down"),
-)
+SHARES = ("loss", "corruption", "cloud_throttled", "world_throttled", "teleop_shut_down",
+          "pod_shut_down")  # fmt: skip
 """Kinds whose value is a share, in [0, 1]."""
-VALUE_MAX = 1e9
 DURATION_MAX = 86_400.0
 """Longest flight [s]."""
 OFFSET_MAX = 1e6
 """Largest difference of the two clocks [s]."""
 _CONFIG = ConfigDict(extra="forbid")
+Time = Annotated[float, Field(ge=0.0, le=DURATION_MAX)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Way = Literal["both", "up", "down"]
+WAYS: tuple[Way, ...] = ("both", "up", "down")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +96,10 @@ class Event:
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
     kind: str
-    at: float
-    duration: float = 0.0
-    value: float = 0.0
-    way: str = "both"
+    at: Time
+    duration: Time = 0.0
+    value: Annotated[float, Field(ge=0.0, le=1e9)] = 0.0
+    way: Way = "both"
 
     @property
     def end(self) -> float:
@@ -105,17 +126,17 @@ class Schedule:
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
-    seed: int
+    seed: Annotated[int, Field(ge=0, le=2**63)]
     profile: str = "paper-p2"
     events: tuple[Event, ...] = ()
-    duplicate: float = 0.0
-    reorder: float = 0.0
-    cloud_offset: float = 0.0
-    cloud_drift: int = 0
+    duplicate: Share = 0.0
+    reorder: Share = 0.0
+    cloud_offset: Annotated[float, Field(ge=-OFFSET_MAX, le=OFFSET_MAX)] = 0.0
+    cloud_drift: Annotated[int, Field(ge=-100_000, le=100_000)] = 0
     policy: str = ""
-    duration: float = 60.0
+    duration: Annotated[float, Field(ge=0.1, le=DURATION_MAX)] = 60.0
     separate: bool = False
-    hold_max: float = 60.0
+    hold_max: Annotated[float, Field(ge=0.1, le=3600.0)] = 60.0
 
     @property
     def teleop_is_separate(self) -> bool:
@@ -200,6 +221,12 @@ def load(path: Path) -> Schedule:
         if not isinstance(document, dict):
             raise _none(path, "it has no keys")
         schedule = _SCHEDULE.validate_python(document)
+        for n, event in enumerate(schedule.events):
+            if event.kind not in KINDS:
+                text = f"events.{n}.kind: no fault '{event.kind}'; there are: {', '.join(KINDS)}"
+                raise _none(path, text)
+            if event.kind in SHARES and event.value > 1.0:
+                raise _none(path, f"events.{n}.value: {event.value:g} is not between 0 and 1")
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"]))
@@ -207,8 +234,6 @@ def load(path: Path) -> Schedule:
     except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
         text = getattr(error, "strerror", None) or to_one_line(str(error))
         raise _none(path, text) from error
-    if problem := _problem(schedule):
-        raise _none(path, problem)
     return schedule
 
 
@@ -217,36 +242,6 @@ _SCHEDULE = TypeAdapter(Schedule)
 
 def _none(path: Path, text: str) -> BadInputError:
     return BadInputError(f"{path}: is no schedule of faults: {text}")
-
-
-def _problem(schedule: Schedule) -> str:
-    """Return why a schedule cannot be flown; "" if it can."""
-    numbers = {
-        "seed": (schedule.seed, 0, 2**63),
-        "duration": (schedule.duration, 0.1, DURATION_MAX),
-        "duplicate": (schedule.duplicate, 0.0, 1.0),
-        "reorder": (schedule.reorder, 0.0, 1.0),
-        "cloud_offset": (schedule.cloud_offset, -OFFSET_MAX, OFFSET_MAX),
-        "cloud_drift": (schedule.cloud_drift, -100_000, 100_000),
-        "hold_max": (schedule.hold_max, 0.1, 3600.0),
-    }
-    for n, event in enumerate(schedule.events):
-        if event.kind not in KINDS:
-            return f"events.{n}.kind: no fault '{event.kind}'; there are: {', '.join(KINDS)}"
-        if event.way not in WAYS:
-            return f"events.{n}.way: '{event.way}' is none of {', '.join(WAYS)}"
-        numbers[f"events.{n}.at"] = (event.at, 0.0, DURATION_MAX)
-        numbers[f"events.{n}.duration"] = (event.duration, 0.0, DURATION_MAX)
-        numbers[f"events.{n}.value"] = (event.value, *_range(event.kind))
-    for place, (value, low, high) in numbers.items():
-        if not low <= value <= high:  # NaN is not, either
-            return f"{place}: {value:g} is not between {low:g} and {high:g}"
-    return ""
-
-
-def _range(kind: str) -> tuple[float, float]:
-    """Return the lowest and highest value of a kind of fault."""
-    return 0.0, 1.0 if kind in SHARES else VALUE_MAX
 
 
 CALM = 45.0
@@ -260,37 +255,6 @@ HOLDS = 0.8, 3.0
 HOLD_MAX = Schedule(0).hold_max
 ONCE = ("second_cloud", "key_rotated")
 """Kinds of which a flight has one at most."""
-
-# Kind -> longest duration [s], lowest and highest value.
-RANGES: dict[str, tuple[float, float, float]] = {
-    "blackout": (8.0, 0.0, 0.0),
-    "delay": (10.0, 0.01, 0.3),
-    "jitter": (10.0, 0.01, 0.15),
-    "loss": (10.0, 0.05, 0.9),
-    "bursts": (15.0, 3.0, 60.0),
-    "corruption": (10.0, 0.01, 1.0),
-    "garbage": (5.0, 1.0, 20.0),
-    "replay": (5.0, 1.0, 20.0),
-    "cloud_killed": (5.0, 0.0, 0.0),
-    "pod_killed": (8.0, 0.0, 0.0),
-    "teleop_killed": (6.0, 0.0, 0.0),
-    "teleop_shut_down": (6.0, 0.0, 1.0),
-    "pod_shut_down": (8.0, 0.0, 1.0),
-    "cloud_paused": (5.0, 0.0, 0.0),
-    "cloud_throttled": (8.0, 0.05, 0.9),
-    "world_paused": (1.0, 0.0, 0.0),
-    "world_killed": (3.0, 0.0, 0.0),
-    "world_throttled": (8.0, 0.1, 0.95),
-    "teleop_paused": (5.0, 0.0, 0.0),
-    "second_cloud": (15.0, 0.0, 0.0),
-    "key_rotated": (10.0, 0.0, 0.0),
-    "key_wrong": (10.0, 0.0, 0.0),
-    "values_invalid": (10.0, 1.0, 12.0),
-    "values_huge": (10.0, 1.0, 4.0),
-    "second_order": (0.0, 0.0, 0.0),
-    "stopped": (0.0, 0.0, 0.0),
-    "held": (5.0, 0.0, 0.0),
-}
 
 
 def compose(seed: int) -> Schedule:
@@ -325,7 +289,7 @@ def compose(seed: int) -> Schedule:
 
 
 def _event(kind: str, rng: np.random.Generator) -> Event:
-    longest, low, high = RANGES[kind]
+    _, longest, low, high = KINDS[kind]
     at = float(rng.uniform(0.5, CALM - 1.0))
     # Short ones are as likely as long ones: 20 ms find as much as 5 s.
     duration = longest * float(rng.uniform()) ** 3 if longest else 0.0
@@ -340,7 +304,8 @@ def _swizzle(rng: np.random.Generator) -> list[Event]:
 
     Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
     """
-    things = [("blackout", "up"), ("blackout", "down"), ("cloud_paused", "both")]
+    things: list[tuple[str, Way]] = [("blackout", "up"), ("blackout", "down")]
+    things.append(("cloud_paused", "both"))
     things.append(("world_paused", "both"))
     starts = float(rng.uniform(1.0, 35.0)) + np.cumsum(rng.uniform(0.05, 0.8, 4))
     ends = rng.permutation(starts[-1] + np.cumsum(rng.uniform(0.05, 1.0, 4)))

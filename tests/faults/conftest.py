@@ -16,6 +16,7 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
+from cloudrc.world.readings import Touch
 from cloudrc.world.rotors import STOPPED
 
 MS = 1_000_000
@@ -31,7 +32,7 @@ class FakeRobot:
         self.guard: Any = SimpleNamespace(
             state=TRACK, reference=ZERO, yaw_rate=yaw_rate, cause=Cause.ENDED
         )
-        self.simulator: Any = SimpleNamespace(steps=0, touch_age=float("inf"))
+        self.simulator: Any = SimpleNamespace(steps=0, touch_age=float("inf"), touches=[])
         self.observers: list[Any] = []
         self.position, self.velocity = INSIDE, ZERO
         self.now_ns = 0
@@ -59,6 +60,10 @@ class FakeRobot:
         for _ in range(count):
             command = Command(0, basis_ns, 0, ZERO, 0.0)
             self.observer.see_command(command, rejection, self.now_ns)
+
+    def touch(self, body: str, *, tip: bool = False) -> None:
+        """Let a contact begin in the next step."""
+        self.simulator.touches.append(Touch(body, tip, self.position, ZERO, ZERO))
 
     def release(self) -> None:
         """Let the operator acknowledge and start, and ten fresh commands come."""

@@ -6,7 +6,6 @@ import pytest
 
 from cloudrc.faults.invariants import can_stop
 from cloudrc.messages import ZERO, GuardState, Request, Start, Vector
-from cloudrc.records import Contact
 from cloudrc.world.rotors import STOPPED
 from tests.faults.conftest import (
     ESTOP,
@@ -22,10 +21,6 @@ from tests.faults.conftest import (
 
 FAR = (9.2 + 1.51, 1.0, 1.0)
 NAN = float("nan")
-
-
-def contact(body: str, *, tip: bool = False, at_ns: int = 0) -> Contact:
-    return Contact(at_ns, body, INSIDE, ZERO, ZERO, tip)
 
 
 @pytest.mark.parametrize("state", [GROUND, TRACK, HOLD, LAND])
@@ -72,7 +67,8 @@ def test_after_a_stop_it_takes_off_where_it_lies_inside(
 
 def test_a_breach_says_how_long_before_something_was_hit() -> None:
     robot = FakeRobot()
-    robot.watch.see_contact(contact("board"), TRACK, honest=False)
+    robot.touch("board")
+    robot.step(TRACK)
     robot.position = OUTSIDE
     robot.step(TRACK)
     texts = [breach.text for breach in robot.watch.breaches]
@@ -184,11 +180,11 @@ def test_without_commands_the_robot_stops_where_it_can(
     assert robot.step(HOLD) == kinds
 
 
-@pytest.mark.parametrize(("ago_ms", "kinds"), [(0, set()), (1000, {"rest"})])
+@pytest.mark.parametrize(("ago_ms", "kinds"), [(2, set()), (1000, {"rest"})])
 def test_a_recent_hit_excuses_drift_until_the_next_flight(ago_ms: int, kinds: set[str]) -> None:
     robot = FakeRobot()
-    robot.watch.see_contact(contact("pipe_3", at_ns=(2 - ago_ms) * MS), TRACK, honest=False)
-    robot.step(TRACK)
+    robot.touch("pipe_3")
+    robot.step(TRACK, ms=ago_ms)
     robot.step(HOLD)
     robot.position = (3.0, 1.0, 1.0)
     assert robot.step(HOLD) == kinds
@@ -202,33 +198,49 @@ def test_a_recent_hit_excuses_drift_until_the_next_flight(ago_ms: int, kinds: se
         ("pipe_1", True, TRACK, {"collision"}),
         ("floor", False, HOLD, {"collision"}),
         ("floor", False, LAND, set()),
-        ("pipe_1", False, ESTOP, {"collision"}),
+        ("pipe_1", False, LAND, set()),
+        ("pipe_1", False, GROUND, {"collision"}),
     ],
 )
 def test_with_an_honest_cloud_only_the_tip_touches_the_board(
     body: str, tip: bool, state: GuardState, kinds: set[str]
 ) -> None:
     for honest, found in ((True, kinds), (False, set())):
-        robot = FakeRobot()
-        robot.watch.see_contact(contact(body, tip=tip), state, honest=honest)
-        assert robot.kinds == found
+        robot = FakeRobot(honest=honest)
+        robot.offer(5, "range")
+        robot.touch(body, tip=tip)
+        assert robot.step(state) == found
+        robot.simulator.touches = []  # as after the telemetry
+        assert robot.step(state) == found
 
 
 @pytest.mark.parametrize("stopped", [False, True])
 def test_a_robot_that_comes_down_may_touch_what_is_below(stopped: bool) -> None:
-    robot = FakeRobot()
+    robot = FakeRobot(honest=True)
     robot.step(TRACK)
     if stopped:
         robot.request(Request.ESTOP)
     robot.offer(5, "range")
+    robot.touch("pipe_3")
     robot.step(ESTOP if stopped else LAND)
-    for state in (ESTOP, GROUND):  # also if it hits it hard, or slides off
-        robot.watch.see_contact(contact("pipe_3"), state, honest=True)
-    assert (robot.kinds, robot.watch.landed_on) == (set(), {"pipe_3"})
+    robot.touch("pipe_2")  # it slides off
+    assert robot.step(GROUND) - {"latch"} == set()
+    assert robot.watch.landed_on == {"pipe_2", "pipe_3"}
     robot.release()
     robot.step(TRACK)
-    robot.watch.see_contact(contact("pipe_3"), ESTOP, honest=True)
-    assert "collision" in robot.kinds, "it has flown since"
+    robot.touch("pipe_3")
+    assert "collision" in robot.step(TRACK), "it has flown since"
+
+
+@pytest.mark.parametrize(("ms", "kinds"), [(198, set()), (204, {"collision"})])
+def test_an_acknowledged_landing_ends_within_a_brake(ms: int, kinds: set[str]) -> None:
+    robot = FakeRobot(honest=True)
+    robot.offer(5, "range")
+    robot.step(LAND)
+    robot.release()
+    robot.step(HOLD, ms=ms)
+    robot.touch("pipe_3")
+    assert robot.step(HOLD) == kinds
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from cloudrc.faults.adversary import POLICIES, choose
-from cloudrc.faults.flight import Flight, state_at, state_before
+from cloudrc.faults.flight import Flight
 from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
 from cloudrc.faults.trial import OrderInvariant, checked_in, fly
-from cloudrc.messages import ZERO, Cause, Command, GuardState, OperatorRequest, Request
-from cloudrc.records import CommandApplied, Contact, GuardChange, SessionOpened
+from cloudrc.messages import ZERO, Command, GuardState, OperatorRequest, Request
+from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
 from cloudrc.world.guard.limits import Limits as GuardLimits
@@ -242,42 +242,6 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints: list[int], kinds: se
     assert set(flight.watch.counts) == kinds
 
 
-def change(at_ms: int, state: GuardState, cause: Cause = Cause.COMMAND) -> GuardChange:
-    return GuardChange(at_ms * MS, state, cause.words)
-
-
-def test_the_state_at_an_instant_is_that_of_the_world_of_then() -> None:
-    changes = [change(10, TRACK), change(50, HOLD), change(300, TRACK)]
-    ends = {5: GROUND, 10: TRACK, 60: HOLD, 199: HOLD, 200: GROUND, 299: GROUND, 300: TRACK}
-    for at_ms, state in ends.items():
-        assert state_at(changes, at_ms * MS, 200 * MS) is state
-        assert state_before(changes, at_ms * MS, 200 * MS) is state
-
-
-@pytest.mark.parametrize(
-    ("changes", "state"),
-    [
-        ([change(0, TRACK), change(2004, ESTOP, Cause.JOLTED)], TRACK),
-        ([change(0, TRACK), change(2000, ESTOP, Cause.JOLTED)], ESTOP),
-        ([change(0, TRACK), change(2004, ESTOP, Cause.STOPPED)], ESTOP),
-        ([change(0, LAND), change(1900, HOLD, Cause.NOT_DOWN)], LAND),
-        ([change(0, LAND), change(1800, HOLD, Cause.NOT_DOWN)], HOLD),
-    ],
-)
-def test_a_contact_began_in_the_state_before_it(
-    changes: list[GuardChange], state: GuardState
-) -> None:
-    assert state_before(changes, 2010 * MS, 0) is state
-
-
-def test_a_crash_onto_the_floor_is_a_collision() -> None:
-    for flown, kinds in ((TRACK, {"collision"}), (LAND, set())):
-        flight = Flight(start=False)
-        contact = Contact(2010 * MS, "floor", ZERO, (0.0, 0.0, -3.0), ZERO, False)
-        flight.note([change(0, flown), change(2004, ESTOP, Cause.JOLTED), contact])
-        assert set(flight.watch.counts) == kinds
-
-
 def test_a_killed_world_and_its_successor_are_on_the_ground() -> None:
     flight = Flight().fly(2.0)
     assert flight.guard_now() == (TRACK, "fresh command")
@@ -285,5 +249,3 @@ def test_a_killed_world_and_its_successor_are_on_the_ground() -> None:
     assert flight.guard_now()[0] is GROUND
     flight.fly(2.55)
     assert flight.guard_now() == (GROUND, "at its spawn")
-    assert flight.state_at(flight.run.now_ns) is GROUND
-    assert flight.state_at(1_900 * MS) is TRACK

@@ -44,7 +44,7 @@ def _short_silence(seed: int) -> Outcome:
 def _gaps(flight: Flight, role: str, at: float) -> int:
     """How many gaps above 50 ms an end has shown within 5 s of a fault that begins `at` [s]."""
     sights = [measures.seen_by(flight, role, until) for until in (at, at + measures.SOON)]
-    before, after = (measures.above(role, seen, "link_gap_seconds", 0.05) for seen in sights)
+    before, after = (measures.above(role, seen, "link_gap_seconds", 0.05)[0] for seen in sights)
     return after - before
 
 

@@ -121,7 +121,7 @@ def _unreachable(seed: int) -> Outcome:
     outcome.most("the leg ends off its limit by", abs(ended - began - leg.time_limit), 0.05, "s")
     measures.moves(outcome, flight, "teleop", "missions_total", "leg_timed_out", since=ended - 0.01)
     flight.fly(flight.now + 10.0)
-    outcome.true("the robot holds", flight.state_at(flight.run.now_ns) is GuardState.HOLD)
+    outcome.true("the robot holds", flight.guard_now()[0] is GuardState.HOLD)
     outcome.most(
         "drift from where the leg ended", measures.drift(flight, ended, flight.now), 0.10, "m"
     )
