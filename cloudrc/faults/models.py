@@ -363,35 +363,23 @@ class InProcessTeleop:
         self._outputs += outputs
 
 
-class _Socket:
-    """A Unix datagram socket: datagrams wait while there is room."""
+class _Peer(UnixPeer):
+    """A process's Unix datagram socket, joined to that of another one."""
 
     def __init__(self, is_open: Callable[[], bool]) -> None:
-        self._is_open = is_open
+        self.unsent, self.other, self._is_open = 0, self, is_open
         self.waiting: list[bytes] = []
-
-    def take(self, data: bytes) -> bool:
-        """Take a datagram; return whether there was room."""
-        taken = self._is_open() and len(self.waiting) < UNIX_SOCKET_MAX
-        if taken:
-            self.waiting.append(data)
-        return taken
-
-
-class _Peer(UnixPeer):
-    """One end of two sockets."""
-
-    def __init__(self, own: _Socket, other: _Socket) -> None:
-        self.unsent, self._inbox, self._outbox = 0, own, other
 
     def receive(self) -> list[bytes]:
         """See `UnixPeer`."""
-        datagrams, self._inbox.waiting = self._inbox.waiting, []
+        datagrams, self.waiting = self.waiting, []
         return datagrams
 
     def send(self, data: bytes) -> bool:
-        """See `UnixPeer`."""
-        sent = self._outbox.take(data)
+        """See `UnixPeer`; datagrams wait in the other socket while there is room."""
+        sent = self.other._is_open() and len(self.other.waiting) < UNIX_SOCKET_MAX
+        if sent:
+            self.other.waiting.append(data)
         self.unsent += not sent
         return sent
 
@@ -406,9 +394,9 @@ class SeparateTeleop(InProcessTeleop):
             contact_speed_max: Speed limit of the arm's tip at the board [m/s].
             phase_ns: Time of the first wake, below `PERIOD_NS` [ns].
         """
-        self._at_teleop = _Socket(lambda: self.service is not None)
-        self._at_cloud = _Socket(lambda: self._host is not None and self._host.inner is not None)
-        self._peer = _Peer(self._at_teleop, self._at_cloud)
+        self._peer = _Peer(lambda: self.service is not None)
+        self._clouds = _Peer(lambda: self._host is not None and self._host.inner is not None)
+        self._peer.other, self._clouds.other = self._clouds, self._peer
         self._host: RestartableEndpoint | None = None
         self._phase_ns, self._free_ns = phase_ns, 0
         super().__init__(contact_speed_max)
@@ -430,9 +418,8 @@ class SeparateTeleop(InProcessTeleop):
 
     def join(self, start_ns: int) -> Operator:
         """See `InProcessTeleop`; what waited for the cloud before is lost."""
-        self._at_cloud.waiting.clear()
-        peer = _Peer(self._at_cloud, self._at_teleop)
-        return RemoteTeleop(peer, wire.encode, wire.decode, start_ns)
+        self._clouds.waiting.clear()
+        return RemoteTeleop(self._clouds, wire.encode, wire.decode, start_ns)
 
     def ask(self, call: Call, now_ns: int) -> None:
         """See `InProcessTeleop`; the call is made in the next wake."""
@@ -456,7 +443,7 @@ class SeparateTeleop(InProcessTeleop):
             self._host.at(self._free_ns * 1e-9, self._turn)  # who is late wakes at once
 
     def _forget(self) -> None:
-        self._at_teleop.waiting.clear()
+        self._peer.waiting.clear()
         self._calls: list[Call] = []
         self._stops: list[Call] = []
         self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)

@@ -131,29 +131,21 @@ class Search:
             return time.monotonic() < until and bool(fly(schedule).kinds & kinds)
 
         smallest = shrink(finding.schedule, fails)
-        name = f"{'-'.join(sorted(kinds))}-{smallest.policy or 'seed'}-{smallest.seed}"
-        text = dump(smallest, _note(finding.schedule.seed, finding.breaches))
+        self._store.mkdir(parents=True, exist_ok=True)
+        name = f"{'-'.join(sorted(kinds))}-{smallest.policy or 'seed'}-{smallest.seed}.yaml"
+        path = self._store / name
+        path.write_text(dump(smallest, _note(finding.schedule.seed, finding.breaches)), "utf-8")
         return {
             "seed": finding.schedule.seed,
             "breaches": [breach._asdict() for breach in finding.breaches],
             "schedule": asdict(smallest),
-            "file": str(_write(self._store, name, text)),
+            "file": str(path),
         }
 
 
 def _note(seed: int, breaches: Iterable[Breach]) -> str:
     lines = [f"{each.time:.3f} s: {each.kind}: {each.text}" for each in breaches]
     return "\n".join([f"Found by seed {seed}, before it was shrunk:", *lines[:3]])
-
-
-def _write(store: Path, name: str, text: str) -> Path:
-    """Store a schedule; never overwrite another one of the same name."""
-    store.mkdir(parents=True, exist_ok=True)
-    path, number = store / f"{name}.yaml", 2
-    while path.exists() and path.read_text(encoding="utf-8") != text:
-        path, number = store / f"{name}-{number}.yaml", number + 1
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 Fails: TypeAlias = Callable[[Schedule], bool]
@@ -198,19 +190,9 @@ def _simpler(schedule: Schedule) -> Iterator[Schedule]:
     for name in ("duplicate", "reorder", "cloud_offset", "cloud_drift", "profile", "separate",
                  "hold_max"):  # fmt: skip
         yield replace(schedule, **{name: getattr(plain, name)})
-    if len(schedule.events) == 1:
-        yield replace(schedule, events=())
     for n, event in enumerate(schedule.events):
-        for shorter in (round(event.duration / 2, 2), round(event.duration, 1)):
-            if 0.0 < shorter < event.duration:
-                yield _with(schedule, n, replace(event, duration=shorter))
-        if event.way == "both":
-            yield _with(schedule, n, replace(event, way="up"))
-            yield _with(schedule, n, replace(event, way="down"))
-        if round(event.at, 1) != event.at:
-            yield _with(schedule, n, replace(event, at=round(event.at, 1)))
-
-
-def _with(schedule: Schedule, n: int, event: Event) -> Schedule:
-    events = schedule.events
-    return replace(schedule, events=(*events[:n], event, *events[n + 1 :]))
+        shorter = replace(event, duration=round(event.duration / 2, 2))
+        if shorter.duration > 0.0:
+            events = list(schedule.events)
+            events[n] = shorter
+            yield replace(schedule, events=tuple(events))

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cloudrc.faults.invariants import can_stop
 from cloudrc.messages import ZERO, GuardState, Request, Start, Vector
-from cloudrc.world.rotors import STOPPED
 from tests.faults.conftest import (
     ESTOP,
     GROUND,
@@ -65,16 +63,6 @@ def test_after_a_stop_it_takes_off_where_it_lies_inside(
     assert robot.step(TRACK) == kinds
 
 
-def test_a_breach_says_how_long_before_something_was_hit() -> None:
-    robot = FakeRobot()
-    robot.touch("board")
-    robot.step(TRACK)
-    robot.position = OUTSIDE
-    robot.step(TRACK)
-    texts = [breach.text for breach in robot.watch.breaches]
-    assert texts == ["base at (9.30, 1.00, 1.00), 0.00 s after it hit board"]
-
-
 @pytest.mark.parametrize(
     ("references", "kinds"),
     [
@@ -119,22 +107,6 @@ def test_what_is_flown_can_stop_before_the_fence(
     robot.position = position
     robot.offer(5, "range")
     assert robot.step(state, reference=reference) == kinds
-
-
-@pytest.mark.parametrize(
-    ("speed", "below", "above", "can"),
-    [
-        (0.0, 0.0, 0.0, True),
-        (1.0, 0.0, 0.47, True),
-        (1.0, 9.0, 0.46, False),
-        (-1.0, 0.47, 0.0, True),
-        (-1.0, 0.46, 9.0, False),
-    ],
-)
-def test_stopping_counts_towards_the_face_ahead(
-    speed: float, below: float, above: float, can: bool
-) -> None:
-    assert can_stop(speed, below, above) == can
 
 
 def test_track_is_for_fresh_commands() -> None:
@@ -265,20 +237,6 @@ def test_a_request_or_a_hit_may_stop_rotors_in_the_air() -> None:
     robot.step(TRACK)
     robot.velocity = (0.0, 0.0, -3.0)
     assert robot.step(ESTOP, ms=4) == set()
-
-
-def test_hard_braking_is_no_stop_of_the_rotors() -> None:
-    robot = FakeRobot()
-    robot.velocity = (0.0, 0.0, -3.0)
-    robot.step(TRACK)
-    robot.simulator.steps += 1
-    robot.observer.see_step(robot.now_ns, _Readings(robot), tuple(0.0 for _ in STOPPED))
-    assert robot.kinds == set()
-
-
-class _Readings:
-    def __init__(self, robot: FakeRobot) -> None:
-        self.position, self.velocity = robot.position, robot.velocity
 
 
 @pytest.mark.parametrize(

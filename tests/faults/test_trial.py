@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from cloudrc.faults.adversary import POLICIES, choose
-from cloudrc.faults.flight import Flight
 from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
 from cloudrc.faults.trial import OrderInvariant, checked_in, fly
@@ -240,12 +239,3 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints: list[int], kinds: se
     )
     OrderInvariant(flight).check_waypoints()
     assert set(flight.watch.counts) == kinds
-
-
-def test_a_killed_world_and_its_successor_are_on_the_ground() -> None:
-    flight = Flight().fly(2.0)
-    assert flight.guard_now() == (TRACK, "fresh command")
-    flight.kill_world(flight.run.now_ns, 0.5)
-    assert flight.guard_now()[0] is GROUND
-    flight.fly(2.55)
-    assert flight.guard_now() == (GROUND, "at its spawn")

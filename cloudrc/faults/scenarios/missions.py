@@ -6,94 +6,64 @@ import re
 from math import inf, nan
 from typing import Any
 
-import numpy as np
-
 from cloudrc import assembly
 from cloudrc.config.mission_check import check_mission
-from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Mission as MissionSchema
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.geometry import fence
-from cloudrc.geometry.placement import find_overlapped_pipe
-from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.geometry.scene import Pipe, Scene, load_scene
 from cloudrc.messages import Command, GuardState, Vector
 from cloudrc.records import Control
 
 
 def _impossible(seed: int) -> Outcome:
-    outcome, scene = Outcome(), load_scene("pipes")
-    wall = _wall_of(scene)
-    cases: dict[str, tuple[Any, str]] = {
-        "outside the fence": ((100.0, 0.0, 1.0), "nearest legal point"),
-        "1 m behind a wall of the fence": ((fence.HIGH[0] + 1.0, 0.0, 1.0), "beyond the fence"),
-        "in a pipe's wall": (wall, "overlaps the wall"),
-        "far below the floor": ((0.0, 0.0, -5.0), "beyond the fence"),
+    outcome, scene, first = Outcome(), load_scene("pipes"), (0.0, 0.0, 1.0)
+    points: dict[str, Vector] = {
+        "outside the fence": (100.0, 0.0, 1.0),
+        "1 m behind a wall of the fence": (fence.HIGH[0] + 1.0, 0.0, 1.0),
+        "far below the floor": (0.0, 0.0, -5.0),
+        "in a pipe's wall": _wall_of(scene.pipes[0]),
     }
-    for name, (position, word) in cases.items():
-        mission = MissionSchema.model_validate(
-            {"waypoints": ({"position_m": (0.0, 0.0, 1.0)}, {"position_m": position})}
-        )
-        problems = check_mission(mission, scene)
-        outcome.true(f"{name}: refused, with the reason", word in _text(problems))
-        outcome.true(f"{name}: names the waypoint's index", "1" in _paths(problems))
-        told = all(f"{value:g}" in problems[0].value for value in position)
-        outcome.true(f"{name}: names what was asked for", told)
-        outcome.true(f"{name}: offers a point that is legal", _offers_legal(problems[0], scene))
-    for name, value in (("NaN", nan), ("infinite", inf), ("a word", "high")):
-        outcome.true(f"{name}: refused", _refused({"position_m": (0.0, 0.0, value)}))
-    bore, beside = {"position_m": scene.pipes[0].centre}, {"position_m": (0.5, 0.0, 0.8)}
-    for way in ((bore, beside), (beside, bore)):
-        (problem,) = check_mission(MissionSchema.model_validate({"waypoints": way}), scene)
-        outcome.true("behind a wall: its index is named", problem.path[1] == "1")
-        outcome.true("behind a wall: the wall is named", scene.pipes[0].name in problem.reason)
-    outcome.true("none at all: refused", bool(check_mission(MissionSchema(), scene)))
-    many = {"waypoints": ({"position_m": (0.0, 0.0, 1.0)},) * 10_001}
-    outcome.true("10,001 waypoints: refused", _refuses(many))
+    for name, point in points.items():
+        problems = _problems([first, point], scene)
+        outcome.true(f"{name}: refused", bool(problems))
+        told = bool(problems) and "1" in problems[0].path
+        told = told and all(f"{value:g}" in problems[0].value for value in point)
+        outcome.true(f"{name}: names the waypoint's index and value", told)
+        offer = re.search(r"nearest legal point found: \[(.*)\]", " ".join(map(str, problems)))
+        offered = [tuple(map(float, offer[1].split(", ")))] if offer else []
+        legal = bool(offered) and not _problems(offered, scene)
+        outcome.true(f"{name}: offers another point, which is legal", legal)
+    bore, beside = scene.pipes[0].centre, (0.5, 0.0, 0.8)
+    others: dict[str, list[Any]] = {
+        "NaN": [(0.0, 0.0, nan)],
+        "infinite": [(0.0, 0.0, inf)],
+        "a word": [(0.0, 0.0, "high")],
+        "behind a wall": [bore, beside],
+        "none at all": [],
+        "10,001 waypoints": [first] * 10_001,
+    }
+    for name, way in others.items():
+        outcome.true(f"{name}: refused", bool(_problems(way, scene)))
     return outcome
 
 
-def _offers_legal(problem: Problem, scene: Scene) -> bool:
-    """Tell whether a refusal names another point, which is not refused."""
-    found = re.search(r"nearest legal point found: \[(.*)\]", problem.reason)
-    if found is None:
-        return False
-    point = tuple(float(each) for each in found[1].split(", "))
-    offered = MissionSchema.model_validate({"waypoints": ({"position_m": point},)})
-    return not check_mission(offered, scene)
-
-
-def _wall_of(scene: Scene) -> Vector:
-    """Return a point in the wall of a pipe."""
-    for y in np.linspace(-8.0, 5.0, 131):
-        for z in np.linspace(0.3, 2.4, 22):
-            points = np.array([[x, y, z] for x in np.linspace(-2.5, 9.0, 116)])
-            hits = np.flatnonzero(find_overlapped_pipe(scene, points, np.zeros(len(points))) >= 0)
-            if len(hits):
-                x, y, z = points[hits[0]].tolist()
-                return (x, y, z)
-    raise AssertionError("the scene has no pipe")
-
-
-def _text(problems: list[Problem]) -> str:
-    return " ".join(map(str, problems))
-
-
-def _paths(problems: list[Problem]) -> set[str]:
-    return {part for problem in problems for part in problem.path}
-
-
-def _refused(waypoint: dict[str, Any]) -> bool:
-    return _refuses({"waypoints": (waypoint,)})
-
-
-def _refuses(document: dict[str, Any]) -> bool:
+def _problems(way: list[Any], scene: Scene) -> list[Any]:
+    """Return why a mission with these waypoints [m] is refused; nothing if it is not."""
     try:
-        MissionSchema.model_validate(document)
-    except ValueError:
-        return True
-    return False
+        waypoints = tuple({"position_m": point} for point in way)
+        mission = MissionSchema.model_validate({"waypoints": waypoints})
+    except ValueError as error:
+        return [error]
+    return list(check_mission(mission, scene))
+
+
+def _wall_of(pipe: Pipe) -> Vector:
+    """Return a point in the wall of a horizontal pipe, beside its middle."""
+    (x, y, z), (ax, ay, _), radius = pipe.centre, pipe.axis, 0.5 * (pipe.inner + pipe.outer)
+    return (x - ay * radius, y + ax * radius, z)
 
 
 def _unreachable(seed: int) -> Outcome:

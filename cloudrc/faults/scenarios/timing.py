@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import isnan, sqrt
+from math import isnan
 
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight, Shape
 from cloudrc.faults.models import Clock
 from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.link.profile import Change
-from cloudrc.messages import Command
 from cloudrc.records import Arrival, Control
 
 HOUR_NS = 3_600_000_000_000
@@ -89,40 +88,7 @@ def _delay_step(seed: int) -> Outcome:
     )
     outcome.same("metric rtt_seconds: round trips above 0.15 s before the step", long, 0)
     outcome.least("metric rtt_seconds: round trips above 0.15 s within 5 s of it", longer, 200)
-    for age_max, least in ((0.25, 5.0), (1.0, 3.5)):
-        _hasty(outcome, seed, shape, age_max, least)
     return outcome
-
-
-def _hasty(outcome: Outcome, seed: int, shape: Shape, age_max: float, least: float) -> None:
-    """At full speed to and fro, through the same step.
-
-    The cap does not wait for an estimate: it is that of the oldest command which may be flown, so
-    the older that may be, the lower it is, before the step as after it.
-    """
-    flight = Flight(
-        f"guard.command_age_max_ms={1000 * age_max:g}",
-        "world.scene=empty",
-        seed=seed,
-        uplink=shape,
-        downlink=shape,
-        honest=False,
-        lies=[_to_and_fro],
-    ).fly(40.0)
-    measures.safe(outcome, flight)
-    # Source: docs/reference/plant.md, "Speed cap": v (command_age_max + 0.2) + v^2/6 = 8.7 m.
-    reaction = age_max + 0.2
-    cap = 3.0 * (sqrt(reaction * reaction + 2.0 * 8.7 / 3.0) - reaction)
-    what = f"at full speed, commands of up to {age_max:g} s:"
-    outcome.most(f"{what} fastest", flight.watch.speed, cap + 1e-3, "m/s")
-    outcome.least(f"{what} not slow", flight.watch.speed, least, "m/s")
-
-
-def _to_and_fro(command: Command, control: Control) -> Command:
-    if control.measured[2] < 1.0:
-        return command._replace(velocity=(0.0, 0.0, 1.0))
-    leg = control.stamp_ns // 4_000_000_000
-    return command._replace(velocity=(1e3 if leg % 2 else -1e3, 0.0, 0.0))
 
 
 def _asymmetry(seed: int) -> Outcome:
@@ -211,8 +177,7 @@ SCENARIOS = (
         10,
         "delay-step",
         "the round trip steps from 20 to 200 ms",
-        "estimator `split` within 20 % in 0.5 s; no HOLD; the caps, which are those of the oldest "
-        "command that may be flown, hold at full speed",
+        "estimator `split` within 20 % in 0.5 s; no HOLD; the caps hold",
         "none",
         "cloudrc_rtt_seconds, cloudrc_delay_estimate_seconds",
         _delay_step,
