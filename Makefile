@@ -16,9 +16,9 @@ JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 # Folder for the results of `make faults`, `make mutants` and `make nightly`.
 EVIDENCE := build/evidence
 # A failing schedule is shrunk and kept in --store; in tests/faults/regressions it becomes a test.
-FUZZ = $(bin)/cloudrc faults fuzz --jobs $(JOBS) --store $(EVIDENCE)/regressions
-# The seeds of each search of `make faults`.
-SEEDS ?= 200
+SEARCH = $(bin)/cloudrc faults search --jobs $(JOBS) --store $(EVIDENCE)/regressions
+# The duration of each search of `make faults` [min].
+MINUTES ?= 5
 # The tests of one part: make test T=tunnel, make test T=tests/cli/test_run.py.
 T ?=
 PART = $(if $(T),$(if $(wildcard tests/$(T)),tests/$(T),$(T)))
@@ -67,11 +67,10 @@ smoke-netem: $(VENV)/dev ## of these the few that every push runs: shape, measur
 test-netem-full: $(VENV)/dev ## as test-netem, and every shipped profile for a minute
 	$(bin)/pytest -m netem -rP tests/link
 
-faults: $(VENV)/dev ## inject every fault, then fly 2 x SEEDS (200) random schedules of faults
-	mkdir -p $(EVIDENCE)
-	$(bin)/cloudrc faults run --all --jobs $(JOBS) --document $(EVIDENCE)/faults.md
-	$(FUZZ) --seeds $(SEEDS)
-	$(FUZZ) --adversarial --seeds $(SEEDS)
+faults: $(VENV)/dev ## inject every fault, then search for MINUTES (5) each: random faults, hostile clouds
+	$(bin)/cloudrc faults run --all --jobs $(JOBS)
+	$(SEARCH) --minutes $(MINUTES)
+	$(SEARCH) --minutes $(MINUTES) --adversarial
 
 coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and journal is tested
 	$(bin)/pytest -n auto --hypothesis-seed=0 --cov --cov-report=term $(CORE)
@@ -87,8 +86,8 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and journal, list the mutants that 
 
 # In this order; each part runs even if an earlier one has failed. The part on a cluster needs Docker,
 # kind, helm and kubectl.
-NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults-virtual.json faults-real.json \
-	faults-flood.json search-clean.json search-adversarial.json search-random.json link.json) \
+NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
+	search-adversarial.json search-random.json link.json) \
 	mutants night-netem e2e-full $(EVIDENCE)/index.md
 
 nightly: export CLOUDRC_EVIDENCE = $(CURDIR)/$(EVIDENCE)
@@ -102,24 +101,14 @@ $(EVIDENCE)/tests.xml:
 $(EVIDENCE)/process.xml:
 	$(bin)/pytest -m process --junitxml=$@
 
-$(EVIDENCE)/faults-virtual.json:
+$(EVIDENCE)/faults.json:
 	$(bin)/cloudrc faults run --all --jobs $(JOBS) -o json > $@
 
-$(EVIDENCE)/faults-real.json:
-	$(bin)/cloudrc faults run --all --real -o json > $@
-
-$(EVIDENCE)/faults-flood.json:
-	CLOUDRC_FLOOD_SECONDS=600 $(bin)/cloudrc faults run garbage-flood --real -o json > $@
-
-# Together about a quarter of an hour on two cores.
-$(EVIDENCE)/search-clean.json:
-	$(FUZZ) --clean --seeds 60 -o json > $@
-
 $(EVIDENCE)/search-adversarial.json:
-	$(FUZZ) --adversarial --seeds 300 -o json > $@
+	$(SEARCH) --adversarial --minutes 5 -o json > $@
 
 $(EVIDENCE)/search-random.json:
-	$(FUZZ) --seeds 1000 -o json > $@
+	$(SEARCH) --minutes 10 -o json > $@
 
 $(EVIDENCE)/link.json:
 	$(bin)/python -m tools.bench_link $(BENCH_LINK) -o json > $@

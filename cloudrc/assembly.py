@@ -94,6 +94,8 @@ def build_cloud(
     identity: CloudIdentity,
     clock: Callable[[], int] = lambda: 0,
     teleop: Operator | None = None,
+    *,
+    make_loop: Callable[..., ControlLoop] = ControlLoop,
 ) -> CloudEndpoint:
     """Build cloud's end: plug-ins, teleoperation and its end of the tunnel.
 
@@ -102,9 +104,10 @@ def build_cloud(
         identity: The identity of this end.
         clock: Its monotonic clock [ns].
         teleop: The source of setpoints; None for an internal one, which starts the mission at once.
+        make_loop: Makes the control loop of the same arguments as `ControlLoop`.
     """
     cloud = experiment.cloud
-    loop = ControlLoop(
+    loop = make_loop(
         lambda: build_plugin("estimators", cloud.estimator),
         build_plugin("predictors", cloud.predictor),
         build_plugin("controllers", cloud.controller),

@@ -50,9 +50,6 @@ ALWAYS = {"errors", "messages", "records", "__version__"}
 SHAPERS = ("link/relay", "link/lateness", "link/verify/probe", "link/verify/monitor")
 API = ("teleop/api", "teleop/auth", "teleop/bridge", "teleop/server")
 
-# Faults with real processes and sockets, and with a wall clock that jumps.
-REAL = ("faults/real/", "faults/cluster/", "faults/walls")
-
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it.
 RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/",),
@@ -73,13 +70,13 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "prometheus_client": ("drivers/",),
     "argparse": ("cli/",),
     "importlib.metadata": ("plugins", "cli/", "report/"),
-    "pkgutil": ("plugins", "faults/scenario"),
-    "subprocess": ("drivers/", "cli/", "cluster/", *REAL),
+    "pkgutil": ("plugins",),
+    "subprocess": ("drivers/", "cli/", "cluster/"),
     "multiprocessing": ("drivers/", "cli/"),
     "concurrent": ("cli/", "cluster/", "teleop/"),
     **dict.fromkeys(
         ("time", "socket", "selectors", "select", "threading", "asyncio", "signal"),
-        ("drivers/", *SHAPERS, *API, "cluster/", "cli/", *REAL),
+        ("drivers/", *SHAPERS, *API, "cluster/", "cli/", "faults/search"),
     ),
     **dict.fromkeys(("random", "secrets", "uuid"), ("drivers/", "cluster/", "cli/")),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),

@@ -66,12 +66,12 @@ def test_the_nightly_page_shows_all_kinds_of_results(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, words in (
-        ("faults-virtual", "faults run F37"),
-        ("search-clean", "faults fuzz --clean --seeds 1"),
+        ("faults", "faults run F17"),
+        ("search-random", "faults search --minutes 0.001"),
     ):
         assert main([*words.split(), "-o", "json"]) == 0
         (tmp_path / f"{name}.json").write_text(capsys.readouterr().out)
-    (tmp_path / "faults-real.json").touch()  # its command failed
+    (tmp_path / "search-adversarial.json").touch()  # its command failed
     (tmp_path / "tests.xml").write_text(
         '<testsuite tests="9" failures="1" errors="0" skipped="2"/>'
     )
@@ -80,8 +80,8 @@ def test_the_nightly_page_shows_all_kinds_of_results(
     )
     evidence.write(tmp_path)
     page = (tmp_path / "index.md").read_text()
-    assert "| virtual | F37 | bad-configuration | passed |" in page
-    assert "## Search: clean" in page
+    assert "| F17 | world-restarted | passed |" in page
+    assert "## Search: random" in page
     assert "| fence breaches | 0 | 1 | p < 1 |" in page
     assert "| tests | 9 | 1 | 0 | 2 |" in page
     assert "| survived | 1 |" in page

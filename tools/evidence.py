@@ -15,8 +15,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.faults_summary import rows as search_rows
-from cloudrc.cli.faults_summary import summary
+from cloudrc.faults.report import search_rows, search_summary
 from cloudrc.report.document import environment_document, write_json
 
 Rows = Iterable[Iterable[object]]
@@ -72,11 +71,11 @@ def test_rows(folder: Path) -> Rows:
 
 
 def fault_rows(folder: Path) -> Rows:
-    """List the faults that were brought about, and the checks that failed."""
-    for each in (each for run in read(folder, "faults-*.json") for each in run["faults"]):
+    """List the faults that were injected, and the checks that failed."""
+    for each in (each for run in read(folder, "faults*.json") for each in run["faults"]):
         failed = [check["text"] for check in each["checks"] if not check["passed"]]
         told = "; ".join(filter(None, [each["reason"], *failed]))
-        yield each["mode"], each["id"], each["name"], each["result"], each["seconds"], told
+        yield each["id"], each["name"], each["result"], each["seconds"], told
 
 
 def section(title: str, head: Iterable[str], rows: Rows) -> str:
@@ -89,7 +88,7 @@ def section(title: str, head: Iterable[str], rows: Rows) -> str:
 
 def page(folder: Path, here: dict[str, Any], found: list[dict[str, Any]]) -> str:
     """Lay out the page, a section for each kind of evidence."""
-    tests, faults = ("run", "tests", "failed", "errors", "skipped"), ("mode", "fault", "name")
+    tests, faults = ("run", "tests", "failed", "errors", "skipped"), ("fault", "name")
     parts = [
         f"# Evidence of commit {here['commit']}\n",
         f"On {here['cores']} cores ({here['processor']}), Python {here['python']}.\n",
@@ -99,7 +98,7 @@ def page(folder: Path, here: dict[str, Any], found: list[dict[str, Any]]) -> str
     ]
     for each in read(folder, "search-*.json"):
         head, *rows = search_rows(each)
-        parts += [section(f"Search: {each['kind']}", head, rows), f"{summary(each)}.\n"]
+        parts += [section(f"Search: {each['kind']}", head, rows), f"{search_summary(each)}.\n"]
     for each in read(folder, "link.json"):
         parts.append(section("Relay", each["lines"][0], (row.values() for row in each["lines"])))
     if (path := folder / "mutants.txt").exists():

@@ -8,7 +8,7 @@ setpoints and operator requests.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from math import nan
 
@@ -154,6 +154,16 @@ class CloudEndpoint:
         self._datagrams: list[bytes] = []
         self._records: list[Record] = []
         self._counts: defaultdict[str, int] = defaultdict(int)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """How often each thing has happened, as of now; a copy."""
+        return Counter(self._counts | self._loop.counts)
+
+    @property
+    def epoch(self) -> int:
+        """Epoch of the session; 0 for none."""
+        return self._session.epoch
 
     @property
     def mission_over(self) -> bool:

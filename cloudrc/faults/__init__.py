@@ -1,9 +1,10 @@
-"""The fault suite: what goes wrong is brought about on purpose, what must follow is checked.
+"""Injects faults into flights in virtual time and checks how the system reacts.
 
-scenario   what a fault is: an injector and the checks of what has to follow
-mortal     an end of the tunnel that can be killed, frozen and replaced
-flight     a whole flight in virtual time, with everything that can break
-watch      the invariants, looked at in every step of the physics
-family_*   the scenarios F1 to F40
-fuzz       faults composed at random, shrunk when they break an invariant
+scenario, scenarios/     named faults with the checks of what must follow
+schedule, injection      random faults of one flight, and how they are injected
+adversary, datagrams     hostile clouds and hostile datagrams
+models, flight           processes, clocks and teleop around the two ends; a whole flight
+invariants, hold_invariants    what is checked after every step of the physics
+measures                 what scenarios ask about a flight
+trial, search, report    one schedule, a search over many, the results
 """

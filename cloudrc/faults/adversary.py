@@ -1,31 +1,24 @@
-"""A cloud that holds valid keys and wants a breach: a policy by name, one command after the other.
+"""Dishonest clouds: they have valid keys and send whatever they like.
 
-Every policy sees what an honest cloud sees (the newest odometry and its own estimate of the delay)
-and sends any command it likes, sealed as it should be. Some also lie about what a command was
-computed from, fall silent to time the guard's transitions, or speak in the operator's name. Every
-second one has an honest link; to the others befalls all that befalls an honest cloud.
+A policy sees what an honest cloud sees (the newest odometry and its own estimate of the delay) and
+sends any command, properly sealed. Some policies also lie about the odometry that a command was
+computed from, fall silent to time the guard's transitions, or make requests in the operator's name:
+world cannot tell who makes them, because cloud relays the operator's requests.
 
-A cloud with valid keys that does not mean well: an honest loop, and what comes out instead.
-
-The operator's words in the mouth of a hostile cloud, said when they do the most harm.
-
-World cannot tell who speaks: cloud carries the operator's requests, sealed with its own keys. So a
-hostile one starts, ends, stops and acknowledges as it likes: at speed, at a face of the fence, in
-the middle of a fall. (Hold and resume are no words to world: an end of the mission is as good, and
-a start from where the robot is.)
+The lies enter at public seams: the control loop and the operator that cloud's end is built with.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import cos, inf, nan, pi, sin
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
+from cloudrc.cloud.operator import Operator
 from cloudrc.errors import BadInputError
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import DURATION, PAPER, Schedule, compose
@@ -41,65 +34,102 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
-from cloudrc.records import Control
+from cloudrc.records import Control, Fault
+from cloudrc.teleop.wire import Outcome, Output, RobotStatus
+from cloudrc.world.robot import STEP_NS
 
 Lie: TypeAlias = Callable[[Command, Control], Command]
-"""What is sent in place of a command; what cloud knew when it made it stands in the record."""
-
-Words: TypeAlias = Callable[[Control, GuardState], OperatorRequest | None]
-"""What is said with it in the operator's name, if anything, to a robot whose guard was last seen
-in that state; cloud gives it its number."""
-
-
-def drop(request: OperatorRequest) -> None:
-    """What the operator says is not passed on."""
+"""Returns what is sent in place of a command; the record has what cloud knew."""
+Words: TypeAlias = Callable[[int, RobotStatus], OperatorRequest | None]
+"""Returns a request in the operator's name, if any, at a time of cloud's clock [ns]; the robot is
+as it was last seen. The request's number is not used."""
 
 
-def tempting(lie: Lie, words: Words | None = None) -> Callable[[CloudEndpoint], None]:
-    """Make what turns an honest cloud into one that lies, and speaks in its operator's place."""
+class DishonestLoop(ControlLoop):
+    """Computes the honest command and sends another one."""
 
-    def tempt(cloud: CloudEndpoint) -> None:
-        relay = cloud._relay
+    def __init__(self, lies: Sequence[Lie], *plugins: Any) -> None:
+        """Change each command by these lies, one after the other.
 
-        def speak(control: Control) -> None:
-            if words is None:
-                return
-            cloud._relay = drop  # type: ignore[method-assign]
-            if (said := words(control, cloud.guard)) is not None:
-                relay(said._replace(number=cloud._asked + 1))
-
-        cloud._loop = Liar(cloud._loop, lie, speak)  # type: ignore[assignment]
-
-    return tempt
-
-
-class Liar:
-    """Stands in the place of a control loop, and asks it for everything else."""
-
-    def __init__(self, loop: ControlLoop, lie: Lie, speak: Callable[[Control], None]) -> None:
-        self._honest, self._lie, self._speak = loop, lie, speak
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._honest, name)
+        Args:
+            lies: The lies.
+            plugins: Arguments of `ControlLoop`.
+        """
+        super().__init__(*plugins)
+        self._lies = lies
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
     ) -> tuple[Command, Control]:
-        """Compute the honest command, and send another.
-
-        Args:
-            setpoint: Where to be.
-            now_ns: Cloud's clock [ns].
-            dt: Time since the last command [s].
-            epoch: Of the session.
-            counter: That the command will carry.
-        """
-        command, control = self._honest.command(setpoint, now_ns, dt, epoch, counter)
-        self._speak(control)
-        return self._lie(command, control), control
+        """See `ControlLoop`."""
+        command, control = super().command(setpoint, now_ns, dt, epoch, counter)
+        for lie in self._lies:
+            command = lie(command, control)
+        return command, control
 
 
-Generator = np.random.Generator
+class HostileOperator:
+    """Passes teleop's setpoints on, and makes its own requests in place of teleop's; an `Operator`.
+
+    Until the first setpoint it passes teleop's requests on, so that a mission begins.
+    """
+
+    def __init__(self, honest: Operator, words: Words) -> None:
+        self._honest, self._words = honest, words
+        self._outputs: list[Output | Fault] = []
+        self._seen: RobotStatus | None = None
+        self._has_setpoint = False
+        self._number = 0  # of the last request in this session
+
+    @property
+    def outputs(self) -> Sequence[Output | Fault]:
+        """See `Operator`."""
+        return self._outputs
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """See `Operator`."""
+        return self._honest.outcome
+
+    @property
+    def settled(self) -> bool:
+        """See `Operator`."""
+        return self._honest.settled
+
+    def see(self, seen: RobotStatus, now_ns: int) -> None:
+        """See `Operator`."""
+        if self._seen is None or self._seen.epoch != seen.epoch:
+            self._number = 0
+        self._seen, self._number = seen, max(self._number, seen.mission)
+        self._honest.see(seen, now_ns)
+        self._collect()
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """See `Operator`."""
+        self._honest.handle_deadline(now_ns)
+        self._collect()
+        if self._has_setpoint and self._seen is not None:
+            if (request := self._words(now_ns, self._seen)) is not None:
+                self._number += 1
+                self._outputs.append(request._replace(number=self._number))
+
+    def take_outputs(self) -> Sequence[Output | Fault]:
+        """See `Operator`."""
+        outputs, self._outputs = self._outputs, []
+        return outputs
+
+    def _collect(self) -> None:
+        for output in self._honest.take_outputs():
+            if isinstance(output, Setpoint):
+                self._has_setpoint = True
+            if isinstance(output, OperatorRequest):
+                if self._has_setpoint:
+                    continue
+                self._number = max(self._number, output.number)
+            self._outputs.append(output)
+
+
+Generator: TypeAlias = np.random.Generator
 
 BEGIN = OperatorRequest(0, Request.START, Start.HERE)
 AGAIN = OperatorRequest(0, Request.START, Start.SPAWN)
@@ -116,35 +146,34 @@ CHOICES = {
     GuardState.LAND: LATCHED,
     GuardState.ESTOP: LATCHED,
 }
-"""How likely each is, by the state that cloud knows of."""
+"""Probability of each request, by the state of the guard that cloud knows of [1]."""
 PATIENCE_NS = 5_000_000_000
-"""For the robot to come near a face [ns]."""
+"""Longest wait for the robot to come near a face of the fence [ns]."""
 REACHED = (0, 1, 7, MISSION_OVER)
 
 
 def at_bad_moments(rng: Generator) -> Words:
-    """Speak after random whiles; every second time wait for the robot to fly near a face."""
+    """Make requests after random pauses; every second one waits until the robot is near a face."""
     pause, near = float(rng.choice([0.05, 0.3, 1.0])), float(rng.uniform(0.2, 1.5))
     due_ns, waits = 0, False
 
-    def words(control: Control, guard: GuardState) -> OperatorRequest | None:
+    def words(now_ns: int, seen: RobotStatus) -> OperatorRequest | None:
         nonlocal due_ns, waits
-        far = guard is GuardState.TRACK and distance(control.measured) > near
-        until_ns = due_ns + PATIENCE_NS if far and waits else due_ns
-        if control.stamp_ns < until_ns:
+        far = seen.guard is GuardState.TRACK and distance_to_fence(seen.position) > near
+        if now_ns < (due_ns + PATIENCE_NS if far and waits else due_ns):
             return None
-        due_ns = control.stamp_ns + int(rng.exponential(pause) * 1e9)
+        due_ns = now_ns + int(rng.exponential(pause) * 1e9)
         waits = bool(rng.random() < 0.5)
-        said, likely = zip(*CHOICES[guard].items(), strict=True)
-        chosen: OperatorRequest = said[int(rng.choice(len(said), p=likely))]
+        requests, probabilities = zip(*CHOICES[seen.guard].items(), strict=True)
+        chosen: OperatorRequest = requests[int(rng.choice(len(requests), p=probabilities))]
         mission, reached = int(rng.integers(0, 3)), REACHED[int(rng.integers(len(REACHED)))]
         return chosen._replace(mission_id=mission, reached=reached)
 
     return words
 
 
-def distance(position: Vector) -> float:
-    """How far a base at `position` [m], shape (3,), is from the nearest wall or the ceiling [m]."""
+def distance_to_fence(position: Vector) -> float:
+    """Return the distance [m] of a position [m], shape (3,), to the nearest wall or the ceiling."""
     return min(
         HIGH[2] - position[2],
         *(min(position[n] - LOW[n], HIGH[n] - position[n]) for n in (0, 1)),
@@ -155,28 +184,26 @@ Policy: TypeAlias = Callable[[Generator], Lie]
 
 HUGE = 1e308
 STRANGE = (nan, inf, -inf, HUGE, -HUGE, 5e-324, -0.0, 1e3, 6.0, -6.0, 0.0)
-TICK_NS = 2_000_000
 NONSENSE_NS = 80_000_000
-"""Long enough for more impossible commands than the guard bears in a second [ns]."""
+"""Duration of impossible commands that makes the guard land [ns]."""
 
 
-def temptation(schedule: Schedule) -> Callable[[CloudEndpoint], None]:
-    """Make what turns an honest cloud into the adversary of a schedule.
+def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
+    """Make the lies and requests of a schedule's policy.
 
     Raises:
-        BadInputError: If there is no such policy; names those that there are.
+        BadInputError: If there is no such policy; names all policies.
     """
     if schedule.policy not in POLICIES:
         names = ", ".join(POLICIES)
         raise BadInputError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
     lie = POLICIES[schedule.policy](generator(schedule.seed, 666))
-    if schedule.policy in SPEAKING:
-        return tempting(lie, at_bad_moments(generator(schedule.seed, 667)))
-    return tempting(lie)
+    speaks = schedule.policy in SPEAKING
+    return lie, at_bad_moments(generator(schedule.seed, 667)) if speaks else None
 
 
 def choose(seed: int) -> Schedule:
-    """Give the adversary of a seed: on a link of its own choice, or amid faults of every kind."""
+    """Choose the hostile cloud of a seed, alone or amid faults of every kind."""
     rng = generator(seed, 665)
     names = sorted(POLICIES)
     profile = ("ideal", *PAPER)[int(rng.integers(4))]
@@ -185,7 +212,7 @@ def choose(seed: int) -> Schedule:
 
 
 def _towards_a_face(rng: Generator) -> Lie:
-    """Full speed towards a face, an edge or a corner of the fence, at once or after a while."""
+    """Fly towards a face, an edge or a corner of the fence."""
     way: list[int] = rng.choice([-1, 0, 1], 3).tolist()
     way = way if any(way) else [0, 0, 1]
     speed = float(rng.choice([2.0, 6.0, 40.0, 1e3]))
@@ -194,7 +221,7 @@ def _towards_a_face(rng: Generator) -> Lie:
 
 
 def _face_after_face(rng: Generator) -> Lie:
-    """At each face the opposite one: the longest run-up, then another axis."""
+    """Fly from a face to the opposite one, for the longest run-up; then along another axis."""
     axis, way = int(rng.integers(3)), 1.0
     near = float(rng.uniform(0.1, 2.0))
 
@@ -213,7 +240,7 @@ def _face_after_face(rng: Generator) -> Lie:
 
 
 def _greedy(rng: Generator) -> Lie:
-    """Towards the nearest wall or the ceiling, with the others as a decoy now and then."""
+    """Fly towards the nearest wall or the ceiling, sometimes elsewhere."""
     decoy = float(rng.uniform(0.0, 0.2))
 
     def lie(command: Command, control: Control) -> Command:
@@ -228,7 +255,7 @@ def _greedy(rng: Generator) -> Lie:
 
 
 def _on_the_limit(rng: Generator) -> Lie:
-    """Rides the stop rule: always a little more than what the robot could stop from."""
+    """Fly slightly faster than the stop rule allows."""
     more = float(rng.uniform(1.0, 1.5))
     way: list[int] = rng.choice([-1, 1], 3).tolist()
 
@@ -249,7 +276,7 @@ def _on_the_limit(rng: Generator) -> Lie:
 
 
 def _shaking(rng: Generator) -> Lie:
-    """Back and forth at a frequency that may meet a resonance of the onboard loops."""
+    """Shake at a frequency that may be a resonance of the onboard loops."""
     frequency, plane = float(rng.uniform(0.2, 10.0)), rng.permutation(3).tolist()
     bias: list[float] = rng.uniform(-3.0, 3.0, 3).tolist()
 
@@ -264,7 +291,7 @@ def _shaking(rng: Generator) -> Lie:
 
 
 def _random(rng: Generator) -> Lie:
-    """A new random velocity after every random while."""
+    """Change to a random velocity at random times."""
     velocity, until_ns = ZERO, 0
 
     def lie(command: Command, control: Control) -> Command:
@@ -278,7 +305,7 @@ def _random(rng: Generator) -> Lie:
 
 
 def _strange_numbers(rng: Generator) -> Lie:
-    """Special values in every field, now and then: too rarely to be landed, or all the time."""
+    """Send special values in all fields: too rarely for a landing, or all the time."""
     share = float(rng.choice([0.01, 0.03, 1.0]))
 
     def lie(command: Command, control: Control) -> Command:
@@ -291,8 +318,8 @@ def _strange_numbers(rng: Generator) -> Lie:
 
 
 def _false_basis(rng: Generator) -> Lie:
-    """Says that its commands were computed from odometry of the future, or hangs on to old ones."""
-    shift_ns = int(rng.choice([1, TICK_NS, 10_000_000, 200_000_000, 2**62]))
+    """Name odometry of the future, or old odometry, as the basis of commands."""
+    shift_ns = int(rng.choice([1, STEP_NS, 10_000_000, 200_000_000, 2**62]))
     sign = int(rng.choice([-1, 1]))
     velocity = (6.0 * sign, 6.0, 2.0)
 
@@ -307,7 +334,7 @@ def _false_basis(rng: Generator) -> Lie:
 
 
 def _stop_and_go(rng: Generator) -> Lie:
-    """Lets commands become stale and fresh again, and uses every resumption for a dash."""
+    """Let commands become stale and fresh again, and dash at every resumption."""
     period_ns = int(rng.uniform(0.3e9, 3e9))
     velocity = _vector(rng.uniform(-6.0, 6.0, 3).tolist())
 
@@ -321,12 +348,12 @@ def _stop_and_go(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Flies by another policy; what it says beside that is in `at_bad_moments`."""
+    """Fly by another policy; the requests come from `at_bad_moments`."""
     return FAST[int(rng.integers(len(FAST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
-    """Fast, and now and then such nonsense that the guard lands; its words undo that in the air."""
+    """Fly fast, and sometimes make the guard land; the requests undo that in the air."""
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 
     def lie(command: Command, control: Control) -> Command:

@@ -1,23 +1,10 @@
-"""The operator's desk in virtual time: teleop's service with its journal, which may die and return.
+"""Models in virtual time of what runs around the two ends: processes, clocks and teleop.
 
-Cloud's end is joined to it as it is to the process of teleop: while that is away, nobody answers.
-It sees and says everything at once, as long as cloud asks it to; see `Apart` for one that does not.
+`RestartableEndpoint` puts an end into a process that a scenario can kill, freeze and start again.
+`InProcessTeleop` is teleop inside cloud's process; `SeparateTeleop` is teleop as a process of its
+own, joined to cloud's end as in production:
 
-An end of the tunnel that can be killed, frozen and replaced, whose clock may be another.
-
-It is an `Endpoint` itself: the driver of virtual time does not know what befalls the end inside.
-Whatever is to happen to it is scheduled, and happens at its very nanosecond.
-
-Teleop as a process of its own, in virtual time: it looks now and then, and waits for its disk.
-
-A model of `cloudrc.drivers.teleop.serve_teleop`, joined to the very `RemoteTeleop` of production:
-
-    CloudEndpoint - RemoteTeleop  <- two sockets, 11 datagrams each ->  Apart - MissionService
-
-It looks every 20 ms, obeys the calls of the API, and sees the newest of what waits for it.
-While it stands still, for an fsync of its journal or stopped by a signal, nothing is heard or said,
-and what its socket has no room for is lost: what waits at the end is of the past, and passed over.
-It lives on while cloud is frozen or killed.
+    CloudEndpoint - RemoteTeleop  <- two sockets, 11 datagrams each ->  SeparateTeleop
 """
 
 from __future__ import annotations
@@ -28,80 +15,80 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from heapq import heappop, heappush
-from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 from cloudrc.cloud.operator import Operator
 from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, UnixPeer, send, turn
 from cloudrc.endpoint import Endpoint
-from cloudrc.faults.scenario import generator
-from cloudrc.faults.schedule import Event
 from cloudrc.messages import NEVER_NS
 from cloudrc.records import Fault, Lateness, MissionEvent, Record
 from cloudrc.teleop import wire
-from cloudrc.teleop.bridge import WAITING_MAX, Call
-from cloudrc.teleop.journal import Entry, Journal
+from cloudrc.teleop.journal import Entry
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import ConflictError, Mission, Order, UnavailableError
-from cloudrc.teleop.wire import Outcome, Output, Plan, RobotStatus
+from cloudrc.teleop.wire import Outcome, Output, RobotStatus
 
 FAR_NS = 1 << 62
 CFS_PERIOD = 0.1
-"""Of the kernel's CPU quota [s]."""
+"""Period of the kernel's CPU quota [s]."""
 SOCKET_MAX = 256
-"""Datagrams that wait in the socket of a process that stands still; Linux' default buffer."""
+"""Number of datagrams that wait in the socket of a frozen process; Linux' default buffer."""
+UNIX_SOCKET_MAX = 11
+"""Number of datagrams that wait in a Unix socket: net.unix.max_dgram_qlen, which is 10, plus 1."""
 
-Action = Callable[[int], None]
+Action: TypeAlias = Callable[[int], None]
 """Something that happens at an instant [ns, virtual time]."""
-Tamper = Callable[[bytes, int], list[bytes]]
-"""What arrives in place of a datagram at an instant [ns]."""
+Tamper: TypeAlias = Callable[[bytes, int], list[bytes]]
+"""Returns what arrives in place of a datagram at an instant [ns, virtual time]."""
+Call: TypeAlias = Callable[[MissionService, int], object]
+"""A call of teleop's API; takes the service and its clock [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A monotonic clock beside virtual time.
+    """A monotonic clock.
 
     Attributes:
-        offset_ns: What it shows at virtual time 0 [ns].
-        drift_ppm: By how much it is fast [ppm], a whole number.
+        offset_ns: Its time at virtual time 0 [ns].
+        drift_ppm: How fast it is [ppm].
     """
 
     offset_ns: int = 0
     drift_ppm: int = 0
 
     def at(self, now_ns: int) -> int:
-        """What it shows at `now_ns` of virtual time [ns]."""
+        """Return its time at `now_ns` of virtual time [ns]."""
         if not self.drift_ppm:
             return now_ns + self.offset_ns
         return now_ns + self.offset_ns + now_ns * self.drift_ppm // 1_000_000
 
-    def when(self, shown_ns: int) -> int:
-        """First instant of virtual time [ns] at which it shows at least `shown_ns` [ns]."""
+    def when(self, own_ns: int) -> int:
+        """Return the first virtual time [ns] at which it has reached `own_ns` [ns]."""
         if not self.drift_ppm:
-            return shown_ns - self.offset_ns
-        elapsed_ns = shown_ns - self.offset_ns
+            return own_ns - self.offset_ns
+        elapsed_ns = own_ns - self.offset_ns
         now_ns = elapsed_ns * 1_000_000 // (1_000_000 + self.drift_ppm) - 1
-        while self.at(now_ns) < shown_ns:
+        while self.at(now_ns) < own_ns:
             now_ns += 1
         return now_ns
 
 
-class Mortal:
-    """World or cloud, at the mercy of a scenario.
+class RestartableEndpoint:
+    """World or cloud in a process that a scenario can kill, freeze and start again.
 
     Attributes:
-        inner: The end that lives now; None while there is none.
-        tamper: What becomes of a datagram before it gets in; None leaves it alone.
-        clock: Its own.
-        lost: Datagrams that found no process.
+        inner: The end that runs; None while there is no process.
+        tamper: Changes the datagrams that arrive; None for no change.
+        clock: The process's clock.
+        lost: Number of datagrams that no process took.
     """
 
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock, name: str = "world") -> None:
-        """Bring the first one up at once.
+        """Start the first process.
 
         Args:
-            build: Makes an end that is born at an instant [ns] of its own clock.
-            clock: Its own.
+            build: Makes an end that starts at an instant of its own clock [ns].
+            clock: The process's clock.
             name: "world" or "cloud", for the records.
         """
         self._build, self.clock, self._name = build, clock, name
@@ -110,60 +97,49 @@ class Mortal:
         self._frozen_until_ns = -1
         self._waiting: list[bytes] = []
         self._left: list[Record] = []
-        self._to_send: list[bytes] = []
         self._actions: list[tuple[int, int, Action]] = []
         self._scheduled = 0
         self.inner: Endpoint | None = build(clock.at(0))
         self._due_ns = FAR_NS
-        self._look()
+        self._set_deadline()
 
     def at(self, seconds: float, action: Action) -> None:
-        """Have something happen.
-
-        Args:
-            seconds: Instant of virtual time [s].
-            action: What.
-        """
+        """Schedule an action at an instant of virtual time [s]."""
         self._scheduled += 1
         heappush(self._actions, (round(seconds * 1e9), self._scheduled, action))
-        self._look()
+        self._set_deadline()
 
     def kill(self, now_ns: int) -> None:
-        """SIGKILL: memory and socket are gone, what was recorded until now is kept."""
+        """Kill the process as SIGKILL does; its records so far are kept."""
         if self.inner is not None:
             self._left += self.inner.take_records()
         self.inner, self._waiting, self._frozen_until_ns = None, [], -1
-        self._look()
+        self._set_deadline()
 
     def start(self, now_ns: int) -> None:
-        """A new process takes the place of one that was killed."""
+        """Start a new process at `now_ns` [ns]."""
         self.inner = self._build(self.clock.at(now_ns))
-        self._look()
+        self._set_deadline()
 
     def freeze(self, now_ns: int, duration: float) -> None:
-        """SIGSTOP: what arrives waits in the socket.
-
-        Args:
-            now_ns: When [ns].
-            duration: How long [s].
-        """
+        """Stop the process as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
         self._frozen_until_ns = max(self._frozen_until_ns, now_ns + round(duration * 1e9))
-        self._look()
+        self._set_deadline()
 
     def throttle(self, start: float, duration: float, share: float) -> None:
-        """Let it run for a part of every CFS period only.
+        """Give the process a share of each CFS period only.
 
         Args:
-            start: From this instant of virtual time on [s].
-            duration: How long [s].
-            share: In which it runs, in [0, 1].
+            start: Beginning [s, virtual time].
+            duration: Duration [s].
+            share: Share of the time in which the process runs, in [0, 1].
         """
         stall = (1.0 - share) * CFS_PERIOD
         for n in range(int(duration / CFS_PERIOD)):
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
-        """Hand over a datagram that somebody else has sent."""
+        """Hand a datagram to the process, past `tamper`."""
         if self.inner is None:
             self.lost += 1
         elif self._frozen_until_ns > now_ns:
@@ -183,12 +159,9 @@ class Mortal:
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
         """See `Endpoint`."""
-        if self.tamper is None:
-            self.receive_now(data, now_ns)
-        else:
-            for each in self.tamper(data, now_ns):
-                self.receive_now(each, now_ns)
-        self._look()
+        for each in [data] if self.tamper is None else self.tamper(data, now_ns):
+            self.receive_now(each, now_ns)
+        self._set_deadline()
 
     def next_deadline_ns(self) -> int:
         """See `Endpoint`."""
@@ -211,7 +184,7 @@ class Mortal:
                 inner.handle_deadline(own_ns)
             if own_ns > was_due_ns + 1000:  # a clock that drifts is off by a nanosecond
                 self._note_late_wake(inner, own_ns, own_ns - was_due_ns)
-        self._look()
+        self._set_deadline()
 
     def take_datagrams(self) -> list[bytes]:
         """See `Endpoint`."""
@@ -225,13 +198,12 @@ class Mortal:
         return left + self.inner.take_records() if self.inner is not None else left
 
     def _note_late_wake(self, inner: Endpoint, own_ns: int, late_ns: int) -> None:
-        """As the driver of real time does with every wake; in virtual time only these are late."""
+        """Record a late wake, as the driver of real time does; others are on time."""
         slip_ns = getattr(inner, "slip_ns", 0)
         self._left += inner.take_records()
         self._left.append(Lateness(own_ns - slip_ns, self._name, late_ns * 1e-9, 0.0, slip_ns))
 
-    def _look(self) -> None:
-        """When something is due next."""
+    def _set_deadline(self) -> None:
         due_ns = self._actions[0][0] if self._actions else FAR_NS
         if self.inner is not None:
             if self._frozen_until_ns >= 0:
@@ -241,288 +213,251 @@ class Mortal:
         self._due_ns = due_ns
 
 
-Keep = Callable[[Entry], None]
-
-
-class Desk:
-    """What cloud's end has for an operator.
+class EndpointGroup:
+    """Ends that share a socket: each hears all datagrams; an `Endpoint` itself.
 
     Attributes:
-        service: The one that lives now; None while teleop is down.
-        entries: What the journal holds.
-        repairs: What was wrong with it whenever it was opened.
-        events: All that has happened to missions, oldest first.
-        refuse: If set, it is called before an entry is kept; a full disk raises OSError.
+        members: The ends; only the records of the first are recorded.
+        others: Records of the other ends, oldest first.
+    """
+
+    def __init__(self, members: Sequence[Endpoint]) -> None:
+        self.members = members
+        self.others: list[Record] = []
+
+    @property
+    def sealed(self) -> bool:
+        """See `Endpoint`."""
+        return all(member.sealed for member in self.members)
+
+    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+        """See `Endpoint`."""
+        for member in self.members:
+            member.receive_datagram(data, now_ns)
+
+    def next_deadline_ns(self) -> int:
+        """See `Endpoint`."""
+        return min(member.next_deadline_ns() for member in self.members)
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """See `Endpoint`."""
+        for member in self.members:
+            if now_ns >= member.next_deadline_ns():
+                member.handle_deadline(now_ns)
+
+    def take_datagrams(self) -> list[bytes]:
+        """See `Endpoint`."""
+        return [data for member in self.members for data in member.take_datagrams()]
+
+    def take_records(self) -> list[Record]:
+        """See `Endpoint`; only those of the first."""
+        first, *others = (member.take_records() for member in self.members)
+        for records in others:
+            self.others += records
+        return first
+
+
+class InProcessTeleop:
+    """Teleop inside cloud's process, with a disk that survives its restarts; an `Operator`.
+
+    Attributes:
+        service: The service that runs; None while teleop is down.
+        events: All events of missions, oldest first.
     """
 
     outcome: Outcome | None = None
     settled = True
 
-    def __init__(
-        self, contact_speed_max: float, path: Path | None = None, name: bytes = b"desk"
-    ) -> None:
-        """Open for the first time.
+    def __init__(self, contact_speed_max: float, name: bytes = b"desk") -> None:
+        """Start for the first time.
 
         Args:
-            contact_speed_max: Below which the arm's tip may meet the board [m/s].
-            name: Tells its missions from those of another desk.
-            path: Of a real journal; None for one in memory that never fails.
+            contact_speed_max: Speed limit of the arm's tip at the board [m/s].
+            name: Makes its mission numbers differ from those of another teleop.
         """
-        self._contact_speed_max, self._path, self._name = contact_speed_max, path, name
-        self._journal: Journal | None = None
-        self._started = 0
-        self.repairs: list[str] = []
-        self.entries: list[Entry] = []
+        self._contact_speed_max, self._name, self._starts = contact_speed_max, name, 0
+        self._disk: list[Entry] = []
         self.events: list[MissionEvent] = []
-        self.refuse: Callable[[], None] | None = None
         self.service: MissionService | None = None
         self._outputs: list[Output | Fault] = []
         self.start()
 
     def start(self) -> None:
-        """A new process, which has nothing but the journal."""
-        if self._path is not None:
-            self._journal = Journal(self._path)
-            self.entries = list(self._journal.entries)
-            self.repairs.append(self._journal.trouble)
-        entries, self._started = list(self.entries), self._started + 1
-        salt = b"%s %d" % (self._name, self._started)  # in production it is random
-        self.service = MissionService(self._contact_speed_max, self._keep, entries, salt=salt)
+        """Start a new process, which knows only what is on the disk."""
+        self._starts += 1
+        salt = b"%s %d" % (self._name, self._starts)  # random in production
+        self.service = MissionService(
+            self._contact_speed_max, self._disk.append, list(self._disk), salt=salt
+        )
 
     def kill(self) -> None:
-        """Teleop is gone, and what it had not written down with it."""
-        if self._journal is not None:
-            self._journal.close()
-        self.service = self._journal = None
+        """Kill the process."""
+        self.service = None
         self._outputs.clear()
 
-    def order(self, plan: Plan, now_ns: int, **options: Any) -> Mission:
-        """Post a mission; it is started at once."""
+    def order(self, order: Order, now_ns: int) -> Mission:
+        """Order a mission at `now_ns` of cloud's clock [ns]; it starts at once."""
         assert self.service is not None, "teleop is down"
-        mission, _ = self.service.create(Order(plan, **options), now_ns)
-        return mission
+        return self.service.create(order, now_ns)[0]
 
     def ask(self, call: Call, now_ns: int) -> None:
-        """Have a call of the API made on cloud's clock [ns]; what it refuses is dropped."""
+        """Make a call of the API at `now_ns` of cloud's clock [ns]; a refusal is ignored."""
         if self.service is not None:
             with suppress(ConflictError, UnavailableError):
                 call(self.service, now_ns)
 
     def stop_rotors(self, now_ns: int) -> None:
-        """An emergency stop by the API at an instant [ns] of cloud's clock."""
+        """Make an emergency stop at `now_ns` of cloud's clock [ns]."""
         self.ask(MissionService.stop_rotors, now_ns)
 
     def shut_down(self, now_ns: int) -> None:
-        """SIGTERM at an instant [ns] of cloud's clock."""
+        """Ask the process to end, as SIGTERM does, at `now_ns` of cloud's clock [ns]."""
         if self.service is not None:
             self.service.pause(now_ns)
 
-    def live(self, host: Mortal) -> None:
-        """Time begins on the machine of cloud, which is teleop's, too."""
+    def run_on(self, host: RestartableEndpoint) -> None:
+        """Begin to run on the machine of `host`."""
 
     def join(self, start_ns: int) -> Operator:
-        """Give a new cloud, born at an instant [ns] of its clock, what it has for teleop."""
+        """Return the `Operator` of a cloud that starts at `start_ns` of its clock [ns]."""
         return self
 
     @property
     def missions(self) -> list[Mission]:
-        """All that the service knows, oldest first; none while it is down."""
+        """All missions, oldest first; none while teleop is down."""
         return list(self.service.book.missions.values()) if self.service is not None else []
 
-    @property
-    def last(self) -> Mission:
-        """The mission ordered last."""
-        return self.missions[-1]
-
-    # What cloud's end knows of it.
+    # The contract of an operator.
 
     @property
     def outputs(self) -> Sequence[Output | Fault]:
-        """See `cloudrc.cloud.operator.Operator`."""
+        """See `Operator`."""
         return self._outputs
 
     def hear(self, now_ns: int) -> None:
-        """Take note that cloud lives."""
+        """Note that cloud runs."""
         if self.service is not None:
             self.service.hear(now_ns)
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """See `cloudrc.cloud.operator.Operator`."""
+        """See `Operator`."""
         if self.service is not None:
             self.service.see(seen, now_ns)
             self._collect()
 
     def handle_deadline(self, now_ns: int) -> None:
-        """See `cloudrc.cloud.operator.Operator`."""
+        """See `Operator`."""
         if self.service is not None:
             self.service.handle_deadline(now_ns)
             self._collect()
 
     def take_outputs(self) -> Sequence[Output | Fault]:
-        """See `cloudrc.cloud.operator.Operator`."""
+        """See `Operator`."""
         outputs, self._outputs = self._outputs, []
         return outputs
 
     def _collect(self) -> None:
         assert self.service is not None
         outputs = self.service.take_outputs()
-        self.events += [said for said in outputs if isinstance(said, MissionEvent)]
+        self.events += [each for each in outputs if isinstance(each, MissionEvent)]
         self._outputs += outputs
 
-    def _keep(self, entry: Entry) -> None:
-        if self.refuse is not None:
-            self.refuse()
-        if self._journal is not None:
-            self._journal.append(entry)
-        self.entries.append(entry)
 
+class _Peer(UnixPeer):
+    """A process's Unix datagram socket, joined to that of another one."""
 
-UNIX_SOCKET_MAX = 11
-"""Datagrams that wait: one more than net.unix.max_dgram_qlen, which is 10 in a new namespace."""
-
-
-class Socket:
-    """What is bound to a path: datagrams come in and wait, as far as there is room.
-
-    Attributes:
-        waiting: Oldest first.
-    """
-
-    def __init__(self, there: Callable[[], bool]) -> None:
-        """Begin empty; `there` says whether a process has it open."""
-        self._there = there
+    def __init__(self, is_open: Callable[[], bool]) -> None:
+        self.unsent, self.other, self._is_open = 0, self, is_open
         self.waiting: list[bytes] = []
-
-    def take(self, data: bytes) -> bool:
-        """Say whether it is taken."""
-        taken = self._there() and len(self.waiting) < UNIX_SOCKET_MAX
-        if taken:
-            self.waiting.append(data)
-        return taken
-
-
-class Peer(UnixPeer):
-    """One of two processes, as its code knows it."""
-
-    def __init__(self, own: Socket, other: Socket) -> None:
-        self.unsent, self._inbox, self._outbox = 0, own, other
 
     def receive(self) -> list[bytes]:
         """See `UnixPeer`."""
-        datagrams, self._inbox.waiting = self._inbox.waiting, []
+        datagrams, self.waiting = self.waiting, []
         return datagrams
 
     def send(self, data: bytes) -> bool:
-        """See `UnixPeer`."""
-        sent = self._outbox.take(data)
+        """See `UnixPeer`; datagrams wait in the other socket while there is room."""
+        sent = self.other._is_open() and len(self.other.waiting) < UNIX_SOCKET_MAX
+        if sent:
+            self.other.waiting.append(data)
         self.unsent += not sent
         return sent
 
 
-class Apart(Desk):
-    """A desk that sees and says nothing but in its turns.
+class SeparateTeleop(InProcessTeleop):
+    """Teleop as a process of its own, which wakes every 20 ms."""
 
-    Its entries are kept one fsync after the other: killed meanwhile, it has written those of which
-    the fsync had begun. The journal in memory is slow, that in a file never is.
-
-    Attributes:
-        slow: While one of these lasts, an fsync of the journal takes its value [s].
-    """
-
-    def __init__(
-        self, contact_speed_max: float, path: Path | None = None, *, phase_ns: int = 0
-    ) -> None:
-        """Open for the first time; see `Desk`.
+    def __init__(self, contact_speed_max: float, *, phase_ns: int = 0) -> None:
+        """Start for the first time.
 
         Args:
-            contact_speed_max: Below which the arm's tip may meet the board [m/s].
-            path: Of a real journal; None for one in memory.
-            phase_ns: Of its turns, below `PERIOD_NS` [ns].
+            contact_speed_max: Speed limit of the arm's tip at the board [m/s].
+            phase_ns: Time of the first wake, below `PERIOD_NS` [ns].
         """
-        self._at_teleop = Socket(lambda: self.service is not None)
-        self._at_cloud = Socket(lambda: self._host is not None and self._host.inner is not None)
-        self._peer = Peer(self._at_teleop, self._at_cloud)
-        self._host: Mortal | None = None
-        self._phase_ns, self._life, self._free_ns = phase_ns, 0, 0
-        self.slow: list[Event] = []
-        super().__init__(contact_speed_max, path)
+        self._peer = _Peer(lambda: self.service is not None)
+        self._clouds = _Peer(lambda: self._host is not None and self._host.inner is not None)
+        self._peer.other, self._clouds.other = self._clouds, self._peer
+        self._host: RestartableEndpoint | None = None
+        self._phase_ns, self._free_ns = phase_ns, 0
+        super().__init__(contact_speed_max)
 
     def start(self) -> None:
-        """See `Desk`; nothing waits for a new process."""
+        """See `InProcessTeleop`; nothing waits for a new process."""
         self._forget()
         super().start()
 
     def kill(self) -> None:
-        """See `Desk`; what waited for the end of an fsync is never said."""
+        """See `InProcessTeleop`."""
         super().kill()
         self._forget()
 
-    def live(self, host: Mortal) -> None:
-        """See `Desk`; whatever befalls cloud, the turns go on."""
+    def run_on(self, host: RestartableEndpoint) -> None:
+        """See `InProcessTeleop`; it wakes whatever happens to cloud's process."""
         self._host = host
-        host.at(self._phase_ns * 1e-9, self._tick)
+        host.at(self._phase_ns * 1e-9, self._wake)
 
     def join(self, start_ns: int) -> Operator:
-        """See `Desk`; what waited for the cloud before is lost with its socket."""
-        self._at_cloud.waiting.clear()
-        peer = Peer(self._at_cloud, self._at_teleop)
-        return RemoteTeleop(peer, wire.encode, wire.decode, start_ns)
+        """See `InProcessTeleop`; what waited for the cloud before is lost."""
+        self._clouds.waiting.clear()
+        return RemoteTeleop(self._clouds, wire.encode, wire.decode, start_ns)
 
     def ask(self, call: Call, now_ns: int) -> None:
-        """See `Desk`; it is answered in the next turn, if not too many wait."""
-        if self.service is not None and len(self._calls) < WAITING_MAX:
+        """See `InProcessTeleop`; the call is made in the next wake."""
+        if self.service is not None:
             self._calls.append(call)
 
     def stop_rotors(self, now_ns: int) -> None:
-        """See `Desk`; its alarm goes past teleop's loop, from the thread of the API.
-
-        So it does from a process that stands still, unlike in production.
-        """
+        """See `InProcessTeleop`; its alarm goes to cloud at once, past teleop's loop."""
         if self.service is not None:
             self._stops.append(MissionService.stop_rotors)
             self._peer.send(wire.encode(wire.ALARM))
 
     def shut_down(self, now_ns: int) -> None:
-        """See `Desk`; it is asked for a signal in every turn."""
+        """See `InProcessTeleop`; it ends in its next wake."""
         self._ends = self.service is not None
 
-    def stop(self, now_ns: int, duration: float) -> None:
-        """SIGSTOP.
-
-        Args:
-            now_ns: When, virtual time [ns].
-            duration: How long [s].
-        """
-        if self.service is not None:
+    def freeze(self, now_ns: int, duration: float) -> None:
+        """Stop the process as SIGSTOP does, from `now_ns` [ns, virtual time] for a while [s]."""
+        if self.service is not None and self._host is not None:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
-            self._turn_when_free()
+            self._host.at(self._free_ns * 1e-9, self._turn)  # who is late wakes at once
 
     def _forget(self) -> None:
-        self._at_teleop.waiting.clear()
+        self._peer.waiting.clear()
         self._calls: list[Call] = []
         self._stops: list[Call] = []
         self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
-        self._ends, self._free_ns, self._turn_ns = False, 0, NEVER_NS
-        self._blind = 0
-        self._life += 1
+        self._ends, self._free_ns, self._turn_ns, self._blind = False, 0, NEVER_NS, 0
 
-    def _tick(self, now_ns: int) -> None:
+    def _wake(self, now_ns: int) -> None:
         assert self._host is not None
         self._turn(now_ns)
-        self._host.at((now_ns + PERIOD_NS) * 1e-9, self._tick)
-
-    def _turn_when_free(self) -> None:
-        """Whoever was late looks again at once."""
-        assert self._host is not None
-        self._host.at(self._free_ns * 1e-9, self._turn)
+        self._host.at((now_ns + PERIOD_NS) * 1e-9, self._wake)
 
     def _turn(self, now_ns: int) -> None:
         if self.service is None or self._host is None or now_ns < self._free_ns:
             return
-        self._send()  # what has waited for the end of an fsync
-        own_ns, turned_ns = self._host.clock.at(now_ns), self._turn_ns
-        self._turn_ns = self._free_ns = now_ns
-        late_ns = now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0
+        turned_ns, self._turn_ns = self._turn_ns, now_ns
         self._blind = turn(
             self,
             self._peer,
@@ -530,13 +465,11 @@ class Apart(Desk):
             self._take_calls,
             stops=self._take_stops,
             blind=self._blind,
-            late_ns=late_ns,
-            now_ns=own_ns,
+            late_ns=now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0,
+            now_ns=self._host.clock.at(now_ns),
         )
-        if self._free_ns > now_ns:
-            self._turn_when_free()
-        else:
-            self._send()
+        # Events wait for a cloud that is there; everything else is repeated.
+        send(self.take_outputs(), self._unsent, self._peer, wire.encode)
 
     def _take_calls(self) -> list[Callable[[int], None]]:
         ask, shut_down = super().ask, super().shut_down
@@ -547,36 +480,4 @@ class Apart(Desk):
 
     def _take_stops(self) -> list[Callable[[int], None]]:
         stops, self._stops = self._stops, []
-        return [partial(super(Apart, self).ask, stop) for stop in stops]
-
-    def _send(self) -> None:
-        """Say it to cloud: events wait for one that is there, everything else is repeated."""
-        send(self.take_outputs(), self._unsent, self._peer, wire.encode)
-
-    def _keep(self, entry: Entry) -> None:
-        began_ns, life = self._free_ns, self._life
-        takes = (e.value for e in self.slow if e.at <= began_ns * 1e-9 < e.end)
-        self._free_ns += round(max(takes, default=0.0) * 1e9)
-        if self._host is None or began_ns <= self._turn_ns:
-            super()._keep(entry)
-            return
-        if self.refuse is not None:
-            self.refuse()
-
-        def reach(_: int) -> None:
-            if self._life == life:
-                self.entries.append(entry)
-
-        self._host.at(began_ns * 1e-9, reach)
-
-
-def apart(contact_speed_max: float, path: Path | None, seed: int) -> Apart:
-    """Open a desk whose turns have the phase of a seed.
-
-    Args:
-        contact_speed_max: Below which the arm's tip may meet the board [m/s].
-        path: Of a real journal; None for one in memory.
-        seed: Of the phase.
-    """
-    phase_ns = int(generator(seed, 45).integers(PERIOD_NS))
-    return Apart(contact_speed_max, path, phase_ns=phase_ns)
+        return [partial(super(SeparateTeleop, self).ask, stop) for stop in stops]

@@ -7,7 +7,7 @@ epochs: a cloud that takes control gets a new one, and a mission that starts fro
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import hypot, isnan, nan
@@ -271,6 +271,16 @@ class WorldEndpoint:
         self._orders = Orders(robot.guard, self._counts, command_age_max_ns)
 
     @property
+    def counts(self) -> Counter[str]:
+        """How often each thing has happened, as of now; a copy."""
+        return Counter(self._counts | self.robot.guard.counts)
+
+    @property
+    def epoch(self) -> int:
+        """Epoch of the session; 0 for none."""
+        return self._session.epoch
+
+    @property
     def slip_ns(self) -> int:
         """Lag of world's clock behind the monotonic clock [ns]."""
         return self._clock.slip_ns
@@ -428,17 +438,23 @@ class WorldEndpoint:
         self._complaints.forget()
         epoch, now_ns = self._session.epoch, self._clock.tick_ns
         self._records.append(SessionOpened(now_ns, "world", epoch, cause))
+        for observer in self.robot.observers:
+            observer.see_session(now_ns)
 
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
         """Carry out an operator request; a mission from the spawn begins a new epoch."""
         tick_ns, waited = self._clock.tick_ns, now_ns == self._stalled_wake_ns
-        if not self._orders.obey(request, tick_ns, waited=waited, has_epoch=self._has_epoch):
-            return
-        if request.start is Start.SPAWN:
+        number = self._orders.number
+        starts = self._orders.obey(request, tick_ns, waited=waited, has_epoch=self._has_epoch)
+        if starts and request.start is Start.SPAWN:
             self.robot.put_on_ground(tick_ns, "mission starts from spawn")
             self._queue([self._door.begin_next_epoch(now_ns)])
             self._begin_epoch("mission starts from spawn")
-        self.robot.guard.start_mission(tick_ns)
+        if starts:
+            self.robot.guard.start_mission(tick_ns)
+        if self._orders.number != number:
+            for observer in self.robot.observers:
+                observer.see_request(request, tick_ns)
 
     def _receive_command(
         self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
@@ -451,7 +467,7 @@ class WorldEndpoint:
         if outcome == USED:
             self._advance(world_ns)
             stalled = now_ns == self._stalled_wake_ns
-            outcome = "stale" if stalled else guard.offer(command, self._clock.tick_ns) or USED
+            outcome = "stale" if stalled else self._offer(command) or USED
         used = outcome == USED
         delay = (now_ns - command.stamp_ns) * 1e-9 if self._clock_is_shared else nan
         if outcome != REPEATED or not self._channel.is_flooded:
@@ -459,6 +475,14 @@ class WorldEndpoint:
         if used and guard.state is TRACK:
             self._waiting = (epoch, counter, command)
         self._counts[outcome] += 1
+
+    def _offer(self, command: Command) -> str | None:
+        """Give a command to the guard; return why the guard rejects it, None if it does not."""
+        tick_ns = self._clock.tick_ns
+        rejection = self.robot.guard.offer(command, tick_ns)
+        for observer in self.robot.observers:
+            observer.see_command(command, rejection, tick_ns)
+        return rejection
 
     def _send(self, kind: int, body: bytes) -> None:
         self._datagrams.append(self._session.seal(kind, body))

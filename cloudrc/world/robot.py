@@ -10,9 +10,12 @@ then on. The guard therefore never skips a tick: a stalled machine makes world s
 
 from __future__ import annotations
 
-from cloudrc.messages import GuardState
+from typing import Protocol
+
+from cloudrc.messages import Command, GuardState, OperatorRequest
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
+from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.rotors import STOPPED
 from cloudrc.world.simulator import Simulator
 
@@ -51,12 +54,41 @@ class SimulationClock:
 TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 
 
+class Observer(Protocol):
+    """Sees all that a robot is told and does, and changes nothing. Times are world's clock [ns]."""
+
+    def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
+        """See a step of the physics, after it.
+
+        Args:
+            now_ns: Beginning of the step.
+            readings: Readings at its beginning, which the guard's tick got.
+            rotor_speeds: Commanded rotor speeds [rad/s], shape (4,).
+        """
+
+    def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
+        """See a command after the guard's answer; `rejection` is None if it was accepted."""
+
+    def see_request(self, request: OperatorRequest, now_ns: int) -> None:
+        """See an operator request after it was carried out."""
+
+    def see_session(self, now_ns: int) -> None:
+        """See a new session begin: earlier commands no longer count."""
+
+
 class Robot:
-    """Runs the ticks of physics, guard and low-level controller."""
+    """Runs the ticks of physics, guard and low-level controller.
+
+    Attributes:
+        simulator: The physics.
+        guard: The guard.
+        observers: Are told of every step, command and request, in this order.
+    """
 
     def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         self.simulator = simulator
         self.guard = guard
+        self.observers: list[Observer] = []
         self._low_level = low_level
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
@@ -72,15 +104,19 @@ class Robot:
             The next tick to run [ns].
         """
         simulator, guard, low_level = self.simulator, self.guard, self._low_level
+        observers = self.observers
         ticks = range(tick_ns, until_ns, STEP_NS)
         for now_ns in ticks:
             readings = simulator.readings
             reference = guard.tick(now_ns, readings, STEP)
             if reference is None:
                 low_level.reset()
-                simulator.step(STOPPED)
+                speeds = STOPPED
             elif guard.state is TRACK or not guard.brakes:
-                simulator.step(low_level.update(readings, reference))
+                speeds = low_level.update(readings, reference)
             else:
-                simulator.step(low_level.brake(readings, reference))
+                speeds = low_level.brake(readings, reference)
+            simulator.step(speeds)
+            for observer in observers:
+                observer.see_step(now_ns, readings, speeds)
         return tick_ns + len(ticks) * STEP_NS

@@ -10,7 +10,7 @@ raw `mj_step`, and its end state equals the simulator's bit by bit, so the compa
 
 from __future__ import annotations
 
-from math import dist
+from math import dist, inf
 from struct import Struct
 from typing import Any, NamedTuple
 
@@ -116,6 +116,21 @@ class Simulator:
         contacts = data.ncon
         if contacts or self._contacts:
             self._check_contacts(contacts, before)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps since the last reset."""
+        return self._steps
+
+    @property
+    def touch_age(self) -> float:
+        """Time since something was touched last [s]; infinite if nothing was."""
+        return (self._steps - max(self._last_touch.values(), default=-inf)) * self.dt
+
+    @property
+    def rotor_speeds(self) -> RotorSpeeds:
+        """Actual rotor speeds [rad/s], shape (4,)."""
+        return self._rotors.speeds
 
     def tip_force(self) -> float:
         """Return the normal force on the arm's tip at the beginning of the last step [N]."""

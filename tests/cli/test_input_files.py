@@ -29,7 +29,7 @@ def no_waiting() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.parametrize("words", ["recover", "faults replay"])
+@pytest.mark.parametrize("words", ["recover", "faults run"])
 @pytest.mark.parametrize("what", ["pipe", "/dev/null", "."])
 def test_a_pipe_device_or_folder_is_refused_at_once(
     words: str,
@@ -64,4 +64,4 @@ def test_a_redirected_file_is_read(tmp_path: Path) -> None:
     schedule = tmp_path / "schedule.yaml"
     schedule.write_text(dump(Schedule(1, duration=0.5)))
     with schedule.open("rb") as handed:
-        assert main(["faults", "replay", f"/dev/fd/{handed.fileno()}"]) == 0
+        assert main(["faults", "run", f"/dev/fd/{handed.fileno()}"]) == 0

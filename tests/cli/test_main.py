@@ -87,7 +87,7 @@ def test_no_argument_prints_help(capsys: pytest.CaptureFixture[str]) -> None:
         ("completion", "required: shell"),
         ("bench --repeats 0", "'0' is not a whole number from 1 to 100000"),
         ("bench --repeats=-3", "'-3' is not a whole number from 1 to 100000"),
-        (f"faults fuzz --first {2**63}", f"is not a whole number from 0 to {SEED_MAX}"),
+        (f"faults search --first {2**63}", f"is not a whole number from 0 to {SEED_MAX}"),
     ],
 )
 def test_a_wrong_command_line_is_one_line_of_error(

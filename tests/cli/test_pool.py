@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import signal
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.cli.pool import BATCH_MAX, WorkerDiedError, map_in_order
-from cloudrc.faults.document import Result
-from cloudrc.faults.fuzz import Finding
-from cloudrc.faults.scenario import Outcome, find
-from cloudrc.faults.schedule import Schedule
 
 KILLED = 5
 """The piece of work, or seed, that kills its process."""
@@ -100,67 +93,6 @@ def test_results_before_a_worker_was_killed_are_kept(monkeypatch: pytest.MonkeyP
     assert results[:KILLED] == list(range(KILLED))
 
 
-def _fly(schedule: Schedule, keep: bool = False) -> Finding:
-    if schedule.seed == KILLED:
-        time.sleep(0.5)  # until earlier results are delivered
-    _kill_at_five(schedule.seed)
-    return Finding(schedule, (), "", 1.0, 1.0, 0, 0, 0.0)
-
-
-def test_a_fault_search_with_a_killed_worker_keeps_results(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cloudrc.faults.fuzz.fly", _fly)
-    assert main("faults fuzz --seeds 9 --jobs 2 -o json".split()) == 6
-    out, error = capsys.readouterr()
-    assert error.count("\n") == 1
-    assert error.startswith("cloudrc: a worker was killed")
-    count = json.loads(out)["count"]
-    assert 1 <= count < KILLED
-    assert f"; {count} of 9 were flown" in error
-    assert f"continue with 'cloudrc faults fuzz --first {count + 1} --seeds {9 - count}'" in error
-    assert main(f"faults fuzz --first {KILLED} --seeds 2 --jobs 2".split()) == 6
-    assert "; no schedule was flown" in capsys.readouterr().err
-
-
-def _kill(which: tuple[str, str, int]) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def _interrupt(which: tuple[str, str, int]) -> Result:
-    scenario = find(which[0], "virtual")
-    if scenario.number > 1:
-        raise KeyboardInterrupt
-    return Result(scenario, Outcome(), 0.0)
-
-
-@pytest.mark.parametrize(
-    ("how", "jobs", "code", "word", "flown"),
-    [(_kill, 2, 6, "a worker was killed", 0), (_interrupt, 1, 130, "interrupted", 1)],
-)
-def test_an_interrupted_fault_run_keeps_its_results(
-    how: object,
-    jobs: int,
-    code: int,
-    word: str,
-    flown: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cloudrc.cli.faults._run", how)
-    line = f"faults run --all --jobs {jobs} --junit f.xml --document f.md -o json"
-    assert main(line.split()) == code
-    captured = capsys.readouterr()
-    assert captured.err.startswith(f"cloudrc: {word}")
-    assert f"; {flown} of " in captured.err
-    assert len(json.loads(captured.out)["faults"]) == flown
-    assert Path("f.xml").read_text().count("<testcase") == flown
-    assert not Path("f.md").exists(), "a page needs all results"
-
-
 def test_ctrl_c_ends_the_workers_at_once() -> None:
     started = time.monotonic()
     done = map_in_order(time.sleep, [0.0, 60.0, 60.0], 2)
@@ -169,12 +101,3 @@ def test_ctrl_c_ends_the_workers_at_once() -> None:
         done.throw(KeyboardInterrupt)
     assert time.monotonic() - started < 30.0
     assert multiprocessing.active_children() == []
-
-
-def test_a_store_that_is_not_a_folder_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("a.json").touch()
-    assert main("faults fuzz --seeds 1 --store a.json/found".split()) == 2
-    assert "this folder cannot be made" in capsys.readouterr().err

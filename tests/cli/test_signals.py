@@ -56,7 +56,8 @@ def test_flying_commands_treat_a_hang_up_as_ctrl_c(
 
 @pytest.mark.process
 @pytest.mark.parametrize(
-    "words", [["faults", "fuzz", "--seeds", "99", "--jobs", "2"], ["run", "steps", "--seeds", "9"]]
+    "words",
+    [["faults", "search", "--minutes", "9", "--jobs", "2"], ["run", "steps", "--seeds", "9"]],
 )
 def test_workers_end_if_their_parent_is_killed(words: list[str], tmp_path: Path) -> None:
     command = [sys.executable, "-m", "cloudrc", *words]

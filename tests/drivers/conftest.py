@@ -19,6 +19,8 @@ from cloudrc.config.load import dump, load_experiment
 from cloudrc.drivers.local import _free_addresses
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.errors import CloudrcError
+from cloudrc.messages import GuardState
+from cloudrc.record.columns import Recording
 
 
 @pytest.fixture
@@ -54,6 +56,19 @@ def slower(told: str) -> float:
 def here() -> float:
     """Measure the slowdown of this machine's interpreter."""
     return slower(subprocess.check_output([sys.executable, "-c", WORK], text=True))
+
+
+def ages_at_hold(recording: Recording) -> list[float]:
+    """Return the age [s] of the newest applied basis at each HOLD for want of fresh commands."""
+    guard, applied = recording["/guard"], recording["/command_applied"]
+    ages = []
+    for stamp_ns, state, cause in zip(
+        *(guard[name].tolist() for name in ("stamp_ns", "state", "cause")), strict=True
+    ):
+        if state == GuardState.HOLD and "age" in cause:
+            before = applied["basis_stamp_ns"][applied["stamp_ns"] <= stamp_ns]
+            ages.append((stamp_ns - int(before.max())) * 1e-9)
+    return ages
 
 
 LIMIT = 30.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,16 +11,25 @@ import pytest
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.drivers.process import _Observers
 from cloudrc.drivers.recording import RecordingThread, WallClock, told
-from cloudrc.faults.walls import Wall, steppable_wall_clock
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import Fault
 from tests.record.conftest import Shelf
 
 
+class Wall:
+    """A wall clock that is wrong by `offset` [s]."""
+
+    offset = 0.0
+
+    def step(self, by: float) -> None:
+        self.offset += by
+
+
 @pytest.fixture
-def wall() -> Iterator[Wall]:
-    with steppable_wall_clock() as clock:
-        yield clock
+def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
+    wall, true = Wall(), time.time
+    monkeypatch.setattr(time, "time", lambda: true() + wall.offset)
+    return wall
 
 
 @pytest.mark.parametrize("by", [3600.0, -3600.0, 1.0, -1.0])

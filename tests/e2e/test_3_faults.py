@@ -1,19 +1,29 @@
-"""Pods are deleted in flight: cloud's mission goes on in the new pod, world's cannot."""
+"""Faults in flight: pods deleted, a container killed, a partition, a busy CPU, a rotated key."""
 
 from __future__ import annotations
 
+import base64
 import json
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
+from cloudrc.cluster.pods import fetch_recording
 from cloudrc.cluster.release import wait_ready
 from cloudrc.config.load import load_mission
-from cloudrc.faults.cluster.pods import COMMANDS_IN, ENDS_IN, POD_START
+from cloudrc.record.columns import Recording
+from tests.drivers.conftest import ages_at_hold
 from tests.e2e.conftest import (
     NAME,
+    NAMESPACE,
+    CommandFailedError,
     JobEnd,
+    cloudrc,
     eventually,
     fly,
     job_end,
@@ -23,12 +33,36 @@ from tests.e2e.conftest import (
     place,
     pod,
     pods,
+    read,
     value,
 )
 
 PIPES = [waypoint.model_dump(mode="json") for waypoint in load_mission("pipes").waypoints]
 LINGER = 12
 """For an old pod to stay beside the new one [s]."""
+ENDS_IN = 2.0
+"""Time for a pod that is asked to end, and for its robot to hold [s].
+Source: docs/reference/faults.md, "F33"."""
+COMMANDS_IN = 2.0
+"""Time for a new cloud to command [s]. Source: docs/reference/faults.md, "F13"."""
+POD_START = 10.0
+"""Time that Kubernetes needs to replace a pod whose image is on the node [s]. On kind with two busy
+CPUs, 6.3 to 9.5 s were measured from the pod's deletion to the flight."""
+CONTAINER_START = 5.0
+"""Time that Kubernetes needs to start a container again [s]."""
+PARTITION = 5.0
+"""Duration of the partition [s]."""
+AGE_MAX = 0.252 + 1e-9
+"""Largest age of a command's basis at a HOLD [s]."""
+KILL = "import resource; resource.prlimit(1, resource.RLIMIT_CPU, (1, 1))"
+"""Kills a container's first process from within the container: no process in it may send SIGKILL to
+it, but the kernel does once the CPU time of a process [s] is above its limit."""
+BURN = """
+import os, time
+child, end = os.fork(), time.monotonic() + 10  # one alone might stay below the limit of a whole CPU
+while time.monotonic() < end: pass
+child and os.waitpid(child, 0)
+"""
 
 
 def fly_until(name: str, line: str, limit: float = 120.0) -> None:
@@ -114,3 +148,100 @@ def test_a_deleted_world_ends_the_mission_as_failed(installed: None) -> None:
     assert (end.condition, end.exit_code) == ("Failed", 1), end
     assert "world_restarted" in end.message
     wait_ready(place(), timeout=60.0)
+
+
+def recording(component: str, folder: Path) -> Recording:
+    """Fetch the recording of an end as it is now."""
+    time.sleep(1.0)  # the recorder's flush
+    path = folder / f"{component}.mcap"
+    fetch_recording(place(), component, path)
+    return Recording.read(path)
+
+
+def set_link(*words: str) -> None:
+    done = cloudrc("link", "set", *words, "-n", NAMESPACE, "--release", NAME)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.full
+def test_a_partition_makes_the_robot_hold_and_go_on(installed: None, tmp_path: Path) -> None:
+    before = len(ages_at_hold(recording("world", tmp_path)))
+    fly_until("parted", "waypoint 2 of 7 reached")
+    try:
+        set_link("uplink.loss=1", "downlink.loss=1")
+        time.sleep(PARTITION)
+    finally:
+        set_link("--profile", "paper-p2")
+    check_resumed(job_end("parted"))
+    ages = ages_at_hold(recording("world", tmp_path))
+    assert len(ages) > before
+    assert max(ages) <= AGE_MAX
+
+
+@pytest.mark.full
+def test_a_mission_survives_a_throttled_cloud(installed: None) -> None:
+    name = "cloudrc_cpu_throttled_periods_total"
+    before = value(metrics("cloud"), name)
+    fly_until("throttled", "waypoint 2 of 7 reached")
+    cloud = pod("cloud")["metadata"]["name"]
+    kubectl("exec", cloud, "--container=cloud", "--", "python", "-c", BURN)
+    assert value(metrics("cloud"), name) - before >= 50
+    check_resumed(job_end("throttled"))
+
+
+@pytest.mark.full
+def test_a_killed_cloud_container_is_replaced(installed: None) -> None:
+    fly_until("struck", "waypoint 2 of 7 reached")
+    epoch, cloud = value(metrics("world"), "cloudrc_session_epoch"), pod("cloud")
+    began = time.monotonic()
+    with suppress(CommandFailedError):  # the messenger is killed, too
+        name = cloud["metadata"]["name"]
+        kubectl("exec", name, "--container=cloud", "--", "python", "-c", KILL)
+    eventually(
+        lambda: value(metrics("world"), "cloudrc_session_epoch") > epoch and guard() == "TRACK",
+        "the new cloud flies the robot",
+        every=0.1,
+    )
+    assert time.monotonic() - began < COMMANDS_IN + CONTAINER_START
+    assert pod("cloud")["metadata"]["uid"] == cloud["metadata"]["uid"]
+    check_resumed(job_end("struck"))
+
+
+@pytest.mark.full
+def test_a_mission_whose_job_is_deleted_is_cancelled(installed: None) -> None:
+    fly_until("leaderless", "waypoint 2 of 7 reached")
+    follow = ["kubectl", f"--namespace={NAMESPACE}", "logs", "--follow", "job/leaderless"]
+    with subprocess.Popen(follow, stdout=subprocess.PIPE, text=True) as reader:
+        assert reader.stdout is not None
+        reader.stdout.readline()  # from here on the log is read: it goes with its pod
+        kubectl("delete", "pod", "--selector=batch.kubernetes.io/job-name=leaderless")
+        assert reader.stdout.read().splitlines()[-1].startswith("INTERRUPTED")
+    eventually(lambda: guard() == "HOLD", "the robot holds")
+    fly("successor", PIPES, 120.0)
+    check_resumed(job_end("successor"))
+
+
+@pytest.mark.full
+def test_a_rotated_key_costs_one_hold_at_most(installed: None, tmp_path: Path) -> None:
+    spec = pod("cloud")["spec"]
+    (cloud,) = [each for each in spec["containers"] if each["name"] == "cloud"]
+    mounts = {each["name"]: each["mountPath"] for each in cloud["volumeMounts"]}
+    (secret,) = [
+        volume["secret"]["secretName"]
+        for volume in spec["volumes"]
+        if mounts.get(volume["name"]) == "/etc/cloudrc-secret"
+    ]
+    key = tmp_path / "key"
+    key.write_bytes(base64.b64decode(read("secret", secret)["data"]["key"]))
+    key.chmod(0o600)
+    subprocess.run([sys.executable, "-m", "cloudrc", "key", "new", str(key)], check=True)
+    before = len(ages_at_hold(recording("world", tmp_path)))
+    data = {"data": {"key": base64.b64encode(key.read_bytes()).decode()}}
+    kubectl("patch", "secret", secret, f"--patch={json.dumps(data)}")
+    for number in range(4):  # a Secret reaches a pod within two minutes
+        fly_until(f"rekeyed-{number}", "waypoint 1 of 7 reached")
+        check_resumed(job_end(f"rekeyed-{number}"))
+    assert len(ages_at_hold(recording("world", tmp_path))) - before <= 1
+    for component in ("world", "cloud"):
+        texts = recording(component, tmp_path)["/fault"]["text"].tolist()
+        assert any("new key" in text for text in texts)

@@ -15,7 +15,7 @@ import yaml
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.parts import Histogram, Readings
 from cloudrc.exposition.table import METRICS
-from cloudrc.faults import asks
+from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.records import Control, Counted
@@ -71,7 +71,7 @@ def scrapes(flight: Flight, role: str, times: range) -> Iterator[Readings]:
     """Yield the readings of a process at each time [s]."""
     live, seen, sent = LiveMetrics(role, missions=role != "cloud"), 0, 0
     for time in times:
-        records = asks.seen_by(flight, role, time)
+        records = measures.seen_by(flight, role, time)
         for record in records[seen:]:
             if isinstance(record, Counted) and record.name == "sent":
                 if record.total < sent:  # a new process, which counts from 0

@@ -1,67 +1,103 @@
-"""A robot for the watch to look at, which does whatever a test has it do."""
+"""A robot for the invariants to watch, which does whatever a test has it do."""
+
+from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
-from cloudrc.faults.invariants import FLOWN, Watch
-from cloudrc.messages import ZERO, Cause, Command, GuardState
+from cloudrc.faults.invariants import FLOWN, Limits, Watch
+from cloudrc.messages import (
+    ZERO,
+    Cause,
+    Command,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Start,
+    Vector,
+)
+from cloudrc.world.readings import Touch
 from cloudrc.world.rotors import STOPPED
 
 MS = 1_000_000
-INSIDE = (1.0, 1.0, 1.0)
-TRACK = GuardState.TRACK
+INSIDE, OUTSIDE = (1.0, 1.0, 1.0), (9.3, 1.0, 1.0)
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
+TURNING = (900.0,) * 4
 
 
-class World:
-    """A robot that is wherever a test puts it."""
+class FakeRobot:
+    """A robot in a mission; it is in whatever state and place a test puts it."""
 
-    def __init__(self, yaw_rate=0.0, refusal=None, honest=False, hold_max_ms=60_000):
-        self.readings = SimpleNamespace(position=INSIDE, velocity=ZERO)
-        self.refusal, self.steps = refusal, 0
-        self.watch = Watch(6.0, 12.0, 1.0, 250 * MS, hold_max_ms * MS)
-        self.simulator = SimpleNamespace(readings=self.readings, step=self._step)
-        self.simulator._steps, self.simulator._last_touch = 0, {}
-        self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
-        self.guard.cause = Cause.ENDED
-        self.guard.offer = lambda command, now: self.refusal
-        for word in ("stop", "acknowledge", "tick", "start_mission", "end_mission"):
-            setattr(self.guard, word, lambda now: None)
-        self.guard.put_on_ground = lambda now, cause: None
-        self.guard.forget_commands = lambda: None
-        self.robot = SimpleNamespace(simulator=self.simulator, guard=self.guard)
-        self.watch.attach(self, 0, honest=honest)
-        self.guard.start_mission(0)
-        self.offer(1)
+    def __init__(self, *, yaw_rate: float = 0.0, honest: bool = False, hold_ms: int = 60_000):
+        self.guard: Any = SimpleNamespace(
+            state=TRACK, reference=ZERO, yaw_rate=yaw_rate, cause=Cause.ENDED
+        )
+        self.simulator: Any = SimpleNamespace(steps=0, touch_age=float("inf"), touches=[])
+        self.observers: list[Any] = []
+        self.position, self.velocity = INSIDE, ZERO
+        self.now_ns = 0
+        self.watch = Watch(Limits(hold_ns=hold_ms * MS))
+        self.watch.attach(self, 0, honest=honest)  # type: ignore[arg-type]
+        (self.observer,) = self.observers
+        self.request(Request.START)
 
-    def offer(self, count):
-        for _ in range(count):
-            self.guard.offer(Command(0, 0, 0, ZERO, 0.0), 0)
-
-    def say_what_is_impossible(self):
-        """Five times, which has a robot land."""
-        refusal, self.refusal = self.refusal, "range"
-        self.offer(5)
-        self.refusal = refusal
-
-    def _step(self, rotor_speeds):
-        self.steps += 1
-        self.simulator._steps += 1
-
-    def tick(
-        self, *references, state=TRACK, position=INSIDE, turns=None, released=True, ruled=True
-    ):
-        """Fly references, one a tick, and say what kinds of breach there were."""
-        for reference in references:
-            if released:
-                self.guard.acknowledge(0)
-                self.offer(10)
-            if state is GuardState.LAND:
-                self.say_what_is_impossible()
-            self.guard.state, self.guard.reference = state, reference
-            if released:
-                self.guard.start_mission(0)
-            self.readings.position = position
-            turns = state in FLOWN if turns is None else turns
-            if ruled:
-                self.guard.tick(self.steps * 2 * MS)
-            self.simulator.step((900.0,) * 4 if turns else STOPPED)
+    @property
+    def kinds(self) -> set[str]:
+        """Kinds of breaches so far."""
         return set(self.watch.counts)
+
+    def request(self, request: Request, start: Start = Start.HERE) -> None:
+        """Carry out an operator request; the guard's state stays what a test says."""
+        if start is Start.SPAWN:
+            self.simulator.steps = 0
+        self.observer.see_request(OperatorRequest(1, request, start), self.now_ns)
+
+    def offer(
+        self, count: int = 1, rejection: str | None = None, basis_ms: float | None = None
+    ) -> None:
+        """Let commands come now; without `basis_ms` they are fresh."""
+        basis_ns = self.now_ns if basis_ms is None else round(basis_ms * MS)
+        for _ in range(count):
+            command = Command(0, basis_ns, 0, ZERO, 0.0)
+            self.observer.see_command(command, rejection, self.now_ns)
+
+    def touch(self, body: str, *, tip: bool = False) -> None:
+        """Let a contact begin in the next step."""
+        self.simulator.touches.append(Touch(body, tip, self.position, ZERO, ZERO))
+
+    def release(self) -> None:
+        """Let the operator acknowledge and start, and ten fresh commands come."""
+        self.request(Request.ACKNOWLEDGE)
+        self.request(Request.START)
+        self.offer(10)
+
+    def step(
+        self,
+        state: GuardState,
+        *,
+        ms: int = 2,
+        reference: Vector | None = None,
+        turns: bool | None = None,
+        fresh: bool = True,
+    ) -> set[str]:
+        """Be in a state for some time; return the kinds of breaches so far.
+
+        Args:
+            state: State of the guard.
+            ms: Duration [ms].
+            reference: New reference [m/s]; None for the last one.
+            turns: Whether the rotors turn; by default in flight.
+            fresh: Whether a fresh command comes before each step in TRACK.
+        """
+        self.guard.state = state
+        if reference is not None:
+            self.guard.reference = reference
+        speeds = TURNING if (state in FLOWN if turns is None else turns) else STOPPED
+        for _ in range(ms // 2):
+            if state is TRACK and fresh:
+                self.offer()
+            self.simulator.steps += 1
+            readings = SimpleNamespace(position=self.position, velocity=self.velocity)
+            self.observer.see_step(self.now_ns, readings, speeds)
+            self.now_ns += 2 * MS
+        return self.kinds

@@ -72,6 +72,7 @@ def bare_robot() -> SimpleNamespace:
     return SimpleNamespace(
         guard=guard,
         simulator=simulator,
+        observers=[],
         run=lambda tick_ns, stop_ns: stop_ns,
         put_on_ground=lambda now_ns, cause: None,
     )

@@ -4,7 +4,7 @@ from math import hypot
 
 import pytest
 
-from cloudrc.faults import asks
+from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.scene import load_scene
@@ -40,7 +40,7 @@ def calm_after(flight, start, end):
         time
         for record in flight.trajectory()
         if start <= (time := record.stamp_ns * 1e-9) < end
-        and hypot(*record.odometry.velocity) >= asks.STANDS
+        and hypot(*record.odometry.velocity) >= measures.STANDS
     ]
     return fast[-1] + SAMPLE - start if fast else 0.0
 
@@ -53,11 +53,11 @@ def greeted_after(flight, back):
 
 def check_kill(figure, at, where="anywhere"):
     (flight, pipe), back = fly_and_kill(at), at + AWAY
-    (hold,) = asks.held(flight)
+    (hold,) = measures.held(flight)
     held = hold.stamp_ns * 1e-9
-    basis_age = asks.basis_age_at_hold(flight)
+    basis_age = measures.basis_age_at_hold(flight)
     calm = calm_after(flight, held, back)
-    resumed = asks.resumed_after(flight, back)
+    resumed = measures.resumed_after(flight, back)
     for name, measured, asked, unit in (
         ("HOLD after, age of the basis", basis_age, 0.252, "s"),
         ("below 0.05 m/s after", calm, 1.0, "s"),

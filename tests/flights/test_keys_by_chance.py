@@ -14,7 +14,7 @@ import pytest
 
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.drivers.virtual import VirtualRun
-from cloudrc.faults.models import Clock, Mortal
+from cloudrc.faults.models import Clock, RestartableEndpoint
 from cloudrc.faults.schedule import Event, Schedule, shaped
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
@@ -41,8 +41,8 @@ class Two:
         profile = DirectionProfile(delay=delay, jitter=min(jitter, delay))
         schedule = Schedule(seed, events=self.link_events())
         up, down = (shaped(schedule, profile, way) for way in ("up", "down"))
-        self.world = Mortal(self.build_world, Clock())
-        self.cloud = Mortal(self.build_cloud, Clock(), "cloud")
+        self.world = RestartableEndpoint(self.build_world, Clock())
+        self.cloud = RestartableEndpoint(self.build_cloud, Clock(), "cloud")
         links = LinkDirection(up, seed, uplink=True), LinkDirection(down, seed, uplink=False)
         self.run = VirtualRun(self.world, self.cloud, *links)
         whatever = (self.rotate, self.rotate, self.kill, self.pause, self.start, self.start)
@@ -107,7 +107,7 @@ class Two:
 
     def pause(self) -> None:
         end, (time, lasts) = self.chance.choice(ENDS), self.when()
-        mortal: Mortal = getattr(self, end)
+        mortal: RestartableEndpoint = getattr(self, end)
         self.at(end, time, lambda now_ns: mortal.freeze(now_ns, lasts), "stands still", lasts)
 
     def start(self) -> None:

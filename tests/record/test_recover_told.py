@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import struct
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.faults.scribe import FullDisk
 from cloudrc.record.columns import Recording
 from cloudrc.record.reader import HEAD, MAGIC
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
 from cloudrc.record.writer import MISSING, McapWriter
 from tests.record.conftest import MS, open_mcap, world_records, write
+
+
+class FullDisk(io.BytesIO):
+    """A file on a disk with room for some bytes."""
+
+    def __init__(self, room: int) -> None:
+        super().__init__()
+        self.room = room
+
+    def write(self, data: Any) -> int:
+        """Write the bytes, or refuse."""
+        if self.tell() + len(data) > self.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return super().write(data)
 
 
 def drained(recorder: Recorder) -> Recorder:

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from cloudrc.faults.adversary import POLICIES, at_bad_moments, tempting
+from cloudrc.faults.adversary import POLICIES, at_bad_moments
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import generator
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.state import Guard
 
-HOSTILE = {"stop-and-go": 1, "false-basis": 8, "strange-numbers": 64}
+HOSTILE = {"stop-and-go": 9, "false-basis": 8, "strange-numbers": 9, "refused-and-released": 3}
 """Hostile policies with a seed each; together they cause all ANSWERS, CAUSES and states."""
 ANSWERS = (
     *("used", "limited_speed", "limited_yaw_rate"),
@@ -46,10 +46,10 @@ def fly_hostile(policy: str, seed: int) -> Flight:
     Check that the guard's bounds are the same before and after.
     """
     lie, words = POLICIES[policy](generator(seed, 666)), at_bad_moments(generator(seed, 667))
-    flight = Flight(seed=seed, honest=False, tempt=tempting(lie, words))
+    flight = Flight(seed=seed, honest=False, lies=[lie], words=words)
     guard, limits = flight.robot.guard, flight.robot.guard._limits
     before = bounds(guard)
-    flight.fly(5.0)
+    flight.fly(8.0)
     assert flight.robot.guard is guard
     assert guard._limits is limits
     assert bounds(guard) == before == bounds(Guard(limits))

@@ -1,1 +1,28 @@
-"""Fault scenarios in virtual time, by the part that they break."""
+"""The faults that are injected in virtual time, by the part that fails."""
+
+from __future__ import annotations
+
+from cloudrc.errors import BadInputError
+from cloudrc.faults.scenario import Scenario
+from cloudrc.faults.scenarios import clouds, combined, ends, intruder, losses, missions, timing
+from cloudrc.plugins import suggest_name
+
+MODULES = (losses, timing, ends, intruder, clouds, missions, combined)
+SCENARIOS: tuple[Scenario, ...] = tuple(
+    sorted((each for module in MODULES for each in module.SCENARIOS), key=lambda each: each.number)
+)
+"""All scenarios, by number."""
+
+
+def find(name: str) -> Scenario:
+    """Return a scenario by its name (cloud-killed) or number (F13).
+
+    Raises:
+        BadInputError: If there is none; names all.
+    """
+    for each in SCENARIOS:
+        if name.lower() in (each.id.lower(), each.name):
+            return each
+    names = ", ".join(f"{each.id} {each.name}" for each in SCENARIOS)
+    hint = suggest_name(name.lower(), [each.name for each in SCENARIOS])
+    raise BadInputError(f"no fault '{name}'; there are: {names}{hint}")

@@ -1,76 +1,60 @@
-"""Faults by intent: damaged, forged, replayed, malformed datagrams, floods, a lying cloud.
-
-A flight that was captured is played to both ends, which have been started anew meanwhile.
-"""
+"""Faults F8, F20 to F22 and F24: damaged, forged, replayed and malformed datagrams, a flood."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
 from itertools import islice
-from math import inf, nan
+from math import nan
 
-from cloudrc.faults import asks
-from cloudrc.faults import asks as meters
-from cloudrc.faults.adversary import Lie, tempting
+from cloudrc.faults import measures
+from cloudrc.faults.datagrams import Generator, HostileSender, check_no_effect, flipped, kind_of
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.held import AGE_MAX
-from cloudrc.faults.models import Mortal, Tamper
+from cloudrc.faults.models import RestartableEndpoint, Tamper
 from cloudrc.faults.scenario import Outcome, Scenario, generator
-from cloudrc.faults.scenarios.link import instant
-from cloudrc.faults.toll import Generator, Toll, kind_of, unharmed
-from cloudrc.messages import Command, GuardState
-from cloudrc.records import Control, Fault, SessionOpened
+from cloudrc.records import Fault, SessionOpened
 from cloudrc.tunnel import codec
 
 FLOOD = 100
 """Datagrams of garbage per honest one: 10,000 in a second."""
 
 
-def flipped(data: bytes, rng: Generator, flips: int) -> bytes:
-    """A datagram with some bits turned over."""
-    bits = bytearray(data)
-    for place in rng.choice(8 * len(data), min(flips, 8 * len(data)), replace=False).tolist():
-        bits[place >> 3] ^= 1 << (place & 7)
-    return bytes(bits)
-
-
 def _corruption(seed: int) -> Outcome:
     """One bit in a hundred datagrams, and for a second one bit in a hundred of all."""
-    outcome, at, rng = Outcome(), instant(seed), generator(seed, 8)
+    outcome, at, rng = Outcome(), measures.instant(seed), generator(seed, 8)
     flight = Flight(seed=seed)
-    toll = Toll()
+    sender = HostileSender()
 
-    def tamper(mortal: Mortal) -> Tamper:
+    def tamper(process: RestartableEndpoint) -> Tamper:
         def tampered(data: bytes, now_ns: int) -> list[bytes]:
             storm = at <= now_ns * 1e-9 < at + 1.0
             flips = int(rng.binomial(8 * len(data), 0.01)) if storm else int(rng.random() < 0.01)
             if not flips:
                 return [data]
-            toll.give(mortal, flipped(data, rng, flips), now_ns)
+            sender.send(process, flipped(data, rng, flips), now_ns)
             return []
 
         return tampered
 
     flight.world.tamper, flight.cloud.tamper = tamper(flight.world), tamper(flight.cloud)
     flight.fly_mission()
-    asks.safe(outcome, flight)
-    asks.done(outcome, flight)
-    outcome.most("HOLD after", asks.basis_age_at_hold(flight), AGE_MAX, "s")
+    measures.safe(outcome, flight)
+    measures.done(outcome, flight)
+    outcome.most("HOLD after", measures.basis_age_at_hold(flight), measures.AGE_MAX, "s")
     metric = ("datagrams_total", "downlink", "tag")
-    meters.moves(outcome, flight, "world", *metric, since=at)
+    measures.moves(outcome, flight, "world", *metric, since=at)
     before, after = (  # world tells its counts once a second
-        meters.reading("world", meters.seen_by(flight, "world", until), *metric)
+        measures.reading("world", measures.seen_by(flight, "world", until), *metric)
         for until in (at, at + 2.0)
     )
     outcome.least(f"metric {' '.join(metric)} in two seconds from the worst on", after - before, 50)
-    outcome.least("corrupted datagrams", toll.given, 100)
-    outcome.same("of them taken", toll.taken, 0)
+    outcome.least("corrupted datagrams", sender.sent, 100)
+    outcome.same("of them taken", sender.taken, 0)
     return outcome
 
 
 def _flood(seed: int) -> Outcome:
-    def garbage(end: Mortal, data: bytes, rng: Generator) -> list[bytes]:
+    def garbage(end: RestartableEndpoint, data: bytes, rng: Generator) -> list[bytes]:
         size = len(data)
         block = rng.bytes(FLOOD * size)
         pieces = [block[at : at + size] for at in range(0, len(block), size)]
@@ -81,27 +65,27 @@ def _flood(seed: int) -> Outcome:
             for n, piece in enumerate(pieces)
         ]
 
-    return unharmed(seed, garbage, "malformed", "tag")
+    return check_no_effect(seed, garbage, "malformed", "tag")
 
 
 def _forgery(seed: int) -> Outcome:
     """Every honest datagram is preceded by copies of it with one bit, or its counter, changed."""
 
-    def forged(end: Mortal, data: bytes, rng: Generator) -> list[bytes]:
+    def forged(end: RestartableEndpoint, data: bytes, rng: Generator) -> list[bytes]:
         ahead = data[:8] + (2**63).to_bytes(8, "little") + data[16:]
         return [flipped(data, rng, 1), flipped(data, rng, 2), ahead]
 
-    return unharmed(seed, forged, "tag")
+    return check_no_effect(seed, forged, "tag")
 
 
 def _malformed(seed: int) -> Outcome:
-    def strange(end: Mortal, data: bytes, rng: Generator) -> list[bytes]:
+    def strange(end: RestartableEndpoint, data: bytes, rng: Generator) -> list[bytes]:
         longer = codec.DATAGRAM_MAX + 1
         cut = int(rng.integers(0, len(data)))
         other = bytes([data[0] + 1]) + data[1:]
         return [b"", data[:cut], data + b"\0", bytes(longer), data[:1] * 2048, other]
 
-    outcome = unharmed(seed, strange, "malformed", "version")
+    outcome = check_no_effect(seed, strange, "malformed", "version")
     _another_version(outcome, seed)
     return outcome
 
@@ -115,75 +99,68 @@ def _another_version(outcome: Outcome, seed: int) -> None:
 
     flight.world.tamper = tamper
     flight.fly(2.0)
-    outcome.same("a cloud of another version: sessions", len(asks.epochs(flight)), 0)
+    outcome.same("a cloud of another version: sessions", len(measures.epochs(flight)), 0)
     flight.fly_mission()
-    asks.safe(outcome, flight)
-    asks.done(outcome, flight)
+    measures.safe(outcome, flight)
+    measures.done(outcome, flight)
     told = [r.text for r in flight.of_world if isinstance(r, Fault) and r.code == "version"]
     text = f"peer speaks v{newer}, we speak v{codec.VERSION}"
     outcome.true(f"it is told once: {text}", len(told) == 1 and told[0].startswith(text))
 
 
-LIES: dict[str, Lie] = {
-    "NaN": lambda command, control: command._replace(velocity=(nan, 0.0, 0.0)),
-    "infinite": lambda command, control: command._replace(velocity=(0.0, inf, 0.0)),
-    "yaw NaN": lambda command, control: command._replace(yaw_rate=nan),
-    "1e308": lambda command, control: command._replace(velocity=(1e308, -1e308, 1e308)),
-    "yaw 1e9": lambda command, control: command._replace(yaw_rate=1e9),
-}
-CLAMPED: dict[str, Lie] = {
-    "denormal": lambda command, control: command._replace(velocity=(5e-324, 0.0, 0.0)),
-    "100 m/s": lambda command, control: command._replace(velocity=(100.0, 0.0, 0.0)),
-    "yaw 100 rad/s": lambda command, control: command._replace(yaw_rate=100.0),
-}
+SETTLED = 2.0
+"""When the session of a new flight stands [s]; a greeting that is answered could hasten it."""
 
 
-LIMITED = {"100 m/s": "speed", "yaw 100 rad/s": "yaw_rate"}
-"""Which limit of the guard each of them meets."""
+def _old_session(seed: int) -> Outcome:
+    """Record a whole flight; play it to a world and a cloud that have both been started anew."""
+    captured: list[bytes] = []
+    first = Flight(seed=seed, life=7)
 
+    def record(data: bytes, now_ns: int) -> list[bytes]:
+        captured.append(data)
+        return [data]
 
-def _between(first: float, last: float, lie: Lie) -> Lie:
-    def lying(command: Command, control: Control) -> Command:
-        now = control.stamp_ns * 1e-9
-        return lie(command, control) if first <= now < last else command
+    first.world.tamper = first.cloud.tamper = record
+    first.fly_mission()
+    tapes: dict[RestartableEndpoint, Iterator[bytes]] = defaultdict(lambda: iter(captured))
 
-    return lying
+    def replayed(end: RestartableEndpoint, data: bytes, rng: Generator) -> list[bytes]:
+        return list(islice(tapes[end], 6))
 
-
-def _liar(seed: int) -> Outcome:
-    outcome, at = Outcome(), instant(seed)
-    for name, lie in LIES.items():
-        flight = _lied_to(seed, _between(at, at + 1.0, lie))
-        asks.safe(outcome, flight)
-        lands = asks.changes_into(flight, GuardState.LAND)
-        labels = ("downlink", "range")
-        meters.moves(outcome, flight, "world", "datagrams_total", *labels, since=at)
-        outcome.most(f"{name}: LAND after", (lands or [nan])[0] - at, 1.0, "s")
-        again = [t for t in asks.changes_into(flight, GuardState.TRACK) if t > (lands or [0.0])[0]]
-        outcome.same(f"{name}: flown again without the operator", len(again), 0)
-        causes = " ".join(c.cause for c in flight.changes if c.state is GuardState.LAND)
-        outcome.true(f"{name}: the cause is told", "impossible commands" in causes)
-    for name, lie in CLAMPED.items():
-        flight = _lied_to(seed, _between(at, at + 1.0, lie), harmless=name != "100 m/s")
-        asks.safe(outcome, flight)
-        refused = sum("impossible" in change.cause for change in flight.changes)
-        outcome.same(f"{name}: taken for impossible", refused, 0)
-        if limit := LIMITED.get(name):
-            outcome.least(f"{name}: clamped", flight.count(f"limited_{limit}"), 20)
-            meters.moves(outcome, flight, "world", "guard_limited_total", limit, since=at)
-    one = _lied_to(seed, _between(at, at + 0.005, LIES["NaN"]))
-    asks.safe(outcome, one)
-    outcome.same("a single NaN: LAND", len(asks.changes_into(one, GuardState.LAND)), 0)
-    asks.done(outcome, one)
+    outcome = check_no_effect(seed, replayed, "tag", since=SETTLED, both=True)
+    for end in tapes.values():
+        outcome.same("captured datagrams that were not played to an end", len(list(end)), 0)
+    _greet_again(outcome, seed, captured)
     return outcome
 
 
-def _lied_to(seed: int, lie: Lie, harmless: bool = True) -> Flight:
-    """Fly with lies; one that is clamped and flown leads wherever it likes, into a pipe, too."""
-    return Flight(seed=seed, honest=harmless, tempt=tempting(lie)).fly(40.0)
+def _greet_again(outcome: Outcome, seed: int, captured: list[bytes]) -> None:
+    """Play the captured greetings to both ends while these are greeting each other."""
+    clean, flight = Flight(seed=seed).fly(SETTLED), Flight(seed=seed)
+    greetings = [data for data in captured if kind_of(data) <= codec.LAST_GREETING]
+    kinds = {kind_of(data) for data in greetings}
+    outcome.least("kinds of greeting captured: hello, challenge, accept", len(kinds), 3)
+
+    def tamper(data: bytes, now_ns: int) -> list[bytes]:
+        return [*greetings, data] if now_ns * 1e-9 < SETTLED else [data]
+
+    flight.world.tamper = flight.cloud.tamper = tamper
+    flight.fly_mission()
+    measures.safe(outcome, flight)
+    measures.done(outcome, flight)
+    late = _opened_at(flight) - _opened_at(clean)
+    outcome.most("amid captured greetings the session opens later by", late, 0.5, "s")
+    outcome.true("and no other one", measures.epochs(flight) == measures.epochs(clean))
 
 
-INTRUDER = (
+def _opened_at(flight: Flight) -> float:
+    """When cloud took its first session [s]."""
+    opened = [r.stamp_ns for r in flight.of_cloud if isinstance(r, SessionOpened)]
+    return min(opened, default=nan) * 1e-9
+
+
+SCENARIOS = (
     Scenario(
         8,
         "corruption",
@@ -212,16 +189,6 @@ INTRUDER = (
         _forgery,
     ),
     Scenario(
-        23,
-        "invalid-values",
-        "NaN, infinite, huge and over-limit values with a valid seal",
-        "refused or clamped; 5 refused in 1 s: LAND, latched",
-        "those commands",
-        "guard LAND with its cause, cloudrc_datagrams_total{outcome=range}, "
-        "cloudrc_guard_limited_total",
-        _liar,
-    ),
-    Scenario(
         24,
         "malformed",
         "empty, truncated, oversized datagrams and those of another version; a cloud of another "
@@ -232,62 +199,6 @@ INTRUDER = (
         "{outcome=version}",
         _malformed,
     ),
-)
-
-
-SETTLED = 2.0
-"""When the session of a new flight stands [s]; a greeting that is answered could hasten it."""
-
-
-def _old_session(seed: int) -> Outcome:
-    """Record a whole flight; play it to a world and a cloud that have both been started anew."""
-    captured: list[bytes] = []
-    first = Flight(seed=seed, life=7)
-
-    def record(data: bytes, now_ns: int) -> list[bytes]:
-        captured.append(data)
-        return [data]
-
-    first.world.tamper = first.cloud.tamper = record
-    first.fly_mission()
-    tapes: dict[Mortal, Iterator[bytes]] = defaultdict(lambda: iter(captured))
-
-    def replayed(end: Mortal, data: bytes, rng: Generator) -> list[bytes]:
-        return list(islice(tapes[end], 6))
-
-    outcome = unharmed(seed, replayed, "tag", since=SETTLED, both=True)
-    for end in tapes.values():
-        outcome.same("captured datagrams that were not played to an end", len(list(end)), 0)
-    _greet_again(outcome, seed, captured)
-    return outcome
-
-
-def _greet_again(outcome: Outcome, seed: int, captured: list[bytes]) -> None:
-    """Play the captured greetings to both ends while these are greeting each other."""
-    clean, flight = Flight(seed=seed).fly(SETTLED), Flight(seed=seed)
-    greetings = [data for data in captured if kind_of(data) <= codec.LAST_GREETING]
-    kinds = {kind_of(data) for data in greetings}
-    outcome.least("kinds of greeting captured: hello, challenge, accept", len(kinds), 3)
-
-    def tamper(data: bytes, now_ns: int) -> list[bytes]:
-        return [*greetings, data] if now_ns * 1e-9 < SETTLED else [data]
-
-    flight.world.tamper = flight.cloud.tamper = tamper
-    flight.fly_mission()
-    asks.safe(outcome, flight)
-    asks.done(outcome, flight)
-    late = _opened_at(flight) - _opened_at(clean)
-    outcome.most("amid captured greetings the session opens later by", late, 0.5, "s")
-    outcome.true("and no other one", asks.epochs(flight) == asks.epochs(clean))
-
-
-def _opened_at(flight: Flight) -> float:
-    """When cloud took its first session [s]."""
-    opened = [r.stamp_ns for r in flight.of_cloud if isinstance(r, SessionOpened)]
-    return min(opened, default=nan) * 1e-9
-
-
-REPLAY = (
     Scenario(
         21,
         "old-session",
@@ -297,10 +208,4 @@ REPLAY = (
         "cloudrc_datagrams_total{outcome=tag}",
         _old_session,
     ),
-)
-
-
-SCENARIOS = (
-    *INTRUDER,
-    *REPLAY,
 )

@@ -1,1 +1,0 @@
-"""Faults in a Kubernetes cluster."""

@@ -1,1 +1,0 @@
-"""Faults with real processes, signals and sockets on this machine."""

@@ -1,0 +1,207 @@
+"""Schedules in files, random ones, and the search: it stores what it finds, and continues."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.errors import BadInputError
+from cloudrc.faults.adversary import POLICIES, choose
+from cloudrc.faults.invariants import Breach
+from cloudrc.faults.schedule import (
+    CALM,
+    KINDS,
+    Event,
+    Schedule,
+    compose,
+    dump,
+    load,
+    shaped,
+)
+from cloudrc.faults.search import shrink
+from cloudrc.faults.trial import Finding, fly
+from cloudrc.link.profile import Change, DirectionProfile
+from tests.conftest import nightly
+
+
+@pytest.mark.parametrize("draw", [compose, choose])
+def test_a_drawn_schedule_is_what_its_file_says(
+    draw: Callable[[int], Schedule], tmp_path: Path
+) -> None:
+    path = tmp_path / "schedule.yaml"
+    for seed in range(100):
+        path.write_text(dump(draw(seed), "a note\nof two lines"))
+        assert load(path) == draw(seed)
+
+
+def test_random_schedules_have_all_faults_and_calm_at_the_end() -> None:
+    drawn = [compose(seed) for seed in range(400)]
+    events = [event for schedule in drawn for event in schedule.events]
+    assert {event.kind for event in events} == set(KINDS)
+    assert max(event.end for event in events) <= CALM
+    assert 10 < sum(not schedule.events for schedule in drawn) < 60
+    assert 150 < sum(schedule.separate for schedule in drawn) < 250
+    assert 70 < sum(schedule.hold_max < 60.0 for schedule in drawn) < 180
+
+
+def test_a_hostile_cloud_flies_alone_or_amid_faults() -> None:
+    chosen = [choose(seed) for seed in range(200)]
+    for policy in POLICIES:
+        alone = {not schedule.events for schedule in chosen if schedule.policy == policy}
+        assert alone == {True, False}
+
+
+@pytest.mark.parametrize("kind", nightly(*KINDS))
+def test_each_kind_of_fault_is_survived(kind: str) -> None:
+    _, longest, low, high = KINDS[kind]
+    events = (Event(kind, 8.0, longest / 2, (low + high) / 2), Event(kind, 14.0, 0.02, high))
+    assert fly(Schedule(3, events=events, duration=26.0)).breaches == ()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[1, 2]",
+        "{{",
+        "[" * 5000,
+        "seed: one",
+        "seed: -1",
+        "seed: 1\nwind: 3",
+        "seed: 1\nduration: .inf",
+        "seed: 1\nreorder: 2",
+        "seed: 1\nevents: [{kind: rain, at: 1}]",
+        "seed: 1\nevents: [{kind: blackout, at: .nan}]",
+        "seed: 1\nevents: [{kind: blackout, at: 1, duration: -3}]",
+        "seed: 1\nevents: [{kind: loss, at: 1, duration: 3, value: 1.5}]",
+        "seed: 1\nevents: [{kind: blackout, at: 1, way: left}]",
+    ],
+)
+def test_a_file_that_is_no_schedule_is_bad_input(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "schedule.yaml"
+    path.write_text(text)
+    with pytest.raises(BadInputError, match=r"schedule\.yaml: is no schedule of faults"):
+        load(path)
+
+
+@pytest.mark.parametrize("line", ["policy: nope", "profile: nope"])
+def test_an_unknown_name_in_a_schedule_is_bad_input(
+    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "schedule.yaml"
+    path.write_text(f"seed: 1\n{line}\n")
+    assert main(["faults", "run", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert f"{path}: " in error
+    assert "nope" in error
+
+
+def test_a_link_fault_keeps_the_time_line_of_the_profile() -> None:
+    profile = DirectionProfile(changes=(Change(5.0, delay=0.1),))
+    silence, waves = Event("blackout", 1.0, 1.0), Event("loss", 1.0, 1.0, 0.5)
+    assert shaped(Schedule(1, events=(silence,)), profile, "up").changes == profile.changes
+    with pytest.raises(BadInputError, match="has a time line, on which loss cannot be laid"):
+        shaped(Schedule(1, events=(waves,)), profile, "up")
+
+
+def test_a_failing_schedule_is_shrunk_to_what_it_takes() -> None:
+    def fails(schedule: Schedule) -> bool:
+        kinds = {event.kind for event in schedule.events}
+        return {"blackout", "loss"} <= kinds and schedule.seed == 5
+
+    noise = [Event(kind, 0.5 + n, 1.0) for n, kind in enumerate(sorted(KINDS))]
+    smallest = shrink(Schedule(5, "lte", tuple(noise), reorder=0.2, separate=True), fails)
+    assert sorted(event.kind for event in smallest.events) == ["blackout", "loss"]
+    assert (smallest.profile, smallest.reorder, smallest.separate) == ("paper-p2", 0.0, False)
+
+
+BAD = 5
+"""Seed whose schedule fails."""
+
+
+def _fly(schedule: Schedule, *, keep: bool = False) -> Finding:
+    breaches = (Breach(1.0, "stuck", "not flown"),) if schedule.seed == BAD else ()
+    return Finding(schedule, breaches, "", 1.0 / (1 + schedule.seed), 2.0, 1, 2)
+
+
+Find = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture
+def find(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Find:
+    """Search with flights that take no time, a number of them; return the document."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(count: int, *flags: str, code: int) -> dict[str, Any]:
+        def fly_for(schedule: Schedule, *, keep: bool = False) -> Finding:
+            clock[0] += 60.0 / count
+            return _fly(schedule)
+
+        clock = [0.0]
+        monkeypatch.setattr("cloudrc.faults.search.fly", fly_for)
+        monkeypatch.setattr("cloudrc.faults.search.SHRINK_MAX", 0.0)
+        monkeypatch.setattr("cloudrc.faults.search.time.monotonic", lambda: clock[0])
+        assert main(["faults", "search", "-o", "json", *flags]) == code
+        document: dict[str, Any] = json.loads(capsys.readouterr().out)
+        return document
+
+    return run
+
+
+def test_a_search_counts_stores_and_can_continue(find: Find) -> None:
+    told = find(3, code=0)
+    assert (told["kind"], told["first"], told["next"], told["count"]) == ("random", 1, 4, 3)
+    told = find(3, "--first", "4", code=1)
+    assert (told["first"], told["next"]) == (4, 7)
+    assert told["invariants"]["stuck"]["broken"] == 1
+    assert told["invariants"]["fence"] == {"judged": 3, "broken": 0}
+    assert told["smallest_margin_m"] == 1 / 7
+    (failure,) = told["failures"]
+    assert failure["seed"] == BAD
+    assert load(Path(failure["file"])).seed == BAD
+    assert "Found by seed 5" in Path(failure["file"]).read_text()
+
+
+def test_no_zero_is_told_of_what_was_not_checked(find: Find) -> None:
+    told = find(1, "--adversarial", code=0)
+    assert told["kind"] == "adversarial"
+    assert told["invariants"]["collision"] == {"judged": 0, "broken": 0}
+    assert told["invariants"]["fence"] == {"judged": 1, "broken": 0}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_search_says_how_to_continue(
+    number: signal.Signals,
+    find: Find,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def interrupt(schedule: Schedule, *, keep: bool = False) -> Finding:
+        if schedule.seed == 3:
+            os.kill(os.getpid(), number)
+        return _fly(schedule)
+
+    monkeypatch.setattr("cloudrc.faults.search.fly", interrupt)
+    assert main(["faults", "search", "--minutes", "9"]) == 130
+    out, err = capsys.readouterr()
+    assert "2 random schedules" in out
+    assert "continue with 'cloudrc faults search --first 3'" in err
+
+
+def test_a_stored_schedule_is_flown_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "schedule.yaml"
+    path.write_text(dump(Schedule(1, events=(Event("blackout", 2.0, 0.5),), duration=3.0)))
+    assert main(["faults", "run", str(path), "-o", "json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["breaches"], len(told["records_sha256"])) == ([], 64)

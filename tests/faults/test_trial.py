@@ -1,0 +1,241 @@
+"""One schedule, flown: what it is checked for, and that a broken part is found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from cloudrc.faults.adversary import POLICIES, choose
+from cloudrc.faults.invariants import Limits, Watch
+from cloudrc.faults.schedule import Event, Schedule, compose, load
+from cloudrc.faults.trial import OrderInvariant, checked_in, fly
+from cloudrc.messages import ZERO, Command, GuardState, OperatorRequest, Request
+from cloudrc.records import CommandApplied, SessionOpened
+from cloudrc.teleop.service import MissionService
+from cloudrc.tunnel.channel import LATE, USED, Channel
+from cloudrc.world.guard.limits import Limits as GuardLimits
+from cloudrc.world.guard.state import Guard
+from tests.conftest import nightly
+
+Patch = pytest.MonkeyPatch
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
+MS = 1_000_000
+REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))
+SHORT = [path for path in REGRESSIONS if load(path).duration < 45.0]
+LONG = [path for path in REGRESSIONS if path not in SHORT]
+
+
+@pytest.mark.parametrize("path", [*SHORT, *nightly(*LONG)], ids=lambda path: path.stem)
+def test_a_schedule_that_found_a_bug_breaks_nothing_now(path: Path) -> None:
+    assert fly(load(path)).breaches == ()
+
+
+@pytest.mark.parametrize("seed", [1, *nightly(*range(2, 9))])
+def test_random_faults_break_no_invariant(seed: int) -> None:
+    assert fly(compose(seed)).breaches == ()
+
+
+@pytest.mark.promise("stays-inside-the-fence")
+@pytest.mark.parametrize("policy", sorted(POLICIES))
+def test_a_hostile_cloud_causes_no_breach(policy: str) -> None:
+    seed = next(seed for seed in range(1, 30) if choose(seed).policy == policy)
+    assert fly(replace(choose(seed), duration=8.0)).breaches == ()
+
+
+STIFFER = "world.low_level.integral_limit_xy=0.30"
+"""Three times the default; it removes the steady error of 32 mm."""
+
+
+@pytest.mark.promise("stays-inside-the-fence")
+@pytest.mark.parametrize("seed", [2, *nightly(*range(3, 40))])
+def test_it_causes_none_with_a_stiffer_low_level_controller(seed: int) -> None:
+    hostile = replace(choose(seed), events=(), duration=15.0)
+    assert fly(hostile, STIFFER).breaches == ()
+
+
+def test_a_hostile_cloud_makes_every_request(monkeypatch: Patch) -> None:
+    heard: list[OperatorRequest] = []
+    schedule = Schedule(27, policy="operators-voice", duration=15.0)
+    attach = Watch.attach
+
+    def listen(watch: Watch, robot: Any, start_ns: int, *, honest: bool) -> None:
+        attach(watch, robot, start_ns, honest=honest)
+        hear = SimpleNamespace(
+            see_step=lambda *_: None,
+            see_command=lambda *_: None,
+            see_request=lambda request, now_ns: heard.append(request),
+            see_session=lambda now_ns: None,
+        )
+        robot.observers.append(hear)
+
+    monkeypatch.setattr(Watch, "attach", listen)
+    assert fly(schedule).breaches == ()
+    assert {request.request for request in heard} == set(Request) - {Request.PROGRESS}
+
+
+@pytest.mark.parametrize(
+    ("events", "policy", "duration", "kinds"),
+    [
+        ((), "", 60.0, {"collision", "waypoint", "stuck", "alarm"}),
+        ((Event("blackout", 44.0, 8.0),), "", 62.0, {"collision", "waypoint", "stuck"}),
+        ((Event("blackout", 44.0, 8.0),), "", 61.0, {"collision", "waypoint"}),
+        ((Event("stopped", 5.0),), "", 60.0, {"collision", "waypoint", "stuck", "obeyed"}),
+        ((Event("stopped", 5.0),), "greedy", 60.0, set()),
+    ],
+)
+def test_a_schedule_is_checked_for_what_it_allows(
+    events: tuple[Event, ...], policy: str, duration: float, kinds: set[str]
+) -> None:
+    schedule = Schedule(1, events=events, policy=policy, duration=duration)
+    some = {"collision", "waypoint", "stuck", "alarm", "obeyed"}
+    assert checked_in(schedule) & some == kinds
+
+
+def test_a_flight_without_faults_is_clean() -> None:
+    finding = fly(Schedule(1, "paper-p1", duration=45.0))
+    assert (finding.breaches, finding.holds, finding.missions) == ((), 0, 1)
+
+
+HELD = Schedule(
+    3,
+    events=(
+        Event("blackout", 6.0, 0.4),
+        Event("blackout", 6.8, 0.3),
+        Event("blackout", 9.5, 1.5),
+        Event("stopped", 12.0),
+        Event("blackout", 15.0, 3.0),
+    ),
+    duration=21.0,
+    hold_max=2.0,
+)
+"""Several HOLDs, a stop, and a LAND."""
+
+
+def test_this_schedule_breaks_nothing() -> None:
+    assert fly(HELD).breaches == ()
+
+
+def ignores_the_fence(patch: Patch) -> None:
+    patch.setattr("cloudrc.faults.invariants.HIGH", (1.2, 1.2, 1.2))
+
+
+def ignores_the_age_of_commands(patch: Patch) -> None:
+    patch.setattr(Limits, "of", lambda guard: Limits(age_ns=50 * MS, hold_ns=2000 * MS))
+
+
+def ignores_the_caps(patch: Patch) -> None:
+    patch.setattr(Limits, "of", lambda guard: Limits(speed=0.1, hold_ns=2000 * MS))
+
+
+def ignores_the_ramp(patch: Patch) -> None:
+    patch.setattr(GuardLimits, "ramp_ns", 0)
+
+
+def ignores_the_settling_time(patch: Patch) -> None:
+    patch.setattr("cloudrc.world.guard.state.SETTLE_NS", 0)
+
+
+def waits_for_ever(patch: Patch) -> None:
+    patch.setattr(GuardLimits, "alone_max_ns", lambda limits, flies: 3_600_000 * MS)
+
+
+def needs_no_start(patch: Patch) -> None:
+    offer = Guard.offer
+
+    def arm(guard: Guard, command: Command, now_ns: int) -> str | None:
+        guard.armed = guard.armed or guard.state is GROUND
+        return offer(guard, command, now_ns)
+
+    patch.setattr(Guard, "offer", arm)
+
+
+def applies_late_commands(patch: Patch) -> None:
+    take: Any = Channel.take
+    patch.setattr(Channel, "take", lambda *_: USED if (said := take(*_)) == LATE else said)
+
+
+def ignores_stops(patch: Patch) -> None:
+    patch.setattr(MissionService, "stop_rotors", lambda service, now_ns: None)
+
+
+def ignores_acknowledgements(patch: Patch) -> None:
+    patch.setattr(MissionService, "acknowledge", lambda service, now_ns: None)
+
+
+def fails_to_shut_down(patch: Patch) -> None:
+    def fail(service: MissionService, now_ns: int) -> None:
+        raise OSError("no way to end")
+
+    patch.setattr(MissionService, "pause", fail)
+
+
+@pytest.mark.parametrize(
+    ("breaks", "kind", "schedule"),
+    [
+        (ignores_the_fence, "fence", Schedule(8, "ideal", policy="towards-a-face", duration=8.0)),
+        (ignores_the_age_of_commands, "stale", replace(HELD, duration=3.0)),
+        (ignores_the_caps, "cap", replace(HELD, duration=3.0)),
+        (ignores_the_ramp, "cap", replace(HELD, duration=9.0)),
+        (ignores_the_settling_time, "hold", replace(HELD, duration=9.0)),
+        (waits_for_ever, "hold", HELD),
+        (needs_no_start, "latch", HELD),
+        (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
+        (ignores_stops, "obeyed", replace(HELD, duration=30.0)),
+        (ignores_acknowledgements, "stuck", replace(HELD, duration=30.0)),
+        (
+            fails_to_shut_down,
+            "error",
+            Schedule(3, events=(Event("pod_shut_down", 4.0, 2.0, 0.5),), duration=5.0),
+        ),
+    ],
+)
+def test_a_broken_part_is_found(
+    breaks: Callable[[Patch], None], kind: str, schedule: Schedule, monkeypatch: Patch
+) -> None:
+    breaks(monkeypatch)
+    assert kind in fly(schedule).kinds
+
+
+@pytest.mark.parametrize(
+    ("commands", "kinds"),
+    [
+        ([(2, 0), (2, 1), (2, 5), (3, 0)], set()),
+        ([(2, 1), (2, 1)], {"order"}),
+        ([(2, 1), (2, 0)], {"order"}),
+        ([(3, 0), (2, 7)], {"order"}),
+        ([(3, None), (3, 0)], set()),
+        ([(3, None), (2, 9)], {"order"}),
+    ],
+)
+def test_a_command_is_applied_once_and_in_order(
+    commands: list[tuple[int, int | None]], kinds: set[str]
+) -> None:
+    flight: Any = SimpleNamespace(listeners=[], watch=Watch(Limits()))
+    order = OrderInvariant(flight)
+    for epoch, counter in commands:
+        opened = SessionOpened(0, "world", epoch, "cloud said hello")
+        order.see([opened if counter is None else CommandApplied(0, epoch, counter, 0, ZERO)], 0)
+    assert set(flight.watch.counts) == kinds
+
+
+@pytest.mark.parametrize(
+    ("waypoints", "kinds"),
+    [([0, 1, 2], set()), ([0, 1, 1], {"waypoint"}), ([0, 2], {"waypoint"}), ([1], {"waypoint"})],
+)
+def test_a_waypoint_is_reached_once_and_in_order(waypoints: list[int], kinds: set[str]) -> None:
+    events = [{"mission": "m", "event": "reached", "waypoint": n} for n in waypoints]
+    events.append({"mission": "n", "event": "reached", "waypoint": 0})
+    book = SimpleNamespace(events_after=lambda number: events)
+    flight: Any = SimpleNamespace(
+        listeners=[],
+        watch=Watch(Limits()),
+        teleop=SimpleNamespace(service=SimpleNamespace(book=book)),
+        run=SimpleNamespace(now_ns=0),
+    )
+    OrderInvariant(flight).check_waypoints()
+    assert set(flight.watch.counts) == kinds
