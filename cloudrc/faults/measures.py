@@ -92,7 +92,7 @@ def above(role: str, records: Iterable[Record], name: str, bound: float) -> tupl
 
 
 def seen_by(flight: Flight, role: str, until: float) -> list[Record]:
-    """Return the records of a process up to `until` [s, virtual time]."""
+    """Return the records of a process up to `until` [s] of virtual time."""
     if role == "teleop":
         records: Iterable[Record] = flight.teleop.events
     else:
