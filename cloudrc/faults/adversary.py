@@ -61,7 +61,7 @@ class DishonestLoop(ControlLoop):
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
     ) -> tuple[Command, Control]:
-        """See `ControlLoop`."""
+        """See `ControlLoop`; `dt` is the time since the last command [s]."""
         command, control = super().command(setpoint, now_ns, dt, epoch, counter)
         for lie in self._lies:
             command = lie(command, control)

@@ -163,7 +163,7 @@ class HoldInvariants:
         self._is_reset = self._impossible = False
 
     def see_step(self, state: GuardState, reference: Vector, now_ns: int) -> None:
-        """Check the wait for the cloud, or the slow growth of the reference after a HOLD."""
+        """Check the wait for the cloud, or the growth of `reference` [m/s] after a HOLD."""
         if state is not TRACK:
             self._impossible = False
             alone_ns = now_ns - self._alone_ns

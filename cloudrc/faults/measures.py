@@ -92,7 +92,7 @@ def above(role: str, records: Iterable[Record], name: str, bound: float) -> tupl
 
 
 def seen_by(flight: Flight, role: str, until: float) -> list[Record]:
-    """Return the records of a process up to an instant of virtual time [s]."""
+    """Return the records of a process up to `until` [s] of virtual time."""
     if role == "teleop":
         records: Iterable[Record] = flight.teleop.events
     else:
@@ -169,7 +169,7 @@ def _ages_at_hold(flight: Flight) -> list[tuple[GuardChange, float]]:
 
 
 def resumed_after(flight: Flight, back: float) -> float:
-    """Return how long after an instant [s] the guard was in TRACK again [s]."""
+    """Return how long after `back` [s] the guard was in TRACK again [s]."""
     times = [time for time in changes_into(flight, GuardState.TRACK) if time >= back - 1e-9]
     return times[0] - back if times else nan
 
@@ -274,7 +274,7 @@ def silence_told(
 
 
 def stopping_time(flight: Flight, since: float) -> float:
-    """Return how long after an instant [s] the robot stands, for at least 0.2 s [s]."""
+    """Return how long after `since` [s] the robot stands, for at least 0.2 s [s]."""
     slow_since = nan
     for record in flight.trajectory():
         now = record.stamp_ns * 1e-9
@@ -290,13 +290,13 @@ def stopping_time(flight: Flight, since: float) -> float:
 
 
 def drift(flight: Flight, start: float, end: float) -> float:
-    """Return the largest distance [m] between two instants [s] from the place at the first."""
+    """Return the largest distance [m] from the place at `start`, until `end` [s]."""
     path = positions(flight, start, end)
     return max((dist(path[0], place) for place in path), default=nan) if path else nan
 
 
 def positions(flight: Flight, start: float, end: float) -> list[Vector]:
-    """Return the positions of the base [m] between two instants [s], every 10 ms."""
+    """Return the positions of the base [m] from `start` to `end` [s], every 10 ms."""
     return [r.odometry.position for r in flight.trajectory() if start <= r.stamp_ns * 1e-9 <= end]
 
 

@@ -104,7 +104,7 @@ class RestartableEndpoint:
         self._set_deadline()
 
     def at(self, seconds: float, action: Action) -> None:
-        """Schedule an action at an instant of virtual time [s]."""
+        """Schedule an action at an instant of virtual time, `seconds` [s]."""
         self._scheduled += 1
         heappush(self._actions, (round(seconds * 1e9), self._scheduled, action))
         self._set_deadline()
@@ -130,7 +130,7 @@ class RestartableEndpoint:
         """Give the process a share of each CFS period only.
 
         Args:
-            start: Beginning [s, virtual time].
+            start: Beginning, virtual time [s].
             duration: Duration [s].
             share: Share of the time in which the process runs, in [0, 1].
         """
@@ -437,7 +437,7 @@ class SeparateTeleop(InProcessTeleop):
         self._ends = self.service is not None
 
     def freeze(self, now_ns: int, duration: float) -> None:
-        """Stop the process as SIGSTOP does, from `now_ns` [ns, virtual time] for a while [s]."""
+        """Stop the process as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
         if self.service is not None and self._host is not None:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
             self._host.at(self._free_ns * 1e-9, self._turn)  # who is late wakes at once
