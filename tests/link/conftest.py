@@ -98,6 +98,13 @@ def bursts(lost: NDArray[np.bool_]) -> list[int]:
     return runs
 
 
+def bind_loopback(port: int = 0) -> socket.socket:
+    """Open a UDP socket on 127.0.0.1; port 0 lets the kernel choose."""
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    bound.bind(("127.0.0.1", port))
+    return bound
+
+
 PEER = ("10.244.0.7", 7400)
 UNKNOWN = Answer(2, "", "Error: Specified qdisc kind is unknown.\n")
 NO_QDISC = Answer(2, "", "Error: No such file or directory.\n")

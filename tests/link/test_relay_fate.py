@@ -17,17 +17,16 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import write_trace
 from cloudrc.tunnel.codec import Kind
 from tests.link.conftest import SIZE
-from tools.bench_link.anchors import fifo_allowed
 from tools.bench_link.flow import EPOCH, Flow, run_flow
-from tools.bench_link.profiles import (
+from tools.bench_link.relays import fifo_allowed, ours
+from tools.bench_link.stages import (
     SEED,
     Links,
     correlation,
-    measure,
+    measure_profiles,
     profiles_of,
     random_walk,
 )
-from tools.bench_link.relays import ours
 
 pytestmark = pytest.mark.process
 STEADY = ("lossy", "paper-p3")
@@ -98,7 +97,7 @@ def _check(folder: Path, links: Links, seconds: float, *, exact: bool) -> Worst:
     """Sound them once; give the worst mean, deviation and order in units of what is allowed."""
     fifo = fifo_allowed()
     mean = deviation = order = 0.0
-    for row in measure(folder, links, seconds, fifo=fifo):
+    for row in measure_profiles(folder, links, seconds, fifo=fifo):
         judged, where = row.judged, f"{row.name} {row.direction}"
         assert judged.wrongly_lost == judged.wrongly_arrived == 0, where
         assert judged.errors.min() >= 0.0, where

@@ -21,8 +21,9 @@ from cloudrc.config.load import load_experiment
 from cloudrc.link.follow import Handed, write_handed
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay import RelayShaper, bind_loopback
+from cloudrc.link.relay import RelayShaper
 from cloudrc.tunnel.codec import Kind, encode_header
+from tests.link.conftest import bind_loopback
 
 pytestmark = pytest.mark.process
 ROOT = Path(__file__).resolve().parents[2]

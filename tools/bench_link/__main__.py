@@ -19,13 +19,9 @@ from cloudrc.cli.output import table
 from cloudrc.config.shipped import names
 from cloudrc.errors import CloudrcError
 from cloudrc.link.traces import write_trace
-from tools.bench_link import report
-from tools.bench_link.anchors import compile_anchors, fifo_allowed, wake_lateness
-from tools.bench_link.draws import measure_bursts
-from tools.bench_link.overload import measure_overload
-from tools.bench_link.profiles import Links, measure, random_walk
-from tools.bench_link.release import measure_releases, measure_throughput
-from tools.bench_link.report import TRACE, Line
+from tools.bench_link import stages
+from tools.bench_link.relays import compile_anchors, fifo_allowed, wake_lateness
+from tools.bench_link.stages import TRACE, Line, Links
 
 STARTING = 7.0
 """Until all links are up, about [s]."""
@@ -53,35 +49,38 @@ def main() -> int:
 
 
 def _measure(
-    folder: Path, stages: tuple[str, ...], *, quick: bool
+    folder: Path, chosen: tuple[str, ...], *, quick: bool
 ) -> tuple[list[Line], list[dict[str, object]]]:
     programs, fifo = compile_anchors(folder), fifo_allowed()
     lines: list[Line] = []
     details: list[dict[str, object]] = []
-    for stage in stages:
+    for stage in chosen:
         print(f"bench-link: {stage} ...", file=sys.stderr, flush=True)
         if stage == "release":
             rounds = (2, 3.0) if quick else (5, 20.0)  # 100,000 of each in all
-            lines += report.releases(measure_releases(folder, programs, *rounds, fifo=fifo), fifo)
+            found = stages.measure_releases(folder, programs, *rounds, fifo=fifo)
+            lines += stages.judge_releases(found, fifo)
         elif stage == "throughput":
             floods = (2, 1.0) if quick else (5, 1.5)
-            lines += report.throughput(measure_throughput(folder, programs[1], *floods))
+            lines += stages.throughput(folder, programs[1], *floods)
         elif stage == "profiles":
             seconds = 6.0 if quick else 60.0
-            (folder / "trace.csv").write_text(write_trace(random_walk(60.0)))
+            (folder / "trace.csv").write_text(write_trace(stages.random_walk(60.0)))
             trace = {"trace": str(folder / "trace.csv")}
             links: Links = {name: {"profile": name} for name in names("profile")}
             links[TRACE] = {"profile": "ideal", "uplink": trace, "downlink": trace}
             with ThreadPoolExecutor(1) as pool:  # what the machine does in the same minute
                 count = round(1000 * (seconds + STARTING))
                 late = pool.submit(wake_lateness, programs[0], count, fifo=fifo)
-                measured = measure(folder, links, seconds, fifo=fifo)
-            found, details = report.profiles(folder, measured, links, late.result())
-            lines += found
+                rows = stages.measure_profiles(folder, links, seconds, fifo=fifo)
+            replayed = stages.profiles_of(folder, links[TRACE])[0]
+            lines += stages.judge_profiles(rows, replayed, late.result())
+            details = [stages.detail(row) for row in rows]
         elif stage == "overload":
-            lines += report.overload(measure_overload(folder, 100_000, 2.0 if quick else 10.0))
+            flooded = stages.measure_overload(folder, 100_000, 2.0 if quick else 10.0)
+            lines += stages.judge_overload(flooded)
         else:
-            lines += report.bursts(measure_bursts())
+            lines += stages.bursts()
     return lines, details
 
 
