@@ -172,22 +172,6 @@ def test_a_relay_that_does_not_answer_is_an_error(
     )
 
 
-def test_a_refused_change_is_an_error_with_the_reason(
-    flight: Flight, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = Path("runs/latest/link")
-
-    def refuse(_: float) -> None:
-        number = json.loads((folder / "change.json").read_text())["number"]
-        state = json.loads((folder / "uplink.json").read_text())
-        state |= {"refused": number, "refusal": "netem cannot do this"}
-        (folder / "uplink.json").write_text(json.dumps(state))
-
-    monkeypatch.setattr(link_set, "sleep", refuse)
-    assert main(["link", "set", "uplink.delay_ms=1"]) == 2
-    assert "the uplink is unchanged: netem cannot do this" in capsys.readouterr().err
-
-
 def test_a_named_run_that_does_not_fly_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

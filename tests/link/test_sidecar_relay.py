@@ -160,7 +160,7 @@ def test_a_change_handed_inside_is_in_force_at_the_commands_end(
     link = pod("uplink: {delay_ms: 300}\n").ready()
     note = json.dumps({"number": "a1", "cause": "by hand", "restart": True})
     files = {"profile.yaml": "uplink: {delay_ms: 20}\n"}
-    document = write_handed(Handed(note, "", files))
+    document = write_handed(Handed(note, files))
     command = ["sh", "-c", APPLY_SCRIPT, "sh", str(link.route.parent), "a1", str(len(document))]
     began = time.monotonic()
     done = subprocess.run(command, input=document, check=True, capture_output=True, text=True)
