@@ -31,7 +31,7 @@ from cloudrc.link.relay import (
 from tests.link.conftest import bind_loopback
 from tools.bench_link.flow import Way, flood, run_flow
 from tools.bench_link.relays import ours
-from tools.bench_link.stages import LINK, measure_overload
+from tools.bench_link.stages import LINK, overload
 
 pytestmark = pytest.mark.process
 linux = pytest.mark.skipif(sys.platform != "linux", reason="Linux alone has it")
@@ -210,15 +210,12 @@ def test_a_signal_ends_it_in_a_fifth_of_a_second(bench: Callable[..., Bench]) ->
 
 def test_a_flood_is_bounded_counted_and_over_in_a_second(tmp_path: Path) -> None:
     for _ in range(TRIES):
-        found = measure_overload(tmp_path, 60_000, 1.0)
-        before, after = found.memory
-        assert after - before < 64 << 20
-        # What the kernel dropped last is told with the next datagram: here the flow's.
-        assert found.accounted == pytest.approx(1.0, abs=0.01)
-        assert found.after.lost == 0
-        if found.recovered:
+        memory, counted, recovered = overload(tmp_path, 60_000, 1.0)
+        assert memory.held, memory
+        assert counted.held, counted
+        if recovered.held:
             return
-    pytest.fail(f"1 s after a flood {found.after}, before it {found.before}")
+    pytest.fail(str(recovered))
 
 
 def test_a_flood_of_strangers_is_not_even_received(tmp_path: Path) -> None:

@@ -40,13 +40,7 @@ _IP_RECVERR = 11
 
 @dataclass
 class Flow:
-    """What was sent and what arrived, in one direction.
-
-    Attributes:
-        uplink: Which direction.
-        sent: By number: when the kernel sent it [ns], wall clock.
-        arrived: In the order of arrival: when [ns], wall clock, and the number.
-    """
+    """Instants [ns], wall clock: of sending by number, and in order of arrival with the number."""
 
     uplink: bool
     sent: dict[int, int] = field(default_factory=dict)
@@ -55,14 +49,7 @@ class Flow:
 
 @dataclass(frozen=True)
 class Way:
-    """Addresses of one direction of a link.
-
-    Attributes:
-        uplink: Which direction.
-        target: Where the link takes in.
-        sink: Where it delivers to.
-        source: Where datagrams are sent from; None: any port.
-    """
+    """Where one direction of a link takes in and delivers to; datagrams come from `source`."""
 
     uplink: bool
     target: Address
@@ -73,7 +60,7 @@ class Way:
 def run_flow(
     ways: Sequence[Way], rate: float, duration: float, tail: float, begin: float = 0.0
 ) -> list[Flow]:
-    """Send on all ways in turns, and receive.
+    """Send on one or two ways in turns, and receive.
 
     Args:
         ways: One or two.
@@ -81,9 +68,6 @@ def run_flow(
         duration: Of the sending [s].
         tail: How long to receive after that [s].
         begin: When to begin [s], monotonic clock; soon if that has passed.
-
-    Returns:
-        A flow for each way.
     """
     flows = [Flow(way.uplink) for way in ways]
     addresses = {address for way in ways for address in (way.source, way.sink)}
@@ -110,20 +94,11 @@ def run_flow(
 
 
 def since_first_ns(number: int, turn: int, turns: int, period_ns: int) -> int:
-    """Return when to send a datagram.
+    """Return when to send a datagram, as time since the first one [ns].
 
     The first one starts the link's time. All others stay clear of whole periods since then: if a
     trace changes just as a datagram leaves, the relay, which receives it a microsecond later, may
     rightly draw its delay from the next row.
-
-    Args:
-        number: Of the datagram on its way.
-        turn: Of the way, from 0.
-        turns: Number of ways, 1 or 2.
-        period_ns: Between two datagrams on the same way [ns].
-
-    Returns:
-        Time since the first one [ns].
     """
     if number == turn == 0:
         return 0
@@ -150,16 +125,9 @@ def flood(way: Way, rate: float, duration: float, first: int = 0) -> int:
 
 @dataclass(frozen=True)
 class Judged:
-    """A flow beside the sequence that the model draws for it.
+    """A flow beside the model: arrays [s] over the datagrams that arrived, and what was wrong.
 
-    Attributes:
-        errors: Measured minus drawn delay of each datagram that arrived [s], shape (n,).
-        measured: Its delay [s], shape (n,).
-        drawn: Its delay as drawn [s], shape (n,).
-        sent: When it was sent, since the first one [s], shape (n,).
-        wrongly_lost: Number of datagrams that should have arrived and did not, copies counted.
-        wrongly_arrived: Number of those that should not have arrived, copies counted.
-        swapped: Number of neighbours that arrived in the wrong order.
+    `errors` is `measured` minus `drawn`; `sent` counts from the first datagram; copies count.
     """
 
     errors: Array
@@ -172,14 +140,7 @@ class Judged:
 
 
 def judge(flow: Flow, profile: DirectionProfile, seed: int, origin_ns: int) -> Judged:
-    """Compare a flow with the model.
-
-    Args:
-        flow: Measured.
-        profile: Of the direction.
-        seed: Of the experiment.
-        origin_ns: When the relay saw its first datagram [ns], wall clock.
-    """
+    """Compare a flow with the model; the relay saw its first datagram at `origin_ns` [ns]."""
     model = LinkDirection(profile, seed, flow.uplink, origin_ns)
     due: dict[int, list[int]] = {}
     for number in sorted(flow.sent):

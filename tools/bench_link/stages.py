@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import socket
 import time
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import suppress
 from itertools import groupby
 from multiprocessing import get_context
 from pathlib import Path
@@ -16,62 +16,33 @@ import numpy as np
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_experiment
+from cloudrc.config.shipped import names
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Trace
-from tools.bench_link.flow import SIZE, Array, Flow, Judged, Way, flood, judge, run_flow
+from cloudrc.link.traces import write_trace
+from tools.bench_link.flow import SIZE, Flow, Judged, Way, flood, judge, run_flow
 from tools.bench_link.relays import DELAY, Process, of_asyncio, of_c, ours, wake_lateness
 
 OURS, OF_C, OF_ASYNCIO, WAKE = "cloudrc relay", "C relay", "asyncio relay", "C clock_nanosleep"
 SEED = 1
-TRACE = "trace"
 LINK: dict[str, object] = {"profile": "ideal", "uplink": {"delay_ms": DELAY * 1e3}}
 Links: TypeAlias = dict[str, dict[str, object]]
 """Name -> the section `link` of an experiment file."""
-TAIL = 1.2
-"""Longer than any shipped delay [s]."""
-START_EACH = 0.6
-"""Time for a process that sends through a link to start [s]."""
-MEMORY_MAX = 64 << 20
-"""Limit of the memory that a flood may take [bytes]."""
+MEMORY_MAX = 64
+"""Limit of the memory that a flood may take [MiB]."""
 FLOW_RATE, FLOW_DURATION = 200.0, 3.0
 """Of the flow before and after a flood: rate [1/s] and duration [s]."""
 US, MS = 1e6, 1e3
 
 
 class Line(NamedTuple):
-    """One thing that was asked.
-
-    Attributes:
-        what: In words.
-        asked: The bound, in words.
-        measured: Likewise.
-        anchor: What else was measured in the same run, to compare.
-        held: Whether it is inside the bound.
-    """
+    """One thing that was asked: in words, the bound, the result, anchors, whether it is held."""
 
     what: str
     asked: str
     measured: str
     anchor: str
     held: bool
-
-
-@dataclass
-class Releases:
-    """Release errors of all relays.
-
-    Attributes:
-        errors: By relay, for each round: released minus due [s], shape (n,); for `WAKE` the
-            lateness of waking.
-        cpu: By relay: share of a core, for each round.
-    """
-
-    errors: dict[str, list[Array]] = field(default_factory=dict)
-    cpu: dict[str, list[float]] = field(default_factory=dict)
-
-    def quantile(self, name: str, share: float) -> float:
-        """Return the median over the rounds of a quantile [s]."""
-        return float(np.median([np.quantile(one, share) for one in self.errors[name]]))
 
 
 def start(name: str, folder: Path, relay: Path, *, fifo: bool) -> Process:
@@ -84,59 +55,52 @@ def start(name: str, folder: Path, relay: Path, *, fifo: bool) -> Process:
     return process
 
 
-def measure_releases(
+def releases(
     folder: Path, programs: tuple[Path, Path], rounds: int, duration: float, *, fifo: bool
-) -> Releases:
-    """Measure all relays at 1 kHz, in turns."""
-    found, (wake, relay) = Releases(), programs
+) -> list[Line]:
+    """Measure the release errors of all relays at 1 kHz, in turns."""
+    errors: dict[str, list[np.ndarray]] = {WAKE: [], OURS: [], OF_C: [], OF_ASYNCIO: []}
+    shares: dict[str, list[float]] = {OURS: [], OF_C: [], OF_ASYNCIO: []}
     for _ in range(rounds):
-        late = wake_lateness(wake, round(1000 * duration), fifo=fifo)
-        found.errors.setdefault(WAKE, []).append(late)
-        for name in (OURS, OF_C, OF_ASYNCIO):
-            process = start(name, folder, relay, fifo=fifo)
+        errors[WAKE].append(wake_lateness(programs[0], round(1000 * duration), fifo=fifo))
+        for name in shares:
+            process = start(name, folder, programs[1], fifo=fifo)
             before, began = process.cpu(), time.monotonic()
             (flow,) = run_flow(process.ways[:1], 1000.0, duration, 2 * DELAY)
-            cpu = (process.cpu() - before) / (time.monotonic() - began)
+            shares[name].append((process.cpu() - before) / (time.monotonic() - began))
             process.stop()
             judged = judge(flow, DirectionProfile(DELAY), SEED, min(flow.sent.values()))
-            found.errors.setdefault(name, []).append(judged.errors)
-            found.cpu.setdefault(name, []).append(cpu)
-    return found
-
-
-def judge_releases(found: Releases, fifo: bool) -> list[Line]:
-    """Judge the release errors at 1 kHz."""
-    p99 = {name: found.quantile(name, 0.99) * US for name in found.errors}
-    p50 = {name: found.quantile(name, 0.5) * US for name in found.errors}
-    anchor = WAKE if fifo else OF_C
-    early = sum(int((one < 0).sum()) for one in found.errors[OURS])
-    count = sum(one.size for one in found.errors[OURS])
+            errors[name].append(judged.errors)
+    # Quantiles of each round, and their median over the rounds [us].
+    p50, p99, top = (
+        {name: US * float(np.median([np.quantile(one, q) for one in rounds]))
+         for name, rounds in errors.items()}
+        for q in (0.5, 0.99, 0.999)
+    )  # fmt: skip
+    cpu = {name: 100 * float(np.median(share)) for name, share in shares.items()}
+    anchor, how = (WAKE, "SCHED_FIFO") if fifo else (OF_C, "normal priority")
+    early = sum(int((one < 0).sum()) for one in errors[OURS])
     ratio, worse = p99[OURS] / p99[anchor], p99[OF_ASYNCIO] / p99[OURS]
-    others = f"{OF_C} {p50[OF_C]:.0f} us, asyncio {p50[OF_ASYNCIO]:.0f} us"
-    tails = f"{anchor} {p99[anchor]:.0f} us, {OF_C} {p99[OF_C]:.0f} us"
-    top = {name: found.quantile(name, 0.999) * US for name in (OURS, OF_C)}
-    cpu = {name: 100 * float(np.median(shares)) for name, shares in found.cpu.items()}
-    how = "SCHED_FIFO" if fifo else "normal priority"
     return [
-        Line(f"release error p50, 1 kHz, {how}", "<= 60 us", f"{p50[OURS]:.1f} us", others,
-             p50[OURS] <= 60),
+        Line(f"release error p50, 1 kHz, {how}", "<= 60 us", f"{p50[OURS]:.1f} us",
+             f"{OF_C} {p50[OF_C]:.0f} us, asyncio {p50[OF_ASYNCIO]:.0f} us", p50[OURS] <= 60),
         Line(f"release error p99 / {anchor} p99", "<= 1.5", f"{ratio:.2f} ({p99[OURS]:.0f} us)",
-             tails, ratio <= 1.5),
+             f"{anchor} {p99[anchor]:.0f} us, {OF_C} {p99[OF_C]:.0f} us", ratio <= 1.5),
         Line("asyncio relay p99 / release error p99", ">= 20", f"{worse:.0f}",
              f"asyncio {p99[OF_ASYNCIO]:.0f} us", worse >= 20 or not fifo),
         Line("release error p99.9", "told", f"{top[OURS]:.0f} us", f"{OF_C} {top[OF_C]:.0f} us",
              True),
-        Line("released early", "0", f"{early} of {count}", "", early == 0),
+        Line("released early", "0", f"{early} of {sum(map(len, errors[OURS]))}", "", early == 0),
         Line("share of a core at 1 kHz", "told", f"{cpu[OURS]:.1f} %",
              f"{OF_C} {cpu[OF_C]:.1f} %, asyncio {cpu[OF_ASYNCIO]:.1f} %", True),
     ]  # fmt: skip
 
 
 def throughput(folder: Path, relay: Path, rounds: int, duration: float) -> list[Line]:
-    """Offer relays more than they can take, in turns, and judge the packets per CPU second."""
-    best: dict[str, float] = {}
+    """Offer relays more than they can take, in turns; judge the packets per CPU second."""
+    best = {OURS: 0.0, OF_C: 0.0, OF_ASYNCIO: 0.0}
     for _ in range(rounds):
-        for name in (OURS, OF_C, OF_ASYNCIO):
+        for name in best:
             process = start(name, folder, relay, fifo=False)
             before = process.cpu()
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
@@ -144,9 +108,8 @@ def throughput(folder: Path, relay: Path, rounds: int, duration: float) -> list[
                 flood(process.ways[0], 1e6, duration)
                 time.sleep(0.5)  # for what is in flight
                 arrived = _count(sink)
-            spent = process.cpu() - before
+            best[name] = max(best[name], arrived / max(process.cpu() - before, 0.01))
             process.stop()
-            best[name] = max(best.get(name, 0.0), arrived / max(spent, 0.01))
     ratio = best[OURS] / best[OF_C]
     others = f"{OF_C} {best[OF_C]:,.0f}, asyncio {best[OF_ASYNCIO]:,.0f}"
     measured = f"{ratio:.2f} ({best[OURS]:,.0f})"
@@ -158,43 +121,23 @@ def _count(sink: socket.socket) -> int:
 
     Source: Linux, net/ipv4/udp.c, udp4_format_sock: last column of /proc/net/udp.
     """
-    waiting, port = 0, sink.getsockname()[1]
+    waiting, port = 0, f":{sink.getsockname()[1]:04X}"
     sink.setblocking(False)
-    try:
-        while sink.recv(SIZE):
+    with suppress(BlockingIOError):
+        while True:
+            sink.recv(SIZE)
             waiting += 1
-    except BlockingIOError:
-        pass
-    for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
-        fields = line.split()
-        if int(fields[1].rpartition(":")[2], 16) == port:
-            return waiting + int(fields[-1])
-    return waiting
+    rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
+    return waiting + sum(int(row[-1]) for row in rows if row[1].endswith(port))
 
 
 class Row(NamedTuple):
-    """One direction of one profile.
-
-    Attributes:
-        name: Of the profile.
-        direction: "uplink" or "downlink".
-        judged: The measurement.
-        own_p99: The relay's own 99th percentile of its release error, both ways [s].
-    """
+    """One direction of one profile, and the relay's own 99th percentile, both ways [s]."""
 
     name: str
     direction: str
     judged: Judged
     own_p99: float
-
-
-class _Task(NamedTuple):
-    """Arguments of `run_flow` for one link."""
-
-    ways: list[Way]
-    rate: float
-    duration: float
-    begin: float
 
 
 def measure_profiles(
@@ -212,11 +155,10 @@ def measure_profiles(
     Returns:
         Two rows for each link.
     """
-    flags = ("--fifo",) if fifo else ()
-    relays = {name: ours(folder, link, *flags) for name, link in links.items()}
-    # Once all processes are up: to start one takes processor time from the others.
-    begin = time.monotonic() + START_EACH * (len(links) + 1)
-    tasks = [_Task(one.ways, rate, duration, begin) for one in relays.values()]
+    relays = {n: ours(folder, link, *(("--fifo",) if fifo else ())) for n, link in links.items()}
+    # Once all senders are up: to start one takes 0.6 s of processor time from the others.
+    begin = time.monotonic() + 0.6 * (len(links) + 1)
+    tasks = [(one.ways, rate, duration, 1.2, begin) for one in relays.values()]
     with ProcessPoolExecutor(len(tasks), mp_context=get_context("spawn")) as pool:
         flows = dict(zip(relays, pool.map(_send, tasks), strict=True))
     rows: list[Row] = []
@@ -230,8 +172,8 @@ def measure_profiles(
     return rows
 
 
-def _send(task: _Task) -> list[Flow]:
-    return run_flow(task.ways, task.rate, task.duration, TAIL, task.begin)
+def _send(task: tuple[list[Way], float, float, float, float]) -> list[Flow]:
+    return run_flow(*task)
 
 
 def profiles_of(folder: Path, link: dict[str, object]) -> tuple[DirectionProfile, DirectionProfile]:
@@ -242,13 +184,16 @@ def profiles_of(folder: Path, link: dict[str, object]) -> tuple[DirectionProfile
     return link_profile(experiment.uplink), link_profile(experiment.downlink)
 
 
-def random_walk(duration: float) -> Trace:
-    """Make a trace of delays: a random walk about 40 ms in steps of 0.1 s, seeded."""
+def replayed_trace(folder: Path) -> dict[str, object]:
+    """Write a trace of 60 s, a random walk about 40 ms in steps of 0.1 s, and name it in a link."""
     generator, delays = np.random.default_rng(5), [0.040]
-    for _ in range(round(duration * 10)):
+    for _ in range(600):
         delay = delays[-1] + 0.004 * generator.standard_normal()
         delays.append(round(min(max(delay, 0.005), 0.120), 6))
-    return Trace(tuple(number / 10 for number in range(len(delays))), tuple(delays))
+    trace = Trace(tuple(number / 10 for number in range(len(delays))), tuple(delays))
+    (folder / "trace.csv").write_text(write_trace(trace))
+    way = {"trace": str(folder / "trace.csv")}
+    return {"profile": "ideal", "uplink": way, "downlink": way}
 
 
 def correlation(judged: Judged, profile: DirectionProfile) -> float:
@@ -259,42 +204,41 @@ def correlation(judged: Judged, profile: DirectionProfile) -> float:
     return float(np.corrcoef(asked, judged.measured)[0, 1])
 
 
-def judge_profiles(rows: list[Row], trace: DirectionProfile, wakes: Array) -> list[Line]:
-    """Judge the shipped profiles and the replayed trace.
-
-    Args:
-        rows: What was measured.
-        trace: Profile of the rows named `TRACE`.
-        wakes: How late the C anchor woke in the same minute [s], shape (n,).
-    """
-    plain = [row for row in rows if row.name != TRACE]
-    means = [abs(float(row.judged.errors.mean())) * MS for row in plain]
-    spreads = [float(row.judged.errors.std()) * MS for row in plain]
-    largest = max(float(row.judged.errors.max()) for row in plain) * MS
+def profiles(
+    folder: Path, wake: Path, seconds: float, *, fifo: bool
+) -> tuple[list[Line], list[dict[str, object]]]:
+    """Judge the shipped profiles and a replayed trace; also describe each direction."""
+    links: Links = {name: {"profile": name} for name in names("profile")}
+    links["trace"] = replayed_trace(folder)
+    with ThreadPoolExecutor(1) as pool:  # what the machine does in the same minute
+        late = pool.submit(wake_lateness, wake, round(1000 * (seconds + 7.0)), fifo=fifo)
+        rows = measure_profiles(folder, links, seconds, fifo=fifo)
+    wakes, trace = late.result() * MS, profiles_of(folder, links["trace"])[0]
+    errors = [row.judged.errors * MS for row in rows]
+    plain = [one for row, one in zip(rows, errors, strict=True) if row.name != "trace"]
+    mean, spread = max(abs(one.mean()) for one in plain), max(one.std() for one in plain)
     wrong = sum(row.judged.wrongly_lost + row.judged.wrongly_arrived for row in rows)
     swapped = sum(row.judged.swapped for row in rows)
-    early = sum(int((row.judged.errors < 0).sum()) for row in rows)
-    count = sum(row.judged.errors.size for row in rows)
-    least = min(float(row.judged.errors.min()) for row in rows)
-    by = f", by {-least * MS:.4f} ms" if early else ""
-    replayed = min(correlation(row.judged, trace) for row in rows if row.name == TRACE)
-    woke = (float(wakes.mean()) * MS, float(wakes.std()) * MS, float(wakes.max()) * MS)
-    return [
-        Line("measured minus drawn, mean, worst profile", "<= 0.3 ms", f"{max(means):.3f} ms",
-             f"{WAKE} {woke[0]:.3f} ms", max(means) <= 0.3),
-        Line("measured minus drawn, deviation, worst", "<= 0.5 ms", f"{max(spreads):.3f} ms",
-             f"{WAKE} {woke[1]:.3f} ms", max(spreads) <= 0.5),
-        Line("measured minus drawn, largest", "told", f"{largest:.1f} ms",
-             f"{WAKE} {woke[2]:.1f} ms", True),
+    every = np.concatenate(errors)
+    early, count = int((every < 0).sum()), every.size
+    by = f", by {-every.min():.4f} ms" if early else ""
+    replayed = min(correlation(row.judged, trace) for row in rows if row.name == "trace")
+    lines = [
+        Line("measured minus drawn, mean, worst profile", "<= 0.3 ms", f"{mean:.3f} ms",
+             f"{WAKE} {wakes.mean():.3f} ms", mean <= 0.3),
+        Line("measured minus drawn, deviation, worst", "<= 0.5 ms", f"{spread:.3f} ms",
+             f"{WAKE} {wakes.std():.3f} ms", spread <= 0.5),
+        Line("measured minus drawn, largest", "told", f"{max(map(np.max, plain)):.1f} ms",
+             f"{WAKE} {wakes.max():.1f} ms", True),
         Line("lost or arrived, not as drawn", "0", f"{wrong} of {count}", "", wrong == 0),
         Line("out of the order drawn (by > 5 us)", "0", f"{swapped} of {count}", "", swapped == 0),
         Line("released early, profiles", "0", f"{early} of {count}{by}", "", early == 0),
         Line("replayed trace, correlation", ">= 0.98", f"{replayed:.4f}", "", replayed >= 0.98),
     ]  # fmt: skip
+    return lines, [_detail(row) for row in rows]
 
 
-def detail(row: Row) -> dict[str, object]:
-    """Describe one direction of one profile."""
+def _detail(row: Row) -> dict[str, object]:
     judged, errors = row.judged, row.judged.errors * MS
     return {
         "profile": row.name,
@@ -311,47 +255,7 @@ def detail(row: Row) -> dict[str, object]:
     }
 
 
-class Served(NamedTuple):
-    """How a flow was served: packets lost, median and 99th percentile of the release error [s]."""
-
-    lost: int
-    p50: float
-    p99: float
-
-
-class Overloaded(NamedTuple):
-    """Result of a flood.
-
-    Attributes:
-        offered: Packets sent.
-        rate: At which they were sent [1/s].
-        counts: What the relay has counted, both flows included.
-        memory: Most that the relay held before and after the flood [bytes].
-        before: How a flow was served before the flood.
-        after: How the same flow was served 1 s after it.
-    """
-
-    offered: int
-    rate: float
-    counts: dict[str, float]
-    memory: tuple[int, int]
-    before: Served
-    after: Served
-
-    @property
-    def accounted(self) -> float:
-        """Return the share of what was offered that the relay has counted, in [0, 1]."""
-        flows = 2 * FLOW_RATE * FLOW_DURATION
-        return (self.counts["received"] + self.counts["unread"] - flows) / self.offered
-
-    @property
-    def recovered(self) -> bool:
-        """Return whether nothing is lost and errors are at most twice those before."""
-        before, after = self.before, self.after
-        return after.lost == 0 and after.p50 <= 2 * before.p50 and after.p99 <= 2 * before.p99
-
-
-def measure_overload(folder: Path, rate: float, duration: float) -> Overloaded:
+def overload(folder: Path, rate: float, duration: float) -> list[Line]:
     """Send a flow, flood, rest for 1 s, and send the flow again.
 
     Args:
@@ -361,7 +265,15 @@ def measure_overload(folder: Path, rate: float, duration: float) -> Overloaded:
     """
     relay = ours(folder, LINK)
     way = relay.ways[0]
-    served, held = _serve(way), relay.memory()
+
+    def serve() -> tuple[int, float, float, float]:
+        """Lost packets, median and 99th percentile of the error [us], memory [MiB]."""
+        (flow,) = run_flow([way], FLOW_RATE, FLOW_DURATION, 0.2)
+        judged = judge(flow, DirectionProfile(DELAY), SEED, min(flow.sent.values()))
+        p50, p99 = US * np.quantile(judged.errors, (0.5, 0.99))
+        return judged.wrongly_lost, float(p50), float(p99), relay.memory() / 2**20
+
+    _, p50, p99, before = serve()
     # Nobody reads what arrives: its kernel drops it, and the sender keeps its core to itself.
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
         sink.bind(way.sink)
@@ -369,54 +281,37 @@ def measure_overload(folder: Path, rate: float, duration: float) -> Overloaded:
         offered = flood(way, rate, duration, first=1 << 40)
         took = time.monotonic() - began
         time.sleep(1.0)
-    held_then, served_then = relay.memory(), _serve(way)
+    lost, p50_then, p99_then, after = serve()
     relay.stop()
-    memory = (held, held_then)
-    return Overloaded(offered, offered / took, relay.counts(), memory, served, served_then)
-
-
-def _serve(way: Way) -> Served:
-    (flow,) = run_flow([way], FLOW_RATE, FLOW_DURATION, 0.2)
-    judged = judge(flow, DirectionProfile(DELAY), SEED, min(flow.sent.values()))
-    p50, p99 = np.quantile(judged.errors, (0.5, 0.99)).tolist()
-    return Served(judged.wrongly_lost, p50, p99)
-
-
-def judge_overload(found: Overloaded) -> list[Line]:
-    """Judge memory, counts and recovery of a flood."""
-    before, after = (size / 2**20 for size in found.memory)
-    counts, share = found.counts, found.accounted
+    counts = relay.counts()
+    flows = 2 * FLOW_RATE * FLOW_DURATION
+    share = (counts["received"] + counts["unread"] - flows) / offered
     gone = counts["unread"] + counts["overflow"] + counts["unsent"]
-    said = f"forwarded {counts['forwarded']:,.0f}, dropped {gone:,.0f}"
-    errors = [f"p50 {one.p50 * US:.0f} us, p99 {one.p99 * US:.0f} us"
-              for one in (found.before, found.after)]  # fmt: skip
+    recovered = lost == 0 and p50_then <= 2 * p50 and p99_then <= 2 * p99
     return [
         Line("flood: memory of the relay", "bounded", f"{after:.0f} MiB",
-             f"before {before:.0f} MiB", after - before <= MEMORY_MAX / 2**20),
-        Line(f"flood: counted of {found.offered:,} at {found.rate:,.0f}/s", ">= 99 %",
-             f"{100 * share:.2f} %", said, 0.99 <= share <= 1.0001),
+             f"before {before:.0f} MiB", after - before <= MEMORY_MAX),
+        Line(f"flood: counted of {offered:,} at {offered / took:,.0f}/s", ">= 99 %",
+             f"{100 * share:.2f} %",
+             f"forwarded {counts['forwarded']:,.0f}, dropped {gone:,.0f}",
+             0.99 <= share <= 1.0001),
         Line("1 s after it: lost, release error", "0, <= 2 x before",
-             f"{found.after.lost}, {errors[1]}", f"before {errors[0]}", found.recovered),
+             f"{lost}, p50 {p50_then:.0f} us, p99 {p99_then:.0f} us",
+             f"before p50 {p50:.0f} us, p99 {p99:.0f} us", recovered),
     ]  # fmt: skip
 
 
-def bursts(start: float = 0.02, end: float = 0.2, count: int = 200_000) -> list[Line]:
-    """Judge the Gilbert-Elliott bursts that the model draws; no clock, no socket.
-
-    Args:
-        start: Probability per packet that a burst begins, in [0, 1].
-        end: Probability per packet that it ends, in [0, 1].
-        count: Number of packets.
-    """
+def bursts() -> list[Line]:
+    """Judge the Gilbert-Elliott bursts that the model draws; no clock, no socket."""
+    start, end, count = 0.02, 0.2, 200_000
     link = LinkDirection(DirectionProfile(loss=GilbertElliott(start, end)), SEED, True)
     lost = [not link.send(1, 3, n, SIZE, n * 10_000_000) for n in range(count)]
     runs = [sum(1 for _ in run) for one, run in groupby(lost) if one]
-    rows = [
-        ("bursts: loss, 200,000 packets", start / (start + end), sum(lost) / count, 4),
-        ("bursts: mean length", 1.0 / end, sum(runs) / len(runs), 2),
-    ]
+    loss, length = sum(lost) / count, sum(runs) / len(runs)
+    asked = start / (start + end)
     return [
-        Line(what, f"{asked:.{digits}f} +-10 %", f"{drawn:.{digits}f}", "",
-             abs(drawn / asked - 1) <= 0.1)
-        for what, asked, drawn, digits in rows
+        Line("bursts: loss, 200,000 packets", f"{asked:.4f} +-10 %", f"{loss:.4f}", "",
+             abs(loss / asked - 1) <= 0.1),
+        Line("bursts: mean length", f"{1 / end:.2f} +-10 %", f"{length:.2f}", "",
+             abs(length * end - 1) <= 0.1),
     ]  # fmt: skip
