@@ -92,10 +92,9 @@ def _set_here(
         BadInputError: If the request is not valid.
         TimedOutError: If the relay does not apply it in time.
     """
-    from cloudrc.cli.relay import PROFILE_FILE
     from cloudrc.config.document import Document
     from cloudrc.config.profile_edit import DIRECTIONS, edit_profile
-    from cloudrc.link.state import CHANGE_FILE, from_text, publish
+    from cloudrc.link.state import CHANGE_FILE, PROFILE_FILE, from_text, publish
 
     def look() -> list[LinkState]:
         try:

@@ -37,7 +37,7 @@ from cloudrc.cli.runtime import (
 from cloudrc.errors import BadInputError
 from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.state import RELEASED_SUFFIX, LinkState, publish, summary, to_text
+from cloudrc.link.state import PROFILE_FILE, RELEASED_SUFFIX, LinkState, publish, summary, to_text
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -181,7 +181,6 @@ def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Cal
     return ask
 
 
-PROFILE_FILE = "profile.json"
 RELEASED_PERIOD = 2.0
 """Time between two publications of the lateness of datagrams [s]; an end reads it as often."""
 
