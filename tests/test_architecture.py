@@ -54,8 +54,7 @@ API = ("teleop/api", "teleop/auth", "teleop/bridge", "teleop/server")
 RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/",),
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
-    # The relay reads the kernel's stamp of every datagram, and reads and sends them in batches.
-    "struct": ("tunnel/codec", "record/", "world/simulator", "link/relay_io"),
+    "struct": ("tunnel/codec", "record/", "world/simulator"),
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "faults/schedule"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "report/write"),

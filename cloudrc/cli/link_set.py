@@ -6,7 +6,8 @@ import argparse
 import json
 import secrets
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
@@ -18,11 +19,9 @@ from cloudrc.cluster.tools import ClusterError
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
 
 if TYPE_CHECKING:
-    from cloudrc.cluster.link import AppliedEdit, LinkParts, ReleasePlace
+    from cloudrc.cluster.link import LinkParts, ReleasePlace, Sent
     from cloudrc.config.profile_edit import Edit
     from cloudrc.link.state import LinkState
-
-    Look = Callable[[], list[LinkState]]
 
 EPILOG = """\
 where:
@@ -61,15 +60,20 @@ def execute(options: argparse.Namespace) -> int:
     began, number = monotonic(), secrets.token_hex(4)
     folder = find_local_run(options, link_folder_of, "no run flies there")
     if folder is not None:
-        edit, look = _set_here(options, folder, number)
-        late = f"within {LOCAL_TIMEOUT:g} s; see {folder.parent / 'relay.log'}"
-        states = _await(look, number, LOCAL_TIMEOUT, late)
+        edit, states = _set_here(options, folder, number)
         took = monotonic() - began
     else:
-        handed = _set_in_cluster(options, number)
-        edit, states = handed.edit, _apply_or_take_back(handed, number)
+        from cloudrc.cluster.client import DEFAULT_RELEASE
+        from cloudrc.cluster.link import ReleasePlace
+
+        release = options.release or DEFAULT_RELEASE
+        place = ReleasePlace(options.context, options.namespace, release)
+        link, sent = _set_in_cluster(options, place, number)
         took = monotonic() - began
-        handed.keep()
+        from cloudrc.cluster.link import keep
+
+        keep(place, link, sent)
+        edit, states = sent.edit, sent.states
     for note in edit.notes:
         print_line(f"cloudrc: note: {note}", sys.stderr)
     if options.output != "table":
@@ -79,12 +83,18 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
-def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[Edit, Look]:
-    """Write a new profile where the run's relay looks for it."""
-    from cloudrc.cli.relay import PROFILE_FILE
+def _set_here(
+    options: argparse.Namespace, folder: Path, number: str
+) -> tuple[Edit, list[LinkState]]:
+    """Write a new profile where the run's relay looks for it, and wait until it has applied it.
+
+    Raises:
+        BadInputError: If the request is not valid.
+        TimedOutError: If the relay does not apply it in time.
+    """
     from cloudrc.config.document import Document
     from cloudrc.config.profile_edit import DIRECTIONS, edit_profile
-    from cloudrc.link.state import CHANGE_FILE, from_text, publish
+    from cloudrc.link.state import CHANGE_FILE, PROFILE_FILE, from_text, publish
 
     def look() -> list[LinkState]:
         try:
@@ -96,47 +106,38 @@ def _set_here(options: argparse.Namespace, folder: Path, number: str) -> tuple[E
     states = look()
     if not states:
         raise BadInputError(f"{folder.parent}: no link is up there (yet); wait for the start")
-    made = edit_profile(Document(states[0].profile), options.profile, options.settings)
-    publish(folder / CHANGE_FILE, _change(made, number))
-    publish(folder / PROFILE_FILE, json.dumps(made.values, indent=2) + "\n")
-    return made, look
+    edit = edit_profile(Document(states[0].profile), options.profile, options.settings)
+    publish(folder / CHANGE_FILE, _note(edit, number))
+    publish(folder / PROFILE_FILE, json.dumps(edit.values, indent=2) + "\n")
+    deadline = monotonic() + LOCAL_TIMEOUT
+    while not (states := look()) or any(state.change != number for state in states):
+        if monotonic() > deadline:
+            late = [s.direction for s in states if s.change != number] or ["link"]
+            raise TimedOutError(
+                f"the {' and '.join(late)} did not apply the change within {LOCAL_TIMEOUT:g} s; "
+                f"see {folder.parent / 'relay.log'}"
+            )
+        sleep(POLL_PERIOD)
+    return edit, states
 
 
-def _set_in_cluster(options: argparse.Namespace, number: str) -> AppliedEdit:
+def _set_in_cluster(
+    options: argparse.Namespace, place: ReleasePlace, number: str
+) -> tuple[LinkParts, Sent]:
     """Give a new profile to both link containers."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from cloudrc.cluster.client import DEFAULT_RELEASE
-    from cloudrc.cluster.link import ReleasePlace
-
-    where = ReleasePlace(options.context, options.namespace, options.release or DEFAULT_RELEASE)
     with ThreadPoolExecutor(1) as pool:
-        looking = pool.submit(_link_of, options, where)
+        looking = pool.submit(_link_of, options, place)
         # Import while the cluster answers: a change should be in force within a second.
-        from cloudrc.cluster.link import change_profile
+        from cloudrc.cluster.link import send
         from cloudrc.config.profile_edit import check_edit
 
         if looking.exception() is not None:
             check_edit(options.profile, options.settings)  # report a wrong command line first
         link = looking.result()
-    return change_profile(
-        where,
-        link,
-        options.profile,
-        options.settings,
-        lambda edit: _change(edit, number),
-    )
-
-
-def _apply_or_take_back(handed: AppliedEdit, number: str) -> list[LinkState]:
-    """Wait for the change in both directions; if one refuses, take it back in both."""
-    from cloudrc.cluster.link import APPLY_LIMIT
-
-    late = f"within {APPLY_LIMIT:g} s; see the logs of the link containers"
-    try:
-        return _await(lambda: handed.told, number, 0.0, late)  # the containers have waited already
-    except CloudrcError as error:
-        raise type(error)("; ".join(filter(None, [str(error), handed.take_back()]))) from None
+    note = partial(_note, number=number)
+    return link, send(place, link, options.profile, options.settings, note)
 
 
 def _link_of(options: argparse.Namespace, where: ReleasePlace) -> LinkParts:
@@ -165,40 +166,9 @@ def _link_of(options: argparse.Namespace, where: ReleasePlace) -> LinkParts:
     raise failed
 
 
-def _change(edit: Edit, number: str) -> str:
+def _note(edit: Edit, number: str) -> str:
+    """Write the text of the file beside the profile: who changed it, and why."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
-
-
-def _await(look: Look, number: str, patience: float, remedy: str) -> list[LinkState]:
-    """Wait until both directions report that the change is in force.
-
-    Args:
-        look: Reads the state of both directions.
-        number: Number of the change.
-        patience: Time limit [s].
-        remedy: End of the error message: the total waiting time and where to look.
-
-    Raises:
-        CloudrcError: If the change is refused or late.
-    """
-    deadline = monotonic() + patience
-    while True:
-        states = look()
-        for state in states:
-            if state.refused == number:
-                raise _RefusedError(f"the {state.direction} is unchanged: {state.refusal}")
-        if states and all(state.change == number for state in states):
-            return states
-        if monotonic() > deadline:
-            late = [s.direction for s in states if s.change != number] or ["link"]
-            raise TimedOutError(f"the {' and '.join(late)} did not apply the change {remedy}")
-        sleep(POLL_PERIOD)
-
-
-class _RefusedError(CloudrcError):
-    """The link refuses the change."""
-
-    exit_code = 2
 
 
 def _document(states: list[LinkState], number: str, took: float) -> dict[str, object]:

@@ -18,8 +18,8 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,9 +34,10 @@ from cloudrc.cli.runtime import (
     resolve_address,
     warn_if_exposed,
 )
+from cloudrc.errors import BadInputError
 from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.state import RELEASED_SUFFIX, LinkState, publish, summary, to_text
+from cloudrc.link.state import PROFILE_FILE, RELEASED_SUFFIX, LinkState, publish, summary, to_text
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -80,57 +81,68 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.feed import Feed
     from cloudrc.drivers.process import StopSignal
-    from cloudrc.link.relay import Relay, settle
-    from cloudrc.tunnel.codec import peek
+    from cloudrc.link.relay import ask_for_fifo, settle
 
     stop, exporter = StopSignal(), open_exporter(options, "link")
     experiment = read_experiment(str(options.config))
     uplink, downlink = assembly.build_links(experiment)
-    world, cloud = (
-        resolve_address("--world", options.world),
-        resolve_address("--cloud", options.cloud),
-    )
     settle()
-    if options.fifo:  # before the relay is made, which reads its own priority
-        _use_fifo()
-    relay = Relay(
-        uplink,
-        downlink,
-        peek,
-        world_side=_bind_side("--world-side", options.world_side),
-        cloud_side=_bind_side("--cloud-side", options.cloud_side),
-        world_peer=world,
-        cloud_peer=cloud,
-    )
+    if options.fifo:
+        refused = ask_for_fifo()
+        result = f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO"
+        print(f"cloudrc relay: {result}", file=sys.stderr, flush=True)
+    relay = open_relay(options, uplink, downlink)
+    first = read_profiles(experiment)
+    asked: Callable[[str, float], object] = exporter.asked if exporter else lambda way, delay: None
     should_stop: Callable[[], bool] = stop
     if options.link:
-        should_stop = follow_folder(
-            stop, options.link, experiment, (uplink, downlink), exporter, relay
-        )
+        links = {"uplink": uplink, "downlink": downlink}
+        control = RelayControl(options.link, links, first, asked, relay)
+        control.start()
+        should_stop = control.stop_after(stop)
     Feed.on_stdout().ready()
-    if exporter is None:
-        relay.run(should_stop)
-    else:
-        if not options.link:  # else the control has shown it
-            export_requested_delay(exporter, experiment)
-        for way in WAYS:
+    if exporter is not None:
+        for way, loaded in first.items():
+            asked(way, summary(loaded.direction)["delay"] or 0.0)
             exporter.shaped("relay", way, "relay")
         exporter.runs(fingerprint(experiment))
         exporter.ready(True)
-        relay.run(_counting(should_stop, relay, exporter))
+        should_stop = _counting(should_stop, relay, exporter)
+    relay.run(should_stop)
     counts = ", ".join(f"{name} {count:g}" for name, count in relay.counts().items())
     print(f"cloudrc relay: {counts}", file=sys.stderr)
     return 0
 
 
-def export_requested_delay(exporter: Exporter, experiment: ResolvedExperiment) -> None:
-    """Export the mean delay that the experiment requests of each direction."""
-    from cloudrc.assembly import link_profile
-    from cloudrc.link.state import summary
+def open_relay(
+    options: argparse.Namespace, uplink: LinkDirection, downlink: LinkDirection
+) -> Relay:
+    """Make the relay between the addresses of the command line.
 
-    for way in WAYS:
-        requested = summary(link_profile(getattr(experiment, way)))
-        exporter.asked(way, requested["delay"] or 0.0)
+    Raises:
+        BadInputError: If an address is not usable; names the flags.
+    """
+    from cloudrc.link.relay import Relay
+    from cloudrc.tunnel.codec import peek
+
+    peers = {
+        "world_peer": resolve_address("--world", options.world),
+        "cloud_peer": resolve_address("--cloud", options.cloud),
+    }
+    with ExitStack() as opened:
+        sides = {
+            "world_side": opened.enter_context(_bind_side("--world-side", options.world_side)),
+            "cloud_side": opened.enter_context(_bind_side("--cloud-side", options.cloud_side)),
+        }
+        try:
+            relay = Relay(uplink, downlink, peek, **sides, **peers)  # type: ignore[arg-type]
+        except OSError as error:
+            raise BadInputError(
+                "the relay cannot reach --world from --world-side, or --cloud from --cloud-side "
+                f"({error.strerror or error}); give each side an address that reaches its end"
+            ) from error
+        opened.pop_all()  # they stay open until this process ends
+        return relay
 
 
 def _bind_side(flag: str, listen: tuple[str, int]) -> socket.socket:
@@ -142,19 +154,17 @@ def _bind_side(flag: str, listen: tuple[str, int]) -> socket.socket:
         return bind(listen)
 
 
-def _use_fifo() -> None:
-    """Ask for SCHED_FIFO and print whether it was granted."""
-    from cloudrc.link.relay import ask_for_fifo
+def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
+    """Read the profiles that the relay starts with, by direction."""
+    from cloudrc.assembly import link_profile
 
-    refused = ask_for_fifo()
-    result = f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO"
-    print(f"cloudrc relay: {result}", file=sys.stderr, flush=True)
+    ways = {way: getattr(experiment, way) for way in WAYS}
+    values = {way: d.model_dump(mode="json", exclude_defaults=True) for way, d in ways.items()}
+    return {way: Loaded(link_profile(direction), values) for way, direction in ways.items()}
 
 
 def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Callable[[], bool]:
     """Wrap `stop`: also export the relay's counts once a second."""
-    import time
-
     from cloudrc.records import Counted
 
     due_ns = 0
@@ -171,43 +181,8 @@ def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Cal
     return ask
 
 
-PROFILE_FILE = "profile.json"
 RELEASED_PERIOD = 2.0
 """Time between two publications of the lateness of datagrams [s]; an end reads it as often."""
-
-
-def follow_folder(
-    stop: Callable[[], bool],
-    folder: Path,
-    experiment: ResolvedExperiment,
-    links: tuple[LinkDirection, LinkDirection],
-    exporter: Exporter | None,
-    relay: Relay,
-) -> Callable[[], bool]:
-    """Follow a folder with requested changes, and wrap `stop` so that it applies them.
-
-    Args:
-        stop: Says whether to end; the relay calls it all the time.
-        folder: Read for changes; gets the link's state.
-        experiment: The experiment that the relay started with.
-        links: Uplink and downlink.
-        exporter: Exports the requested delay; None without metrics.
-        relay: Queues received datagrams before a change, and gives their lateness.
-    """
-    from cloudrc.assembly import link_profile
-
-    ways = {"uplink": experiment.uplink, "downlink": experiment.downlink}
-    values = {way: d.model_dump(mode="json", exclude_defaults=True) for way, d in ways.items()}
-    control = RelayControl(
-        folder,
-        dict(zip(ways, links, strict=True)),
-        {way: Loaded(link_profile(direction), values) for way, direction in ways.items()},
-        exporter.asked if exporter else lambda direction, delay: None,
-        relay.take_in,
-        relay.released,
-    )
-    control.start()
-    return control.stop_after(stop)
 
 
 class RelayControl:
@@ -216,24 +191,22 @@ class RelayControl:
     def __init__(
         self,
         folder: Path,
-        links: dict[str, LinkDirection],
-        first: dict[str, Loaded],
-        asked: Callable[[str, float], None] = lambda direction, delay: None,
-        take_in: Callable[[], None] = lambda: None,
-        released: Callable[[str], dict[str, int]] = lambda way: {},
+        links: Mapping[str, LinkDirection],
+        first: Mapping[str, Loaded],
+        asked: Callable[[str, float], object],
+        relay: Relay,
     ) -> None:
         """Publish the initial state.
 
         Args:
-            folder: Created if missing.
+            folder: Created if missing; read for changes, gets the link's state.
             links: "uplink" and "downlink".
             first: The profiles that the links started with.
             asked: Called with a direction and its newly requested mean delay [s].
-            take_in: Queues received datagrams under the old profile, before a change.
-            released: Gives the lateness of the datagrams of a direction so far.
+            relay: Takes in what has arrived before a change, and gives its lateness.
         """
-        self._folder, self._links, self._asked, self._take_in = folder, links, asked, take_in
-        self._released, self._released_at = released, 0.0
+        self._folder, self._links, self._asked, self._relay = folder, links, asked, relay
+        self._released_at = 0.0
         folder.mkdir(exist_ok=True)
         file = folder / PROFILE_FILE
         self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
@@ -249,7 +222,7 @@ class RelayControl:
 
     def swap(self) -> None:
         """Apply the pending profiles; the relay's loop calls this between datagrams."""
-        self._take_in()
+        self._relay.take_in()
         while self._pending:
             way, loaded = self._pending.popleft()
             self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
@@ -280,7 +253,7 @@ class RelayControl:
         if time.monotonic() - self._released_at >= RELEASED_PERIOD:
             self._released_at = time.monotonic()
             for way in self._links:
-                if released := self._released(way):
+                if released := self._relay.released(way):
                     publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
 
     def _follow(self) -> None:

@@ -1,9 +1,9 @@
 """Change the link of a release in flight: `cloudrc link set` in a cluster.
 
 The new profile goes into both running link containers, so that it is in force within a second, and
-then into the ConfigMap, so that it survives a restart. If only one direction accepts a change, both
-get the old files again: the one that accepted it, and the other one, which would otherwise read the
-refused files when it restarts. Traces are files beside the profile.
+then into the ConfigMap, so that a restart keeps it. A change that a container refuses does not go
+into the ConfigMap, and one that fails says what has it and what has not. Traces are files beside
+the profile.
 
 For speed, this module uses kubectl, which starts in 0.1 s, not the Python client, which takes
 0.5 s; and a few lines of `sh` in the containers, not Python.
@@ -13,21 +13,20 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, NoReturn, TypeAlias
+from typing import Any, NamedTuple
 
 from cloudrc.cluster.tools import ClusterError, run
-from cloudrc.config.document import parse_yaml, read_document, write_yaml
+from cloudrc.config.document import read_document, write_yaml
 from cloudrc.config.load import FILE_READERS
-from cloudrc.config.profile_edit import DIRECTIONS, TIME_LINE_KEYS, Edit, edit_profile
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.config.profile_edit import DIRECTIONS, Edit, edit_profile
+from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 from cloudrc.link.follow import HANDED_FILE, Handed, write_handed
-from cloudrc.link.state import CHANGE_FILE, STATE_FILE, Change, LinkState, from_text, read_change
+from cloudrc.link.state import CHANGE_FILE, STATE_FILE, LinkState, from_text, read_change
 
 PROFILE = "profile.yaml"
 """Key of the profile in the ConfigMap."""
@@ -166,63 +165,90 @@ def send_change(place: ReleasePlace, pod: str, handed: Handed) -> str:
     return run("kubectl", command, timeout=SEND_LIMIT, given=document)
 
 
-DIRECTION_OF = dict(zip(COMPONENTS, DIRECTIONS, strict=True))
-"""Component -> direction that its link container shapes."""
-Answer: TypeAlias = LinkState | CloudrcError
-"""State that a link container reports, or the error if it reports none."""
-
-
-@dataclass(frozen=True)
-class SentChange:
-    """A change that was sent to both link containers.
+class Sent(NamedTuple):
+    """A change that was sent to both link containers, none of which refused it.
 
     Attributes:
-        change: Number, cause, and whether time lines start again.
-        answers: Component -> answer of its container.
+        edit: The edited profile.
+        files: Files for the ConfigMap.
+        states: States of the directions that report one, after the change.
+        failed: Errors of the others.
     """
 
-    change: Change
-    answers: Mapping[str, Answer]
-
-    def took(self, part: str) -> bool:
-        """Whether the change is in force in a component's container."""
-        answer = self.answers[part]
-        return isinstance(answer, LinkState) and answer.change == self.change.number
-
-    def refused(self, part: str) -> bool:
-        """Whether a component's container has refused the change."""
-        answer = self.answers[part]
-        return isinstance(answer, LinkState) and answer.refused == self.change.number
+    edit: Edit
+    files: dict[str, str]
+    states: list[LinkState]
+    failed: list[CloudrcError]
 
 
-class UnknownStateError(ClusterError):
-    """A link container reports a state in the format of another version."""
-
-
-def send_to_both(
-    place: ReleasePlace, link: LinkParts, given: Mapping[str, Handed]
-) -> dict[str, Answer]:
-    """Send a change to each link container, and wait until both have accepted or refused it.
+def send(
+    place: ReleasePlace,
+    link: LinkParts,
+    profile: str | None,
+    settings: Sequence[str],
+    note: Callable[[Edit], str],
+) -> Sent:
+    """Change the profile in both link containers, and wait until they have applied it.
 
     Args:
         place: The release.
-        link: Its link.
-        given: Component -> change for its container.
+        link: Its present link.
+        profile: New profile, as in `cloudrc.config.profile_edit.edit_profile`.
+        settings: Values to set, likewise.
+        note: Returns the text of the file beside the profile: who changed it, and why.
 
-    Returns:
-        Component -> answer of its container.
+    Raises:
+        BadInputError: If the request is not valid, or a container refuses the change.
     """
+    edit, files = with_files(link.files, profile, settings)
+    files[CHANGE_FILE] = note(edit)
+    number = read_change(files[CHANGE_FILE]).number
+    handed = Handed(files[CHANGE_FILE], needed_files(edit.values, {**link.files, **files}))
 
-    def hand(part: str) -> Answer:
+    def ask(part: str) -> LinkState | CloudrcError:
         try:
-            return from_text(send_change(place, link.pods[part], given[part]))
+            state = from_text(send_change(place, link.pods[part], handed))
         except CloudrcError as error:
             return error
         except ValueError as error:
-            return UnknownStateError(f"a link container has another version: {error}")
+            return ClusterError(f"a link container has another version: {error}")
+        if number in (state.change, state.refused):
+            return state
+        return TimedOutError(
+            f"the {state.direction} did not apply the change within {APPLY_LIMIT:g} s; see the log "
+            f"of the container link of pod {link.pods[part]}"
+        )
 
     with ThreadPoolExecutor(len(COMPONENTS)) as pool:
-        return dict(zip(COMPONENTS, pool.map(hand, COMPONENTS), strict=True))
+        answers = list(pool.map(ask, COMPONENTS))
+    failed = [answer for answer in answers if isinstance(answer, CloudrcError)]
+    states = [answer for answer in answers if isinstance(answer, LinkState)]
+    if refused := [state for state in states if state.refused == number]:
+        said = [f"the {state.direction} is unchanged: {state.refusal}" for state in refused]
+        said += [f"the {s.direction} has the change" for s in states if s not in refused]
+        said += map(str, failed)
+        kept = "the ConfigMap is unchanged, and restarted pods take it"
+        raise BadInputError("; ".join([*said, kept]))
+    return Sent(edit, files, states, failed)
+
+
+def keep(place: ReleasePlace, link: LinkParts, sent: Sent) -> None:
+    """Write a change into the ConfigMap, and report everything that has failed.
+
+    Raises:
+        CloudrcError: If a container or the ConfigMap does not have the change.
+    """
+    said = list(map(str, sent.failed))
+    try:
+        write_files(place, link.name, sent.files)
+    except CloudrcError as error:
+        said.append(f"the ConfigMap is unchanged: {error}")
+        for state in sent.states:
+            said.append(f"the {state.direction} has the change until its pod is replaced")
+        raise ClusterError("; ".join(said)) from None
+    if sent.failed:
+        said.append("the ConfigMap has the change, and the pods apply it within 2 minutes")
+        raise type(sent.failed[0])("; ".join(said))
 
 
 def needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
@@ -235,157 +261,6 @@ def needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[st
     ways = [value for value in values.values() if isinstance(value, dict)]
     named = {Path(str(way[key])).name for way in ways for key in FILE_READERS if way.get(key)}
     return {name: text for name, text in files.items() if name == PROFILE or name in named}
-
-
-def roll_back(place: ReleasePlace, link: LinkParts, given: SentChange) -> str:
-    """Send the old files to both link containers again.
-
-    Args:
-        place: The release.
-        link: Its link before the change.
-        given: The change, which not both containers accepted.
-
-    Returns:
-        The differences from the state before the change, and what to do; "" if there are none.
-    """
-    values, _ = parse_yaml(link.files[PROFILE], PROFILE)
-    values = values if isinstance(values, dict) else {}
-    files = needed_files(values, link.files)
-    before = read_change(link.files.get(CHANGE_FILE, "")).number
-    number, cause = f"{given.change.number}-back", f"taken back: {given.change.cause}"
-    documents = {}
-    for part in COMPONENTS:
-        # A direction that never applied the change continues its old time line.
-        restart = given.change.restart and given.took(part)
-        change = {"number": number, "cause": cause, "restart": restart}
-        documents[part] = Handed(json.dumps(change) + "\n", before, files)
-    again = SentChange(Change(number, cause), send_to_both(place, link, documents))
-    return "; ".join(_words(place, link, values, given, again))
-
-
-def _words(
-    place: ReleasePlace,
-    link: LinkParts,
-    values: Mapping[str, Any],
-    given: SentChange,
-    again: SentChange,
-) -> Iterator[str]:
-    """Describe the final state of each direction."""
-    for part, way in DIRECTION_OF.items():
-        own, answer = values.get(way) or {}, again.answers[part]
-        if again.took(part):
-            if given.took(part):
-                restarted = given.change.restart and any(own.get(key) for key in TIME_LINE_KEYS)
-                timed = "; its time line starts again" if restarted else ""
-                yield f"the {way} had the change for a moment and has its old profile again{timed}"
-        elif isinstance(answer, LinkState) and not again.refused(part):
-            yield f"the {way} (pod {link.pods[part]}) gets its old profile when it responds"
-        else:
-            keeps = "keeps the change" if given.took(part) else "may have the change"
-            if given.refused(part):
-                keeps = "may apply the refused change when its container restarts"
-            why = answer.refusal if isinstance(answer, LinkState) else str(answer)
-            yield (
-                f"the {way} (pod {link.pods[part]}) {keeps}, because the old profile could not be "
-                f"restored: {why}; send the old profile to both again: {_command(place, way, own)}"
-            )
-
-
-def _command(place: ReleasePlace, way: str, own: Mapping[str, Any]) -> str:
-    """Return a command that sets a value to its present value, and so sends the whole profile.
-
-    The value is `keep_order`, which no time line changes.
-    """
-    order = "true" if own.get("keep_order") else "false"
-    words = ["cloudrc link set", f"{way}.keep_order={order}", f"--release={place.name}"]
-    return " ".join([*words, *place.flags])
-
-
-class AppliedEdit(NamedTuple):
-    """A change that was sent to both link containers.
-
-    Attributes:
-        edit: The edited profile.
-        told: States of uplink and downlink after the change.
-        keep: Writes the change into the ConfigMap, so that it survives a restart; raises a
-            ClusterError.
-        take_back: Sends the old files again, and returns the differences from the state before;
-            "" if there are none.
-    """
-
-    edit: Edit
-    told: list[LinkState]
-    keep: Callable[[], None]
-    take_back: Callable[[], str]
-
-
-def change_profile(
-    place: ReleasePlace,
-    link: LinkParts,
-    profile: str | None,
-    settings: Sequence[str],
-    change: Callable[[Edit], str],
-) -> AppliedEdit:
-    """Change the profile of a release, and wait until both directions have accepted or refused it.
-
-    Args:
-        place: The release.
-        link: Its present link.
-        profile: New profile, as in `cloudrc.config.edit.edit`.
-        settings: Values to set, as in `cloudrc.config.edit.edit`.
-        change: Returns the text of the file beside the profile: who changed it, and why.
-
-    Raises:
-        CloudrcError: If the request is not valid, or the cluster refuses.
-    """
-    edited, files = with_files(link.files, profile, settings)
-    files[CHANGE_FILE] = change(edited)
-    whole = needed_files(edited.values, {**link.files, **files})
-    before = read_change(link.files.get(CHANGE_FILE, "")).number
-    handed = Handed(files[CHANGE_FILE], before, whole)
-    answers = send_to_both(place, link, dict.fromkeys(COMPONENTS, handed))
-    given = SentChange(read_change(files[CHANGE_FILE]), answers)
-    keep = partial(write_files, place, link.name, files)
-    back = partial(roll_back, place, link, given)
-    if failed := [answer for answer in answers.values() if isinstance(answer, CloudrcError)]:
-        _keep_or_take_back(failed, given, keep, back)
-    told = [answer for answer in answers.values() if isinstance(answer, LinkState)]
-    return AppliedEdit(edited, told, partial(_keep_applied, keep), back)
-
-
-def _keep_applied(keep: Callable[[], None]) -> None:
-    """Write a change that is in force in both directions into the ConfigMap."""
-    try:
-        keep()
-    except CloudrcError as error:
-        raise ClusterError(f"{error}; the change is in force until the pods are replaced") from None
-
-
-def _keep_or_take_back(
-    failed: Sequence[CloudrcError],
-    given: SentChange,
-    keep: Callable[[], None],
-    back: Callable[[], str],
-) -> NoReturn:
-    """Write the change into the ConfigMap if no container refused it; else take it back.
-
-    Raises:
-        ClusterError: Always; it describes the final state.
-    """
-    error: CloudrcError = failed[0]
-    other_version = any(isinstance(each, UnknownStateError) for each in failed)
-    if not other_version and not any(map(given.refused, COMPONENTS)):
-        try:
-            keep()
-        except CloudrcError as refusal:
-            if not any(map(given.took, COMPONENTS)):
-                raise
-            error = refusal
-        else:
-            raise ClusterError(
-                f"{error}; the ConfigMap has the change, and the pods apply it within 2 minutes"
-            )
-    raise ClusterError("; ".join(filter(None, [str(error), back()])))
 
 
 def with_files(

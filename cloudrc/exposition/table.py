@@ -180,7 +180,7 @@ LINKS = (
     ),
     counter(
         "cloudrc_link_restored_total",
-        "Times that another program removed or changed netem's qdisc and it was restored.",
+        "Times that another program removed or changed netem's qdisc.",
         (LINK,),
     ),
     gauge(

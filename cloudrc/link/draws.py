@@ -164,10 +164,6 @@ PARETO_CUT = 1e-3
 _PARETO_MEAN = 1.5 * (1.0 - PARETO_CUT ** (2 / 3)) / (1.0 - PARETO_CUT)
 _PARETO_SQUARE = 3.0 * (1.0 - PARETO_CUT ** (1 / 3)) / (1.0 - PARETO_CUT)
 _PARETO_DEVIATION = sqrt(_PARETO_SQUARE - _PARETO_MEAN**2)
-_PARETO_REACH: float = (_PARETO_MEAN - 1.0) / _PARETO_DEVIATION
-_NORMAL_REACH = 8.3
-"""Largest distance below 0 of a normal variate [1]: that of the smallest uniform draw. With
-correlation a lower value is possible, once in about 10^15 packets."""
 _HALF_ROOT = sqrt(0.5)
 
 
@@ -272,15 +268,6 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
     return [
         ((PARETO_CUT + kept * s) ** (-1 / 3) - _PARETO_MEAN) / _PARETO_DEVIATION for s in survival
     ]
-
-
-def reach(profile: DirectionProfile) -> float:
-    """Return the largest distance of a variate of `shape` below 0 [1]."""
-    if profile.distribution == "table":
-        return -min(profile.table)
-    if profile.distribution == "uniform":
-        return 1.0
-    return _NORMAL_REACH if profile.distribution == "normal" else _PARETO_REACH
 
 
 def _from_table(

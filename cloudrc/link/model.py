@@ -22,7 +22,6 @@ from cloudrc.link.draws import (
     Fate,
     bit_flips,
     impairments,
-    reach,
     stream_key,
 )
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
@@ -51,7 +50,6 @@ class LinkDirection:
 
     Attributes:
         corrupts: Whether datagrams may be damaged; then `corrupted` must be called.
-        least_delay_ns: Lower bound of the delay of all packets [ns].
     """
 
     def __init__(
@@ -91,8 +89,6 @@ class LinkDirection:
         self.corrupts = profile.corrupt > 0.0
         self._profile = profile
         self._timeline = Timeline(profile)
-        reorders = profile.reorder > 0.0
-        self.least_delay_ns = 0 if reorders else self._timeline.least_delay_ns(reach(profile))
         only = self._timeline.only()
         shaped = only is None or only.blackout or only.rate is not None or profile.keep_order
         self._always = None if shaped else only

@@ -184,16 +184,6 @@ class Timeline:
         """Return the conditions `elapsed_ns` [ns] after the link came up."""
         return self._pieces[max(bisect_right(self.starts_ns, elapsed_ns) - 1, 0)]
 
-    def least_delay_ns(self, reach: float) -> int:
-        """Return a lower bound of the delay of all packets [ns], >= 0.
-
-        Args:
-            reach: Largest distance of a delay below its mean, in units of the jitter [1].
-        """
-        passing = [piece for piece in self._pieces if not piece.blackout]
-        least = [piece.delay_ns - round(reach * piece.jitter * 1e9) for piece in passing]
-        return max(0, min(least, default=0))
-
     def only(self) -> Conditions | None:
         """Return the conditions if they never change, otherwise None."""
         return self._pieces[0] if len(self._pieces) == 1 else None

@@ -1,13 +1,6 @@
-"""The `link` container of a pod: it chooses a shaper, tells the route, and follows what changes.
+"""Run the `link` container of a pod: choose a shaper, publish the route, follow what changes.
 
-Peer and profile come from other threads, which leave them here; the shaper is touched by the one
-thread that is in `run` and by no other.
-
-What a pod's sidecar asks of whatever shapes the pod's egress: relay or netem.
-
-What a link's process tells whoever judges it: who shapes, what is in force, whose netem is near.
-
-It is found out when somebody asks (/link.json of the metrics' port): tc and ip are started for it.
+Other threads leave the peer and the profile here; only the thread in `run` touches the shaper.
 """
 
 from __future__ import annotations
@@ -37,9 +30,17 @@ from cloudrc.link.state import (
 )
 from cloudrc.link.tc import Iproute2, Run, check, notes
 
+Mode: TypeAlias = Literal["auto", "netem", "relay"]
+COUNT_PERIOD_NS = 1_000_000_000
+"""Time between two updates of the metrics [ns]."""
+RELEASED_PERIOD_NS = 2_000_000_000
+"""Time between two publications of how late datagrams left [ns]; an end reads it as often."""
+STEP = 0.05
+"""Longest time in which a change that was left here is not seen [s]."""
+
 
 class Shaper(Protocol):
-    """Shapes what one pod's tunnel end sends to the other's."""
+    """Shapes what one pod's tunnel end sends to the other's: the relay, or netem."""
 
     @property
     def name(self) -> str:
@@ -62,7 +63,7 @@ class Shaper(Protocol):
 
         Args:
             profile: Conditions.
-            restart: Whether their time line counts from now; else from when the old one did.
+            restart: Whether their time line starts now; otherwise it continues.
 
         Raises:
             CloudrcError: If it cannot; then the old profile stays in force.
@@ -74,11 +75,11 @@ class Shaper(Protocol):
         ...
 
     def counts(self) -> dict[str, int]:
-        """Say how many datagrams met which outcome so far."""
+        """Return how many datagrams met which outcome so far."""
         ...
 
     def released(self) -> dict[str, int]:
-        """Say how late datagrams left since the beginning; empty if that is not known here."""
+        """Return how late datagrams left since the beginning; empty if that is not known."""
         ...
 
     def close(self) -> None:
@@ -86,12 +87,16 @@ class Shaper(Protocol):
         ...
 
 
+Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
+"""Makes a shaper from conditions and the start of their time line [ns]."""
+
+
 @dataclass(frozen=True, slots=True)
 class Near:
     """The netem qdiscs of a network namespace, whoever put them there.
 
     Attributes:
-        interface: Over which the tunnel's flow leaves.
+        interface: The one through which the tunnel's flow leaves.
         netems: By interface: objects of `tc -s -j qdisc show`; only where there are any.
     """
 
@@ -106,7 +111,7 @@ class Told:
     Attributes:
         shaper: "relay" or "netem".
         why: Why this one, in words.
-        applied: What it was told to put in force and has; None while a time line runs.
+        applied: What it was asked to apply and has applied; None while a time line runs.
         near: What the kernel says; None where that cannot be asked.
     """
 
@@ -129,11 +134,6 @@ def look_near(run: Run, host: str) -> Near | None:
     return Near(interface, netems)
 
 
-def in_force_now(profile: DirectionProfile, elapsed_ns: int) -> DirectionProfile | None:
-    """Say what holds so long [ns] after the link came up, if it holds for ever; else None."""
-    return settled(profile) if elapsed_ns >= Timeline(profile).starts_ns[-1] else None
-
-
 def write_told(told: Told) -> str:
     """Write it as JSON."""
     return TypeAdapter(Told).dump_json(told, indent=2).decode() + "\n"
@@ -142,18 +142,6 @@ def write_told(told: Told) -> str:
 def read_told(text: str) -> Told:
     """Read it; raises a ValueError if it is something else."""
     return TypeAdapter(Told).validate_json(text)
-
-
-Mode: TypeAlias = Literal["auto", "netem", "relay"]
-Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
-"""Makes a shaper from conditions and the instant [ns] that their time line counts from."""
-
-COUNT_PERIOD_NS = 1_000_000_000
-RELEASED_PERIOD_NS = 2_000_000_000
-"""Between two tellings of how late datagrams left [ns]: as often as an end notes it."""
-_WAIT = 0.05
-_STEP = 0.05
-"""Longest time in which a change that was left here is not seen [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +172,7 @@ class Machine:
         try_netem: Raises a CloudrcError if this kernel has no netem; leaves nothing behind.
         clock: Monotonic [ns].
         today: Date and time in UTC as text, for reports.
-        wait: Sleeps for so long [s].
+        wait: Sleeps for a time [s].
         log: Gets lines for people.
     """
 
@@ -199,10 +187,10 @@ class Machine:
 
 
 class Watcher(Protocol):
-    """Whoever keeps the metrics."""
+    """Keeps the metrics of a sidecar."""
 
     def shapes(self, shaper: str) -> None:
-        """Learn that from now on this shaper is in force, and that the route is told."""
+        """Learn that this shaper is in force from now on, and that the route is published."""
         ...
 
     def asked(self, delay: float) -> None:
@@ -218,7 +206,7 @@ class Sidecar:
     """Shapes what one pod's tunnel end sends to the other's.
 
     Attributes:
-        peer: Where the other pod's tunnel end is; another thread sets it.
+        peer: Address of the other pod's tunnel end; another thread sets it.
         profile: What is asked for; another thread sets it.
     """
 
@@ -227,21 +215,19 @@ class Sidecar:
     ) -> None:
         self.peer: Address | None = None
         self.profile = profile
-        self._settings = settings
-        self._machine = machine
-        self._watcher = watcher
+        self._settings, self._machine, self._watcher = settings, machine, watcher
         self._reason = ""
         self._origin_ns: int | None = None
         self._state: LinkState | None = None
         self._published: LinkState | None = None
         self._in_force: tuple[LinkState, DirectionProfile] | None = None
         self._released, self._released_ns = settings.state.with_suffix(RELEASED_SUFFIX), 0
-        self._seen = profile.change.number
+        self._number = profile.change.number
 
     def run(
         self, stop: Callable[[], bool], wait_for_peer: Callable[[], None] = lambda: None
     ) -> None:
-        """Shape until `stop` says True.
+        """Shape until `stop` returns True.
 
         Args:
             stop: Whether to end.
@@ -253,12 +239,12 @@ class Sidecar:
         """
         withdraw(self._settings.route)  # an earlier process may have left one
         if self._settings.mode == "netem":
-            self._insist()
+            self._check_netem()
         wait_for_peer()
         while self.peer is None:
             if stop():
                 return
-            self._machine.wait(_WAIT)
+            self._machine.wait(STEP)
         try:
             while not stop():
                 self._shape(self.peer, stop)
@@ -267,15 +253,16 @@ class Sidecar:
             withdraw(self._released)
 
     def told(self) -> Told | None:
-        """Say who shapes, and what is in force; None before that. Other threads may ask."""
+        """Say what shapes, and what is in force; None before that. Any thread may call this."""
         if self._in_force is None:
             return None
         state, profile = self._in_force
         elapsed_ns = self._machine.clock() - (state.origin_ns or 0)
-        return Told(state.shaper, state.reason, in_force_now(profile, elapsed_ns))
+        over = elapsed_ns >= Timeline(profile).starts_ns[-1]
+        return Told(state.shaper, state.reason, settled(profile) if over else None)
 
-    def _insist(self) -> None:
-        """Find out whether netem will do, before anybody is waited for."""
+    def _check_netem(self) -> None:
+        """Find out whether netem will do, before the peer is waited for."""
         if not self._machine.may_shape:
             raise MissingPrerequisiteError(
                 "link.mode=netem needs uid 0 and NET_ADMIN; give this container both, or set "
@@ -301,26 +288,15 @@ class Sidecar:
                     profile = self.profile
                     if not self._replace(shaper, profile):
                         return
-                shaper.step(_STEP)
+                shaper.step(STEP)
                 if (now_ns := self._machine.clock()) >= count_ns:
                     count_ns = now_ns + COUNT_PERIOD_NS
                     self._count(shaper, now_ns)
         finally:
             shaper.close()
 
-    def _count(self, shaper: Shaper, now_ns: int) -> None:
-        """Tell how it goes: the metrics what became of datagrams, this pod's end how late."""
-        if self._watcher:
-            self._watcher.counted(now_ns, shaper.counts())
-        if self._published is not self._state:
-            self._publish()
-        if now_ns >= self._released_ns and (released := shaper.released()):
-            self._released_ns = now_ns + RELEASED_PERIOD_NS
-            with suppress(OSError):  # a full disk is no reason to stop shaping
-                publish(self._released, json.dumps(released))
-
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
-        """Take the shaper of the mode, or find out which one works; say why."""
+        """Take the shaper of the mode, or find out which one works; remember why."""
         machine, mode = self._machine, self._settings.mode
         self._reason = f"link.mode={mode}"
         if mode != "relay":
@@ -328,47 +304,48 @@ class Sidecar:
             try:
                 if not machine.may_shape:
                     raise MissingPrerequisiteError("no uid 0 with NET_ADMIN")
-                route = netem.follow_peer(peer)
+                return netem, netem.follow_peer(peer)
             except CloudrcError as error:
                 if mode == "netem":
                     raise
                 self._reason = f"netem does not work here: {_cause(error)}"
-            else:
-                return netem, route
         relay = machine.relay(profile.direction, self._origin_ns or 0)
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
-        """Put a new profile in force; False if that takes another shaper."""
+        """Apply a new profile; return False if that takes another shaper."""
+        change = self._change_of(profile)
         try:
-            shaper.follow_profile(profile.direction, restart=self._change_of(profile).restart)
+            shaper.follow_profile(profile.direction, restart=change.restart)
         except CloudrcError as error:
             if self._settings.mode == "auto":
                 self._machine.log(f"changes the shaper: {_cause(error)}")
                 return False
             self._machine.log(f"the new profile is refused, the old one stays: {error}")
-            self._refuse(profile, str(error))
+            if self._state is not None:
+                number = profile.change.number
+                self._state = replace(self._state, refused=number, refusal=str(error))
+                self._publish()
             return True
-        if self._change_of(profile).restart:
+        if change.restart:
             self._origin_ns = self._machine.clock()
-        self._machine.log(f"the new profile is in force ({self._change_of(profile).cause})")
+        self._machine.log(f"the new profile is in force ({change.cause})")
         self._tell(shaper, profile)
         return True
 
+    def _change_of(self, profile: Loaded) -> Change:
+        """Return the change of a profile; a note that was there before is not about this one."""
+        return profile.change if profile.change.number != self._number else Change()
+
     def _announce(self, shaper: Shaper, route: Address, profile: Loaded) -> None:
-        settings = self._settings
-        self._machine.log(f"{shaper.name} shapes the {settings.direction} ({self._reason})")
+        self._machine.log(f"{shaper.name} shapes the {self._settings.direction} ({self._reason})")
         self._tell(shaper, profile)
-        publish_route(settings.route, route)
+        publish_route(self._settings.route, route)
         if self._watcher:
             self._watcher.shapes(shaper.name)
 
-    def _change_of(self, profile: Loaded) -> Change:
-        """Say who changed a profile; a note that was there before is not about this change."""
-        return profile.change if profile.change.number != self._seen else Change()
-
     def _tell(self, shaper: Shaper, profile: Loaded) -> None:
-        """Write for ends, users and reports what shapes the link from now on."""
+        """Publish for ends, users and reports what shapes the link from now on."""
         before, change, asked = self._state, self._change_of(profile), summary(profile.direction)
         for note in notes(profile.direction) if shaper.name == "netem" else ():
             self._machine.log(note)
@@ -387,19 +364,24 @@ class Sidecar:
             origin_ns=self._origin_ns,
         )
         self._in_force = self._state, profile.direction
-        self._seen = profile.change.number
+        self._number = profile.change.number
         self._publish()
         if self._watcher:
             self._watcher.asked(asked["delay"] or 0.0)
 
-    def _refuse(self, profile: Loaded, why: str) -> None:
-        """Write for users that their change did not take force."""
-        if self._state is not None:
-            self._state = replace(self._state, refused=profile.change.number, refusal=why)
+    def _count(self, shaper: Shaper, now_ns: int) -> None:
+        """Update the metrics, and tell this pod's end how late datagrams left."""
+        if self._watcher:
+            self._watcher.counted(now_ns, shaper.counts())
+        if self._published is not self._state:
             self._publish()
+        if now_ns >= self._released_ns and (released := shaper.released()):
+            self._released_ns = now_ns + RELEASED_PERIOD_NS
+            with suppress(OSError):  # a full disk is no reason to stop shaping
+                publish(self._released, json.dumps(released))
 
     def _publish(self) -> None:
-        """Write the state for others; what a full disk does not take is written a second later."""
+        """Write the state; what a full disk does not take is written a second later."""
         if self._state is not None:
             with suppress(OSError):
                 publish(self._settings.state, to_text(self._state))
@@ -407,5 +389,5 @@ class Sidecar:
 
 
 def _cause(error: CloudrcError) -> str:
-    """Take from an error what is wrong, without what to do about it."""
+    """Take the cause from an error, without the remedy."""
     return str(error).partition("; ")[0]

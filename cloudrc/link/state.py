@@ -17,6 +17,8 @@ from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
 STATE_FILE = "link.json"
 """Name of the state file, beside the route file."""
+PROFILE_FILE = "profile.json"
+"""Name of the profile that a local run's relay follows, in the folder of its states."""
 STATE_MAX = 1 << 16
 """Size limit of a state file that an end of the tunnel reads [bytes], about 800 changes of a time
 line; a file of 1 MiB could block the loop for 2 s."""

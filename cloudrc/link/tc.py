@@ -1,28 +1,19 @@
-"""How iproute2 is asked and understood: argument lists go to a runner, answers come out as data.
+"""Ask iproute2, and translate a profile into the words and the tables of jitter of tc-netem.
 
-Nothing here starts a process: whoever has the right to, passes the runner in.
-
-The model's distributions of jitter in the form that tc-netem takes: one file of integers each.
-
-netem draws an entry of a table of up to 16,384 and multiplies it by the jitter; 8192 stands for 1,
-and 16 bits end at 4. tc's own tables are not ours (see `fates.shape`), and it has none for the
-uniform distribution, without which a qdisc cannot go back to uniform once it had another.
-
-Source: iproute2 netem/README.distribution, Linux, net/sched/sch_netem.c (tabledist).
-
-A direction's conditions in tc's words: a profile goes in, the words after `netem` come out.
-
-What netem cannot do is refused by its name.
-
-Every option is spelled out every time: `tc qdisc change` leaves the rate and the correlation that
+Every option of netem is written every time: `tc qdisc change` leaves a rate and a correlation that
 are not named as they were.
+
+netem draws jitter from a table of at most 16,384 integers of 16 bits; 8192 stands for the jitter.
+tc's own tables differ from the model's distributions, and there is none for the uniform one.
+
+Source: tc-netem(8); iproute2 netem/README.distribution; Linux, net/sched/sch_netem.c (tabledist).
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from hashlib import blake2b
 from itertools import pairwise
 from math import ceil, sqrt
@@ -34,12 +25,14 @@ from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 from cloudrc.link.draws import PARETO_CUT
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
 
+NOT_FOUND = 127
+"""Exit code when the program does not exist."""
 _TRIAL = "7402:"
 _INSTEAD = "set link.mode=relay, which needs nothing of the kernel"
 
 
 class Answer(NamedTuple):
-    """What a program said: its exit code, standard output and standard error."""
+    """Exit code, standard output and standard error of a program."""
 
     code: int
     output: str
@@ -47,7 +40,7 @@ class Answer(NamedTuple):
 
 
 Run: TypeAlias = Callable[[Sequence[str]], Answer]
-"""Runs a program to its end; 127 is the code of one that is not there."""
+"""Runs a program to its end."""
 
 
 class Iproute2:
@@ -65,7 +58,7 @@ class Iproute2:
         return list(json.loads(self._checked("tc", ("-s", "-j", *words)) or "[]"))
 
     def device(self, host: str) -> str:
-        """Name the interface over which an address is reached."""
+        """Return the interface through which an address is reached."""
         routes = json.loads(self._checked("ip", ("-j", "route", "get", host)))
         return str(routes[0]["dev"])
 
@@ -79,7 +72,7 @@ class Iproute2:
 def try_netem(run: Run) -> None:
     """Find out whether this kernel has netem, by a qdisc on the loopback that delays nothing.
 
-    A qdisc of somebody else is left alone: then nothing is found out.
+    A qdisc of another program is left alone: then nothing is found out.
 
     Raises:
         MissingPrerequisiteError: If there is none, or this container may not use it.
@@ -94,31 +87,32 @@ def try_netem(run: Run) -> None:
 
 
 def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
-    """Put an answer that is not the wanted one into words: the cause, and what to do."""
+    """Make the error for a failed call: the cause, and what to do."""
     text = answer.error or answer.output
-    kind = _kind(words)
-    if answer.code == 127:
-        return MissingPrerequisiteError(
-            f"no program {program} (package iproute2); install it, or {_INSTEAD}"
-        )
+    kind = next((word for word in words if word in ("netem", "prio")), "")
     missing = kind and "change" not in words and "No such file or directory" in text
-    if missing or "qdisc kind is unknown" in text:
-        return MissingPrerequisiteError(
-            f"this kernel has no sch_{kind or 'netem'}; {_INSTEAD}, or use nodes whose kernel has "
-            f"it ('modprobe sch_{kind or 'netem'}' there) and a namespace for privileged pods"
+    if answer.code == NOT_FOUND:
+        said = f"no program {program} (package iproute2); install it, or {_INSTEAD}"
+    elif missing or "qdisc kind is unknown" in text:
+        module = f"sch_{kind or 'netem'}"
+        said = (
+            f"this kernel has no {module}; {_INSTEAD}, or use nodes whose kernel has it "
+            f"('modprobe {module}' there) and a namespace for privileged pods"
         )
-    if "classifier not found" in text:
-        return MissingPrerequisiteError(
+    elif "classifier not found" in text:
+        said = (
             f"this kernel has neither cls_u32 nor cls_flower; {_INSTEAD}, or use a node whose "
             "kernel has one of them"
         )
-    if "Operation not permitted" in text:
-        return MissingPrerequisiteError(
-            f"tc may not change the network of this container; give it NET_ADMIN and uid 0, or "
+    elif "Operation not permitted" in text:
+        said = (
+            "tc may not change the network of this container; give it NET_ADMIN and uid 0, or "
             f"{_INSTEAD}"
         )
-    line = " ".join(text.split()) or f"exit code {answer.code}"
-    return MissingPrerequisiteError(f"'{program} {' '.join(words)}' failed: {line}; {_INSTEAD}")
+    else:
+        line = " ".join(text.split()) or f"exit code {answer.code}"
+        said = f"'{program} {' '.join(words)}' failed: {line}; {_INSTEAD}"
+    return MissingPrerequisiteError(said)
 
 
 def may_shape(status: str) -> bool:
@@ -133,19 +127,14 @@ def may_shape(status: str) -> bool:
     return uid[1] == "0" and bool(int(effective[1], 16) >> 12 & 1)
 
 
-def _kind(words: Sequence[str]) -> str:
-    """Name the kind of qdisc that a command is about, if it is about one."""
-    return next((word for word in words if word in ("netem", "prio")), "")
-
-
 ENTRIES = 4096
+"""Length of a table [1]."""
 STRETCH = {"uniform": 1, "normal": 1, "pareto": 4}
-"""How many times smaller than the jitter a table's entries are, so that its tail fits in 16 bits;
-the jitter that tc is given has to be as many times larger."""
-
+"""Factor by which a table's entries are smaller than the jitter, so that its tail fits in 16 bits;
+the jitter that tc gets is larger by the same factor."""
 _ONE = 8192
-_END = 32_767 / _ONE
-"""Largest entry in units of the jitter: 16 bits."""
+_END_OF_TABLE = 32_767 / _ONE
+"""Largest entry, 16 bits, in units of the jitter [1]."""
 
 
 def _pareto(share: float) -> float:
@@ -179,28 +168,28 @@ def table(distribution: str) -> list[int]:
 
 
 def stretch(profile: DirectionProfile) -> int:
-    """Say by what the jitter that tc is given is larger than a profile's, as in `STRETCH`."""
+    """Return the factor by which tc's jitter is larger than a profile's, as in `STRETCH`."""
     if profile.distribution != "table":
         return STRETCH[profile.distribution]
-    return ceil(max(map(abs, profile.table)) / _END) or 1
+    return ceil(max(map(abs, profile.table)) / _END_OF_TABLE) or 1
 
 
 def distribution_name(profile: DirectionProfile) -> str:
     """Name a profile's distribution for tc: one of `STRETCH`, or that of a measured table."""
     if profile.distribution != "table":
         return profile.distribution
-    # Letters and digits: tc makes a file's name of it. Another table is another file.
+    # tc makes a file name of it, so only letters and digits; another table is another file.
     return "table" + blake2b(repr(profile.table).encode(), digest_size=8).hexdigest()
 
 
 def write_tables(folder: Path) -> None:
-    """Write all tables as tc finds them when the environment's TC_LIB_DIR names this folder."""
+    """Write all tables as tc finds them if its TC_LIB_DIR names this folder."""
     for distribution in STRETCH:
         _write(folder, distribution, table(distribution))
 
 
 def write_measured(folder: Path, profile: DirectionProfile) -> None:
-    """Write the table of a profile whose distribution was measured; else do nothing."""
+    """Write the table of a profile with a measured distribution; else do nothing."""
     if profile.distribution == "table":
         unit, values = _ONE / stretch(profile), sorted(profile.table)
         picked = [values[(2 * i + 1) * len(values) // (2 * ENTRIES)] for i in range(ENTRIES)]
@@ -208,34 +197,30 @@ def write_measured(folder: Path, profile: DirectionProfile) -> None:
 
 
 def _write(folder: Path, name: str, entries: Iterable[int]) -> None:
-    listed = list(entries)
-    rows = [listed[start : start + 8] for start in range(0, ENTRIES, 8)]
-    text = "\n".join(" ".join(map(str, row)) for row in rows)
-    (folder / f"{name}.dist").write_text(f"# {name}\n{text}\n")
+    (folder / f"{name}.dist").write_text("\n".join([f"# {name}", *map(str, entries), ""]))
 
 
 STEP_NS = 5_000_000
-"""Shortest time between two steps of the qdisc [ns]; what changes faster is passed over."""
+"""Shortest time between two steps of the qdisc [ns]; faster changes are passed over."""
 LIMIT = 10_000
-"""Packets that the qdisc holds at once, as many as the relay."""
+"""Limit of packets in the qdisc without a bottleneck [1], as in the relay."""
 DELAY_MAX_NS = 274_000_000_000
-"""tc keeps times in 64 ns ticks of 32 bits and refuses what is longer [ns]."""
-
+"""Longest delay that tc accepts [ns]: ticks of 64 ns in 32 bits."""
 _IN_ORDER = "100gbit"
-"""netem lets no packet leave before the one before it as soon as it has a rate, whichever."""
+"""A rate, however high, makes netem keep the order."""
 _ETHERNET_BYTES = 14
-"""netem counts the Ethernet header, the model does not."""
+"""Length of the Ethernet header, which netem counts and the model does not [bytes]."""
 _PACKET_BITS = 8 * 116
-"""A command, the smaller of our datagrams, with its headers: more of them fit into a delay."""
+"""Size of a command with its headers, the smaller of the two kinds of datagram [bit]."""
 _PACKETS = 1_000
-"""More than a tunnel sends in a second, or a probe, where no rate says how many pass [1/s]."""
+"""Datagrams a second where no rate limits them, more than a tunnel or a probe sends [1/s]."""
 _TABLE_END = 4.0
-"""Longest draw of a table, in units of the jitter that tc is given."""
+"""Longest draw of a table, in units of the jitter that tc gets [1]."""
 
 
 def check(profile: DirectionProfile) -> None:
     """Raise a BadInputError that names what netem cannot do of a profile."""
-    pieces = list(_pieces(profile))
+    pieces = _pieces(profile)
     if any(isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad for piece in pieces):
         _refuse("loss.delay_bad_ms", "more delay while a burst of losses lasts")
     if any(piece.rate and piece.jitter for piece in pieces) and not profile.keep_order:
@@ -250,8 +235,14 @@ def check(profile: DirectionProfile) -> None:
             )
 
 
+def _refuse(key: str, meaning: str) -> None:
+    raise BadInputError(
+        f"netem cannot do {key} ({meaning}); set link.mode=relay, which can, or leave it out"
+    )
+
+
 def notes(profile: DirectionProfile) -> list[str]:
-    """Say in words what netem realises otherwise than asked."""
+    """Say in words what netem realises differently from the profile."""
     said = []
     if profile.jitter and profile.correlation:
         said.append(f"netem realises next to nothing of correlation {profile.correlation:g}")
@@ -271,12 +262,12 @@ def notes(profile: DirectionProfile) -> list[str]:
 
 
 def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
-    """Put what holds at one instant into tc's words.
+    """Translate the conditions of one instant.
 
     Args:
         profile: Passed `check`.
         conditions: That hold now.
-        room: Its `limit`, which takes long to work out for a trace [packets].
+        room: Limit of the qdisc [packets].
 
     Returns:
         Arguments for `tc qdisc add|change ... netem`.
@@ -289,42 +280,34 @@ def options(profile: DirectionProfile, conditions: Conditions, room: int) -> lis
     # Of a packet that is doubled and lost one copy arrives: in a blackout none may.
     copied = 0.0 if conditions.blackout else profile.duplicate
     words += ["duplicate", _percent(copied), "corrupt", _percent(profile.corrupt)]
-    # tc refuses it without a delay, where nothing is there to be overtaken.
+    # tc refuses it without a delay, where there is nothing to overtake.
     if profile.reorder and conditions.delay_ns and not profile.keep_order:
         words += ["reorder", _percent(profile.reorder)]
     if conditions.rate is not None:
         return [*words, "rate", f"{conditions.rate:.0f}bit", str(-_ETHERNET_BYTES)]
-    # A rate is the one way to keep the order; 0 takes back one that was given before.
+    # 0 takes back a rate that was given before.
     return [*words, "rate", _IN_ORDER if profile.keep_order else "0bit"]
 
 
 def limit(profile: DirectionProfile) -> int:
-    """Give room for what is under way at most and, behind a bottleneck, for its queue [packets].
+    """Return the room for all packets under way and, behind a bottleneck, for its queue [packets].
 
-    One number for the whole time line: a step to a shorter delay must not turn packets away
-    because those of the longer one are still under way.
+    One number for the whole time line: a step to a shorter delay must not drop packets because
+    those of the longer one are still under way.
     """
-    pieces = list(_pieces(profile))
+    pieces = _pieces(profile)
     if all(piece.rate is None for piece in pieces):
         return LIMIT
-    reach = stretch(profile) * _TABLE_END  # once: a trace has many pieces, a table many entries
-    return ceil(profile.queue_packets + max(_under_way(piece, reach) for piece in pieces))
+    reach, most = stretch(profile) * _TABLE_END, 0.0
+    for piece in pieces:
+        longest = piece.delay_ns * 1e-9 + piece.jitter * reach
+        most = max(most, longest * (piece.rate / _PACKET_BITS if piece.rate else _PACKETS))
+    return ceil(profile.queue_packets + most)
 
 
-def _under_way(piece: Conditions, reach: float) -> float:
-    """Say how many packets behind the bottleneck are under way at once, at most.
-
-    Args:
-        piece: Of the time line.
-        reach: Longest draw, in units of the jitter [1].
-    """
-    longest = piece.delay_ns * 1e-9 + piece.jitter * reach
-    return longest * (_PACKETS if piece.rate is None else piece.rate / _PACKET_BITS)
-
-
-def _pieces(profile: DirectionProfile) -> Iterator[Conditions]:
+def _pieces(profile: DirectionProfile) -> list[Conditions]:
     timeline = Timeline(profile)
-    return (timeline.at(start_ns) for start_ns in timeline.starts_ns)
+    return [timeline.at(start_ns) for start_ns in timeline.starts_ns]
 
 
 def _loss(loss: Loss) -> list[str]:
@@ -340,9 +323,3 @@ def _microseconds(duration_ns: float) -> str:
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.9g}%"
-
-
-def _refuse(key: str, meaning: str) -> None:
-    raise BadInputError(
-        f"netem cannot do {key} ({meaning}); set link.mode=relay, which can, or leave it out"
-    )

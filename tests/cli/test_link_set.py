@@ -6,6 +6,8 @@ import json
 from collections.abc import Iterator
 from errno import ENOSPC
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -103,7 +105,8 @@ class Flight:
         folder.mkdir(parents=True)
         self.delays: list[tuple[str, float]] = []
         note = lambda way, delay: self.delays.append((way, delay))  # noqa: E731
-        self.control = RelayControl(folder / "link", self.links, first, note)
+        relay: Any = SimpleNamespace(take_in=lambda: None, released=lambda way: {})
+        self.control = RelayControl(folder / "link", self.links, first, note, relay)
 
     def wait(self, _: float) -> None:
         self.control.look()
@@ -170,22 +173,6 @@ def test_a_relay_that_does_not_answer_is_an_error(
         "cloudrc: error: the uplink and downlink did not apply the change within 0 s; "
         f"see {Path('runs/latest/relay.log')}\n"
     )
-
-
-def test_a_refused_change_is_an_error_with_the_reason(
-    flight: Flight, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = Path("runs/latest/link")
-
-    def refuse(_: float) -> None:
-        number = json.loads((folder / "change.json").read_text())["number"]
-        state = json.loads((folder / "uplink.json").read_text())
-        state |= {"refused": number, "refusal": "netem cannot do this"}
-        (folder / "uplink.json").write_text(json.dumps(state))
-
-    monkeypatch.setattr(link_set, "sleep", refuse)
-    assert main(["link", "set", "uplink.delay_ms=1"]) == 2
-    assert "the uplink is unchanged: netem cannot do this" in capsys.readouterr().err
 
 
 def test_a_named_run_that_does_not_fly_is_an_error(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import os
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -13,7 +12,6 @@ from cloudrc.cli import link_record
 from cloudrc.cli.link import ACTIONS
 from cloudrc.cli.link_verify import find_experiment
 from cloudrc.cli.main import main
-from cloudrc.cli.relay import export_requested_delay
 from cloudrc.config.load import load_experiment
 from cloudrc.link.traces import read_table, read_trace
 from tests.record.conftest import world_records, write
@@ -182,15 +180,6 @@ def test_a_file_with_any_key_of_an_experiment_is_verified_as_one(key: str, here:
     assert find_experiment("./mine.yaml", []).uplink == load_experiment("./mine.yaml").uplink
     (here / "mine.yaml").write_text("description: mine\nuplink: {delay_ms: 12}\n")
     assert find_experiment("./mine.yaml", []).uplink.delay_ms == 12.0
-
-
-def test_a_relay_exports_the_delay_of_its_trace(here: Path) -> None:
-    (here / "t.csv").write_text("time_s,delay_ms\n0,40\n5,90\n")
-    (here / "mine.yaml").write_text("link: {uplink: {trace: t.csv}, downlink: {delay_ms: 25}}\n")
-    told: dict[str, float] = {}
-    exporter = SimpleNamespace(asked=told.__setitem__)
-    export_requested_delay(exporter, load_experiment("./mine.yaml"))  # type: ignore[arg-type]
-    assert told == {"uplink": 0.04, "downlink": 0.025}
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])

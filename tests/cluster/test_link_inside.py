@@ -17,7 +17,7 @@ from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
 
 NOTE = json.dumps({"number": "b2", "cause": "zwölf", "restart": False})
 TRACE = "time_s,delay_ms\n" + "0,40\n" * 20_000
-DOCUMENT = write_handed(Handed(NOTE, "", {"profile.yaml": "uplink: {trace: t.csv}\n", "t": TRACE}))
+DOCUMENT = write_handed(Handed(NOTE, {"profile.yaml": "uplink: {trace: t.csv}\n", "t": TRACE}))
 
 
 def start(folder: Path, length: int = len(DOCUMENT.encode())) -> subprocess.Popen[str]:
@@ -36,7 +36,7 @@ def tell(folder: Path, **state: str) -> str:
 def test_the_script_hands_over_a_change_and_prints_the_state(
     tmp_path: Path, state: dict[str, str]
 ) -> None:
-    tell(tmp_path, change="a1", refused="b2-back")
+    tell(tmp_path, change="a1", refused="b22")
     running = start(tmp_path)
     decided = list[str]()
 

@@ -27,7 +27,7 @@ def test_a_change_reaches_both_pods_and_the_configmap(
     for pod in ("world-1", "cloud-1"):
         handed = cluster.handed(pod)[-1]
         assert handed["files"] == {"profile.yaml": cluster.patched()["profile.yaml"]}
-        assert (json.loads(handed["change"]), handed["after"]) == (change, "")
+        assert json.loads(handed["change"]) == change
     asked = cluster.asked()
     verbs = [word for line in asked for word in line.split() if word in ("get", "exec", "patch")]
     assert verbs == ["get", "exec", "exec", "patch"], "in force first, then for good"
@@ -36,18 +36,12 @@ def test_a_change_reaches_both_pods_and_the_configmap(
     assert shown[2].split()[:4] == ["downlink", "netem", "120", "ms"]
 
 
-def test_a_trace_goes_to_the_pods_with_the_previous_change(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_a_trace_goes_to_the_pods_and_the_configmap(cluster: Cluster, tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(TRACE)
-    cluster.items[0]["data"] |= {
-        "change.json": '{"number": "a1", "cause": "x", "restart": true}',
-        "old.csv": "of a profile before",
-    }
+    cluster.items[0]["data"] |= {"old.csv": "of a profile before"}
     cluster.tell()
     assert main(["link", "set", f"uplink.trace={tmp_path / 't.csv'}", "--release", "cloudrc"]) == 0
     handed = cluster.handed("world-1")[-1]
-    assert handed["after"] == "a1"
     assert set(handed["files"]) == {"profile.yaml", "uplink-t.csv"}
     assert handed["files"]["uplink-t.csv"] == cluster.patched()["uplink-t.csv"] == TRACE
 
@@ -76,22 +70,72 @@ def test_a_trace_too_long_for_a_configmap_is_refused(
         with_files({"profile.yaml": PROFILE}, None, [f"uplink.trace={tmp_path / 't.csv'}"])
 
 
-@pytest.mark.parametrize(
-    ("verb", "beside"),
-    [
-        ("patch", "the change is in force until the pods are replaced"),
-        ("exec", "the ConfigMap has the change, and the pods apply it within 2 minutes"),
-    ],
-)
-def test_a_partly_allowed_change_reports_the_final_state(
-    cluster: Cluster, capsys: pytest.CaptureFixture[str], verb: str, beside: str
+def error(capsys: pytest.CaptureFixture[str]) -> str:
+    """Return the one line of an error message."""
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+FORBIDDEN = "Error from server (Forbidden): this is forbidden"
+LATER = "; the ConfigMap has the change, and the pods apply it within 2 minutes"
+
+
+@pytest.mark.parametrize(("gone", "count"), [(["cloud-1"], 1), (["world-1", "cloud-1"], 2)])
+def test_an_unreachable_container_gets_the_change_later(
+    cluster: Cluster, capsys: pytest.CaptureFixture[str], gone: list[str], count: int
 ) -> None:
-    cluster.refuse(verb, "Error from server (Forbidden): this is forbidden")
+    for pod in gone:
+        cluster.make("broken", pod)
     assert main(["link", "set", "downlink.delay_ms=120", "-n", "demo"]) == 5
-    said = capsys.readouterr().err
-    assert "forbidden" in said
-    assert beside in said
-    assert len(said.splitlines()) == 1
+    said = error(capsys)
+    assert said.count("the pod is gone") == count
+    assert said.endswith(LATER)
+    assert cluster.kept()
+
+
+def test_without_the_right_to_write_the_change_does_not_last(
+    cluster: Cluster, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cluster.refuse("patch", FORBIDDEN)
+    assert main(["link", "set", "downlink.delay_ms=120", "-n", "demo"]) == 5
+    said = error(capsys)
+    assert "the ConfigMap is unchanged: 'kubectl patch configmap' failed" in said
+    for way in ("uplink", "downlink"):
+        assert f"the {way} has the change until its pod is replaced" in said
+
+
+def test_a_change_that_reaches_nobody_says_so(
+    cluster: Cluster, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for verb in ("patch", "exec"):
+        cluster.refuse(verb, FORBIDDEN)
+    assert main(["link", "set", "downlink.delay_ms=120", "-n", "demo"]) == 5
+    said = error(capsys)
+    assert said.count("this is forbidden") == 3
+    assert "has the change" not in said
+
+
+def test_a_change_that_one_direction_refuses_does_not_last(
+    cluster: Cluster, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cluster.make("cannot", "cloud-1", "corrupt")
+    assert main(["link", "set", "downlink.corrupt=0.5", "uplink.delay_ms=9", "-n", "demo"]) == 2
+    assert error(capsys) == (
+        "cloudrc: error: the downlink is unchanged: netem cannot do that; the uplink has the "
+        "change; the ConfigMap is unchanged, and restarted pods take it"
+    )
+    assert not cluster.kept()
+
+
+def test_a_silent_container_is_waited_for_and_named(
+    cluster: Cluster, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cluster.make("deaf", "cloud-1")
+    assert main(["link", "set", "downlink.delay_ms=120", "-n", "demo"]) == 4
+    assert error(capsys) == (
+        "cloudrc: error: the downlink did not apply the change within 5 s; see the log of the "
+        f"container link of pod cloud-1{LATER}"
+    )
 
 
 def test_a_container_of_another_version_is_reported(
@@ -99,10 +143,7 @@ def test_a_container_of_another_version_is_reported(
 ) -> None:
     (cluster.folder / "state-cloud-1.json").write_text("{}")
     assert main(["link", "set", "downlink.delay_ms=120", "-n", "demo"]) == 5
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "a link container has another version: not the state of a link" in line
-    assert "the uplink had the change for a moment and has its old profile again" in line
-    assert not cluster.kept()
+    assert "a link container has another version: not the state of a link" in error(capsys)
 
 
 def test_a_missing_release_is_reported(

@@ -196,7 +196,7 @@ def test_the_link_is_set_by_hand_and_read_back(flight: None, note: Callable[[str
 def hand_behind_its_back(component: str, profile: dict[str, Any]) -> None:
     """Hand a profile to one pod's link container alone; `link set` hands it to both."""
     change = {"number": str(time.time_ns()), "cause": "a seeded fault", "restart": False}
-    handed = Handed(json.dumps(change), "", {PROFILE: yaml.safe_dump(profile)})
+    handed = Handed(json.dumps(change), {PROFILE: yaml.safe_dump(profile)})
     where, name = ReleasePlace(None, NAMESPACE, NAME), str(pod(component)["metadata"]["name"])
     told = json.loads(send_change(where, name, handed))
     assert told["change"] == change["number"], told

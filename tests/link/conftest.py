@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cloudrc.cli.link_run import Programs, make_programs
+from cloudrc.drivers.iproute2 import Programs
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
@@ -96,6 +96,13 @@ def bursts(lost: NDArray[np.bool_]) -> list[int]:
             runs.append(length)
             length = 0
     return runs
+
+
+def bind_loopback(port: int = 0) -> socket.socket:
+    """Open a UDP socket on 127.0.0.1; port 0 lets the kernel choose."""
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    bound.bind(("127.0.0.1", port))
+    return bound
 
 
 PEER = ("10.244.0.7", 7400)
@@ -186,9 +193,14 @@ class Clock:
         self.now_ns += round(duration * 1e9)
 
 
-def netem(kernel: Kernel, profile: DirectionProfile, clock: Clock | None = None) -> Netem:
+def netem(
+    kernel: Kernel,
+    profile: DirectionProfile,
+    clock: Clock | None = None,
+    log: Callable[[str], None] = lambda line: None,
+) -> Netem:
     clock = clock or Clock()
-    return Netem(kernel.run, profile, origin_ns=0, clock=clock, wait=clock.wait)
+    return Netem(kernel.run, profile, origin_ns=0, clock=clock, wait=clock.wait, log=log)
 
 
 NEAR, FAR = f"crc-near-{os.getpid()}", f"crc-far-{os.getpid()}"
@@ -254,7 +266,7 @@ _programs: dict[Path, Programs] = {}
 def run_near(tables: Path) -> Programs:
     """Run tc and ip in the near namespace."""
     if tables not in _programs:
-        _programs[tables] = make_programs(str(tables), ("ip", "netns", "exec", NEAR))
+        _programs[tables] = Programs(str(tables), ("ip", "netns", "exec", NEAR))
     return _programs[tables]
 
 

@@ -171,3 +171,25 @@ def test_a_trace_without_losses_keeps_loss_and_adds_jitter() -> None:
     arrived = [copies[0] for copies in fate if copies]
     assert 800 < len(arrived) < 1200
     assert 25 * MS <= min(arrived) < 26 * MS < 34 * MS < max(arrived) <= 35 * MS
+
+
+def test_a_new_time_line_may_count_from_the_next_packet() -> None:
+    after = DirectionProfile(0.02, changes=(Change(5.0, delay=0.2),))
+    direction = LinkDirection(DirectionProfile(0.04), 1, True, 0)
+    direction.replace_profile(after, restart=True)
+    for now, delay in ((7.0, 0.02), (11.9, 0.02), (12.1, 0.2)):
+        (release_ns,) = direction.send(1, 3, 0, 172, round(now * 1e9))
+        assert release_ns == round(now * 1e9) + round(delay * 1e9)
+
+
+def test_a_new_profile_keeps_seed_origin_and_counts() -> None:
+    changes = (Change(5.0, delay=0.2),)
+    after = DirectionProfile(0.02, 0.01, distribution="normal", loss=0.1, changes=changes)
+    direction = LinkDirection(DirectionProfile(0.04, 0.01), 1, True, 100)
+    always = LinkDirection(after, 1, True, 100)
+    for n in range(300):
+        direction.send(1, 3, n, 172, n)
+    direction.replace_profile(after)
+    for n, now_ns in ((299, 400), (300, 500), (900, 5_000_000_200)):
+        assert direction.send(1, 3, n, 172, now_ns) == always.send(1, 3, n, 172, now_ns)
+    assert direction.counts()["passed"] >= 300

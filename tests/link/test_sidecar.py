@@ -1,20 +1,25 @@
-"""The sidecar's decisions, with shapers that only take notes."""
+"""The sidecar's decisions, with shapers that only take notes; and what it tells `link verify`."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from errno import ENOSPC
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from cloudrc.cli.link_run import EMPTY_STATUS, LinkStatusSource
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link import sidecar
 from cloudrc.link.follow import Loaded
-from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.sidecar import Mode
+from cloudrc.link.profile import Blackout, DirectionProfile, GilbertElliott
+from cloudrc.link.profile import Change as Step
+from cloudrc.link.sidecar import Mode, Near, Told, look_near, read_told, write_told
 from cloudrc.link.state import Change, publish
-from cloudrc.link.tc import notes
+from cloudrc.link.tc import Answer, notes
 from tests.link.conftest import PEER, REFUSED, Bench, told
 
 NEXT = ("10.244.0.9", 7400)
@@ -29,7 +34,6 @@ def test_relay_touches_no_netem_and_leaves_no_route(tmp_path: Path) -> None:
     assert routes == ["127.0.0.1:7401\n"]
     assert bench.did == ["relay 10.244.0.7", "metric relay", "relay closes"]
     assert bench.log == ["relay shapes the uplink (link.mode=relay)"]
-    assert not bench.route.exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link.json"]
 
 
@@ -57,15 +61,15 @@ def test_auto_takes_netem_where_it_works(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize(
-    ("refuses", "may_shape", "reason"),
-    [
-        (NO_NETEM, True, "this kernel has no sch_netem"),
-        (REFUSED, True, "netem cannot do delay_ms above 274000 (far)"),
-        (None, False, "no uid 0 with NET_ADMIN"),
-    ],
-)
-def test_auto_takes_the_relay_where_it_does_not_and_says_why(
+CANNOT = [
+    (NO_NETEM, True, "this kernel has no sch_netem"),
+    (REFUSED, True, "netem cannot do delay_ms above 274000 (far)"),
+    (None, False, "no uid 0 with NET_ADMIN"),
+]
+
+
+@pytest.mark.parametrize(("refuses", "may_shape", "reason"), CANNOT)
+def test_auto_takes_the_relay_elsewhere_and_says_why(
     tmp_path: Path, refuses: Exception | None, may_shape: bool, reason: str
 ) -> None:
     bench = Bench(tmp_path, "auto", refuses, may_shape).run()
@@ -74,25 +78,36 @@ def test_auto_takes_the_relay_where_it_does_not_and_says_why(
     assert (told(bench)["shaper"], told(bench)["reason"]) == ("relay", reason)
 
 
-@pytest.mark.parametrize(
-    ("refuses", "may_shape", "words"),
-    [
-        (NO_NETEM, True, "no sch_netem; set"),
-        (REFUSED, True, "cannot do delay_ms"),
-        (None, False, "needs uid 0 and NET_ADMIN"),
-    ],
-)
+@pytest.mark.parametrize(("refuses", "may_shape", "_"), CANNOT)
 def test_netem_is_strict(
-    tmp_path: Path, refuses: Exception | None, may_shape: bool, words: str
+    tmp_path: Path, refuses: Exception | None, may_shape: bool, _: str
 ) -> None:
     bench = Bench(tmp_path, "netem", refuses, may_shape)
+    words = "sch_netem; set|cannot do delay_ms|needs uid 0 and NET_ADMIN"
     with pytest.raises((MissingPrerequisiteError, BadInputError), match=words):
         bench.run()
     assert bench.did == []
     assert not bench.route.exists()
 
 
-def test_nothing_is_told_before_the_peer_is_known(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("no_netem", "profile", "words"),
+    [
+        (NO_NETEM, None, "no sch_netem; set"),
+        (None, DirectionProfile(300.0), "delay_ms above 274000"),
+    ],
+)
+def test_strict_netem_fails_before_the_peer_is_waited_for(
+    tmp_path: Path, no_netem: Exception | None, profile: DirectionProfile | None, words: str
+) -> None:
+    bench = Bench(tmp_path, "netem", profile=profile)
+    bench.sidecar.peer, bench.no_netem = None, no_netem
+    with pytest.raises((MissingPrerequisiteError, BadInputError), match=words):
+        bench.run()
+    assert bench.now_ns == 0
+
+
+def test_nothing_is_published_before_the_peer_is_known(tmp_path: Path) -> None:
     bench = Bench(tmp_path, "relay")
     bench.route.write_text("10.0.0.1:7400\n")  # an earlier process was killed
     bench.sidecar.peer = None
@@ -100,12 +115,9 @@ def test_nothing_is_told_before_the_peer_is_known(tmp_path: Path) -> None:
     bench.at(2.0, lambda: setattr(bench.sidecar, "peer", PEER))
     bench.run()
     assert bench.did[:2] == ["False", "relay 10.244.0.7"]
-    bench = Bench(tmp_path, "relay")
-    bench.sidecar.peer = None
-    assert bench.run().did == []
 
 
-def test_a_new_address_is_followed_and_told(tmp_path: Path) -> None:
+def test_a_new_address_is_followed_and_published(tmp_path: Path) -> None:
     bench = Bench(tmp_path, "netem")
     routes: list[str] = []
     bench.at(1.0, lambda: setattr(bench.sidecar, "peer", NEXT))
@@ -126,9 +138,7 @@ def test_a_new_profile_is_followed_within_a_step(tmp_path: Path) -> None:
     assert bench.delays == [0.0, 0.5]
 
 
-def test_a_change_is_told_once_and_may_continue_the_time_line(
-    tmp_path: Path,
-) -> None:
+def test_a_change_by_hand_may_continue_the_time_line(tmp_path: Path) -> None:
     bench = Bench(tmp_path, "relay")
     states: list[dict[str, object]] = []
     by_hand = Change("a1", "downlink.delay_ms=500", restart=False)
@@ -142,26 +152,6 @@ def test_a_change_is_told_once_and_may_continue_the_time_line(
     assert told(bench)["cause"] == "the profile's file changed"
 
 
-def test_a_change_that_is_refused_is_told_with_its_number(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, "netem")
-    bench.at(1.0, lambda: bench.replace(9.0, Change("b2", "far", restart=True)))
-    state = told(bench.run())
-    assert (state["changes"], state["refused"]) == (0, "b2")
-    assert "netem cannot do delay_ms" in str(state["refusal"])
-
-
-def test_strict_netem_fails_before_anybody_is_waited_for(tmp_path: Path) -> None:
-    for no_netem, profile, words in (
-        (NO_NETEM, None, "no sch_netem; set"),
-        (None, DirectionProfile(300.0), "delay_ms above 274000"),
-    ):
-        bench = Bench(tmp_path, "netem", profile=profile)
-        bench.sidecar.peer, bench.no_netem = None, no_netem
-        with pytest.raises((MissingPrerequisiteError, BadInputError), match=words):
-            bench.run()
-        assert bench.now_ns == 0
-
-
 def test_the_time_line_counts_from_when_the_link_came_up(tmp_path: Path) -> None:
     bench = Bench(tmp_path, "auto")
     bench.sidecar.peer = None
@@ -172,17 +162,23 @@ def test_the_time_line_counts_from_when_the_link_came_up(tmp_path: Path) -> None
     assert 2.0e9 <= bench.origins_ns[0] < 2.2e9
 
 
-def test_a_profile_netem_cannot_do_is_refused_or_uses_the_relay(tmp_path: Path) -> None:
-    for mode, did in (("netem", "netem closes"), ("auto", "relay closes")):
-        bench = Bench(tmp_path, mode)  # type: ignore[arg-type]
-        bench.at(1.0, lambda bench=bench: bench.replace(9.0))  # type: ignore[misc]
-        assert bench.run().did[-1] == did
-        assert any("netem cannot do delay_ms" in line for line in bench.log)
-        assert told(bench)["shaper"] == did.split()[0]
+@pytest.mark.parametrize(("mode", "left"), [("netem", "netem"), ("auto", "relay")])
+def test_a_profile_netem_cannot_do_is_refused_or_relayed(
+    tmp_path: Path, mode: Mode, left: str
+) -> None:
+    bench = Bench(tmp_path, mode)
+    bench.at(1.0, lambda: bench.replace(9.0, Change("b2", "far")))
+    assert bench.run().did[-1] == f"{left} closes"
+    assert any("netem cannot do delay_ms" in line for line in bench.log)
+    state = told(bench)
+    assert state["shaper"] == left
+    if mode == "netem":
+        assert (state["changes"], state["refused"]) == (0, "b2")
+        assert "netem cannot do delay_ms" in str(state["refusal"])
 
 
 @pytest.mark.parametrize("mode", ["netem", "relay"])
-def test_netems_deviations_are_reported_for_each_profile(tmp_path: Path, mode: Mode) -> None:
+def test_netems_deviations_are_logged_for_each_profile(tmp_path: Path, mode: Mode) -> None:
     first, later = DirectionProfile(corrupt=0.1), DirectionProfile(corrupt=0.2)
     bench = Bench(tmp_path, mode, profile=first)
     bench.at(1.0, lambda: setattr(bench.sidecar, "profile", Loaded(later, {})))
@@ -217,3 +213,82 @@ def test_it_counts_once_a_second(tmp_path: Path) -> None:
     at = [at_ns * 1e-9 for at_ns in bench.counted_ns]
     assert at[0] < 0.2
     assert [later - one for one, later in pairwise(at)] == pytest.approx([1.0] * 5, abs=0.1)
+
+
+RICH = DirectionProfile(
+    0.04, 0.01, "table", loss=GilbertElliott(0.01, 0.2), duplicate=0.02, rate=2e6, table=(-1.0, 1.0)
+)
+OURS: dict[str, Any] = {"kind": "netem", "handle": "7401:", "dev": "eth0", "options": {}}
+THEIRS: dict[str, Any] = {"kind": "netem", "handle": "8001:", "dev": "eth0", "options": {}}
+
+
+@pytest.mark.parametrize(
+    "status",
+    [
+        Told("netem", "link.mode=auto", RICH, Near("eth0", {"eth0": [OURS]})),
+        Told("relay", "link.mode=relay", None),
+    ],
+)
+def test_a_status_is_written_and_read_again(status: Told) -> None:
+    assert read_told(write_told(status)) == status
+
+
+@pytest.mark.parametrize("text", ["{}", "no JSON", '{"shaper": "relay", "why": "", "applied": 3}'])
+def test_what_is_no_status_is_a_value_error(text: str) -> None:
+    with pytest.raises(ValueError, match="Told"):
+        read_told(text)
+
+
+@pytest.mark.parametrize("code", [0, 127])
+def test_all_netems_of_a_namespace_are_found(code: int) -> None:
+    qdiscs = [{"kind": "noqueue", "dev": "lo"}, OURS, THEIRS, {**THEIRS, "dev": "eth1"}]
+
+    def run(words: Sequence[str]) -> Answer:
+        return Answer(code, json.dumps([{"dev": "eth1"}] if words[0] == "ip" else qdiscs), "")
+
+    found = Near("eth1", {"eth0": [OURS, THEIRS], "eth1": [{**THEIRS, "dev": "eth1"}]})
+    assert look_near(run, PEER[0]) == (found if code == 0 else None)
+
+
+def statuses(bench: Bench, *at: float) -> list[Told | None]:
+    """Return what a sidecar tells at these times [s]."""
+    found: list[Told | None] = []
+    for one in at:
+        bench.at(one, lambda: found.append(bench.sidecar.told()))
+    bench.run(max(at) + 0.5)
+    return found
+
+
+def test_a_sidecar_tells_what_is_in_force(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, "relay", profile=RICH)
+    assert bench.sidecar.told() is None
+    bench.at(1.0, lambda: bench.replace(0.07))
+    assert statuses(bench, 0.5, 1.5) == [
+        Told("relay", "link.mode=relay", RICH),
+        Told("relay", "link.mode=relay", DirectionProfile(0.07)),
+    ]
+
+
+def test_while_a_time_line_runs_nothing_is_applied(tmp_path: Path) -> None:
+    changes = (Step(1.0, delay=0.08, jitter=0.01),)
+    profile = DirectionProfile(0.04, changes=changes, blackouts=(Blackout(0.2, 0.1),))
+    running, over = statuses(Bench(tmp_path, "relay", profile=profile), 0.5, 1.5)
+    assert running is not None
+    assert running.applied is None
+    assert over is not None
+    assert over.applied == DirectionProfile(0.08, 0.01)
+
+
+def test_tools_are_started_at_most_once_a_second(tmp_path: Path) -> None:
+    bench, asked, now = Bench(tmp_path, "relay"), list[str](), [0.0]
+
+    def look(host: str) -> Near:
+        asked.append(host)
+        return Near("eth0", {})
+
+    source = LinkStatusSource(bench.sidecar, look, lambda: now[0])
+    assert source.text() == EMPTY_STATUS
+    bench.run(0.5)
+    for now[0] in (1.0, 1.5, 1.9, 2.1):
+        assert read_told(source.text()).near == Near("eth0", {})
+    assert asked == [PEER[0]] * 2

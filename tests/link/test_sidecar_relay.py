@@ -21,8 +21,9 @@ from cloudrc.config.load import load_experiment
 from cloudrc.link.follow import Handed, write_handed
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay import RelayShaper, bind_loopback
+from cloudrc.link.relay import RelayShaper
 from cloudrc.tunnel.codec import Kind, encode_header
+from tests.link.conftest import bind_loopback
 
 pytestmark = pytest.mark.process
 ROOT = Path(__file__).resolve().parents[2]
@@ -159,7 +160,7 @@ def test_a_change_handed_inside_is_in_force_at_the_commands_end(
     link = pod("uplink: {delay_ms: 300}\n").ready()
     note = json.dumps({"number": "a1", "cause": "by hand", "restart": True})
     files = {"profile.yaml": "uplink: {delay_ms: 20}\n"}
-    document = write_handed(Handed(note, "", files))
+    document = write_handed(Handed(note, files))
     command = ["sh", "-c", APPLY_SCRIPT, "sh", str(link.route.parent), "a1", str(len(document))]
     began = time.monotonic()
     done = subprocess.run(command, input=document, check=True, capture_output=True, text=True)

@@ -11,24 +11,14 @@ import json
 import os
 import platform
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from cloudrc.cli.output import table
-from cloudrc.config.shipped import names
 from cloudrc.errors import CloudrcError
-from cloudrc.link.traces import write_trace
-from tools.bench_link import report
-from tools.bench_link.anchors import compile_anchors, fifo_allowed, wake_lateness
-from tools.bench_link.draws import measure_bursts
-from tools.bench_link.overload import measure_overload
-from tools.bench_link.profiles import Links, measure, random_walk
-from tools.bench_link.release import measure_releases, measure_throughput
-from tools.bench_link.report import TRACE, Line
+from tools.bench_link import stages
+from tools.bench_link.relays import compile_anchors, fifo_allowed
 
-STARTING = 7.0
-"""Until all links are up, about [s]."""
 STAGES = ("release", "throughput", "profiles", "overload", "bursts")
 
 
@@ -39,9 +29,28 @@ def main() -> int:
     parser.add_argument("--only", action="append", choices=STAGES, help="this stage; repeatable")
     parser.add_argument("-o", "--output", choices=("table", "json"), default="table")
     options = parser.parse_args()
+    lines: list[stages.Line] = []
+    details: list[dict[str, object]] = []
+    quick, fifo = options.quick, fifo_allowed()
     try:
-        with TemporaryDirectory(prefix="bench-link-") as folder:
-            lines, details = _measure(Path(folder), options.only or STAGES, quick=options.quick)
+        with TemporaryDirectory(prefix="bench-link-") as name:
+            folder, programs = Path(name), compile_anchors(Path(name))
+            for stage in options.only or STAGES:
+                print(f"bench-link: {stage} ...", file=sys.stderr, flush=True)
+                if stage == "release":
+                    rounds = (2, 3.0) if quick else (5, 20.0)  # 100,000 of each in all
+                    lines += stages.releases(folder, programs, *rounds, fifo=fifo)
+                elif stage == "throughput":
+                    floods = (2, 1.0) if quick else (5, 1.5)
+                    lines += stages.throughput(folder, programs[1], *floods)
+                elif stage == "profiles":
+                    seconds = 6.0 if quick else 60.0
+                    found, details = stages.profiles(folder, programs[0], seconds, fifo=fifo)
+                    lines += found
+                elif stage == "overload":
+                    lines += stages.overload(folder, 100_000, 2.0 if quick else 10.0)
+                else:
+                    lines += stages.bursts()
     except CloudrcError as error:
         print(f"bench-link: {error}", file=sys.stderr)
         return error.exit_code
@@ -52,46 +61,10 @@ def main() -> int:
     return 0 if all(line.held for line in lines) else 1
 
 
-def _measure(
-    folder: Path, stages: tuple[str, ...], *, quick: bool
-) -> tuple[list[Line], list[dict[str, object]]]:
-    programs, fifo = compile_anchors(folder), fifo_allowed()
-    lines: list[Line] = []
-    details: list[dict[str, object]] = []
-    for stage in stages:
-        print(f"bench-link: {stage} ...", file=sys.stderr, flush=True)
-        if stage == "release":
-            rounds = (2, 3.0) if quick else (5, 20.0)  # 100,000 of each in all
-            lines += report.releases(measure_releases(folder, programs, *rounds, fifo=fifo), fifo)
-        elif stage == "throughput":
-            floods = (2, 1.0) if quick else (5, 1.5)
-            lines += report.throughput(measure_throughput(folder, programs[1], *floods))
-        elif stage == "profiles":
-            seconds = 6.0 if quick else 60.0
-            (folder / "trace.csv").write_text(write_trace(random_walk(60.0)))
-            trace = {"trace": str(folder / "trace.csv")}
-            links: Links = {name: {"profile": name} for name in names("profile")}
-            links[TRACE] = {"profile": "ideal", "uplink": trace, "downlink": trace}
-            with ThreadPoolExecutor(1) as pool:  # what the machine does in the same minute
-                count = round(1000 * (seconds + STARTING))
-                late = pool.submit(wake_lateness, programs[0], count, fifo=fifo)
-                measured = measure(folder, links, seconds, fifo=fifo)
-            found, details = report.profiles(folder, measured, links, late.result())
-            lines += found
-        elif stage == "overload":
-            lines += report.overload(measure_overload(folder, 100_000, 2.0 if quick else 10.0))
-        else:
-            lines += report.bursts(measure_bursts())
-    return lines, details
-
-
-def _print(lines: list[Line], details: list[dict[str, object]]) -> None:
+def _print(lines: list[stages.Line], details: list[dict[str, object]]) -> None:
     system = f"Linux {platform.release()}, {os.cpu_count()} CPUs, load {os.getloadavg()[0]:.1f}"
     rows: list[tuple[str, ...]] = [(system, "asked", "measured", "anchor", "")]
-    rows += [
-        (line.what, line.asked, line.measured, line.anchor, "" if line.held else "MISSED")
-        for line in lines
-    ]
+    rows += [(*line[:4], "" if line.held else "MISSED") for line in lines]
     print(table(rows))
     if details:
         print("\nmeasured minus drawn delay, both ways at 100 Hz; all links at the same time")

@@ -1,7 +1,7 @@
-"""A flow of numbered datagrams through a relay, stamped by the kernel where it leaves and arrives.
+"""Send numbered datagrams through a link, and compare what arrives with what the model draws.
 
-Both stamps are of the wall clock, taken by the kernel in the call that sends and in the one that
-delivers: how late Python is woken does not matter.
+The kernel stamps each datagram when it leaves and when it arrives, so that late wakes of Python do
+not matter. Both stamps are of the wall clock.
 """
 
 from __future__ import annotations
@@ -10,35 +10,37 @@ import socket
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.profile import DirectionProfile
 from cloudrc.tunnel.codec import Kind, encode_header
 
 Address: TypeAlias = tuple[str, int]
+Array: TypeAlias = NDArray[np.float64]
 
 SIZE = 172
-"""About what telemetry has on the wire [bytes]."""
+"""Length of a datagram, about that of telemetry [bytes]."""
 EPOCH = 1
-
+TIE_NS = 5_000
+"""Difference of two due instants below which their order is chance [ns]."""
+_BUFFER = 4 << 20
 # Source: Linux, include/uapi/asm-generic/socket.h, linux/net_tstamp.h, linux/errqueue.h.
 _SO_TIMESTAMPNS = 35
 _SO_TIMESTAMPING = 37
 _TX_SOFTWARE, _SOFTWARE, _ID, _STAMP_ONLY = 1 << 1, 1 << 4, 1 << 7, 1 << 11
 _IP_RECVERR = 11
-_SECOND_NS = 1_000_000_000
-_BUFFER = 4 << 20
 
 
 @dataclass
 class Flow:
-    """What was sent and what arrived, in one direction.
-
-    Attributes:
-        uplink: Which direction.
-        sent: By number: when the kernel sent it [ns], wall clock.
-        arrived: In the order of arrival: when [ns], wall clock, and the number.
-    """
+    """Instants [ns], wall clock: of sending by number, and in order of arrival with the number."""
 
     uplink: bool
     sent: dict[int, int] = field(default_factory=dict)
@@ -47,14 +49,7 @@ class Flow:
 
 @dataclass(frozen=True)
 class Way:
-    """One direction to be sounded.
-
-    Attributes:
-        uplink: Which direction.
-        target: Where the relay takes in.
-        sink: Where it delivers to.
-        source: Where datagrams are sent from; None: from any port.
-    """
+    """Where one direction of a link takes in and delivers to; datagrams come from `source`."""
 
     uplink: bool
     target: Address
@@ -65,107 +60,142 @@ class Way:
 def run_flow(
     ways: Sequence[Way], rate: float, duration: float, tail: float, begin: float = 0.0
 ) -> list[Flow]:
-    """Send on all ways in turns, and receive.
+    """Send on one or two ways in turns, and receive.
 
     Args:
         ways: One or two.
         rate: On each way [1/s].
         duration: Of the sending [s].
-        tail: How long to go on receiving [s].
+        tail: How long to receive after that [s].
         begin: When to begin [s], monotonic clock; soon if that has passed.
-
-    Returns:
-        A flow for each way.
     """
-    ends = [_End(way) for way in ways]
-    try:
-        period_ns = round(_SECOND_NS / rate)
-        start_ns = max(time.monotonic_ns() + 10_000_000, round(begin * _SECOND_NS))
+    flows = [Flow(way.uplink) for way in ways]
+    addresses = {address for way in ways for address in (way.source, way.sink)}
+    with ExitStack() as opened:
+        ends = {address: opened.enter_context(_open(address)) for address in addresses}
+
+        def drain() -> None:
+            for way, flow in zip(ways, flows, strict=True):
+                _drain(ends[way.sink], ends[way.source], flow)
+
+        period_ns = round(1e9 / rate)
+        start_ns = max(time.monotonic_ns() + 10_000_000, round(begin * 1e9))
         for number in range(round(rate * duration)):
-            for turn, end in enumerate(ends):
-                due_ns = start_ns + since_first_ns(number, turn, len(ends), period_ns)
+            for turn, way in enumerate(ways):
+                due_ns = start_ns + since_first_ns(number, turn, len(ways), period_ns)
                 time.sleep(max(0.0, (due_ns - time.monotonic_ns()) * 1e-9))
-                end.send(number)
-            for end in ends:
-                end.drain()
+                ends[way.source].sendto(_datagram(way.uplink, number), way.target)
+            drain()
         until = time.monotonic() + tail
         while time.monotonic() < until:
             time.sleep(0.02)
-            for end in ends:
-                end.drain()
-        return [end.flow for end in ends]
-    finally:
-        for end in ends:
-            end.close()
+            drain()
+    return flows
 
 
 def since_first_ns(number: int, turn: int, turns: int, period_ns: int) -> int:
-    """Say when to send a datagram.
+    """Return when to send a datagram, as time since the first one [ns].
 
-    The first begins the link's time. All others stay clear of whole periods since then: where a
-    trace or a time line changes just as a datagram leaves, the relay, which sees it come a
-    microsecond later than it was sent, may rightly draw its delay from what holds after the change.
-
-    Args:
-        number: Of the datagram on its way.
-        turn: Of the way, from 0.
-        turns: How many ways there are, 1 or 2.
-        period_ns: Between two on the same way [ns].
-
-    Returns:
-        The instant [ns], since the first.
+    The first one starts the link's time. All others stay clear of whole periods since then: if a
+    trace changes just as a datagram leaves, the relay, which receives it a microsecond later, may
+    rightly draw its delay from the next row.
     """
     if number == turn == 0:
         return 0
     return number * period_ns + turn * period_ns // turns + period_ns // 4
 
 
-class _End:
-    """Source and sink of one direction."""
+def flood(way: Way, rate: float, duration: float, first: int = 0) -> int:
+    """Send bursts of 100, at most `rate` [1/s], for `duration` [s]; return how many were sent."""
+    sent, start, burst = 0, time.monotonic(), 100
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as source:
+        if way.source is not None:
+            source.bind(way.source)
+        source.connect(way.target)
+        while (now := time.monotonic()) < start + duration:
+            if now < start + sent / rate:
+                time.sleep(0.0002)
+                continue
+            for number in range(first + sent, first + sent + burst):
+                with suppress(ConnectionRefusedError):
+                    source.send(_datagram(True, number))
+            sent += burst
+    return sent
 
-    def __init__(self, way: Way) -> None:
-        self.flow = Flow(way.uplink)
-        self._way = way
-        self._kind = Kind.TELEMETRY if way.uplink else Kind.COMMAND
-        self._source = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sink = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._source.bind(way.source or ("127.0.0.1", 0))
-        flags = _TX_SOFTWARE | _SOFTWARE | _ID | _STAMP_ONLY
-        self._source.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, flags)
-        self._sink.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        self._sink.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        self._sink.bind(way.sink)
-        self._sink.setblocking(False)
-        self._source.setblocking(False)
 
-    def send(self, number: int) -> None:
-        header = encode_header(self._kind, 0 if self._way.uplink else 1, EPOCH, number)
-        self._source.sendto(header.ljust(SIZE, b"\0"), self._way.target)
+@dataclass(frozen=True)
+class Judged:
+    """A flow beside the model: arrays [s] over the datagrams that arrived, and what was wrong.
 
-    def drain(self) -> None:
-        """Read what has come, and when the kernel sent what was sent."""
+    `errors` is `measured` minus `drawn`; `sent` counts from the first datagram; copies count.
+    """
+
+    errors: Array
+    measured: Array
+    drawn: Array
+    sent: Array
+    wrongly_lost: int
+    wrongly_arrived: int
+    swapped: int
+
+
+def judge(flow: Flow, profile: DirectionProfile, seed: int, origin_ns: int) -> Judged:
+    """Compare a flow with the model; the relay saw its first datagram at `origin_ns` [ns]."""
+    model = LinkDirection(profile, seed, flow.uplink, origin_ns)
+    due: dict[int, list[int]] = {}
+    for number in sorted(flow.sent):
+        releases = model.send(EPOCH, _kind(flow.uplink), number, SIZE, flow.sent[number])
+        due[number] = sorted(releases, reverse=True)
+    rows, order, too_many = [], [], 0
+    start_ns = min(flow.sent.values())
+    for at_ns, number in flow.arrived:
+        if not due[number]:
+            too_many += 1
+            continue
+        due_ns, sent_ns = due[number].pop(), flow.sent[number]
+        order.append(due_ns)
+        rows.append((at_ns - due_ns, at_ns - sent_ns, due_ns - sent_ns, sent_ns - start_ns))
+    errors, measured, drawn, sent = np.array(rows, dtype=float).reshape(-1, 4).T * 1e-9
+    swapped = sum(a > b + TIE_NS for a, b in pairwise(order))
+    missing = sum(map(len, due.values()))
+    return Judged(errors, measured, drawn, sent, missing, too_many, swapped)
+
+
+def _kind(uplink: bool) -> Kind:
+    return Kind.TELEMETRY if uplink else Kind.COMMAND
+
+
+def _datagram(uplink: bool, number: int) -> bytes:
+    return encode_header(_kind(uplink), 0 if uplink else 1, EPOCH, number).ljust(SIZE, b"\0")
+
+
+def _open(address: Address | None) -> socket.socket:
+    one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+    one.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+    flags = _TX_SOFTWARE | _SOFTWARE | _ID | _STAMP_ONLY
+    one.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, flags)
+    one.setblocking(False)
+    one.bind(address or ("127.0.0.1", 0))
+    return one
+
+
+def _drain(sink: socket.socket, source: socket.socket, flow: Flow) -> None:
+    """Read what has arrived, and when the kernel sent what was sent."""
+    with suppress(BlockingIOError):
         while True:
-            try:
-                data, ancillary, _, _ = self._sink.recvmsg(SIZE, 64)
-            except BlockingIOError:
-                break
-            number = int.from_bytes(data[8:16], "little")
-            self.flow.arrived.append((_stamp(ancillary[0][2]), number))
+            data, ancillary, _, _ = sink.recvmsg(SIZE, 512)
+            stamp = next(value for _, kind, value in ancillary if kind == _SO_TIMESTAMPNS)
+            flow.arrived.append((_stamp(stamp), int.from_bytes(data[8:16], "little")))
+    with suppress(BlockingIOError):
         while True:
-            try:
-                _, ancillary, _, _ = self._source.recvmsg(0, 512, socket.MSG_ERRQUEUE)
-            except BlockingIOError:
-                break
+            _, ancillary, _, _ = source.recvmsg(0, 512, socket.MSG_ERRQUEUE)
             by_kind = {(level, kind): data for level, kind, data in ancillary}
             error = by_kind[socket.IPPROTO_IP, _IP_RECVERR]
             number = int.from_bytes(error[12:16], sys.byteorder)
-            self.flow.sent[number] = _stamp(by_kind[socket.SOL_SOCKET, _SO_TIMESTAMPING][:16])
-
-    def close(self) -> None:
-        self._source.close()
-        self._sink.close()
+            flow.sent[number] = _stamp(by_kind[socket.SOL_SOCKET, _SO_TIMESTAMPING][:16])
 
 
 def _stamp(data: bytes) -> int:
     seconds, rest = memoryview(data).cast("l")
-    return int(seconds * _SECOND_NS + rest)
+    return int(seconds * 1_000_000_000 + rest)

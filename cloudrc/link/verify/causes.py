@@ -125,7 +125,7 @@ class Evidence:
         late: 99th percentile of the shaper's release error [s]; None if it does not measure it.
         throttled: Share of the CPU's periods in which the shaper was stopped, in [0, 1]; None
             if unknown.
-        restored: How often another hand had removed or changed netem's qdisc, which was put back.
+        restored: How often another program has removed or changed netem's qdisc.
     """
 
     shaper: str = ""
@@ -166,7 +166,7 @@ def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
     found = {way: _first(way, one) for way, one in findings.items() if are_off(one.rows)}
     silent = [
         way
-        for way, cause in found.items()  # what was put back shapes again
+        for way, cause in found.items()  # another program took it away
         if cause.code in _UNSHAPED and not findings[way].evidence.restored
     ]
     shaped = [way for way in findings if way not in silent]
@@ -232,7 +232,7 @@ def _of_machine(one: Findings) -> Iterator[tuple[str, str]]:
             yield "no_qdisc", f"there is no qdisc of ours on {where}: nothing shapes the flow"
     if evidence.restored:
         times = f"{evidence.restored} times" if evidence.restored > 1 else "once"
-        yield "no_qdisc", f"another hand removed or changed the qdisc {times}; it was put back"
+        yield "no_qdisc", f"another program removed or changed the qdisc {times}"
     sent, passed, unread = evidence.sent, evidence.passed, evidence.unread
     if sent and unread is not None and unread > UNREAD_SHARE * sent:
         text = (

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from cloudrc.link.relay_io import ANCILLARY_SIZE, Stamps, ask_for_stamps, instant_ns
+from cloudrc.link.relay import ANCILLARY_SIZE, Stamps, ask_for_stamps, instant_ns
 from cloudrc.link.verify.measure import Log
 
 Address = tuple[str, int]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.link_run import Programs
+from cloudrc.drivers.iproute2 import Programs
 
 TC = f"""#!{sys.executable}
 import sys
@@ -35,11 +35,12 @@ SHOW = ("tc", "-s", "-j", "qdisc", "show", "dev", "eth0")
 
 
 @pytest.fixture
-def programs(tmp_path: Path) -> Programs:
+def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Programs:
     program = tmp_path / "tc"
     program.write_text(TC)
     program.chmod(0o755)
-    return Programs({"PATH": f"{tmp_path}:/usr/bin:/bin", "HOME": str(tmp_path)})
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    return Programs()
 
 
 def commands_run(tmp_path: Path) -> list[str]:
@@ -82,8 +83,11 @@ def test_a_tc_process_that_died_is_replaced(programs: Programs) -> None:
     programs.close()
 
 
-def test_a_tool_without_permission_gives_an_error(tmp_path: Path) -> None:
+def test_a_tool_without_permission_gives_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "ip").mkdir()  # a folder is no program: EACCES even for root
-    code, _, error = Programs({"PATH": str(tmp_path)})(("ip", "route"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    code, _, error = Programs()(("ip", "route"))
     assert code
     assert "denied" in error
