@@ -89,8 +89,9 @@ def apply_overrides(document: Document, overrides: Iterable[Override]) -> None:
 
 
 def is_spelled_out(direction: Any) -> bool:
-    """Whether a direction has every key, as in a resolved file."""
-    return isinstance(direction, dict) and direction.keys() >= Direction.model_fields.keys()
+    """Whether a direction has every key, as in a resolved file; old files have no `loop`."""
+    wanted = Direction.model_fields.keys() - {"loop"}
+    return isinstance(direction, dict) and direction.keys() >= wanted
 
 
 def _make_parents(document: Document, path: KeyPath) -> None:

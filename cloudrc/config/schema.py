@@ -168,6 +168,11 @@ class Direction(Section):
         description="CSV file with the columns time_s,delay_ms[,loss]; it replaces delay_ms, and "
         "loss if it has that column. A relative path starts at the file that names it",
     )
+    loop: bool = Field(
+        False,
+        description="Whether the trace begins again after its end; then changes and blackouts "
+        "repeat with it. Not for netem",
+    )
     blackouts: tuple[Blackout, ...] = Field(
         (), description="Intervals in which every packet is lost; they may overlap"
     )
@@ -176,6 +181,8 @@ class Direction(Section):
     def _check_table(self) -> Direction:
         if self.distribution == "table" and self.table is None:
             raise ValueError("distribution: table needs the key table: a CSV file of delays")
+        if self.loop and self.trace is None:
+            raise ValueError("loop: true needs the key trace, which it repeats")
         return self
 
     @field_validator("changes")

@@ -131,7 +131,9 @@ def look_near(run: Run, host: str) -> Near | None:
 
 def in_force_now(profile: DirectionProfile, elapsed_ns: int) -> DirectionProfile | None:
     """Say what holds so long [ns] after the link came up, if it holds for ever; else None."""
-    return settled(profile) if elapsed_ns >= Timeline(profile).starts_ns[-1] else None
+    timeline = Timeline(profile)
+    over = timeline.period_ns is None and elapsed_ns >= timeline.starts_ns[-1]
+    return settled(profile) if over else None
 
 
 def write_told(told: Told) -> str:
