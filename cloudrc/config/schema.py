@@ -181,8 +181,6 @@ class Direction(Section):
     def _check_table(self) -> Direction:
         if self.distribution == "table" and self.table is None:
             raise ValueError("distribution: table needs the key table: a CSV file of delays")
-        if self.loop and self.trace is None:
-            raise ValueError("loop: true needs the key trace, which it repeats")
         return self
 
     @field_validator("changes")
