@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from cloudrc.assembly import link_profile
 from cloudrc.config import document, shipped
+from cloudrc.config.document import parse_value
 from cloudrc.config.load import (
     ResolvedExperiment,
     dump,
@@ -137,6 +138,17 @@ def test_set_reaches_into_mission_and_time_line_by_index() -> None:
 def test_set_appends_to_a_list() -> None:
     experiment = load_experiment("hover", ["mission.waypoints.1.position_m=[0, 1, 1]"])
     assert experiment.mission.waypoints[1].position_m == (0, 1, 1)
+
+
+@pytest.mark.parametrize("text", ["exp #2", "exp: 2", "*x", "exp ", "12:30"])
+def test_a_value_is_the_whole_rest_of_its_argument(text: str) -> None:
+    assert parse_value(text, "--set name") == text
+    assert load_experiment("hover", [f"name={text}"]).name == text
+
+
+def test_a_value_may_be_a_number_a_list_or_quoted() -> None:
+    values = {"1e-3": 0.001, "true": True, "": None, "[1, 'a #']": [1, "a #"], '"5"': "5"}
+    assert {text: parse_value(text, "x") for text in values} == values
 
 
 def test_the_order_of_settings_does_not_matter() -> None:
