@@ -162,7 +162,7 @@ def _addresses(name: str, family: int) -> list[str]:
             raise
         raise OSError(
             "it has IPv6 addresses alone, and a link is shaped over IPv4; in a cluster with both "
-            "families set service.ipFamilyPolicy=PreferDualStack"
+            "families set ipFamilyPolicy=PreferDualStack"
         ) from None
     return [str(entry[4][0]) for entry in found]
 
