@@ -122,12 +122,14 @@ def _fly_local(
             "run: pip install 'cloudrc[api]'",
             file=sys.stderr,
         )
+    local = LocalRun(folder, see, api=not absent)
     try:
-        LocalRun(folder, see, api=not absent).fly(experiment.criteria.time_limit_s + GRACE)
+        local.fly(experiment.criteria.time_limit_s + GRACE)
     except KeyboardInterrupt:
         run = replace(run, interrupted=True)
     except CloudrcError as error:
         run, failure = replace(run, interrupted=True, notes=(str(error),)), error
+    run = replace(run, notes=(*local.notes, *run.notes))
     document = _report_ends(folder, experiment, run, page, failure or nothing_recorded)
     if failure is not None:
         raise failure

@@ -107,7 +107,9 @@ def execute(options: argparse.Namespace) -> int:
         should_stop = follow_folder(
             stop, options.link, experiment, (uplink, downlink), exporter, relay
         )
-    Feed.on_stdout().ready()
+    feed = Feed.on_stdout(watched=options.feed)
+    feed.ready()
+    should_stop = feed.alive_while(should_stop)
     if exporter is None:
         relay.run(should_stop)
     else:
