@@ -122,6 +122,7 @@ def _fly_local(
             "run: pip install 'cloudrc[api]'",
             file=sys.stderr,
         )
+    check_own_models(experiment)
     local = LocalRun(folder, see, api=not absent)
     try:
         local.fly(experiment.criteria.time_limit_s + GRACE)
@@ -134,6 +135,15 @@ def _fly_local(
     if failure is not None:
         raise failure
     return document
+
+
+def check_own_models(experiment: ResolvedExperiment) -> None:
+    """Compile a user's own robot or scene before a process starts, which would die of a bad one."""
+    world = experiment.world
+    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
+        from cloudrc.world.scene import compile_model
+
+        compile_model(world.robot, world.scene)
 
 
 def _report_ends(

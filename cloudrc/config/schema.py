@@ -332,10 +332,12 @@ class World(Section):
     """The robot and the scene in which it flies."""
 
     robot: str = Field(
-        "pelican", description="Robot that ships with cloudrc: a file name without .xml"
+        "pelican",
+        description="Robot that ships with cloudrc, or a path of an MJCF file (.xml) for which the "
+        "onboard controller is made: mass, inertia, rotors",
     )
     scene: str = Field(
-        "pipes", description="Scene that ships with cloudrc: a file name without .xml"
+        "pipes", description="Scene that ships with cloudrc, or a path of an MJCF file (.xml)"
     )
     low_level: LowLevel = LowLevel()
     sensors: Sensors = Sensors()

@@ -77,12 +77,12 @@ class Scene:
 
 
 def load_scene(name: str) -> Scene:
-    """Read a shipped scene by its file name without .xml.
+    """Read a shipped scene by its file name without .xml, or one by the path of its .xml file.
 
     Raises:
         BadInputError: If the file does not exist, or its numbers do not fit the table above.
     """
-    return read_scene(SCENES / f"{name}.xml")
+    return read_scene(Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml")
 
 
 def read_scene(path: Path) -> Scene:

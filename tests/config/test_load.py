@@ -21,6 +21,7 @@ from cloudrc.config.load import (
     read_experiment,
 )
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.scene import load_scene
 
 EXPERIMENTS = shipped.names("experiment")
 PROFILES = shipped.names("profile")
@@ -284,3 +285,21 @@ def test_a_short_file_has_the_hash_of_its_given_parameters(
     assert given != fingerprint(load_experiment(path))
     path.write_text(dump(load_experiment(path)))
     assert fingerprint(read_experiment(str(path))) == fingerprint(load_experiment(path)) != given
+
+
+def test_robot_and_scene_may_be_files_beside_the_experiment(tmp_path: Path) -> None:
+    folder = Path(shipped.FOLDERS["scene"])
+    (tmp_path / "mine.xml").write_text((folder / "pipes.xml").read_text())
+    (tmp_path / "e.yaml").write_text("world: {robot: ./mine.xml, scene: mine.xml}\n")
+    world = load_experiment(tmp_path / "e.yaml").world
+    assert world.robot == world.scene == str(tmp_path / "mine.xml")
+    assert load_scene(world.scene).pipes == load_scene("pipes").pipes
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("./no.xml", "no such file: .*no.xml; names of shipped robots: pelican"), ("/x/q", "not an")],
+)
+def test_a_robot_that_is_no_file_is_refused(name: str, says: str) -> None:
+    with pytest.raises(BadInputError, match=f"world.robot: {says}"):
+        load_experiment("hover", [f"world.robot={name}"])
