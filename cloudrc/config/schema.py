@@ -241,8 +241,8 @@ class Waypoint(Section):
     """A point to fly to."""
 
     position_m: tuple[Finite, Finite, Finite] = Field(
-        description="Position of the base [m], world frame; must be inside the fence and clear of "
-        "the pipes' walls"
+        description="Position of the base [m], world frame; must be where the guard lets the robot "
+        "fly and clear of the pipes' walls, and so must the straight way there"
     )
     yaw_deg: Finite = Field(
         0.0, description="Heading [deg]; only 0 is accepted, the onboard controller holds yaw at 0"

@@ -38,12 +38,12 @@ def _impossible(seed: int) -> Outcome:
     cases: dict[str, tuple[Any, str]] = {
         "outside the fence": ((100.0, 0.0, 1.0), "nearest legal point"),
         "1 m behind a wall of the fence": ((fence.HIGH[0] + 1.0, 0.0, 1.0), "beyond the fence"),
-        "in a pipe's wall": (wall, "overlaps the wall"),
+        "in a pipe's wall": (wall, "of the wall of"),
         "far below the floor": ((0.0, 0.0, -5.0), "beyond the fence"),
     }
     for name, (position, word) in cases.items():
         mission = MissionSchema.model_validate(
-            {"waypoints": ({"position_m": (0.0, 0.0, 1.0)}, {"position_m": position})}
+            {"waypoints": ({"position_m": (0.5, 0.0, 1.0)}, {"position_m": position})}
         )
         problems = check_mission(mission, scene)
         outcome.true(f"{name}: refused, with the reason", word in _text(problems))
@@ -55,7 +55,8 @@ def _impossible(seed: int) -> Outcome:
         outcome.true(f"{name}: refused", _refused({"position_m": (0.0, 0.0, value)}))
     bore, beside = {"position_m": scene.pipes[0].centre}, {"position_m": (0.5, 0.0, 0.8)}
     for way in ((bore, beside), (beside, bore)):
-        (problem,) = check_mission(MissionSchema.model_validate({"waypoints": way}), scene)
+        there = MissionSchema.model_validate({"start": "here", "waypoints": way})
+        (problem,) = check_mission(there, scene)
         outcome.true("behind a wall: its index is named", problem.path[1] == "1")
         outcome.true("behind a wall: the wall is named", scene.pipes[0].name in problem.reason)
     outcome.true("none at all: refused", bool(check_mission(MissionSchema(), scene)))
@@ -78,17 +79,17 @@ def _judge_way_out(
     if found is None:
         return
     near = np.array([float(each) for each in found[1].split(", ")])
-    offered = {"waypoints": ({"position_m": tuple(near.tolist())},)}
+    offered = {"start": "here", "waypoints": ({"position_m": tuple(near.tolist())},)}
     legal = not check_mission(MissionSchema.model_validate(offered), scene)
     outcome.true(f"{name}: it is legal", legal)
-    start = np.array(fence.clamp(position))
+    start = np.clip(position, fence.INNER_LOW, fence.INNER_HIGH)
     rng = generator(27, 0)
     reach = float(np.linalg.norm(near - start)) - NEARER
     around = rng.normal(size=(LOOKED_AT, 3))
     around *= rng.uniform(0.0, max(reach, 0.0), (LOOKED_AT, 1)) / np.linalg.norm(
         around, axis=1, keepdims=True
     )
-    points = np.array([fence.clamp((x, y, z)) for x, y, z in (start + around).tolist()])
+    points = np.clip(start + around, fence.INNER_LOW, fence.INNER_HIGH)
     nearer = (find_overlapped_pipe(scene, points, np.zeros(LOOKED_AT)) < 0) & (reach > 0.0)
     outcome.same(f"{name}: legal points nearer than it by more than 5 cm", int(nearer.sum()), 0)
 
