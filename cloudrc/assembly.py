@@ -7,6 +7,7 @@ module puts them together.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import dist, inf, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -182,7 +183,9 @@ def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> Direc
         rate=_scaled(direction.rate_kbit, 1e3),
         queue_packets=direction.queue_packets,
         changes=tuple(_change(change) for change in direction.changes),
-        trace=None if file is None else read_trace(Path(file), file_max),
+        trace=None
+        if file is None
+        else replace(read_trace(Path(file), file_max), loop=direction.loop),
         blackouts=tuple(Blackout(b.start_s, b.duration_s) for b in direction.blackouts),
         table=_table(direction, file_max),
     )

@@ -206,6 +206,11 @@ class MissionJob(Values):
         86_400,
         description="Time for which the finished Job is kept [s]; a later upgrade flies again",
     )
+    pod_annotations: Texts = Field(
+        {},
+        description="Further annotations of the pods of missions and of helm test. A mesh's "
+        'sidecar keeps a Job from ending; for Istio: sidecar.istio.io/inject: "false"',
+    )
     resources: Resources = resources("10m", "48Mi", "500m", "128Mi")
 
 
@@ -302,6 +307,31 @@ class ChartValues(Values):
     secret: Secret = Field(Secret(), description="Pre-shared key of the tunnel")
     service_account: ServiceAccount = Field(
         ServiceAccount(), description="Service accounts of the pods"
+    )
+    ip_family_policy: Literal["SingleStack", "PreferDualStack", "RequireDualStack"] | None = Field(
+        "PreferDualStack",
+        description="Address families of the Services. The pods listen at both; the tunnel needs "
+        "IPv4. null: the cluster's default",
+    )
+    pod_security_context: dict[str, Any] | None = Field(
+        {
+            "runAsNonRoot": True,
+            "runAsUser": 10_001,
+            "runAsGroup": 10_001,
+            "fsGroup": 10_001,
+            "seccompProfile": {"type": "RuntimeDefault"},
+        },
+        description="Security context of all pods, as in Kubernetes. null leaves it out, for "
+        "OpenShift, which gives each namespace its own user ids",
+    )
+    container_security_context: dict[str, Any] | None = Field(
+        {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        },
+        description="Security context of all containers but a link with netem, which has its own. "
+        "null leaves it out",
     )
     termination_grace_period_seconds: Seconds = Field(
         10, description="Time for the pods to end [s], after which they are killed; they need 2 s"

@@ -14,7 +14,7 @@ from cloudrc.cli.extras import require
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.link.traces import Direction, Packets
+    from cloudrc.link.logs import Direction, Packets
     from cloudrc.record.columns import Recording, Table
 
 
@@ -82,7 +82,8 @@ def _write(packets: Packets, path: Path, direction: str, *, halve: bool) -> None
     """Write one trace; print its statistics and the settings that use it."""
     from statistics import fmean, pstdev
 
-    from cloudrc.link.traces import trace_of, write_trace
+    from cloudrc.link.logs import trace_of
+    from cloudrc.link.traces import write_trace
 
     path.write_text(write_trace(trace_of(packets)), encoding="utf-8")
     arrived = [delay * 1e3 for delay in packets.arrived]
@@ -92,6 +93,7 @@ def _write(packets: Packets, path: Path, direction: str, *, halve: bool) -> None
         f"{path}: {count} packets in {packets.duration:.1f} s, {'half of ' if halve else ''}"
         f"{'each round trip' if halve else 'one way'} {mean:.4g} ± {deviation:.3g} ms "
         f"(mean, standard deviation), {packets.lost / count:.3g} lost"
+        + "".join(f"; {note}" for note in packets.notes)
     )
     print(f"  replay:   --set link.profile=ideal --set link.{direction}.trace={path}")
     if deviation:
@@ -143,27 +145,27 @@ def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_unit
     Raises:
         BadInputError: If it is none of these or cannot be used.
     """
-    from cloudrc.link.traces import is_ping, read_csv, read_irtt, read_lines, read_ping
+    from cloudrc.link.logs import read_csv, read_irtt, refuse_others
+    from cloudrc.link.ping import is_ping, read_ping
+    from cloudrc.link.traces import read_lines
 
     name = str(path)
     remedy = "give a run, a log of ping or irtt, or a CSV file"
-    lines = _lines(path) or read_lines(path, name, remedy)
-    if lines and lines[0].lstrip().startswith("{"):
-        if direction is None and not halve:
-            raise BadInputError(
-                f"{name}: irtt measures both directions; choose --direction uplink (sent by its "
-                "client) or downlink"
-            )
-        return read_irtt("\n".join(lines), name, direction or "uplink", halve=halve)
+    lines = _unpack(path) or read_lines(path, name, remedy)
+    refuse_others(lines, name)
+    if lines and lines[0].lstrip().startswith(("{", "[{")):
+        return read_irtt("\n".join(lines), name, direction, halve=halve)
     if is_ping(lines):
         return read_ping(lines, name, halve=halve)
     return read_csv(lines, name, halve=halve, trust_units=trust_units)
 
 
-def _lines(path: Path) -> list[str]:
+def _unpack(path: Path) -> list[str]:
     """Unpack a file that irtt has compressed; empty if it is not compressed."""
     import gzip
     import zlib
+
+    from cloudrc.link.traces import decode
 
     if path.suffix != ".gz":
         return []
@@ -172,8 +174,8 @@ def _lines(path: Path) -> list[str]:
             data = file.read(UNPACKED_MAX + 1)
         if len(data) > UNPACKED_MAX:
             raise OSError(f"it holds more than {UNPACKED_MAX >> 20} MiB")
-        return data.decode().splitlines()
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        return decode(data)
+    except (OSError, EOFError, ValueError, zlib.error) as error:
         raise BadInputError(
             f"{path}: cannot be unpacked: {error}; give the unpacked file"
         ) from None
@@ -201,7 +203,7 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     """
     from math import isnan
 
-    from cloudrc.link.traces import in_order
+    from cloudrc.link.logs import Log
 
     sent_topic, topic = TOPICS[direction]
     sent, arrivals = recording[sent_topic], recording[topic]
@@ -211,6 +213,7 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
             f"{path}: no rows on {missing}, so no {direction}; "
             "give the run's folder or its mission.mcap"
         )
+    log = Log(str(path))
     delays: dict[tuple[float, float], float] = {}
     for epoch, counter, delay in _columns(arrivals, "epoch", "counter", "delay"):
         if isnan(delay):
@@ -218,6 +221,7 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
                 f"{path}: its ends did not share a clock, so one-way delays are not known; take "
                 "half of each round trip with --halve-rtt"
             )
+        log.counts["duplicates left out"] += (epoch, counter) in delays
         delays[epoch, counter] = min(delay, delays.get((epoch, counter), delay))
     rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
     # The far end may refuse datagrams sent before the session was open there, or near its end. The
@@ -225,13 +229,15 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     latest_first = reversed(list(_columns(arrivals, "epoch", "stamp_ns")))
     opened_ns = {epoch: stamp_ns for epoch, stamp_ns in latest_first}  # the first arrival remains
     last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
-    entries = [
+    log.entries = [
         ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter)))
         for stamp_ns, epoch, counter in rows
         if (epoch, counter) in delays
         or opened_ns.get(epoch, stamp_ns) < stamp_ns <= last_ns[epoch] - SETTLING_NS
     ]
-    return in_order(entries, str(path))
+    unknown = len(rows) - len(log.entries)
+    log.counts["left out, sent before the session was open or in its last 2 s"] += unknown
+    return log.packets()
 
 
 def _halves(recording: Recording, path: Path) -> Packets:
@@ -242,19 +248,22 @@ def _halves(recording: Recording, path: Path) -> Packets:
     """
     from math import isnan
 
-    from cloudrc.link.traces import in_order
+    from cloudrc.link.logs import Log
 
     estimates = recording["/delay_estimate"]
-    rows: list[tuple[float, float]] = []
-    previous = None
+    log, previous, start_ns = Log(str(path)), None, None
     for stamp_ns, rtt, loop in _columns(estimates, "stamp_ns", "rtt", "loop_delay"):
-        if not isnan(rtt) and (rtt, loop) != previous:
-            previous = (rtt, loop)
-            rows.append((stamp_ns - round(loop * 1e9), rtt))
-    if not rows:
+        if isnan(rtt):
+            continue
+        if (rtt, loop) == previous:
+            log.counts["repeated echoes left out"] += 1
+            continue
+        previous, sent_ns = (rtt, loop), stamp_ns - round(loop * 1e9)
+        start_ns = sent_ns if start_ns is None else start_ns
+        log.entries.append(((sent_ns - start_ns) * 1e-9, rtt / 2))
+    if not log.entries:
         raise BadInputError(f"{path}: holds no round trip; give the folder of a run that flew")
-    start_ns = min(stamp_ns for stamp_ns, _ in rows)
-    return in_order((((stamp_ns - start_ns) * 1e-9, rtt / 2) for stamp_ns, rtt in rows), str(path))
+    return log.packets()
 
 
 def _columns(table: Table, *names: str) -> Iterator[tuple[float, ...]]:

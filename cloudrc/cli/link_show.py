@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +15,7 @@ from cloudrc.errors import BadInputError
 if TYPE_CHECKING:
     from cloudrc.config.schema import Direction, Profile
     from cloudrc.link.model import Numbers, Stream
-    from cloudrc.link.profile import DirectionProfile
+    from cloudrc.link.profile import DirectionProfile, Trace
     from cloudrc.report.figures.link import DirectionSample
 
 EPILOG = """\
@@ -25,13 +26,16 @@ examples:
   cloudrc link show ./my.yaml --packets 300000 --rate 200
 
 The delays come from the same link model as in a flight, packet by packet: a
-flight with the same seed has exactly these delays. All delays are one way."""
+flight with the same seed has exactly these delays. All delays are one way.
+Of a trace every row counts the same, however long it holds."""
 RATE_HZ = 100.0
 """Default rate of packets [1/s]."""
 DIRECTIONS = ("uplink", "downlink")
 DEFAULT_PACKETS = 100_000
 """Default number of packets for the statistics of a link that does not change."""
 PACKETS_MAX, RATE_MAX = 10_000_000, 10_000.0
+ROWS = 1000
+"""Fewest packets that show a trace: each of fewer rows gets several of them."""
 SECONDS = 30.0
 """Shortest time that the picture shows by default [s]."""
 KINDS = ("png", "svg", "pdf")
@@ -119,8 +123,9 @@ def _profile(name: str) -> Profile:
 
     if _is_trace(name):
         path = Path(name).absolute()
-        read_trace(path)
-        return Profile(description="a trace", uplink=Direction(trace=str(path)))
+        times = read_trace(path).times
+        about = f"a trace of {len(times)} rows in {times[-1] - times[0]:.4g} s"
+        return Profile(description=about, uplink=Direction(trace=str(path)))
     return load_profile(name)
 
 
@@ -135,11 +140,17 @@ def _way(
 
     profile = link_profile(asked)
     starts_ns = Timeline(profile).starts_ns
-    last_change, seed, rate = starts_ns[-1] * 1e-9, options.seed, options.rate
-    is_trace = profile.trace and last_change
-    default = last_change if is_trace else max(SECONDS, 1.1 * last_change)
-    count = round((options.seconds or default) * rate)
-    shown = stream(profile, name, seed, count, rate)
+    seed, rate = options.seed, options.rate
+    if profile.trace is not None and options.seconds is None:
+        shown = _rows(profile, profile.trace, name, seed)
+    else:
+        seconds = options.seconds or max(SECONDS, 1.1e-9 * starts_ns[-1])
+        if seconds * rate > PACKETS_MAX:
+            raise BadInputError(
+                f"{seconds:g} s at {rate:g} packets a second are more than {PACKETS_MAX} packets; "
+                "give less with --seconds or --rate"
+            )
+        shown = stream(profile, name, seed, round(seconds * rate), rate)
     steady = len(starts_ns) == 1
     many = stream(profile, name, seed, options.packets, rate) if steady else shown
     counted = numbers(many)
@@ -158,13 +169,33 @@ def stream(
         count: Number of packets.
         rate: Rate of packets [1/s].
     """
+    period_ns = round(1e9 / rate)
+    return _stream(profile, name, seed, range(0, max(count, 1) * period_ns, period_ns))
+
+
+def _rows(profile: DirectionProfile, trace: Trace, name: str, seed: int) -> Stream:
+    """Simulate a packet at each row of a trace, or several if it has few rows."""
+    rows = [round(time * 1e9) for time in trace.times]
+    share = -(-ROWS // len(rows))
+    if len(rows) == 1 or share == 1:
+        return _stream(profile, name, seed, rows)
+    ends = [*rows[1:], 2 * rows[-1] - rows[-2]]
+    return _stream(
+        profile,
+        name,
+        seed,
+        [a + n * (b - a) // share for a, b in zip(rows, ends, strict=True) for n in range(share)],
+    )
+
+
+def _stream(profile: DirectionProfile, name: str, seed: int, sent_ns: Sequence[int]) -> Stream:
     from cloudrc.link.model import LinkDirection, sample
     from cloudrc.tunnel.codec import SIZES, Kind
 
     uplink = name == "uplink"
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     link = LinkDirection(profile, seed, uplink)
-    return sample(link, kind, max(count, 1), round(1e9 / rate), SIZES[kind])
+    return sample(link, kind, sent_ns, SIZES[kind])
 
 
 def _table(counted: dict[str, Numbers]) -> str:

@@ -17,12 +17,15 @@ from typing import Any, TypeVar
 from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, token_reader
 from cloudrc.cli.output import escape, format_document, print_line, table
 from cloudrc.cli.pool import interrupt_on_signals
+from cloudrc.drivers.machine import Deadline
 from cloudrc.errors import BadInputError, CloudrcError
 
 POLL_PERIOD = 0.5
 """Pause between two polls of a mission [s]."""
 API_TIMEOUT = 180.0
 """Longest absence of the API [s]: a pod on another node first loads its image."""
+TURN_MAX = 30.0
+"""Longest time for a request and the pause after it [s]; beyond it this process stood still."""
 TERMINATION_LOG = Path("/dev/termination-log")
 """File in a pod whose text `kubectl describe` shows once a container has ended."""
 
@@ -79,12 +82,12 @@ class MissionFollower:
 
     def _retry(self, request: Callable[[], _Answer]) -> _Answer:
         """Repeat a request until there is an answer, or patience ends."""
-        deadline, reported = time.monotonic() + self._patience, False
+        deadline, reported = Deadline(self._patience, TURN_MAX), False
         while True:
             try:
                 return request()
             except UnreachableError as error:
-                if time.monotonic() > deadline:
+                if deadline.passed():
                     raise WaitedTooLongError(
                         f"{error}; gave up after {self._patience:g} s"
                     ) from None

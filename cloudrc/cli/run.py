@@ -324,16 +324,28 @@ def _fly_local(
             "run: pip install 'cloudrc[api]'",
             file=sys.stderr,
         )
+    check_own_models(experiment)
+    local = LocalRun(folder, see, api=not absent)
     try:
-        LocalRun(folder, see, api=not absent).fly(experiment.criteria.time_limit_s + GRACE)
+        local.fly(experiment.criteria.time_limit_s + GRACE)
     except KeyboardInterrupt:
         run = replace(run, interrupted=True)
     except CloudrcError as error:
         run, failure = replace(run, interrupted=True, notes=(str(error),)), error
+    run = replace(run, notes=(*local.notes, *run.notes))
     document = _report_ends(folder, experiment, run, page, failure or nothing_recorded)
     if failure is not None:
         raise failure
     return document
+
+
+def check_own_models(experiment: ResolvedExperiment) -> None:
+    """Compile a user's own robot or scene before a process starts, which would die of a bad one."""
+    world = experiment.world
+    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
+        from cloudrc.world.scene import compile_model
+
+        compile_model(world.robot, world.scene)
 
 
 def _report_ends(

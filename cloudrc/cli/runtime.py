@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 Address = tuple[str, int]
-LOOPBACK_NAMES = ("localhost", "::1", "[::1]")
+LOOPBACK_NAMES = ("localhost", "::1")
 EPILOG = """\
 'cloudrc run --mode local' starts this process with all the flags it needs.
 It ends on SIGTERM, on Ctrl-C, and when the process that started it ends."""
@@ -115,39 +115,87 @@ def _target_arguments(target: argparse._MutuallyExclusiveGroup) -> None:
 
 
 def read_address(text: str) -> Address:
-    """Read HOST:PORT; a type for argparse."""
+    """Read HOST:PORT, with an IPv6 address in brackets; a type for argparse.
+
+    [::] stands for all addresses of both families; on a machine without IPv6 for those of IPv4.
+    """
     host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
+    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    if not bare or not port.isdecimal() or not 0 < int(port) < 65_536:
         raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT")
-    return host, int(port)
+    if ":" in bare and bare == host:
+        raise argparse.ArgumentTypeError(f"'{text}': put an IPv6 address in brackets, [::1]:7400")
+    return "0.0.0.0" if bare == "::" and not _has_ipv6() else bare, int(port)
+
+
+def _has_ipv6() -> bool:
+    """Check whether this machine can open a socket for IPv6."""
+    try:
+        socket.socket(socket.AF_INET6, socket.SOCK_DGRAM).close()
+    except OSError:
+        return False
+    return True
+
+
+def show_address(where: Address) -> str:
+    """Write an address as HOST:PORT, with an IPv6 address in brackets."""
+    host, port = where
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def ipv4_addresses(name: str) -> list[str]:
-    """Give the IPv4 addresses of a host name.
+    """Give the IPv4 addresses of a host name; relay and netem shape no other.
 
     Raises:
-        OSError: If the name has none.
+        OSError: If the name has none; says so if it has IPv6 addresses alone.
     """
+    return _addresses(name, socket.AF_INET)
+
+
+def _addresses(name: str, family: int) -> list[str]:
     try:
-        found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_DGRAM)
+        found = socket.getaddrinfo(name, None, family, socket.SOCK_DGRAM)
     except UnicodeError as error:  # an empty label, or one that is too long
         raise OSError(f"not a name: {error}") from error
+    except OSError:
+        if family != socket.AF_INET or not _only_ipv6(name):
+            raise
+        raise OSError(
+            "it has IPv6 addresses alone, and a link is shaped over IPv4; in a cluster with both "
+            "families set ipFamilyPolicy=PreferDualStack"
+        ) from None
     return [str(entry[4][0]) for entry in found]
 
 
-def resolve_address(flag: str, where: Address) -> Address:
+def _only_ipv6(name: str) -> bool:
+    try:
+        return bool(socket.getaddrinfo(name, None, socket.AF_INET6, socket.SOCK_DGRAM))
+    except OSError:
+        return False
+
+
+def resolve_address(flag: str, where: Address, listen: Address | None = None) -> Address:
     """Resolve an address once, before the loop, which must not wait for a name server.
+
+    Args:
+        flag: Flag of the address, for messages.
+        where: The address.
+        listen: The own address; if it is one of IPv6, `where` may be one, too.
 
     Raises:
         BadInputError: If its host cannot be resolved; names the flag.
     """
     host, port = where
+    own = "" if listen is None else listen[0]
+    # A socket at [::] reaches both families, one at another address only its own.
+    family = 0 if own == "::" else socket.AF_INET6 if ":" in own else socket.AF_INET
     try:
-        return ipv4_addresses(host)[0], port
+        return _addresses(host, family)[0], port
     except OSError as error:
+        wanted = "IPv6" if family == socket.AF_INET6 else "IPv4"
         raise BadInputError(
-            f"{flag} {host}:{port}: {host} cannot be resolved ({error.strerror or error}); name a"
-            " host that has an IPv4 address, or the address itself"
+            f"{flag} {show_address(where)}: {host} cannot be resolved ({error.strerror or error});"
+            f" name a host that has an {wanted} address, or the address itself"
         ) from error
 
 
@@ -190,7 +238,7 @@ def listening(flag: str, listen: Address) -> Iterator[None]:
         yield
     except OSError as error:
         raise BadInputError(
-            f"{flag} {listen[0]}:{listen[1]}: cannot receive there: {error.strerror or error};"
+            f"{flag} {show_address(listen)}: cannot receive there: {error.strerror or error};"
             " name an address of this machine and a port that is free"
         ) from error
 
@@ -299,7 +347,9 @@ def _open_peer(options: argparse.Namespace) -> Peer:
 
     warn_if_exposed(options.listen)
     destination = (
-        resolve_address("--peer", options.peer) if options.route is None else Route(options.route)
+        resolve_address("--peer", options.peer, options.listen)
+        if options.route is None
+        else Route(options.route)
     )
     if options.route is not None and not options.route.exists():
         print(f"cloudrc: sends nothing until {options.route} exists", file=sys.stderr)

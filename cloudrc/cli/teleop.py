@@ -463,7 +463,7 @@ def _fly(
         calls=calls,
         stops=stops,
         tell=publish,
-        stop=update_and_check,
+        stop=feed.alive_while(update_and_check),
     )
 
 

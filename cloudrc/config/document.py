@@ -6,6 +6,7 @@ and `12:30` are text. Duplicate keys are refused.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from dataclasses import dataclass, field
@@ -95,6 +96,37 @@ def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
     except (yaml.YAMLError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise BadInputError(f"{name}: not readable as YAML: {reason}") from error
+
+
+def parse_value(text: str, name: str) -> Any:
+    """Parse a value of the command line; all of the text belongs to it, also behind ` #` or `: `.
+
+    Args:
+        text: A list or mapping in YAML's brackets, quoted text, several lines of YAML, or a scalar.
+        name: Its name in messages.
+
+    Raises:
+        BadInputError: If brackets hold no YAML, or something follows them.
+    """
+    stripped = text.strip()
+    if "\n" in stripped:
+        return parse_yaml(text, name)[0]
+    quoted = len(stripped) > 1 and stripped[0] in "'\"" and stripped[0] == stripped[-1]
+    if quoted or stripped.startswith(("[", "{")):
+        # A comment would swallow the outer bracket, and what follows the value adds an element.
+        with contextlib.suppress(BadInputError):
+            values = parse_yaml(f"[{stripped}, null]", name)[0]
+            if len(values) == 2:
+                return values[0]
+        parse_yaml(stripped, name)  # raises if that is no YAML either
+        raise BadInputError(f"{name}: {stripped}: text behind the value; delete or quote it")
+    loader = _Loader("")
+    tag = loader.resolve(yaml.ScalarNode, stripped, (True, False))
+    if tag != "tag:yaml.org,2002:str":
+        return loader.construct_object(yaml.ScalarNode(tag, stripped))
+    if "\0" in text:
+        raise BadInputError(f"{name}: text with the character NUL, which no path can contain")
+    return text
 
 
 def write_yaml(value: Any) -> str:

@@ -332,13 +332,14 @@ def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
 
 
 def _check_files(document: Document) -> list[Problem]:
-    """Check that robot and scene are shipped files."""
+    """Check that robot and scene are shipped or exist; make their paths absolute."""
     found = []
     for key in ("robot", "scene"):
         name = document.get("world", key)
         if isinstance(name, str):
             try:
-                shipped.check_name(key, name)
+                source = document.source(("world", key))
+                document.tree["world"][key] = shipped.model_path(key, name, source.folder)
             except BadInputError as error:
                 found.append(Problem(("world", key), "", str(error)))
     return found

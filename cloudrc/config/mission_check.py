@@ -1,19 +1,20 @@
 """Check whether a mission can be flown in a scene.
 
-Each waypoint must be inside the fence, the base's box and the arm must be clear of the pipes'
-walls, and no straight way between waypoints may cross a wall. The board is not checked: the
-paper's last waypoint is behind it. The rotors are not checked either: the metrics report how close
-a flight comes.
+Each waypoint must be where the guard lets the robot fly, and the whole robot must be clear of the
+pipes' walls there and on the straight ways, the one from the spawn included. The board is not
+checked: the paper's last waypoint is behind it.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import MAX_WAYPOINTS, Mission, Steps
 from cloudrc.geometry import fence
 from cloudrc.geometry.placement import (
+    CLEARANCE_MIN,
     find_crossed_pipe,
     find_nearest_legal,
     find_overlapped_pipe,
@@ -55,7 +56,9 @@ def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
 def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
     yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
-    outside = outside_fence(positions)
+    # A waypoint counts as reached within its tolerance; half of it is left for the flight's errors.
+    slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
+    outside = outside_fence(positions, slack) | ~_in_fence(positions)
     hit = find_overlapped_pipe(scene, positions, yaws)
     wrong = np.flatnonzero(outside | (hit >= 0))
     problems = [
@@ -65,32 +68,43 @@ def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
     for index in wrong[:_REPORTED]:
         point = mission.waypoints[index].position_m
         if outside[index]:
-            reason = f"beyond the fence, {_fence_in_words()}"
+            reason = f"beyond the fence, or nearer than the guard flies: {_fence_in_words()}"
         else:
-            reason = f"base box or arm overlaps the wall of {scene.pipes[hit[index]].name}"
+            name = scene.pipes[hit[index]].name
+            reason = f"the robot would be within {CLEARANCE_MIN:g} m of the wall of {name}"
         near = find_nearest_legal(scene, point, float(yaws[index]))
         if near is not None:
             reason += f"; nearest legal point found: {_point(near)}"
         path = ("waypoints", str(index), "position_m")
         problems.append(Problem(path, _point(point), reason))
     if len(wrong) > _REPORTED:
-        rest = f"{len(wrong) - _REPORTED} more waypoints are beyond the fence or in a pipe's wall"
+        rest = f"{len(wrong) - _REPORTED} more waypoints are beyond the fence or at a pipe's wall"
         problems.append(Problem(("waypoints",), "", rest))
-    return problems if len(wrong) else problems + _check_ways(positions, scene)
+    if len(wrong):
+        return problems
+    starts = [scene.spawn] if mission.start == "spawn" else [mission.waypoints[0].position_m]
+    return problems + _check_ways(np.concatenate([starts, positions]), scene)
+
+
+def _in_fence(positions: Array) -> NDArray[np.bool_]:
+    inside: NDArray[np.bool_] = np.all((positions >= fence.LOW) & (positions <= fence.HIGH), axis=1)
+    return inside
 
 
 def _check_ways(positions: Array, scene: Scene) -> list[Problem]:
-    """List the straight ways between waypoints [m], shape (n, 3), that cross a wall."""
+    """List the straight ways from start to waypoints [m], shape (n, 3), that lead into a wall."""
     through = find_crossed_pipe(scene, positions[:-1], positions[1:])
     problems = []
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
         x, y, z = positions[index + 1].tolist()
         name = scene.pipes[through[index]].name
+        start = f"waypoint {index - 1}" if index else "the spawn"
         reason = (
-            f"the straight way there from waypoint {index} leads through the wall of {name}; "
-            "add waypoints in between that lead around it or through the pipe"
+            f"the straight way there from {start} leads through the wall of {name}, or within "
+            f"{CLEARANCE_MIN:g} m of it; add waypoints in between that lead around it or through "
+            "the pipe"
         )
-        path = ("waypoints", str(index + 1), "position_m")
+        path = ("waypoints", str(index), "position_m")
         problems.append(Problem(path, _point((x, y, z)), reason))
     return problems
 
@@ -102,7 +116,10 @@ def _check_steps(steps: Steps, scene: Scene) -> list[Problem]:
     with np.errstate(over="ignore"):  # infinity is beyond the fence
         positions = centre + box * reach
     if outside_fence(positions).any():
-        reason = f"steps reach beyond the fence, {_fence_in_words()}; choose a smaller range_m"
+        reason = (
+            "steps reach beyond the fence, or nearer to it than the guard flies: "
+            f"{_fence_in_words()}; choose a smaller range_m"
+        )
         return [Problem(("steps",), "", reason)]
     hit = find_overlapped_pipe(scene, positions, np.zeros(len(positions)))
     if (hit >= 0).any():
@@ -115,7 +132,7 @@ def _check_steps(steps: Steps, scene: Scene) -> list[Problem]:
 def _fence_in_words() -> str:
     spans = (
         f"{name} {low:g} to {high:g}"
-        for name, low, high in zip("xyz", fence.LOW, fence.HIGH, strict=True)
+        for name, low, high in zip("xyz", fence.INNER_LOW, fence.INNER_HIGH, strict=True)
     )
     return f"{', '.join(spans)} [m]"
 

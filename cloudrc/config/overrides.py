@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from cloudrc import plugins
 from cloudrc.config import problems
-from cloudrc.config.document import SET_LABEL, Document, KeyPath, Source, parse_yaml
+from cloudrc.config.document import SET_LABEL, Document, KeyPath, Source, parse_value
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Direction, Experiment, PlugIn
 from cloudrc.errors import BadInputError
@@ -55,12 +55,12 @@ class Override:
 
 
 def parse_settings(texts: Iterable[str]) -> list[Override]:
-    """Read `key=value` texts, values as YAML; shorter keys come first.
+    """Read `key=value` texts, values as `document.parse_value` does; shorter keys come first.
 
     Raises:
-        BadInputError: If a text has no key or no `=`, or its value is not YAML.
+        BadInputError: If a text has no key or no `=`, a key is set twice, or a value is not YAML.
     """
-    result = []
+    result: list[Override] = []
     for text in texts:
         key, equals, value = text.partition("=")
         path = tuple(part.strip() for part in key.split("."))
@@ -68,7 +68,9 @@ def parse_settings(texts: Iterable[str]) -> list[Override]:
             raise BadInputError(
                 f"{SET_LABEL} {text}: must be key=value; for example cloud.predictor=last_sample"
             )
-        result.append(Override(path, parse_yaml(value, f"{SET_LABEL} {key}")[0]))
+        if any(override.path == path for override in result):
+            raise BadInputError(f"{SET_LABEL} {key}: is set twice; keep one of them")
+        result.append(Override(path, parse_value(value, f"{SET_LABEL} {key}")))
     return sorted(result, key=lambda override: len(override.path))
 
 
@@ -89,8 +91,9 @@ def apply_overrides(document: Document, overrides: Iterable[Override]) -> None:
 
 
 def is_spelled_out(direction: Any) -> bool:
-    """Whether a direction has every key, as in a resolved file."""
-    return isinstance(direction, dict) and direction.keys() >= Direction.model_fields.keys()
+    """Whether a direction has every key, as in a resolved file; old files have no `loop`."""
+    wanted = Direction.model_fields.keys() - {"loop"}
+    return isinstance(direction, dict) and direction.keys() >= wanted
 
 
 def _make_parents(document: Document, path: KeyPath) -> None:

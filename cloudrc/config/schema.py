@@ -168,6 +168,11 @@ class Direction(Section):
         description="CSV file with the columns time_s,delay_ms[,loss]; it replaces delay_ms, and "
         "loss if it has that column. A relative path starts at the file that names it",
     )
+    loop: bool = Field(
+        False,
+        description="Whether the trace begins again after its end; then changes and blackouts "
+        "repeat with it. Not for netem",
+    )
     blackouts: tuple[Blackout, ...] = Field(
         (), description="Intervals in which every packet is lost; they may overlap"
     )
@@ -236,8 +241,8 @@ class Waypoint(Section):
     """A point to fly to."""
 
     position_m: tuple[Finite, Finite, Finite] = Field(
-        description="Position of the base [m], world frame; must be inside the fence and clear of "
-        "the pipes' walls"
+        description="Position of the base [m], world frame; must be where the guard lets the robot "
+        "fly and clear of the pipes' walls, and so must the straight way there"
     )
     yaw_deg: Finite = Field(
         0.0, description="Heading [deg]; only 0 is accepted, the onboard controller holds yaw at 0"
@@ -327,10 +332,12 @@ class World(Section):
     """The robot and the scene in which it flies."""
 
     robot: str = Field(
-        "pelican", description="Robot that ships with cloudrc: a file name without .xml"
+        "pelican",
+        description="Robot that ships with cloudrc, or a path of an MJCF file (.xml) for which the "
+        "onboard controller is made: mass, inertia, rotors",
     )
     scene: str = Field(
-        "pipes", description="Scene that ships with cloudrc: a file name without .xml"
+        "pipes", description="Scene that ships with cloudrc, or a path of an MJCF file (.xml)"
     )
     low_level: LowLevel = LowLevel()
     sensors: Sensors = Sensors()

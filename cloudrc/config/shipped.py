@@ -65,6 +65,27 @@ def _shipped_names(kind: str, name: str) -> str:
     return f"names of shipped {kind}s: {', '.join(available)}{suggest_name(name, available)}"
 
 
+def model_path(kind: str, name: str, folder: Path) -> str:
+    """Return the name of a shipped robot or scene, or the absolute path of an .xml file.
+
+    Args:
+        kind: "robot" or "scene".
+        name: As in an experiment.
+        folder: Folder at which a relative path starts.
+
+    Raises:
+        BadInputError: If there is no such file.
+    """
+    if not (is_path(name) or name.endswith(".xml")):
+        check_name(kind, name)
+        return name
+    path = os.path.realpath(folder / os.path.expanduser(name))
+    if not path.endswith(".xml") or not os.path.isfile(path):
+        reason = "no such file" if path.endswith(".xml") else "not an .xml file"
+        raise BadInputError(f"{reason}: {path}; {_shipped_names(kind, Path(path).stem)}")
+    return path
+
+
 def is_path(name: str) -> bool:
     """Whether a name is the path of a file outside the package."""
     return "/" in name or "\\" in name or name.endswith((".yaml", ".yml"))

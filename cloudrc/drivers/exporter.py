@@ -82,6 +82,7 @@ class ProbeServer(socketserver.ThreadingTCPServer):
         self.pages = pages
         self._open: dict[Any, float] = {}
         self._guard = threading.Lock()
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         try:
             super().__init__(address, _Handler)
         except OSError as error:

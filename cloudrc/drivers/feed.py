@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable
 from enum import IntEnum
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -24,7 +25,9 @@ from cloudrc.records import (
 )
 
 READY = "ready"
-"""The line that a process writes once it can receive."""
+"""The line that a process writes once it can receive, and later as a sign of life."""
+ALIVE_PERIOD = 1.0
+"""Time between two signs of life [s]."""
 PERIOD_NS = 100_000_000
 """Time between two records of a type in `SAMPLED` [ns]."""
 EVENTS = (GuardChange, MissionEvent, Fault, LinkChanged)
@@ -60,6 +63,21 @@ class Feed:
     def ready(self) -> None:
         """Report that the process can receive."""
         self._write(READY)
+
+    def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
+        """Wrap the `stop` that a loop asks in every turn: also give a supervisor signs of life."""
+        if not self._watched:
+            return stop
+        due = 0.0
+
+        def ask() -> bool:
+            nonlocal due
+            if (now := time.monotonic()) >= due:
+                due = now + ALIVE_PERIOD
+                self._write(READY)
+            return stop()
+
+        return ask
 
     def tell(self, records: Iterable[Record]) -> None:
         """Send the records that a supervisor wants to see."""

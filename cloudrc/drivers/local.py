@@ -27,10 +27,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from cloudrc.drivers.feed import READY, from_line
-from cloudrc.drivers.machine import interpreter
+from cloudrc.drivers.machine import Deadline, interpreter
 from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.errors import InvalidRunError, TimedOutError, to_one_line
+from cloudrc.drivers.teleop import PATH_MAX
+from cloudrc.errors import BadInputError, InvalidRunError, TimedOutError, to_one_line
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
@@ -138,10 +139,14 @@ START_LIMIT = 60.0
 """Longest time for a process to become ready [s]; a cold start reads some 100 MB from disk."""
 STOP_LIMIT = 1.5
 """Longest time for a process to end after it was asked to [s]; then it is killed."""
-TELL_ALWAYS = ("world", "cloud")
-"""Processes that send records to the supervisor continuously (`drivers/feed.py`)."""
 SILENCE_LIMIT = 5.0
-"""Time without output after which a process of `TELL_ALWAYS` counts as hung [s]."""
+"""Time without a line of its feed after which a process counts as hung [s]: world and cloud send
+records all the time, relay and teleop a sign of life every second."""
+PAUSE = 1.0
+"""Time without a turn of its loop after which the supervisor itself stood still [s]: it was stopped
+or this machine is overloaded."""
+SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
+"""Longest name of a socket of a run, below the folder for temporary files."""
 LOOPBACK = "127.0.0.1"
 API_FILE = "api.json"
 """File in a run's folder with the address of its API during the flight, for other programs.
@@ -172,7 +177,7 @@ class Child:
         process: Running or ended.
         log: File with its standard error.
         unread: Start of a feed line whose end has not arrived yet.
-        heard: When its last feed line arrived [s], monotonic clock; None before the first.
+        heard: When its last feed line arrived [s], monotonic clock; None before the flight.
         ready: Whether it can receive.
         garbled: Whether it has written a line that is no record.
     """
@@ -192,7 +197,11 @@ class Child:
 
 
 class LocalRun:
-    """The four processes of one run."""
+    """The four processes of one run.
+
+    Attributes:
+        notes: What the report has to say of this run.
+    """
 
     def __init__(
         self, folder: Path, see: Callable[[list[Record]], None], *, api: bool = True
@@ -209,6 +218,7 @@ class LocalRun:
         self._key = folder  # replaced by the key file in `fly`
         self._children: list[Child] = []
         self._selector = selectors.DefaultSelector()
+        self.notes: tuple[str, ...] = ()
 
     def fly(self, limit: float) -> None:
         """Fly until teleop reports the end of the mission. All processes have ended afterwards.
@@ -219,12 +229,13 @@ class LocalRun:
         Raises:
             ProcessDiedError: If a process ends too early; names it.
             TimedOutError: If the limit is reached or a process falls silent; names it.
+            BadInputError: If no folder for sockets has a short path.
             KeyboardInterrupt: If the user interrupts.
         """
         # A Unix socket's path must be short; the path of the run's folder may be long.
         # The folder is private, since it also holds this run's key.
         with (
-            tempfile.TemporaryDirectory(prefix="cloudrc-") as sockets,
+            tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets,
             announced(self._folder, url := self._url(sockets)) as is_announced,
         ):
             if url and not is_announced:
@@ -296,24 +307,37 @@ class LocalRun:
         self._children.append(child)
 
     def _wait_until_ready(self) -> None:
-        deadline = time.monotonic() + START_LIMIT
+        deadline = Deadline(START_LIMIT, PAUSE)
         while waiting := [child.name for child in self._children if not child.ready]:
-            if time.monotonic() > deadline:
+            if deadline.passed():
                 raise TimedOutError(f"{' and '.join(waiting)}: not ready within {START_LIMIT:g} s")
             self._listen()
             self._check_alive()
 
     def _watch(self, limit: float) -> None:
-        deadline = time.monotonic() + limit
+        deadline, paused = Deadline(limit, PAUSE), 0.0
         teleop = next(child for child in self._children if child.name == "teleop")
+        for child in self._children:
+            child.heard = time.monotonic()
         while teleop.process.poll() is None:
-            if time.monotonic() > deadline:
-                raise TimedOutError(f"the flight was ended after {limit:g} s, its limit")
             self._see(self._listen())
+            if deadline.passed():
+                raise TimedOutError(f"the flight was ended after {limit:g} s, its limit")
+            if deadline.pause > paused:
+                self._note_pause(deadline.pause - paused)
+                paused = deadline.pause
             self._check_alive()
             self._check_silence()
         self._check_alive()
         self._see(self._listen())
+
+    def _note_pause(self, pause: float) -> None:
+        """Mark the run, and begin anew to wait for each process."""
+        text = f"the supervisor of this run stood still for {pause:.1f} s; the flight went on"
+        self.notes += (text,)
+        self._see([Fault(0, "supervisor", text)])
+        for child in self._children:
+            child.heard = time.monotonic()
 
     def _listen(self) -> list[Record]:
         """Return the records of all feeds since the last call; waits at most 50 ms."""
@@ -325,12 +349,11 @@ class LocalRun:
                 self._selector.unregister(key.fileobj)
             *lines, child.unread = (child.unread + data).split(b"\n")
             for line in lines:
+                child.heard = time.monotonic()
                 if line == READY.encode():
                     child.ready = True
                 else:
                     records += _parse_line(child, line)
-                    if child.name in TELL_ALWAYS:
-                        child.heard = time.monotonic()
         return records
 
     def _check_silence(self) -> None:
@@ -368,6 +391,23 @@ class LocalRun:
         for child in self._children:
             if child.process.stdout is not None:
                 child.process.stdout.close()
+
+
+def socket_folder() -> str:
+    """Choose a folder for temporary files with a path that is short enough for Unix sockets.
+
+    Raises:
+        BadInputError: If there is none; names TMPDIR.
+    """
+    given = tempfile.gettempdir()
+    for folder in dict.fromkeys((given, os.environ.get("XDG_RUNTIME_DIR", ""), "/tmp")):
+        fits = len(os.fsencode(folder)) + len(SOCKET_NAME) <= PATH_MAX
+        if folder and fits and os.access(folder, os.W_OK | os.X_OK):
+            return folder
+    raise BadInputError(
+        f"TMPDIR {given} is too long for a socket: its path may have "
+        f"{PATH_MAX - len(SOCKET_NAME)} bytes; run with TMPDIR=/tmp"
+    )
 
 
 def _parse_line(child: Child, line: bytes) -> list[Record]:

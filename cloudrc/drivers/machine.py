@@ -1,10 +1,15 @@
-"""Describe this machine: its monotonic clock, its fast cipher and its Python interpreter."""
+"""Describe this machine: its monotonic clock, its fast cipher and its Python interpreter.
+
+`Deadline` is a time limit on that clock for a process that waits for others.
+"""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 LINUX_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -55,3 +60,38 @@ def interpreter(*words: str) -> list[str]:
     """
     here = os.getcwd() in sys.path or "" in sys.path
     return [sys.executable, *(() if here else ("-P",)), *words]
+
+
+class Deadline:
+    """A time limit that does not count the time in which this process itself stood still.
+
+    A process that was stopped, or whose container was paused, cannot tell what others did
+    meanwhile: it has to give them their time anew.
+
+    Attributes:
+        pause: How long this process stood still in all [s].
+    """
+
+    def __init__(
+        self, limit: float, turn_max: float, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Begin.
+
+        Args:
+            limit: Time until it passes [s].
+            turn_max: Longest time between two calls of `passed` while this process runs [s].
+            clock: A monotonic clock [s].
+        """
+        self._left, self._turn_max, self._clock = limit, turn_max, clock
+        self._before = clock()
+        self.pause = 0.0
+
+    def passed(self) -> bool:
+        """Check whether the limit has passed; call it in every turn of a loop."""
+        now = self._clock()
+        turn, self._before = now - self._before, now
+        if turn > self._turn_max:
+            self.pause += turn
+        else:
+            self._left -= turn
+        return self._left < 0.0

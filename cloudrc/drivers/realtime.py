@@ -16,7 +16,7 @@ import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from ipaddress import AddressValueError, IPv4Address
+from ipaddress import ip_address
 from pathlib import Path
 
 from cloudrc.endpoint import Endpoint
@@ -52,16 +52,19 @@ class Route:
 
 
 def parse(text: str) -> Address:
-    """Parse HOST:PORT.
+    """Parse HOST:PORT, with an IPv6 address in brackets.
 
     Raises:
-        ValueError: If it is not a numeric IPv4 address and a port.
+        ValueError: If it is not a numeric address and a port.
     """
     host, _, port = text.strip().rpartition(":")
+    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
     try:
-        numeric = str(IPv4Address(host))
-    except AddressValueError as error:
-        raise ValueError(f"'{host}' is not a numeric IPv4 address") from error
+        numeric = str(ip_address(bare))
+    except ValueError as error:
+        raise ValueError(f"'{host}' is not a numeric address") from error
+    if (":" in numeric) == (bare == host):
+        raise ValueError(f"'{host}' is not an address with brackets around IPv6 alone")
     if not port.isdecimal() or not 0 < int(port) < 65_536:
         raise ValueError(f"'{port}' is not a port")
     return numeric, int(port)
@@ -108,15 +111,16 @@ class Peer:
     @classmethod
     def bind(cls, listen: tuple[str, int], where: tuple[str, int] | Route) -> Peer:
         """Bind a socket at `listen`, for a fixed peer address or for that of a route file."""
+        bound = bind(listen)
         if isinstance(where, Route):
-            return cls(bind(listen), None, where)
-        return cls(bind(listen), where)
+            return cls(bound, None, where)
+        return cls(bound, _reachable(bound, where))
 
     def follow(self, now_ns: int) -> None:
         """Update the address from the route file, if a check is due at `now_ns` [ns]."""
         if self.route is not None and now_ns >= self._followed_ns:
             self._followed_ns = now_ns + ROUTE_PERIOD_NS
-            self.address = self.route.look()
+            self.address = _reachable(self.socket, self.route.look())
 
     def receive(self, most: int = DRAIN_MAX) -> list[bytes]:
         """Return at most `most` waiting datagrams; an oversized one keeps one byte too many."""
@@ -142,9 +146,19 @@ class Peer:
                 self.unsent += 1
 
 
+def _reachable(bound: socket.socket, address: Address | None) -> Address | None:
+    """Write an IPv4 address as a socket of IPv6 needs it."""
+    if address is None or bound.family != socket.AF_INET6 or ":" in address[0]:
+        return address
+    return f"::ffff:{address[0]}", address[1]
+
+
 def bind(listen: tuple[str, int]) -> socket.socket:
-    """Open a UDP socket that does not block."""
-    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    """Open a UDP socket that does not block; at the host `::` it receives IPv4, too."""
+    family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
+    udp = socket.socket(family, socket.SOCK_DGRAM)
+    if listen[0] == "::":
+        udp.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
     udp.setblocking(False)
     udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
     try:

@@ -179,7 +179,7 @@ class RemoteTeleop:
                 self.outputs.append(output)
         if not self._silent and now_ns - self._heard_ns > SILENCE_NS:
             self._silent = True
-            text = "teleop has been silent for 1 s: the last setpoint is kept; see teleop's log"
+            text = "no word from teleop for 1 s: the last setpoint is kept; see teleop's log"
             self.outputs.append(Fault(now_ns, "teleop_silent", text))
 
     def take_outputs(self) -> list[Any]:

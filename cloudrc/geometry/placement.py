@@ -1,29 +1,41 @@
-"""Check whether the robot may fly to a position: the fence, the pipes, and the way there."""
+"""Check whether the robot can fly to a position: the guard's limits, the pipes, the way there."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cloudrc.geometry import fence
 from cloudrc.geometry.clearance import clearance_per_pipe
-from cloudrc.geometry.robot import Array, hull_points
+from cloudrc.geometry.robot import Array, robot_points
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 
+CLEARANCE_MIN = 0.04
+"""Least distance of the whole robot from a wall at a waypoint and on the way there [m]. It is more
+than the steady error of 32 mm with which the published gains hover."""
+STEP_MIN = 0.02
+"""Shortest step along a way [m]; below it a way near a wall would take forever."""
 _SEARCH = 1.5  # [m] largest distance of a suggested legal point
+_FAR = 1e3  # [m] positions beyond it would overflow
 
 
-def outside_fence(positions: Array) -> NDArray[np.bool_]:
-    """Tell which positions of the base [m], world frame, shape (n, 3), are outside the fence."""
-    outside: NDArray[np.bool_] = np.any((positions < fence.LOW) | (positions > fence.HIGH), axis=1)
+def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]:
+    """Tell which positions are farther outside than the guard lets the robot fly.
+
+    Args:
+        positions: Positions of the base [m], world frame, shape (n, 3).
+        slack: Distance beyond the guard's limits that still counts as inside [m], shape () or (n,).
+    """
+    nearest = np.clip(positions, fence.INNER_LOW, fence.INNER_HIGH)
+    near = np.all(np.abs(positions) < _FAR, axis=1)
+    beyond = np.linalg.norm(np.where(near[:, None], positions - nearest, _FAR), axis=1)
+    outside: NDArray[np.bool_] = beyond > np.asarray(slack) + 1e-9
     return outside
 
 
 def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
-    """Find the pipe whose wall the base's box or the arm would overlap.
-
-    The rotors do not count here; the metrics judge how near they come to a wall.
+    """Find the pipe whose wall the robot, rotors included, would touch.
 
     Args:
         scene: The scene; its board does not count.
@@ -31,25 +43,22 @@ def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray
         yaws: Headings of the level robot [rad], shape (n,).
 
     Returns:
-        Index of the pipe with the deepest overlap, or -1, shape (n,).
+        Index of the nearest pipe that is nearer than `CLEARANCE_MIN`, or -1, shape (n,).
     """
     result = np.full(len(positions), -1, dtype=np.int64)
-    # Points far outside the fence would overflow.
-    near = np.flatnonzero(np.all(np.abs(positions) < 1e3, axis=1))
+    near = np.flatnonzero(np.all(np.abs(positions) < _FAR, axis=1))
     if len(near) == 0 or not scene.pipes:
         return result
-    facing = np.zeros((len(near), 4))
-    facing[:, 0], facing[:, 3] = np.cos(yaws[near] / 2), np.sin(yaws[near] / 2)
-    distance = clearance_per_pipe(scene, positions[near], facing, hull_points())
-    result[near] = np.where(distance.min(axis=1) < 0, distance.argmin(axis=1), -1)
+    distance = _distances(scene, positions[near], yaws[near])
+    result[near] = np.where(distance.min(axis=1) < CLEARANCE_MIN, distance.argmin(axis=1), -1)
     return result
 
 
 def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
-    """Find the pipe whose wall a straight way of the base's centre crosses.
+    """Find the pipe that the robot would touch on a straight way, level and with yaw 0.
 
-    A way that only grazes a wall does not count, because the flight may deviate from the straight
-    way.
+    The robot flies each way in steps as long as its distance from the nearest wall. A robot that
+    begins nearer to a wall than `CLEARANCE_MIN` may move away from it.
 
     Args:
         scene: The scene; its board does not count.
@@ -57,22 +66,27 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
         ends: Ends of the ways [m], world frame, likewise, shape (n, 3).
 
     Returns:
-        Index of the last such pipe, or -1, shape (n,).
+        Index of the first such pipe, or -1, shape (n,).
     """
     result = np.full(len(starts), -1, dtype=np.int64)
-    for index, pipe in enumerate(scene.pipes):
-        axis = np.asarray(pipe.axis)
-        from_centre, along = starts - np.asarray(pipe.centre), ends - starts
-        depth, deeper = from_centre @ axis, along @ axis
-        away, farther = from_centre - depth[:, None] * axis, along - deeper[:, None] * axis
-        # The way meets the middle of the wall where |away + t farther| = radius.
-        a, b = np.sum(farther**2, axis=1), 2 * np.sum(away * farther, axis=1)
-        c = np.sum(away**2, axis=1) - ((pipe.inner + pipe.outer) / 2) ** 2
-        with np.errstate(invalid="ignore", divide="ignore"):  # no such t, or parallel to the axis
-            root = np.sqrt(b**2 - 4 * a * c)
-            for t in ((-b - root) / (2 * a), (-b + root) / (2 * a)):
-                meets = (t >= 0) & (t <= 1) & (np.abs(depth + t * deeper) <= pipe.length / 2)
-                result[meets] = index
+    length = np.linalg.norm(ends - starts, axis=1)
+    flown = np.zeros(len(starts))
+    least = np.full(len(starts), CLEARANCE_MIN)
+    flying = np.arange(len(starts) if scene.pipes else 0)
+    first = True
+    while len(flying):
+        share = flown[flying] / np.maximum(length[flying], 1e-12)
+        at = starts[flying] + share[:, None] * (ends - starts)[flying]
+        distances = _distances(scene, at, np.zeros(len(at)))
+        nearest = distances.min(axis=1)
+        if first:  # where the robot is, it may be
+            least, first = np.minimum(least, nearest - STEP_MIN), False
+        touching = nearest < least[flying]
+        result[flying[touching]] = distances[touching].argmin(axis=1)
+        is_over = touching | (flown[flying] >= length[flying])
+        step = np.maximum(nearest - CLEARANCE_MIN, STEP_MIN)[~is_over]
+        flying = flying[~is_over]
+        flown[flying] = np.minimum(flown[flying] + step, length[flying])
     return result
 
 
@@ -88,10 +102,10 @@ def find_nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | N
         yaw: Heading [rad].
 
     Returns:
-        A point inside the fence without an overlap [m], shape (3,); None if there is none within
-        1.5 m.
+        A point that the guard lets the robot reach, without an overlap [m], shape (3,); None if
+        there is none within 1.5 m.
     """
-    start = np.array(fence.clamp(position))
+    start = np.clip(position, fence.INNER_LOW, fence.INNER_HIGH)
     directions = [*np.eye(3), *-np.eye(3)]
     for pipe in scene.pipes:
         relative = start - np.asarray(pipe.centre)
@@ -109,3 +123,10 @@ def find_nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | N
     candidates = candidates[legal]
     best = candidates[np.linalg.norm(candidates - start, axis=1).argmin()]
     return float(best[0]), float(best[1]), float(best[2])
+
+
+def _distances(scene: Scene, positions: Array, yaws: Array) -> Array:
+    """Compute the distance of the level robot from each pipe [m], shape (n, number of pipes)."""
+    facing = np.zeros((len(positions), 4))
+    facing[:, 0], facing[:, 3] = np.cos(yaws / 2), np.sin(yaws / 2)
+    return clearance_per_pipe(scene, positions, facing, robot_points())

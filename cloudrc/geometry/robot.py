@@ -38,21 +38,15 @@ class Spheres:
 
 def key_points() -> Spheres:
     """Return the 225 points for the clearance: rotors, arm, base box, top rod."""
-    rotors = [
-        _ring(x, y, height, ROTOR_RADIUS, 24)
-        for x, y in ((ROTOR_ARM, 0), (0, ROTOR_ARM), (-ROTOR_ARM, 0), (0, -ROTOR_ARM))
-        for height in (ROTOR_HEIGHT - ROTOR_HALF_THICKNESS, ROTOR_HEIGHT + ROTOR_HALF_THICKNESS)
-    ]
-    rod = [_ring(0, 0, height, ROD_RADIUS, 8) for height in (ROD_BOTTOM, ROD_TOP)]
-    return _points([*rotors, _box(2, 2, 2), *rod], arm=9)
+    return _points([*_rotor_rings(), _box(2, 2, 2), *_rod_rings()], arm=9)
 
 
-def hull_points() -> Spheres:
-    """Return points of the base's box and the arm, dense enough to find every overlap with a wall.
+def robot_points() -> Spheres:
+    """Return points of the whole robot, dense enough to find every overlap with a wall.
 
-    Neighbours are 0.02 m apart in the box and 0.01 m on the arm; a wall is 0.038 m thick.
+    Neighbours are at most 0.034 m apart; a wall is 0.038 m thick.
     """
-    return _points([_box(6, 6, 11)], arm=41)
+    return _points([*_rotor_rings(), *_rod_rings(), _box(4, 4, 7)], arm=21)
 
 
 def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) -> Array:
@@ -80,6 +74,18 @@ def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) ->
     placed: Array = points.positions @ rotation.transpose(0, 2, 1)
     placed += positions[:, None, :]
     return placed
+
+
+def _rotor_rings() -> list[Array]:
+    return [
+        _ring(x, y, height, ROTOR_RADIUS, 24)
+        for x, y in ((ROTOR_ARM, 0), (0, ROTOR_ARM), (-ROTOR_ARM, 0), (0, -ROTOR_ARM))
+        for height in (ROTOR_HEIGHT - ROTOR_HALF_THICKNESS, ROTOR_HEIGHT + ROTOR_HALF_THICKNESS)
+    ]
+
+
+def _rod_rings() -> list[Array]:
+    return [_ring(0, 0, height, ROD_RADIUS, 8) for height in (ROD_BOTTOM, ROD_TOP)]
 
 
 def _points(parts: list[Array], arm: int) -> Spheres:

@@ -20,6 +20,8 @@ from xml.etree import ElementTree
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Vector
 
+SPAWN: Vector = (0.0, 0.0, 0.1)
+"""Where the robot starts in the shipped scenes [m], world frame, shape (3,)."""
 SCENES = Path(__file__).parents[1] / "world" / "scenes"
 
 
@@ -68,21 +70,23 @@ class Scene:
         pipes: The pipes, in the order of the file.
         board: The board, if any.
         floor: Height z of the floor [m].
+        spawn: Where the robot starts [m], world frame, shape (3,).
     """
 
     name: str
     pipes: tuple[Pipe, ...] = ()
     board: Board | None = None
     floor: float = 0.0
+    spawn: Vector = SPAWN
 
 
 def load_scene(name: str) -> Scene:
-    """Read a shipped scene by its file name without .xml.
+    """Read a shipped scene by its file name without .xml, or one by the path of its .xml file.
 
     Raises:
         BadInputError: If the file does not exist, or its numbers do not fit the table above.
     """
-    return read_scene(SCENES / f"{name}.xml")
+    return read_scene(Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml")
 
 
 def read_scene(path: Path) -> Scene:
@@ -108,7 +112,9 @@ def read_scene(path: Path) -> Scene:
             board = Board(x, (spans[0], spans[1]), (spans[2], spans[3]))
         elif name == "floor":
             (floor,) = _numbers(path, element, 1)
-    return Scene(path.stem, tuple(pipes), board, floor)
+    frame = root.find("./worldbody/frame[@name='spawn']")
+    spawn = SPAWN if frame is None else _place(path, frame.get("pos", "0 0 0"))
+    return Scene(path.stem, tuple(pipes), board, floor, spawn)
 
 
 def _pipe(path: Path, name: str, data: list[float]) -> Pipe:
@@ -120,6 +126,14 @@ def _pipe(path: Path, name: str, data: list[float]) -> Pipe:
             "0 < inner < outer radius"
         )
     return Pipe(name, (cx, cy, cz), (ax / norm, ay / norm, az / norm), length, inner, outer)
+
+
+def _place(path: Path, text: str) -> Vector:
+    try:
+        x, y, z = map(float, text.split())
+    except ValueError:
+        raise BadInputError(f"scene {path.name}: spawn: pos must be 3 numbers: {text!r}") from None
+    return x, y, z
 
 
 def _numbers(path: Path, element: ElementTree.Element, count: int) -> list[float]:

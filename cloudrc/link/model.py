@@ -9,6 +9,7 @@ profile has the same statistics there as in a flight.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar
 
@@ -290,25 +291,23 @@ class Numbers:
     duplicated: float
 
 
-def sample(link: LinkDirection, kind: int, count: int, period_ns: int, size: int) -> Stream:
-    """Send packets at a steady rate.
+def sample(link: LinkDirection, kind: int, sent_ns: Sequence[int], size: int) -> Stream:
+    """Send packets.
 
     Args:
         link: A new direction with origin 0.
         kind: Message type in the header.
-        count: Number of packets.
-        period_ns: Time between two packets [ns].
+        sent_ns: When each is sent, rising [ns], shape (n,).
         size: UDP payload of each [bytes].
     """
-    delays = np.full(count, np.nan)
-    copies = np.zeros(count, dtype=np.int64)
-    for n in range(count):
-        now_ns = n * period_ns
+    delays = np.full(len(sent_ns), np.nan)
+    copies = np.zeros(len(sent_ns), dtype=np.int64)
+    for n, now_ns in enumerate(sent_ns):
         releases = link.send(1, kind, n, size, now_ns)
         if releases:
             delays[n] = (min(releases) - now_ns) * 1e-9
             copies[n] = len(releases)
-    return Stream(np.arange(count) * (period_ns * 1e-9), delays, copies)
+    return Stream(np.array(sent_ns) * 1e-9, delays, copies)
 
 
 def numbers(stream: Stream) -> Numbers:

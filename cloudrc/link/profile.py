@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass, replace
+from math import ceil
 from typing import Literal, NamedTuple, TypeAlias
 
 
@@ -89,6 +90,8 @@ class Blackout:
 class Trace:
     """Measured conditions over time: each row holds until the next, the last one without end.
 
+    A trace that loops begins again after its last row, which then lasts as long as a mean row.
+
     A trace replaces `delay`, and `loss` if it has losses; jitter is added to it.
 
     Attributes:
@@ -96,11 +99,21 @@ class Trace:
             also holds before its time.
         delays: One way [s], shape (n,).
         losses: In [0, 1], shape (n,), or None.
+        loop: Whether it begins again after its end.
     """
 
     times: tuple[float, ...]
     delays: tuple[float, ...]
     losses: tuple[float, ...] | None = None
+    loop: bool = False
+
+    @property
+    def period(self) -> float | None:
+        """Return the time after which the trace begins again [s]; None if it does not."""
+        count = len(self.times)
+        if not self.loop or count < 2:
+            return None
+        return self.times[-1] + (self.times[-1] - self.times[0]) / (count - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,11 +176,19 @@ class Conditions(NamedTuple):
     blackout: bool
 
 
+LOOP_SPAN = 3600.0
+"""Time for which a time line that loops is written out [s], for readers of `starts_ns`."""
+LOOP_PIECES = 500_000
+"""Most pieces of such a time line that are written out."""
+
+
 class Timeline:
     """The conditions of one direction over time.
 
     Attributes:
-        starts_ns: Start of each piece, as time since the link came up, rising [ns].
+        starts_ns: Start of each piece, as time since the link came up, rising [ns]; of a time line
+            that loops, for `LOOP_SPAN`.
+        period_ns: Time after which `starts_ns` begins again [ns]; None if it does not.
     """
 
     def __init__(self, profile: DirectionProfile) -> None:
@@ -179,11 +200,37 @@ class Timeline:
         ordered = sorted(instants)
         self.starts_ns = [round(instant * 1e9) for instant in ordered]
         self._pieces = [_conditions(profile, instant) for instant in ordered]
+        period = profile.trace.period if profile.trace else None
+        self.period_ns = None if period is None else self._repeat(round(period * 1e9))
 
     def at(self, elapsed_ns: int) -> Conditions:
         """Return the conditions `elapsed_ns` [ns] after the link came up."""
+        if self.period_ns is not None and elapsed_ns > 0:
+            elapsed_ns %= self.period_ns
         return self._pieces[max(bisect_right(self.starts_ns, elapsed_ns) - 1, 0)]
 
+<<<<<<< HEAD
+=======
+    def _repeat(self, period_ns: int) -> int:
+        """Repeat the pieces for `LOOP_SPAN`; return the time that they then last [ns]."""
+        pieces = list(zip(self.starts_ns, self._pieces, strict=True))
+        pieces = [(start_ns, piece) for start_ns, piece in pieces if start_ns < period_ns]
+        count = min(ceil(LOOP_SPAN * 1e9 / period_ns), max(LOOP_PIECES // len(pieces), 1))
+        self.starts_ns = [n * period_ns + start_ns for n in range(count) for start_ns, _ in pieces]
+        self._pieces = [piece for _ in range(count) for _, piece in pieces]
+        return count * period_ns
+
+    def least_delay_ns(self, reach: float) -> int:
+        """Return a lower bound of the delay of all packets [ns], >= 0.
+
+        Args:
+            reach: Largest distance of a delay below its mean, in units of the jitter [1].
+        """
+        passing = [piece for piece in self._pieces if not piece.blackout]
+        least = [piece.delay_ns - round(reach * piece.jitter * 1e9) for piece in passing]
+        return max(0, min(least, default=0))
+
+>>>>>>> w33-foreign
     def only(self) -> Conditions | None:
         """Return the conditions if they never change, otherwise None."""
         return self._pieces[0] if len(self._pieces) == 1 else None

@@ -325,7 +325,7 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
         summary="Fly to a point",
         description="A mission of its own, or another place for a mission that is held. The way "
         "there is straight: a pipe's wall in it is refused (409).",
-        openapi_extra=_takes(models.GoToRequest, {"position_m": [0.0, 0.0, 1.2], "yaw_deg": 0.0}),
+        openapi_extra=_takes(models.GoToRequest, {"position_m": [0.5, 0.0, 1.2], "yaw_deg": 0.0}),
         **_gives(models.MissionView, "On its way"),
     )
     async def go_to(request: Request) -> JSONResponse:

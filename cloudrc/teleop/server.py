@@ -484,12 +484,13 @@ def _bound(address: Address) -> tuple[socket.socket, str]:
     tcp = socket.socket(family, socket.SOCK_STREAM)
     tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        tcp.bind((host.strip("[]"), port))
+        tcp.bind((host, port))
     except OSError as error:
         tcp.close()
         text = f"--api {host}:{port}: {error.strerror or error}; choose another address"
         raise BadInputError(text) from error
-    return tcp, f"http://{host}:{tcp.getsockname()[1]}"
+    shown = f"[{host}]" if ":" in host else host
+    return tcp, f"http://{shown}:{tcp.getsockname()[1]}"
 
 
 def _bound_file(path: Path) -> socket.socket:

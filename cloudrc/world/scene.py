@@ -1,5 +1,8 @@
 """Compile a robot and a scene into one MuJoCo model.
 
+The robot may be somebody's own. The onboard controller and the rotors have fixed numbers. A robot
+with others would fly badly or not at all, so it is refused by what differs.
+
 No other module of `world` imports the package `mujoco`; they take it from here.
 """
 
@@ -8,10 +11,15 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.world.low_level import GRAVITY, MASS, THRUST_MAX
+from cloudrc.world.rotors import ARM, HEIGHT, TORQUE_RATIO
 
 ROBOT_PREFIX = "robot/"
 """Prefix of all names that belong to the robot in a compiled model."""
@@ -20,6 +28,12 @@ ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
 TIMESTEP = 0.002
 """Step of the physics and of the onboard part [s].
 Source: docs/reference/plant.md, "Physics step"."""
+INERTIA = (0.0121, 0.0116, 0.0226)
+"""Inertia about x, y, z for which the attitude gains are made [kg m^2], that of the pelican."""
+TIP = (0.40, 0.0, 0.17)
+"""Place of the arm's tip, from which clearance is computed [m], body frame."""
+SHOWN = 6
+"""Most differences that one message lists [1]."""
 FOLDER = Path(__file__).parent
 _NO_GL = {"", "disable", "disabled", "off", "false", "0"}
 
@@ -98,6 +112,10 @@ def compile_model(robot: str, scene: str) -> Any:
             geom.name = f"{geom.parent.name or 'unnamed'}/{number}"
         if spec.frame("spawn") is None:
             raise BadInputError(f"{scene_path}: needs a frame named spawn in its worldbody")
+        if spec.body("floor") is None:
+            raise BadInputError(
+                f"{scene_path}: needs a body named floor; other bodies are obstacles"
+            )
         # An empty prefix would make MuJoCo write MUJOCO_LOG.TXT into the working directory.
         spec.attach(mujoco.MjSpec.from_file(str(robot_path)), prefix=ROBOT_PREFIX, frame="spawn")
         spec.compiler.fusestatic = True
@@ -128,3 +146,91 @@ def _check(model: Any, robot_path: Path, scene_path: Path) -> None:
         raise BadInputError(
             f"{scene_path}: option timestep is {model.opt.timestep}, not {TIMESTEP}"
         )
+    differs = [what for what in _facts(model) if not what.fits]
+    if differs:
+        found = "; ".join(
+            f"{what.name} is {what.found:.4g}, not {what.wanted}" for what in differs[:SHOWN]
+        )
+        found += f"; and {len(differs) - SHOWN} more" * (len(differs) > SHOWN)
+        where = (
+            scene_path if all(what.name == "gravity [m/s^2]" for what in differs) else robot_path
+        )
+        raise BadInputError(f"{where}: the onboard controller is not made for it: {found}")
+
+
+class _Fact(NamedTuple):
+    """A number of a model that the onboard controller relies on.
+
+    Attributes:
+        name: Its name, with the unit.
+        found: Its value.
+        wanted: What the controller is made for, in words.
+        fits: Whether the value is near enough.
+    """
+
+    name: str
+    found: float
+    wanted: str
+    fits: bool
+
+
+def _near(name: str, found: float, wanted: float, tolerance: float) -> _Fact:
+    """Compare a value with the one that the controller assumes."""
+    words = f"{wanted:g} +- {tolerance:.2g}"
+    return _Fact(name, found, words, abs(found - wanted) <= tolerance)
+
+
+def _facts(model: Any) -> Iterator[_Fact]:
+    """Compare a model with what the onboard controller and the rotors assume.
+
+    The velocity loop makes up for 1 N of weight, attitude gains for half of the inertia.
+    """
+    base = model.jnt_bodyid[0]
+    yield _near("mass [kg]", model.body_mass[base], MASS, 0.1 * MASS)
+    yield _near("gravity [m/s^2]", -model.opt.gravity[2], GRAVITY, 0.02 * GRAVITY)
+    for axis, offset, most in zip("xyz", model.body_ipos[base], (0.01, 0.01, 0.03), strict=True):
+        yield _near(f"centre of mass, {axis} [m]", offset, 0.0, most)
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, model.body_iquat[base])
+    turned = axes.reshape(3, 3)
+    inertia = np.diag(turned @ np.diag(model.body_inertia[base]) @ turned.T)
+    for axis, found, wanted in zip("xyz", inertia, INERTIA, strict=True):
+        yield _near(f"inertia about {axis} [kg m^2]", found, wanted, 0.5 * wanted)
+    yield _Fact("damping of the base", max(model.dof_damping), "0", not model.dof_damping.any())
+    tip = model.site(f"{ROBOT_PREFIX}tip").pos
+    for axis, found, wanted in zip("xyz", tip, TIP, strict=True):
+        yield _near(f"tip, {axis} [m]", found, wanted, 0.01)
+    places = ((ARM, 0.0), (0.0, ARM), (-ARM, 0.0), (0.0, -ARM))
+    for number, (x, y) in enumerate(places):
+        yield from _rotor_facts(model, number, (x, y, HEIGHT), 1 if x else -1)
+
+
+def _rotor_facts(
+    model: Any, number: int, place: tuple[float, float, float], sign: int
+) -> Iterator[_Fact]:
+    """Compare one actuator with the rotor at this place [m], body frame, turning by `sign`."""
+    name = ROTORS[number]
+    if model.actuator_trntype[number] != mujoco.mjtTrn.mjTRN_SITE:
+        yield _Fact(f"{name} transmission", model.actuator_trntype[number], "a site", False)
+        return
+    site = model.actuator_trnid[number, 0]
+    for axis, found, wanted in zip("xyz", model.site_pos[site], place, strict=True):
+        yield _near(f"{name} place, {axis} [m]", found, wanted, 0.01)
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, model.site_quat[site])
+    gear = model.actuator_gear[number]
+    thrust, torque = axes.reshape(3, 3) @ gear[:3], axes.reshape(3, 3) @ gear[3:]
+    for axis, found, wanted in zip("xyz", thrust, (0.0, 0.0, 1.0), strict=True):
+        yield _near(f"{name} gear, thrust along {axis}", found, wanted, 0.01)
+    for axis, found, wanted in zip("xyz", torque, (0.0, 0.0, sign * TORQUE_RATIO), strict=True):
+        yield _near(f"{name} gear, torque about {axis} [m]", found, wanted, 0.001)
+    yield _near(f"{name} gain", model.actuator_gainprm[number, 0], 1.0, 0.01)
+    for kind in ("bias", "dyn"):
+        found = getattr(model, f"actuator_{kind}type")[number]
+        yield _Fact(f"{name} {kind}type", found, "0 (none)", found == 0)
+    for kind in ("ctrl", "force"):
+        low, high = getattr(model, f"actuator_{kind}range")[number]
+        free = not getattr(model, f"actuator_{kind}limited")[number]
+        wide = f"at least {THRUST_MAX:.3g}, the largest thrust"
+        yield _Fact(f"{name} {kind}range, end [N]", high, wide, free or high >= THRUST_MAX)
+        yield _Fact(f"{name} {kind}range, begin [N]", low, "0 or less", free or low <= 0.0)

@@ -97,3 +97,19 @@ def test_allowed_peers_may_call_the_api() -> None:
 
 def test_policies_can_be_disabled() -> None:
     assert policies({"networkPolicy": {"enabled": False}}) == {}
+
+
+def test_everything_listens_at_both_address_families() -> None:
+    flags = ("--listen=", "--metrics=", "--api=")
+    objects = render()
+    for name in ("world", "cloud"):
+        for part in containers(pod_specs(objects)[name]).values():
+            listens = [word for word in part["args"] if word.startswith(flags)]
+            assert listens
+            assert all("=[::]:" in word or "=127.0.0.1:" in word for word in listens)
+    policies = [
+        thing["spec"].get("ipFamilyPolicy") for thing in of_kind(objects, "Service").values()
+    ]
+    assert policies == ["PreferDualStack"] * 3
+    for thing in of_kind(render({"ipFamilyPolicy": None}), "Service").values():
+        assert "ipFamilyPolicy" not in thing["spec"]

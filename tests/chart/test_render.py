@@ -28,7 +28,7 @@ from tests.chart.conftest import (
 
 kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="comes with the extra dev")
 
-OLDEST = re.fullmatch(r">=(\d+\.\d+)\.0-0", METADATA["kubeVersion"])[1]  # type: ignore[index]
+OLDEST = re.match(r">=(\d+\.\d+)\.0-0 ", METADATA["kubeVersion"])[1]  # type: ignore[index]
 NEWEST = ".".join(kubernetes_validate.latest_version().split(".")[:2])
 FILES = [*CI_VALUES, *EXAMPLES]
 RANDOM = {"Secret"}

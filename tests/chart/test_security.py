@@ -57,6 +57,27 @@ def test_a_release_passes_restricted_with_the_relay(path: Path) -> None:
     assert {name: breaches(pod) for name, pod in pods.items() if breaches(pod)} == {}
 
 
+def test_security_contexts_can_be_left_out_or_changed() -> None:
+    """OpenShift gives each namespace its own user ids and refuses others."""
+    values = {"podSecurityContext": None, "containerSecurityContext": None}
+    objects = render({**values, "cloud": {"backgroundLoad": {"enabled": True}}})
+    for pod in pod_specs(objects).values():
+        assert "securityContext" not in pod
+        assert not any("securityContext" in part for part in containers(pod).values())
+    for pod in pod_specs(render({"podSecurityContext": {"runAsUser": 12_345}})).values():
+        assert pod["securityContext"]["runAsUser"] == 12_345
+        assert pod["securityContext"]["runAsNonRoot"] is True
+
+
+def test_missions_and_tests_can_do_without_a_meshs_sidecar() -> None:
+    inject = {"sidecar.istio.io/inject": "false"}
+    objects = render({"mission": {"enabled": True, "podAnnotations": inject}})
+    (job,) = of_kind(objects, "Job").values()
+    assert job["spec"]["template"]["metadata"]["annotations"] == inject
+    for pod in of_kind(objects, "Pod").values():
+        assert pod["metadata"]["annotations"].items() > inject.items()
+
+
 def test_the_default_is_restricted_if_the_namespace_is_unknown() -> None:
     assert not any(map(breaches, pod_specs(render()).values()))
 

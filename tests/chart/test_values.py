@@ -24,7 +24,7 @@ jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-val
 
 DEFAULTS = values_of(CHART / "values.yaml")
 # Values that Helm, Kubernetes or a plug-in defines and checks.
-OPEN = {"global", "affinity", "tolerations"}
+OPEN = {"global", "affinity", "tolerations", "podSecurityContext", "containerSecurityContext"}
 
 
 def parts(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Object]]:

@@ -8,13 +8,21 @@ import signal
 import socket
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
 from cloudrc import assembly
 from cloudrc.cli.main import main
-from cloudrc.cli.runtime import _open_peer, open_exporter, read_size, resolve_address
+from cloudrc.cli.runtime import (
+    _open_peer,
+    ipv4_addresses,
+    open_exporter,
+    read_address,
+    read_size,
+    resolve_address,
+    show_address,
+)
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent
@@ -78,7 +86,7 @@ def test_an_address_in_use_is_reported_with_its_flag(
     assert error.endswith("; name an address of this machine and a port that is free\n")
 
 
-def no_such_name(*asked: object) -> None:
+def no_such_name(*asked: object) -> NoReturn:
     raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
 
@@ -111,6 +119,35 @@ def test_an_unresolvable_name_is_reported_at_the_start(
         f"cloudrc: error: {flag} nowhere:7400: nowhere cannot be resolved (Name or service not"
         " known); name a host that has an IPv4 address, or the address itself\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [("127.0.0.1:7400", ("127.0.0.1", 7400)), ("[::1]:7400", ("::1", 7400)), ("[::]:1", ("::", 1))],
+)
+def test_an_address_of_ipv6_is_in_brackets(text: str, address: tuple[str, int]) -> None:
+    assert read_address(text) == address
+    assert show_address(address) == text
+    with pytest.raises(argparse.ArgumentTypeError, match=r"put an IPv6 address in brackets"):
+        read_address("::1:7400")
+
+
+def test_without_ipv6_all_addresses_are_those_of_ipv4(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*asked: object) -> None:
+        raise OSError("Address family not supported by protocol")
+
+    monkeypatch.setattr(socket, "socket", refuse)
+    assert read_address("[::]:7400") == ("0.0.0.0", 7400)
+
+
+def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def look_up(name: str, port: None, family: int, kind: int) -> list[tuple[Any, ...]]:
+        return [(family, kind, 17, "", ("::5", 0))] if family == socket.AF_INET6 else no_such_name()
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    with pytest.raises(OSError, match="IPv6 addresses alone, and a link is shaped over IPv4"):
+        ipv4_addresses("cloud")
+    assert resolve_address("--peer", ("cloud", 1), ("::1", 2)) == ("::5", 1)
 
 
 def test_a_name_with_too_long_a_label_is_refused() -> None:

@@ -173,10 +173,17 @@ def test_a_missing_parameter_is_reported_once(mine: Path) -> None:
     assert text == "mine.yaml:2: cloud.predictor.share: is missing; must be a number"
 
 
-@pytest.mark.parametrize("text", ["seed", "=3", "a..b=1", ".=1", "seed=["])
+@pytest.mark.parametrize(
+    "text", ["seed", "=3", "a..b=1", ".=1", "seed=[", "seed=[1] # x", 'name="a" # b"']
+)
 def test_an_invalid_setting_is_refused(text: str) -> None:
     with pytest.raises(BadInputError, match="--set"):
         load_experiment("paper", [text])
+
+
+def test_a_key_that_is_set_twice_is_refused() -> None:
+    with pytest.raises(BadInputError, match="--set seed: is set twice; keep one of them"):
+        load_experiment("paper", ["seed=1", "name=x", "seed=2"])
 
 
 def test_an_index_beyond_the_end_is_refused() -> None:

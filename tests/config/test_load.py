@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from cloudrc.assembly import link_profile
 from cloudrc.config import document, shipped
+from cloudrc.config.document import parse_value
 from cloudrc.config.load import (
     ResolvedExperiment,
     dump,
@@ -20,6 +21,7 @@ from cloudrc.config.load import (
     read_experiment,
 )
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.scene import load_scene
 
 EXPERIMENTS = shipped.names("experiment")
 PROFILES = shipped.names("profile")
@@ -137,6 +139,17 @@ def test_set_reaches_into_mission_and_time_line_by_index() -> None:
 def test_set_appends_to_a_list() -> None:
     experiment = load_experiment("hover", ["mission.waypoints.1.position_m=[0, 1, 1]"])
     assert experiment.mission.waypoints[1].position_m == (0, 1, 1)
+
+
+@pytest.mark.parametrize("text", ["exp #2", "exp: 2", "*x", "exp ", "12:30"])
+def test_a_value_is_the_whole_rest_of_its_argument(text: str) -> None:
+    assert parse_value(text, "--set name") == text
+    assert load_experiment("hover", [f"name={text}"]).name == text
+
+
+def test_a_value_may_be_a_number_a_list_or_quoted() -> None:
+    values = {"1e-3": 0.001, "true": True, "": None, "[1, 'a #']": [1, "a #"], '"5"': "5"}
+    assert {text: parse_value(text, "x") for text in values} == values
 
 
 def test_the_order_of_settings_does_not_matter() -> None:
@@ -272,3 +285,21 @@ def test_a_short_file_has_the_hash_of_its_given_parameters(
     assert given != fingerprint(load_experiment(path))
     path.write_text(dump(load_experiment(path)))
     assert fingerprint(read_experiment(str(path))) == fingerprint(load_experiment(path)) != given
+
+
+def test_robot_and_scene_may_be_files_beside_the_experiment(tmp_path: Path) -> None:
+    folder = Path(shipped.FOLDERS["scene"])
+    (tmp_path / "mine.xml").write_text((folder / "pipes.xml").read_text())
+    (tmp_path / "e.yaml").write_text("world: {robot: ./mine.xml, scene: mine.xml}\n")
+    world = load_experiment(tmp_path / "e.yaml").world
+    assert world.robot == world.scene == str(tmp_path / "mine.xml")
+    assert load_scene(world.scene).pipes == load_scene("pipes").pipes
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("./no.xml", "no such file: .*no.xml; names of shipped robots: pelican"), ("/x/q", "not an")],
+)
+def test_a_robot_that_is_no_file_is_refused(name: str, says: str) -> None:
+    with pytest.raises(BadInputError, match=f"world.robot: {says}"):
+        load_experiment("hover", [f"world.robot={name}"])

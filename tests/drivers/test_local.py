@@ -197,14 +197,30 @@ def test_what_a_plug_in_prints_goes_to_the_log(tmp_path):
     assert "hello" in (tmp_path / "run" / "cloud.log").read_text()
 
 
-def test_a_process_that_hangs_ends_the_run_and_is_named(tmp_path):
+@pytest.mark.parametrize("victim", ["relay", "teleop", *nightly("world", "cloud")])
+def test_a_process_that_hangs_ends_the_run_and_is_named(tmp_path, victim):
     run = start(tmp_path / "run")
     pids = wait_until_flying(run)
-    os.kill(pids["world"], signal.SIGSTOP)
+    os.kill(pids[victim], signal.SIGSTOP)
+    stopped = time.monotonic()
+    while any(alive(pid) for pid in pids.values()):
+        assert time.monotonic() - stopped < 10.0
+        time.sleep(0.05)
     _, errors = run.communicate(timeout=60)
     assert run.returncode == 4
-    assert "the world process was silent" in errors
-    assert not any(alive(pid) for pid in pids.values())
+    assert f"the {victim} process was silent" in errors
+
+
+def test_a_supervisor_that_stood_still_takes_the_flight_up_again(tmp_path):
+    run = start(tmp_path / "run", dwell=8.0)
+    wait_until_flying(run)
+    os.kill(run.pid, signal.SIGSTOP)
+    time.sleep(flights.SILENCE_LIMIT + 1.0)
+    os.kill(run.pid, signal.SIGCONT)
+    _, errors = run.communicate(timeout=60)
+    assert run.returncode in FLOWN, errors
+    (note,) = (note for note in report(tmp_path / "run")["notes"] if "supervisor" in note)
+    assert "stood still for 6." in note
 
 
 def test_a_run_whose_supervisor_was_killed_gets_a_report(tmp_path):

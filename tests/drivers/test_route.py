@@ -68,11 +68,24 @@ def test_what_is_no_file_or_an_endless_one_is_not_waited_for(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "text", ["cloud:7400", "1.2.3:7400", "1.2.3.4:0", "1.2.3.4:65536", "1.2.3.4:x", "[::1]:7400"]
+    "text",
+    [
+        "cloud:7400",
+        "1.2.3:7400",
+        "1.2.3.4:0",
+        "1.2.3.4:65536",
+        "1.2.3.4:x",
+        "::1:7400",
+        "[1.2.3.4]:1",
+    ],
 )
 def test_only_numbers_are_an_address(text: str) -> None:
     with pytest.raises(ValueError, match="is not"):
         parse(text)
+
+
+def test_an_ipv6_address_has_brackets() -> None:
+    assert parse("[::1]:7400\n") == ("::1", 7400)
 
 
 def test_a_peer_follows_its_route_twice_a_second(tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ import pytest
 
 from cloudrc.cli.link_record import TOPICS, one_way
 from cloudrc.config.load import load_experiment
-from cloudrc.link.traces import Direction, Packets, read_trace, trace_of, write_trace
+from cloudrc.link.logs import Direction, Packets, trace_of
+from cloudrc.link.traces import read_trace, write_trace
 from cloudrc.record.columns import Recording
 from tests.flights.conftest import records
 

@@ -16,7 +16,7 @@ from cloudrc.geometry.clearance import (
     inside_pipe,
     pipe_index,
 )
-from cloudrc.geometry.robot import hull_points, key_points, place_points
+from cloudrc.geometry.robot import key_points, place_points, robot_points
 from cloudrc.geometry.scene import Pipe, Scene, load_scene
 
 PIPES = load_scene("pipes")
@@ -124,7 +124,7 @@ def test_points_are_those_of_the_plant() -> None:
     assert points.positions[:, 1].max() == pytest.approx(0.338)
     assert (points.positions[:, 2].min(), points.positions[:, 2].max()) == (-0.1, 0.18)
     assert sorted(set(points.radii)) == [0, 0.01]
-    assert len(hull_points().radii) == 41 + 6 * 6 * 11
+    assert len(robot_points().radii) == 21 + 8 * 24 + 2 * 8 + 4 * 4 * 7
 
 
 def test_inside_a_pipe_is_in_its_bore_and_between_its_ends() -> None:

@@ -12,15 +12,18 @@ from hypothesis import strategies as st
 from cloudrc.config.load import load_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.schema import Mission, Steps, Waypoint
+from cloudrc.geometry import fence
+from cloudrc.geometry.clearance import clearance
 from cloudrc.geometry.placement import (
+    CLEARANCE_MIN,
     find_crossed_pipe,
     find_nearest_legal,
     find_overlapped_pipe,
     outside_fence,
 )
-from cloudrc.geometry.robot import Array
-from cloudrc.geometry.scene import Pipe, Scene, load_scene
+from cloudrc.geometry.scene import Scene, load_scene
 from cloudrc.messages import Vector
+from cloudrc.world.guard.limits import Limits
 
 PIPES = load_scene("pipes")
 
@@ -33,26 +36,75 @@ def hit(position: Vector, yaw: float = 0.0) -> int:
     ("position", "yaw", "pipe"),
     [
         ((-1.0, 0.0, 0.8), 0, -1),
-        # The arm's tip is at x + .40, z + .17: from x = -.77 on it is in the wall of pipe 1.
-        ((-0.78, 0.0, 0.8), 0, -1),
-        ((-0.76, 0.0, 0.8), 0, 0),
+        # The arm's tip is at x + .40, z + .17: from x = -.81 on it is within .04 m of the wall.
+        ((-0.82, 0.0, 0.8), 0, -1),
+        ((-0.80, 0.0, 0.8), 0, 0),
         # Beyond that the tip is outside and the arm goes through the wall.
         ((-0.60, 0.0, 0.8), 0, 0),
         # Turned along the pipe, the arm is clear.
-        ((-0.76, 0.0, 0.8), math.pi / 2, -1),
-        # The bottom of the base's box: z - .10 against the bore's z - .662.
-        ((-1.0, 0.0, 0.25), math.pi / 2, -1),
-        ((-1.0, 0.0, 0.23), math.pi / 2, 0),
-        # The wall is inside the box, and all corners of the box are outside the wall.
-        ((-1.0, 0.0, 0.119), math.pi / 2, 0),
-        # At (0, 0) only the rotors overlap; they do not count.
-        ((0.0, 0.0, 0.8), 0, -1),
+        ((-0.80, 0.0, 0.8), math.pi / 2, -1),
+        # The rims of the rotors, .338 from the axis, in the lower part of the bore.
+        ((-1.0, 0.0, 0.29), math.pi / 2, -1),
+        ((-1.0, 0.0, 0.25), math.pi / 2, 0),
+        # At (0, 0) the rear rotor is in the outside of pipe 1.
+        ((0.0, 0.0, 0.8), 0, 0),
         # Behind the board.
         ((8.235, -6.422, 0.7), 0, -1),
     ],
 )
 def test_overlaps(position: Vector, yaw: float, pipe: int) -> None:
     assert hit(position, yaw) == pipe
+
+
+def test_the_limits_are_those_of_the_guard() -> None:
+    corners = Limits(fence_low=fence.LOW, fence_high=fence.HIGH).inner_corners()
+    assert corners == (fence.INNER_LOW, fence.INNER_HIGH)
+
+
+@pytest.mark.parametrize(
+    ("position", "tolerance", "outside"),
+    [
+        ((9.2, 0.0, 1.0), 0.1, True),  # in the fence; the guard stops the robot at 9.03
+        ((9.05, 0.0, 1.0), 0.1, False),  # within half of the tolerance
+        ((9.05, 0.0, 1.0), 0.01, True),
+        ((9.25, 0.0, 1.0), 1.0, True),  # beyond the fence
+        ((0.5, 0.0, 0.1), 0.1, True),
+        ((0.5, 0.0, 0.3), 0.1, False),
+    ],
+)
+def test_a_waypoint_that_the_guard_keeps_the_robot_from_is_refused(
+    position: Vector, tolerance: float, outside: bool
+) -> None:
+    mission = Mission(waypoints=(Waypoint(position_m=position, tolerance_m=tolerance),))
+    problems = check_mission(mission, PIPES)
+    assert bool(problems) is outside
+    if outside:
+        assert "x -2.8 to 9, y -8.3 to 5.3, z 0.35 to 2.3 [m]" in str(problems[0])
+
+
+def test_the_example_of_goto_can_be_flown_and_straight_up_cannot() -> None:
+    for position, start, legal in (
+        ((0.5, 0.0, 1.2), "spawn", True),
+        ((0.0, 0.0, 1.2), "spawn", False),
+        ((0.0, 0.0, 1.2), "here", True),
+        ((0.0, 0.0, 0.8), "here", False),
+    ):
+        mission = Mission(start=start, waypoints=(Waypoint(position_m=position),))  # type: ignore[arg-type]
+        assert (check_mission(mission, PIPES) == []) is legal
+
+
+def test_the_way_from_the_spawn_is_checked() -> None:
+    beyond = Mission(waypoints=(Waypoint(position_m=(-2.5, 0.0, 0.8)),))
+    (problem,) = check_mission(beyond, PIPES)
+    assert "the straight way there from the spawn leads through the wall of pipe_1" in str(problem)
+    assert check_mission(beyond.model_copy(update={"start": "here"}), PIPES) == []
+
+
+def test_a_robot_that_is_at_a_wall_may_move_away_from_it() -> None:
+    at, away, nearer = np.array([[-0.78, 0.0, 0.8]]), (-1.0, 0.0, 0.8), (-0.7, 0.0, 0.8)
+    assert hit(at[0]) == 0
+    assert find_crossed_pipe(PIPES, at, np.array([away]))[0] == -1
+    assert find_crossed_pipe(PIPES, at, np.array([nearer]))[0] == 0
 
 
 @settings(max_examples=30, deadline=None)
@@ -78,11 +130,11 @@ def test_shipped_missions_can_be_flown(experiment: str) -> None:
 
 
 def test_every_bad_waypoint_is_named_up_to_a_number() -> None:
-    bad = Waypoint(position_m=(-1.0, 0.0, 0.15))
+    bad = Waypoint(position_m=(-0.6, 0.0, 0.7))
     good = Waypoint(position_m=(-1.0, 0.0, 0.7))
     problems = check_mission(Mission(waypoints=(good, bad) * 30), PIPES)
     assert len(problems) == 21
-    assert str(problems[0]).startswith("waypoints.1.position_m: [-1, 0, 0.15]: base box or arm")
+    assert str(problems[0]).startswith("waypoints.1.position_m: [-0.6, 0, 0.7]: the robot would")
     assert str(problems[-1]).startswith("waypoints: 10 more waypoints")
 
 
@@ -97,46 +149,38 @@ def test_every_bad_waypoint_is_named_up_to_a_number() -> None:
         ((-1.0, 0.0, 0.8), (-1.0, 0.0, 0.8), -1),
         ((-1.0, -1.0, 0.8), (-1.0, 1.0, 0.8), -1),  # along the axis
         ((0.5, -2.0, 0.8), (0.5, 2.0, 0.8), -1),  # past it
-        ((-2.5, 2.7, 0.8), (0.5, 2.7, 0.8), -1),  # across, in front of its mouth
-        ((-2.5, 0.0, 1.6), (0.5, 0.0, 1.6), -1),  # over it
-        ((-1.0, -2.0, 0.8), (5.66, -6.42, 0.8), 2),  # out of one bore, into another
+        ((-2.5, 2.9, 0.8), (0.5, 2.9, 0.8), -1),  # across, in front of its mouth
+        ((-2.5, 2.7, 0.8), (0.5, 2.7, 0.8), 0),  # with a rotor in it
+        ((-2.5, 0.0, 1.7), (0.5, 0.0, 1.7), -1),  # over it
+        ((-2.5, 0.0, 1.6), (0.5, 0.0, 1.6), 0),  # its box would scrape along the top
+        ((-1.0, -2.0, 0.8), (5.66, -6.42, 0.8), 0),  # out of one bore, into another
     ],
 )
 def test_a_straight_way_through_a_wall_is_found(start: Vector, end: Vector, pipe: int) -> None:
     assert find_crossed_pipe(PIPES, np.array([start]), np.array([end]))[0] == pipe
 
 
-def in_pipe(points: Array, pipe: Pipe) -> tuple[Array, Array]:
-    """Return the depth along the axis and the distance from it [m], shapes (n,)."""
-    relative = points - np.array(pipe.centre)
-    depth = relative @ np.array(pipe.axis)
-    return depth, np.linalg.norm(relative - depth[:, None] * np.array(pipe.axis), axis=1)
-
-
 @settings(max_examples=50, deadline=None)
-@given(*[st.tuples(st.floats(-3, 9), st.floats(-8, 5), st.floats(0, 2))] * 2)
-def test_a_way_crosses_a_wall_if_it_changes_sides(start: Vector, end: Vector) -> None:
-    """Cut the way into short pieces: a piece that changes sides crosses the wall."""
-    points = np.linspace(start, end, 2_000)
+@given(*[st.tuples(st.floats(-2.8, 9), st.floats(-8.3, 5.3), st.floats(0.4, 2.2))] * 2)
+def test_a_way_is_found_to_touch_a_wall_if_a_piece_of_it_does(start: Vector, end: Vector) -> None:
+    """Fly the way in steps of 1 cm, with the points by which the metrics judge the clearance."""
+    if hit(start) >= 0:
+        return
+    points = np.linspace(start, end, 1 + int(100 * math.dist(start, end)))
+    distance = clearance(PIPES, points, np.tile([1.0, 0, 0, 0], (len(points), 1))).min()
     (found,) = find_crossed_pipe(PIPES, np.array([start]), np.array([end])).tolist()
-    for pipe in PIPES.pipes:
-        depth, radius = in_pipe(points, pipe)
-        within = radius < (pipe.inner + pipe.outer) / 2
-        beside = np.abs(depth) < pipe.length / 2 - 0.02
-        if np.any((within[1:] != within[:-1]) & beside[1:] & beside[:-1]):
-            assert found != -1, pipe.name
-    if found != -1:
-        pipe = PIPES.pipes[found]
-        depth, radius = in_pipe(points, pipe)
-        near = np.abs(radius - (pipe.inner + pipe.outer) / 2) < 0.02
-        assert np.any(near & (np.abs(depth) < pipe.length / 2 + 0.02))
+    if distance < CLEARANCE_MIN - 0.02:
+        assert found != -1
+    if distance > CLEARANCE_MIN + 0.02:
+        assert found == -1
 
 
 def test_a_waypoint_behind_a_wall_is_refused_with_its_way() -> None:
     inside, outside = Waypoint(position_m=(-1.0, 0.0, 0.7)), Waypoint(position_m=(0.5, 0.0, 0.7))
-    (problem,) = check_mission(Mission(waypoints=(inside, outside)), PIPES)
+    (problem,) = check_mission(Mission(start="here", waypoints=(inside, outside)), PIPES)
     assert str(problem).startswith("waypoints.1.position_m: [0.5, 0, 0.7]: the straight way there")
     assert "from waypoint 0 leads through the wall of pipe_1" in problem.reason
+    assert "from the spawn" in str(check_mission(Mission(waypoints=(inside,)), PIPES)[0])
     assert check_mission(Mission(waypoints=(outside, outside)), PIPES) == []
 
 

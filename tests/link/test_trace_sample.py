@@ -14,7 +14,7 @@ from tests.link.conftest import MS, TELEMETRY, link
 
 
 def measured(profile: DirectionProfile, count: int = 20_000) -> Numbers:
-    return numbers(sample(link(profile), TELEMETRY, count, 10 * MS, 191))
+    return numbers(sample(link(profile), TELEMETRY, range(0, count * 10 * MS, 10 * MS), 191))
 
 
 def test_uniform_jitter_larger_than_the_gap_reorders() -> None:

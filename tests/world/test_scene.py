@@ -179,6 +179,33 @@ def test_a_robot_that_cannot_fly_is_refused(tmp_path, monkeypatch, robot, messag
     assert list(tmp_path.iterdir()) == [path], "MuJoCo wrote a log"
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('mass="1.0"', 'mass="1.265"', r"mass .kg. is 1.325, not 1.05 \+- 0.1"),
+        (".01 .01 .02", ".02 .01 .02", "inertia about x .kg m.2. is 0.0215"),
+        ('inertial pos="0 0 0"', 'inertial pos="0 .03 0"', "centre of mass, y .m. is 0.028"),
+        ("<freejoint", "<joint type='free' damping='.1'", "damping of the base is 0.1, not 0"),
+        ('pos=".21 0 .05"', 'pos=".15 .15 .05"', "rotor_front place, x .m. is 0.15, not 0.21"),
+        ('"0 .21 .05" childclass', '"0 .21 .05" euler="9 0 0" childclass', "rotor_left gear"),
+        ('gear="0 0 1 0 0 .016"', 'gear="0 0 1 0 0 .02"', "torque about z .m. is 0.02, not 0.016"),
+        ('gear="0 0 1 0 0 -.016"', 'gear="0 0 1 0 0 .016"', "is 0.016, not -0.016"),
+        ('gear="0 0 1 0 0 .016"', 'gear="0 0 2 0 0 .016"', "thrust along z is 2, not 1"),
+        ('ctrllimited="false"', 'ctrlrange="0 13"', "ctrlrange, end .N. is 13, not at least 33.7"),
+        ('ctrllimited="false"', 'forcerange="1 40"', "forcerange, begin .N. is 1, not 0 or less"),
+        ('ctrllimited="false"', 'gainprm="2"', "rotor_front gain is 2, not 1"),
+        ('ctrllimited="false"', 'dyntype="filter" dynprm="1"', "nothing else|dyntype is 2, not 0"),
+        ('size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip, x .m. is 0.3, not 0.4"),
+    ],
+)
+def test_what_the_controller_is_not_made_for_is_refused_by_name(tmp_path, old, new, message):
+    path = tmp_path / "robot.xml"
+    assert old in GOOD
+    path.write_text(GOOD.replace(old, new))
+    with pytest.raises(BadInputError, match=f"robot.xml: [^\n]*{message}"):
+        compile_model(str(path), "empty")
+
+
 SCENE = (FOLDER / "scenes" / "empty.xml").read_text()
 
 
@@ -187,8 +214,10 @@ SCENE = (FOLDER / "scenes" / "empty.xml").read_text()
     [
         (SCENE.replace('name="spawn"', 'name="start"'), "needs a frame named spawn"),
         (SCENE.replace('timestep=".002"', 'timestep=".01"'), "timestep is 0.01, not 0.002"),
-        (SCENE.replace('<body name="floor">', '<body><freejoint/><geom size="1"/></body><body>'),
-         "nothing else may move"),
+        (SCENE.replace('<body name="floor">', '<body><freejoint/><geom size="1"/></body>'
+                       '<body name="floor">'), "nothing else may move"),
+        (SCENE.replace('<body name="floor">', "<body>"), "needs a body named floor"),
+        (SCENE.replace("-9.8066", "-1.62"), r"gravity .m/s.2. is 1.62, not 9.81"),
     ],
 )  # fmt: skip
 def test_a_scene_that_cannot_be_flown_in_is_refused(tmp_path, scene, message):

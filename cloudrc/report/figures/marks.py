@@ -7,7 +7,7 @@ next. Within a span the profile follows its own time line.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import inf, isnan
 from pathlib import Path
@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 
 from cloudrc.config.schema import Direction
 from cloudrc.errors import BadInputError
+from cloudrc.link.profile import DirectionProfile, Timeline
 from cloudrc.link.traces import read_trace
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import holds
@@ -50,7 +51,7 @@ def band(direction: Direction) -> Band | None:
     """
     trace = direction.trace
     try:
-        steps = _trace_delays(Path(trace)) if trace else [(0.0, direction.delay_ms)]
+        steps = _trace_delays(Path(trace), direction) if trace else [(0.0, direction.delay_ms)]
     except BadInputError:
         return None
     delay, jitter = steps[0][1], direction.jitter_ms
@@ -71,11 +72,12 @@ def bounds_at(steps: Band, time: Array) -> tuple[Array, Array]:
     return steps.low[rows], steps.high[rows]
 
 
-def _trace_delays(path: Path) -> list[tuple[float, float]]:
+def _trace_delays(path: Path, direction: Direction) -> list[tuple[float, float]]:
     """Read times [s] and delays [ms] of a trace; the first row also applies before its time."""
-    trace = read_trace(path)
-    delays = [delay * 1e3 for delay in trace.delays]
-    return [(0.0, delays[0]), *zip(trace.times, delays, strict=True)]
+    profile = DirectionProfile(trace=replace(read_trace(path), loop=direction.loop))
+    timeline = Timeline(profile)
+    starts_ns = timeline.starts_ns
+    return [(start_ns * 1e-9, timeline.at(start_ns).delay_ns * 1e-6) for start_ns in starts_ns]
 
 
 SAME_CHANGE = 0.05

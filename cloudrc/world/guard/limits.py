@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import copysign, inf, isfinite, sqrt
 
-from cloudrc.geometry.fence import FLOOR_MARGIN
+from cloudrc.geometry.fence import FLOOR_MARGIN, WALL_MARGIN
 from cloudrc.messages import ZERO, Vector
 
 BRAKE = 3.0
@@ -24,7 +24,7 @@ STOPPING_DISTANCE = 8.7
 Source: docs/reference/plant.md, "Speed cap"."""
 STOP_COEFFICIENT = 1.0 / (2.0 * BRAKE)
 """Braking distance over speed squared [s^2/m]."""
-FENCE_REACTION, FENCE_MARGIN = 0.6, 0.2
+FENCE_REACTION, FENCE_MARGIN = 0.6, WALL_MARGIN
 """Towards a wall or the ceiling of the fence, the speed v keeps
 FENCE_REACTION v + v^2/6 <= distance - FENCE_MARGIN [s], [m]. Towards the floor, REACTION and
 FLOOR_MARGIN replace them, because the robot climbs readily.

@@ -103,15 +103,17 @@ auto
     - --peer={{ include "cloudrc.fullname" .root }}-{{ .peer }}:7400
     - --listen=127.0.0.1:7401
     - --route=/run/cloudrc/route
-    - --metrics=0.0.0.0:9102
+    - "--metrics=[::]:9102"
   ports:
     - {name: link-metrics, containerPort: 9102, protocol: TCP}
   {{- include "cloudrc.probes" "link-metrics" | nindent 2 }}
   terminationMessagePolicy: FallbackToLogsOnError
+  {{- if eq $mode "relay" }}
+  {{- with include "cloudrc.containerSecurity" .root }}
+  {{- . | nindent 2 }}
+  {{- end }}
+  {{- else }}
   securityContext:
-    {{- if eq $mode "relay" }}
-    {{- include "cloudrc.containerSecurity" . | nindent 4 }}
-    {{- else }}
     allowPrivilegeEscalation: false
     readOnlyRootFilesystem: true
     runAsNonRoot: false
@@ -119,7 +121,7 @@ auto
     capabilities:
       drop: [ALL]
       add: [NET_ADMIN]
-    {{- end }}
+  {{- end }}
   resources:
     {{- toYaml .root.Values.link.resources | nindent 4 }}
   volumeMounts:

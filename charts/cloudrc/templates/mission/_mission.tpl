@@ -38,8 +38,9 @@
         fieldRef:
           fieldPath: {{ .uid }}
   terminationMessagePolicy: FallbackToLogsOnError
-  securityContext:
-    {{- include "cloudrc.containerSecurity" . | nindent 4 }}
+  {{- with include "cloudrc.containerSecurity" .root }}
+  {{- . | nindent 2 }}
+  {{- end }}
   resources:
     {{- toYaml .root.Values.mission.resources | nindent 4 }}
   volumeMounts:
@@ -64,6 +65,10 @@
 metadata:
   labels:
     {{- include "cloudrc.podLabels" (dict "root" . "component" "mission") | nindent 4 }}
+  {{- with .Values.mission.podAnnotations }}
+  annotations:
+    {{- toYaml . | nindent 4 }}
+  {{- end }}
 spec:
   restartPolicy: Never
   {{- include "cloudrc.pod" (dict "root" . "component" "cloud") | nindent 2 }}

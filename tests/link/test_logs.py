@@ -1,0 +1,245 @@
+"""CSV logs and logs of irtt: units, losses, directions; everything left out is counted."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from cloudrc.errors import BadInputError
+from cloudrc.link.logs import Direction, Log, Packets, read_csv, read_irtt, refuse_others, trace_of
+
+
+def read(text: str, *, halve: bool = False, trust_units: bool = False) -> Packets:
+    return read_csv(text.splitlines(), "x.csv", halve=halve, trust_units=trust_units)
+
+
+def test_a_row_of_a_trace_begins_halfway_between_two_packets() -> None:
+    trace = trace_of(Packets((5.0, 5.01, 5.02, 5.03), (0.040, None, 0.060, 0.045)))
+    assert trace.times == pytest.approx((0.0, 0.005, 0.015, 0.025))
+    assert trace.delays == (0.040, 0.040, 0.060, 0.045)
+    assert trace.losses == (0.0, 1.0, 0.0, 0.0)
+    assert trace_of(Packets((0.0, 1.0), (0.040, 0.050))).losses is None
+
+
+@pytest.mark.parametrize(
+    ("text", "delays"),
+    [
+        ("time_s,delay_ms\n10,45\n10.5,60", (0.045, 0.060)),
+        ("time_ms, delay_us\n10000, 45000\n10500, 60000", (0.045, 0.060)),
+        ("host,delay_s,sent_us,note\na,0.045,1000000,x\n\nb,0.060,1500000,y", (0.045, 0.060)),
+        (
+            "timestamp_ns,delay_ns\n1700000000000000000,45000000\n1700000000500000000,6e7",
+            (0.045, 0.06),
+        ),
+        ("\ufeffTime (ms);Delay [µs]\n0;45000,5\n500;6e4".lstrip("\ufeff"), (0.0450005, 0.060)),
+        (
+            'timestamp\t"delay_ms"\n2024-01-20 10:00:00.000\t45\n2024-01-20T10:00:00.500\t60',
+            (0.045, 0.06),
+        ),
+    ],
+)
+def test_units_and_separators_are_those_of_the_header(text: str, delays: tuple[float]) -> None:
+    packets = read(text)
+    assert packets.sent == pytest.approx((0.0, 0.5))
+    assert packets.delays == pytest.approx(delays)
+    assert packets.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "note"),
+    [
+        ("time_s,delay_ms,loss", "1,,0", ""),
+        ("time_s,delay_ms,loss", "1,30,1", ""),
+        ("time_s,delay_ms,loss", "1,0,yes", ""),
+        ("time_s,delay_ms", "1,nan", ""),
+        ("time_s,delay_ms", "1,-", ""),
+        ("time_s,delay_ms", "1,no answer yet", ""),
+        ("time_s,delay_ms", "1,-1", "1 with delay_ms -1 taken as lost"),
+        ("time_s,delay_ms", "1,0", "1 with delay_ms 0 taken as lost"),
+    ],
+)
+def test_the_marks_of_lost_packets_are_known(header: str, row: str, note: str) -> None:
+    end = ",0" if "loss" in header else ""
+    packets = read(f"{header}\n0,45{end}\n{row}\n2,46{end}")
+    assert packets.delays == pytest.approx((0.045, None, 0.046))
+    assert packets.notes == ((note,) if note else ())
+
+
+def test_zeros_are_delays_if_rounded_or_said_to_have_arrived() -> None:
+    assert read("time_s,delay_ms\n0,0\n1,1\n2,2").lost == 0
+    assert read("time_s,delay_ms,loss\n0,0,0\n1,90,0").lost == 0
+
+
+def test_round_trips_are_halved_if_asked_only() -> None:
+    assert read("time_s,rtt_ms\n0,90\n1,80", halve=True).delays == pytest.approx((0.045, 0.040))
+    assert read("time_s,delay_ms\n0,90\n1,80", halve=True).delays == pytest.approx((0.090, 0.080))
+    with pytest.raises(BadInputError, match=r"column rtt_ms: has round trips; .*--halve-rtt"):
+        read("time_s,rtt_ms\n0,90")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("time_s,delay_ms\n0,0.045\n1,0.07", "delay_ms is at most 0.07 ms, which looks like sec"),
+        ("time_s,delay_us\n0,0.5\n1,0.4", "delay_us is at most 0.5 us"),
+        ("time_s,delay_s\n0,45\n1,70", "delay_s has a median of 57.5 s, which looks like ms"),
+        ("time_s,delay_ms\n1700000000000,45", "time_s is 1700000000000, a finer unit than s"),
+        ("time,delay_ms\n0,45", "column time does not say its unit; call it time_s, time_ms"),
+        ("time_s,delay\n0,45", "column delay does not say its unit"),
+        ("time_s,latency\n0,45", "no column delay, found time_s,latency; name them time_s"),
+        ("delay_ms\n45", "no column time"),
+        ("", "no column time, found nothing"),
+        ("time_s,delay_ms,rtt_ms\n0,45,90", "has delay_ms and rtt_ms; keep only one"),
+        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a number"),
+        ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a number"),
+        ("time_s,delay_ms,loss\n0,45,0.5", "line 2: loss is '0.5'; give 0 or 1"),
+        ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ"),
+        ("time_s,rtt_ms\n0,45\n1,-3\n2,-1", "rtt_ms is -3, which is no round trip"),
+        ("time_s,delay_ms\n0,1,234.5\n1,41", "line 2: more values than columns"),
+        ("time_s,delay_ms\n0,45\n1", "line 3: delay_ms is nothing"),
+        ("time_s,delay_ms", "no packet arrived"),
+        ("sent_ms,delay_ms\n" + "1.7212E+12,20\n" * 50, "49 of 50 packets have the same time"),
+        ("20.1\n21\n19.5", "numbers without a header"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(text: str, says: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        read(text, halve="rtt" in says)
+    assert str(caught.value).startswith("x.csv")
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_units_are_trusted_if_the_user_says_so() -> None:
+    packets = read("time_s,delay_ms\n0,0.045\n1,0.07", trust_units=True)
+    assert packets.delays == pytest.approx((45e-6, 70e-6))
+
+
+def test_up_to_1_percent_may_be_unusable_and_all_is_counted() -> None:
+    """Of 200 rows one is torn, one comes late, one is at the time of another; then a pause."""
+    rows = [f"{n / 10:g},{40 + n % 5}" for n in range(200)]
+    rows[20], rows[21] = rows[21], rows[20]
+    rows[50] = "5"
+    rows[60] = rows[59]
+    packets = read("\n".join(["time_s,delay_ms", *rows, "919.9,40"]))
+    assert packets.notes == (
+        "1 out of order, sorted",
+        "1 left out, at the time of another one",
+        "1 left out, unreadable",
+        "nothing sent for 900 s after packet 198: a pause, two sessions in one log, or a step of "
+        "the clock",
+    )
+    assert len(packets.sent) == 199
+    rows[70] = rows[80] = "7"
+    with pytest.raises(BadInputError, match=r"line 52: .* \(3 of 200 rows cannot be used\)"):
+        read("\n".join(["time_s,delay_ms", *rows]))
+
+
+def test_packets_are_put_in_the_order_of_sending() -> None:
+    log = Log("x", [(2.0, 0.1), (1.0, None)])
+    packets = log.packets()
+    assert (packets.sent, packets.delays) == ((1.0, 2.0), (None, 0.1))
+    assert (packets.lost, packets.duration) == (1, 1.0)
+    with pytest.raises(BadInputError, match="no packet arrived"):
+        Log("x", [(0.0, None)]).packets()
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ('{"start":{"version":"iperf 3.16"}}', "output of iperf, which has no delay of each"),
+        ("[ ID] Interval           Transfer     Bitrate         Jitter", "output of iperf"),
+        ("Reply from 192.0.2.1: bytes=32 time=20ms TTL=57", "ping of Windows"),
+        ("Antwort von 192.0.2.7: Bytes=32 Zeit<1ms TTL=57", "ping of Windows"),
+        ("traceroute to 192.0.2.1, 30 hops max", "traceroute or mtr"),
+    ],
+)
+def test_other_tools_are_called_by_their_names(line: str, says: str) -> None:
+    with pytest.raises(BadInputError, match=f"x: the output of .*{says}|x: the {says}"):
+        refuse_others(["", line], "x")
+
+
+def trip(number: int, lost: Any = False, send: int = 30, receive: int = 20) -> dict[str, Any]:
+    """Make a round trip as irtt 0.9 writes it; delays in [ms], one packet every 10 ms."""
+    wall = 1_700_000_000_000_000_000 + number * 10_000_000
+    send, receive = send * 1_000_000, receive * 1_000_000
+    sent = {"wall": wall, "monotonic": 5_000 + number * 10_000_000}
+    if lost:
+        return {"lost": lost, "timestamps": {"client": {"send": sent}}, "delay": {}}
+    there = {"receive": {"wall": wall + send, "monotonic": number * 10_000_000 + send}}
+    delay = {"send": send, "receive": receive, "rtt": send + receive}
+    return {
+        "lost": "false",
+        "timestamps": {"client": {"send": sent}, "server": there},
+        "delay": delay,
+    }
+
+
+def irtt(trips: list[dict[str, Any]], direction: Direction | None = None, **stats: int) -> Packets:
+    text = json.dumps({"round_trips": trips, "stats": stats})
+    return read_irtt(text, "x", direction, halve=direction is None)
+
+
+TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(4)]
+
+
+@pytest.mark.parametrize(
+    ("direction", "sent", "delays"),
+    [
+        ("uplink", (0.0, 0.010, 0.030, 0.040), (0.030, None, None, 0.030)),
+        ("downlink", (0.0, 0.020, 0.030, 0.040), (0.020, None, None, 0.020)),
+        (None, (0.0, 0.010, 0.020, 0.030, 0.040), (0.025, None, None, None, 0.025)),
+    ],
+)
+def test_irtt_knows_both_ways(
+    direction: Direction | None, sent: tuple[float, ...], delays: tuple[float | None, ...]
+) -> None:
+    """Packets lost on the uplink were never on the downlink, and vice versa."""
+    packets = irtt(TRIPS, direction, packets_sent=5, packets_received=3, duplicates=1)
+    assert packets.sent == pytest.approx(sent)
+    assert packets.delays == pytest.approx(delays)
+    assert packets.notes == ("1 duplicates left out",)
+
+
+STEPPED = [trip(0), trip(1), trip(2)]
+STEPPED[2]["timestamps"]["server"]["receive"]["monotonic"] -= 30_000_000
+NO_STAMPS = [trip(0)]
+del NO_STAMPS[0]["delay"]["send"]
+
+
+@pytest.mark.parametrize("direction", ["uplink", "downlink"])
+@pytest.mark.parametrize(
+    ("trips", "stats", "says"),
+    [
+        ([trip(0, send=-5, receive=60)], {}, "arrived 5 ms before it was sent: the two clocks dif"),
+        ([trip(0, send=60, receive=-5)], {}, "arrived 5 ms before it was sent: the two clocks dif"),
+        (STEPPED, {}, "the clock of irtt's server made a step of 30 ms"),
+        (NO_STAMPS, {}, r"server sent no stamps.*--halve-rtt"),
+        (
+            TRIPS,
+            {"packets_sent": 6},
+            "counts are 6 sent and 2 received, but it has 5 packets and 2",
+        ),
+        (TRIPS, {"packets_received": 5}, "counts are 5 sent and 5 received"),
+        ([], {}, "no packet arrived"),
+    ],
+)
+def test_irtt_that_contradicts_itself_is_refused(
+    trips: list[dict[str, Any]], stats: dict[str, int], says: str, direction: Direction
+) -> None:
+    with pytest.raises(BadInputError, match=says):
+        irtt(trips, direction, **stats)
+
+
+ENDLESS = {"lost": "false", "timestamps": {"client": {"send": {"wall": float("inf")}}}}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{", "{}", '{"round_trips": [{}]}', "[" * 100_000, json.dumps({"round_trips": [ENDLESS]})],
+)
+def test_other_json_is_refused(text: str) -> None:
+    with pytest.raises(BadInputError, match="not a log of irtt"):
+        read_irtt(text, "x", "uplink", halve=False)
