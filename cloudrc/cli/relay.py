@@ -96,29 +96,16 @@ def execute(options: argparse.Namespace) -> int:
     asked: Callable[[str, float], object] = exporter.asked if exporter else lambda way, delay: None
     should_stop: Callable[[], bool] = stop
     if options.link:
-<<<<<<< HEAD
         links = {"uplink": uplink, "downlink": downlink}
         control = RelayControl(options.link, links, first, asked, relay)
         control.start()
         should_stop = control.stop_after(stop)
-    Feed.on_stdout().ready()
-    if exporter is not None:
-        for way, loaded in first.items():
-            asked(way, summary(loaded.direction)["delay"] or 0.0)
-=======
-        should_stop = follow_folder(
-            stop, options.link, experiment, (uplink, downlink), exporter, relay
-        )
     feed = Feed.on_stdout(watched=options.feed)
     feed.ready()
     should_stop = feed.alive_while(should_stop)
-    if exporter is None:
-        relay.run(should_stop)
-    else:
-        if not options.link:  # else the control has shown it
-            export_requested_delay(exporter, experiment)
-        for way in WAYS:
->>>>>>> w33-foreign
+    if exporter is not None:
+        for way, loaded in first.items():
+            asked(way, summary(loaded.direction)["delay"] or 0.0)
             exporter.shaped("relay", way, "relay")
         exporter.runs(fingerprint(experiment))
         exporter.ready(True)

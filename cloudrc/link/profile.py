@@ -209,8 +209,6 @@ class Timeline:
             elapsed_ns %= self.period_ns
         return self._pieces[max(bisect_right(self.starts_ns, elapsed_ns) - 1, 0)]
 
-<<<<<<< HEAD
-=======
     def _repeat(self, period_ns: int) -> int:
         """Repeat the pieces for `LOOP_SPAN`; return the time that they then last [ns]."""
         pieces = list(zip(self.starts_ns, self._pieces, strict=True))
@@ -220,17 +218,6 @@ class Timeline:
         self._pieces = [piece for _ in range(count) for _, piece in pieces]
         return count * period_ns
 
-    def least_delay_ns(self, reach: float) -> int:
-        """Return a lower bound of the delay of all packets [ns], >= 0.
-
-        Args:
-            reach: Largest distance of a delay below its mean, in units of the jitter [1].
-        """
-        passing = [piece for piece in self._pieces if not piece.blackout]
-        least = [piece.delay_ns - round(reach * piece.jitter * 1e9) for piece in passing]
-        return max(0, min(least, default=0))
-
->>>>>>> w33-foreign
     def only(self) -> Conditions | None:
         """Return the conditions if they never change, otherwise None."""
         return self._pieces[0] if len(self._pieces) == 1 else None

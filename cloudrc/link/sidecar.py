@@ -134,16 +134,6 @@ def look_near(run: Run, host: str) -> Near | None:
     return Near(interface, netems)
 
 
-<<<<<<< HEAD
-=======
-def in_force_now(profile: DirectionProfile, elapsed_ns: int) -> DirectionProfile | None:
-    """Say what holds so long [ns] after the link came up, if it holds for ever; else None."""
-    timeline = Timeline(profile)
-    over = timeline.period_ns is None and elapsed_ns >= timeline.starts_ns[-1]
-    return settled(profile) if over else None
-
-
->>>>>>> w33-foreign
 def write_told(told: Told) -> str:
     """Write it as JSON."""
     return TypeAdapter(Told).dump_json(told, indent=2).decode() + "\n"

@@ -220,13 +220,9 @@ _TABLE_END = 4.0
 
 def check(profile: DirectionProfile) -> None:
     """Raise a BadInputError that names what netem cannot do of a profile."""
-<<<<<<< HEAD
     pieces = _pieces(profile)
-=======
-    pieces = list(_pieces(profile))
     if profile.trace is not None and profile.trace.loop:
         _refuse("loop", "a trace that begins again")
->>>>>>> w33-foreign
     if any(isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad for piece in pieces):
         _refuse("loss.delay_bad_ms", "more delay while a burst of losses lasts")
     if any(piece.rate and piece.jitter for piece in pieces) and not profile.keep_order:
