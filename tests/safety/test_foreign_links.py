@@ -19,8 +19,9 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.merge import write_mission
 from cloudrc.record.recover import recover
 from cloudrc.report.document import write_json
-from cloudrc.report.write import read_run, write_report
-from tests.record.conftest import world_records, write
+from cloudrc.report.folder import read_run
+from cloudrc.report.write import write_report
+from tests.record.conftest import cloud_records, world_records, write
 
 HEX = b"\xab" * 8
 
@@ -121,10 +122,11 @@ def test_a_report_follows_no_link(
     monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
     (theirs / "config.yaml").write_text("seed: 1")
     write(theirs / "world.mcap", world_records(20))
-    (theirs / "cloud.mcap").write_bytes((theirs / "world.mcap").read_bytes())
-    names = ("report.json", "environment.json", "report.html", "mission.mcap")
+    write(theirs / "cloud.mcap", cloud_records(20))
+    names = ("report.json", "environment.json", "report.html")
     for name in names:
         (theirs / name).symlink_to(mine)
+    (theirs / "mission.mcap").symlink_to(tmp_path / "nothing")
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (theirs / "figures").symlink_to(elsewhere)
@@ -136,6 +138,6 @@ def test_a_report_follows_no_link(
     write_report(theirs, *read_run(theirs))
     assert mine.read_text() == "mine"
     assert not any(elsewhere.iterdir())
-    assert not any((theirs / name).is_symlink() for name in names)
+    assert not any((theirs / name).is_symlink() for name in (*names, "mission.mcap"))
     assert (theirs / "figures" / "error.png").read_bytes().startswith(b"\x89PNG")
     assert Recording.read(theirs / "mission.mcap").complete
