@@ -16,12 +16,11 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.state import publish
 from cloudrc.record.columns import Recording
-from cloudrc.record.merge import write_mission
 from cloudrc.record.recover import recover
 from cloudrc.report.document import write_json
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
-from tests.record.conftest import cloud_records, world_records, write
+from tests.record.conftest import cloud_records, world_records, write, write_mission
 
 HEX = b"\xab" * 8
 
