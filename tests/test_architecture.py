@@ -57,7 +57,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "struct": ("tunnel/codec", "record/", "world/simulator"),
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "faults/schedule"),
     "pydantic": (
-        *("config/", "link/", "cli/", "teleop/", "report/write"),
+        *("config/", "link/", "cli/", "teleop/", "report/folder"),
         "faults/schedule",
     ),
     **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/server")),

@@ -1,4 +1,4 @@
-"""`cloudrc recover FILE`: write a clean copy of a damaged recording."""
+"""`cloudrc recover FILE`: write a whole copy of a torn recording, up to its first damaged part."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _document(recovery: Recovery, target: Path) -> dict[str, object]:
 
 def _show(recovery: Recovery, target: Path) -> None:
     kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)
-    print(f"kept {recovery.share:.1%}: {kept or 'nothing'}")
+    print(f"kept {recovery.share:.1%}: {kept}")
     for note in recovery.notes:
         print_line(f"lossy: {note}")
     if recovery.complete and recovery.index_is_new:

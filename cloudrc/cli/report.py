@@ -38,7 +38,8 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
     from cloudrc.cli.run import exit_code, show
-    from cloudrc.report.write import read_run, write_report
+    from cloudrc.report.folder import read_run
+    from cloudrc.report.write import write_report
 
     metrics.check(options.metric)
     recording, experiment, run = read_run(options.run)

@@ -129,6 +129,8 @@ class Recording:
         metadata: The file's metadata, such as its clock; empty if made from records.
         attachments: Attached files, by name.
         note: What is missing, in words; "" if nothing is missing.
+        lacking: The part of `note` that no killed process explains; "" without.
+        remarks: What was ignored or sorted, as in `Contents`.
     """
 
     def __init__(self, rows: _Rows, contents: Contents | None = None) -> None:
@@ -143,6 +145,8 @@ class Recording:
         self.metadata: Mapping[str, str] = contents.metadata if contents else {}
         self.attachments: Mapping[str, bytes] = contents.attachments if contents else {}
         self.note = contents.note if contents else ""
+        self.lacking = contents.lacking if contents else ""
+        self.remarks = contents.remarks if contents else ()
 
     @property
     def complete(self) -> bool:
@@ -201,7 +205,9 @@ class Recording:
                 unreadable += 1
         recording = cls(rows, contents)
         if unreadable:
-            recording.note += f"{'; ' * bool(recording.note)}{unreadable} messages are not readable"
+            text = f"{unreadable} messages are not readable"
+            recording.note = "; ".join(filter(None, [recording.note, text]))
+            recording.lacking = "; ".join(filter(None, [recording.lacking, text]))
         return recording
 
     def __getitem__(self, topic: str) -> Table:
@@ -210,14 +216,6 @@ class Recording:
                 raise KeyError(f"no topic {topic!r}; there are: {', '.join(TOPICS)}")
             self._tables[topic] = Table(TOPICS[topic], self._rows.get(topic, []))
         return self._tables[topic]
-
-    def get(self, topic: str) -> Table:
-        """Return a topic's table, like `recording[topic]`.
-
-        Args:
-            topic: A name in `TOPICS`.
-        """
-        return self[topic]
 
 
 def _column(kind: Kind, values: Iterable[Any]) -> Column:

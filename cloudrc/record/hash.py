@@ -49,10 +49,22 @@ def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
         messages: Topic, log time [ns] and CDR bytes of each message, in the file's order.
     """
     sha256 = hashlib.sha256()
-    for topic, log_time_ns, data in messages:
-        sha256.update(b"%s %d %d " % (topic.encode(), log_time_ns, len(data)))
-        sha256.update(data)
+    for message in messages:
+        add_message(sha256, *message)
     return sha256.hexdigest()
+
+
+def add_message(sha256: hashlib._Hash, topic: str, log_time_ns: int, data: bytes) -> None:
+    """Add a message to a hash as `messages_sha256` does.
+
+    Args:
+        sha256: The hash of the messages before.
+        topic: Its topic.
+        log_time_ns: When it was recorded [ns].
+        data: Its CDR bytes.
+    """
+    sha256.update(b"%s %d %d " % (topic.encode(), log_time_ns, len(data)))
+    sha256.update(data)
 
 
 class _Packers(dict[type, _Pack]):

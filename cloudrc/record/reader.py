@@ -1,442 +1,223 @@
-"""Read an MCAP file, even if it is torn or damaged, as far as it is readable.
+"""Read an MCAP file from its start to its end, or to its first damaged part.
 
-A killed process leaves a file without an end, which is read up to the last complete chunk. Damaged
-parts are skipped and counted by kind; the scan continues at the next chunk. A file may also be
-hostile, so each length in it is checked against the file and a limit before it is used. Memory is
-bounded by one record.
+A killed process leaves a file without an end: it is read up to its last complete chunk. `Records`
+yields the records of any MCAP file; `read_contents` collects what cloudrc records. The package
+`mcap` parses the format; this module bounds what a file may unpack to and says in words what is
+missing.
 """
 
 from __future__ import annotations
 
-import io
+import json
 import os
-import re
-import struct
-import zlib
+from array import array
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BufferedReader
-from itertools import chain
+from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any
+from typing import Self
 
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
 from cloudrc.record import missing
 from cloudrc.record.ros import is_known
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import MISSING
+from cloudrc.record.writer import CLOCK, COUNTS, MISSING
 
 try:
+    import lz4.frame
     import zstandard
-    from mcap import records as kinds
-    from mcap.data_stream import ReadDataStream
+    from mcap.exceptions import EndOfFile
     from mcap.opcode import Opcode
     from mcap.records import (
         Attachment,
         Channel,
         Chunk,
         DataEnd,
-        Footer,
         McapRecord,
         Message,
-        MessageIndex,
         Metadata,
         Schema,
         Statistics,
     )
+    from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
+    from mcap.writer import MCAP0_MAGIC
 except ImportError as error:
     raise missing(error) from error
 
-RECORD_MAX = 64 << 20
-"""Longest record that is read [bytes]."""
-CHUNK_MAX = 16 << 20
-"""Longest chunk after decompression [bytes]; ours end after 1 MiB, those of other tools after 4."""
-DEFINITION_MAX = 1 << 20
-"""Longest schema or channel [bytes]; its parts become many objects in memory."""
-HEAD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
-MAGIC = b"\x89MCAP0\r\n"
-
-_CLASSES: dict[int, Any] = {
-    Opcode.HEADER: kinds.Header,
-    Opcode.SCHEMA: kinds.Schema,
-    Opcode.CHANNEL: kinds.Channel,
-    Opcode.CHUNK: kinds.Chunk,
-    Opcode.MESSAGE_INDEX: kinds.MessageIndex,
-    Opcode.ATTACHMENT: kinds.Attachment,
-    Opcode.METADATA: kinds.Metadata,
-    Opcode.STATISTICS: kinds.Statistics,
-    Opcode.DATA_END: kinds.DataEnd,
-    Opcode.FOOTER: kinds.Footer,
-}
-_DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
-_MARK = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
-_MARK_MAX = 8
-_MARK_OFFSET = 37  # from a chunk's first byte to the name of its compression
-_BLOCK_MIN, _BLOCK_MAX = 1 << 12, 1 << 20
-"""Smallest and largest block of a search for chunks [bytes]. The first block is small, since each
-chunk may be damaged; each further one is twice as large."""
+UNPACKED_MAX = 64
+"""Largest size of a recording in memory, as a multiple of its size in the file [1]. A file below
+1 MiB counts as 1 MiB. Recordings of flights need 10, those of an idle robot 30."""
+MESSAGE_COST = 128
+"""Memory of a message's objects beside its bytes [bytes]."""
+LISTED_MAX = 3
+"""Largest number of topics that a message lists with their numbers."""
+HEAD_SIZE = 16
+"""Number of bytes that show of which kind a file is."""
+KINDS = (
+    (b"#ROSBAG V", "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert"),
+    (b"SQLite format 3", "is an SQLite file, not MCAP; convert it with: ros2 bag convert"),
+)
+"""First bytes of other recordings, and what to say about them."""
 
 
-class DamagedError(ValueError):
-    """Bytes that are not a valid record of their kind."""
+class NothingReadableError(BadInputError):
+    """A file of which not one message can be read, as a kill at the start leaves it."""
 
 
-class _Exact(io.BytesIO):
-    """Bytes whose `read` fails at the end; mcap's reader would accept fewer bytes."""
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        data = super().read(size)
-        if size is None or size < 0 or len(data) < size:
-            raise DamagedError("too short")
-        return data
+class _TooMuchError(Exception):
+    """A file unpacks to more than any recording."""
 
 
-def parse(opcode: int, payload: bytes) -> McapRecord | None:
-    """Parse one record.
-
-    Returns:
-        The record, or None for a kind that is not used.
-
-    Raises:
-        DamagedError: If the bytes are not a valid record.
-    """
-    try:
-        if opcode == Opcode.MESSAGE:
-            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(payload)
-            data = payload[_MESSAGE.size :]
-            return kinds.Message(channel, log_time, data, publish_time, sequence)
-        if opcode not in _CLASSES:
-            return None
-        if opcode in _DEFINITIONS and len(payload) > DEFINITION_MAX:
-            raise DamagedError("too long")
-        record: McapRecord = _CLASSES[opcode].read(ReadDataStream(_Exact(payload)))
-    except DamagedError:
-        raise
-    except Exception as error:  # the library may raise anything on a malformed record
-        raise DamagedError(f"{type(error).__name__}: {error}") from error
-    if opcode == Opcode.ATTACHMENT:
-        (crc,) = struct.unpack("<I", payload[-4:])
-        if crc and crc != zlib.crc32(payload[:-4]):
-            raise DamagedError("checksum")
-    return record
-
-
-def unpack(chunk: Chunk) -> Iterator[McapRecord]:
-    """Split a chunk into its records, after a check of all of it.
-
-    Returns:
-        Its records, parsed one at a time, since a chunk may hold millions.
-
-    Raises:
-        DamagedError: If its checksum or anything in it is wrong, or it is longer than CHUNK_MAX;
-            raised before the first record.
-    """
-    data = _decompressed(chunk)
-    if len(data) != chunk.uncompressed_size:
-        raise DamagedError("length")
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise DamagedError("checksum")
-    for opcode, start, end in _payloads(data):
-        if opcode == Opcode.MESSAGE:
-            if end - start < _MESSAGE.size:
-                raise DamagedError("too short")
-        elif opcode in _DEFINITIONS:
-            parse(opcode, data[start:end])
-        elif opcode in _CLASSES:
-            raise DamagedError("a chunk must not hold this record")
-    records = (parse(opcode, data[start:end]) for opcode, start, end in _payloads(data))
-    return (record for record in records if record is not None)
-
-
-def _payloads(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield the opcode of each record, and the start and end of its payload."""
-    at = 0
-    while at < len(data):
-        if at + HEAD.size > len(data):
-            raise DamagedError("too short")
-        opcode, length = HEAD.unpack_from(data, at)
-        at += HEAD.size
-        if length > len(data) - at:
-            raise DamagedError("too short")
-        yield opcode, at, at + length
-        at += length
-
-
-def _decompressed(chunk: Chunk) -> bytes:
-    """Decompress a chunk to at most the size that it states, which is at most CHUNK_MAX."""
-    size = chunk.uncompressed_size
-    if size > CHUNK_MAX:
-        raise DamagedError("too long")
-    if chunk.compression == "":
-        return chunk.data
-    if chunk.compression != "zstd":
-        raise DamagedError(f"compression {chunk.compression}")
-    try:
-        # Not `decompress`, which allocates the length that the frame states without a check.
-        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
-            data: bytes = reader.read(size + 1)
-    except zstandard.ZstdError as error:
-        raise DamagedError("compression") from error
-    return data
-
-
-def next_chunk(stream: IO[bytes], start: int, size: int) -> int | None:
-    """Find the position of the next record from `start` on that looks like a chunk.
-
-    Args:
-        stream: The file; its position changes.
-        start: First byte to search.
-        size: Size of the file [bytes].
-    """
-    for place in _marks(stream, start + _MARK_OFFSET, size):
-        at = place - _MARK_OFFSET
-        stream.seek(at)
-        head = stream.read(_MARK_OFFSET + 16)
-        opcode, length = HEAD.unpack_from(head)
-        name = 4 + int.from_bytes(head[_MARK_OFFSET : _MARK_OFFSET + 4], "little")
-        stream.seek(place + name)
-        data = int.from_bytes(stream.read(8), "little")
-        whole = length == _MARK_OFFSET - HEAD.size + name + 8 + data
-        if opcode == Opcode.CHUNK and whole and at + HEAD.size + length <= size:
-            return at
-    return None
-
-
-def _marks(stream: IO[bytes], start: int, size: int) -> Iterator[int]:
-    """Yield the positions of compression names, in the order of the file."""
-    length = _BLOCK_MIN
-    while start < size:
-        stream.seek(start)
-        block = stream.read(length + _MARK_MAX - 1)
-        for mark in _MARK.finditer(block):
-            if mark.start() < length:
-                yield start + mark.start()
-        start += length
-        length = min(2 * length, _BLOCK_MAX)
-
-
-KNOWN = {int(opcode) for opcode in Opcode}
-NAMES: dict[int, str] = {
-    Opcode.CHUNK: "chunks",
-    Opcode.ATTACHMENT: "attachments",
-    Opcode.METADATA: "metadata",
-    Opcode.MESSAGE: "messages",
-}
-ROOM_MIN, ROOM_SHARE = 16 << 20, 64
-"""Limit of the unpacked size of a file: `ROOM_MIN` [bytes] or `ROOM_SHARE` times its size [1].
-
-A valid file stays below: its index takes 16 bytes for each message, and a message has at most 750.
-"""
-RECORD_COST = 128
-"""Memory counted for each record's object, beside its bytes [bytes]."""
-OF_THE_END = (DataEnd, Footer, Statistics)
-"""Record types that must not occur in the data."""
-DATA_END_SIZE = 4
-"""Size of the payload of a data end record [bytes]."""
-END_SIZE = HEAD.size + 20 + len(MAGIC)
-"""Size of the footer and the closing magic [bytes]."""
-
-
-@dataclass(slots=True)
-class Summary:
-    """The summary at the end of a complete file, with a valid checksum.
+class Records:
+    """The records of one MCAP file, including those in chunks, without the chunks themselves.
 
     Attributes:
-        start: Position of its first byte.
-        definitions: Schemas and channels.
-        messages: Number of messages in the file; None if it is not stated.
-    """
-
-    start: int
-    definitions: list[McapRecord] = field(default_factory=list)
-    messages: int | None = None
-
-
-class TooMuchError(ValueError):
-    """A file that unpacks to more than any valid recording."""
-
-
-class Scan:
-    """One pass over a file.
-
-    Attributes:
-        summary: The summary of a complete file; None for another one.
-        dropped: Number of damaged chunks, attachments, metadata and records, by kind; also of the
-            messages that the index lists for a damaged chunk.
-        skipped: Bytes that belong to no record [bytes].
+        path: The file, for messages.
         size: Size of the file [bytes].
-        is_mcap: Whether the file begins with MCAP's magic.
-        ended: Whether the end of the data was reached.
-        checked: Whether the checksum over all data is right; None without a checksum.
+        position: Number of bytes of the file up to the last intact record [bytes].
         chunks: Number of intact chunks.
+        data_ended: Whether the end of the data was reached; behind it is only the index.
+        ended: Whether the end of the file was reached.
+        fault: Why reading stopped or what is wrong, in words; "" if nothing is wrong.
+        cut: Whether the fault is at the end of the file, as a killed process leaves it.
+        stated: Number of messages that the index states; None if it was not reached.
     """
 
-    def __init__(self, stream: IO[bytes]) -> None:
-        """Read the size and the summary of a file.
-
-        Args:
-            stream: The file, binary and seekable.
-        """
-        self._stream = stream
-        self.size = stream.seek(0, os.SEEK_END)
-        self.dropped: Counter[str] = Counter()
-        self.skipped = 0
-        self.is_mcap = self.ended = False
-        self.checked: bool | None = None
-        self.chunks = 0
-        self.summary = self._read_summary()
-        self._room = max(ROOM_MIN, ROOM_SHARE * self.size)
-        self._crc = 0
-        self._broken = self._lost_chunk = False
-
-    def definitions(self) -> list[McapRecord]:
-        """Return the summary's definitions; the chunk that holds them may be lost."""
-        return self.summary.definitions if self.summary else []
-
-    def records(self) -> Iterator[McapRecord]:
-        """Yield every intact record of the data in order, including those in chunks.
+    def __init__(self, path: Path) -> None:
+        """Open a file; close it by `with`.
 
         Raises:
-            TooMuchError: If the file unpacks to more than any valid recording.
+            BadInputError: If it cannot be opened or is not an MCAP file.
         """
-        stream, at = self._stream, len(MAGIC)
-        stream.seek(0)
-        magic = stream.read(at)
-        self.is_mcap = magic == MAGIC
-        self._crc, self._broken = zlib.crc32(magic), not self.is_mcap
-        if self._broken:
-            at = self._resume(0, 0)
-        end = self.summary.start if self.summary else self.size
-        while at < end and not self.ended:
-            stream.seek(at)
-            head = stream.read(HEAD.size)
-            opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
-            if not opcode or length > min(RECORD_MAX, self.size - at - HEAD.size):
-                at = self._resume(at, opcode)
-                continue
-            payload = stream.read(length)
-            at += HEAD.size + length
-            if opcode == Opcode.DATA_END and length == DATA_END_SIZE and at <= end:
-                # A record of this opcode elsewhere is damaged and not the end.
-                if self.summary is None or at == end:
-                    self._end(payload)
-                    if self.summary is None:
-                        self._count_rest(at)
-                    continue
-            self._crc = zlib.crc32(payload, zlib.crc32(head, self._crc))
-            yield from self._take(opcode, payload)
-
-    def _take(self, opcode: int, payload: bytes) -> Iterator[McapRecord]:
+        self.path = path
         try:
-            record = parse(opcode, payload)
-            if isinstance(record, Chunk):
-                self._lost_chunk = True
-                inside = unpack(record)
-                self._lost_chunk = False
-                self.chunks += 1
-                self._take_room(record.uncompressed_size)
-                for each in inside:
-                    self._take_room(RECORD_COST)
-                    yield each
-                return
-        except DamagedError:
-            self._note(opcode)
-            return
-        if isinstance(record, MessageIndex):
-            if self._lost_chunk:
-                self.dropped["messages"] += len(record.records)
-        elif isinstance(record, OF_THE_END) or opcode not in KNOWN:
-            self._note(opcode)
-        elif record is not None:
-            yield record
+            self._stream = BufferedReader(open_file(path))
+        except OSError as error:
+            raise BadInputError(
+                f"{path}: cannot be read ({error.strerror}); name a recording (.mcap)"
+            ) from error
+        except ValueError as error:  # a pipe or a device
+            raise BadInputError(f"{error}; name a recording (.mcap)") from error
+        self.size = os.fstat(self._stream.fileno()).st_size
+        self.position = self.chunks = 0
+        self.data_ended = self.ended = self.cut = False
+        self.fault = ""
+        self._room = UNPACKED_MAX * max(self.size, 1 << 20)
+        self.stated: int | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stream.close()
+
+    def __iter__(self) -> Iterator[McapRecord]:
+        """Yield the records up to the file's end or its first damaged part.
+
+        Raises:
+            BadInputError: If the file is not MCAP or is compressed in an unknown way.
+        """
+        self._stream.seek(0)
+        head = self._stream.read(HEAD_SIZE)
+        if not head.startswith(MCAP0_MAGIC):
+            raise self._foreign(head)
+        self._stream.seek(0)
+        reader = StreamReader(
+            self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.size
+        )
+        try:
+            for record in reader.records:
+                if isinstance(record, Chunk):
+                    yield from self._unpack(record)
+                    self.chunks += 1
+                elif not self.data_ended:  # what follows repeats the definitions
+                    yield record
+                if isinstance(record, Statistics):
+                    self.stated = record.message_count
+                self.data_ended |= isinstance(record, DataEnd)
+                self.position = self._stream.tell()
+            self.position = self._stream.tell()
+            self.ended = self.data_ended = True
+            if self.position < self.size:
+                self.fault = "something follows its end"
+        except BadInputError:
+            raise
+        except CRCValidationError as error:
+            self.fault = "damaged: a checksum is wrong"
+            if isinstance(error.record, DataEnd):  # all was read
+                self.data_ended = self.ended = True
+                self.position = self.size
+                self.fault = "damaged: a byte outside the chunks is wrong"
+        except EndOfFile:
+            self.fault, self.cut = "cut short", True
+        except _TooMuchError:
+            self.fault = f"unpacks to more than {UNPACKED_MAX} times its size, as no recording does"
+        except OSError as error:
+            self.fault = f"unreadable: {error.strerror}"
+        except Exception:  # the library may raise anything on damaged bytes
+            self.cut = self._stream.tell() >= self.size
+            self.fault = "cut short" if self.cut else "damaged"
+
+    @property
+    def unread(self) -> int:
+        """Return the size of the part that was not read [bytes], without a torn index."""
+        return 0 if self.data_ended and not self.ended else self.size - self.position
 
     def _take_room(self, size: int) -> None:
         self._room -= size
         if self._room < 0:
-            raise TooMuchError(
-                f"its {self.size} bytes unpack to more than those of any recording and would fill "
-                "the memory; use another file"
-            )
+            raise _TooMuchError
 
-    def _end(self, payload: bytes) -> None:
-        self.ended = True
-        crc = int.from_bytes(payload, "little")
-        if crc:
-            self.checked = not self._broken and crc == self._crc
+    def _unpack(self, chunk: Chunk) -> Iterator[McapRecord]:
+        size = chunk.uncompressed_size
+        self._take_room(size)
+        # Not the library's: it allocates what the compressed data states, without a bound.
+        match chunk.compression:
+            case "":
+                data = chunk.data
+            case "zstd":
+                packed = zstandard.ZstdDecompressor().stream_reader(
+                    chunk.data, read_across_frames=True
+                )
+                data = packed.read(size + 1)
+            case "lz4":
+                data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
+            case other if not self.chunks:
+                raise BadInputError(
+                    f"{self.path}: its chunks are compressed by {to_one_line(other)!r}; cloudrc"
+                    " reads zstd and lz4: convert it with: mcap compress"
+                )
+            case _:
+                raise ValueError("another compression than in the chunks before")
+        if len(data) != size:
+            raise ValueError("the chunk is not as long as it states")
+        whole = replace(chunk, compression="", data=data)
+        stream, _ = get_chunk_data_stream(whole, validate_crc=True)
+        while stream.count < size:  # one at a time: a chunk may hold millions
+            opcode, length = stream.read1(), stream.read8()
+            end = stream.count + length
+            if opcode == Opcode.MESSAGE:
+                self._take_room(MESSAGE_COST)
+                yield Message.read(stream, length)
+            elif opcode == Opcode.SCHEMA:
+                yield Schema.read(stream)
+            elif opcode == Opcode.CHANNEL:
+                yield Channel.read(stream)
+            else:
+                stream.read(length)
+            if stream.count != end:
+                raise ValueError("a record is not as long as it states")
 
-    def _count_rest(self, at: int) -> None:
-        """Count the chunks and messages after the end, such as a second recording, as lost."""
-        stream, start = self._stream, next_chunk(self._stream, at, self.size)
-        if start is None:
-            return
-        self.skipped += self.size - start
-        self._lost_chunk = True
-        while start + HEAD.size <= self.size:
-            stream.seek(start)
-            opcode, length = HEAD.unpack(stream.read(HEAD.size))
-            start += HEAD.size + length
-            if start > self.size or opcode not in KNOWN:
-                break
-            if opcode == Opcode.CHUNK:
-                self._note(opcode)
-            elif opcode == Opcode.MESSAGE_INDEX and length <= RECORD_MAX:
-                for _ in self._take(opcode, stream.read(length)):  # counts what was in the chunk
-                    pass
-
-    def _note(self, opcode: int) -> None:
-        self.dropped[NAMES.get(opcode, "records")] += 1
-
-    def _resume(self, broken: int, opcode: int) -> int:
-        """Find the position to continue after the damage at `broken`; count what is skipped."""
-        self._broken = True
-        found = next_chunk(self._stream, broken + 1 if broken else 0, self.size)
-        if found is not None and broken:
-            self._note(opcode)  # if no chunk follows, only the end is missing
-        at = self.size if found is None else found
-        self.skipped += at - broken
-        return at
-
-    def _read_summary(self) -> Summary | None:
-        stream, start = self._stream, self.size - END_SIZE
-        if start < len(MAGIC):
-            return None
-        stream.seek(start)
-        end = stream.read(END_SIZE)
-        try:
-            footer = parse(end[0], end[HEAD.size : -len(MAGIC)])
-        except DamagedError:
-            return None
-        if not isinstance(footer, Footer) or not end.endswith(MAGIC):
-            return None
-        first = footer.summary_start or start
-        if not len(MAGIC) < first <= start or start - first > RECORD_MAX:
-            return None
-        stream.seek(first)
-        data = stream.read(start - first)
-        crc = zlib.crc32(end[: HEAD.size + 16], zlib.crc32(data))
-        if footer.summary_crc not in (0, crc):
-            return None
-        return _summary(first, data)
-
-
-def _summary(start: int, data: bytes) -> Summary | None:
-    summary, stream = Summary(start), io.BytesIO(data)
-    try:
-        while head := stream.read(HEAD.size):
-            opcode, length = HEAD.unpack(head)
-            record = parse(opcode, stream.read(min(length, len(data))))
-            if isinstance(record, Schema | Channel):
-                summary.definitions.append(record)
-            elif isinstance(record, Statistics):
-                summary.messages = record.message_count
-    except (DamagedError, ValueError):
-        return None
-    except Exception:  # struct.error: a head that is cut short
-        return None
-    return summary
+    def _foreign(self, head: bytes) -> BadInputError:
+        """Name what the file is by its first bytes, since it is not MCAP."""
+        if not head.strip(b"\0"):
+            return NothingReadableError(f"{self.path}: is empty; name a recording (.mcap)")
+        kinds = (text for magic, text in KINDS if head.startswith(magic))
+        text = next(kinds, "is not an MCAP file; name a recording (.mcap)")
+        return BadInputError(f"{self.path}: {text}")
 
 
 @dataclass(slots=True)
@@ -444,124 +225,146 @@ class Contents:
     """The contents of a file.
 
     Attributes:
-        messages: Topic, log time [ns] and CDR bytes of each, in the order of the file.
+        messages: Topic, log time [ns] and CDR bytes of each, in the order of their log times.
         metadata: All metadata of the file; later values of a key replace earlier ones.
         attachments: The attached files by name.
         note: What is missing, in words; "" if nothing is missing.
+        lacking: Of what is missing the part that no killed process explains: damaged, filtered or
+            foreign parts; "" without.
+        remarks: What was ignored or sorted, each as a sentence about the recording without its
+            subject; nothing is missing for it.
     """
 
     messages: list[tuple[str, int, bytes]] = field(default_factory=list)
     metadata: dict[str, str] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     note: str = ""
+    lacking: str = ""
+    remarks: tuple[str, ...] = ()
 
 
 def read_contents(path: Path) -> Contents:
-    """Read a file as far as it is readable.
+    """Read what cloudrc has recorded, up to the end of a file or its first damaged part.
 
     Args:
         path: An MCAP file, possibly torn.
 
-    Returns:
-        All messages of intact chunks.
-
     Raises:
-        BadInputError: If nothing in it is readable, or it unpacks to more than any recording.
+        BadInputError: If nothing in it is readable.
     """
-    try:
-        with BufferedReader(open_file(path)) as stream:
-            collector = _Collector()
-            scan = collector.pass_over(stream)
-            if collector.came_late:
-                collector = _Collector(collector)
-                scan = collector.pass_over(stream)
-    except OSError as error:
-        raise BadInputError(
-            f"{path}: cannot be read ({error.strerror}); name a recording (.mcap)"
-        ) from error
-    except TooMuchError as error:
-        raise BadInputError(f"{path}: {error}") from error
-    except ValueError as error:
-        raise BadInputError(f"{error}; name a recording (.mcap)") from error
-    contents = collector.finish(scan)
-    if not scan.ended and not contents.messages:
-        reason = "is cut short or damaged" if scan.is_mcap else "is not an MCAP file"
-        raise BadInputError(
-            f"{path}: holds no readable message: it {reason}; name another recording"
-        )
-    return contents
+    with Records(path) as records:
+        collector = _Collector(records)
+        for record in records:
+            collector.take(record)
+    return collector.finish()
 
 
 class _Collector:
-    """Collects the contents of MCAP records.
+    """Collects what cloudrc has recorded from the records of a file."""
 
-    Attributes:
-        contents: The contents collected so far.
-        came_late: Whether a channel was defined after messages of its own. These messages are
-            read in a second pass, which knows the channels of the first.
-    """
-
-    def __init__(self, before: _Collector | None = None) -> None:
-        self.contents = Contents()
-        self.came_late = False
-        self._foreign: set[str] = set()
+    def __init__(self, records: Records) -> None:
+        self._records = records
+        self._contents = Contents()
         self._types: dict[int, tuple[str, str]] = {}
-        self._topics: dict[int, str] = dict(before._topics) if before else {}
-        self._without_channel: set[int] = set()
-
-    def pass_over(self, stream: IO[bytes]) -> Scan:
-        """Collect the contents of a file."""
-        scan = Scan(stream)
-        for record in chain(scan.definitions(), scan.records()):
-            self.take(record)
-        return scan
+        self._channels: dict[int, tuple[str, bool]] = {}  # name of the topic; whether it is ours
+        self._seen: Counter[int] = Counter()  # messages by channel
+        self._sequences = array("L")
 
     def take(self, record: McapRecord) -> None:
-        contents = self.contents
+        contents = self._contents
         if isinstance(record, Message):
-            topic = self._topics.get(record.channel_id)
-            if topic is None:
-                self._without_channel.add(record.channel_id)
-            else:
+            self._seen[record.channel_id] += 1
+            topic, ours = self._channels.get(record.channel_id, ("", False))
+            if ours:
                 contents.messages.append((topic, record.log_time, record.data))
+                self._sequences.append(record.sequence)
         elif isinstance(record, Schema):
             self._types[record.id] = record.name, record.data.decode("utf-8", "replace")
         elif isinstance(record, Channel):
-            self._open(record)
+            topic, (ros_type, text) = record.topic, self._types.get(record.schema_id, ("", ""))
+            known = topic in TOPICS and TOPICS[topic].ros_type == ros_type
+            self._channels[record.id] = topic, known and is_known(ros_type, text)
         elif isinstance(record, Metadata):
             contents.metadata.update(record.metadata)
         elif isinstance(record, Attachment):
             contents.attachments[record.name] = record.data
 
-    def _open(self, channel: Channel) -> None:
-        ros_type, text = self._types.get(channel.schema_id, ("", ""))
-        topic = TOPICS.get(channel.topic)
-        known = topic is not None and topic.ros_type == ros_type and is_known(ros_type, text)
-        if known:
-            self._topics[channel.id] = channel.topic
-            self.came_late |= channel.id in self._without_channel
-        else:
-            self._topics.pop(channel.id, None)
-            self._foreign.add(channel.topic)
-
-    def finish(self, scan: Scan) -> Contents:
-        """Add the note to the contents."""
-        messages, notes = self.contents.messages, []
-        if not scan.ended:
-            until = messages[-1][1] * 1e-9 if messages else 0.0
-            notes.append(
-                f"cut short: {len(messages)} messages were read, the last at {until:.2f} s"
+    def finish(self) -> Contents:
+        """Sort the messages; say what is missing."""
+        contents, records = self._contents, self._records
+        messages = contents.messages
+        if not records.data_ended and not messages:
+            raise NothingReadableError(
+                f"{records.path}: holds no readable message: {records.fault}; name another"
+                " recording"
             )
-        elif scan.summary is None:
-            notes.append(f"cut short in its index: all {len(messages)} messages were read")
-        for kind, count in scan.dropped.items():
-            if kind != "messages":
-                notes.append(f"{count} damaged {kind} were left out")
-        if scan.checked is False and not scan.dropped:
-            notes.append("a byte outside the chunks is wrong")
-        if self._foreign:
-            names = to_one_line(", ".join(sorted(self._foreign)))
-            notes.append(f"topics of another layout were left out: {names}")
-        notes.append(to_one_line(self.contents.metadata.get(MISSING, "")))
-        self.contents.note = "; ".join(filter(None, notes))
-        return self.contents
+        late = sum(after[1] < before[1] for before, after in pairwise(messages))
+        if late:
+            order = sorted(range(len(messages)), key=lambda n: (messages[n][1], self._sequences[n]))
+            contents.messages = messages = [messages[n] for n in order]
+            contents.remarks += (f"was not in order of time: {late} messages were sorted",)
+        cut = [self._fault()] if records.cut or not records.fault else []
+        lacking = [] if cut else [self._fault()]
+        lacking += self._lacking(Counter(message[0] for message in messages))
+        told = to_one_line(contents.metadata.get(MISSING, ""))
+        contents.lacking = "; ".join(filter(None, lacking))
+        contents.note = "; ".join(filter(None, [*cut, *lacking, told]))
+        return contents
+
+    def _fault(self) -> str:
+        """Say how far the file was read, if that is not to its end."""
+        messages, records = self._contents.messages, self._records
+        if not records.data_ended:
+            until = messages[-1][1] * 1e-9
+            count = f"{len(messages)} messages were read, the last at {until:.2f} s"
+            return f"{records.fault}: {count}"
+        if not records.ended:
+            return f"{records.fault} in its index: all {len(messages)} messages were read"
+        return records.fault
+
+    def _lacking(self, read: Counter[str]) -> Iterator[str]:
+        """Say what other programs have removed or added.
+
+        Args:
+            read: Number of messages by topic.
+        """
+        names, seen = self._channels, self._seen
+        channels = [names.get(number, ("", False)) for number in seen]
+        foreign = sorted({name for name, ours in channels if not ours and name not in TOPICS})
+        if foreign:
+            listed = to_one_line(", ".join(foreign))
+            self._contents.remarks += (f"has topics that cloudrc does not record: {listed}",)
+        if other := sorted({name for name, ours in channels if not ours and name in TOPICS}):
+            yield f"topics of another layout were left out: {', '.join(other)}"
+        twice = Counter(name for name, ours in channels if ours and TOPICS[name].end != "either")
+        if double := [name for name, count in twice.items() if count > 1]:
+            yield f"two robots or two recordings are in one file: {', '.join(double)}"
+        if CLOCK not in self._contents.metadata:
+            yield "the metadata of cloudrc, which names the clock, is not there"
+        stated, total = self._records.stated, seen.total()
+        if self._records.ended and stated not in (None, total):
+            yield f"the index states {stated} messages, {total} were read"
+        if self._records.data_ended:
+            counts = _parse_counts(self._contents.metadata.get(COUNTS, ""))
+            wrong = [
+                f"{read[topic]} of {count} on {topic}"
+                for topic, count in counts.items()
+                if read[topic] != count
+            ]
+            more = f" and {len(wrong) - LISTED_MAX} more topics" if len(wrong) > LISTED_MAX else ""
+            if wrong:
+                listed = ", ".join(wrong[:LISTED_MAX])
+                yield f"messages were removed or added: it holds {listed}{more}"
+
+
+def _parse_counts(text: str) -> dict[str, int]:
+    """Parse the writer's own number of messages by topic; empty if there is none.
+
+    Args:
+        text: Value of `COUNTS` in the metadata.
+    """
+    try:
+        found = json.loads(text)
+        return {str(topic): int(count) for topic, count in found.items() if topic in TOPICS}
+    except (AttributeError, TypeError, ValueError):
+        return {}

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import BaseModel
-
-from cloudrc.config.load import ResolvedExperiment, read_experiment
+from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, describe_error
-from cloudrc.files import read, write_atomically
+from cloudrc.files import write_atomically
 from cloudrc.geometry.scene import load_scene
-from cloudrc.metrics import METRIC_NOTE, Flight, Number, measure_all
+from cloudrc.metrics import Flight, Number, measure_all
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import (
     Run,
@@ -25,8 +23,8 @@ from cloudrc.report.document import (
     write_json,
 )
 
-REPORT_BYTES_MAX = 16 << 20
-"""Largest report.json that is read [bytes]; it may have many notes."""
+RECORDING_NOTE = "The recording "
+"""Begin of the notes about a recording, which each report writes anew."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +48,6 @@ class Assessment:
     verdict: Verdict
     notes: tuple[str, ...]
     document: dict[str, Any]
-
-
-class _EarlierReport(BaseModel):
-    """Content of an earlier report.json that a new report keeps."""
-
-    mode: Literal["virtual", "local", "cluster"]
-    shaper: str
-    records_sha256: str | None = None
-    verdict: str = ""
-    notes: tuple[str, ...] = ()
 
 
 def assess(
@@ -89,9 +77,10 @@ def assess(
         real_time=run.mode != "virtual",
         interrupted=run.interrupted or torn,
     )
-    incomplete = (f"The recording is incomplete: {recording.note}.",) if torn else ()
+    incomplete = (f"{RECORDING_NOTE}is incomplete: {recording.note}.",) if torn else ()
+    remarks = tuple(f"{RECORDING_NOTE}{remark}." for remark in recording.remarks)
     faults = tuple(f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text)
-    notes = tuple(dict.fromkeys((*run.notes, *incomplete, *faults, *metric_notes)))
+    notes = tuple(dict.fromkeys((*run.notes, *incomplete, *remarks, *faults, *metric_notes)))
     document = report_document(
         run,
         experiment,
@@ -137,59 +126,6 @@ def write_report(
     if page:
         _write_page(folder, assessment, environment)
     return assessment.document
-
-
-def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
-    """Read the folder of a run, complete or torn, as arguments for `write_report`.
-
-    If the run ended before it merged the recordings of both ends, they are merged now.
-
-    Raises:
-        BadInputError: If the folder has no experiment or no readable recording.
-    """
-    if not (folder / "config.yaml").is_file():
-        raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
-    experiment = read_experiment(folder / "config.yaml")
-    recording = _read_recording(folder)
-    return recording, experiment, _read_run(folder, recording)
-
-
-def _read_recording(folder: Path) -> Recording:
-    merged = folder / "mission.mcap"
-    ends = folder / "world.mcap", folder / "cloud.mcap"
-    if not any(path.is_file() for path in (merged, *ends)):
-        raise BadInputError(f"{folder}: has no mission.mcap; name the folder of a run")
-    try:
-        recording = Recording.read(merged)
-        if recording.complete:
-            return recording
-    except (BadInputError, FileNotFoundError):
-        if not any(path.is_file() for path in ends):
-            raise
-    else:
-        if not all(path.is_file() for path in ends):
-            return recording
-    from cloudrc.record.merge import merge
-
-    mission = merge(*ends)
-    mission.write(merged)
-    return mission.recording()
-
-
-def _read_run(folder: Path, recording: Recording) -> Run:
-    """Read mode, shaper, checksum, interruption and notes from an earlier report.json.
-
-    Without one, guess mode and shaper: a run that recorded lateness was in real time.
-    """
-    try:
-        earlier = _EarlierReport.model_validate_json(read(folder / "report.json", REPORT_BYTES_MAX))
-    except (OSError, ValueError):
-        real_time = len(recording["/lateness"]) > 0
-        return Run("local", "relay") if real_time else Run("virtual", "virtual")
-    # Metrics are measured again and write their notes anew.
-    notes = tuple(note for note in earlier.notes if not note.startswith(METRIC_NOTE))
-    interrupted = earlier.verdict == "interrupted"
-    return Run(earlier.mode, earlier.shaper, earlier.records_sha256, interrupted, notes)
 
 
 def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any]) -> None:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Channel, Message
+from mcap.writer import CompressionType, Writer
 
 from cloudrc import records as rec
 from cloudrc.messages import GuardState, Odometry, Telemetry
-from cloudrc.record.columns import Recording
+from cloudrc.record.columns import Recording, merged
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
@@ -101,6 +104,68 @@ def write(path: Path, records: list[Record], clock: str = "world", clock_id: str
     with McapWriter(path, clock=clock, clock_id=clock_id) as writer:
         writer.write(records)
     return path
+
+
+def write_mission(
+    path: Path,
+    world: Iterable[Record],
+    cloud: Iterable[Record],
+    attachments: Mapping[str, bytes] | None = None,
+) -> None:
+    """Record both ends as one mission, as a run in virtual time does."""
+    with McapWriter(path, clock="world") as writer:
+        for log_time_ns, row in merged(world, cloud):
+            writer.write_row(row, log_time_ns)
+        for name, data in (attachments or {}).items():
+            writer.attach(name, data)
+
+
+def rewrite(
+    source: Path,
+    target: Path,
+    *,
+    keep: Callable[[Channel, Message], object] = lambda channel, message: True,
+    rename: Callable[[str], str] = str,
+    shuffle: Callable[[list[Any]], object] = lambda messages: None,
+    metadata: bool = True,
+    **options: Any,
+) -> Path:
+    """Rewrite a recording as another program does.
+
+    Args:
+        source: The recording.
+        target: The new file.
+        keep: Whether a message is kept.
+        rename: Gives the new name of a topic.
+        shuffle: Changes the list of messages in place.
+        metadata: Whether metadata and attachments are kept.
+        options: Options of mcap's writer.
+    """
+    with source.open("rb") as old, target.open("wb") as new:
+        reader = make_reader(old)
+        messages = [(s, c, m) for s, c, m in reader.iter_messages() if keep(c, m)]
+        shuffle(messages)
+        writer = Writer(new, **{"compression": CompressionType.ZSTD} | options)
+        writer.start(profile="ros2", library="another")
+        ids: dict[int, int] = {}
+        for schema, channel, message in messages:
+            if channel.id not in ids:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                name = rename(channel.topic)
+                ids[channel.id] = writer.register_channel(name, "cdr", number, channel.metadata)
+            writer.add_message(
+                ids[channel.id],
+                message.log_time,
+                message.data,
+                message.publish_time,
+                message.sequence,
+            )
+        for each in reader.iter_attachments() if metadata else ():
+            writer.add_attachment(0, each.log_time, each.name, each.media_type, each.data)
+        for entry in reader.iter_metadata() if metadata else ():
+            writer.add_metadata(entry.name, entry.metadata)
+        writer.finish()
+    return target
 
 
 def assert_equal(one: Recording, other: Recording) -> None:

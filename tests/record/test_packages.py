@@ -8,7 +8,7 @@ import sys
 import pytest
 
 BLOCK = "import sys; sys.modules.update(dict.fromkeys({names!r}))\n"
-NEEDED = ["mcap", "rosbags", "zstandard"]
+NEEDED = ["lz4", "mcap", "rosbags", "zstandard"]
 
 
 def run(code: str, without: list[str]) -> str:
@@ -19,7 +19,7 @@ def run(code: str, without: list[str]) -> str:
     return done.stdout.strip()
 
 
-@pytest.mark.parametrize("module", ["reader", "writer", "merge"])
+@pytest.mark.parametrize("module", ["reader", "recover", "merge"])
 def test_a_missing_package_is_named_with_its_remedy(module: str) -> None:
     code = f"""
 from cloudrc.errors import MissingPrerequisiteError

@@ -1,4 +1,4 @@
-"""Writing a report: complete, again from its folder, without figures, from a torn recording."""
+"""A report is written as far as its packages are installed."""
 
 from __future__ import annotations
 
@@ -11,14 +11,12 @@ from typing import Any
 
 import pytest
 
-from cloudrc.config.load import dump
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.record.columns import Recording
-from cloudrc.record.merge import write_mission
 from cloudrc.records import Record
 from cloudrc.report.document import Run
-from cloudrc.report.write import read_run, write_report
-from tests.metrics.conftest import at, flown, paper, touch
+from cloudrc.report.write import write_report
+from tests.metrics.conftest import flown, paper, touch
 
 RUN = Run("virtual", "virtual", "f" * 64)
 
@@ -31,53 +29,8 @@ def records() -> tuple[list[Record], list[Record]]:
     return world, cloud
 
 
-def run_folder(folder: Path) -> Path:
-    (folder / "config.yaml").write_text(dump(paper()[0]))
-    write_mission(folder / "mission.mcap", *records())
-    return folder
-
-
-def test_a_run_folder_gives_the_same_report_again(tmp_path: Path) -> None:
-    run_folder(tmp_path)
-    first = write_report(tmp_path, *_in_memory(), RUN, page=False)
-    again = write_report(tmp_path, *read_run(tmp_path), page=False)
-    assert again == first
-    assert json.loads((tmp_path / "report.json").read_text()) == first
-
-
 def _in_memory() -> tuple[Recording, Any]:
     return Recording.from_records(*records()), paper()[0]
-
-
-def test_a_torn_recording_still_gives_a_report(tmp_path: Path) -> None:
-    mission = run_folder(tmp_path) / "mission.mcap"
-    whole = mission.read_bytes()
-    mission.write_bytes(whole[: len(whole) // 2])
-    report = write_report(tmp_path, *read_run(tmp_path), page=False)
-    assert report["verdict"] == "interrupted"
-    assert report["complete"] is False
-    assert "incomplete" in report["notes"][0]
-    assert 0 < report["numbers"]["duration"]["value"] < 10
-    assert "records_sha256" not in report
-
-
-def test_an_interrupted_run_stays_interrupted(tmp_path: Path) -> None:
-    run_folder(tmp_path)
-    world, cloud = ([r for r in part if r.stamp_ns < at(4)] for part in records())
-    write_mission(tmp_path / "mission.mcap", world, cloud)
-    recording = Recording.from_records(world, cloud)
-    stopped = Run("local", "relay", interrupted=True, notes=("the relay died",))
-    assert write_report(tmp_path, recording, paper()[0], stopped, page=False)["verdict"] == (
-        "interrupted"
-    )
-    assert read_run(tmp_path)[2] == stopped
-
-
-@pytest.mark.parametrize("name", ["config.yaml", "mission.mcap"])
-def test_a_folder_without_a_run_is_refused(tmp_path: Path, name: str) -> None:
-    (run_folder(tmp_path) / name).unlink()
-    with pytest.raises(BadInputError, match=f"has no {name}"):
-        read_run(tmp_path)
 
 
 def test_without_matplotlib_the_numbers_are_written(

@@ -21,11 +21,12 @@ from cloudrc.files import open_file
 from cloudrc.link import traces
 from cloudrc.link.traces import read_trace
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
-from cloudrc.record.merge import write_mission
 from cloudrc.record.reader import read_contents
 from cloudrc.records import GroundTruth
-from cloudrc.report.write import read_run, write_report
+from cloudrc.report.folder import read_run
+from cloudrc.report.write import write_report
 from tests.metrics.conftest import flown
+from tests.record.conftest import write_mission
 
 
 @pytest.fixture(autouse=True)
@@ -139,7 +140,9 @@ def test_an_old_report_is_used_completely_or_not_at_all(run: Path, before: str) 
 def test_undrawable_data_gives_one_line_of_error(run: Path) -> None:
     nowhere = Odometry(1, (nan, nan, nan), UPRIGHT, ZERO, ZERO)
     world = [
-        record._replace(odometry=nowhere) if isinstance(record, GroundTruth) else record
+        record._replace(odometry=nowhere._replace(stamp_ns=record.stamp_ns))
+        if isinstance(record, GroundTruth)
+        else record
         for record in flown().world
     ]
     write_mission(run / "mission.mcap", sorted(world, key=lambda each: each.stamp_ns), ())

@@ -16,11 +16,12 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.state import publish
 from cloudrc.record.columns import Recording
-from cloudrc.record.merge import write_mission
+from cloudrc.record.merge import merge
 from cloudrc.record.recover import recover
 from cloudrc.report.document import write_json
-from cloudrc.report.write import read_run, write_report
-from tests.record.conftest import world_records, write
+from cloudrc.report.folder import read_run
+from cloudrc.report.write import write_report
+from tests.record.conftest import cloud_records, world_records, write
 
 HEX = b"\xab" * 8
 
@@ -52,12 +53,17 @@ def recovered(path: Path) -> None:
     recover(write(path.with_name("torn.mcap"), world_records(20)), path)
 
 
+def merged(path: Path) -> None:
+    ends = (write(path.with_name(f"{n}.mcap"), world_records(20)) for n in range(2))
+    merge(*ends).write(path)
+
+
 WRITERS: list[Callable[[Path], object]] = [
     lambda path: write_atomically(path, b"new"),
     lambda path: replace_durably(path, b"new"),
     lambda path: publish(path, "new"),
     lambda path: write_json(path, {}),
-    lambda path: write_mission(path, world_records(20), ()),
+    merged,
     recovered,
 ]
 
@@ -121,10 +127,11 @@ def test_a_report_follows_no_link(
     monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
     (theirs / "config.yaml").write_text("seed: 1")
     write(theirs / "world.mcap", world_records(20))
-    (theirs / "cloud.mcap").write_bytes((theirs / "world.mcap").read_bytes())
-    names = ("report.json", "environment.json", "report.html", "mission.mcap")
+    write(theirs / "cloud.mcap", cloud_records(20))
+    names = ("report.json", "environment.json", "report.html")
     for name in names:
         (theirs / name).symlink_to(mine)
+    (theirs / "mission.mcap").symlink_to(tmp_path / "nothing")
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (theirs / "figures").symlink_to(elsewhere)
@@ -136,6 +143,6 @@ def test_a_report_follows_no_link(
     write_report(theirs, *read_run(theirs))
     assert mine.read_text() == "mine"
     assert not any(elsewhere.iterdir())
-    assert not any((theirs / name).is_symlink() for name in names)
+    assert not any((theirs / name).is_symlink() for name in (*names, "mission.mcap"))
     assert (theirs / "figures" / "error.png").read_bytes().startswith(b"\x89PNG")
     assert Recording.read(theirs / "mission.mcap").complete

@@ -1,0 +1,194 @@
+"""Read the folder of a recorded run, and refuse it if its recording cannot carry a report.
+
+A report is written again from `mission.mcap`. Other programs may have filtered, cut, renamed or
+replaced that file. Then the report would be wrong, so the command ends with the reason, and the
+earlier report.json stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel
+
+from cloudrc.config.document import parse_yaml
+from cloudrc.config.load import ResolvedExperiment, read_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.files import read
+from cloudrc.metrics import METRIC_NOTE
+from cloudrc.metrics.flight import CONTROL_TOPICS
+from cloudrc.record.columns import Recording
+from cloudrc.record.hash import messages_sha256
+from cloudrc.record.merge import merge
+from cloudrc.record.reader import Contents, NothingReadableError, read_contents
+from cloudrc.record.topics import TOPICS
+from cloudrc.record.writer import SHA256
+from cloudrc.records import Arrival
+from cloudrc.report.document import Run
+from cloudrc.report.write import RECORDING_NOTE
+
+REPORT_BYTES_MAX = 16 << 20
+"""Largest report.json that is read [bytes]; it may have many notes."""
+JUDGEMENT = ("criteria", "description", "name", "report")
+"""Keys of an experiment that change its report, but not its flight."""
+FOLLOWS = (("/command_applied", "/guard"), ("/pid", "/mission"))
+"""Topics of which the first has rows only if the second has."""
+
+
+class _EarlierReport(BaseModel):
+    """Content of an earlier report.json that a new report keeps."""
+
+    mode: Literal["virtual", "local", "cluster"]
+    shaper: str
+    records_sha256: str | None = None
+    verdict: str = ""
+    complete: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
+    """Read the folder of a run, complete or torn, as arguments for `write_report`.
+
+    If the run ended before it merged the recordings of both ends, they are merged now.
+
+    Raises:
+        BadInputError: If the folder has no experiment or no readable recording, or if the
+            recording lacks what a report needs.
+    """
+    if not (folder / "config.yaml").is_file():
+        raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
+    experiment = read_experiment(folder / "config.yaml")
+    mission, contents = None, _read_merged(folder)
+    if contents is None:
+        mission = merge(folder / "world.mcap", folder / "cloud.mcap")
+        contents = mission.contents
+    recording = Recording.from_contents(contents)
+    earlier = _read_earlier(folder / "report.json")
+    for lack in _lacking(recording, folder / "config.yaml", earlier):
+        raise BadInputError(f"{folder / 'mission.mcap'}: {lack}; no report is written")
+    if mission is not None:
+        mission.write(folder / "mission.mcap")
+    run = _describe(recording, earlier, messages_sha256(contents.messages))
+    return recording, experiment, run
+
+
+def _read_merged(folder: Path) -> Contents | None:
+    """Read mission.mcap; None if it is absent or torn and the recordings of the ends are there."""
+    merged, ends = folder / "mission.mcap", (folder / "world.mcap", folder / "cloud.mcap")
+    there = [path.is_file() for path in ends]
+    if not merged.exists():
+        if not any(there):
+            raise BadInputError(f"{folder}: has no mission.mcap; name the folder of a run")
+        return None
+    try:
+        contents = read_contents(merged)
+    except NothingReadableError:
+        if not any(there):
+            raise
+        return None
+    torn = contents.note and not contents.lacking
+    return None if torn and all(there) else contents
+
+
+def _lacking(recording: Recording, config: Path, earlier: _EarlierReport | None) -> Iterator[str]:
+    """Yield what keeps a recording from carrying a report, the plainest reason first.
+
+    Args:
+        recording: The recording.
+        config: Configuration in the folder of the run.
+        earlier: The report that is there.
+    """
+    if not any(len(recording[topic]) for topic in TOPICS):
+        yield "; ".join(["holds no message of cloudrc", *recording.remarks])
+    if recording.lacking:
+        yield recording.lacking
+    if recording.note and earlier is not None and earlier.complete:
+        yield (
+            f"{recording.note}, but report.json is of the whole recording: to report on what is"
+            " left, move report.json away"
+        )
+    if "config.yaml" in recording.attachments:
+        there = _flown(recording.attachments["config.yaml"], "its config.yaml")
+        here = _flown(read(config), str(config))
+        if names := sorted(key for key in there | here if there.get(key) != here.get(key)):
+            yield f"is the recording of an experiment with other values for: {', '.join(names)}"
+    if SHA256 not in recording.metadata:  # without the writer's own count of its messages
+        yield from _unequal(recording)
+    for topic in ("/ground_truth", *CONTROL_TOPICS):
+        steps = np.diff(recording[topic]["stamp_ns"])
+        wrong = int((steps < (topic == "/ground_truth")).sum())
+        if wrong:
+            yield f"has {wrong} rows on {topic} that are not later than the row before"
+
+
+def _unequal(recording: Recording) -> Iterator[str]:
+    """Yield topics whose rows are fewer than those of other topics show."""
+    for topic in TOPICS.values():
+        count = len(recording[topic.name])
+        siblings = [t.name for t in TOPICS.values() if t.source is topic.source]
+        if topic.source is not Arrival and (
+            more := [name for name in siblings if len(recording[name]) > count + 1]
+        ):
+            yield f"has {count} rows on {topic.name}, but {len(recording[more[0]])} on {more[0]}"
+    for first, second in FOLLOWS:
+        if len(recording[first]) and not len(recording[second]):
+            yield f"has rows on {first}, but none on {second}"
+
+
+def _flown(data: bytes, name: str) -> dict[str, Any]:
+    """Parse the part of a configuration that determines a flight."""
+    document, _ = parse_yaml(data.decode("utf-8", "replace"), name)
+    values = document if isinstance(document, dict) else {}
+    return {key: value for key, value in values.items() if key not in JUDGEMENT}
+
+
+def _read_earlier(path: Path) -> _EarlierReport | None:
+    try:
+        return _EarlierReport.model_validate_json(read(path, REPORT_BYTES_MAX))
+    except (OSError, ValueError):
+        return None
+
+
+def _describe(recording: Recording, earlier: _EarlierReport | None, sha256: str) -> Run:
+    """Describe a run by its earlier report.
+
+    Without one, guess mode and shaper: a run that recorded lateness was in real time.
+
+    Args:
+        recording: Its recording.
+        earlier: Its earlier report.
+        sha256: Hash of the recording's messages.
+    """
+    if earlier is None:
+        real_time = len(recording["/lateness"]) > 0
+        earlier = _EarlierReport(
+            mode="local" if real_time else "virtual", shaper="relay" if real_time else "virtual"
+        )
+    # Each report writes these notes anew.
+    anew = (METRIC_NOTE, RECORDING_NOTE)
+    notes = [note for note in earlier.notes if not note.startswith(anew)]
+    digest: str | None = sha256
+    if earlier.mode == "virtual":
+        digest = _records_sha256(recording)
+        if recording.metadata.get(SHA256, sha256) != sha256:
+            digest = None
+            notes.append(f"{RECORDING_NOTE}was changed after the run: its hash is left out.")
+    return Run(
+        earlier.mode,
+        earlier.shaper,
+        digest if recording.complete else None,
+        earlier.verdict == "interrupted",
+        tuple(notes),
+    )
+
+
+def _records_sha256(recording: Recording) -> str | None:
+    """Return the hash of the records of a run in virtual time, which its recording keeps."""
+    try:
+        kept = _EarlierReport.model_validate_json(recording.attachments["report.json"])
+    except (KeyError, ValueError):
+        return None
+    return kept.records_sha256

@@ -1,0 +1,224 @@
+"""A run's folder gives its report again, or is refused with the reason and stays as it is."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+from mcap.writer import CompressionType
+
+from cloudrc.cli.main import main
+from cloudrc.config.load import dump
+from cloudrc.errors import BadInputError
+from cloudrc.record.columns import Recording, merged
+from cloudrc.record.writer import McapWriter
+from cloudrc.records import Counted, Record
+from cloudrc.report.document import Run
+from cloudrc.report.folder import read_run
+from cloudrc.report.write import write_report
+from tests.metrics.conftest import at, flown, paper, touch
+from tests.record.conftest import rewrite, write_mission
+
+RUN = Run("virtual", "virtual", "f" * 64)
+Change = Callable[[Path, Path], object]
+
+
+def ends() -> tuple[list[Record], list[Record]]:
+    log = flown()
+    log.world.append(touch(8))
+    world, cloud = (sorted(r, key=lambda record: record.stamp_ns) for r in (log.world, log.cloud))
+    return world, cloud
+
+
+@pytest.fixture(scope="module")
+def flown_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run in virtual time, with its report."""
+    folder, (world, cloud) = tmp_path_factory.mktemp("run"), ends()
+    (folder / "config.yaml").write_text(dump(paper()[0]))
+    write_report(folder, Recording.from_records(world, cloud), paper()[0], RUN, page=False)
+    kept = {name: (folder / name).read_bytes() for name in ("config.yaml", "report.json")}
+    write_mission(folder / "mission.mcap", world, cloud, attachments=kept)
+    return folder
+
+
+@pytest.fixture
+def run(flown_once: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(flown_once, tmp_path / "run")
+
+
+def report(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "report.json").read_text())
+    return found
+
+
+def test_a_run_gives_the_same_report_again(run: Path) -> None:
+    first = report(run)
+    assert first["records_sha256"] == "f" * 64
+    assert write_report(run, *read_run(run), page=False) == first
+    (run / "report.json").unlink()
+    assert write_report(run, *read_run(run), page=False) == first
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": CompressionType.LZ4},
+        {"shuffle": lambda messages: Random(1).shuffle(messages)},
+        {"use_chunking": False, "use_statistics": False},
+    ],
+    ids=["lz4", "shuffled", "bare"],
+)
+def test_another_layout_gives_the_same_report(run: Path, options: dict[str, Any]) -> None:
+    first, recording = report(run), run / "mission.mcap"
+    rewrite(recording, run / "n.mcap", **options).replace(recording)
+    again = write_report(run, *read_run(run), page=False)
+    sorted_ = "The recording was not in order of time: "
+    assert again["notes"] == [] or again["notes"][0].startswith(sorted_)
+    assert again | {"notes": []} == first
+
+
+def filtered(**options: Any) -> Change:
+    return lambda source, target: rewrite(source, target, **options)
+
+
+def cut(source: Path, target: Path) -> None:
+    target.write_bytes(source.read_bytes()[: source.stat().st_size // 2])
+
+
+def damaged(source: Path, target: Path) -> None:
+    data = bytearray(source.read_bytes())
+    data[data.index(b"zstd") + 1000] ^= 255
+    target.write_bytes(data)
+
+
+def recorded(*, more: int = 0, config: bytes = b"") -> Change:
+    """Record the flight anew: with more records of ground truth, or of another experiment."""
+
+    def change(source: Path, target: Path) -> None:
+        world, cloud = ends()
+        world[more:more] = world[:more]
+        write_mission(target, world, cloud, attachments={"config.yaml": config} if config else {})
+
+    return change
+
+
+OTHER = b"seed: 2\nmission: pipes\n"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            filtered(keep=lambda c, m: c.topic in ("/odometry", "/cmd_vel")),
+            "it holds 0 of 2 on /session, .* and 12 more",
+        ),
+        (filtered(keep=lambda c, m: c.topic != "/guard"), "it holds 0 of 3 on /guard"),
+        (filtered(keep=lambda c, m: m.log_time < at(5)), "it holds"),
+        (filtered(keep=lambda c, m: m.log_time > at(5)), "it holds"),
+        (filtered(rename=lambda topic: f"/r1{topic}"), "does not record: /r1/cmd_vel, "),
+        (filtered(metadata=False), "the metadata of cloudrc, which names the clock, is not there"),
+        (cut, "cut short: .* but report.json is of the whole recording"),
+        (damaged, "damaged: a checksum is wrong"),
+        (recorded(more=40), "on /ground_truth that are not later than the row before"),
+        (recorded(config=OTHER), "is the recording of an experiment with other values for: "),
+        (lambda source, target: target.write_bytes(b"PK"), "is not an MCAP file"),
+        (lambda source, target: target.write_bytes(b""), "is empty"),
+        (lambda source, target: target.mkdir(), "Is a directory"),
+    ],
+)
+def test_a_recording_that_carries_no_report_is_refused(
+    run: Path, capsys: pytest.CaptureFixture[str], change: Change, said: str
+) -> None:
+    (run / "report.html").write_text("the page")
+    change(run / "mission.mcap", run / "n.mcap")
+    (run / "mission.mcap").unlink()
+    (run / "n.mcap").rename(run / "mission.mcap")
+    before = {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    assert main(["report", str(run)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(said, line), line
+    assert {path: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("topic", "said"),
+    [
+        ("/telemetry", "has 0 rows on /telemetry, but 401 on /odometry"),
+        ("/guard", "has rows on /command_applied, but none on /guard"),
+        ("/mission", "has rows on /pid, but none on /mission"),
+    ],
+)
+def test_a_killed_runs_topics_are_compared(
+    run: Path, monkeypatch: pytest.MonkeyPatch, topic: str, said: str
+) -> None:
+    """Its writer has not counted its messages."""
+    monkeypatch.setattr(McapWriter, "close", McapWriter.flush)
+    (run / "report.json").unlink()
+    for left_out in ("", topic):
+        with McapWriter(run / "mission.mcap", clock="world") as writer:
+            for log_time_ns, row in merged(*ends()):
+                if row[0] != left_out:
+                    writer.write_row(row, log_time_ns)
+        if not left_out:
+            assert read_run(run)[0].note.startswith("cut short")
+    with pytest.raises(BadInputError, match=said):
+        read_run(run)
+
+
+def test_a_torn_recording_still_gives_a_report(run: Path) -> None:
+    (run / "report.json").unlink()
+    mission = run / "mission.mcap"
+    cut(mission, mission)
+    found = write_report(run, *read_run(run), page=False)
+    assert (found["verdict"], found["complete"]) == ("interrupted", False)
+    assert found["notes"][0].startswith("The recording is incomplete: cut short")
+    assert 0 < found["numbers"]["duration"]["value"] < 10
+    assert "records_sha256" not in found
+    again = write_report(run, *read_run(run), page=False)
+    assert again == found
+
+
+def test_a_hash_is_of_the_recording_beside_it(run: Path) -> None:
+    world, cloud = ends()
+    longer = [*world, Counted(world[-1].stamp_ns, "world", "sent", 1)]
+    write_mission(run / "mission.mcap", longer, cloud)
+    found = write_report(run, *read_run(run), page=False)
+    assert "records_sha256" not in found
+
+
+def test_an_interrupted_run_stays_interrupted(run: Path) -> None:
+    world, cloud = ([r for r in part if r.stamp_ns < at(4)] for part in ends())
+    write_mission(run / "mission.mcap", world, cloud)
+    recording = Recording.from_records(world, cloud)
+    stopped = Run("local", "relay", interrupted=True, notes=("the relay died",))
+    assert write_report(run, recording, paper()[0], stopped, page=False)["verdict"] == (
+        "interrupted"
+    )
+    found = read_run(run)[2]
+    assert (found.mode, found.shaper, found.interrupted) == ("local", "relay", True)
+    assert (found.notes, len(found.records_sha256 or "")) == (stopped.notes, 64)
+
+
+def test_the_ends_are_merged_if_nobody_has(run: Path) -> None:
+    world, cloud = ends()
+    for end, part in (("world", world), ("cloud", cloud)):
+        with McapWriter(run / f"{end}.mcap", clock=end, clock_id="same") as writer:
+            writer.write(part)
+    first = report(run)["numbers"]
+    for what in (Path.unlink, lambda path: path.write_bytes(b"")):
+        what(run / "mission.mcap")
+        assert write_report(run, *read_run(run), page=False)["numbers"] == first
+        assert Recording.read(run / "mission.mcap").complete
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "mission.mcap"])
+def test_a_folder_without_a_run_is_refused(run: Path, name: str) -> None:
+    (run / name).unlink()
+    with pytest.raises(BadInputError, match=f"has no {name}"):
+        read_run(run)
