@@ -207,7 +207,6 @@ class Flight:
         generations: How many processes there have been of each end.
         rings: The keys of the processes that live, by end.
         secrets: What their key files hold, by end.
-        epoch: The newest that world has written to its disk.
         rival: The desk of another cloud, if there is one.
         wall: Asked by a process that starts how old its key file is; None for not at all.
         listeners: Get world's new records and the instant [ns], every 100 ms.
@@ -231,7 +230,6 @@ class Flight:
         secrets = options.get("secrets") or {"world": SECRET, "cloud": SECRET}
         self.secrets = {"rival": SECRET} | secrets
         self.rings: dict[str, KeyRing] = {}
-        self.epoch = 0
         self.wall: Wall | None = None
         self.rival: Desk | None = None
         self.listeners: list[Callable[[list[Record], int], None]] = []
@@ -333,9 +331,7 @@ class Flight:
 
     def rotate(self, end: str, keys: KeySet, now_ns: int) -> None:
         """Put another Secret before an end at an instant [ns]; one that is down reads it later."""
-        self.secrets[end] = keys
-        mortal = self.world if end == "world" else self.cloud
-        self.rings[end].replace(keys, mortal.clock.at(now_ns))
+        self.secrets[end] = self.rings[end].keys = keys
 
     def send_rival_away(self) -> None:
         """The other cloud ends; the one that was first has to get the robot back."""
@@ -360,12 +356,7 @@ class Flight:
     def _build_world(self, start_ns: int) -> WorldEndpoint:
         self.generations["world"] += 1
         nonce = b"world-%d-%d" % (self._life, self.generations["world"])
-        identity = WorldIdentity(
-            SHARED,
-            nonce.ljust(16),
-            ring=self._ring("world", start_ns),
-            next_epoch=self._next_epoch,
-        )
+        identity = WorldIdentity(SHARED, nonce.ljust(16), ring=self._ring("world"))
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self._born_ns = start_ns
         self.watch.attach(world, start_ns, honest=self.honest)
@@ -374,9 +365,7 @@ class Flight:
     def _build_cloud(self, start_ns: int) -> Endpoint:
         self.generations["cloud"] += 1
         nonce = b"cloud-%d-%d" % (self._life, self.generations["cloud"])
-        identity = CloudIdentity(
-            self._cloud_clock_id, nonce.ljust(16), self._ring("cloud", start_ns)
-        )
+        identity = CloudIdentity(self._cloud_clock_id, nonce.ljust(16), self._ring("cloud"))
         teleop = self.desk.join(start_ns)
         cloud = assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
         if self._tempt is not None:
@@ -391,19 +380,13 @@ class Flight:
         limit = self.experiment.criteria.contact_speed_max_mps
         self.rival = Desk(limit, name=b"rival")
         self.rival.order(assembly.build_plan(self.experiment), start_ns)
-        identity = CloudIdentity(SHARED, b"rival".ljust(16), self._ring("rival", start_ns))
+        identity = CloudIdentity(SHARED, b"rival".ljust(16), self._ring("rival"))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, self.rival)
 
-    def _ring(self, end: str, now_ns: int) -> KeyRing:
+    def _ring(self, end: str) -> KeyRing:
         """The keys that a process reads at its start."""
-        wall = self.wall.at(self.run.now_ns) if self.wall is not None else None
-        ring = self.rings[end] = KeyRing(self.secrets[end], now_ns, wall)
+        ring = self.rings[end] = KeyRing(self.secrets[end])
         return ring
-
-    def _next_epoch(self) -> int:
-        """What world has written to its disk before it uses it."""
-        self.epoch += 1
-        return self.epoch
 
     def _sink(self, of_world: list[Record], of_cloud: list[Record]) -> None:
         if self._keep:

@@ -19,7 +19,7 @@ from cloudrc.faults.models import Apart, Mortal, Tamper
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.scenarios.intruder import flipped
 from cloudrc.faults.schedule import STALLS, Event, Schedule
-from cloudrc.faults.walls import TAKE_OFF, Wall
+from cloudrc.faults.walls import Wall
 from cloudrc.link.follow import PEER_PAUSE, PeerName
 from cloudrc.teleop.bridge import Bridge, Call
 from cloudrc.teleop.journal import MAGIC, parse, to_bytes
@@ -114,7 +114,7 @@ def _follow(end: Mortal, events: list[Event], rng: np.random.Generator) -> Tampe
     return lambda data, now_ns: [data] if goes[0] == home(now_ns * 1e-9) else []
 
 
-NEXT_KEY = KeySet(Key(b"the next key of a fuzzed flight!"), SECRET.current, 30.0)
+NEXT_KEY = KeySet(Key(b"the next key of a fuzzed flight!"), SECRET.current)
 WRONG_KEY = Key(b"a key that world has never read!")
 FLOOD_PERIOD = 0.1
 """Between two bunches of requests [s]."""
@@ -163,13 +163,10 @@ def _around(flight: Flight, event: Event, wall: Wall) -> None:
     if event.kind == "second_cloud":
         cloud.at(event.end, lambda _: flight.send_rival_away())
     elif event.kind == "key_rotated":
-        # Made by an operator whose clock is right; that of the ends may have been stepped.
-        until = TAKE_OFF + event.at + NEXT_KEY.overlap
-        keys = NEXT_KEY._replace(until=float(round(until)))
-        world.at(event.at, lambda now_ns: flight.rotate("world", keys, now_ns))
-        cloud.at(event.end, lambda now_ns: flight.rotate("cloud", keys, now_ns))
+        world.at(event.at, lambda now_ns: flight.rotate("world", NEXT_KEY, now_ns))
+        cloud.at(event.end, lambda now_ns: flight.rotate("cloud", NEXT_KEY, now_ns))
     elif event.kind == "key_wrong":
-        wrong = KeySet(WRONG_KEY, None, event.value)
+        wrong = KeySet(WRONG_KEY)
         cloud.at(event.at, lambda now_ns: flight.rotate("cloud", wrong, now_ns))
         # The right one is the one that world has read by then.
         cloud.at(event.end, lambda now_ns: flight.rotate("cloud", flight.secrets["world"], now_ns))

@@ -35,7 +35,7 @@ from cloudrc.record.recover import Recovery, recover
 from cloudrc.teleop.bridge import WAITING_MAX
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.wire import RobotStatus
-from cloudrc.tunnel.keys import KeyRing, KeySet
+from cloudrc.tunnel.keys import KeySet
 
 Patch = pytest.MonkeyPatch
 NEW = (
@@ -93,18 +93,6 @@ def test_a_teleop_shutdown_pauses_and_its_successor_continues(kind: str) -> None
     assert flight.mission.state == "done"
 
 
-@pytest.mark.parametrize(("step", "keys"), [(0.0, 2), (60.0, 1), (-3600.0, 1)])
-def test_at_startup_the_wall_clock_decides_on_the_previous_key(step: float, keys: int) -> None:
-    events = (Event("key_rotated", 1.0), Event("wall_clock", 1.5, value=step))
-    flight = Flight(seed=3)
-    inject(flight, Schedule(3, events=(*events, Event("world_killed", 2.0, 0.1))), Wall())
-    flight.fly(1.8)
-    assert len(flight.rings["world"].accepted(flight.run.now_ns)) == 2, "in flight none is asked"
-    flight.fly(2.5)
-    assert flight.generations["world"] == 2
-    assert len(flight.rings["world"].accepted(flight.run.now_ns)) == keys
-
-
 def test_no_more_requests_are_drawn_than_teleop_lets_wait() -> None:
     assert RANGES["api_flood"][2] == WAITING_MAX
 
@@ -148,14 +136,14 @@ def test_names_that_are_lost_while_nobody_moves_change_nothing(way: str) -> None
 def test_the_right_key_that_is_not_read_is_found(monkeypatch: Patch) -> None:
     wrong = Event("key_wrong", 8.0, 4.0, 0.5)
     assert _flown(wrong) == set()
-    replace, read = KeyRing.replace, set[int]()
+    rotate, read = Flight.rotate, set[str]()
 
-    def once(ring: KeyRing, keys: KeySet, now_ns: int) -> None:
-        if id(ring) not in read:
-            replace(ring, keys, now_ns)
-        read.add(id(ring))
+    def once(flight: Flight, end: str, keys: KeySet, now_ns: int) -> None:
+        if end not in read:
+            rotate(flight, end, keys, now_ns)
+        read.add(end)
 
-    monkeypatch.setattr(KeyRing, "replace", once)
+    monkeypatch.setattr(Flight, "rotate", once)
     assert _flown(wrong) == {"stuck"}
 
 

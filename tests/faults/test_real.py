@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from cloudrc.cluster.tools import ClusterError
 from cloudrc.errors import BadInputError
 from cloudrc.faults.cluster import pods
 from cloudrc.faults.real.wire import FLOOD_SECONDS, flood_seconds
 from cloudrc.faults.scenario import Outcome, Scenario, find, scenarios
 from cloudrc.messages import GuardState
-from cloudrc.tunnel.keys import Key, KeySet, write
 
 REAL = scenarios("real")
 QUICK = ("recorder-killed",)
@@ -115,22 +111,3 @@ def test_the_last_word_of_a_job_is_heard_while_its_pod_goes(
     assert [check.show() for check in outcome.checks if not check.passed] == (
         [] if heard else ["the Job ends with INTERRUPTED: NO"]
     )
-
-
-def test_a_key_that_is_promised_for_a_time_is_not_rotated_away(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    keys = KeySet(Key(bytes(32))).rotated(bytes(range(32)), time.time())
-    encoded = base64.b64encode(write(keys).encode()).decode()
-    asked: list[str] = []
-
-    def kubectl(release: object, *words: str) -> str:
-        asked.append(words[0])
-        return json.dumps({"data": {"key": encoded}})
-
-    monkeypatch.setattr(pods, "kubectl", kubectl)
-    monkeypatch.setattr(pods, "release_there", SimpleNamespace)
-    monkeypatch.setattr(pods, "_key_secret", lambda release: "key")
-    with pytest.raises(ClusterError, match=r"the one before, is valid for [23]\d\d s more"):
-        find("F38", "cluster").run(1)
-    assert asked == ["get"]

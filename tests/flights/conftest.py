@@ -43,7 +43,7 @@ from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.handshake import ClientHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.session import AES_256_GCM, Session, make_session
+from cloudrc.tunnel.session import Session, make_session
 from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
 from cloudrc.world.robot import STEP_NS
 
@@ -128,7 +128,7 @@ class BareCloud:
 
     def __init__(self, nonce: bytes, keys: KeyRing | None) -> None:
         self.session: Session = make_session(Direction.DOWNLINK, keys)
-        self.handshake = ClientHandshake(nonce.ljust(16), CLOCK, AES_256_GCM)
+        self.handshake = ClientHandshake(nonce.ljust(16), CLOCK)
         self.heard: list[str] = []
 
     def hello(self) -> bytes:
@@ -155,13 +155,11 @@ class BareCloud:
         if kind == Kind.CHALLENGE:
             hello = self.handshake.answer_challenge(codec.decode_challenge(body))
             return hello and self.session.greet(Kind.HELLO, hello)
-        if kind == Kind.BUSY:
-            self.handshake.receive_busy(codec.decode_busy(body))
         if kind == Kind.ACCEPT:
             accept = codec.decode_accept(body)
-            agreement = self.handshake.receive_accept(epoch, accept, self.session.epoch, asks=True)
-            if agreement is not None:
-                self.session.begin(epoch, agreement)
+            nonces = self.handshake.receive_accept(epoch, accept, asks=True)
+            if nonces is not None:
+                self.session.begin(epoch, nonces)
         return None
 
 
@@ -449,10 +447,7 @@ class Talk:
         """The cloud process of this name; from here on the one that speaks."""
         if nonce not in self.clouds:
             session = Session(Direction.DOWNLINK, KeyRing(KeySet(self.key)))
-            self.clouds[nonce] = (
-                session,
-                ClientHandshake(nonce.ljust(16), SHARED_CLOCK, AES_256_GCM),
-            )
+            self.clouds[nonce] = session, ClientHandshake(nonce.ljust(16), SHARED_CLOCK)
         self.session = self.clouds[nonce][0]
         return self.clouds[nonce]
 
@@ -491,9 +486,9 @@ class Talk:
                 answers = self.hear(Kind.ACCEPT)
         for _, epoch, body in answers:
             accept = codec.decode_accept(body)
-            agreement = handshake.receive_accept(epoch, accept, session.epoch, asks=True)
-            if agreement is not None:
-                session.begin(epoch, agreement)
+            nonces = handshake.receive_accept(epoch, accept, asks=True)
+            if nonces is not None:
+                session.begin(epoch, nonces)
             return epoch
         return 0
 

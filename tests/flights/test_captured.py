@@ -1,4 +1,4 @@
-"""Datagrams captured in one run are refused in the next, even if world has lost its epochs."""
+"""Datagrams captured in one run are refused in the next, even if epochs begin again."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def accepted(run: Captured) -> dict[str, int]:
 
 
 @pytest.mark.promise("old-datagrams-do-nothing")
-@pytest.mark.parametrize("last_epoch", [0, 2, 4096], ids=["epochs lost", "kept", "kept in blocks"])
+@pytest.mark.parametrize("last_epoch", [0, 2], ids=["epochs begin again", "epochs rise"])
 @pytest.mark.parametrize("seconds", [0, 0.05, 1, 3])
 def test_a_run_replayed_after_both_restarts_is_not_accepted(first, last_epoch, seconds, figure):
     run = Captured(b"world 2", b"cloud 2", last_epoch)
@@ -177,8 +177,7 @@ def greetings(run: Captured, kind: Kind, *, to_world: bool) -> list[bytes]:
 @pytest.mark.parametrize("which", ["old hello", "fresh hello", "hellos", "challenges", "all"])
 def test_repeated_greetings_do_not_delay_a_restarted_cloud(first, which, rate_hz):
     """Captured greetings keep valid tags; they must not keep out an honest cloud."""
-    run = Captured(b"world 2", b"cloud 2", 4096)
-    run.world._door._next_epoch = iter(range(1, 9)).__next__
+    run = Captured(b"world 2", b"cloud 2")
     run.go(4 * SECOND_NS)
     hellos = greetings(first, Kind.HELLO, to_world=True)
     challenges = greetings(first, Kind.CHALLENGE, to_world=False)

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from cloudrc.cluster.pods import NO_PROXY
 from cloudrc.config.load import dump, load_experiment
-from cloudrc.drivers.epochs import replace_durably
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import TimedOutError
 from cloudrc.faults.flight import SECRET
+from cloudrc.files import write_atomically
 from cloudrc.record.columns import Recording
 from cloudrc.record.recover import Recovery, recover
 from cloudrc.teleop.store import ENDED, STATES
@@ -54,7 +54,7 @@ class Processes:
         self.folder = Path(self._temporary.name)
         experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         (self.folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        replace_durably(self.folder / "key", write(SECRET).encode())
+        write_atomically(self.folder / "key", write(SECRET).encode(), 0o600)
         self.ports = dict(zip(("world", "cloud"), free_ports(2), strict=True))
         self.metrics = dict(zip(NAMES, free_ports(len(NAMES), socket.SOCK_STREAM), strict=True))
         self.running: dict[str, subprocess.Popen[bytes]] = {}
@@ -71,7 +71,7 @@ class Processes:
         here, there = (f"{LOOPBACK}:{self.ports[end]}" for end in ("world", "cloud"))
         flags = {
             "world": [
-                *("--listen", here, "--peer", there, "--key", "key", "--epochs", "epochs", *record),
+                *("--listen", here, "--peer", there, "--key", "key", *record),
             ],
             "cloud": [
                 *("--listen", there, "--peer", here, "--key", "key", "--teleop", ".", *record),
@@ -224,9 +224,8 @@ udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 def noise(n):  # pure; behind a right head, too short; as long as an honest one, of an early epoch
     if n % 3 == 0:
         return os.urandom(16 + n % 200)
-    epoch, generation = 1 + n % 2, n // 2 % 2
     number = random.getrandbits(40)
-    head = struct.pack("<BBIBBQ", version, direction, epoch, generation, kind, number)
+    head = struct.pack("<BBIxBQ", version, direction, 1 + n % 2, kind, number)
     return head + os.urandom(n % 40 if n % 3 == 1 else size - len(head))
 began, sent = time.monotonic(), 0
 while (now := time.monotonic() - began) < seconds:
