@@ -43,9 +43,7 @@ from cloudrc.tunnel.codec import (
     encode_hello,
     peek,
 )
-from cloudrc.tunnel.session import ACCEPT, ALIVE, NO_EPOCH, Session
-
-BUSY, CHALLENGE, OPERATOR = int(Kind.BUSY), int(Kind.CHALLENGE), int(Kind.OPERATOR)
+from cloudrc.tunnel.session import NO_EPOCH, Session
 
 EPOCH_MAX = 2**32 - 1
 """Last epoch that the header can hold; 1 follows it."""
@@ -100,8 +98,7 @@ class ServerHandshake:
             session: World's session; this class begins its epochs.
             nonce: 16 bytes that identify this process, new at every start.
             clock: 16 bytes that identify its monotonic clock.
-            age_max_ns: Longest silence of the cloud that has the session; after it, another cloud
-                may take the session [ns].
+            age_max_ns: Silence after which a cloud loses the session to another one [ns].
             last_epoch: Last epoch before this process.
         """
         self._session = session
@@ -113,12 +110,9 @@ class ServerHandshake:
         self._repeated = 0  # acceptances of this epoch since its cloud was last heard
         self._challenged_ns = -CHALLENGE_NS
         self._counters: dict[bytes, int] = {}  # newest counter answered, by nonce
-        self._windows = {int(kind): Channel(newest_wins=True) for kind in (ALIVE, OPERATOR)}
-
-    @property
-    def shares_clock(self) -> bool:
-        """Whether the cloud that has the session reads the same clock as world."""
-        return self._incumbent.clock == self._clock
+        self._windows = {
+            int(kind): Channel(newest_wins=True) for kind in (Kind.ALIVE, Kind.OPERATOR)
+        }
 
     def hear(self, now_ns: int) -> None:
         """Note a new datagram of the session at `now_ns` [ns]: its cloud is alive."""
@@ -152,7 +146,7 @@ class ServerHandshake:
                 return HelloAnswer("unanswered", [])
             self._challenged_ns = now_ns
             challenge = encode_challenge(self._cookie(now_ns))
-            return HelloAnswer("hello", [session.greet(CHALLENGE, challenge, key)])
+            return HelloAnswer("hello", [session.greet(Kind.CHALLENGE, challenge, key)])
         if counter <= self._counters.get(hello.nonce, -1):
             return HelloAnswer(REPEATED, [])
         self._remember(hello.nonce, counter)
@@ -160,7 +154,7 @@ class ServerHandshake:
             if self._keeps_epoch(now_ns):  # cloud takes the answer's key as the key of the epoch
                 return HelloAnswer("hello", [self._accept()])
         elif now_ns <= self._fresh_until_ns:
-            return HelloAnswer("busy", [session.greet(BUSY, hello.nonce, key)])
+            return HelloAnswer("busy", [session.greet(Kind.BUSY, hello.nonce, key)])
         self._incumbent = hello
         if is_newer(hello.epoch, self._epoch):
             self._epoch = hello.epoch
@@ -169,11 +163,7 @@ class ServerHandshake:
         return HelloAnswer("hello", [self._accept()], opened=True)
 
     def begin_next_epoch(self, now_ns: int) -> bytes:
-        """Begin the next epoch of the same session and make the datagram that tells cloud.
-
-        Args:
-            now_ns: Monotonic clock [ns].
-        """
+        """Begin the next epoch of the session at `now_ns` [ns]; make the datagram for cloud."""
         self._begin(now_ns)
         self._session.begin(self._epoch)
         return self._accept()
@@ -207,7 +197,7 @@ class ServerHandshake:
 
     def _accept(self) -> bytes:
         accept = Accept(self._incumbent.nonce, self._nonce, self._clock)
-        return self._session.greet(ACCEPT, encode_accept(accept))
+        return self._session.greet(Kind.ACCEPT, encode_accept(accept))
 
     def _cookie(self, now_ns: int, slots_ago: int = 0) -> bytes:
         slot = now_ns // COOKIE_NS - slots_ago
@@ -245,13 +235,9 @@ class ClientHandshake:
         return self._hello()
 
     def answer_challenge(self, cookie: bytes) -> bytes | None:
-        """Handle a challenge and make the body of the hello that answers it.
+        """Make the body of the hello that answers a challenge, or None if it is not needed.
 
-        A repeated cookie is ignored: the next hello has it if it is the newest, and an older one
-        must not replace the newest.
-
-        Returns:
-            The body, or None if no answer is needed.
+        A repeated cookie is ignored, because an older one must not replace the newest.
         """
         if self._replies == 0 or cookie in self._cookies:
             return None
@@ -263,11 +249,11 @@ class ClientHandshake:
         return self._hello()
 
     def is_refused(self, nonce: bytes) -> bool:
-        """Check whether a refusal that names this nonce answers our hello."""
+        """Check whether a refusal with this nonce answers our hello."""
         return nonce == self._nonce
 
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:
-        """Handle an acceptance.
+        """Handle an acceptance; return cloud's and world's nonce for the new epoch, or None.
 
         Cloud accepts another world process only while it asks for a session, because a late
         datagram of a dead process may arrive. If cloud has accepted a dead process nevertheless,
@@ -277,16 +263,14 @@ class ClientHandshake:
             epoch: Epoch in the header.
             accept: Body of the datagram.
             asks: Whether cloud wants a session: it has none, or does not hear world.
-
-        Returns:
-            Cloud's and world's nonce, for the new epoch; None if the acceptance is old or not for
-            us.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):
             return None
-        if accept.world_nonce in self._old_worlds:
-            self._change_nonce()
+        if accept.world_nonce in self._old_worlds:  # ask with a nonce that nobody has captured
+            self._nonces += 1
+            self._nonce = hashlib.sha256(b"%s %d" % (self._seed, self._nonces)).digest()[:16]
+            self._old_worlds.clear()
             return None
         if known and not is_newer(epoch, self._epoch):
             return None
@@ -295,17 +279,11 @@ class ClientHandshake:
         self._world, self._epoch = accept.world_nonce, epoch
         return accept.nonce + accept.world_nonce
 
-    def _change_nonce(self) -> None:
-        """Use a new nonce, of which nobody can have captured datagrams."""
-        self._nonces += 1
-        text = b"%s %d" % (self._seed, self._nonces)
-        self._nonce = hashlib.sha256(text).digest()[:16]
-        self._old_worlds.clear()
-
     def _hello(self) -> bytes:
         return encode_hello(Hello(self._nonce, self._clock, self._cookie, self._epoch))
 
 
+VERSION_TEXT = "peer speaks v{}, we speak v{}: run the same version of cloudrc at both ends"
 KEY_TEXT = "the peer uses another key: give both ends the same key file"
 BUSY_TEXT = "another cloud controls the robot: this one waits until the other is silent"
 SILENCE_TEXT = (
@@ -325,7 +303,7 @@ class HandshakeLog:
         self._logged.clear()
 
     def about(self, outcome: str, data: bytes, now_ns: int) -> list[Fault]:
-        """Log why a datagram was refused while there is no session.
+        """Log at `now_ns` [ns] why a datagram was refused while there is no session.
 
         Args:
             outcome: Text of the DecodeError.
@@ -333,25 +311,17 @@ class HandshakeLog:
             now_ns: Own clock [ns].
         """
         if outcome == "version":
-            text = (
-                f"peer speaks v{data[0]}, we speak v{VERSION}: "
-                "run the same version of cloudrc at both ends"
-            )
+            text = VERSION_TEXT.format(data[0], VERSION)
             return self.say("version", text, now_ns)
         if outcome == "tag" and peek(data)[0] <= LAST_GREETING:
             return self.say("key", KEY_TEXT, now_ns)
         return []
 
     def say(self, code: str, text: str, now_ns: int) -> list[Fault]:
-        """Log a fault unless the same text has been logged.
+        """Log a fault at `now_ns` [ns] unless the same text has been logged.
 
         The text decides, not the code: a datagram with any version, which anybody can send, does
         not hide the version of the peer.
-
-        Args:
-            code: Code of the fault.
-            text: Text of the fault.
-            now_ns: Own clock [ns].
         """
         if text in self._logged:
             return []

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+from dataclasses import dataclass
 from typing import NamedTuple, NoReturn
 
 from cryptography.hazmat.primitives.hashes import SHA256
@@ -89,16 +90,11 @@ class KeySet(NamedTuple):
         return (self.current,) if self.previous is None else (self.current, self.previous)
 
 
+@dataclass
 class KeyRing:
-    """The keys of one end.
+    """The keys of one end; the driver replaces `keys` in flight."""
 
-    Attributes:
-        keys: Content of the key file; the driver replaces it in flight.
-    """
-
-    def __init__(self, keys: KeySet) -> None:
-        """Begin with the keys of a file."""
-        self.keys = keys
+    keys: KeySet
 
 
 def parse(data: bytes) -> KeySet:

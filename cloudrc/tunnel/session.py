@@ -8,9 +8,6 @@ Each kind has its own counter, so that greetings and probes never shift the coun
 and commands. Counters restart with every epoch, except those of greetings without an epoch: the
 link draws its impairments from the counter, and a repeated one would always get the same draw.
 
-A session keeps its pre-shared key until the next epoch. If the key file no longer has that key, the
-session ends at once.
-
 Two ends in one process may use an unsealed session, because virtual time has no wire to protect and
 sealing would take a twentieth of the flight's time. Drivers with a socket refuse such a session
 (`Endpoint.sealed`), so a missing key is an error at the start and never plaintext on a wire.
@@ -34,11 +31,23 @@ from cloudrc.tunnel.codec import (
 )
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
-ACCEPT, ALIVE = int(Kind.ACCEPT), int(Kind.ALIVE)  # looking up an enum's member is slow
 NO_EPOCH = 0
 """Epoch of an end without a session, and of every hello, challenge and refusal."""
-TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {ACCEPT}
+TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}
 """Kinds of datagram that belong to no epoch: all greetings except ACCEPT."""
+_NO_TAG = bytes(TAG_SIZE)
+
+
+class NoCipher:
+    """Take the place of the cipher between two ends in one process."""
+
+    def encrypt(self, nonce: bytes, body: bytes, header: bytes) -> bytes:
+        """Append zeros in place of a tag."""
+        return body + _NO_TAG
+
+    def decrypt(self, nonce: bytes, data: bytes, header: bytes) -> bytes:
+        """Remove the zeros."""
+        return data[:-TAG_SIZE]
 
 
 class Session:
@@ -62,8 +71,7 @@ class Session:
             ring: The pre-shared keys.
         """
         self.epoch = NO_EPOCH
-        self.ring = ring
-        self._keys = ring.keys
+        self.ring, self._keys = ring, ring.keys
         self.greeting_key = self.epoch_key = ring.keys.current
         self.is_outdated = False
         self._sends, self._opens = int(sends), 1 - int(sends)
@@ -72,8 +80,6 @@ class Session:
 
     def begin(self, epoch: int, nonces: bytes = b"", key: Key | None = None) -> None:
         """Begin an epoch: derive new keys and restart the counters.
-
-        Kinds of datagram in TIMELESS belong to no epoch; their counters continue.
 
         Args:
             epoch: Number of the epoch.
@@ -132,8 +138,7 @@ class Session:
 
     def follow_keys(self) -> None:
         """Adopt a new key file; end the session if the file does not have its key."""
-        keys = self.ring.keys
-        if keys is self._keys:
+        if (keys := self.ring.keys) is self._keys:
             return
         self._keys = keys
         self.is_outdated = self.epoch_key != keys.current
@@ -148,59 +153,34 @@ class Session:
                 return signed[HEADER_SIZE:]
         raise DecodeError("tag")
 
-    def _derive(self, direction: int) -> AESGCM:
+    def _derive(self, direction: int) -> AESGCM | NoCipher:
         assert self._nonces, "the handshake comes first"
         use = b"session %d %d" % (direction, self.epoch)
         return AESGCM(self.epoch_key.derive(self._nonces, use))
 
 
-def pair(epoch: int = 1, secret: bytes = b"p" * 32) -> tuple[Session, Session]:
-    """Make world's and cloud's end of a session for tests; equal arguments give equal keys."""
-    world, cloud = (
-        Session(sends, KeyRing(KeySet(Key(secret))))
-        for sends in (Direction.UPLINK, Direction.DOWNLINK)
-    )
-    for end in (world, cloud):
-        end.begin(epoch, b"cloud".ljust(16) + b"world".ljust(16))
-    return world, cloud
-
-
-NO_SECRET = KeySet(Key(b"nothing is secret in one process"))
-"""Key of the greetings within one process."""
-NO_TAG = bytes(TAG_SIZE)
-
-
 class UnsealedSession(Session):
-    """A session for two ends in one process: datagrams keep their length but have no tag."""
+    """A session for two ends in one process: only its greetings have a tag."""
 
     sealed = False
 
     def __init__(self, sends: Direction) -> None:
         """Start without a session."""
-        super().__init__(sends, KeyRing(NO_SECRET))
+        super().__init__(sends, KeyRing(KeySet(Key(b"nothing is secret in one process"))))
 
-    def seal(self, kind: int, body: bytes) -> bytes:
-        """Seal `body` as the next datagram of this kind."""
-        counter = self._counters[kind]
-        self._counters[kind] = counter + 1
-        return encode_header(kind, self._sends, self.epoch, counter) + body + NO_TAG
-
-    def open(self, data: bytes) -> Datagram:
-        """Check and decode a datagram.
-
-        Raises:
-            DecodeError: As in `Session.open`; "tag" for greetings only.
-        """
-        _, direction, epoch, kind, counter = check(data)
-        if direction != self._opens:
-            raise DecodeError("direction")
-        if kind <= LAST_GREETING:
-            return kind, direction, epoch, counter, self._open_greeting(data)
-        if epoch != self.epoch or not epoch:
-            raise DecodeError("old_epoch")
-        return kind, direction, epoch, counter, data[HEADER_SIZE:-TAG_SIZE]
+    def _derive(self, direction: int) -> AESGCM | NoCipher:
+        return NoCipher()
 
 
 def make_session(sends: Direction, ring: KeyRing | None) -> Session:
     """Make an end's session: sealed if it has keys, else unsealed and only for one process."""
     return UnsealedSession(sends) if ring is None else Session(sends, ring)
+
+
+def pair(epoch: int = 1, secret: bytes = b"p" * 32) -> tuple[Session, Session]:
+    """Make world's and cloud's end of a session for tests; equal arguments give equal keys."""
+    ring = KeyRing(KeySet(Key(secret)))
+    ends = Session(Direction.UPLINK, ring), Session(Direction.DOWNLINK, ring)
+    for end in ends:
+        end.begin(epoch, b"cloud".ljust(16) + b"world".ljust(16))
+    return ends

@@ -400,7 +400,7 @@ class WorldEndpoint:
         answer = self._door.receive_hello(hello, counter, now_ns)
         self._counts[answer.outcome] += 1
         if answer.opened:
-            self._clock_is_shared = self._door.shares_clock
+            self._clock_is_shared = hello.clock == self._identity.clock_id
             self._orders.number = 0
             self._begin_epoch("cloud said hello")
         self._queue(answer.datagrams)

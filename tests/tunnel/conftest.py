@@ -41,7 +41,6 @@ class Doorstep:
         counter: int | None = None,
         key: Key | None = None,
         epoch: int = NO_EPOCH,
-        clock: bytes = CLOCK,
     ) -> HelloAnswer:
         """Send a hello, by default with a valid cookie, the next counter and the newest key."""
         self.counter += 1
@@ -49,7 +48,7 @@ class Doorstep:
         cookie = self.door._cookie(self.now_ns) if cookie is None else cookie
         self.world.follow_keys()
         self.world.greeting_key = key or self.world.ring.keys.current
-        return self.door.receive_hello(Hello(nonce, clock, cookie, epoch), counter, self.now_ns)
+        return self.door.receive_hello(Hello(nonce, CLOCK, cookie, epoch), counter, self.now_ns)
 
     def answer(self, *given: Any, **named: Any) -> tuple[int, int, bytes]:
         """Return kind, epoch and body of the answer to a hello."""

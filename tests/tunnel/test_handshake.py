@@ -130,14 +130,6 @@ def test_a_new_epoch_gives_its_cloud_time_to_be_heard(step: Doorstep, begins: st
     assert step.receive_hello(OTHER).opened
 
 
-def test_world_knows_whether_the_clock_is_shared(step: Doorstep) -> None:
-    step.receive_hello()
-    assert step.door.shares_clock
-    step.now_ns += 2 * SECOND_NS
-    step.receive_hello(OTHER, clock=b"d" * 16)
-    assert not step.door.shares_clock
-
-
 def test_operator_and_alive_are_let_in_once(step: Doorstep) -> None:
     for kind in (Kind.OPERATOR, Kind.ALIVE):
         step.door.accept_once(kind, 5, step.now_ns)
