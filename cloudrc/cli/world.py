@@ -28,7 +28,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.epochs:
         print("cloudrc: --epochs is ignored: cloud keeps the session number", file=sys.stderr)
     runtime = open_end(options, "world")
-    identity = WorldIdentity(runtime.clock, os.urandom(16), ring=runtime.keys.ring)
+    identity = WorldIdentity(runtime.clock, os.urandom(16), runtime.keys.ring)
     world = assembly.build_world(runtime.experiment, identity, time.monotonic_ns)
     runtime.fly(world, stop, lambda: world.robot.guard.armed, slip_ns=lambda: world.slip_ns)
     return 0

@@ -356,7 +356,7 @@ class Flight:
     def _build_world(self, start_ns: int) -> WorldEndpoint:
         self.generations["world"] += 1
         nonce = b"world-%d-%d" % (self._life, self.generations["world"])
-        identity = WorldIdentity(SHARED, nonce.ljust(16), ring=self._ring("world"))
+        identity = WorldIdentity(SHARED, nonce.ljust(16), self._ring("world"))
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self._born_ns = start_ns
         self.watch.attach(world, start_ns, honest=self.honest)

@@ -89,9 +89,7 @@ class HelloAnswer(NamedTuple):
 class ServerHandshake:
     """World's side: decide which cloud has authority, and under which epoch."""
 
-    def __init__(
-        self, session: Session, nonce: bytes, clock: bytes, age_max_ns: int, last_epoch: int = 0
-    ) -> None:
+    def __init__(self, session: Session, nonce: bytes, clock: bytes, age_max_ns: int) -> None:
         """Begin without a session.
 
         Args:
@@ -99,10 +97,9 @@ class ServerHandshake:
             nonce: 16 bytes that identify this process, new at every start.
             clock: 16 bytes that identify its monotonic clock.
             age_max_ns: Silence after which a cloud loses the session to another one [ns].
-            last_epoch: Last epoch before this process.
         """
         self._session = session
-        self._nonce, self._clock, self._epoch = nonce, clock, last_epoch
+        self._nonce, self._clock, self._epoch = nonce, clock, NO_EPOCH
         self._cookies = session.ring.keys.current.derive(nonce, b"cookies")
         self._age_max_ns = age_max_ns
         self._fresh_until_ns = -1

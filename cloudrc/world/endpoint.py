@@ -202,13 +202,11 @@ class WorldIdentity:
     Attributes:
         clock_id: 16 bytes that name this machine's monotonic clock.
         nonce: 16 bytes that name this process; never the same twice.
-        last_epoch: Last epoch that was handed out before this process started.
         ring: The pre-shared keys; None for an end whose datagrams stay in its process.
     """
 
     clock_id: bytes
     nonce: bytes
-    last_epoch: int = 0
     ring: KeyRing | None = None
 
 
@@ -247,11 +245,7 @@ class WorldEndpoint:
         self._clock, self._pace = SimulationClock(start_ns), PaceMonitor()
         self._session = make_session(Direction.UPLINK, identity.ring)
         self._door = ServerHandshake(
-            self._session,
-            identity.nonce,
-            identity.clock_id,
-            command_age_max_ns,
-            identity.last_epoch,
+            self._session, identity.nonce, identity.clock_id, command_age_max_ns
         )
         self._channel = Channel(newest_wins)
         self._complaints = HandshakeLog()

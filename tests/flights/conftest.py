@@ -78,10 +78,10 @@ def bare_robot() -> SimpleNamespace:
 
 
 def bare_world(
-    nonce: bytes = b"w", last_epoch: int = 0, ring: KeyRing | None = None, start_ns: int = 0
+    nonce: bytes = b"w", ring: KeyRing | None = None, start_ns: int = 0
 ) -> WorldEndpoint:
     """Make world's end, sealed if it gets keys."""
-    identity = WorldIdentity(CLOCK, nonce.ljust(16), last_epoch, ring)
+    identity = WorldIdentity(CLOCK, nonce.ljust(16), ring)
     return WorldEndpoint(
         bare_robot(),
         SimpleNamespace(measure=lambda truth: truth),
@@ -435,9 +435,9 @@ HOVER = load_experiment("hover", ["link.profile=ideal"])
 class Talk:
     """A sealed world with clouds that the test controls."""
 
-    def __init__(self, last_epoch: int = 0, nonce: bytes = b"world", key: Key = KEY) -> None:
+    def __init__(self, nonce: bytes = b"world", key: Key = KEY) -> None:
         ring = KeyRing(KeySet(KEY))
-        identity = WorldIdentity(SHARED_CLOCK, nonce.ljust(16), last_epoch, ring)
+        identity = WorldIdentity(SHARED_CLOCK, nonce.ljust(16), ring)
         self.world = assembly.build_world(HOVER, identity)
         self.key, self.now_ns, self.records = key, 0, []
         self.clouds: dict[bytes, tuple[Session, ClientHandshake]] = {}

@@ -77,7 +77,7 @@ def test_used_up_numbers_last_until_the_next_session(
     assert say(ends, said._replace(number=NUMBER_MAX + 1), ALARM) == []
     run.fly(lambda: False, run.now_ns + S, lambda world, cloud: None)
     assert cloud._counts["words_dropped"] > 2
-    identity = WorldIdentity(SHARED_CLOCK, b"another".ljust(16), last_epoch=cloud._session.epoch)
+    identity = WorldIdentity(SHARED_CLOCK, b"another".ljust(16))
     world = assembly.build_world(HOVER, identity, lambda: run.now_ns)
     run._world = world
     run.fly(lambda: False, run.now_ns + 2 * S, lambda world, cloud: None)

@@ -27,10 +27,10 @@ OTHER = b"m" * 16
 class Doorstep:
     """World's side of the handshake, with a cloud that sends hellos."""
 
-    def __init__(self, nonce: bytes = WORLD, last_epoch: int = 0, key: Key = KEY) -> None:
+    def __init__(self, nonce: bytes = WORLD, key: Key = KEY) -> None:
         self.world = Session(Direction.UPLINK, KeyRing(KeySet(key)))
         self.cloud = Session(Direction.DOWNLINK, self.world.ring)
-        self.door = ServerHandshake(self.world, nonce, CLOCK, 250 * MS, last_epoch)
+        self.door = ServerHandshake(self.world, nonce, CLOCK, 250 * MS)
         self.now_ns = 10 * COOKIE_NS
         self.counter = 0
 

@@ -76,7 +76,8 @@ class Ends:
 
     def __init__(self) -> None:
         self.world, self.cloud = (Session(way, KeyRing(KeySet(Key(SECRET)))) for way in Direction)
-        self.server = ServerHandshake(self.world, WORLD, CLOCK, 1, last_epoch=6)
+        self.server = ServerHandshake(self.world, WORLD, CLOCK, 1)
+        self.server._epoch = 6
         self.client = ClientHandshake(CLOUD, CLOCK)
 
     def hello(self) -> bytes:
