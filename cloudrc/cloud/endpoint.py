@@ -230,7 +230,9 @@ class CloudEndpoint:
                 if hello is not None and asks:
                     self._greet(hello, self._session.greeting_key)
             elif kind == Kind.BUSY:
-                if self._handshake.is_refused(body) and self._wants_session(now_ns):
+                if self._handshake.is_refused(codec.decode_busy(body)) and self._wants_session(
+                    now_ns
+                ):
                     self._counts["busy"] += 1
                     self._records += self._complaints.say("busy", BUSY_TEXT, now_ns)
             elif kind != Kind.ALIVE:

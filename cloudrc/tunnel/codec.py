@@ -78,7 +78,7 @@ class Hello(NamedTuple):
     Attributes:
         nonce: 16 bytes that identify the requested session.
         clock: 16 bytes that identify cloud's monotonic clock.
-        cookie: Cookie from world's challenge; zeros before the first challenge.
+        cookie: Cookie from world's challenge, 13 bytes; zeros before the first challenge.
         epoch: Newest epoch that cloud has had; world continues from it.
     """
 
@@ -107,11 +107,13 @@ _TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIdIQHBB")
 _STAMPS = struct.Struct(f"<q{struct.calcsize('<3d4d3d3ddqq')}xq")
 _COMMAND = struct.Struct("<qqq3dd")
 _OPERATOR = struct.Struct("<IBBQHq")
-_HELLO = struct.Struct("<16s16s16sI")
-_ACCEPT = struct.Struct("<16s16s16s")
-_CHALLENGE = struct.Struct("<16s36x")  # as long as the hello that answers it
-NONCE_SIZE = 16
-"""Size of a nonce, a clock's name and a cookie [bytes]."""
+# The greetings are as long as in version 5: a link with a limited rate delays all as before.
+_HELLO = struct.Struct("<16s16s13sI")
+_ACCEPT = struct.Struct("<16s16s16sx")
+_CHALLENGE = struct.Struct("<13s36x")  # as long as the hello that answers it
+_BUSY = struct.Struct("<16sx")
+COOKIE_SIZE = 13
+"""Size of a cookie [bytes]."""
 
 NUMBER_MAX = 2**32 - 1
 """Highest number of an operator request."""
@@ -123,7 +125,7 @@ BODY_SIZES = {
     Kind.HELLO: _HELLO.size,
     Kind.ACCEPT: _ACCEPT.size,
     Kind.CHALLENGE: _CHALLENGE.size,
-    Kind.BUSY: NONCE_SIZE,  # nonce of the hello that this answers
+    Kind.BUSY: _BUSY.size,
     Kind.TELEMETRY: _TELEMETRY.size,
     Kind.COMMAND: _COMMAND.size,
     Kind.OPERATOR: _OPERATOR.size,
@@ -265,13 +267,23 @@ def decode_accept(body: bytes) -> Accept:
 
 
 def encode_challenge(cookie: bytes) -> bytes:
-    """Encode the body of a CHALLENGE datagram: a cookie of 16 bytes, then zeros."""
+    """Encode the body of a CHALLENGE datagram: a cookie, then zeros."""
     return _CHALLENGE.pack(cookie)
 
 
 def decode_challenge(body: bytes) -> bytes:
-    """Decode the cookie of 16 bytes from the body of a CHALLENGE datagram."""
-    return body[:NONCE_SIZE]
+    """Decode the cookie from the body of a CHALLENGE datagram."""
+    return body[:COOKIE_SIZE]
+
+
+def encode_busy(nonce: bytes) -> bytes:
+    """Encode the body of a BUSY datagram: the nonce of the hello that it answers."""
+    return _BUSY.pack(nonce)
+
+
+def decode_busy(body: bytes) -> bytes:
+    """Decode the nonce from the body of a BUSY datagram."""
+    return body[:-1]
 
 
 _GUARD_STATES, _CAUSES = tuple(GuardState), tuple(Cause)

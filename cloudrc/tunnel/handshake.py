@@ -32,6 +32,7 @@ from typing import NamedTuple
 from cloudrc.records import Fault
 from cloudrc.tunnel.channel import REPEATED, Channel
 from cloudrc.tunnel.codec import (
+    COOKIE_SIZE,
     LAST_GREETING,
     VERSION,
     Accept,
@@ -39,6 +40,7 @@ from cloudrc.tunnel.codec import (
     Hello,
     Kind,
     encode_accept,
+    encode_busy,
     encode_challenge,
     encode_hello,
     peek,
@@ -57,7 +59,7 @@ REPEATS_MAX = 3
 """Number of times that world repeats its acceptance to a cloud that it does not hear."""
 CLOUDS_MAX = 64
 """Number of nonces of which world remembers the newest counter."""
-NO_COOKIE = bytes(16)
+NO_COOKIE = bytes(COOKIE_SIZE)
 """Cookie of the first hello."""
 REPLIES_MAX = 3
 """Largest number of challenges that cloud answers between two periodic hellos."""
@@ -151,7 +153,7 @@ class ServerHandshake:
             if self._keeps_epoch(now_ns):  # cloud takes the answer's key as the key of the epoch
                 return HelloAnswer("hello", [self._accept()])
         elif now_ns <= self._fresh_until_ns:
-            return HelloAnswer("busy", [session.greet(Kind.BUSY, hello.nonce, key)])
+            return HelloAnswer("busy", [session.greet(Kind.BUSY, encode_busy(hello.nonce), key)])
         self._incumbent = hello
         if is_newer(hello.epoch, self._epoch):
             self._epoch = hello.epoch
@@ -198,7 +200,7 @@ class ServerHandshake:
 
     def _cookie(self, now_ns: int, slots_ago: int = 0) -> bytes:
         slot = now_ns // COOKIE_NS - slots_ago
-        return hmac.digest(self._cookies, b"%d" % slot, hashlib.sha256)[:16]
+        return hmac.digest(self._cookies, b"%d" % slot, hashlib.sha256)[:COOKIE_SIZE]
 
     def _has_cookie(self, hello: Hello, now_ns: int) -> bool:
         return any(

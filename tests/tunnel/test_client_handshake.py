@@ -47,18 +47,18 @@ def accepted(
 def test_a_hello_has_nonce_clock_cookie_and_newest_epoch(handshake: ClientHandshake) -> None:
     assert hello(handshake) == Hello(NONCE, CLOCK, NO_COOKIE, 0)
     assert accepted(handshake, 3) == NONCE + WORLD
-    answer = handshake.answer_challenge(b"1" * 16)
+    answer = handshake.answer_challenge(b"1" * 13)
     assert answer is not None
-    assert codec.decode_hello(answer) == hello(handshake) == Hello(NONCE, CLOCK, b"1" * 16, 3)
+    assert codec.decode_hello(answer) == hello(handshake) == Hello(NONCE, CLOCK, b"1" * 13, 3)
 
 
 def test_repeated_challenges_get_a_limited_number_of_answers(handshake: ClientHandshake) -> None:
-    assert handshake.answer_challenge(b"0" * 16) is None  # it has not asked
+    assert handshake.answer_challenge(b"0" * 13) is None  # it has not asked
     handshake.make_hello()
-    answers = [handshake.answer_challenge(b"%016d" % n) for n in range(50)]
+    answers = [handshake.answer_challenge(b"%013d" % n) for n in range(50)]
     assert sum(answer is not None for answer in answers) == REPLIES_MAX
     handshake.make_hello()
-    assert handshake.answer_challenge(b"%016d" % 49)
+    assert handshake.answer_challenge(b"%013d" % 49)
 
 
 def test_repeated_old_challenges_use_up_no_answers(handshake: ClientHandshake) -> None:
@@ -67,19 +67,19 @@ def test_repeated_old_challenges_use_up_no_answers(handshake: ClientHandshake) -
     assert all(handshake.answer_challenge(cookie) for cookie in old)
     handshake.make_hello()
     assert [handshake.answer_challenge(cookie) for cookie in 100 * old] == 300 * [None]
-    assert handshake.answer_challenge(b"1" * 16)
+    assert handshake.answer_challenge(b"1" * 13)
     assert [handshake.answer_challenge(cookie) for cookie in old] == REPLIES_MAX * [None]
-    assert hello(handshake).cookie == b"1" * 16
+    assert hello(handshake).cookie == b"1" * 13
 
 
 def test_the_memory_of_cookies_and_worlds_is_bounded(handshake: ClientHandshake) -> None:
     for number in range(COOKIES_MAX + 1):
         handshake.make_hello()
-        handshake.answer_challenge(b"%016d" % number)
+        handshake.answer_challenge(b"%013d" % number)
         accepted(handshake, 1, b"%016d" % number)
     assert len(handshake._cookies) == COOKIES_MAX
-    assert handshake.answer_challenge(b"%016d" % 1) is None
-    assert handshake.answer_challenge(b"%016d" % 0)
+    assert handshake.answer_challenge(b"%013d" % 1) is None
+    assert handshake.answer_challenge(b"%013d" % 0)
     assert len(handshake._old_worlds) == WORLDS_MAX
 
 

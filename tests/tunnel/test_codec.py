@@ -58,18 +58,19 @@ def datagram(kind: Kind, body: bytes) -> bytes:
     return codec.encode_header(kind, 0, 1, 2) + body + bytes(codec.TAG_SIZE)
 
 
-names = st.binary(min_size=16, max_size=16)
+names, cookies = (st.binary(min_size=size, max_size=size) for size in (16, codec.COOKIE_SIZE))
 COME_BACK = {
     "telemetry": (telemetries, codec.encode_telemetry, codec.decode_telemetry),
     "command": (commands, codec.encode_command, codec.decode_command),
     "request": (requests, codec.encode_operator, codec.decode_operator),
     "hello": (
-        st.builds(Hello, names, names, names, st.integers(0, 2**32 - 1)),
+        st.builds(Hello, names, names, cookies, st.integers(0, 2**32 - 1)),
         codec.encode_hello,
         codec.decode_hello,
     ),
     "accept": (st.builds(Accept, names, names, names), codec.encode_accept, codec.decode_accept),
-    "challenge": (names, codec.encode_challenge, codec.decode_challenge),
+    "challenge": (cookies, codec.encode_challenge, codec.decode_challenge),
+    "busy": (names, codec.encode_busy, codec.decode_busy),
 }
 
 

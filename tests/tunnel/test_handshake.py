@@ -109,7 +109,7 @@ def test_another_cloud_is_refused_while_the_incumbent_is_fresh(step: Doorstep) -
     step.now_ns += 250 * MS
     answer = step.receive_hello(OTHER)
     assert (answer.outcome, answer.opened) == ("busy", False)
-    assert step.cloud.open(answer.datagrams[0])[4] == OTHER
+    assert codec.decode_busy(step.cloud.open(answer.datagrams[0])[4]) == OTHER
     step.now_ns += 1
     assert step.receive_hello(OTHER).opened
     assert step.world.epoch == 2

@@ -28,23 +28,23 @@ def derived(salt: bytes, info: bytes) -> bytes:
 GREETED = {
     "hello": (
         "06010000000000010000000000000000636c6f75642020202020202020202020636c6f636b2020202020"
-        "2020202020200000000000000000000000000000000000000000c9f6510c898585c68b82a7c72e01aa57"
+        "2020202020200000000000000000000000000000000000ffd9fef35109202b7c812b6a71cc6e87"
     ),
     "challenge": (
-        "06000000000000030000000000000000fba235fa80cc3ee895bf7fcdedc1b17700000000000000000000"
-        "00000000000000000000000000000000000000000000000000007ee4bbe5fd6ec321e243592b289d2f0d"
+        "06000000000000030000000000000000fba235fa80cc3ee895bf7fcded00000000000000000000000000"
+        "000000000000000000000000000000000000000000000032d534ba04e4d65b6c6787bed97eb2c3"
     ),
     "answer": (
         "06010000000000010100000000000000636c6f75642020202020202020202020636c6f636b2020202020"
-        "202020202020fba235fa80cc3ee895bf7fcdedc1b17700000000db6abc636c20a415e1ed91fd8497df4d"
+        "202020202020fba235fa80cc3ee895bf7fcded00000000ad6dd6c0621ed880642810b8c3752748"
     ),
     "accept": (
         "06000700000000020000000000000000636c6f75642020202020202020202020776f726c642020202020"
-        "202020202020636c6f636b20202020202020202020203da096ecaee72e2b5e5e020cee553099"
+        "202020202020636c6f636b202020202020202020202000dd78ebc4d57ae7a9a0b488b1fca35b57"
     ),
     "busy": (
-        "060000000000000400000000000000006d6d6d6d6d6d6d6d6d6d6d6d6d6d6d6d9e8f8f8a2b3cbc13d409"
-        "6e30a6aca001"
+        "060000000000000400000000000000006d6d6d6d6d6d6d6d6d6d6d6d6d6d6d6d00f64113349cbf435ec7"
+        "9cc6581920b791"
     ),
 }
 SEALED = {
@@ -102,7 +102,7 @@ class Ends:
 
 def test_the_handshake_is_as_described_and_as_it_was() -> None:
     ends = Ends()
-    cookie = hmac.digest(derived(WORLD, b"cloudrc 6 cookies"), b"3", hashlib.sha256)[:16]
+    cookie = hmac.digest(derived(WORLD, b"cloudrc 6 cookies"), b"3", hashlib.sha256)[:13]
     hello, told = CLOUD + CLOCK, struct.pack("<I", 0)
     first = ends.hello()
     challenge = ends.answer(first)
@@ -114,11 +114,11 @@ def test_the_handshake_is_as_described_and_as_it_was() -> None:
     busy = ends.answer(other)
     made = dict(zip(GREETED, (first, challenge, second, accept, busy), strict=True))
     assert made == {
-        "hello": greeting(1, 0, 1, 0, hello + bytes(16) + told),
+        "hello": greeting(1, 0, 1, 0, hello + bytes(13) + told),
         "challenge": greeting(0, 0, 3, 0, cookie + bytes(36)),
         "answer": greeting(1, 0, 1, 1, hello + cookie + told),
-        "accept": greeting(0, 7, 2, 0, CLOUD + WORLD + CLOCK),
-        "busy": greeting(0, 0, 4, 0, b"m" * 16),
+        "accept": greeting(0, 7, 2, 0, CLOUD + WORLD + CLOCK + b"\0"),
+        "busy": greeting(0, 0, 4, 0, b"m" * 16 + b"\0"),
     }
     assert {name: data.hex() for name, data in made.items()} == GREETED
 
