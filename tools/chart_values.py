@@ -252,7 +252,7 @@ class Secret(Values):
     """The tunnel's pre-shared key."""
 
     existing_secret: Name = Field(
-        "", description="Existing Secret with 32 bytes under `key`; empty: the chart makes one once"
+        "", description="Existing Secret with the key file under `key`; empty: the chart makes one"
     )
 
 
