@@ -94,9 +94,9 @@ def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
         raise
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a whole file through `draft`."""
-    with atomic_file(path) as file:
+def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
+    """Write a whole file through `atomic_file`."""
+    with atomic_file(path, mode) as file:
         file.write(data)
 
 

@@ -58,11 +58,11 @@ class Cause(IntEnum):
     IMPOSSIBLE = 7, "impossible commands"
     STOPPED = 8, "emergency stop"
     OVERTURNED = 9, "turned over"
-    ACKNOWLEDGED = 12, "acknowledged"
-    STILL_FIRST = 13, "acknowledged, takes off once it has been still, 0.5 m inside the fence"
-    NOT_DOWN = 14, "acknowledged before touch-down"
-    DOWN = 15, "touched down, rotors stopped"
-    NOT_OFF = 16, "not off the ground yet, rotors stopped"
+    ACKNOWLEDGED = 10, "acknowledged"
+    STILL_FIRST = 11, "acknowledged, takes off once it has been still, 0.5 m inside the fence"
+    NOT_DOWN = 12, "acknowledged before touch-down"
+    DOWN = 13, "touched down, rotors stopped"
+    NOT_OFF = 14, "not off the ground yet, rotors stopped"
 
 
 class Start(IntEnum):

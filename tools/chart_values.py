@@ -93,22 +93,10 @@ class Placement(Values):
     )
 
 
-class Epochs(Values):
-    """The volume that keeps the highest session number when the pod is replaced."""
-
-    existing_claim: Name = Field(
-        "", description="Existing claim to use; empty: the chart makes one"
-    )
-    storage_class_name: str = Field(
-        "", description="Storage class of the volume; empty: the cluster's default"
-    )
-    size: Quantity = Field("1Mi", description="Size of the volume [bytes]")
-
-
 class WorldPod(Placement):
     """The pod of the robot."""
 
-    epochs: Epochs = Field(Epochs(), description="Volume that keeps the highest session number")
+    epochs: Texts = Field({}, description="Ignored: world needs no volume any more")
     resources: Resources = resources("60m", "96Mi", "1", "256Mi")
     recording_size_limit: Quantity = Field(
         "1Gi",
@@ -269,7 +257,7 @@ class Secret(Values):
     """The tunnel's pre-shared key."""
 
     existing_secret: Name = Field(
-        "", description="Existing Secret with 32 bytes under `key`; empty: the chart makes one once"
+        "", description="Existing Secret with the key file under `key`; empty: the chart makes one"
     )
 
 

@@ -108,14 +108,14 @@ def measure_wire(rounds: int = ROUNDS) -> WireCost:
     from cloudrc.messages import GuardState, Odometry, Telemetry
     from cloudrc.tunnel import codec
     from cloudrc.tunnel.codec import Direction, Kind
-    from cloudrc.tunnel.session import Agreement, Session, UnsealedSession, pair
+    from cloudrc.tunnel.session import Session, UnsealedSession, pair
 
     odometry = Odometry(1, (0.1, 0.2, 0.3), (0.9, 0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
     telemetry = Telemetry(1, odometry, 0.0, 2, 3, 0, 1, GuardState.TRACK)
     kind = int(Kind.TELEMETRY)
     unsealed = UnsealedSession(Direction.UPLINK), UnsealedSession(Direction.DOWNLINK)
     for end in unsealed:
-        end.begin(1, Agreement(bytes(16), bytes(16)))
+        end.begin(1, bytes(32))
 
     def cost(ends: tuple[Session, Session]) -> float:
         seal, unseal = ends[0].seal, ends[1].open

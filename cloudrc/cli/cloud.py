@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.runtime import end_arguments, fast_suite, open_end
+from cloudrc.cli.runtime import end_arguments, open_end
 
 if TYPE_CHECKING:
     from cloudrc.cloud.operator import Operator
@@ -37,7 +37,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.messages import GuardState
 
     runtime = open_end(options, "cloud")
-    identity = CloudIdentity(runtime.clock, os.urandom(16), runtime.keys.ring, fast_suite())
+    identity = CloudIdentity(runtime.clock, os.urandom(16), runtime.keys.ring)
     teleop = _connect_teleop(options.teleop) if options.teleop else None
     cloud = assembly.build_cloud(runtime.experiment, identity, time.monotonic_ns, teleop)
 

@@ -320,22 +320,13 @@ def open_end(options: argparse.Namespace, name: str) -> EndRuntime:
     return EndRuntime(options, name, exporter, experiment, clock, recorder, keys, peer)
 
 
-def fast_suite() -> int:
-    """Give the cipher suite that is fast on this machine."""
-    from cloudrc.drivers.machine import has_fast_aes
-    from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305
-
-    return AES_256_GCM if has_fast_aes() else CHACHA20_POLY1305
-
-
 def _open_keys(options: argparse.Namespace) -> KeyFile:
     """Read the keys of an end."""
     import time
 
     from cloudrc.drivers.keyfile import KeyFile, is_exposed
 
-    # The wall clock is read only here, before the flight: it gives the age of a replaced key.
-    keys = KeyFile(options.key, time.monotonic_ns(), time.time())
+    keys = KeyFile(options.key, time.monotonic_ns())
     if is_exposed(options.key):
         print(f"cloudrc: warning: everybody can read {options.key}: chmod 600", file=sys.stderr)
     return keys

@@ -25,8 +25,8 @@ from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
 from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake, HandshakeLog
-from cloudrc.tunnel.keys import KeyRing
-from cloudrc.tunnel.session import AES_256_GCM, NO_EPOCH, make_session
+from cloudrc.tunnel.keys import Key, KeyRing
+from cloudrc.tunnel.session import NO_EPOCH, make_session
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +37,11 @@ class CloudIdentity:
         clock_id: 16 bytes that identify this machine's monotonic clock.
         nonce: 16 bytes that identify this process; new at every start.
         ring: The pre-shared keys; None if both ends are in one process.
-        suite: Cipher that is fast on this machine.
     """
 
     clock_id: bytes
     nonce: bytes
     ring: KeyRing | None = None
-    suite: int = AES_256_GCM
 
 
 MISSED_MAX = 50
@@ -89,6 +87,9 @@ PERIOD_NS = 10_000_000
 """Time between two commands [ns]. Source: docs/reference/plant.md, "Commands"."""
 HELLO_PERIOD_NS = 100_000_000
 """Least time between two periodic hellos [ns]."""
+KEY_PERIOD_NS = 5_000_000_000
+"""Time between two hellos with a new key while the session has the old one [ns]. World, which may
+not have the new key yet, counts them as forged: 12 a minute raise no alert."""
 GIVE_UP_NS = 5_000_000_000
 """Longest time for which cloud tries to tell the robot that its mission is over [ns]."""
 SILENCE_NS = 500_000_000
@@ -132,8 +133,8 @@ class CloudEndpoint:
         self._loop = loop
         self.teleop = teleop
         self._identity = identity
-        self._session = make_session(Direction.DOWNLINK, identity.ring, start_ns)
-        self._handshake = ClientHandshake(identity.nonce, identity.clock_id, identity.suite)
+        self._session = make_session(Direction.DOWNLINK, identity.ring)
+        self._handshake = ClientHandshake(identity.nonce, identity.clock_id)
         self._complaints = HandshakeLog()
         self._channel = Channel(newest_wins)
         self._hellos = 0
@@ -145,7 +146,7 @@ class CloudEndpoint:
         self._alarm, self._missed_periods = EmergencyStopRepeater(), MissedPeriods()
         self._asked = 0  # highest number of an operator request in this session
         self._tick_ns = start_ns
-        self._hello_ns = start_ns
+        self._hello_ns = start_ns - KEY_PERIOD_NS  # of the last periodic hello
         self._alive_ns = start_ns
         self._heard_ns = start_ns
         self._flying_ns = start_ns
@@ -199,10 +200,14 @@ class CloudEndpoint:
             self._counts["missed_periods"] += missed
             self._records += self._missed_periods.miss(missed, now_ns)
         self._tick_ns += (missed + 1) * PERIOD_NS
+        self._session.follow_keys()
         if self._wants_session(now_ns):
             self._say_hello_if_due(now_ns)
             if now_ns - self._heard_ns > PATIENCE_NS:
                 self._records += self._complaints.say("no_session", SILENCE_TEXT, now_ns)
+        elif self._session.is_outdated:
+            self._hellos = 0  # with the new key
+            self._say_hello_if_due(now_ns, KEY_PERIOD_NS)
         self.teleop.handle_deadline(now_ns)
         if self.teleop.outputs:
             self._take_from_teleop()
@@ -231,11 +236,13 @@ class CloudEndpoint:
                 self._receive_accept(epoch, codec.decode_accept(body), now_ns)
             elif kind == Kind.CHALLENGE:
                 hello = self._handshake.answer_challenge(codec.decode_challenge(body))
-                if hello is not None and self._wants_session(now_ns):
-                    self._greet(hello)
+                asks = self._wants_session(now_ns) or self._session.is_outdated
+                if hello is not None and asks:
+                    self._greet(hello, self._session.greeting_key)
             elif kind == Kind.BUSY:
-                is_ours = self._handshake.receive_busy(codec.decode_busy(body))
-                if is_ours and self._wants_session(now_ns):
+                if self._handshake.is_refused(codec.decode_busy(body)) and self._wants_session(
+                    now_ns
+                ):
                     self._counts["busy"] += 1
                     self._records += self._complaints.say("busy", BUSY_TEXT, now_ns)
             elif kind != Kind.ALIVE:
@@ -250,33 +257,32 @@ class CloudEndpoint:
         elif self._wants_session(now_ns):
             self._records += self._complaints.about(outcome, data, now_ns)
 
-    def _say_hello_if_due(self, now_ns: int) -> None:
-        if now_ns < self._hello_ns:
+    def _say_hello_if_due(self, now_ns: int, period_ns: int = HELLO_PERIOD_NS) -> None:
+        """Say hello once a period; while two keys are accepted, with each of them in turn."""
+        if now_ns < self._hello_ns + period_ns:
             return
-        self._hello_ns = now_ns + HELLO_PERIOD_NS
-        self._greet(self._handshake.make_hello())
+        self._hello_ns = now_ns
+        keys = self._session.ring.keys.accepted
+        key = keys[self._hellos % len(keys)]
+        self._hellos += 1
+        self._greet(self._handshake.make_hello(), key)
 
     def _wants_session(self, now_ns: int) -> bool:
         """Whether cloud asks for a session: it has none, or does not hear world."""
         return self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
 
-    def _greet(self, hello: bytes) -> None:
-        """Send a hello; while two keys are valid, use them in turn."""
-        keys = self._session.accepted
-        key = keys[self._hellos % len(keys)]
-        self._hellos += 1
+    def _greet(self, hello: bytes, key: Key) -> None:
         self._datagrams.append(self._session.greet(Kind.HELLO, hello, key))
         self._counts["sent"] += 1
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
         """Begin the epoch that world assigns to this process, if it is new."""
         asks = self._wants_session(now_ns)
-        current = self._session.epoch
-        agreement = self._handshake.receive_accept(epoch, accept, current, asks=asks)
-        if agreement is None:
+        nonces = self._handshake.receive_accept(epoch, accept, asks=asks)
+        if nonces is None:
             self._counts["accept_ignored"] += 1
             return
-        self._session.begin(epoch, agreement, self._session.greeting_key)
+        self._session.begin(epoch, nonces, self._session.greeting_key)
         self._complaints.forget()
         self._channel.reset()
         self._loop.reset()
@@ -353,7 +359,6 @@ class CloudEndpoint:
 
     def _record_counts(self, now_ns: int) -> None:
         self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
-        self._datagrams += self._session.maintain(now_ns)
         for name, count in sorted((self._counts | self._loop.counts).items()):
             self._records.append(Counted(now_ns, "cloud", name, count))
 

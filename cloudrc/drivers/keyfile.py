@@ -24,62 +24,41 @@ MAKE = "make one: cloudrc key new FILE"
 class KeyFile:
     """The keys of one end; `ring` always holds the valid ones."""
 
-    def __init__(self, path: Path, now_ns: int, wall: float | None = None) -> None:
-        """Read the file for the first time.
-
-        Args:
-            path: The key file.
-            now_ns: Monotonic clock [ns].
-            wall: Wall clock [s since 1970], to detect an expired previous key; None to skip that
-                check.
+    def __init__(self, path: Path, now_ns: int) -> None:
+        """Read the file for the first time, at `now_ns` [ns, monotonic clock].
 
         Raises:
             BadInputError: If the file is missing or holds no key.
         """
-        self._path = path
+        self._path, self._due_ns, self._trouble = path, now_ns, ""
         self._seen = version(path)
-        self._keys = read_keys(path)
-        self._due_ns, self._trouble = now_ns, ""
-        self.ring = KeyRing(self._keys, now_ns, wall)
-        self._caution = "" if wall is None else self._keys.warning(wall)
+        self.ring = KeyRing(read_keys(path))
 
     def follow(self, now_ns: int) -> list[Fault]:
         """Check the file for changes, if a check is due at `now_ns` [ns, monotonic clock].
 
         Returns:
-            Records of a new key or of the reason to keep the old ones; at the first call the
-            warning about an expired previous key.
+            Records of a new key or of the reason to keep the old ones.
         """
         if now_ns < self._due_ns:
             return []
         self._due_ns = now_ns + PERIOD_NS
-        caution, self._caution = self._caution, ""
-        return [Fault(now_ns, "key", caution)] if caution else self._poll(now_ns)
-
-    def _poll(self, now_ns: int) -> list[Fault]:
-        seen = version(self._path)
+        seen, last, before = version(self._path), self._trouble, self.ring.keys
         if seen == self._seen or seen is None:  # ignore a file that is missing for a moment
             return []
-        self._seen = seen
+        self._seen, self._trouble = seen, ""
         try:
             keys = read_keys(self._path)
         except BadInputError as error:
             self._seen = None  # try again: `version` does not show a change of permissions
-            last, self._trouble = self._trouble, f"the old keys stay in use: {error}"
+            self._trouble = f"the old keys stay in use: {error}"
             return [] if last == self._trouble else [Fault(now_ns, "key", self._trouble)]
-        self._trouble = ""
-        if keys == self._keys:
+        if keys == before:
             return []
-        before, self._keys = self.ring.current, keys
-        self.ring.replace(keys, now_ns)
-        name = keys.current.name
-        if keys.current != before:
-            text = f"new key {name}; the previous one is valid for {keys.overlap:g} s more"
-        elif keys.previous is None:
-            text = f"key {name} alone; the previous one is no longer valid"
-        else:
-            text = f"key {name} unchanged; the entry of the previous one changed"
-        return [Fault(now_ns, "key", text)]
+        self.ring.keys = keys
+        new = "new " if keys.current != before.current else ""
+        also = f"{keys.previous.name} is accepted, too" if keys.previous else "no other is accepted"
+        return [Fault(now_ns, "key", f"{new}key {keys.current.name}; {also}")]
 
 
 def read_keys(path: Path, named: str = "--key ", remedy: str = MAKE) -> KeySet:

@@ -1,4 +1,4 @@
-"""Describe this machine: its monotonic clock, its fast cipher and its Python interpreter.
+"""Describe this machine: its monotonic clock and its Python interpreter.
 
 `Deadline` is a time limit on that clock for a process that waits for others.
 """
@@ -13,7 +13,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 LINUX_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-CPU_INFO = Path("/proc/cpuinfo")
 MACOS_BOOT_ID = ("sysctl", "-n", "kern.bootsessionuuid")
 
 
@@ -29,16 +28,6 @@ def clock_id() -> bytes:
     except ValueError:
         boot = b""
     return boot if len(boot) == 16 else os.urandom(16)
-
-
-def has_fast_aes() -> bool:
-    """Check whether the processor has AES instructions; True where that is unknown."""
-    try:
-        lines = CPU_INFO.read_text(errors="replace").splitlines()
-    except OSError:
-        return True
-    flags = [line for line in lines if line.lower().startswith(("flags", "features"))]
-    return not flags or "aes" in flags[0].split()
 
 
 def _boot_id() -> str:

@@ -440,7 +440,7 @@ _ENTRIES = (
     ),
     counter(
         "cloudrc_guard_starts_refused_total",
-        "Mission starts refused: in LAND or ESTOP, or because no new epoch was available.",
+        "Mission starts refused: in LAND or ESTOP.",
         (WORLD,),
     ),
     counter(

@@ -67,6 +67,7 @@ class Flight:
         of_world: World's records, if they are kept.
         of_cloud: Cloud's records, if they are kept.
         changes: Changes of the guard's state.
+        world_starts_ns: Start of each process of world [ns], world's clock.
         generations: Number of processes of each end so far.
         rings: Keys of the running processes, by end.
         secrets: Contents of the key files, by end.
@@ -117,23 +118,28 @@ class Flight:
         self.rival: InProcessTeleop | None = None
         self.listeners: list[Callable[[list[Record], int], None]] = []
         self.generations = {"world": 0, "cloud": 0}
-        self.of_world: list[Record] = []
-        self.of_cloud: list[Record] = []
-        self.changes: list[GuardChange] = []
-        self._epoch, self._hash = 0, RecordHash()
-        self.watch = Watch(Limits.of(self.experiment.guard))
-        limit = self.experiment.criteria.contact_speed_max_mps
-        self.teleop = InProcessTeleop(limit)
-        if separate:
-            self.teleop = SeparateTeleop(limit, phase_ns=int(generator(seed, 45).integers(WAKE_NS)))
+        self.of_world, self.of_cloud = list[Record](), list[Record]()
+        self.changes, self.world_starts_ns = list[GuardChange](), list[int]()
+        self._hash, self.watch = RecordHash(), Watch(Limits.of(self.experiment.guard))
+        self.teleop = self._make_teleop(seed, separate)
+        self._connect(uplink, downlink)
         if start:
             self.order(0)
+
+    def _connect(self, uplink: Shape | None, downlink: Shape | None) -> None:
+        """Make the processes of both ends and the link between them."""
         self.world = RestartableEndpoint(self._build_world, Clock())
         self.cloud = RestartableEndpoint(self._build_cloud, self._clock, "cloud")
         self.teleop.run_on(self.cloud)
         self.uplink = _link(self.experiment, uplink, up=True)
         self.downlink = _link(self.experiment, downlink, up=False)
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
+
+    def _make_teleop(self, seed: int, separate: bool) -> InProcessTeleop:
+        limit = self.experiment.criteria.contact_speed_max_mps
+        if separate:
+            return SeparateTeleop(limit, phase_ns=int(generator(seed, 45).integers(WAKE_NS)))
+        return InProcessTeleop(limit)
 
     @property
     def robot(self) -> Robot:
@@ -192,11 +198,9 @@ class Flight:
         self.world.kill(now_ns)
         self.world.at(now_ns * 1e-9 + down, self.world.start)
 
-    def replace_key(self, end: str, keys: KeySet, now_ns: int) -> None:
-        """Write an end's key file at `now_ns` [ns]; a process that is down reads it later."""
-        self.secrets[end] = keys
-        process = self.world if end == "world" else self.cloud
-        self.rings[end].replace(keys, process.clock.at(now_ns))
+    def replace_key(self, end: str, keys: KeySet) -> None:
+        """Write an end's key file; a process that is down reads it later."""
+        self.secrets[end] = self.rings[end].keys = keys
 
     def end_rival(self) -> None:
         """End the other cloud; the first one has to get the robot back."""
@@ -232,20 +236,14 @@ class Flight:
         return self.robot.guard.state, self.robot.guard.cause.words
 
     def _build_world(self, start_ns: int) -> WorldEndpoint:
-        identity = WorldIdentity(
-            SHARED,
-            self._nonce("world"),
-            ring=self._read_key("world", start_ns),
-            next_epoch=self._next_epoch,
-        )
+        identity = WorldIdentity(SHARED, self._nonce("world"), self._read_key("world"))
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self.watch.attach(world.robot, start_ns, honest=self.honest)
+        self.world_starts_ns.append(start_ns)
         return world
 
     def _build_cloud(self, start_ns: int) -> Endpoint:
-        identity = CloudIdentity(
-            self._clock_id, self._nonce("cloud"), self._read_key("cloud", start_ns)
-        )
+        identity = CloudIdentity(self._clock_id, self._nonce("cloud"), self._read_key("cloud"))
         teleop = self.teleop.join(start_ns)
         if self._words is not None:
             teleop = HostileOperator(teleop, self._words)
@@ -268,20 +266,16 @@ class Flight:
         limit = self.experiment.criteria.contact_speed_max_mps
         self.rival = InProcessTeleop(limit, name=b"rival")
         self.rival.order(Order(assembly.build_plan(self.experiment)), start_ns)
-        identity = CloudIdentity(SHARED, b"rival".ljust(16), KeyRing(SECRET, start_ns))
+        identity = CloudIdentity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, self.rival)
 
     def _nonce(self, end: str) -> bytes:
         self.generations[end] += 1
         return f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)
 
-    def _read_key(self, end: str, now_ns: int) -> KeyRing:
-        ring = self.rings[end] = KeyRing(self.secrets[end], now_ns)
+    def _read_key(self, end: str) -> KeyRing:
+        ring = self.rings[end] = KeyRing(self.secrets[end])
         return ring
-
-    def _next_epoch(self) -> int:
-        self._epoch += 1
-        return self._epoch
 
     def _sink(self, of_world: list[Record], of_cloud: list[Record]) -> None:
         if self._keep:

@@ -87,14 +87,14 @@ def _inject_into_ends(flight: Flight, event: Event) -> None:
         case "second_cloud":
             cloud.at(event.end, lambda _: flight.end_rival())
         case "key_rotated":
-            world.at(at, lambda now_ns: flight.replace_key("world", NEXT_KEY, now_ns))
-            cloud.at(event.end, lambda now_ns: flight.replace_key("cloud", NEXT_KEY, now_ns))
+            world.at(at, lambda _: flight.replace_key("world", NEXT_KEY))
+            cloud.at(event.end, lambda _: flight.replace_key("cloud", NEXT_KEY))
         case "key_wrong":
 
             def repair(now_ns: int) -> None:
-                flight.replace_key("cloud", flight.secrets["world"], now_ns)
+                flight.replace_key("cloud", flight.secrets["world"])
 
-            cloud.at(at, lambda now_ns: flight.replace_key("cloud", WRONG_KEY, now_ns))
+            cloud.at(at, lambda _: flight.replace_key("cloud", WRONG_KEY))
             cloud.at(event.end, repair)
 
 

@@ -6,6 +6,7 @@ end the robot must fly again; otherwise it is stuck.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
 
 from cloudrc.faults.adversary import dishonesty
@@ -197,11 +198,14 @@ class OrderInvariant:
 
     def __init__(self, flight: Flight) -> None:
         self._flight = flight
-        self._newest = (0, -1)  # epoch and counter
+        self._newest = (0, 0, -1)  # process of world, epoch and counter
         flight.listeners.append(self.see)
 
     def see(self, records: list[Record], now_ns: int) -> None:
-        """Check that no command is older than one before, or of an epoch that has ended."""
+        """Check that no command is older than one before, or of an epoch that has ended.
+
+        A new process of world counts epochs on from what its cloud knows, which may be nothing.
+        """
         for record in records:
             if isinstance(record, CommandApplied):
                 self._check(record.epoch, record.counter, record.stamp_ns)
@@ -219,10 +223,11 @@ class OrderInvariant:
                 self._flight.watch.note(self._flight.run.now_ns, "waypoint", text)
 
     def _check(self, epoch: int, counter: int, stamp_ns: int) -> None:
-        if (epoch, counter) <= self._newest:
-            text = f"command {counter} of epoch {epoch} after {self._newest}"
+        this = bisect_right(self._flight.world_starts_ns, stamp_ns), epoch, counter
+        if this <= self._newest:
+            text = f"command {counter} of epoch {epoch} after {self._newest[1:]}"
             self._flight.watch.note(stamp_ns, "order", text)
-        self._newest = max(self._newest, (epoch, counter))
+        self._newest = max(self._newest, this)
 
 
 def _check_alarms(flight: Flight) -> None:

@@ -177,7 +177,7 @@ class SetpointSelector:
             Whether it is the first of its session.
         """
         before, self._seen = self._seen, seen
-        return before is None or before.epoch != seen.epoch
+        return before is None or (before.epoch, before.world) != (seen.epoch, seen.world)
 
     def begin(self, plan: Plan, mission_id: int, before: Continue | None = None) -> None:
         """Begin a mission; a continued mission that is held gets no setpoint before its resume.

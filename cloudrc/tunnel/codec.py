@@ -1,8 +1,8 @@
 """Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
-A datagram has a 16-byte header (version, direction, epoch, generation, kind, counter), a body whose
-length follows from its kind, and a 16-byte tag. This module defines the layout only; `session`
-seals and opens datagrams. `check` and the decoders raise no exception except DecodeError.
+A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body whose length
+follows from its kind, and a 16-byte tag. This module defines the layout only; `session` seals and
+opens datagrams. `check` and the decoders raise no exception except DecodeError.
 
 The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
 nonce of the cipher: no two datagrams of one direction and epoch have the same kind and counter.
@@ -28,11 +28,11 @@ from cloudrc.messages import (
     Telemetry,
 )
 
-VERSION = 5
+VERSION = 6
 """Version of the wire format. A build speaks one version and refuses all others.
 
 Version 1 had no tags; 2 had no basis stamp in requests; 3 had no cause of the guard's state; in 4 a
-challenge was shorter than its answer.
+challenge was shorter than its answer; 5 had a choice of ciphers and several keys in an epoch.
 """
 DATAGRAM_MAX = 512
 """Size of the receive buffer [bytes], above every valid datagram; longer ones are refused."""
@@ -66,8 +66,8 @@ class DecodeError(ValueError):
     """A datagram is not valid; the error's text is the outcome under which it is counted."""
 
 
-Header: TypeAlias = tuple[int, int, int, int, int, int]
-"""Version, direction, epoch, key generation, kind and counter."""
+Header: TypeAlias = tuple[int, int, int, int, int]
+"""Version, direction, epoch, kind and counter."""
 Datagram: TypeAlias = tuple[int, int, int, int, bytes]
 """Kind, direction, epoch and counter from the header, and the body."""
 
@@ -78,14 +78,14 @@ class Hello(NamedTuple):
     Attributes:
         nonce: 16 bytes that identify the requested session.
         clock: 16 bytes that identify cloud's monotonic clock.
-        cookie: Cookie from world's challenge; zeros before the first challenge.
-        suite: Cipher that cloud prefers.
+        cookie: Cookie from world's challenge, 13 bytes; zeros before the first challenge.
+        epoch: Newest epoch that cloud has had; world continues from it.
     """
 
     nonce: bytes
     clock: bytes
     cookie: bytes
-    suite: int
+    epoch: int
 
 
 class Accept(NamedTuple):
@@ -95,36 +95,25 @@ class Accept(NamedTuple):
         nonce: Nonce of the hello that this answers.
         world_nonce: 16 bytes that identify world's process.
         clock: 16 bytes that identify world's monotonic clock.
-        suite: Cipher of the session.
     """
 
     nonce: bytes
     world_nonce: bytes
     clock: bytes
-    suite: int
 
 
-class Busy(NamedTuple):
-    """World's refusal of a session.
-
-    Attributes:
-        nonce: Nonce of the hello that this answers.
-        used: True: this nonce has already had a session. False: another cloud has authority.
-    """
-
-    nonce: bytes
-    used: bool
-
-
-_HEADER = struct.Struct("<BBIBBQ")
+_HEADER = struct.Struct("<BBIxBQ")  # the pad byte is 0
 _TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIdIQHBB")
 _STAMPS = struct.Struct(f"<q{struct.calcsize('<3d4d3d3ddqq')}xq")
 _COMMAND = struct.Struct("<qqq3dd")
 _OPERATOR = struct.Struct("<IBBQHq")
-_HELLO = struct.Struct("<16s16s16sB")
-_ACCEPT = struct.Struct("<16s16s16sB")
-_CHALLENGE = struct.Struct("<16s33x")  # as long as the hello that answers it
-_BUSY = struct.Struct("<16s?")
+# The greetings are as long as in version 5: a link with a limited rate delays all as before.
+_HELLO = struct.Struct("<16s16s13sI")
+_ACCEPT = struct.Struct("<16s16s16sx")
+_CHALLENGE = struct.Struct("<13s36x")  # as long as the hello that answers it
+_BUSY = struct.Struct("<16sx")
+COOKIE_SIZE = 13
+"""Size of a cookie [bytes]."""
 
 NUMBER_MAX = 2**32 - 1
 """Highest number of an operator request."""
@@ -148,11 +137,9 @@ SIZES = {int(kind): HEADER_SIZE + size + TAG_SIZE for kind, size in BODY_SIZES.i
 _size_of = SIZES.get
 
 
-def encode_header(
-    kind: int, direction: int, epoch: int, counter: int, generation: int = 0
-) -> bytes:
-    """Encode the header; epoch < 2^32, generation < 2^8, counter < 2^64."""
-    return _HEADER.pack(VERSION, direction, epoch, generation, kind, counter)
+def encode_header(kind: int, direction: int, epoch: int, counter: int) -> bytes:
+    """Encode the header; epoch < 2^32, counter < 2^64."""
+    return _HEADER.pack(VERSION, direction, epoch, kind, counter)
 
 
 def check(data: bytes) -> Header:
@@ -169,7 +156,7 @@ def check(data: bytes) -> Header:
     header = _unpack_header(data)
     if header[0] != VERSION:
         raise DecodeError("version")
-    if _size_of(header[4]) != size or header[1] > 1:
+    if _size_of(header[3]) != size or header[1] > 1:
         raise DecodeError("malformed")
     return header
 
@@ -182,7 +169,7 @@ def peek(data: bytes) -> tuple[int, int, int]:
     """
     if len(data) < HEADER_SIZE:
         raise DecodeError("malformed")
-    _, _, epoch, _, kind, counter = _unpack_header(data)
+    _, _, epoch, kind, counter = _unpack_header(data)
     return kind, epoch, counter
 
 
@@ -280,23 +267,23 @@ def decode_accept(body: bytes) -> Accept:
 
 
 def encode_challenge(cookie: bytes) -> bytes:
-    """Encode the body of a CHALLENGE datagram: a cookie of 16 bytes, then zeros."""
+    """Encode the body of a CHALLENGE datagram: a cookie, then zeros."""
     return _CHALLENGE.pack(cookie)
 
 
 def decode_challenge(body: bytes) -> bytes:
-    """Decode the cookie of 16 bytes from the body of a CHALLENGE datagram."""
-    return body[:16]
+    """Decode the cookie from the body of a CHALLENGE datagram."""
+    return body[:COOKIE_SIZE]
 
 
-def encode_busy(busy: Busy) -> bytes:
-    """Encode the body of a BUSY datagram."""
-    return _BUSY.pack(*busy)
+def encode_busy(nonce: bytes) -> bytes:
+    """Encode the body of a BUSY datagram: the nonce of the hello that it answers."""
+    return _BUSY.pack(nonce)
 
 
-def decode_busy(body: bytes) -> Busy:
-    """Decode the body of a BUSY datagram."""
-    return Busy(*_BUSY.unpack(body))
+def decode_busy(body: bytes) -> bytes:
+    """Decode the nonce from the body of a BUSY datagram."""
+    return body[:-1]
 
 
 _GUARD_STATES, _CAUSES = tuple(GuardState), tuple(Cause)

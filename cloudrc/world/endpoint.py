@@ -8,7 +8,6 @@ epochs: a cloud that takes control gets a new one, and a mission that starts fro
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import hypot, isnan, nan
 
@@ -37,9 +36,9 @@ from cloudrc.records import (
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
-from cloudrc.tunnel.handshake import NO_EPOCH_TEXT, HandshakeLog, ServerHandshake
+from cloudrc.tunnel.handshake import HandshakeLog, ServerHandshake
 from cloudrc.tunnel.keys import KeyRing
-from cloudrc.tunnel.session import AES_256_GCM, make_session
+from cloudrc.tunnel.session import make_session
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Touch
 from cloudrc.world.robot import CATCH_UP_NS, Robot, SimulationClock
@@ -102,7 +101,6 @@ class Orders:
         now_ns: int,
         *,
         waited: bool,
-        has_epoch: Callable[[], bool],
     ) -> bool:
         """Carry out a request; the caller itself begins a mission.
 
@@ -110,7 +108,6 @@ class Orders:
             request: The operator's request.
             now_ns: World's clock [ns].
             waited: Whether the request may have waited in the socket during a stall.
-            has_epoch: Tells whether there is an epoch for a start from the spawn.
 
         Returns:
             Whether the caller must begin a mission.
@@ -128,7 +125,7 @@ class Orders:
         if starts:
             self._refuse_old(now_ns - request.basis_stamp_ns, waited)
             # Not carried out, so not confirmed either: the operator must acknowledge first.
-            if self._guard.latched or (request.start is Start.SPAWN and not has_epoch()):
+            if self._guard.latched:
                 self._counts["start_refused"] += 1
                 return False
         self.number = request.number
@@ -205,24 +202,17 @@ class WorldIdentity:
     Attributes:
         clock_id: 16 bytes that name this machine's monotonic clock.
         nonce: 16 bytes that name this process; never the same twice.
-        last_epoch: Last epoch that was handed out before this process started.
         ring: The pre-shared keys; None for an end whose datagrams stay in its process.
-        suite: The cipher that is fastest on this machine.
-        next_epoch: Returns the next epoch once it is on disk, or None while the disk refuses it.
-            Without this function, epochs continue from `last_epoch`.
     """
 
     clock_id: bytes
     nonce: bytes
-    last_epoch: int = 0
     ring: KeyRing | None = None
-    suite: int = AES_256_GCM
-    next_epoch: Callable[[], int | None] | None = None
 
 
 ODOMETRY_PERIOD_NS = 10_000_000
 """Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""
-COUNT_PERIOD_NS = TEND_PERIOD_NS = 1_000_000_000
+COUNT_PERIOD_NS = 1_000_000_000
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # looking up a member of an enum is slow
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # used in every period
 _new = tuple.__new__  # makes a named tuple in half the time of its own constructor
@@ -253,8 +243,10 @@ class WorldEndpoint:
         """
         self.robot, self._sensors, self._identity = robot, sensors, identity
         self._clock, self._pace = SimulationClock(start_ns), PaceMonitor()
-        self._session = make_session(Direction.UPLINK, identity.ring, start_ns)
-        self._door = ServerHandshake(self._session, identity, age_max_ns=command_age_max_ns)
+        self._session = make_session(Direction.UPLINK, identity.ring)
+        self._door = ServerHandshake(
+            self._session, identity.nonce, identity.clock_id, command_age_max_ns
+        )
         self._channel = Channel(newest_wins)
         self._complaints = HandshakeLog()
         self._command_age_max_ns = command_age_max_ns
@@ -262,7 +254,6 @@ class WorldEndpoint:
         self._stalled_wake_ns = NEVER_NS
         self._odometry_ns = start_ns
         self._count_ns = start_ns + COUNT_PERIOD_NS
-        self._tend_ns = start_ns + TEND_PERIOD_NS
         self._waiting: tuple[int, int, Command] | None = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._datagrams: list[bytes] = []
@@ -296,10 +287,8 @@ class WorldEndpoint:
 
     def handle_deadline(self, now_ns: int) -> None:
         """Run every tick up to and including `now_ns`; telemetry is sent on the way."""
+        self._session.follow_keys()
         self._advance(self._follow(now_ns) + 1)
-        if now_ns >= self._tend_ns:  # on the machine's clock, because world's may lag
-            self._tend_ns = now_ns + TEND_PERIOD_NS
-            self._queue(self._session.maintain(now_ns))
 
     def take_datagrams(self) -> list[bytes]:
         """Return the datagrams to send."""
@@ -414,20 +403,11 @@ class WorldEndpoint:
             raise DecodeError("stale")
         answer = self._door.receive_hello(hello, counter, now_ns)
         self._counts[answer.outcome] += 1
-        if not answer.datagrams:
-            self._has_epoch()
         if answer.opened:
-            self._clock_is_shared = self._door.shares_clock
+            self._clock_is_shared = hello.clock == self._identity.clock_id
             self._orders.number = 0
             self._begin_epoch("cloud said hello")
         self._queue(answer.datagrams)
-
-    def _has_epoch(self) -> bool:
-        """Tell whether an epoch can begin; if not, record a fault."""
-        ready = self._door.ready
-        if not ready:
-            self._records += self._complaints.say("epochs", NO_EPOCH_TEXT, self._clock.tick_ns)
-        return ready
 
     def _begin_epoch(self, cause: str) -> None:
         """Forget everything that belongs to the old epoch."""
@@ -445,7 +425,7 @@ class WorldEndpoint:
         """Carry out an operator request; a mission from the spawn begins a new epoch."""
         tick_ns, waited = self._clock.tick_ns, now_ns == self._stalled_wake_ns
         number = self._orders.number
-        starts = self._orders.obey(request, tick_ns, waited=waited, has_epoch=self._has_epoch)
+        starts = self._orders.obey(request, tick_ns, waited=waited)
         if starts and request.start is Start.SPAWN:
             self.robot.put_on_ground(tick_ns, "mission starts from spawn")
             self._queue([self._door.begin_next_epoch(now_ns)])

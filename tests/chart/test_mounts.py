@@ -10,7 +10,7 @@ END = {"experiment ro", "secret ro", "run", "data"}
 LINK = {"experiment ro", "link ro", "run"}
 MISSION = {"mission ro", "tokens ro"}
 MOUNTS = {
-    "world": {"link": LINK, "world": END | {"epochs"}},
+    "world": {"link": LINK, "world": END},
     "cloud": {
         "link": LINK,
         "cloud": END | {"teleop"},

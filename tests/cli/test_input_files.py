@@ -47,12 +47,11 @@ def test_a_pipe_device_or_folder_is_refused_at_once(
     assert os.listdir() == ["pipe"]
 
 
-def test_a_device_is_refused_for_epochs(capsys: pytest.CaptureFixture[str]) -> None:
-    """A file without epochs is renamed; for root that would be /dev/null itself."""
-    words = "world --config none.json --listen 127.0.0.1:9 --epochs /dev/null"
+def test_a_file_of_epochs_is_ignored_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    words = "world --config none --listen 127.0.0.1:9 --peer 127.0.0.1:9 --key none --epochs none"
     assert main(words.split()) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "--epochs: /dev/null: not a regular file" in line
+    line, _ = capsys.readouterr().err.splitlines()
+    assert line == "cloudrc: --epochs is ignored: cloud keeps the session number"
 
 
 def test_a_redirected_file_is_read(tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def test_an_address_in_use_is_reported_with_its_flag(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    (tmp_path / "key").write_bytes(bytes(32))
+    (tmp_path / "key").write_bytes(b"k" * 32)
     (tmp_path / "key").chmod(0o600)
     others = [str(tmp_path / "key") if word == "KEY" else word for word in others]
     assert main([command, *CONFIG, flag, taken, *others]) == 2
@@ -107,7 +107,7 @@ def test_an_unresolvable_name_is_reported_at_the_start(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    (tmp_path / "key").write_bytes(bytes(32))
+    (tmp_path / "key").write_bytes(b"k" * 32)
     (tmp_path / "key").chmod(0o600)
     others = [str(tmp_path / "key") if word == "KEY" else word for word in others]
     look_up = socket.getaddrinfo
@@ -189,7 +189,7 @@ def test_an_end_stopped_at_its_start_completes_its_recording(
 
     monkeypatch.setattr(assembly, f"build_{end}", stop_and_build)
     record = tmp_path / "end.mcap"
-    (tmp_path / "key").write_bytes(bytes(32))
+    (tmp_path / "key").write_bytes(b"k" * 32)
     (tmp_path / "key").chmod(0o644)
     key = ["--key", str(tmp_path / "key")]
     free = [free_port(), "--peer", FREE, "--record", str(record), *key]

@@ -65,7 +65,7 @@ class Pods:
         self.folder = folder
         experiment = load_experiment("hover", ["mission.waypoints.0.dwell_s=60"])
         (folder / "experiment.yaml").write_text(dump(experiment))
-        (folder / "key").write_bytes(bytes(32))
+        (folder / "key").write_bytes(b"k" * 32)
         ports = free_ports(4)
         self.tunnel = {"world": ports[0], "cloud": ports[1]}
         self.metrics = {"world": ports[2], "cloud": ports[3]}

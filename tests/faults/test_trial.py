@@ -204,7 +204,10 @@ def test_a_broken_part_is_found(
 @pytest.mark.parametrize(
     ("commands", "kinds"),
     [
-        ([(2, 0), (2, 1), (2, 5), (3, 0)], set()),
+        # The stamps are 0, 1, 2...; a new process of world starts at 3.
+        ([(2, 0), (2, 1), (2, 5), (1, None), (1, 0)], set()),
+        ([(2, 0), (2, 1), (2, 5), (1, 7), (1, 6)], {"order"}),
+        ([(2, 0), (2, 5), (3, 0)], set()),
         ([(2, 1), (2, 1)], {"order"}),
         ([(2, 1), (2, 0)], {"order"}),
         ([(3, 0), (2, 7)], {"order"}),
@@ -215,11 +218,11 @@ def test_a_broken_part_is_found(
 def test_a_command_is_applied_once_and_in_order(
     commands: list[tuple[int, int | None]], kinds: set[str]
 ) -> None:
-    flight: Any = SimpleNamespace(listeners=[], watch=Watch(Limits()))
+    flight: Any = SimpleNamespace(listeners=[], watch=Watch(Limits()), world_starts_ns=[0, 3])
     order = OrderInvariant(flight)
-    for epoch, counter in commands:
-        opened = SessionOpened(0, "world", epoch, "cloud said hello")
-        order.see([opened if counter is None else CommandApplied(0, epoch, counter, 0, ZERO)], 0)
+    for at, (epoch, counter) in enumerate(commands):
+        opened = SessionOpened(at, "world", epoch, "cloud said hello")
+        order.see([opened if counter is None else CommandApplied(at, epoch, counter, 0, ZERO)], 0)
     assert set(flight.watch.counts) == kinds
 
 

@@ -43,7 +43,7 @@ from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.handshake import ClientHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.session import AES_256_GCM, Session, make_session
+from cloudrc.tunnel.session import Session, make_session
 from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
 from cloudrc.world.robot import STEP_NS
 
@@ -79,10 +79,10 @@ def bare_robot() -> SimpleNamespace:
 
 
 def bare_world(
-    nonce: bytes = b"w", last_epoch: int = 0, ring: KeyRing | None = None, start_ns: int = 0
+    nonce: bytes = b"w", ring: KeyRing | None = None, start_ns: int = 0
 ) -> WorldEndpoint:
     """Make world's end, sealed if it gets keys."""
-    identity = WorldIdentity(CLOCK, nonce.ljust(16), last_epoch, ring)
+    identity = WorldIdentity(CLOCK, nonce.ljust(16), ring)
     return WorldEndpoint(
         bare_robot(),
         SimpleNamespace(measure=lambda truth: truth),
@@ -129,7 +129,7 @@ class BareCloud:
 
     def __init__(self, nonce: bytes, keys: KeyRing | None) -> None:
         self.session: Session = make_session(Direction.DOWNLINK, keys)
-        self.handshake = ClientHandshake(nonce.ljust(16), CLOCK, AES_256_GCM)
+        self.handshake = ClientHandshake(nonce.ljust(16), CLOCK)
         self.heard: list[str] = []
 
     def hello(self) -> bytes:
@@ -156,13 +156,11 @@ class BareCloud:
         if kind == Kind.CHALLENGE:
             hello = self.handshake.answer_challenge(codec.decode_challenge(body))
             return hello and self.session.greet(Kind.HELLO, hello)
-        if kind == Kind.BUSY:
-            self.handshake.receive_busy(codec.decode_busy(body))
         if kind == Kind.ACCEPT:
             accept = codec.decode_accept(body)
-            agreement = self.handshake.receive_accept(epoch, accept, self.session.epoch, asks=True)
-            if agreement is not None:
-                self.session.begin(epoch, agreement)
+            nonces = self.handshake.receive_accept(epoch, accept, asks=True)
+            if nonces is not None:
+                self.session.begin(epoch, nonces)
         return None
 
 
@@ -438,9 +436,9 @@ HOVER = load_experiment("hover", ["link.profile=ideal"])
 class Talk:
     """A sealed world with clouds that the test controls."""
 
-    def __init__(self, last_epoch: int = 0, nonce: bytes = b"world", key: Key = KEY) -> None:
+    def __init__(self, nonce: bytes = b"world", key: Key = KEY) -> None:
         ring = KeyRing(KeySet(KEY))
-        identity = WorldIdentity(SHARED_CLOCK, nonce.ljust(16), last_epoch, ring)
+        identity = WorldIdentity(SHARED_CLOCK, nonce.ljust(16), ring)
         self.world = assembly.build_world(HOVER, identity)
         self.key, self.now_ns, self.records = key, 0, []
         self.clouds: dict[bytes, tuple[Session, ClientHandshake]] = {}
@@ -450,10 +448,7 @@ class Talk:
         """The cloud process of this name; from here on the one that speaks."""
         if nonce not in self.clouds:
             session = Session(Direction.DOWNLINK, KeyRing(KeySet(self.key)))
-            self.clouds[nonce] = (
-                session,
-                ClientHandshake(nonce.ljust(16), SHARED_CLOCK, AES_256_GCM),
-            )
+            self.clouds[nonce] = session, ClientHandshake(nonce.ljust(16), SHARED_CLOCK)
         self.session = self.clouds[nonce][0]
         return self.clouds[nonce]
 
@@ -492,9 +487,9 @@ class Talk:
                 answers = self.hear(Kind.ACCEPT)
         for _, epoch, body in answers:
             accept = codec.decode_accept(body)
-            agreement = handshake.receive_accept(epoch, accept, session.epoch, asks=True)
-            if agreement is not None:
-                session.begin(epoch, agreement)
+            nonces = handshake.receive_accept(epoch, accept, asks=True)
+            if nonces is not None:
+                session.begin(epoch, nonces)
             return epoch
         return 0
 

@@ -102,15 +102,6 @@ def test_a_command_waiting_during_a_stop_is_not_echoed(talk):
     assert len(talk.take(CommandApplied)) == applied
 
 
-def test_world_rekeys_by_the_machines_clock(talk):
-    """World's simulated clock lags behind the machine's clock by the slip."""
-    talk.wait(talk.now_ns + 100 * MS)
-    before_ns = talk.now_ns
-    talk.world.handle_deadline(before_ns + 60_000 * MS)
-    assert talk.world.slip_ns > 50_000 * MS
-    assert talk.world._session._tended_ns == before_ns + 60_000 * MS
-
-
 def test_the_end_of_a_mission_is_confirmed_even_while_latched(talk):
     ask(talk, 2, Request.ESTOP)
     assert ask(talk, 3, Request.END) == (GuardState.ESTOP, 3)

@@ -36,7 +36,7 @@ class Two:
         self.said: list[tuple[Any, ...]] = []
         self.files = dict.fromkeys(ENDS, KeySet(KEYS[0]))
         self.rings: dict[str, KeyRing] = {}
-        self.numbers, self.lives, self.epoch = count(1), count(1), 0
+        self.numbers, self.lives = count(1), count(1)
         delay, jitter = chance.choice((0.001, 0.02, 0.15)), chance.choice((0.0, 0.01, 0.1))
         profile = DirectionProfile(delay=delay, jitter=min(jitter, delay))
         schedule = Schedule(seed, events=self.link_events())
@@ -51,11 +51,11 @@ class Two:
         self.end_with_key_files()
 
     def build_world(self, start_ns: int) -> Any:
-        ring = self.rings["world"] = KeyRing(self.files["world"], start_ns)
-        return bare_world(b"world %d" % next(self.lives), self.epoch, ring, start_ns)
+        ring = self.rings["world"] = KeyRing(self.files["world"])
+        return bare_world(b"world %d" % next(self.lives), ring=ring, start_ns=start_ns)
 
     def build_cloud(self, start_ns: int) -> CloudEndpoint:
-        ring = self.rings["cloud"] = KeyRing(self.files["cloud"], start_ns)
+        ring = self.rings["cloud"] = KeyRing(self.files["cloud"])
         return bare_cloud(b"cloud %d" % next(self.lives), ring, start_ns)
 
     def link_events(self) -> tuple[Event, ...]:
@@ -78,8 +78,7 @@ class Two:
         """One end reads another key file, or both do, one after the other."""
         chance, (time, later) = self.chance, self.when()
         current, previous = chance.choice(KEYS[:3]), chance.choice((None, None, *KEYS[:2]))
-        overlap = chance.choice((0.5, 1.5, 4.0, 300.0))
-        keys = KeySet(current, previous if previous != current else None, overlap)
+        keys = KeySet(current, previous)
         first, second = chance.sample(ENDS, 2)
         self.read(first, time, keys)
         if chance.random() < 0.5:
@@ -87,22 +86,14 @@ class Two:
 
     def read(self, end: str, time: float, keys: KeySet) -> None:
         def read(now_ns: int) -> None:
-            self.files[end] = keys
-            self.rings[end].replace(keys, now_ns)
+            self.files[end] = self.rings[end].keys = keys
 
         self.at(end, time, read, "reads", keys)
 
     def kill(self) -> None:
         end, (time, lasts) = self.chance.choice(ENDS), self.when()
         mortal: Any = getattr(self, end)
-        keeps = self.chance.random() < 0.8
-
-        def kill(now_ns: int) -> None:
-            if end == "world" and mortal.inner is not None:
-                self.epoch = mortal.inner._session.epoch if keeps else 0  # as its disk does, or not
-            mortal.kill(now_ns)
-
-        self.at(end, time, kill, "is killed")
+        self.at(end, time, mortal.kill, "is killed")
         self.at(end, time + lasts, mortal.start, "starts")
 
     def pause(self) -> None:
@@ -123,7 +114,7 @@ class Two:
     def end_with_key_files(self) -> None:
         """The same for both, or different ones with a key in common, as after a roll-back."""
         chance, common = self.chance, self.chance.choice(KEYS)
-        one = KeySet(common, None, chance.choice((0.5, 4.0, 300.0)))
+        one = KeySet(common)
         alike = chance.random() < 0.5
         for end in chance.sample(ENDS, 2):
             keys = one if alike else self.with_key(common)
@@ -131,13 +122,8 @@ class Two:
 
     def with_key(self, common: Key) -> KeySet:
         other = self.chance.choice([key for key in KEYS if key != common])
-        files = KeySet(common), KeySet(common, other, 4.0), KeySet(common, other, 300.0)
-        return self.chance.choice((*files, KeySet(other, common, 300.0)))
-
-    def have_a_key_in_common(self) -> bool:
-        """A key before that was known as such only becomes shorter valid: it may be over."""
-        accepted = [set(self.rings[end].accepted(self.run.now_ns)) for end in ENDS]
-        return bool(accepted[0] & accepted[1])
+        files = KeySet(common), KeySet(common, other), KeySet(other, common)
+        return self.chance.choice(files)
 
     def hear_each_other(self) -> bool:
         self.run.fly(lambda: False, round(END * 1e9), lambda of_world, of_cloud: None)
@@ -146,15 +132,13 @@ class Two:
         if world._session.epoch != cloud._session.epoch:
             return False
         heard_ns = self.run.now_ns - cloud._heard_ns
-        return world._door._fresh_until_ns >= self.run.now_ns and heard_ns < 500 * MS
+        silent_ns = self.run.now_ns - world._door._fresh_until_ns  # beyond the age limit
+        return silent_ns < 300 * MS and heard_ns < 500 * MS
 
 
 @pytest.mark.parametrize("first", [0, pytest.param(1_000, marks=pytest.mark.full)])
 def test_after_the_rotations_both_ends_hear_each_other(first: int) -> None:
-    seeds, judged = range(first, 4 * first or 40), 0
-    for seed in seeds:
+    for seed in range(first, 4 * first or 40):
         two = Two(seed)
         hear, said = two.hear_each_other(), sorted(two.said, key=lambda each: each[:2])
-        judged += two.have_a_key_in_common()
-        assert hear or not two.have_a_key_in_common(), f"seed {seed}: {said}"
-    assert judged > 0.9 * len(seeds)
+        assert hear, f"seed {seed}: {said}"

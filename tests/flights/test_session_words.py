@@ -77,7 +77,7 @@ def test_used_up_numbers_last_until_the_next_session(
     assert say(ends, said._replace(number=NUMBER_MAX + 1), ALARM) == []
     run.fly(lambda: False, run.now_ns + S, lambda world, cloud: None)
     assert cloud._counts["words_dropped"] > 2
-    identity = WorldIdentity(SHARED_CLOCK, b"another".ljust(16), last_epoch=cloud._session.epoch)
+    identity = WorldIdentity(SHARED_CLOCK, b"another".ljust(16))
     world = assembly.build_world(HOVER, identity, lambda: run.now_ns)
     run._world = world
     run.fly(lambda: False, run.now_ns + 2 * S, lambda world, cloud: None)
@@ -134,15 +134,3 @@ def test_a_slow_teleop_starts_missions_in_the_session_it_saw() -> None:
     _, second, _ = teleop.epochs.values()  # the third is that of the start from the spawn
     assert changes[0].stamp_ns >= second + LAG_NS
     assert changes[-1].state is GuardState.TRACK
-
-
-def test_after_a_stall_cloud_maintains_its_keys_once(
-    ends: Ends, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Checks must be a second apart, because an end counts those that find another key."""
-    looks: list[int] = []
-    monkeypatch.setattr(ends.cloud._session, "maintain", lambda now_ns: looks.append(now_ns) or [])
-    woken_ns = ends.run.now_ns + 60 * S
-    for late_ns in range(0, S // 2, S // 100):
-        ends.cloud.handle_deadline(woken_ns + late_ns)
-    assert 1 <= len(looks) <= 2

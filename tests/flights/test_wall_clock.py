@@ -68,8 +68,8 @@ def wall_clocks(tree: ast.AST) -> list[str]:
 
 
 CONTROL_PATH = ("world/", "cloud/", "teleop/", "tunnel/", "link/", "endpoint", "drivers/realtime",
-                "drivers/process", "drivers/keyfile", "drivers/epochs",
-                "drivers/virtual", "drivers/teleop")  # fmt: skip
+                "drivers/process", "drivers/keyfile", "drivers/virtual",
+                "drivers/teleop")  # fmt: skip
 ALLOWED = {
     # The kernel's stamps of datagrams are converted to an age of 0 to 50 ms at once.
     "link/relay.py": ["time.time_ns"],

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.drivers.epochs import replace_durably
 from cloudrc.errors import BadInputError
 from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.state import publish
@@ -60,7 +59,6 @@ def merged(path: Path) -> None:
 
 WRITERS: list[Callable[[Path], object]] = [
     lambda path: write_atomically(path, b"new"),
-    lambda path: replace_durably(path, b"new"),
     lambda path: publish(path, "new"),
     lambda path: write_json(path, {}),
     merged,

@@ -94,7 +94,7 @@ def test_a_replay_after_a_restart_of_both_ends_has_no_effect() -> None:
     talk.request(2, Request.START, Start.HERE)
     fly(talk, 1.0, (0.0, 0.0, 0.5))
     assert talk.take(CommandApplied)
-    after = Talk(last_epoch=1, nonce=b"world again")
+    after = Talk(nonce=b"world again")
     after.hello(b"cloud again")
     after.wait(20 * MS)
     for data in captured:

@@ -1,50 +1,64 @@
 """Share a world that answers hellos between the tests of the handshake."""
 
-from types import SimpleNamespace
+from __future__ import annotations
+
+from typing import Any
 
 from cloudrc.tunnel.codec import Direction, Hello, Kind, decode_challenge
-from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, NO_COOKIE, ServerHandshake
+from cloudrc.tunnel.handshake import (
+    CHALLENGE_NS,
+    COOKIE_NS,
+    NO_COOKIE,
+    HelloAnswer,
+    ServerHandshake,
+)
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.session import AES_256_GCM, Session
+from cloudrc.tunnel.session import NO_EPOCH, Session
 
 MS = 1_000_000
 SECOND_NS = 1000 * MS
 KEY = Key(b"k" * 32)
+NEW = Key(b"n" * 32)
 NONCE, CLOCK, WORLD = b"n" * 16, b"c" * 16, b"w" * 16
+OTHER = b"m" * 16
+"""Nonce of another cloud."""
 
 
 class Doorstep:
     """World's side of the handshake, with a cloud that sends hellos."""
 
-    def __init__(self, nonce=WORLD, suite=AES_256_GCM, **options):
-        ring = KeyRing(KeySet(KEY))
-        self.world = Session(Direction.UPLINK, ring)
-        self.cloud = Session(Direction.DOWNLINK, ring)
-        identity = SimpleNamespace(
-            nonce=nonce, clock_id=CLOCK, suite=suite, last_epoch=options.get("last_epoch", 0),
-            next_epoch=options.get("next_epoch"),
-        )  # fmt: skip
-        self.door = ServerHandshake(self.world, identity, age_max_ns=250 * MS)
+    def __init__(self, nonce: bytes = WORLD, key: Key = KEY) -> None:
+        self.world = Session(Direction.UPLINK, KeyRing(KeySet(key)))
+        self.cloud = Session(Direction.DOWNLINK, self.world.ring)
+        self.door = ServerHandshake(self.world, nonce, CLOCK, 250 * MS)
         self.now_ns = 10 * COOKIE_NS
         self.counter = 0
 
     def receive_hello(
-        self, nonce=NONCE, cookie=NO_COOKIE, clock=CLOCK, suite=AES_256_GCM, counter=None
-    ):  # fmt: skip
-        """Send a hello with this counter, or the next one."""
+        self,
+        nonce: bytes = NONCE,
+        cookie: bytes | None = None,
+        counter: int | None = None,
+        key: Key | None = None,
+        epoch: int = NO_EPOCH,
+    ) -> HelloAnswer:
+        """Send a hello, by default with a valid cookie, the next counter and the newest key."""
         self.counter += 1
         counter = self.counter if counter is None else counter
-        return self.door.receive_hello(Hello(nonce, clock, cookie, suite), counter, self.now_ns)
+        cookie = self.door._cookie(self.now_ns) if cookie is None else cookie
+        self.world.follow_keys()
+        self.world.greeting_key = key or self.world.ring.keys.current
+        return self.door.receive_hello(Hello(nonce, CLOCK, cookie, epoch), counter, self.now_ns)
 
-    def answer(self, *given, **named):
+    def answer(self, *given: Any, **named: Any) -> tuple[int, int, bytes]:
         """Return kind, epoch and body of the answer to a hello."""
         (data,) = self.receive_hello(*given, **named).datagrams
         kind, _, epoch, _, body = self.cloud.open(data)
         return kind, epoch, body
 
-    def cookie(self, nonce=NONCE):
+    def cookie(self) -> bytes:
         """Return the cookie of a challenge, as soon as world may send one."""
         self.now_ns = max(self.now_ns, self.door._challenged_ns + CHALLENGE_NS)
-        kind, _, body = self.answer(nonce)
+        kind, _, body = self.answer(cookie=NO_COOKIE)
         assert kind == Kind.CHALLENGE
         return decode_challenge(body)

@@ -1,167 +1,173 @@
-"""Cloud's side of the handshake: its hellos, and which answers it accepts."""
+"""Cloud's side of the handshake, and the log of why there is no session."""
+
+from __future__ import annotations
 
 import pytest
 
+from cloudrc.records import Fault
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.codec import Accept, Busy, Hello
-from cloudrc.tunnel.handshake import COOKIES_MAX, LEFT_MAX, NO_COOKIE, REPLIES_MAX, ClientHandshake
-from cloudrc.tunnel.session import AES_256_GCM, CHACHA20_POLY1305, Agreement
+from cloudrc.tunnel.codec import Accept, Hello, Kind
+from cloudrc.tunnel.handshake import (
+    COOKIES_MAX,
+    KEY_TEXT,
+    NO_COOKIE,
+    REPLIES_MAX,
+    WORLDS_MAX,
+    ClientHandshake,
+    HandshakeLog,
+)
+from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from tests.flights.conftest import Bare, BareCloud, ring
+from tests.tunnel.conftest import CLOCK, NONCE, WORLD
 
-NONCE, CLOCK, WORLD = b"n" * 16, b"c" * 16, b"w" * 16
+NEXT_WORLD = b"v" * 16
+STRANGER = KeyRing(KeySet(Key(b"x" * 32)))
 
 
 @pytest.fixture
-def handshake():
-    return ClientHandshake(NONCE, CLOCK, CHACHA20_POLY1305)
+def handshake() -> ClientHandshake:
+    return ClientHandshake(NONCE, CLOCK)
 
 
-def test_a_hello_has_nonce_clock_cookie_and_suite(handshake):
-    hello = codec.decode_hello(handshake.make_hello())
-    assert hello == Hello(NONCE, CLOCK, NO_COOKIE, CHACHA20_POLY1305)
+def hello(handshake: ClientHandshake) -> Hello:
+    return codec.decode_hello(handshake.make_hello())
 
 
-def test_answers_and_later_hellos_have_the_cookie(handshake):
-    handshake.make_hello()
-    answer = handshake.answer_challenge(b"1" * 16)
+def accepted(
+    handshake: ClientHandshake,
+    epoch: int,
+    world: bytes = WORLD,
+    nonce: bytes = NONCE,
+    *,
+    asks: bool = True,
+) -> bytes | None:
+    return handshake.receive_accept(epoch, Accept(nonce, world, CLOCK), asks=asks)
+
+
+def test_a_hello_has_nonce_clock_cookie_and_newest_epoch(handshake: ClientHandshake) -> None:
+    assert hello(handshake) == Hello(NONCE, CLOCK, NO_COOKIE, 0)
+    assert accepted(handshake, 3) == NONCE + WORLD
+    answer = handshake.answer_challenge(b"1" * 13)
     assert answer is not None
-    assert codec.decode_hello(answer).cookie == b"1" * 16
-    assert codec.decode_hello(handshake.make_hello()).cookie == b"1" * 16
+    assert codec.decode_hello(answer) == hello(handshake) == Hello(NONCE, CLOCK, b"1" * 13, 3)
 
 
-def test_repeated_challenges_get_a_limited_number_of_answers(handshake):
-    assert handshake.answer_challenge(b"0" * 16) is None  # it has not asked
+def test_repeated_challenges_get_a_limited_number_of_answers(handshake: ClientHandshake) -> None:
+    assert handshake.answer_challenge(b"0" * 13) is None  # it has not asked
     handshake.make_hello()
-    assert handshake.answer_challenge(b"1" * 16)
-    assert handshake.answer_challenge(b"1" * 16) is None
-    answers = [handshake.answer_challenge(b"%016d" % n) for n in range(50)]
-    assert sum(answer is not None for answer in answers) == REPLIES_MAX - 1
+    answers = [handshake.answer_challenge(b"%013d" % n) for n in range(50)]
+    assert sum(answer is not None for answer in answers) == REPLIES_MAX
+    handshake.make_hello()
+    assert handshake.answer_challenge(b"%013d" % 49)
 
 
-def test_repeated_old_challenges_use_up_no_answers(handshake):
+def test_repeated_old_challenges_use_up_no_answers(handshake: ClientHandshake) -> None:
     old = [b"old %d" % n for n in range(REPLIES_MAX)]
     handshake.make_hello()
     assert all(handshake.answer_challenge(cookie) for cookie in old)
     handshake.make_hello()
     assert [handshake.answer_challenge(cookie) for cookie in 100 * old] == 300 * [None]
-    answer = handshake.answer_challenge(b"1" * 16)
-    assert codec.decode_hello(answer).cookie == b"1" * 16
+    assert handshake.answer_challenge(b"1" * 13)
     assert [handshake.answer_challenge(cookie) for cookie in old] == REPLIES_MAX * [None]
-    assert codec.decode_hello(handshake.make_hello()).cookie == b"1" * 16
+    assert hello(handshake).cookie == b"1" * 13
 
 
-def test_a_cookie_beyond_the_limit_is_answered_next_time(handshake):
-    handshake.make_hello()
-    for number in range(REPLIES_MAX):
-        handshake.answer_challenge(b"old %d" % number)
-    assert handshake.answer_challenge(b"1" * 16) is None
-    handshake.make_hello()
-    assert handshake.answer_challenge(b"1" * 16)
-
-
-def test_the_memory_of_cookies_is_bounded(handshake):
+def test_the_memory_of_cookies_and_worlds_is_bounded(handshake: ClientHandshake) -> None:
     for number in range(COOKIES_MAX + 1):
         handshake.make_hello()
-        handshake.answer_challenge(b"%016d" % number)
+        handshake.answer_challenge(b"%013d" % number)
+        accepted(handshake, 1, b"%016d" % number)
     assert len(handshake._cookies) == COOKIES_MAX
-    assert handshake.answer_challenge(b"%016d" % 1) is None
-    assert handshake.answer_challenge(b"%016d" % 0)
+    assert handshake.answer_challenge(b"%013d" % 1) is None
+    assert handshake.answer_challenge(b"%013d" % 0)
+    assert len(handshake._old_worlds) == WORLDS_MAX
 
 
-def accept(nonce=NONCE, world=WORLD, suite=AES_256_GCM):
-    return Accept(nonce, world, CLOCK, suite)
-
-
-def accepted(handshake, epoch, answer, current, *, asks=True):
-    return handshake.receive_accept(epoch, answer, current, asks=asks)
-
-
-def test_an_acceptance_gives_the_agreement(handshake):
-    agreement = accepted(handshake, 3, accept(suite=CHACHA20_POLY1305), 0)
-    assert agreement == Agreement(NONCE, WORLD, CHACHA20_POLY1305)
-
-
-@pytest.mark.parametrize(("epoch", "counts"), [(2, False), (3, False), (4, True)])
-def test_of_one_world_only_a_newer_epoch_counts(handshake, epoch, counts):
-    accepted(handshake, 3, accept(), 0)
-    assert (accepted(handshake, epoch, accept(), 3) is not None) == counts
-
-
-@pytest.mark.parametrize(("ahead", "counts"), [(2**31 - 1, True), (2**31, False)])
-def test_half_of_all_epochs_are_newer(handshake, ahead, counts):
-    accepted(handshake, 1, accept(), 0)
-    assert (accepted(handshake, 1 + ahead, accept(), 1) is not None) == counts
-
-
-def test_a_new_world_process_may_begin_with_epoch_1(handshake):
-    accepted(handshake, 3, accept(), 0)
-    assert accepted(handshake, 1, accept(world=b"v" * 16), 3)
+@pytest.mark.parametrize(
+    ("known", "epoch", "counts"),
+    [
+        *((3, 2, False), (3, 3, False), (3, 4, True)),
+        *((1, 2**31, True), (1, 1 + 2**31, False)),  # half of all epochs are newer
+        *((2**32 - 1, 2**32 - 2, False), (2**32 - 1, 1, True)),
+    ],
+)
+def test_of_one_world_only_a_newer_epoch_counts(
+    handshake: ClientHandshake, known: int, epoch: int, counts: bool
+) -> None:
+    handshake._world, handshake._epoch = WORLD, known
+    assert (accepted(handshake, epoch) is not None) == counts
 
 
 @pytest.mark.promise("old-datagrams-do-nothing")
-def test_a_dead_world_does_not_come_back(handshake):
-    accepted(handshake, 3, accept(), 0)
-    accepted(handshake, 4, accept(world=b"v" * 16), 3)
-    assert accepted(handshake, 9, accept(), 4) is None
-    name = codec.decode_hello(handshake.make_hello()).nonce
-    assert accepted(handshake, 5, accept(name, b"v" * 16), 4)
+def test_a_dead_world_does_not_come_back(handshake: ClientHandshake) -> None:
+    accepted(handshake, 3)
+    assert accepted(handshake, 1, NEXT_WORLD, asks=False) is None, "cloud hears its world"
+    assert accepted(handshake, 4, asks=False)
+    assert accepted(handshake, 1, NEXT_WORLD), "a new process may begin with epoch 1"
+    assert accepted(handshake, 9) is None
+    assert accepted(handshake, 5, NEXT_WORLD, hello(handshake).nonce)
 
 
-def test_a_late_acceptance_of_a_dead_world_is_ignored(
-    handshake,
-):
-    accepted(handshake, 3, accept(), 0)
-    assert accepted(handshake, 1, accept(world=b"v" * 16), 3, asks=False) is None
-    assert accepted(handshake, 4, accept(), 3, asks=False)
-
-
-def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(handshake):
+def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(handshake: ClientHandshake) -> None:
     """Cloud has accepted a late datagram of a dead world while it heard nobody."""
-    accepted(handshake, 3, accept(world=b"v" * 16), 0)
-    accepted(handshake, 9, accept(), 3)
-    assert accepted(handshake, 3, accept(world=b"v" * 16), 9) is None  # alive, and answers
-    name = codec.decode_hello(handshake.make_hello()).nonce
-    assert name != NONCE
-    assert accepted(handshake, 9, accept(), 9) is None  # the late datagram again
-    assert accepted(handshake, 4, accept(name, b"v" * 16), 9)
-    assert codec.decode_hello(handshake.make_hello()).nonce == name
+    accepted(handshake, 3, NEXT_WORLD)
+    accepted(handshake, 9)
+    assert accepted(handshake, 3, NEXT_WORLD) is None  # alive, and answers
+    nonce = hello(handshake).nonce
+    assert nonce != NONCE
+    assert accepted(handshake, 9) is None  # the late datagram again
+    assert accepted(handshake, 4, NEXT_WORLD, nonce)
+    assert hello(handshake).nonce == nonce
 
 
-def test_the_first_epoch_is_newer_than_the_last(handshake):
-    accepted(handshake, 2**32 - 1, accept(), 0)
-    assert accepted(handshake, 2**32 - 2, accept(), 2**32 - 1) is None
-    assert accepted(handshake, 1, accept(), 2**32 - 1)
+def test_answers_for_another_nonce_are_ignored(handshake: ClientHandshake) -> None:
+    assert accepted(handshake, 3, nonce=b"m" * 16) is None
+    assert handshake.is_refused(NONCE)
+    assert not handshake.is_refused(b"m" * 16)
 
 
-def test_an_acceptance_for_another_nonce_is_ignored(handshake):
-    assert accepted(handshake, 3, accept(nonce=b"m" * 16), 0) is None
+def faults(bare: Bare) -> list[Fault]:
+    return [record for record in bare.world.take_records() if isinstance(record, Fault)]
 
 
-def test_after_a_refusal_cloud_asks_again_with_the_same_nonce(handshake):
-    assert handshake.receive_busy(Busy(NONCE, used=False))
-    assert codec.decode_hello(handshake.make_hello()).nonce == NONCE
+@pytest.mark.parametrize(
+    ("data", "code", "text"),
+    [
+        (lambda: bytes([5]) + Bare(ring()).cloud("a").hello()[1:], "version", "v5, we speak v6: "),
+        (lambda: BareCloud(b"a", STRANGER).hello(), "key", "same key file"),
+    ],
+)
+def test_another_version_or_key_is_logged_once(data: object, code: str, text: str) -> None:
+    bare, hello = Bare(ring()), data()  # type: ignore[operator]
+    for _ in range(3):
+        bare.world.receive_datagram(hello, 0)
+    (fault,) = faults(bare)
+    assert (fault.code, text in fault.text) == (code, True)
+    assert bare.world.take_datagrams() == []
 
 
-def test_a_used_nonce_is_replaced_once(handshake):
-    assert not handshake.receive_busy(Busy(NONCE, used=True))
-    second = codec.decode_hello(handshake.make_hello()).nonce
-    assert second != NONCE
-    assert not handshake.receive_busy(Busy(NONCE, used=True))  # an answer to a hello before that
-    assert codec.decode_hello(handshake.make_hello()).nonce == second
-    handshake.receive_busy(Busy(second, used=True))
-    assert codec.decode_hello(handshake.make_hello()).nonce not in (NONCE, second)
-    assert accepted(handshake, 1, accept(), 0) is None
+def test_within_a_session_garbage_is_only_counted() -> None:
+    bare = Bare(ring())
+    bare.send(bare.cloud("a").hello())
+    bare.world.receive_datagram(BareCloud(b"b", STRANGER).hello(), 0)
+    assert faults(bare) == []
+    assert bare.world._counts["tag"] == 1
 
 
-def test_a_refusal_for_another_nonce_is_ignored(handshake):
-    assert not handshake.receive_busy(Busy(b"m" * 16, used=False))
+def test_only_another_version_and_a_wrong_key_are_logged() -> None:
+    for outcome in ("malformed", "direction", "old_epoch"):
+        assert HandshakeLog().about(outcome, bytes(16), 0) == []
+    for kind in Kind:
+        data = codec.encode_header(kind, 1, 1, 1)
+        said = [Fault(7, "key", KEY_TEXT)] if kind <= Kind.BUSY else []
+        assert HandshakeLog().about("tag", data, 7) == said
 
 
-def test_the_first_world_makes_no_old_world(handshake):
-    accepted(handshake, 3, accept(), 0)
-    assert not handshake._old_worlds
-
-
-def test_the_memory_of_old_worlds_is_bounded(handshake):
-    for number in range(3 * LEFT_MAX):
-        accepted(handshake, 1, accept(world=b"%016d" % number), 0)
-    assert len(handshake._old_worlds) == LEFT_MAX
+def test_a_text_is_logged_once_in_a_session() -> None:
+    log = HandshakeLog()
+    assert len(log.about("version", bytes(16), 7)) == 1
+    (fault,) = log.about("version", bytes([4]) + bytes(15), 8)  # garbage does not hide the peer's
+    assert fault.text.startswith("peer speaks v4, ")
+    assert log.say("version", fault.text, 8) == []
+    log.forget()
+    assert log.say("version", fault.text, 9) == [Fault(9, "version", fault.text)]

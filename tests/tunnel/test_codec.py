@@ -1,7 +1,5 @@
 """The codec: every message survives a round trip, and everything else is refused."""
 
-import struct
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,7 +15,7 @@ from cloudrc.messages import (
     Telemetry,
 )
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.codec import Accept, Busy, DecodeError, Hello, Kind
+from cloudrc.tunnel.codec import Accept, DecodeError, Hello, Kind
 
 stamps = st.integers(-(2**63), 2**63 - 1)
 floats = st.floats(allow_nan=False)
@@ -60,10 +58,29 @@ def datagram(kind: Kind, body: bytes) -> bytes:
     return codec.encode_header(kind, 0, 1, 2) + body + bytes(codec.TAG_SIZE)
 
 
-@given(telemetries)
+names, cookies = (st.binary(min_size=size, max_size=size) for size in (16, codec.COOKIE_SIZE))
+COME_BACK = {
+    "telemetry": (telemetries, codec.encode_telemetry, codec.decode_telemetry),
+    "command": (commands, codec.encode_command, codec.decode_command),
+    "request": (requests, codec.encode_operator, codec.decode_operator),
+    "hello": (
+        st.builds(Hello, names, names, cookies, st.integers(0, 2**32 - 1)),
+        codec.encode_hello,
+        codec.decode_hello,
+    ),
+    "accept": (st.builds(Accept, names, names, names), codec.encode_accept, codec.decode_accept),
+    "challenge": (cookies, codec.encode_challenge, codec.decode_challenge),
+    "busy": (names, codec.encode_busy, codec.decode_busy),
+}
+
+
+@pytest.mark.parametrize("name", COME_BACK)
+@given(st.data())
 @settings(max_examples=50, deadline=None)
-def test_telemetry_comes_back_as_it_was(telemetry):
-    assert codec.decode_telemetry(codec.encode_telemetry(telemetry)) == telemetry
+def test_every_body_comes_back_as_it_was(name, data):
+    strategy, encode, decode = COME_BACK[name]
+    message = data.draw(strategy)
+    assert decode(encode(message)) == message
 
 
 @given(telemetries)
@@ -73,28 +90,14 @@ def test_the_stamps_of_telemetry_can_be_read_alone(telemetry):
     assert stamps_ns == (telemetry.stamp_ns, telemetry.slip_ns)
 
 
-@given(commands)
-@settings(max_examples=50, deadline=None)
-def test_a_command_comes_back_as_it_was(command):
-    assert codec.decode_command(codec.encode_command(command)) == command
-
-
-@given(requests)
-@settings(max_examples=50, deadline=None)
-def test_a_request_comes_back_as_it_was(request_):
-    assert codec.decode_operator(codec.encode_operator(request_)) == request_
-
-
-@given(requests, st.integers(0, 2**32 - 1))
-@settings(max_examples=50, deadline=None)
-def test_the_epoch_of_a_request_is_not_in_its_body(request_, epoch):
-    said = request_._replace(epoch=epoch)
-    assert codec.encode_operator(said) == codec.encode_operator(request_)
+def test_the_epoch_of_a_request_is_not_in_its_body():
+    said = OperatorRequest(1, Request.END)
+    assert codec.encode_operator(said._replace(epoch=7)) == codec.encode_operator(said)
 
 
 def test_the_header_has_the_documented_layout():
-    data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788, generation=9)
-    assert data == bytes([5, 1, 4, 3, 2, 1, 9, 6]) + bytes.fromhex("8877665544332211")
+    data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788)
+    assert data == bytes([6, 1, 4, 3, 2, 1, 0, 6]) + bytes.fromhex("8877665544332211")
     assert codec.peek(data) == (Kind.COMMAND, 0x01020304, 0x1122334455667788)
 
 
@@ -112,34 +115,6 @@ def test_no_answer_is_longer_than_its_hello():
     assert max(codec.SIZES.values()) <= codec.DATAGRAM_MAX
 
 
-@given(st.builds(Hello, *[st.binary(min_size=16, max_size=16)] * 3, st.integers(0, 255)))
-@settings(max_examples=20, deadline=None)
-def test_a_hello_comes_back_as_it_was(hello):
-    assert codec.decode_hello(codec.encode_hello(hello)) == hello
-
-
-@given(st.builds(Accept, *[st.binary(min_size=16, max_size=16)] * 3, st.integers(0, 255)))
-@settings(max_examples=20, deadline=None)
-def test_an_accept_comes_back_as_it_was(accept):
-    assert codec.decode_accept(codec.encode_accept(accept)) == accept
-
-
-def test_a_challenge_is_a_cookie_and_zeros():
-    body = codec.encode_challenge(bytes(range(16)))
-    assert body == bytes(range(16)) + bytes(33)
-    assert codec.decode_challenge(body) == bytes(range(16))
-
-
-@pytest.mark.parametrize("used", [False, True])
-def test_a_refusal_comes_back_as_it_was(used):
-    assert codec.decode_busy(codec.encode_busy(Busy(b"n" * 16, used))) == Busy(b"n" * 16, used)
-
-
-def test_a_command_is_laid_out_as_documented():
-    body = codec.encode_command(Command(1, 2, 3, (4.0, 5.0, 6.0), 7.0))
-    assert body == struct.pack("<qqqdddd", 1, 2, 3, 4.0, 5.0, 6.0, 7.0)
-
-
 @pytest.mark.parametrize("kind", list(Kind))
 def test_every_wrong_length_is_refused(kind):
     whole = datagram(kind, bytes(codec.BODY_SIZES[kind]))
@@ -149,12 +124,12 @@ def test_every_wrong_length_is_refused(kind):
             codec.check(whole[:length].ljust(length, b"\0"))
 
 
-@pytest.mark.parametrize("version", sorted({*range(256)} - {codec.VERSION}))
-def test_every_other_version_is_refused_by_name(version):
+def test_every_other_version_is_refused_by_name():
     data = bytearray(datagram(Kind.COMMAND, bytes(codec.BODY_SIZES[Kind.COMMAND])))
-    data[0] = version
-    with pytest.raises(DecodeError, match=r"^version$"):
-        codec.check(bytes(data))
+    for version in {*range(256)} - {codec.VERSION}:
+        data[0] = version
+        with pytest.raises(DecodeError, match=r"^version$"):
+            codec.check(bytes(data))
 
 
 @given(st.binary(max_size=400))
@@ -194,7 +169,7 @@ def test_an_unknown_state_or_cause_of_the_guard_is_refused(place, field, kind):
             codec.decode_telemetry(bytes(body))
 
 
-@pytest.mark.parametrize("size", range(codec.HEADER_SIZE))
-def test_peek_refuses_a_datagram_shorter_than_a_header(size):
-    with pytest.raises(DecodeError, match=r"^malformed$"):
-        codec.peek(bytes(size))
+def test_peek_refuses_a_datagram_shorter_than_a_header():
+    for size in range(codec.HEADER_SIZE):
+        with pytest.raises(DecodeError, match=r"^malformed$"):
+            codec.peek(bytes(size))

@@ -7,16 +7,13 @@ import random
 import re
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Callable
-from mmap import PAGESIZE, mmap
 from pathlib import Path
 
 import pytest
 
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
-from cloudrc.tunnel.session import Openers
 from tests.tunnel.hostile import LONGEST, Target, memory
 
 
@@ -38,19 +35,9 @@ def test_hostile_datagrams_are_not_accepted(target: Target) -> None:
     assert target.tried > 25_000
 
 
-def test_time_passes_between_hostile_datagrams(monkeypatch: pytest.MonkeyPatch) -> None:
-    looked: Counter[tuple[bool, bool]] = Counter()
-    generations = Openers._generations
-
-    def counted(openers: Openers, byte: int) -> range:
-        found = generations(openers, byte)
-        looked[openers is target.world._session._openers, len(found) > 1] += 1
-        return found
-
-    monkeypatch.setattr(Openers, "_generations", counted)
+def test_time_passes_between_hostile_datagrams() -> None:
     target = Target(pace=300)
     flood(target, 30_000, seed=4)
-    assert min(looked[at_world, far] for at_world in (True, False) for far in (True, False)) > 30
     assert target.world._counts["unanswered"] > 0
     assert target.now_ns > 1000e9
 
@@ -78,17 +65,6 @@ def test_the_check_finds_accepted_hostile_datagrams() -> None:
 
 
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux: /proc")
-
-
-@needs_linux
-def test_a_memory_leak_below_a_peak_is_found() -> None:
-    peak = b"x" * (128 << 20)
-    del peak
-    before = memory()
-    with mmap(-1, 64 << 20) as leak:  # from the kernel, because malloc may reuse freed memory
-        for at in range(0, len(leak), PAGESIZE):
-            leak[at] = 1
-        assert memory() - before == pytest.approx(len(leak) / 2**20, abs=1.0)
 
 
 @needs_linux

@@ -1,4 +1,4 @@
-"""World keeps its epoch on a volume; world and cloud read the key from a file."""
+"""World and cloud read the key from a file."""
 
 from __future__ import annotations
 
@@ -34,22 +34,7 @@ def test_the_link_sees_no_key() -> None:
         assert "secret" not in {mount["name"] for mount in mounts}
 
 
-def test_the_epoch_is_on_a_claim_of_the_chart() -> None:
-    objects = render()
-    volume = volume_at(objects, "world", argument(objects, "world", "--epochs"))
-    assert volume["persistentVolumeClaim"]["claimName"] == "demo-cloudrc-epochs"
-    assert "epochs" in of_kind(objects, "PersistentVolumeClaim")
-
-
-def test_an_existing_claim_is_used() -> None:
-    objects = render({"world": {"epochs": {"existingClaim": "mine"}}})
-    volume = volume_at(objects, "world", argument(objects, "world", "--epochs"))
-    assert volume["persistentVolumeClaim"]["claimName"] == "mine"
-    assert "epochs" not in of_kind(objects, "PersistentVolumeClaim")
-
-
-def test_class_and_size_of_the_claim_are_values() -> None:
-    epochs = {"storageClassName": "fast", "size": "8Mi"}
-    claim = of_kind(render({"world": {"epochs": epochs}}), "PersistentVolumeClaim")["epochs"]
-    assert claim["spec"]["storageClassName"] == "fast"
-    assert claim["spec"]["resources"]["requests"]["storage"] == "8Mi"
+def test_world_needs_no_volume_for_its_epochs() -> None:
+    """The value of older releases is accepted."""
+    objects = render({"world": {"epochs": {"storageClassName": "fast"}}})
+    assert set(of_kind(objects, "PersistentVolumeClaim")) == {"journal"}
