@@ -125,6 +125,7 @@ def test_a_hold_after_commands_on_older_odometry_is_allowed() -> None:
         robot.step(HOLD, ms=250)
         robot.offer(10)
         robot.step(TRACK, ms=10)
+        robot.step(TRACK, ms=10, fresh=False)
         for basis_ms in bases_ms:
             robot.offer(basis_ms=1260 + basis_ms)
         robot.guard.cause = Cause.SILENCE

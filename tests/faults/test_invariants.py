@@ -114,6 +114,10 @@ def test_track_is_for_fresh_commands() -> None:
     robot.offer()
     assert robot.step(TRACK, ms=252, fresh=False) == set()
     assert robot.step(TRACK, fresh=False) == {"stale"}
+    for basis_ms, kinds in ((0, set()), (-251, {"stale"}), (1, {"stale"})):
+        robot = FakeRobot()
+        robot.offer(basis_ms=basis_ms)
+        assert robot.kinds == kinds
 
 
 def test_a_step_without_a_tick_of_the_guard_is_a_breach() -> None:
