@@ -156,16 +156,6 @@ def test_without_commands_the_robot_stops_where_it_can(
     assert robot.step(HOLD) == kinds
 
 
-@pytest.mark.parametrize(("ago_ms", "kinds"), [(2, set()), (1000, {"rest"})])
-def test_a_recent_hit_excuses_drift_until_the_next_flight(ago_ms: int, kinds: set[str]) -> None:
-    robot = FakeRobot()
-    robot.touch("pipe_3")
-    robot.step(TRACK, ms=ago_ms)
-    robot.step(HOLD)
-    robot.position = (3.0, 1.0, 1.0)
-    assert robot.step(HOLD) == kinds
-
-
 @pytest.mark.parametrize(
     ("body", "tip", "state", "kinds"),
     [
