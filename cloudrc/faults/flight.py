@@ -71,7 +71,6 @@ class Flight:
         generations: Number of processes of each end so far.
         rings: Keys of the running processes, by end.
         secrets: Contents of the key files, by end.
-        rival: Teleop of another cloud, if there is one.
         listeners: Get world's new records and the time [ns] every 100 ms.
     """
 
@@ -111,23 +110,14 @@ class Flight:
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self.honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
-        self._clock_id = SHARED if cloud_clock is None else OTHER
-        self._clock = cloud_clock or Clock()
-        self.secrets = {"world": SECRET, "cloud": SECRET}
-        self.rings: dict[str, KeyRing] = {}
-        self.rival: InProcessTeleop | None = None
+        self._clock, self._clock_id = cloud_clock or Clock(), OTHER if cloud_clock else SHARED
+        self.secrets, self.rings = {"world": SECRET, "cloud": SECRET}, dict[str, KeyRing]()
         self.listeners: list[Callable[[list[Record], int], None]] = []
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
         self.changes, self.world_starts_ns = list[GuardChange](), list[int]()
         self._hash, self.watch = RecordHash(), Watch(Limits.of(self.experiment.guard))
-        self.teleop = self._make_teleop(seed, separate)
-        self._connect(uplink, downlink)
-        if start:
-            self.order(0)
-
-    def _connect(self, uplink: Shape | None, downlink: Shape | None) -> None:
-        """Make the processes of both ends and the link between them."""
+        self.teleop = self._make_teleop(separate, start)
         self.world = RestartableEndpoint(self._build_world, Clock())
         self.cloud = RestartableEndpoint(self._build_cloud, self._clock, "cloud")
         self.teleop.run_on(self.cloud)
@@ -135,11 +125,15 @@ class Flight:
         self.downlink = _link(self.experiment, downlink, up=False)
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
 
-    def _make_teleop(self, seed: int, separate: bool) -> InProcessTeleop:
+    def _make_teleop(self, separate: bool, start: bool) -> InProcessTeleop:
         limit = self.experiment.criteria.contact_speed_max_mps
+        teleop = InProcessTeleop(limit)
         if separate:
-            return SeparateTeleop(limit, phase_ns=int(generator(seed, 45).integers(WAKE_NS)))
-        return InProcessTeleop(limit)
+            phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
+            teleop = SeparateTeleop(limit, phase_ns=phase_ns)
+        if start:
+            teleop.order(self.make_order(), self._clock.at(0))
+        return teleop
 
     @property
     def robot(self) -> Robot:
@@ -161,10 +155,6 @@ class Flight:
         """Make an order of the experiment's mission."""
         plan = assembly.build_plan(self.experiment)
         return Order(plan, contact=self.experiment.criteria.contact)
-
-    def order(self, now_ns: int) -> Mission:
-        """Order the experiment's mission at `now_ns` [ns, virtual time]."""
-        return self.teleop.order(self.make_order(), self._clock.at(now_ns))
 
     def order_if_possible(self, now_ns: int) -> None:
         """Order the experiment's mission at `now_ns` [ns, virtual time], unless it is refused."""
@@ -264,10 +254,10 @@ class Flight:
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
         """Build another cloud with the same key, which wants to fly the same mission."""
         limit = self.experiment.criteria.contact_speed_max_mps
-        self.rival = InProcessTeleop(limit, name=b"rival")
-        self.rival.order(Order(assembly.build_plan(self.experiment)), start_ns)
+        teleop = InProcessTeleop(limit, name=b"rival")
+        teleop.order(Order(assembly.build_plan(self.experiment)), start_ns)
         identity = CloudIdentity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
-        return assembly.build_cloud(self.experiment, identity, lambda: start_ns, self.rival)
+        return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
 
     def _nonce(self, end: str) -> bytes:
         self.generations[end] += 1

@@ -5,7 +5,7 @@ fence      The base stays inside the fence while the rotors turn. After an emerg
            again only where it lies still inside.
 cap, stop  The reference stays below the caps and can be stopped before the fence. In LAND the floor
            is no limit.
-stale      In TRACK the basis of the newest accepted command is never older than the limit.
+stale      No command with an older basis than the limit is accepted, nor flown in TRACK.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
            request, after a hit, or where the robot stands.
 collision  With an honest cloud only the arm's tip touches anything, and only the board. A robot
@@ -179,7 +179,7 @@ class RobotInvariants:
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
         """See `Observer`."""
-        self._motion.see_command(command, rejection)
+        self._motion.see_command(command, rejection, now_ns)
         self._hold.see_command(command, rejection, self._state, now_ns)
         self._state = self._guard.state
 
@@ -216,10 +216,13 @@ class MotionInvariants:
         self._touched: tuple[int, str] | None = None
         self._left, self._way = ZERO, inf  # where TRACK ended, and how far the robot may go
 
-    def see_command(self, command: Command, rejection: str | None) -> None:
-        """Note the basis of an accepted command."""
-        if rejection is None and command.basis_stamp_ns > self._basis_ns:
-            self._basis_ns = command.basis_stamp_ns
+    def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
+        """Check the age of an accepted command."""
+        if rejection is None:
+            age_ns = now_ns - command.basis_stamp_ns
+            if not 0 <= age_ns <= self._watch.limits.age_ns:
+                self._note(now_ns, "stale", f"accepted a command {age_ns * 1e-9:.3f} s old")
+            self._basis_ns = max(self._basis_ns, command.basis_stamp_ns)
 
     def see_stop(self, state: GuardState) -> None:
         """Note an emergency stop in a state."""

@@ -114,6 +114,10 @@ def test_track_is_for_fresh_commands() -> None:
     robot.offer()
     assert robot.step(TRACK, ms=252, fresh=False) == set()
     assert robot.step(TRACK, fresh=False) == {"stale"}
+    for basis_ms, kinds in ((0, set()), (-251, {"stale"}), (1, {"stale"})):
+        robot = FakeRobot()
+        robot.offer(basis_ms=basis_ms)
+        assert robot.kinds == kinds
 
 
 def test_a_step_without_a_tick_of_the_guard_is_a_breach() -> None:
@@ -149,16 +153,6 @@ def test_without_commands_the_robot_stops_where_it_can(
     robot.step(TRACK)
     robot.step(HOLD)
     robot.position = (1.0, 1.0 + way, 1.0)
-    assert robot.step(HOLD) == kinds
-
-
-@pytest.mark.parametrize(("ago_ms", "kinds"), [(2, set()), (1000, {"rest"})])
-def test_a_recent_hit_excuses_drift_until_the_next_flight(ago_ms: int, kinds: set[str]) -> None:
-    robot = FakeRobot()
-    robot.touch("pipe_3")
-    robot.step(TRACK, ms=ago_ms)
-    robot.step(HOLD)
-    robot.position = (3.0, 1.0, 1.0)
     assert robot.step(HOLD) == kinds
 
 

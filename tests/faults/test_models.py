@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from functools import partial
-from itertools import pairwise
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cloudrc.drivers.teleop import PERIOD_NS
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.injection import inject
 from cloudrc.faults.models import (
@@ -22,7 +19,6 @@ from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.messages import GuardState
 from cloudrc.records import Record
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.wire import RobotStatus
 
 MS = 1_000_000
 
@@ -103,30 +99,10 @@ def test_a_clock_reaches_a_time_exactly_when_it_says(
     assert clock.at(when_ns - 1) < clock.at(now_ns)
 
 
-@pytest.fixture
-def looks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """When teleop has seen the robot [ns]."""
-    looks: list[int] = []
-    see = MissionService.see
-
-    def look(service: MissionService, seen: RobotStatus, now_ns: int) -> None:
-        looks.append(now_ns)
-        see(service, seen, now_ns)
-
-    monkeypatch.setattr(MissionService, "see", look)
-    return looks
-
-
 def separate(*events: Event, start: bool = True) -> Flight:
     flight = Flight("link.profile=ideal", seed=3, separate=True, start=start)
     inject(flight, Schedule(3, events=events))
     return flight
-
-
-def test_a_separate_teleop_looks_every_20_ms(looks: list[int]) -> None:
-    flight = separate().fly(4.0)
-    assert {b - a for a, b in pairwise(looks) if a > 1000 * MS} == {PERIOD_NS}
-    assert flight.guard_now()[0] is GuardState.TRACK
 
 
 def test_a_separate_teleop_pauses_and_its_successor_resumes() -> None:

@@ -178,16 +178,12 @@ def test_no_zero_is_told_of_what_was_not_checked(find: Find) -> None:
     assert told["invariants"]["fence"] == {"judged": 1, "broken": 0}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_search_says_how_to_continue(
-    number: signal.Signals,
-    find: Find,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    find: Find, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupt(schedule: Schedule, *, keep: bool = False) -> Finding:
         if schedule.seed == 3:
-            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGTERM)
         return _fly(schedule)
 
     monkeypatch.setattr("cloudrc.faults.search.fly", interrupt)

@@ -10,11 +10,12 @@ from typing import Any
 
 import pytest
 
-from cloudrc.faults.adversary import POLICIES, choose
+from cloudrc.faults.adversary import POLICIES, choose, dishonesty
+from cloudrc.faults.flight import Flight
 from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
 from cloudrc.faults.trial import OrderInvariant, checked_in, fly
-from cloudrc.messages import ZERO, Command, GuardState, OperatorRequest, Request
+from cloudrc.messages import ZERO, Command, GuardState, Request
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
@@ -58,24 +59,15 @@ def test_it_causes_none_with_a_stiffer_low_level_controller(seed: int) -> None:
     assert fly(hostile, STIFFER).breaches == ()
 
 
-def test_a_hostile_cloud_makes_every_request(monkeypatch: Patch) -> None:
-    heard: list[OperatorRequest] = []
-    schedule = Schedule(27, policy="operators-voice", duration=15.0)
-    attach = Watch.attach
-
-    def listen(watch: Watch, robot: Any, start_ns: int, *, honest: bool) -> None:
-        attach(watch, robot, start_ns, honest=honest)
-        hear = SimpleNamespace(
-            see_step=lambda *_: None,
-            see_command=lambda *_: None,
-            see_request=lambda request, now_ns: heard.append(request),
-            see_session=lambda now_ns: None,
-        )
-        robot.observers.append(hear)
-
-    monkeypatch.setattr(Watch, "attach", listen)
-    assert fly(schedule).breaches == ()
-    assert {request.request for request in heard} == set(Request) - {Request.PROGRESS}
+def test_a_hostile_cloud_makes_every_request() -> None:
+    lie, words = dishonesty(Schedule(27, policy="operators-voice"))
+    flight, heard = Flight(seed=27, honest=False, lies=[lie], words=words), set[Request]()
+    ear = dict.fromkeys(("see_step", "see_command", "see_session"), lambda *_: None)
+    hear = SimpleNamespace(**ear, see_request=lambda request, _: heard.add(request.request))
+    flight.robot.observers.append(hear)
+    flight.fly(15.0)
+    assert flight.watch.breaches == []
+    assert heard == set(Request) - {Request.PROGRESS}
 
 
 @pytest.mark.parametrize(

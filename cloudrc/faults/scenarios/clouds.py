@@ -16,20 +16,14 @@ from cloudrc.world.endpoint import WorldEndpoint
 
 LIES: dict[str, Lie] = {
     "NaN": lambda command, control: command._replace(velocity=(nan, 0.0, 0.0)),
-    "infinite": lambda command, control: command._replace(velocity=(0.0, inf, 0.0)),
-    "yaw NaN": lambda command, control: command._replace(yaw_rate=nan),
+    "yaw infinite": lambda command, control: command._replace(yaw_rate=inf),
     "1e308": lambda command, control: command._replace(velocity=(1e308, -1e308, 1e308)),
-    "yaw 1e9": lambda command, control: command._replace(yaw_rate=1e9),
 }
 CLAMPED: dict[str, Lie] = {
-    "denormal": lambda command, control: command._replace(velocity=(5e-324, 0.0, 0.0)),
-    "100 m/s": lambda command, control: command._replace(velocity=(100.0, 0.0, 0.0)),
-    "yaw 100 rad/s": lambda command, control: command._replace(yaw_rate=100.0),
+    "speed": lambda command, control: command._replace(velocity=(100.0, 0.0, 0.0)),
+    "yaw_rate": lambda command, control: command._replace(yaw_rate=100.0),
 }
-
-
-LIMITED = {"100 m/s": "speed", "yaw 100 rad/s": "yaw_rate"}
-"""Which limit of the guard each of them meets."""
+"""Commands of 100 m/s and 100 rad/s, by the limit of the guard that they meet."""
 
 
 def _between(first: float, last: float, lie: Lie) -> Lie:
@@ -55,14 +49,13 @@ def _liar(seed: int) -> Outcome:
         outcome.same(f"{name}: flown again without the operator", len(again), 0)
         causes = " ".join(c.cause for c in flight.changes if c.state is GuardState.LAND)
         outcome.true(f"{name}: the cause is told", "impossible commands" in causes)
-    for name, lie in CLAMPED.items():
-        flight = _lied_to(seed, _between(at, at + 1.0, lie), harmless=name != "100 m/s")
+    for limit, lie in CLAMPED.items():
+        flight = _lied_to(seed, _between(at, at + 1.0, lie), harmless=limit != "speed")
         measures.safe(outcome, flight)
         refused = sum("impossible" in change.cause for change in flight.changes)
-        outcome.same(f"{name}: taken for impossible", refused, 0)
-        if limit := LIMITED.get(name):
-            outcome.least(f"{name}: clamped", flight.count(f"limited_{limit}"), 20)
-            measures.moves(outcome, flight, "world", "guard_limited_total", limit, since=at)
+        outcome.same(f"100 times {limit}: taken for impossible", refused, 0)
+        outcome.least(f"100 times {limit}: clamped", flight.count(f"limited_{limit}"), 20)
+        measures.moves(outcome, flight, "world", "guard_limited_total", limit, since=at)
     one = _lied_to(seed, _between(at, at + 0.005, LIES["NaN"]))
     measures.safe(outcome, one)
     outcome.same("a single NaN: LAND", len(measures.changes_into(one, GuardState.LAND)), 0)
@@ -71,7 +64,7 @@ def _liar(seed: int) -> Outcome:
 
 
 def _lied_to(seed: int, lie: Lie, harmless: bool = True) -> Flight:
-    """Fly with lies; one that is clamped and flown leads wherever it likes, into a pipe, too."""
+    """Fly with a lie; unless it is harmless, the robot may hit a pipe."""
     return Flight(seed=seed, honest=harmless, lies=[lie]).fly(40.0)
 
 

@@ -11,11 +11,11 @@ from cloudrc.faults.flight import Flight, blackouts
 from cloudrc.faults.scenario import Outcome, Scenario, generator
 
 THINGS = ("uplink", "downlink", "cloud", "world", "teleop")
-"""In the order in which they freeze: a direction before its sender, so that something is lost."""
+"""Order in which the things freeze: a direction before its sender, so that datagrams are lost."""
 
 
 class Span(NamedTuple):
-    """How long a thing is frozen.
+    """When a thing is frozen.
 
     Attributes:
         start: Instant of virtual time [s].
@@ -27,7 +27,7 @@ class Span(NamedTuple):
 
 
 def _spans(seed: int) -> dict[str, Span]:
-    """Freeze the things one by one, let them go in random order.
+    """Choose when the things freeze, one by one, and return, in random order.
 
     Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
     """
@@ -61,7 +61,7 @@ def _swizzle(seed: int) -> Outcome:
 
 
 def _chain(outcome: Outcome, flight: Flight, spans: dict[str, Span]) -> None:
-    """Check that the guard tells why it held, and each thing that it was frozen."""
+    """Check that the guard tells why it held, and that each thing tells that it was frozen."""
     measures.causes_told(outcome, flight)
     since, over = spans[THINGS[0]].start, max(sum(span) for span in spans.values())
     for role, *metric in (

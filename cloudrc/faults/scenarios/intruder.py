@@ -20,7 +20,7 @@ FLOOD = 100
 
 
 def _corruption(seed: int) -> Outcome:
-    """One bit in a hundred datagrams, and for a second one bit in a hundred of all."""
+    """Flip one bit in 1 % of the datagrams, and for a second 1 % of all bits."""
     outcome, at, rng = Outcome(), measures.instant(seed), generator(seed, 8)
     flight = Flight(seed=seed)
     sender = HostileSender()
@@ -69,7 +69,7 @@ def _flood(seed: int) -> Outcome:
 
 
 def _forgery(seed: int) -> Outcome:
-    """Every honest datagram is preceded by copies of it with one bit, or its counter, changed."""
+    """Send copies before each honest datagram, with a bit or the counter changed."""
 
     def forged(end: RestartableEndpoint, data: bytes, rng: Generator) -> list[bytes]:
         ahead = data[:8] + (2**63).to_bytes(8, "little") + data[16:]
@@ -91,7 +91,7 @@ def _malformed(seed: int) -> Outcome:
 
 
 def _another_version(outcome: Outcome, seed: int) -> None:
-    """A cloud of the next version is there for 2 s, then one of ours."""
+    """Let a cloud of the next version run for 2 s, then one of ours."""
     flight, newer = Flight(seed=seed), codec.VERSION + 1
 
     def tamper(data: bytes, now_ns: int) -> list[bytes]:
@@ -109,11 +109,11 @@ def _another_version(outcome: Outcome, seed: int) -> None:
 
 
 SETTLED = 2.0
-"""When the session of a new flight stands [s]; a greeting that is answered could hasten it."""
+"""Time at which a new flight has its session [s]; an answered greeting could open it earlier."""
 
 
 def _old_session(seed: int) -> Outcome:
-    """Record a whole flight; play it to a world and a cloud that have both been started anew."""
+    """Record a whole flight, and replay it to both ends after their restart."""
     captured: list[bytes] = []
     first = Flight(seed=seed, life=7)
 
@@ -136,7 +136,7 @@ def _old_session(seed: int) -> Outcome:
 
 
 def _greet_again(outcome: Outcome, seed: int, captured: list[bytes]) -> None:
-    """Play the captured greetings to both ends while these are greeting each other."""
+    """Replay the captured greetings while both ends greet each other."""
     clean, flight = Flight(seed=seed).fly(SETTLED), Flight(seed=seed)
     greetings = [data for data in captured if kind_of(data) <= codec.LAST_GREETING]
     kinds = {kind_of(data) for data in greetings}
@@ -155,7 +155,7 @@ def _greet_again(outcome: Outcome, seed: int, captured: list[bytes]) -> None:
 
 
 def _opened_at(flight: Flight) -> float:
-    """When cloud took its first session [s]."""
+    """Return when cloud got its first session [s]."""
     opened = [r.stamp_ns for r in flight.of_cloud if isinstance(r, SessionOpened)]
     return min(opened, default=nan) * 1e-9
 

@@ -13,7 +13,7 @@ from cloudrc.messages import Cause, GuardState
 
 
 def _short_silence(seed: int) -> Outcome:
-    """Both ways amid the jitter; one way without it, where every longer gap is the silence."""
+    """Cut both directions, then one of them on a link without jitter, which has no other gaps."""
     outcome, at = Outcome(), measures.instant(seed)
     cut = blackouts((at, 0.1))
     steady: Shape = lambda profile: replace(profile, jitter=0.0)  # noqa: E731
@@ -42,7 +42,7 @@ def _short_silence(seed: int) -> Outcome:
 
 
 def _gaps(flight: Flight, role: str, at: float) -> int:
-    """How many gaps above 50 ms an end has shown within 5 s of a fault that begins `at` [s]."""
+    """Return how many gaps above 50 ms an end shows within 5 s of a fault that begins `at` [s]."""
     sights = [measures.seen_by(flight, role, until) for until in (at, at + measures.SOON)]
     before, after = (measures.above(role, seen, "link_gap_seconds", 0.05)[0] for seen in sights)
     return after - before
@@ -84,7 +84,7 @@ def _silence(seed: int) -> Outcome:
 
 
 def _long_silence(seed: int) -> Outcome:
-    """Over the free floor, and anywhere on the way through the pipes."""
+    """Cut the link over the free floor, and anywhere on the way through the pipes."""
     outcome = Outcome()
     flight = _silent(outcome, seed, measures.instant(seed, 1.6, 2.6), "over the floor")
     first, last = flight.trajectory()[0].odometry, flight.trajectory()[-1].odometry
@@ -97,7 +97,7 @@ def _long_silence(seed: int) -> Outcome:
 
 
 def _silent(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
-    """Silence that begins somewhere, and lasts: the robot lands and lies, its rotors off."""
+    """Cut the link at `at` [s] for long: the robot lands and stops its rotors."""
     cut = blackouts((at, 75.0))
     flight = Flight("criteria.time_limit_s=200", seed=seed, uplink=cut, downlink=cut, separate=True)
     shown = measures.look(flight, at + 70.0)

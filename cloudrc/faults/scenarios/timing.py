@@ -14,7 +14,7 @@ from cloudrc.records import Arrival, Control
 
 HOUR_NS = 3_600_000_000_000
 AGE = "command_age_seconds"
-"""How old the command in use is, by world's own clock."""
+"""Metric of the age of the command in use, on world's clock."""
 
 
 def _disorder(seed: int) -> Outcome:
@@ -62,7 +62,7 @@ def _clocks(seed: int) -> Outcome:
 
 
 def _delay_step(seed: int) -> Outcome:
-    """With a jitter of 1 ms: of round trips that are the same bit by bit the metric shows one."""
+    """Step the delay; a jitter of 1 ms makes the round trips differ, as the metric needs."""
     outcome, at = Outcome(), measures.instant(seed)
     shape: Shape = lambda profile: replace(  # noqa: E731
         profile, delay=0.01, jitter=0.001, changes=(Change(at, delay=0.1),)
