@@ -17,6 +17,7 @@ from cloudrc.cli.teleop import EmergencyStopSender, ServedApi
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.teleop.bridge import Bridge
 from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import MissionStore, connect
 from cloudrc.teleop.wire import ALARM, encode
 
 Peers = tuple[UnixPeer, UnixPeer]
@@ -74,7 +75,8 @@ def test_a_full_socket_delays_an_emergency_stop_until_drained(
     monkeypatch.setattr("cloudrc.drivers.feed.Feed.on_stdout", lambda **how: _Feed())
     options = argparse.Namespace(socket=tmp_path, feed=False)
     served = ServedApi(bridge, None, None)  # type: ignore[arg-type]
-    teleop._fly(options, MissionService(1.0, salt=bytes(16)), served, None, lambda: True, "")
+    service = MissionService(1.0, MissionStore(connect(), b""))
+    teleop._fly(options, service, served, None, lambda: True)
     cloud.close()
     assert sum(told) == 1
 
