@@ -1,14 +1,9 @@
-"""Run `cloudrc teleop`: the process that flies missions, with its API and its stored missions.
-
-An emergency stop bypasses teleop's loop, which may be waiting for its disk: a thread repeats one
-datagram until cloud accepts it.
-"""
+"""Run `cloudrc teleop`: the process that flies missions, with its API and its stored missions."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -34,58 +29,6 @@ if TYPE_CHECKING:
     from cloudrc.teleop.server import ApiServer
     from cloudrc.teleop.service import MissionService
     from cloudrc.teleop.store import MissionStore
-
-
-REPEAT_PERIOD = 0.02
-"""Pause between two attempts to send an emergency stop [s]."""
-REPEAT_LIMIT = 2.0
-"""Time for which an emergency stop is repeated [s]. If cloud is blocked for that long, the robot
-holds."""
-
-
-class EmergencyStopSender:
-    """Send an emergency stop to cloud, from any thread, without blocking.
-
-    The socket of a blocked cloud queues eleven datagrams and refuses more. Then a thread repeats
-    the stop until cloud accepts it.
-    """
-
-    def __init__(self, send: Callable[[], bool]) -> None:
-        """Store how to send.
-
-        Args:
-            send: Sends the stop once; returns whether cloud accepted it. Must not block.
-        """
-        self._send = send
-        self._lock = threading.Lock()
-        self._deadline = 0.0
-        self._repeating = False  # whether the thread runs
-
-    def __call__(self) -> None:
-        """Send the stop, now or as soon as cloud accepts it."""
-        with self._lock:
-            if self._send():
-                self._deadline = 0.0  # ends the thread
-                return
-            self._deadline = time.monotonic() + REPEAT_LIMIT
-            if self._repeating:
-                return
-            try:
-                threading.Thread(target=self._repeat, name="alarm", daemon=True).start()
-            except RuntimeError:  # no more threads: teleop's loop repeats the stop
-                return
-            self._repeating = True
-
-    def _repeat(self) -> None:
-        while self._try_again(REPEAT_PERIOD):
-            pass
-
-    def _try_again(self, period: float) -> bool:
-        """Wait, then send again; return whether another attempt is needed."""
-        time.sleep(period)
-        with self._lock:  # `_repeating` is true only while this thread will try again
-            self._repeating = time.monotonic() < self._deadline and not self._send()
-            return self._repeating
 
 
 LOOPBACK = "127.0.0.1"
@@ -297,7 +240,7 @@ def _fly(
 ) -> None:
     """Run the service until `stop()`."""
     from cloudrc.drivers.feed import Feed
-    from cloudrc.drivers.teleop import UnixPeer, serve_teleop
+    from cloudrc.drivers.teleop import EmergencyStopSender, UnixPeer, serve_teleop
     from cloudrc.records import Fault
     from cloudrc.teleop import wire
 

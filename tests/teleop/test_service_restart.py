@@ -1,6 +1,5 @@
 """After a restart: what was known is known, and the mission in flight goes on, or has failed."""
 
-
 import pytest
 
 from cloudrc.messages import MISSION_OVER, GuardState, Request, Start
