@@ -17,11 +17,11 @@ from typing import Any
 
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
+from cloudrc.metrics.verdict import Observations
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError, busy
-from cloudrc.teleop.verdict import MissionObservations
 from cloudrc.teleop.wire import (
     Acknowledge,
     Cancel,
@@ -166,6 +166,10 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
 def _known(value: float) -> float | None:
     """Replace NaN and infinity, which JSON does not have, by None."""
     return value if isfinite(value) else None
+
+
+def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
+    return seen.pipe_contacts, seen.touch_speed, seen.slip_ns
 
 
 SETPOINT_PERIOD_NS = 100_000_000
@@ -423,7 +427,7 @@ class MissionService:
     def _note_contacts(self, mission: Mission, seen: RobotStatus, now_ns: int) -> None:
         """Store new contacts of the robot at once."""
         before = mission.witness
-        mission.witness = before.see(seen)
+        mission.witness = before.see(*_contacts(seen))
         for event, text in mission.witness.news(before, self._teleop.elapsed(now_ns)):
             self._note(mission, event, text, now_ns)
 
@@ -442,7 +446,7 @@ class MissionService:
         assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
-            changed |= {"world": seen.world, "witness": MissionObservations.begin(seen)}
+            changed |= {"world": seen.world, "witness": Observations.begin(*_contacts(seen))}
         outcome = self._teleop.outcome
         if outcome is not None and event.event == outcome.code:
             elapsed = self._teleop.elapsed(now_ns)

@@ -20,14 +20,14 @@ import sqlite3
 from collections import Counter, deque
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.messages import Start
-from cloudrc.teleop.verdict import Criteria, Failure, MissionObservations, Verdict, judge
+from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, judge
 from cloudrc.teleop.wire import Continue, Leg, Outcome, Plan, StartMission
 
 Entry: TypeAlias = dict[str, Any]
@@ -105,7 +105,7 @@ class Mission:
     reached: list[dict[str, Any]] = field(default_factory=list)
     events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=SHOWN))
     happened: Counter[str] = field(default_factory=Counter)
-    witness: MissionObservations = field(default_factory=MissionObservations)
+    witness: Observations = field(default_factory=Observations)
     verdict: dict[str, Any] | None = None
 
     @property
@@ -165,9 +165,15 @@ class Mission:
             contact_speed_max: Limit of the arm's tip speed when it touches the board [m/s].
             elapsed: Duration [s].
         """
-        criteria = Criteria(self.order.contact, contact_speed_max)
-        count = len(self.order.plan.legs)
-        return judge(outcome, self.witness, criteria, waypoints=count, elapsed=elapsed).as_json()
+        evidence = self.witness.evidence(
+            Ending(outcome.code, outcome.text),
+            elapsed,
+            waypoints=len(self.order.plan.legs),
+            reached=outcome.reached,
+            contact=self.order.contact,
+            contact_speed_max=contact_speed_max,
+        )
+        return judge(evidence).as_json()
 
     def summary(self) -> dict[str, Any]:
         """Return what a list of missions shows."""
@@ -607,7 +613,9 @@ def _row(mission: Mission) -> int:
 
 def _status(mission: Mission) -> str:
     status = {name: getattr(mission, name) for name in ("state", "world", "elapsed", "verdict")}
-    return json.dumps({**status, "happened": mission.happened, "witness": asdict(mission.witness)})
+    return json.dumps(
+        {**status, "happened": mission.happened, "witness": mission.witness.as_json()}
+    )
 
 
 def to_json(order: Order, number: int) -> str:
@@ -640,5 +648,5 @@ def from_json(
         read["number"],
         **status,
     )
-    mission.happened, mission.witness = Counter(happened), MissionObservations(**witness)
+    mission.happened, mission.witness = Counter(happened), Observations(**witness)
     return mission
