@@ -76,7 +76,11 @@ def test_a_stop_after_an_acknowledgement_holds_and_one_before_is_undone() -> Non
     ends.cloud.teleop.operate(Acknowledge(), 5 * S)
     ends.cloud.teleop.handle_deadline(5 * S)
     ends.cloud.teleop.operate(EmergencyStop(), 5 * S)
-    assert fly(ends, 7 * S)[-1] is GuardState.ESTOP
+    assert fly(ends, 6 * S)[-1] is GuardState.ESTOP
+    assert ends.cloud.teleop.settled
+    ends.cloud.teleop.operate(EmergencyStop(), 6 * S)  # of a robot that is stopped
+    assert fly(ends, 7 * S) == []
+    assert ends.cloud.teleop.settled
     ends.cloud.teleop.outputs.append(ALARM)  # late, of before
     ends.cloud.teleop.requests.ask(Request.ACKNOWLEDGE)
     assert fly(ends, 9 * S)[-1] is GuardState.GROUND
