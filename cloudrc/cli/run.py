@@ -47,7 +47,6 @@ GRACE = 30.0
 
 See = Callable[["list[Record]"], None]
 """Function that shows records of a flight during the flight."""
-EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
 
 # The most important numbers -> their labels; report.html and report.json show all numbers.
@@ -391,6 +390,8 @@ def _report(
 
 def exit_code(report: Mapping[str, Any]) -> int:
     """Give the exit code of a report's verdict."""
+    from cloudrc.metrics.verdict import EXIT_CODES
+
     return EXIT_CODES[report["verdict"]]
 
 

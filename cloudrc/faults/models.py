@@ -23,9 +23,15 @@ from cloudrc.endpoint import Endpoint
 from cloudrc.messages import NEVER_NS
 from cloudrc.records import Fault, Lateness, MissionEvent, Record
 from cloudrc.teleop import wire
-from cloudrc.teleop.journal import Entry
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import ConflictError, Mission, Order, UnavailableError
+from cloudrc.teleop.store import (
+    ConflictError,
+    Mission,
+    MissionStore,
+    Order,
+    UnavailableError,
+    connect,
+)
 from cloudrc.teleop.wire import Outcome, Output, RobotStatus
 
 FAR_NS = 1 << 62
@@ -276,7 +282,7 @@ class InProcessTeleop:
             name: Makes its mission numbers differ from those of another teleop.
         """
         self._contact_speed_max, self._name, self._starts = contact_speed_max, name, 0
-        self._disk: list[Entry] = []
+        self._disk = b""  # the bytes of its database
         self.events: list[MissionEvent] = []
         self.service: MissionService | None = None
         self._outputs: list[Output | Fault] = []
@@ -286,12 +292,16 @@ class InProcessTeleop:
         """Start a new process, which knows only what is on the disk."""
         self._starts += 1
         salt = b"%s %d" % (self._name, self._starts)  # random in production
-        self.service = MissionService(
-            self._contact_speed_max, self._disk.append, list(self._disk), salt=salt
-        )
+        self._database = connect()
+        if self._disk:
+            self._database.deserialize(self._disk)
+        self.service = MissionService(self._contact_speed_max, MissionStore(self._database, salt))
 
     def kill(self) -> None:
         """Kill the process."""
+        if self.service is not None:
+            self._disk = self._database.serialize()
+            self._database.close()
         self.service = None
         self._outputs.clear()
 

@@ -28,7 +28,7 @@ from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import SHA256
 from cloudrc.records import Arrival
 from cloudrc.report.document import Run
-from cloudrc.report.write import RECORDING_NOTE
+from cloudrc.report.write import DIFFERS, RECORDING_NOTE
 
 REPORT_BYTES_MAX = 16 << 20
 """Largest report.json that is read [bytes]; it may have many notes."""
@@ -168,7 +168,7 @@ def _describe(recording: Recording, earlier: _EarlierReport | None, sha256: str)
             mode="local" if real_time else "virtual", shaper="relay" if real_time else "virtual"
         )
     # Each report writes these notes anew.
-    anew = (METRIC_NOTE, RECORDING_NOTE)
+    anew = (METRIC_NOTE, RECORDING_NOTE, DIFFERS)
     notes = [note for note in earlier.notes if not note.startswith(anew)]
     digest: str | None = sha256
     if earlier.mode == "virtual":

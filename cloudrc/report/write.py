@@ -12,17 +12,18 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError, describe_err
 from cloudrc.files import write_atomically
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import Flight, Number, measure_all
+from cloudrc.metrics.verdict import Verdict, flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import (
     Run,
-    Verdict,
     clock_offset_document,
     environment_document,
-    judge,
     report_document,
     write_json,
 )
 
+DIFFERS = "By what telemetry had shown when the mission ended, the operator's verdict is "
+"""Beginning of the note on an operator's verdict that differs."""
 RECORDING_NOTE = "The recording "
 """Begin of the notes about a recording, which each report writes anew."""
 
@@ -71,16 +72,23 @@ def assess(
     flight = Flight(recording, experiment.criteria, waypoints, scene)
     numbers, metric_notes = measure_all(flight, own)
     torn = not recording.complete
-    verdict = judge(
+    evidence = flight_evidence(
         flight,
         numbers,
         real_time=run.mode != "virtual",
         interrupted=run.interrupted or torn,
     )
+    verdict, operator = judge(evidence), None
+    if flight.ending is not None:
+        operator = operator_verdict(flight, evidence, numbers)
+    if operator is not None and operator.outcome == verdict.outcome:
+        operator = None
     incomplete = (f"{RECORDING_NOTE}is incomplete: {recording.note}.",) if torn else ()
     remarks = tuple(f"{RECORDING_NOTE}{remark}." for remark in recording.remarks)
     faults = tuple(f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text)
-    notes = tuple(dict.fromkeys((*run.notes, *incomplete, *remarks, *faults, *metric_notes)))
+    differs = () if operator is None else (f"{DIFFERS}{operator.outcome}. This report's counts.",)
+    notes = (*run.notes, *incomplete, *remarks, *faults, *differs, *metric_notes)
+    notes = tuple(dict.fromkeys(notes))
     document = report_document(
         run,
         experiment,
@@ -89,6 +97,7 @@ def assess(
         notes,
         clock_offset=clock_offset_document(recording.metadata),
         complete=not torn,
+        operator=operator,
     )
     return Assessment(run, experiment, flight, numbers, verdict, notes, document)
 

@@ -3,16 +3,19 @@
 `Teleop` is a pure state machine (`State`) that exchanges only messages with controller and robot:
 
     teleop.see(seen, now_ns)            for every new telemetry
-    teleop.operate(verb, now_ns)        for every verb of the operator
+    teleop.start(now_ns, plan), ...     for every verb of the operator
     teleop.handle_deadline(now_ns)      regularly, at 10 Hz or faster
     teleop.take_outputs()               after each of them: Setpoint, OperatorRequest, MissionEvent
 
 A `Setpoint` is valid until the next one, within its session. An `OperatorRequest` is repeated at
 10 Hz until telemetry shows that the robot has acted on it. Each `MissionEvent` is sent once.
 
-              StartMission             start seen             every waypoint reached
+An emergency stop is the request `ALARM`, without a number: cloud numbers and repeats it. Teleop
+tells cloud so, also at 10 Hz and before everything else, until telemetry shows the stop.
+
+              start                    start seen             every waypoint reached
         IDLE -------------> STARTING -------------> FLYING --------------------------> DONE
-    (or any end)                                Hold | ^ Resume
+    (or any end)                                hold | ^ resume
                                                      v |
                                                      HELD
 
@@ -37,25 +40,17 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
 from cloudrc.messages import MISSION_OVER, NEVER_NS, GuardState, Request, Setpoint, Start, Vector
 from cloudrc.records import MissionEvent
-from cloudrc.teleop.requests import RequestSender
+from cloudrc.teleop.requests import REPEAT_NS, RequestSender
 from cloudrc.teleop.wire import (
+    ALARM,
     NO_PLAN,
-    Acknowledge,
-    Cancel,
     Continue,
-    EmergencyStop,
-    GoTo,
-    Hold,
     Leg,
     Outcome,
     Output,
-    Pause,
     Plan,
-    Resume,
     RobotStatus,
-    StartMission,
     State,
-    Verb,
 )
 
 WORST_GUARD = GuardState.HOLD
@@ -74,75 +69,23 @@ ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
 END_LOST = "end_lost", "the robot reports that the mission is over, but its outcome is lost;"
 INACTIVE = tuple(state for state in State if state not in UNDER_WAY)
 
-_RULES: dict[type[Verb], tuple[str, tuple[State, ...], str]] = {
-    StartMission: ("start", INACTIVE, "cancel it first"),
-    Continue: ("continue", (State.IDLE,), "teleop has already flown a mission"),
-    Hold: ("hold", (State.FLYING,), "it must be flying"),
-    Resume: ("resume", (State.HELD,), "it must be held"),
-    Cancel: ("cancel", UNDER_WAY, "no mission is under way"),
-    GoTo: ("goto", (State.HELD, *INACTIVE), "hold or cancel it first"),
-    Acknowledge: ("acknowledge", INACTIVE, "the robot flies a mission"),
-    Pause: ("pause", UNDER_WAY, "no mission is under way"),
+_RULES: dict[str, tuple[tuple[State, ...], str]] = {
+    "start": (INACTIVE, "cancel it first"),
+    "continue": ((State.IDLE,), "teleop has already flown a mission"),
+    "hold": ((State.FLYING,), "it must be flying"),
+    "resume": ((State.HELD,), "it must be held"),
+    "cancel": (UNDER_WAY, "no mission is under way"),
+    "goto": ((State.HELD, *INACTIVE), "hold or cancel it first"),
+    "acknowledge": (INACTIVE, "the robot flies a mission"),
+    "pause": (UNDER_WAY, "no mission is under way"),
 }
-"""Name of each verb, the states that allow it, and the reason for a refusal in the others; an
-emergency stop is always allowed."""
-
-
-def check_state(verb: Verb, state: State) -> None:
-    """Check that the state of the mission allows a verb.
-
-    Raises:
-        BadInputError: If it does not.
-    """
-    name, allowed, why = _RULES.get(type(verb), ("", (state,), ""))
-    if state not in allowed:
-        raise BadInputError(f"{name}: the mission is {state.name}; {why}")
-
-
-def make_hold_setpoint(seen: RobotStatus, last: Setpoint | None) -> Setpoint:
-    """Make a setpoint at the robot's position, with the yaw of the last setpoint."""
-    x, y, z = seen.position
-    yaw = 0.0 if last is None else last.yaw
-    return Setpoint((x, y, max(z, HELD_LOWEST)), yaw, NO_WAYPOINT)
+"""For each verb the states that allow it, and the reason for a refusal in the others; an emergency
+stop is always allowed."""
 
 
 def reached_on_board(seen: RobotStatus, mission_id: int) -> int:
     """Return how many waypoints of a mission the robot has stored as reached."""
     return seen.reached if seen.mission_id == mission_id != 0 else 0
-
-
-def is_over(seen: RobotStatus, mission_id: int, over: int) -> bool:
-    """Whether the robot has stored that a mission is over: at least `over` waypoints reached."""
-    return reached_on_board(seen, mission_id) >= over
-
-
-def may_take_off(seen: RobotStatus) -> bool:
-    """Whether the robot stands on the ground and has a mission, for which it may take off."""
-    return seen.guard is GuardState.GROUND and seen.mission_id != 0
-
-
-def find_failure(
-    seen: RobotStatus, mission_id: int, world: str, expected: tuple[int, ...], over: int
-) -> tuple[str, str] | None:
-    """Return code and text of a failure that telemetry shows and that ends the mission, if any.
-
-    Args:
-        seen: The newest telemetry.
-        mission_id: Number of the mission.
-        world: World in which it was started, or `ANY_WORLD`.
-        expected: Missions that may be on board: this one, and before its start the one that a
-            mission from here has found there; empty if it may be any.
-        over: See `is_over`.
-    """
-    if world not in (ANY_WORLD, seen.world):
-        return "world_restarted", "world restarted"
-    if expected and seen.mission_id not in expected:
-        return "taken_over", "somebody else has started another mission"
-    if is_over(seen, mission_id, over):
-        return END_LOST
-    if seen.guard > WORST_GUARD:
-        return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
-    return None
 
 
 class SetpointSelector:
@@ -241,7 +184,9 @@ class SetpointSelector:
     def select_here(self) -> None:
         """Select the robot's position, if telemetry has arrived."""
         if self._seen is not None:
-            self._select(make_hold_setpoint(self._seen, self.setpoint))
+            x, y, z = self._seen.position
+            yaw = 0.0 if self.setpoint is None else self.setpoint.yaw
+            self.select_point((x, y, max(z, HELD_LOWEST)), yaw)
 
     def stay(self) -> None:
         """Select the robot's position and ignore all waypoints from now on."""
@@ -312,34 +257,6 @@ class LegWatch:
         return now_ns - self._near_since_ns >= leg.dwell * 1e9
 
 
-def name_leg(plan: Plan, leg: int) -> str:
-    """Name the waypoint of a leg in words."""
-    return f"waypoint {leg + 1} of {len(plan.legs)}"
-
-
-def find_timeout(
-    plan: Plan, leg: int, state: State, elapsed: float, flown: float
-) -> tuple[str, str] | None:
-    """Return code and text of an exceeded time limit, if any.
-
-    Args:
-        plan: Plan of the mission.
-        leg: Index of the current waypoint.
-        state: State of the mission, which is under way.
-        elapsed: Time since the mission began [s]; before the robot starts, since it was asked for.
-        flown: Time for which the leg has been flown [s].
-    """
-    limit, leg_limit = plan.time_limit, plan.legs[leg].time_limit
-    if elapsed >= limit and state is State.STARTING:
-        return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
-    if elapsed >= limit:
-        text = f"mission not done within {limit:g} s: on the way to {name_leg(plan, leg)}"
-        return "timed_out", text
-    if flown >= leg_limit and state is State.FLYING:
-        return "leg_timed_out", f"{name_leg(plan, leg)} not reached in {leg_limit:g} s"
-    return None
-
-
 # Looking up an enum's member is slow, and these are used in every period.
 FLYING, STARTING = State.FLYING, State.STARTING
 
@@ -352,6 +269,7 @@ class Teleop:
         leg: Index of the current waypoint; the number of waypoints once all are reached.
         outcome: How the mission ended; None while there is none or it is under way.
         requests: Requests to the robot.
+        stopping: Whether an emergency stop is pending: telemetry does not show it yet.
         outputs: Messages since the last `take_outputs`.
     """
 
@@ -360,6 +278,9 @@ class Teleop:
         self.state = State.IDLE
         self.outcome: Outcome | None = None
         self.requests = RequestSender()
+        self.stopping = False
+        self._stop_ns = 0
+        self._stopped_before: tuple[int, int] | None = None  # see `stop`
         self.outputs: list[Output] = []
         self.leg = 0
         self._is_ended = ended
@@ -380,7 +301,7 @@ class Teleop:
     @property
     def settled(self) -> bool:
         """Whether telemetry shows that the robot has acted on the last request."""
-        return self.requests.settled
+        return self.requests.settled and not self.stopping
 
     def elapsed(self, now_ns: int) -> float:
         """Return the time since the mission began [s]."""
@@ -391,44 +312,121 @@ class Teleop:
         outputs, self.outputs = self.outputs, []
         return outputs
 
-    def operate(self, verb: Verb, now_ns: int) -> None:
-        """Carry out a verb of the operator.
+    # The operator's verbs: each raises a BadInputError, and changes nothing, if the state of the
+    # mission does not allow it.
 
-        GoTo is a mission of one waypoint that starts from here. While a mission is held, GoTo moves
-        only the point where it is held, and Resume continues the leg as before.
+    def start(self, now_ns: int, plan: Plan, mission_id: int = 0, *, again: bool = False) -> None:
+        """Fly a plan.
 
-        Raises:
-            BadInputError: If the state does not allow the verb or a value is invalid; nothing
-                changes then.
+        Args:
+            now_ns: Own clock [ns].
+            plan: Plan of the mission.
+            mission_id: Number under which the robot stores the progress; 0 to store none.
+            again: Whether an earlier teleop may have flown it; if it is over, it is not flown
+                again.
         """
-        check_state(verb, self.state)
-        match verb:
-            case StartMission(plan, mission_id, again):
-                self._start(plan, mission_id, now_ns, again=again)
-            case Continue():
-                self._continue(verb, now_ns)
-            case Hold():
-                self._hold(now_ns)
-            case Resume():
-                self._resume(now_ns)
-            case Cancel():
-                self._end("cancelled", "mission cancelled", now_ns)
-            case GoTo(position, yaw, mission_id):
-                self._go_to(Leg(position, yaw), mission_id, now_ns)
-            case EmergencyStop():
-                if self.state in UNDER_WAY:
-                    self._end("emergency_stopped", f"emergency stop {self._where()}", now_ns)
-                self.requests.ask(Request.ESTOP)
-            case Acknowledge():
-                self.requests.ask(Request.ACKNOWLEDGE, after=True)
-            case Pause():
-                self._report("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
-                self.requests.ask(Request.END)
-                self._setpoints.stay()  # cloud keeps this setpoint if the request is lost
+        self._check("start")
+        self._order(plan, mission_id, now_ns)
+        # A mission from here keeps the waypoints that were reached.
+        self._may_be_flown = again and plan.start is Start.SPAWN
+        here = None if plan.start is Start.SPAWN else self._seen
+        self._world = here.world if here else ANY_WORLD
+        self._expected = (here.mission_id, mission_id) if here else ()
+        if self._seen and again and reached_on_board(self._seen, mission_id) >= self._over:
+            code, text = END_LOST
+            self._end(code, f"{text} {self._where()}", now_ns)
+            return
+        self.requests.report(mission_id, 0)
+        self.requests.ask(Request.START, plan.start, after=True)
+        self._setpoints.begin(plan, mission_id)
+        self._setpoints.select_early(0)
+
+    def continue_mission(self, now_ns: int, before: Continue) -> None:
+        """Continue a mission of an earlier teleop from here, with its current waypoint."""
+        self._check("continue")
+        self._order(before.plan, before.mission_id, now_ns - round(before.elapsed * 1e9))
+        self.leg, self._continued, self._world = before.leg, before, before.world
+        self._expected = (before.mission_id,)
+        self.requests.report(self._mission_id, self.leg)
+        self.requests.ask(Request.START, Start.HERE)
+        self._setpoints.begin(before.plan, before.mission_id, before)
+        if self._seen:
+            self.see(self._seen, now_ns)  # the mission may be over, or the world another one
+
+    def go_to(self, now_ns: int, position: Vector, yaw: float = 0.0, mission_id: int = 0) -> None:
+        """Fly to a point: as a mission of one waypoint from here, or as another place to hold.
+
+        Args:
+            now_ns: Own clock [ns].
+            position: The point [m], world frame, shape (3,).
+            yaw: Heading to hold [rad].
+            mission_id: See `start`.
+        """
+        self._check("goto")
+        leg, (x, y, z) = Leg(position, yaw), position
+        self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
+        if self.state is State.HELD:
+            self._setpoints.select_point(position, yaw)
+        else:
+            self.start(now_ns, Plan((leg,), Start.HERE, leg.time_limit), mission_id)
+
+    def hold(self, now_ns: int) -> None:
+        """Stop the robot where it is and wait, at `now_ns` [ns]."""
+        self._check("hold")
+        self._hold(now_ns)
+
+    def resume(self, now_ns: int) -> None:
+        """Continue the held leg, at `now_ns` [ns]."""
+        self._check("resume")
+        self.state = State.FLYING
+        self._watch.pause()
+        self._setpoints.select_leg(self.leg)
+        self._report("resumed", self.leg, f"resumed {self._where()}", now_ns)
+
+    def cancel(self, now_ns: int) -> None:
+        """End the mission, at `now_ns` [ns]."""
+        self._check("cancel")
+        self._end("cancelled", "mission cancelled", now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        """Stop the rotors at once; what was asked of the robot before does not count any more.
+
+        A robot that is stopped already may be about to act on an acknowledgement. Then its state
+        alone is not enough, and telemetry has to show a new request.
+
+        Args:
+            now_ns: Own clock [ns].
+        """
+        if self.state in UNDER_WAY:
+            self._end("emergency_stopped", f"emergency stop {self._where()}", now_ns)
+        self.requests.forget()
+        seen = self._seen
+        stopped = seen is not None and seen.guard is GuardState.ESTOP
+        self._stopped_before = (seen.epoch, seen.mission) if seen and stopped else None
+        self.stopping, self._stop_ns = True, 0
+
+    def acknowledge(self, now_ns: int) -> None:
+        """Let a robot fly again that has landed or was stopped, at `now_ns` [ns]."""
+        self._check("acknowledge")
+        self.requests.ask(Request.ACKNOWLEDGE, after=True)
+
+    def pause(self, now_ns: int) -> None:
+        """Let the robot hold, at `now_ns` [ns], until the next teleop continues the mission."""
+        self._check("pause")
+        self._report("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
+        self.requests.ask(Request.END)
+        self._setpoints.stay()  # cloud keeps this setpoint if the request is lost
+
+    def _check(self, verb: str) -> None:
+        allowed, why = _RULES[verb]
+        if self.state not in allowed:
+            raise BadInputError(f"{verb}: the mission is {self.state.name}; {why}")
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry at its arrival `now_ns` [ns]."""
         before, self._seen = self._seen, seen
+        if seen.guard is GuardState.ESTOP and (seen.epoch, seen.mission) != self._stopped_before:
+            self.stopping = False
         new_session = self._setpoints.see(seen)
         last = self._setpoints.setpoint
         onboard, legs = reached_on_board(seen, self._mission_id), self._plan.legs
@@ -439,9 +437,7 @@ class Teleop:
         if self.state not in UNDER_WAY:
             if new_session or (before and before.mission_id != seen.mission_id):
                 self._stop_foreign_mission(seen)
-        elif failure := find_failure(
-            seen, self._mission_id, self._world, self._expected, self._over
-        ):
+        elif failure := self._find_failure(seen):
             code, text = failure
             self._end(code, f"{text} {self._where()}", now_ns)
         elif started:
@@ -460,59 +456,52 @@ class Teleop:
 
     def handle_deadline(self, now_ns: int) -> None:
         """Check the time limits and repeat the request that is due at `now_ns` [ns]."""
-        if self.state in UNDER_WAY:
-            elapsed, flown = self.elapsed(now_ns), self._watch.flown
-            if timeout := find_timeout(self._plan, self.leg, self.state, elapsed, flown):
-                self._end(*timeout, now_ns)
-        if (request := self.requests.due(now_ns)) is not None:
+        if self.state in UNDER_WAY and (timeout := self._find_timeout(now_ns)):
+            self._end(*timeout, now_ns)
+        if self.stopping:
+            if now_ns >= self._stop_ns:
+                self._stop_ns = now_ns + REPEAT_NS
+                self.outputs.append(ALARM)
+        elif (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
+
+    def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
+        """Return code and text of a failure that telemetry shows and that ends the mission."""
+        if self._world not in (ANY_WORLD, seen.world):
+            return "world_restarted", "world restarted"
+        if self._expected and seen.mission_id not in self._expected:
+            return "taken_over", "somebody else has started another mission"
+        if reached_on_board(seen, self._mission_id) >= self._over:
+            return END_LOST
+        if seen.guard > WORST_GUARD:
+            return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
+        return None
+
+    def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
+        """Return code and text of an exceeded time limit, if any."""
+        limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
+        if self.elapsed(now_ns) >= limit and self.state is STARTING:
+            return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
+        if self.elapsed(now_ns) >= limit:
+            return "timed_out", f"mission not done within {limit:g} s: {self._where()}"
+        if self._watch.flown >= leg_limit and self.state is FLYING:
+            return "leg_timed_out", f"{self._leg_name()} not reached in {leg_limit:g} s"
+        return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
         """Hold a robot that flies without a mission here, and keep a standing one on the ground."""
         mission_id = seen.mission_id
-        over = self._is_ended(mission_id) or may_take_off(seen)
-        if mission_id != self._mission_id and over and not self.requests.stopping:
+        may_take_off = seen.guard is GROUND and mission_id != 0
+        over = self._is_ended(mission_id) or may_take_off
+        if mission_id != self._mission_id and over and not self.stopping:
             self.requests.ask(Request.END, after=True)
         self._setpoints.select_here()
 
-    def _start(self, plan: Plan, mission_id: int, now_ns: int, *, again: bool = False) -> None:
-        self.state = STARTING
-        self.outcome = None
-        self.leg = 0
-        self._plan = plan
-        self._mission_id = mission_id
-        self._continued = None
-        # A mission from here keeps the waypoints that were reached.
-        self._may_be_flown = again and plan.start is Start.SPAWN
-        self._began_ns = now_ns
-        here = None if plan.start is Start.SPAWN else self._seen
-        self._world = here.world if here else ANY_WORLD
-        self._expected = (here.mission_id, mission_id) if here else ()
-        if self._seen and again and is_over(self._seen, mission_id, self._over):
-            code, text = END_LOST
-            self._end(code, f"{text} {self._where()}", now_ns)
-            return
-        self.requests.report(mission_id, 0)
-        self.requests.ask(Request.START, plan.start, after=True)
-        self._setpoints.begin(plan, mission_id)
-        self._setpoints.select_early(0)
-
-    def _continue(self, before: Continue, now_ns: int) -> None:
-        """Start from here again, with the waypoint that was the current one."""
-        self.state = STARTING
-        self.outcome = None
-        self.leg = before.leg
-        self._plan = before.plan
-        self._mission_id = before.mission_id
-        self._continued = before
-        self._began_ns = now_ns - round(before.elapsed * 1e9)
-        self._world = before.world
-        self._expected = (before.mission_id,)
-        self.requests.report(self._mission_id, self.leg)
-        self.requests.ask(Request.START, Start.HERE)
-        self._setpoints.begin(before.plan, before.mission_id, before)
-        if self._seen:
-            self.see(self._seen, now_ns)  # the mission may be over, or the world another one
+    def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
+        """Note a mission that begins: its plan, its number, and since when its time counts."""
+        self.state, self.outcome, self.leg = STARTING, None, 0
+        self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
+        self._continued, self._may_be_flown = None, False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission after telemetry shows its start: start its clock and the leg's."""
@@ -536,7 +525,7 @@ class Teleop:
 
     def _advance(self, how: str, now_ns: int, *, select: bool = True) -> None:
         """Go on to the next waypoint or end the mission; `select` tells whether to select it."""
-        text = f"{name_leg(self._plan, self.leg)} {how} at {self.elapsed(now_ns):.2f} s"
+        text = f"{self._leg_name()} {how} at {self.elapsed(now_ns):.2f} s"
         self._report("reached", self.leg, text, now_ns)
         self.leg += 1
         self.requests.report(self._mission_id, self.leg)
@@ -551,20 +540,6 @@ class Teleop:
         self.state = State.HELD
         self._setpoints.select_here()
         self._report("held", self.leg, f"held {self._where()}", now_ns)
-
-    def _resume(self, now_ns: int) -> None:
-        self.state = State.FLYING
-        self._watch.pause()
-        self._setpoints.select_leg(self.leg)
-        self._report("resumed", self.leg, f"resumed {self._where()}", now_ns)
-
-    def _go_to(self, leg: Leg, mission_id: int, now_ns: int) -> None:
-        x, y, z = leg.position
-        self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
-        if self.state is State.HELD:
-            self._setpoints.select_point(leg.position, leg.yaw)
-        else:
-            self._start(Plan((leg,), Start.HERE, leg.time_limit), mission_id, now_ns)
 
     def _end(self, code: str, text: str, now_ns: int) -> None:
         """End the mission, and ask the robot to hold where it is."""
@@ -591,4 +566,7 @@ class Teleop:
         self.outputs.append(MissionEvent(now_ns, event, waypoint, text))
 
     def _where(self) -> str:
-        return f"on the way to {name_leg(self._plan, self.leg)}"
+        return f"on the way to {self._leg_name()}"
+
+    def _leg_name(self) -> str:
+        return f"waypoint {self.leg + 1} of {len(self._plan.legs)}"

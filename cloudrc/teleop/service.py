@@ -12,79 +12,19 @@ the robot has flown another mission since or is another one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from collections.abc import Callable
+from functools import partial
 from math import isfinite
 from typing import Any
 
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
+from cloudrc.metrics.verdict import Ending, Observations, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
-from cloudrc.teleop.journal import Entry
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError, busy
-from cloudrc.teleop.verdict import MissionObservations
-from cloudrc.teleop.wire import (
-    Acknowledge,
-    Cancel,
-    Continue,
-    EmergencyStop,
-    GoTo,
-    Hold,
-    Leg,
-    Output,
-    Pause,
-    Plan,
-    Resume,
-    RobotStatus,
-    StartMission,
-    Verb,
-)
-
-
-class PersistentStop:
-    """Send the emergency stop, also after a restart of teleop, until it is acknowledged."""
-
-    def __init__(self, book: MissionStore, teleop: Teleop) -> None:
-        """Send a stop again that an earlier teleop has sent."""
-        self._book, self._teleop = book, teleop
-        self._is_released = False
-        self._is_inherited = book.stopped() is not None  # until this process is asked for a stop
-        if self._is_inherited:
-            teleop.operate(EmergencyStop(), 0)
-
-    @property
-    def is_asked(self) -> bool:
-        """Whether a stop is pending: telemetry does not show it yet."""
-        return self._teleop.requests.stopping
-
-    def ask(self, now_ns: int) -> None:
-        """Stop the rotors at once, at `now_ns` [ns]."""
-        self._is_released = self._is_inherited = False
-        self._teleop.operate(EmergencyStop(), now_ns)
-
-    def release(self, now_ns: int) -> None:
-        """Acknowledge the stop; the robot is told after it has stopped."""
-        self._teleop.operate(Acknowledge(), now_ns)
-        self._is_released = True
-
-    def check_first(self, seen: RobotStatus) -> None:
-        """Check the first telemetry: withdraw a stop that was meant for another robot or mission.
-
-        Call it before teleop gets the telemetry.
-        """
-        stopped = self._book.stopped()
-        if self._is_inherited and stopped is not None and seen.mission_id != stopped.number:
-            self._teleop.requests.withdraw_stop()
-
-    def released(self) -> Mission | None:
-        """Return the stopped mission once, when the robot has acted on the acknowledgement."""
-        if not self._is_released or not self._teleop.settled:
-            return None
-        self._is_released = False
-        return self._book.stopped()
-
+from cloudrc.teleop.wire import Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED = (LAND, ESTOP)
@@ -215,6 +155,18 @@ def _known(value: float) -> float | None:
     return value if isfinite(value) else None
 
 
+def describe_session(mission: Mission) -> str:
+    """Describe that the controller has another session with the same robot."""
+    where = f"waypoint {mission.waypoint + 1} of {len(mission.order.plan.legs)}"
+    is_held = mission.state == store.HELD
+    goes_on = f"is held on the way to {where}" if is_held else f"goes on to {where}"
+    return f"the controller has a new session, as after a restart; the mission {goes_on}"
+
+
+def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
+    return seen.pipe_contacts, seen.touch_speed, seen.slip_ns
+
+
 SETPOINT_PERIOD_NS = 100_000_000
 """Time between two copies of the setpoint [ns]; copies let either process restart."""
 
@@ -227,21 +179,12 @@ class MissionService:
         book: The missions.
     """
 
-    def __init__(
-        self,
-        contact_speed_max: float,
-        write: Callable[[Entry], None] = lambda entry: None,
-        entries: Iterable[Entry] = (),
-        *,
-        salt: bytes,
-    ) -> None:
-        """Load the earlier missions; nothing flies before the first deadline.
+    def __init__(self, contact_speed_max: float, book: MissionStore) -> None:
+        """Begin with the missions of a store; nothing flies before the first deadline.
 
         Args:
             contact_speed_max: Speed limit for the arm's tip when it touches the board [m/s].
-            write: Stores an entry; raises OSError on failure.
-            entries: Entries stored earlier, oldest first.
-            salt: Random bytes that make mission numbers differ from those of another journal.
+            book: Missions of this teleop and of earlier ones.
         """
         self._contact_speed_max = contact_speed_max
         self._outputs: list[Output | Fault] = []
@@ -250,9 +193,11 @@ class MissionService:
         self._setpoint_ns = 0
         self._current: Mission | None = None
         self._ends = False  # whether this process ends; the next one starts the queued missions
-        self.book = MissionStore(write, entries, salt)
+        self.book = book
         self._teleop = Teleop(self.book.has_ended)
-        self._stop = PersistentStop(self.book, self._teleop)
+        # Whether an earlier teleop has sent a stop; until this process is asked for one.
+        self._inherits_stop = book.stopped() is not None
+        self._acknowledges = False  # whether the robot has still to act on an acknowledgement
 
     @property
     def over(self) -> bool:
@@ -266,12 +211,15 @@ class MissionService:
             The mission, and whether it is new: the same key gives the same mission.
 
         Raises:
-            ConflictError: If another mission is under way and the order may not wait, the queue is
-                full, or the operator has to acknowledge first.
+            ConflictError: If the key belongs to another order, another mission is under way and
+                the order may not wait, the queue is full, or the operator has to acknowledge first.
             UnavailableError: If the mission cannot be stored, or this process ends.
         """
         known = self.book.with_key(order.key)
         if known is not None:
+            if (known.order.plan, known.order.contact) != (order.plan, order.contact):
+                text = f"the key '{order.key}' is that of mission {known.id}, with another plan"
+                raise ConflictError(f"{text}; take a new key", known.id)
             return known, False
         waiting = self.book.waits_for(order)
         self._check_can_fly()
@@ -279,7 +227,9 @@ class MissionService:
         if waiting:
             self._note(mission, "queued", f"mission waits for {waiting[-1].id}", now_ns)
         else:
-            self._launch(mission, StartMission(order.plan, mission.number), now_ns)
+            self._current = mission
+            self._teleop.start(now_ns, order.plan, mission.number)
+            self._note_start(mission, now_ns)
         return mission, True
 
     def cancel(self, mission_id: str, now_ns: int) -> Mission:
@@ -292,7 +242,7 @@ class MissionService:
         """
         mission = self.book.find(mission_id)
         if not mission.ended and mission is self._start_next(now_ns):
-            return self._operate(Cancel(), now_ns)
+            return self._operate(self._teleop.cancel, now_ns)
         if mission.ended:  # also if it has just failed, because world restarted
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         self.book.cancel(mission)
@@ -300,7 +250,7 @@ class MissionService:
 
     def hold(self, now_ns: int) -> Mission:
         """Stop the robot where it is; raises ConflictError unless it flies a mission."""
-        return self._operate(Hold(), now_ns)
+        return self._operate(self._teleop.hold, now_ns)
 
     def resume(self, now_ns: int) -> Mission:
         """Continue the held mission.
@@ -310,7 +260,7 @@ class MissionService:
             UnavailableError: If this process ends.
         """
         self._check_can_fly()
-        return self._operate(Resume(), now_ns)
+        return self._operate(self._teleop.resume, now_ns)
 
     def go_to(self, position: Vector, yaw: float, now_ns: int) -> Mission:
         """Fly to a point: as a new mission, or as another place to hold the current one.
@@ -330,16 +280,19 @@ class MissionService:
         if waiting and waiting[0].state != store.HELD:
             raise busy(waiting[0], "hold or cancel it first")
         if waiting:
-            return self._operate(GoTo(position, yaw), now_ns)
+            return self._operate(partial(self._teleop.go_to, position=position, yaw=yaw), now_ns)
         leg = Leg(position, yaw)
         mission = self.book.add(Order(Plan((leg,), Start.HERE, leg.time_limit), "goto"))
-        self._launch(mission, GoTo(position, yaw, mission.number), now_ns)
+        self._current = mission
+        self._teleop.go_to(now_ns, position, yaw, mission.number)
+        self._note_start(mission, now_ns)
         return mission
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state, and return the mission that failed, if any."""
         mission = self._start_next(now_ns)
-        self._stop.ask(now_ns)
+        self._inherits_stop = self._acknowledges = False
+        self._teleop.stop(now_ns)
         self._collect(now_ns)
         return mission
 
@@ -347,14 +300,15 @@ class MissionService:
         """Let a robot fly again that has landed or was stopped; ConflictError in a mission."""
         if self._current is not None:
             raise busy(self._current, "there is nothing to acknowledge")
-        self._stop.release(now_ns)
+        self._teleop.acknowledge(now_ns)
+        self._acknowledges = True
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
         """Hold the mission under way before this process ends; the next process continues it."""
         self._ends = True
         if self._start_next(now_ns) is not None:
-            self._operate(Pause(), now_ns)
+            self._operate(self._teleop.pause, now_ns)
 
     @property
     def settled(self) -> bool:
@@ -368,17 +322,32 @@ class MissionService:
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry at `now_ns` [ns]."""
         mission = self._current
-        if self.sight.seen is None:
-            self._stop.check_first(seen)
+        if self._inherits_stop:
+            self._repeat_stop(seen, now_ns)
         is_new_session = self.sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
             self._note_contacts(mission, seen, now_ns)
             if is_new_session:
-                self._note(mission, "new_session", mission.in_new_session(), now_ns)
+                self._note(mission, "new_session", describe_session(mission), now_ns)
         self._teleop.see(seen, now_ns)
-        if (stopped := self._stop.released()) is not None:
-            self._note(stopped, "acknowledged", "the operator has acknowledged the stop", now_ns)
+        if self._acknowledges and self._teleop.settled:
+            self._acknowledges = False
+            if (stopped := self.book.stopped()) is not None:
+                text = "the operator has acknowledged the stop"
+                self._note(stopped, "acknowledged", text, now_ns)
         self._collect(now_ns)
+
+    def _repeat_stop(self, seen: RobotStatus, now_ns: int) -> None:
+        """Repeat the stop of an earlier teleop, unless the first telemetry is of another mission.
+
+        It is not, if the robot has flown since, or is another one.
+        """
+        self._inherits_stop = False
+        stopped = self.book.stopped()
+        if stopped is not None and seen.mission_id == stopped.number:
+            self._teleop.stop(now_ns)
+            if self._acknowledges:  # meanwhile
+                self._teleop.acknowledge(now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
         """Start a waiting mission, check time limits, and repeat what is due at `now_ns` [ns]."""
@@ -410,7 +379,7 @@ class MissionService:
     @property
     def _blocked(self) -> str:
         """Why nothing can fly before the operator acknowledges it; "" if it can."""
-        if self._stop.is_asked:
+        if self._teleop.stopping or self._inherits_stop:
             return "an emergency stop is on its way to the robot"
         return self.sight.latched
 
@@ -422,12 +391,12 @@ class MissionService:
                 f"{self._blocked}; find the cause, then: cloudrc mission acknowledge"
             )
 
-    def _operate(self, verb: Verb, now_ns: int) -> Mission:
+    def _operate(self, verb: Callable[[int], None], now_ns: int) -> Mission:
         mission = self._current
         if mission is None:
             raise ConflictError("no mission is under way")
         try:
-            self._teleop.operate(verb, now_ns)
+            verb(now_ns)
         except BadInputError as error:
             raise ConflictError(str(error), mission.id) from None
         self._collect(now_ns)
@@ -440,24 +409,29 @@ class MissionService:
             if queued and waiting[0].state == store.QUEUED:
                 self.book.begin(waiting[0], now_ns)
             if waiting[0].state != store.QUEUED:
-                self._launch(waiting[0], store.first_verb(waiting[0]), now_ns)
+                self._take_over(waiting[0], now_ns)
         return self._current
 
-    def _launch(self, mission: Mission, verb: Verb, now_ns: int) -> None:
-        self._current = mission
-        self._teleop.operate(verb, now_ns)
-        if isinstance(verb, Continue):
+    def _take_over(self, mission: Mission, now_ns: int) -> None:
+        """Fly a mission that this or an earlier teleop has begun."""
+        self._current, before = mission, mission.before()
+        if before is None:
+            self._teleop.start(now_ns, mission.order.plan, mission.number, again=True)
+        else:
+            self._teleop.continue_mission(now_ns, before)
             mission.witness = mission.witness.after_restart()
             text = "teleop has restarted; the robot is asked to go on"
             self._note(mission, "restarted", text, now_ns)
-        elif mission.state == store.QUEUED:
-            self._note(mission, "starting", "the robot is asked to start", now_ns)
+        self._collect(now_ns)
+
+    def _note_start(self, mission: Mission, now_ns: int) -> None:
+        self._note(mission, "starting", "the robot is asked to start", now_ns)
         self._collect(now_ns)
 
     def _note_contacts(self, mission: Mission, seen: RobotStatus, now_ns: int) -> None:
         """Store new contacts of the robot at once."""
         before = mission.witness
-        mission.witness = before.see(seen)
+        mission.witness = before.see(*_contacts(seen))
         for event, text in mission.witness.news(before, self._teleop.elapsed(now_ns)):
             self._note(mission, event, text, now_ns)
 
@@ -476,16 +450,23 @@ class MissionService:
         assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
-            changed |= {"world": seen.world, "witness": asdict(MissionObservations.begin(seen))}
+            changed |= {"world": seen.world, "witness": Observations.begin(*_contacts(seen))}
         outcome = self._teleop.outcome
         if outcome is not None and event.event == outcome.code:
-            elapsed = self._teleop.elapsed(now_ns)
-            changed["verdict"] = mission.judged(outcome, self._contact_speed_max, elapsed)
+            evidence = mission.witness.evidence(
+                Ending(outcome.code, outcome.text),
+                self._teleop.elapsed(now_ns),
+                waypoints=len(mission.order.plan.legs),
+                reached=outcome.reached,
+                contact=mission.order.contact,
+                contact_speed_max=self._contact_speed_max,
+            )
+            changed["verdict"] = judge(evidence).as_json()
         self._note(mission, event.event, event.text, now_ns, **changed)
         if mission.ended:
             self._current = None
 
     def _note(self, mission: Mission, event: str, text: str, now_ns: int, **changed: Any) -> None:
         if mission is self._current:
-            changed["time_s"] = round(self._teleop.elapsed(now_ns), 3)
+            changed["elapsed"] = round(self._teleop.elapsed(now_ns), 3)
         self.book.note(mission, event, text, **changed)

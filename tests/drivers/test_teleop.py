@@ -12,6 +12,7 @@ from cloudrc.drivers.teleop import (
     RemoteTeleop,
     UnixPeer,
     serve_teleop,
+    turn,
 )
 from cloudrc.errors import BadInputError
 from cloudrc.messages import OperatorRequest, Request, Setpoint
@@ -150,15 +151,8 @@ class Service:
         self._thread.start()
 
     def _run(self, peer):
-        serve_teleop(
-            self.machine,
-            peer,
-            encode,
-            decode,
-            calls=self._take,
-            tell=self.told.extend,
-            stop=self._stop.is_set,
-        )
+        how = {"calls": self._take, "tell": self.told.extend, "stop": self._stop.is_set}
+        serve_teleop(self.machine, peer, encode, decode, **how)
 
     def _take(self):
         calls, self.calls = self.calls, []
@@ -193,38 +187,20 @@ def test_deadlines_calls_and_messages_meet_in_one_loop(peers, service):
     assert service.machine.seen == [POINT]
 
 
-def test_what_is_asked_for_comes_before_what_has_arrived(peers):
+def serve(machine, peer, wakes, calls=list):
+    """Run the loop for a number of wakes."""
+    stops = iter([False] * wakes + [True])
+    how = {"calls": calls, "tell": lambda told: None, "stop": lambda: next(stops)}
+    serve_teleop(machine, peer, encode, decode, **how)
+
+
+def test_what_is_asked_for_comes_before_the_newest_that_has_arrived(peers):
     """The emergency stop is made before the state that shows its effect."""
-    machine, stops = Machine(), iter([False, True])
-    calls = [lambda now_ns: machine.seen.append("asked")]
-    peers[1].send(encode(POINT))
-    serve_teleop(
-        machine,
-        peers[0],
-        encode,
-        decode,
-        calls=lambda: calls,
-        tell=lambda told: None,
-        stop=lambda: next(stops),
-    )
-    assert machine.seen == ["asked", POINT]
-
-
-def test_of_what_has_arrived_meanwhile_the_newest_counts(peers):
-    machine, stops = Machine(), iter([False, True])
-    newest = Setpoint((3.0, 2.0, 1.0))
+    machine, newest = Machine(), Setpoint((3.0, 2.0, 1.0))
     for data in (encode(POINT), encode(newest), b"rubbish"):
         peers[1].send(data)
-    serve_teleop(
-        machine,
-        peers[0],
-        encode,
-        decode,
-        calls=list,
-        tell=lambda told: None,
-        stop=lambda: next(stops),
-    )
-    assert (machine.seen, machine.deadlines) == ([newest], 1)
+    serve(machine, peers[0], 1, lambda: [lambda now_ns: machine.seen.append("asked")])
+    assert (machine.seen, machine.deadlines) == (["asked", newest], 1)
 
 
 @pytest.mark.parametrize(
@@ -244,7 +220,7 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
     At each wake a new state has arrived (p), or the wake follows a stall (s) with an old one.
     """
     machine, clock = Machine(), [SECOND]
-    coming, stops = iter(wakes), iter([False] * len(wakes) + [True])
+    coming = iter(wakes)
     calls = [[lambda now_ns: machine.seen.append("asked")]]
     if wakes == "-":
         peers[1].send(encode(PAST))
@@ -257,40 +233,57 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
 
     monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
-    serve_teleop(
-        machine,
-        peers[0],
-        encode,
-        decode,
-        calls=lambda: calls.pop() if calls else [],
-        tell=lambda told: None,
-        stop=lambda: next(stops),
-    )
+    serve(machine, peers[0], len(wakes), lambda: calls.pop() if calls else [])
     assert machine.seen == done
 
 
-def test_events_wait_for_an_absent_cloud_and_keep_their_order(peers, service, tmp_path):
+def test_events_wait_for_an_absent_cloud_bounded_and_in_order(peers, service, tmp_path):
     _, cloud = peers
     cloud.close()
     (tmp_path / "b.sock").unlink()
-    events = [event(number) for number in range(3)]
+    events = [event(number) for number in range(EVENTS_KEPT + 50)]
     service.machine.outputs = [POINT, *events, Fault(0, "journal", "full")]
-    until(lambda: len(service.told) == 4)
-    back = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
-    received = []
-    until(lambda: received.extend(map(decode, back.receive())) or len(received) >= 3)
-    assert received == events  # setpoints are repeated anyway; faults are not for cloud
-    back.close()
-
-
-def test_what_waits_is_bounded(peers, service, tmp_path):
-    _, cloud = peers
-    cloud.close()
-    (tmp_path / "b.sock").unlink()
-    service.machine.outputs = [event(number) for number in range(EVENTS_KEPT + 50)]
-    until(lambda: len(service.told) == EVENTS_KEPT + 50)
+    until(lambda: len(service.told) == len(events) + 1)
     back = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
     received = []
     until(lambda: received.extend(map(decode, back.receive())) or len(received) >= EVENTS_KEPT)
-    assert received[0] == event(50)
+    assert received == events[50:]  # setpoints are repeated anyway; faults are not for cloud
     back.close()
+
+
+def told(cloud, teleop, seconds, telemetry):
+    """Return what cloud sends in `seconds` [s] after the end of its telemetry."""
+    cloud, received = remote(cloud), []
+    for now_ns in range(0, round(seconds * 1e9), 10_000_000):
+        if now_ns < telemetry * 1e9:
+            cloud.see(POINT, now_ns)
+        cloud.handle_deadline(now_ns)
+        received += teleop.receive()
+    return received
+
+
+def test_without_telemetry_cloud_signals_life_5_times_a_second(peers):
+    assert told(*peers, seconds=1.0, telemetry=0.0) == [b""] * 5
+    received = told(*peers, seconds=2.0, telemetry=1.0)
+    assert b"" not in received[:50]
+    assert 4 <= received.count(b"") <= 5
+
+
+def test_teleop_hears_of_cloud_whatever_it_says_but_after_a_stall(peers):
+    cloud, teleop = peers
+    machine, heard = Machine(), []
+
+    def wake(now_ns, *, data=None, blind=0, late_ns=0):
+        if data is not None:
+            cloud.send(data)
+        how = {"blind": blind, "late_ns": late_ns, "now_ns": now_ns}
+        return turn(machine, teleop, decode, list, **how)
+
+    machine.hear = heard.append
+    for now_ns, data in enumerate((None, b"", b"rubbish", encode(POINT))):
+        wake(now_ns, data=data)
+    assert (heard, machine.seen) == ([1, 2, 3], [POINT])
+    assert wake(4, data=b"", late_ns=STALL_NS + 1) == BLIND_WAKES
+    assert wake(5, data=b"", blind=BLIND_WAKES) == BLIND_WAKES - 1
+    assert wake(6, data=encode(POINT), blind=BLIND_WAKES - 1) == 0
+    assert (heard, machine.seen) == ([1, 2, 3, 6], [POINT, POINT])

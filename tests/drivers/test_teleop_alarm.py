@@ -12,15 +12,16 @@ from typing import Any
 import pytest
 
 from cloudrc.cli import teleop
-from cloudrc.cli import teleop as teleop_alarm
-from cloudrc.cli.teleop import EmergencyStopSender, ServedApi
-from cloudrc.drivers.teleop import UnixPeer
+from cloudrc.cli.teleop import ServedApi
+from cloudrc.drivers.teleop import EmergencyStopSender, UnixPeer
 from cloudrc.teleop.bridge import Bridge
 from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import MissionStore, connect
 from cloudrc.teleop.wire import ALARM, encode
 
 Peers = tuple[UnixPeer, UnixPeer]
 WORD = encode(ALARM)
+PAUSE = threading.Event()
 
 
 def fill(peer: UnixPeer) -> None:
@@ -34,7 +35,7 @@ def until(condition: Callable[[], object], limit: float = 5.0) -> None:
     ends = time.monotonic() + limit
     while not condition():
         assert time.monotonic() < ends
-        time.sleep(0.002)
+        PAUSE.wait(0.002)
 
 
 def threads() -> list[threading.Thread]:
@@ -74,7 +75,8 @@ def test_a_full_socket_delays_an_emergency_stop_until_drained(
     monkeypatch.setattr("cloudrc.drivers.feed.Feed.on_stdout", lambda **how: _Feed())
     options = argparse.Namespace(socket=tmp_path, feed=False)
     served = ServedApi(bridge, None, None)  # type: ignore[arg-type]
-    teleop._fly(options, MissionService(1.0, salt=bytes(16)), served, None, lambda: True, "")
+    service = MissionService(1.0, MissionStore(connect(), b""))
+    teleop._fly(options, service, served, None, lambda: True)
     cloud.close()
     assert sum(told) == 1
 
@@ -102,92 +104,37 @@ def test_a_cloud_that_is_away_hears_it_when_it_is_back(peers: Peers, tmp_path: P
     back.close()
 
 
-def test_however_often_it_is_asked_for_there_is_one_thread(peers: Peers) -> None:
-    teleop_peer, cloud = peers
-    fill(teleop_peer)
-    alarm = EmergencyStopSender(lambda: teleop_peer.send(WORD))
-    callers = [threading.Thread(target=alarm) for _ in range(20)]
-    for caller in callers:
-        caller.start()
-    for caller in callers:
-        caller.join()
-    assert len(threads()) == 1
-    until(lambda: heard(cloud))
-    until(lambda: not threads())
-    fill(teleop_peer)  # and fill it again
-    alarm()
-    assert len(threads()) == 1
-    until(lambda: heard(cloud))
-
-
-def test_the_last_word_counts_for_how_long_it_is_repeated(
-    peers: Peers, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = [100.0]
-    tries: list[float] = []
-
-    def send() -> bool:
-        tries.append(clock[0])
-        return False
-
-    def sleep(seconds: float) -> None:
-        clock[0] += seconds
-        if len(tries) == 51:  # half of the time has passed
-            again.set()
-            asked.wait()
-
-    again, asked = threading.Event(), threading.Event()
-    monkeypatch.setattr(teleop_alarm, "time", _Clock(clock, sleep))
-    alarm = EmergencyStopSender(send)
-    alarm()
-    again.wait(5.0)
-    (repeats,) = threads()
-    alarm()
-    asked.set()
-    repeats.join(5.0)
-    assert not repeats.is_alive()
-    assert tries[-1] == pytest.approx(103.0, abs=0.1)
-    assert tries[1] - tries[0] == pytest.approx(0.02)
-
-
-class _Clock:
-    """Replaces the module `time`."""
-
-    def __init__(self, now: list[float], sleep: Callable[[float], None]) -> None:
-        self.monotonic, self.sleep = (lambda: now[0]), sleep
-
-
-def test_what_was_taken_meanwhile_is_not_said_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    tries: list[bool] = []
-
-    def send() -> bool:
-        tries.append(bool(tries))  # the first attempt fails
-        return tries[-1]
-
-    asked = threading.Event()
-    monkeypatch.setattr(teleop_alarm, "time", _Clock([100.0], lambda seconds: asked.wait(5.0)))
-    alarm = EmergencyStopSender(send)
-    alarm()
-    (repeats,) = threads()
-    alarm()
-    asked.set()
-    repeats.join(5.0)
-    assert not repeats.is_alive()
-    assert tries == [False, True]
-
-
-def test_where_there_can_be_no_thread_the_caller_goes_on(
+def test_however_often_it_is_asked_for_there_is_one_thread(
     peers: Peers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     teleop_peer, cloud = peers
-    fill(teleop_peer)
     alarm = EmergencyStopSender(lambda: teleop_peer.send(WORD))
+    for _ in range(2):
+        fill(teleop_peer)
+        callers = [threading.Thread(target=alarm) for _ in range(20)]
+        for caller in callers:
+            caller.start()
+        for caller in callers:
+            caller.join()
+        assert len(threads()) == 1
+        until(lambda: heard(cloud))
+        until(lambda: not threads())
 
     def refuse(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
+    fill(teleop_peer)
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, "start", refuse)
-        alarm()
+        alarm()  # the caller goes on
     alarm()  # now it is possible
     until(lambda: heard(cloud))
+
+
+def test_it_gives_up_after_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", slept.append)
+    EmergencyStopSender(lambda: False)()
+    for thread in threads():
+        thread.join(5.0)
+    assert sum(slept) == pytest.approx(2.0)

@@ -65,3 +65,22 @@ def test_an_acknowledgement_ends_the_alarm() -> None:
     fly(ends, 5 * S)
     ends.cloud.teleop.requests.ask(Request.ACKNOWLEDGE)
     assert fly(ends, 9 * S) == [GuardState.GROUND]
+
+
+def test_a_stop_after_an_acknowledgement_holds_and_one_before_is_undone() -> None:
+    """The robot still shows the first stop, when the second is asked for."""
+    ends = join(HOVER)
+    fly(ends, 4 * S)
+    ends.cloud.teleop.outputs.append(ALARM)
+    fly(ends, 5 * S)
+    ends.cloud.teleop.acknowledge(5 * S)
+    ends.cloud.teleop.handle_deadline(5 * S)
+    ends.cloud.teleop.stop(5 * S)
+    assert fly(ends, 6 * S)[-1] is GuardState.ESTOP
+    assert ends.cloud.teleop.settled
+    ends.cloud.teleop.stop(6 * S)  # of a robot that is stopped
+    assert fly(ends, 7 * S) == []
+    assert ends.cloud.teleop.settled
+    ends.cloud.teleop.outputs.append(ALARM)  # late, of before
+    ends.cloud.teleop.requests.ask(Request.ACKNOWLEDGE)
+    assert fly(ends, 9 * S)[-1] is GuardState.GROUND

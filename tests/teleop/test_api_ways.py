@@ -58,5 +58,8 @@ def test_a_mission_from_here_begins_with_a_way_that_can_be_flown():
         status, refusal = api.post("/v1/missions", order)
         assert status == 409
         assert "through the wall of pipe_1" in refusal["detail"]
-        assert api.post("/v1/missions", {**order, "start": "spawn"})[0] == 201
+        at(api, WEST)
+        assert api.post("/v1/missions", order)[0] == 201
+        at(api, EAST)
         assert api.post("/v1/missions", order)[0] == 200, "known already, wherever the robot is"
+        assert api.post("/v1/missions", {**order, "start": "spawn"})[0] == 409, "another plan"
