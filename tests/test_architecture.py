@@ -48,7 +48,7 @@ ALWAYS = {"errors", "messages", "records", "__version__"}
 
 # Parts that run in real time besides the drivers: link shapers and teleop's API.
 SHAPERS = ("link/relay", "link/lateness", "link/verify/probe", "link/verify/monitor")
-API = ("teleop/api", "teleop/auth", "teleop/bridge", "teleop/server")
+API = ("teleop/api", "teleop/auth", "teleop/bridge")
 
 # Faults with real processes and sockets, and with a wall clock that jumps.
 REAL = ("faults/real/", "faults/cluster/", "faults/walls")
@@ -64,7 +64,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
         *("config/", "link/", "cli/", "teleop/", "report/write"),
         "faults/schedule",
     ),
-    **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/server")),
+    **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/auth")),
     "fcntl": ("teleop/journal", "drivers/local"),
     "matplotlib": ("report/",),
     "mcap": ("record/",),

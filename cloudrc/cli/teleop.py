@@ -1,8 +1,5 @@
 """Run `cloudrc teleop`: the process that flies missions, with its API and its journal.
 
-An emergency stop bypasses teleop's loop, which may be waiting for its disk: a thread repeats one
-datagram until cloud accepts it.
-
 A start removes old missions from the journal: it writes the others to a new file beside it. A full
 disk has no room for that, so a reserve file keeps some. It is deleted when the room is needed, and
 made again once the old journal is gone. All this happens while teleop holds the journal's lock.
@@ -14,7 +11,6 @@ import argparse
 import errno
 import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -34,142 +30,50 @@ from cloudrc.cli.runtime import (
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.drivers.teleop import Calls
     from cloudrc.records import Counted
-    from cloudrc.teleop.auth import Audit
+    from cloudrc.teleop.api import ApiServer
     from cloudrc.teleop.bridge import Bridge
     from cloudrc.teleop.journal import Disk, Entry, Journal
-    from cloudrc.teleop.server import ApiServer
     from cloudrc.teleop.service import MissionService
 
 
-REPEAT_PERIOD = 0.02
-"""Pause between two attempts to send an emergency stop [s]."""
-REPEAT_LIMIT = 2.0
-"""Time for which an emergency stop is repeated [s]. If cloud is blocked for that long, the robot
-holds."""
-
-
-class EmergencyStopSender:
-    """Send an emergency stop to cloud, from any thread, without blocking.
-
-    The socket of a blocked cloud queues eleven datagrams and refuses more. Then a thread repeats
-    the stop until cloud accepts it.
-    """
-
-    def __init__(self, send: Callable[[], bool]) -> None:
-        """Store how to send.
-
-        Args:
-            send: Sends the stop once; returns whether cloud accepted it. Must not block.
-        """
-        self._send = send
-        self._lock = threading.Lock()
-        self._deadline = 0.0
-        self._repeating = False  # whether the thread runs
-
-    def __call__(self) -> None:
-        """Send the stop, now or as soon as cloud accepts it."""
-        with self._lock:
-            if self._send():
-                self._deadline = 0.0  # ends the thread
-                return
-            self._deadline = time.monotonic() + REPEAT_LIMIT
-            if self._repeating:
-                return
-            try:
-                threading.Thread(target=self._repeat, name="alarm", daemon=True).start()
-            except RuntimeError:  # no more threads: teleop's loop repeats the stop
-                return
-            self._repeating = True
-
-    def _repeat(self) -> None:
-        while self._try_again(REPEAT_PERIOD):
-            pass
-
-    def _try_again(self, period: float) -> bool:
-        """Wait, then send again; return whether another attempt is needed."""
-        time.sleep(period)
-        with self._lock:  # `_repeating` is true only while this thread will try again
-            self._repeating = time.monotonic() < self._deadline and not self._send()
-            return self._repeating
-
-
 LOOPBACK = "127.0.0.1"
-COUNT_PERIOD_NS = 1_000_000_000
-"""Time between two updates of the metrics from the API's counts [ns]."""
 
 
-class ServedApi:
-    """Serve the API; until `open` it answers that teleop is not ready.
-
-    Attributes:
-        bridge: Passes calls from the API's threads to teleop's loop.
-    """
-
-    def __init__(self, bridge: Bridge, server: ApiServer, audit: Audit) -> None:
-        self.bridge, self._server, self._audit = bridge, server, audit
-        self._service: MissionService | None = None
-        self._counted_ns = 0
-
-    def open(self, service: MissionService, alarm: Callable[[], object]) -> None:
-        """Start to serve missions.
-
-        Args:
-            service: The service that flies them.
-            alarm: Sends an emergency stop directly to cloud; called from any thread.
-        """
-        self.bridge.alarm, self._service = alarm, service
-        self.bridge.open(service)
-
-    def counted(self) -> list[Counted]:
-        """Return the counts of requests once a second, else an empty list."""
-        import time
-
-        from cloudrc.records import Counted
-
-        now_ns = time.monotonic_ns()
-        if now_ns - self._counted_ns < COUNT_PERIOD_NS:
-            return []
-        self._counted_ns = now_ns
-        counts = {**self._server.counts, "audit_dropped": self._audit.dropped}
-        if self._service is not None:
-            counts["events_dropped"] = self._service.book.dropped
-        return [Counted(now_ns, "teleop", f"api_{name}", n) for name, n in sorted(counts.items())]
-
-    def stop(self) -> None:
-        """Finish the open requests and stop."""
-        self._server.stop()
-        self._audit.close()
-
-
-def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> ServedApi:
-    """Start the API; it answers that teleop is not ready until it is opened."""
+def serve_api(
+    options: argparse.Namespace, experiment: ResolvedExperiment, bridge: Bridge
+) -> ApiServer:
+    """Start the API; it answers that teleop is not ready until the bridge is opened."""
     import json
     from functools import partial
 
     from cloudrc import assembly
     from cloudrc.geometry.scene import load_scene
     from cloudrc.link.state import publish
-    from cloudrc.teleop.api import Surroundings, create_app
-    from cloudrc.teleop.auth import Audit, Tokens
-    from cloudrc.teleop.bridge import Bridge
-    from cloudrc.teleop.server import ApiServer, Gate
+    from cloudrc.teleop.api import ApiServer, Surroundings, create_app
+    from cloudrc.teleop.auth import Audit, Gate, Tokens
 
     if not isinstance(options.api, Path):
         warn_if_exposed(options.api)
-    criteria, bridge = experiment.criteria, Bridge()
-    scene = load_scene(experiment.world.scene)
+    criteria, scene = experiment.criteria, load_scene(experiment.world.scene)
     plan = partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps)
     surroundings = Surroundings(scene, criteria.time_limit_s, criteria.contact, plan)
-    tokens = Tokens(options.tokens) if options.tokens else None
-    audit = Audit(options.audit, log_line)
-    gate = Gate(create_app(bridge, surroundings), tokens, audit, complain=log_line)
+    tokens = Tokens(options.tokens, log_line) if options.tokens else None
+    audit = Audit(options.audit, log_line) if options.audit else None
+    gate = Gate(create_app(bridge, surroundings, log_line), tokens, audit)
     server = ApiServer(gate, bridge, options.api)
     server.start()
     if options.api_file is not None:
         publish(options.api_file, json.dumps({"schemaVersion": 1, "url": server.url}) + "\n")
-    return ServedApi(bridge, server, audit)
+    return server
+
+
+def api_counts(server: ApiServer, service: MissionService) -> list[Counted]:
+    """Return the counts of the API for the metrics."""
+    from cloudrc.records import Counted
+
+    counts, now_ns = {**server.counts, "events_dropped": service.book.dropped}, time.monotonic_ns()
+    return [Counted(now_ns, "teleop", f"api_{name}", number) for name, number in counts.items()]
 
 
 def log_line(text: str) -> None:
@@ -316,8 +220,9 @@ and when its parent process has ended. A flying robot then holds; a new teleop
 with the same journal resumes the mission.
 
 /openapi.json describes the API. The API asks for a token, except on a socket
-file, which only its owner can open. To make a token:
-openssl rand -hex 32 > DIR/operator. The token in DIR/reader may only read."""
+file, which only its owner can open. To make a token that only you can read:
+(umask 077; openssl rand -hex 32 > DIR/operator). A token in DIR/reader may only
+read."""
 LOCK_PERIOD = 0.2
 """Pause between two attempts to lock the journal [s]."""
 PAUSE_LIMIT_NS = 500_000_000
@@ -369,6 +274,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.process import StopSignal
     from cloudrc.records import Counted
+    from cloudrc.teleop.bridge import Bridge
 
     if options.api:
         require("the API of teleop", ("api",))
@@ -376,11 +282,12 @@ def execute(options: argparse.Namespace) -> int:
     experiment = read_experiment(str(options.config))
     if exporter is not None:
         exporter.runs(fingerprint(experiment))
-    served = serve_api(options, experiment) if options.api else None
+    bridge = Bridge()
+    server = serve_api(options, experiment, bridge) if options.api else None
     journal = None
     try:
         if options.journal:
-            journal = _open_journal(options.journal, stop, served.bridge if served else None)
+            journal = _open_journal(options.journal, stop, bridge)
             if journal is None:
                 return 0  # stopped while another teleop held the journal
         service = _open_service(experiment, journal)
@@ -389,10 +296,10 @@ def execute(options: argparse.Namespace) -> int:
         over = lambda: ending() or (single_mission and service.over)  # noqa: E731
         if exporter is not None and journal is not None and journal.repaired:
             exporter.see([Counted(0, "teleop", "journal_repaired", 1)])
-        _fly(options, service, served, exporter, over, journal.trouble if journal else "")
+        _fly(options, service, bridge, server, exporter, over, journal.trouble if journal else "")
     finally:
-        if served is not None:
-            served.stop()
+        if server is not None:
+            server.stop()
         if journal is not None:
             journal.close()
     return 0
@@ -421,7 +328,8 @@ class _Ending:
 def _fly(
     options: argparse.Namespace,
     service: MissionService,
-    served: ServedApi | None,
+    bridge: Bridge,
+    server: ApiServer | None,
     exporter: Exporter | None,
     stop: Callable[[], bool],
     trouble: str,
@@ -434,11 +342,8 @@ def _fly(
 
     feed = Feed.on_stdout(watched=options.feed)
     peer = UnixPeer(options.socket / "teleop.sock", options.socket / "cloud.sock")
-    calls: Calls = list
-    stops: Calls = list
-    if served is not None:
-        served.open(service, EmergencyStopSender(lambda: peer.send(wire.encode(wire.ALARM))))
-        calls, stops = served.bridge.take, served.bridge.take_urgent
+    bridge.alarm = lambda: peer.send(wire.encode(wire.ALARM))
+    bridge.open(service)
     feed.ready()
 
     def publish(records: list[Any]) -> None:
@@ -449,8 +354,8 @@ def _fly(
     def update_and_check() -> bool:
         if exporter is not None:
             exporter.ready(service.sight.seen is not None)
-            if served is not None:
-                exporter.see(served.counted())
+            if server is not None:
+                exporter.see(api_counts(server, service))
         return stop()
 
     if trouble:
@@ -460,14 +365,14 @@ def _fly(
         peer,
         wire.encode,
         wire.decode,
-        calls=calls,
-        stops=stops,
+        calls=bridge.take,
+        stops=bridge.take_urgent,
         tell=publish,
         stop=update_and_check,
     )
 
 
-def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge | None) -> Journal | None:
+def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge) -> Journal | None:
     """Open the journal once no other teleop holds it; None if stopped before."""
     import time
 
@@ -481,8 +386,7 @@ def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge | None) -
             if not reported:
                 print(f"cloudrc teleop: {error}", file=sys.stderr, flush=True)
                 reported = True
-            if bridge is not None:
-                bridge.close(str(error))
+            bridge.close(str(error))
             time.sleep(LOCK_PERIOD)
             continue
         if journal.trouble:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from math import nan
 from pathlib import Path
+from typing import Any
 
 from cloudrc import assembly
 from cloudrc.drivers.teleop import LastWord
@@ -17,7 +18,6 @@ from cloudrc.faults.scenarios.link import instant
 from cloudrc.messages import GuardState
 from cloudrc.teleop.bridge import Bridge
 from cloudrc.teleop.journal import Entry, parse
-from cloudrc.teleop.server import Receive, Scope, Send
 from cloudrc.teleop.store import LOGGED, Order, UnavailableError
 
 PER_PERIOD = 10
@@ -61,8 +61,15 @@ def _flood(seed: int) -> Outcome:
 def _at_the_gate(count: int) -> int:
     """Have so many requests come at once to the API's gate; say how many it calls too many."""
 
-    async def application(scope: Scope, receive: Receive, send: Send) -> None:
-        return
+    class Waits:
+        """An answer that never comes."""
+
+        def __await__(self) -> Generator[None, None, None]:
+            while True:
+                yield
+
+    async def application(scope: Any, receive: Any, send: Any) -> None:
+        await Waits()
 
     return toll.counted(application, "GET", "/v1/state", count)["busy"]
 
