@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import errno
 import os
+import resource
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 
 
 LOOPBACK = "127.0.0.1"
+FILES_MAX = 8_192
+"""Limit of open files: idle connections of strangers leave room for that of an emergency stop."""
 
 
 def serve_api(
@@ -62,6 +65,10 @@ def serve_api(
     audit = Audit(options.audit, log_line) if options.audit else None
     gate = Gate(create_app(bridge, surroundings, log_line), tokens, audit)
     server = ApiServer(gate, bridge, options.api)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if 0 <= soft < FILES_MAX:  # negative: no limit
+        files = min(hard, FILES_MAX) if hard >= 0 else FILES_MAX
+        resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
     server.start()
     if options.api_file is not None:
         publish(options.api_file, json.dumps({"schemaVersion": 1, "url": server.url}) + "\n")

@@ -23,8 +23,6 @@ waypoints:
 RATE = 1000.0
 TRIES = 3
 """Number of attempts, of which the best counts: the machine may be busy."""
-DAWDLERS, DAWDLED = 50, 15.0
-"""Number of slow clients, and the time after which they must be disconnected [s]."""
 COMMAND = "/cmd_vel"
 PERIOD = 0.010
 
@@ -73,25 +71,23 @@ def flood(folder: Path, seconds: float):
 
 
 def is_undisturbed(folder: Path, seconds: float, figure, tries: int, is_last: bool):
-    """Check that a flood does not disturb the loop and the answers are correct."""
+    """Check that a flood does not disturb the loop and is answered."""
     answers, quiet, loud = flood(folder, seconds)
-    assert answers.get("429", 0) > 0
-    assert seconds < DAWDLED or answers.get("cut off", 0) >= DAWDLERS
+    took, sent = answers.pop("seconds"), answers.pop("sent")
+    assert sum(answers.values()) == sent == seconds * RATE
     assert not [status for status in answers if status.startswith("5")]
-    answered = sum(count for status, count in answers.items() if status.isdigit())
-    sent, answered = (count / (seconds * RATE) for count in (answers["sent"], answered))
+    rate = sent / took
     calm_p99, flood_p99 = (float(np.percentile(each, 99)) * 1e3 for each in (quiet, loud))
     grown = flood_p99 - calm_p99
-    good = min(sent, answered) >= 0.95 and grown <= 2.0
+    good = rate >= 0.9 * RATE and grown <= 2.0
     if good or is_last:
         best = f", best of {tries}" if tries > 1 else ""
-        kind, count = f"API flood of {seconds:g} s{best}", answers["sent"]
-        figure(f"{kind}: share of the requests that was sent", sent, ">=", 0.95, count=count)
-        figure(f"{kind}: share that was answered", answered, ">=", 0.95, count=count)
+        kind = f"API flood of {seconds:g} s{best}"
+        figure(f"{kind}: answers", rate, ">=", 0.9 * RATE, "1/s", count=sent)
         figure(f"{kind}: control period error p99 grows by", grown, "<=", 2.0, "ms")
     if is_last:
         found = {"requests": answers, "calm_p99_ms": calm_p99, "flood_p99_ms": flood_p99}
-        assert good, {**found, "processors": os.cpu_count()}
+        assert good, {**found, "rate": rate, "processors": os.cpu_count()}
     return good
 
 
