@@ -13,14 +13,15 @@ import json
 import os
 import re
 import socket
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
 
-from cloudrc.cli.output import escape
+from cloudrc.cli.output import escape, print_line
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.files import read
+from cloudrc.files import read, readable_by_others
 
 REQUEST_TIMEOUT = 10.0
 """Time limit of one request [s]."""
@@ -192,8 +193,15 @@ def token_file(options: argparse.Namespace) -> Path | None:
 
 
 def token_reader(path: Path | None) -> Callable[[], str]:
-    """Make the function that reads the token anew for each request; "" without a file."""
-    return (lambda: "") if path is None else (lambda: _read(path))
+    """Make the function that reads the token anew for each request; "" without a file.
+
+    Warn now if others can read the file.
+    """
+    if path is None:
+        return lambda: ""
+    if readable_by_others(path):
+        print_line(f"cloudrc: warning: {path} can be read by others: chmod 600 {path}", sys.stderr)
+    return lambda: _read(path)
 
 
 def _read(path: Path) -> str:

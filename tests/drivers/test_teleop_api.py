@@ -23,6 +23,7 @@ FILES = 256
 def address(tmp_path):
     (tmp_path / "config.yaml").write_text(dump(load_experiment("hover")))
     (tmp_path / "operator").write_text(TOKEN)
+    (tmp_path / "operator").chmod(0o644)
     words = ["teleop", "--config", "config.yaml", "--socket", ".", "--tokens", "."]
     command = [
         sys.executable,

@@ -248,8 +248,9 @@ class Running:
     def __init__(self, *, ready=True, unix=False, host="127.0.0.1"):
         self.folder = TemporaryDirectory(prefix="cloudrc-")
         folder = Path(self.folder.name)
-        (folder / "operator").write_text(OPERATOR + "\n")
-        (folder / "reader").write_text(READER + "\n")
+        for role, token in (("operator", OPERATOR), ("reader", READER)):
+            (folder / role).write_text(token + "\n")
+            (folder / role).chmod(0o600)
         self.flight, self.bridge = ServiceFlight(), Bridge()
         self.alarms, self.complaints = [], []
         self.bridge.alarm = self.note_alarm
