@@ -22,10 +22,10 @@ SEEDS ?= 200
 # The tests of one part: make test T=tunnel, make test T=tests/cli/test_run.py.
 T ?=
 PART = $(if $(T),$(if $(wildcard tests/$(T)),tests/$(T),$(T)))
-# Tests of guard, tunnel and journal that take seconds.
+# Tests of guard, tunnel and store that take seconds.
 SLOW := %_any_input.py %_falls.py %_flight.py %_machine.py %_proof.py %_hostile.py
 CORE := $(filter-out $(SLOW),$(wildcard \
-	tests/world/guard/test_*.py tests/tunnel/test_*.py tests/teleop/test_journal*.py))
+	tests/world/guard/test_*.py tests/tunnel/test_*.py tests/teleop/test_store.py))
 BUILD_ARGS := $(BASE:%=--build-arg BASE=%) --build-arg VERSION=$(VERSION) \
 	--build-arg SOURCE=$(or $(filter https://%,$(shell git config remote.origin.url)),unpublished) \
 	--build-arg REVISION=$(or $(shell git rev-parse HEAD 2>/dev/null),unknown)
@@ -73,11 +73,11 @@ faults: $(VENV)/dev ## inject every fault, then fly 2 x SEEDS (200) random sched
 	$(FUZZ) --seeds $(SEEDS)
 	$(FUZZ) --adversarial --seeds $(SEEDS)
 
-coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and journal is tested
+coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and store is tested
 	$(bin)/pytest -n auto --hypothesis-seed=0 --cov --cov-report=term $(CORE)
 
 # mutmut writes into its working folder. `mutmut show NAME` in build/mutants shows a mutant.
-mutants: $(VENV)/dev ## mutate guard, tunnel and journal, list the mutants that tests find
+mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that tests find
 	rm -rf build/mutants && mkdir -p build/mutants $(EVIDENCE)
 	cp -r cloudrc tests pyproject.toml build/mutants
 	find build/mutants/tests -name 'test_*.py' -delete && cp --parents $(CORE) build/mutants

@@ -65,7 +65,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
         "faults/schedule",
     ),
     **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/auth")),
-    "fcntl": ("teleop/journal", "drivers/local"),
+    "fcntl": ("drivers/local",),
     "matplotlib": ("report/",),
     "mcap": ("record/",),
     "rosbags": ("record/",),

@@ -1,20 +1,12 @@
-"""Run `cloudrc teleop`: the process that flies missions, with its API and its journal.
-
-A start removes old missions from the journal: it writes the others to a new file beside it. A full
-disk has no room for that, so a reserve file keeps some. It is deleted when the room is needed, and
-made again once the old journal is gone. All this happens while teleop holds the journal's lock.
-"""
+"""Run `cloudrc teleop`: the process that flies missions, with its API and its stored missions."""
 
 from __future__ import annotations
 
 import argparse
-import errno
-import os
 import resource
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,8 +26,8 @@ if TYPE_CHECKING:
     from cloudrc.records import Counted
     from cloudrc.teleop.api import ApiServer
     from cloudrc.teleop.bridge import Bridge
-    from cloudrc.teleop.journal import Disk, Entry, Journal
     from cloudrc.teleop.service import MissionService
+    from cloudrc.teleop.store import MissionStore
 
 
 LOOPBACK = "127.0.0.1"
@@ -97,141 +89,18 @@ def api_address(text: str) -> Address | Path:
     return (host, 0) if host and port == "0" else read_address(f"{host}:{port}")
 
 
-RESERVE_SIZE = 2 << 20
-"""Size of the reserve file [bytes].
-
-A start keeps at most the last 100 missions that have ended and 17 others. The paper's mission with
-seven waypoints takes 3.8 kB, 117 of them 0.45 MB; the reserve suffices for 45 waypoints in each.
-The chart's volume has 64 MiB, of which the audit log may take 16.
-"""
-FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors that mean a full disk."""
-
-
-def free_space(folder: Path) -> int:
-    """Return the free space of a folder's volume for this user [bytes]."""
-    volume = os.statvfs(folder)
-    return volume.f_bavail * volume.f_frsize
-
-
-def shorten_journal(journal: Journal, known: Sequence[Entry], disk: Disk | None = None) -> str:
-    """Reduce the journal to its known entries, also on a full disk, and renew the reserve.
-
-    If the disk refuses, teleop continues with the old journal.
-
-    Args:
-        journal: The open journal.
-        known: Entries to keep.
-        disk: Disk of the journal; None for the real one.
-
-    Returns:
-        The problem and its remedy; "" without a problem.
-    """
-    reserve = Reserve(journal.path, disk)
-    try:
-        if len(known) < len(journal.entries):
-            _rewrite(journal, known, reserve)
-    except OSError as error:  # do not renew the reserve: the journal needs its room now
-        return (
-            f"{journal.path}: cannot be shortened to the missions still known: {error.strerror}; "
-            "once it is full no mission can start: free space or repair the volume, then restart "
-            "teleop"
-        )
-    try:
-        reserve.make()
-    except OSError as error:
-        log_line(
-            f"{reserve.path}: {error.strerror}: without it a restart cannot shorten a journal that "
-            "has filled its volume; free space or repair the volume"
-        )
-    return ""
-
-
-def _rewrite(journal: Journal, known: Sequence[Entry], reserve: Reserve) -> None:
-    """Rewrite the journal; on a full disk delete the reserve first."""
-    try:
-        journal.rewrite(known)
-    except OSError as error:
-        if error.errno not in FULL or not reserve.give_up():
-            raise
-        journal.rewrite(known)
-
-
-class Reserve:
-    """Manage the reserve: a file beside the journal that only occupies space.
-
-    Attributes:
-        path: Path of the reserve.
-    """
-
-    def __init__(self, journal: Path, disk: Disk | None = None) -> None:
-        """Store the path; touch no file.
-
-        Args:
-            journal: Path of the journal.
-            disk: Disk of the journal; None for the real one.
-        """
-        from cloudrc.teleop.journal import Disk
-
-        self.path, self._disk = journal.with_name(f"{journal.name}.reserve"), disk or Disk()
-
-    def give_up(self) -> bool:
-        """Delete the reserve; return whether it existed.
-
-        Raises:
-            OSError: If the disk refuses.
-        """
-        if self._size() is None:
-            return False
-        self._disk.remove(self.path)
-        self._disk.sync_folder(self.path.parent)  # some disks free the space only then
-        return True
-
-    def make(self) -> None:
-        """Make the reserve, unless it exists in full size.
-
-        Raises:
-            OSError: If the disk refuses or has too little space; there is no reserve then.
-        """
-        if self._size() == RESERVE_SIZE:
-            return
-        self._disk.remove(self.path)  # the rest of a crash, or a symbolic link
-        if free_space(self.path.parent) < 2 * RESERVE_SIZE:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        file = self._disk.open(self.path, new=True)
-        try:
-            # Random bytes: a file system that compresses would keep no space for zeros or holes.
-            left = memoryview(os.urandom(RESERVE_SIZE))
-            while left:
-                left = left[self._disk.write(file, bytes(left)) :]
-            self._disk.sync(file)
-        except OSError:
-            with suppress(OSError):
-                self._disk.remove(self.path)
-            raise
-        finally:
-            self._disk.close(file)
-
-    def _size(self) -> int | None:
-        """Return the size of the reserve [bytes]; None without one."""
-        try:
-            return self.path.lstat().st_size
-        except OSError:
-            return None
-
-
 EPILOG = """\
 teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
 --start or --mission it ends after that mission; otherwise on SIGTERM, on Ctrl-C
 and when its parent process has ended. A flying robot then holds; a new teleop
-with the same journal resumes the mission.
+with the same --journal resumes the mission.
 
 /openapi.json describes the API. The API asks for a token, except on a socket
 file, which only its owner can open. To make a token that only you can read:
 (umask 077; openssl rand -hex 32 > DIR/operator). A token in DIR/reader may only
 read."""
 LOCK_PERIOD = 0.2
-"""Pause between two attempts to lock the journal [s]."""
+"""Pause between two attempts to open a journal that another teleop has open [s]."""
 PAUSE_LIMIT_NS = 500_000_000
 """Longest wait for the robot to hold before teleop ends [ns]."""
 SALT_SIZE = 16
@@ -282,6 +151,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.drivers.process import StopSignal
     from cloudrc.records import Counted
     from cloudrc.teleop.bridge import Bridge
+    from cloudrc.teleop.service import MissionService
 
     if options.api:
         require("the API of teleop", ("api",))
@@ -291,24 +161,23 @@ def execute(options: argparse.Namespace) -> int:
         exporter.runs(fingerprint(experiment))
     bridge = Bridge()
     server = serve_api(options, experiment, bridge) if options.api else None
-    journal = None
+    book = None
     try:
-        if options.journal:
-            journal = _open_journal(options.journal, stop, bridge)
-            if journal is None:
-                return 0  # stopped while another teleop held the journal
-        service = _open_service(experiment, journal)
+        book = _open_store(options.journal, stop, bridge)
+        if book is None:
+            return 0  # stopped while another teleop held the journal
+        service = MissionService(experiment.criteria.contact_speed_max_mps, book)
         single_mission = _start(options, experiment, service)
         ending = _Ending(service, stop)
         over = lambda: ending() or (single_mission and service.over)  # noqa: E731
-        if exporter is not None and journal is not None and journal.repaired:
+        if exporter is not None and book.damaged:
             exporter.see([Counted(0, "teleop", "journal_repaired", 1)])
-        _fly(options, service, bridge, server, exporter, over, journal.trouble if journal else "")
+        _fly(options, service, bridge, server, exporter, over)
     finally:
         if server is not None:
             server.stop()
-        if journal is not None:
-            journal.close()
+        if book is not None:
+            book.close()
     return 0
 
 
@@ -339,7 +208,6 @@ def _fly(
     server: ApiServer | None,
     exporter: Exporter | None,
     stop: Callable[[], bool],
-    trouble: str,
 ) -> None:
     """Run the service until `stop()`."""
     from cloudrc.drivers.feed import Feed
@@ -365,8 +233,8 @@ def _fly(
                 exporter.see(api_counts(server, service))
         return stop()
 
-    if trouble:
-        publish([Fault(0, "journal", trouble)])
+    if notice := service.book.notice:
+        publish([Fault(0, "journal", notice)])
     serve_teleop(
         service,
         peer,
@@ -379,51 +247,29 @@ def _fly(
     )
 
 
-def _open_journal(path: Path, stop: Callable[[], bool], bridge: Bridge) -> Journal | None:
-    """Open the journal once no other teleop holds it; None if stopped before."""
-    import time
+def _open_store(path: Path | None, stop: Callable[[], bool], bridge: Bridge) -> MissionStore | None:
+    """Open the store once no other teleop holds it; None if stopped before."""
+    import os
 
-    from cloudrc.teleop.journal import Journal, JournalLockedError
+    from cloudrc.teleop.store import MissionStore, StoreLockedError, connect, open_store
 
-    reported = False
+    salt, reported = os.urandom(SALT_SIZE), False
+    if path is None:
+        return MissionStore(connect(), salt)
     while not stop():
         try:
-            journal = Journal(path)
-        except JournalLockedError as error:
+            book = open_store(path, salt)
+        except StoreLockedError as error:
             if not reported:
-                print(f"cloudrc teleop: {error}", file=sys.stderr, flush=True)
+                log_line(str(error))
                 reported = True
             bridge.close(str(error))
             time.sleep(LOCK_PERIOD)
             continue
-        if journal.trouble:
-            print(f"cloudrc teleop: {journal.trouble}", file=sys.stderr, flush=True)
-        return journal
+        if book.notice:
+            log_line(book.notice)
+        return book
     return None
-
-
-def _open_service(experiment: ResolvedExperiment, journal: Journal | None) -> MissionService:
-    """Make the service from the journal, and remove missions that are too old from it."""
-    import os
-
-    from cloudrc.errors import BadInputError
-    from cloudrc.teleop.service import MissionService
-
-    limit, salt = experiment.criteria.contact_speed_max_mps, os.urandom(SALT_SIZE)
-    if journal is None:
-        return MissionService(limit, salt=salt)
-    try:
-        service = MissionService(limit, journal.append, journal.entries, salt=salt)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise BadInputError(
-            f"--journal {journal.path}: this version cannot read its entries; was it written by "
-            "another version? Move it away, or name another file"
-        ) from error
-    known = [entry for entry in journal.entries if service.book.knows(entry)]
-    if trouble := shorten_journal(journal, known):
-        log_line(trouble)
-        journal.trouble = "; ".join(filter(None, (journal.trouble, trouble)))
-    return service
 
 
 def _start(

@@ -7,6 +7,7 @@ The conditions of the link itself are no part of it: see `cloudrc.faults.schedul
 
 from __future__ import annotations
 
+import sqlite3
 from collections import deque
 from functools import partial
 from itertools import islice
@@ -22,7 +23,6 @@ from cloudrc.faults.schedule import STALLS, Event, Schedule
 from cloudrc.faults.walls import TAKE_OFF, Wall
 from cloudrc.link.follow import PEER_PAUSE, PeerName
 from cloudrc.teleop.bridge import Bridge, Call
-from cloudrc.teleop.journal import MAGIC, parse, to_bytes
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import Order, UnavailableError
 from cloudrc.tunnel.keys import Key, KeySet
@@ -231,18 +231,13 @@ def _stall(flight: Flight, event: Event) -> None:
 
 
 def _refuse() -> None:
-    raise OSError(28, "No space left on device")
+    raise sqlite3.OperationalError("database or disk is full")
 
 
 def _damage(flight: Flight, event: Event, now_ns: int) -> None:
-    """The pod dies, and its journal is not what it was: torn at the end, or wrong in one bit."""
+    """The pod dies, and the last commit of its store is lost."""
     flight.kill_cloud_pod(now_ns, event.duration)
-    data = bytearray(to_bytes(flight.desk.entries))
-    if event.kind == "journal_torn":
-        del data[max(len(MAGIC), len(data) - int(event.value)) :]
-    else:
-        data[min(int(event.value * len(data)), len(data) - 1)] ^= 4
-    flight.desk.entries = parse(bytes(data)).entries
+    flight.desk.image = flight.desk.image_before
 
 
 def _ask(flight: Flight, call: Call, now_ns: int) -> None:

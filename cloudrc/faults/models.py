@@ -22,6 +22,7 @@ It lives on while cloud is frozen or killed.
 
 from __future__ import annotations
 
+import sqlite3
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -40,9 +41,17 @@ from cloudrc.messages import NEVER_NS
 from cloudrc.records import Fault, Lateness, MissionEvent, Record
 from cloudrc.teleop import wire
 from cloudrc.teleop.bridge import WAITING_MAX, Call
-from cloudrc.teleop.journal import Entry, Journal
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import ConflictError, Mission, Order, UnavailableError
+from cloudrc.teleop.store import (
+    ConflictError,
+    Entry,
+    Mission,
+    MissionStore,
+    Order,
+    UnavailableError,
+    connect,
+    open_store,
+)
 from cloudrc.teleop.wire import Outcome, Output, Plan, RobotStatus
 
 FAR_NS = 1 << 62
@@ -241,7 +250,24 @@ class Mortal:
         self._due_ns = due_ns
 
 
-Keep = Callable[[Entry], None]
+class Database(sqlite3.Connection):
+    """A database whose commits a scenario sees.
+
+    Attributes:
+        before: Called before a commit; an `sqlite3.OperationalError` refuses it.
+        after: Called after a commit.
+    """
+
+    before: Callable[[], None] | None = None
+    after: Callable[[], None] | None = None
+
+    def commit(self) -> None:
+        """See `sqlite3.Connection`."""
+        if self.before is not None:
+            self.before()
+        super().commit()
+        if self.after is not None:
+            self.after()
 
 
 class Desk:
@@ -249,10 +275,9 @@ class Desk:
 
     Attributes:
         service: The one that lives now; None while teleop is down.
-        entries: What the journal holds.
-        repairs: What was wrong with it whenever it was opened.
+        image: What the store holds, in memory: the bytes of its database.
         events: All that has happened to missions, oldest first.
-        refuse: If set, it is called before an entry is kept; a full disk raises OSError.
+        refuse: If set, it is called before a commit; a full disk raises sqlite3.OperationalError.
     """
 
     outcome: Outcome | None = None
@@ -266,13 +291,12 @@ class Desk:
         Args:
             contact_speed_max: Below which the arm's tip may meet the board [m/s].
             name: Tells its missions from those of another desk.
-            path: Of a real journal; None for one in memory that never fails.
+            path: Of a real store; None for one in memory that never fails.
         """
         self._contact_speed_max, self._path, self._name = contact_speed_max, path, name
-        self._journal: Journal | None = None
+        self._database: Database | None = None
         self._started = 0
-        self.repairs: list[str] = []
-        self.entries: list[Entry] = []
+        self.image, self.image_before = b"", b""
         self.events: list[MissionEvent] = []
         self.refuse: Callable[[], None] | None = None
         self.service: MissionService | None = None
@@ -280,21 +304,38 @@ class Desk:
         self.start()
 
     def start(self) -> None:
-        """A new process, which has nothing but the journal."""
-        if self._path is not None:
-            self._journal = Journal(self._path)
-            self.entries = list(self._journal.entries)
-            self.repairs.append(self._journal.trouble)
-        entries, self._started = list(self.entries), self._started + 1
+        """A new process, which has nothing but the store."""
+        self._started += 1
         salt = b"%s %d" % (self._name, self._started)  # in production it is random
-        self.service = MissionService(self._contact_speed_max, self._keep, entries, salt=salt)
+        if self._path is not None:
+            book = open_store(self._path, salt, self._open)
+        else:
+            connection = connect(None, self._open)
+            if self.image:
+                connection.deserialize(self.image)
+            book = MissionStore(connection, salt)
+        assert self._database is not None
+        self._database.before, self._database.after = self._refuse, self._keep
+        self.service = MissionService(self._contact_speed_max, book)
 
     def kill(self) -> None:
         """Teleop is gone, and what it had not written down with it."""
-        if self._journal is not None:
-            self._journal.close()
-        self.service = self._journal = None
+        if self._database is not None:
+            self._database.close()
+        self.service = self._database = None
         self._outputs.clear()
+
+    @property
+    def entries(self) -> list[Entry]:
+        """Events that the disk holds, oldest first."""
+        if self.service is not None and self._path is not None:
+            return self.service.book.events_after(0)
+        connection = connect(self._path)
+        if self.image:
+            connection.deserialize(self.image)
+        events = MissionStore(connection, b"").events_after(0)
+        connection.close()
+        return events
 
     def order(self, plan: Plan, now_ns: int, **options: Any) -> Mission:
         """Post a mission; it is started at once."""
@@ -369,12 +410,21 @@ class Desk:
         self.events += [said for said in outputs if isinstance(said, MissionEvent)]
         self._outputs += outputs
 
-    def _keep(self, entry: Entry) -> None:
+    def _open(self, *words: Any, **options: Any) -> Database:
+        self._database = Database(*words, **options)
+        return self._database
+
+    def _refuse(self) -> None:
         if self.refuse is not None:
             self.refuse()
-        if self._journal is not None:
-            self._journal.append(entry)
-        self.entries.append(entry)
+
+    def _keep(self) -> None:
+        """Something is on the disk."""
+        if self._path is None and self._database is not None:
+            self._hold(self._database.serialize())
+
+    def _hold(self, image: bytes) -> None:
+        self.image_before, self.image = self.image, image
 
 
 UNIX_SOCKET_MAX = 11
@@ -443,7 +493,7 @@ class Apart(Desk):
         self._at_cloud = Socket(lambda: self._host is not None and self._host.inner is not None)
         self._peer = Peer(self._at_teleop, self._at_cloud)
         self._host: Mortal | None = None
-        self._phase_ns, self._life, self._free_ns = phase_ns, 0, 0
+        self._phase_ns, self._life, self._free_ns, self._began_ns = phase_ns, 0, 0, 0
         self.slow: list[Event] = []
         super().__init__(contact_speed_max, path)
 
@@ -553,19 +603,22 @@ class Apart(Desk):
         """Say it to cloud: events wait for one that is there, everything else is repeated."""
         send(self.take_outputs(), self._unsent, self._peer, wire.encode)
 
-    def _keep(self, entry: Entry) -> None:
-        began_ns, life = self._free_ns, self._life
+    def _refuse(self) -> None:
+        began_ns = self._free_ns
         takes = (e.value for e in self.slow if e.at <= began_ns * 1e-9 < e.end)
         self._free_ns += round(max(takes, default=0.0) * 1e9)
+        self._began_ns = began_ns
+        super()._refuse()
+
+    def _hold(self, image: bytes) -> None:
+        life, began_ns = self._life, self._began_ns
         if self._host is None or began_ns <= self._turn_ns:
-            super()._keep(entry)
+            super()._hold(image)
             return
-        if self.refuse is not None:
-            self.refuse()
 
         def reach(_: int) -> None:
             if self._life == life:
-                self.entries.append(entry)
+                super(Apart, self)._hold(image)
 
         self._host.at(began_ns * 1e-9, reach)
 

@@ -12,8 +12,6 @@ the robot has flown another mission since or is another one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict
 from math import isfinite
 from typing import Any
 
@@ -21,7 +19,6 @@ from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
-from cloudrc.teleop.journal import Entry
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError, busy
 from cloudrc.teleop.verdict import MissionObservations
@@ -227,21 +224,12 @@ class MissionService:
         book: The missions.
     """
 
-    def __init__(
-        self,
-        contact_speed_max: float,
-        write: Callable[[Entry], None] = lambda entry: None,
-        entries: Iterable[Entry] = (),
-        *,
-        salt: bytes,
-    ) -> None:
-        """Load the earlier missions; nothing flies before the first deadline.
+    def __init__(self, contact_speed_max: float, book: MissionStore) -> None:
+        """Begin with the missions of a store; nothing flies before the first deadline.
 
         Args:
             contact_speed_max: Speed limit for the arm's tip when it touches the board [m/s].
-            write: Stores an entry; raises OSError on failure.
-            entries: Entries stored earlier, oldest first.
-            salt: Random bytes that make mission numbers differ from those of another journal.
+            book: Missions of this teleop and of earlier ones.
         """
         self._contact_speed_max = contact_speed_max
         self._outputs: list[Output | Fault] = []
@@ -250,7 +238,7 @@ class MissionService:
         self._setpoint_ns = 0
         self._current: Mission | None = None
         self._ends = False  # whether this process ends; the next one starts the queued missions
-        self.book = MissionStore(write, entries, salt)
+        self.book = book
         self._teleop = Teleop(self.book.has_ended)
         self._stop = PersistentStop(self.book, self._teleop)
 
@@ -266,12 +254,15 @@ class MissionService:
             The mission, and whether it is new: the same key gives the same mission.
 
         Raises:
-            ConflictError: If another mission is under way and the order may not wait, the queue is
-                full, or the operator has to acknowledge first.
+            ConflictError: If the key belongs to another order, another mission is under way and
+                the order may not wait, the queue is full, or the operator has to acknowledge first.
             UnavailableError: If the mission cannot be stored, or this process ends.
         """
         known = self.book.with_key(order.key)
         if known is not None:
+            if (known.order.plan, known.order.contact) != (order.plan, order.contact):
+                text = f"the key '{order.key}' is that of mission {known.id}, with another plan"
+                raise ConflictError(f"{text}; take a new key", known.id)
             return known, False
         waiting = self.book.waits_for(order)
         self._check_can_fly()
@@ -476,7 +467,7 @@ class MissionService:
         assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
-            changed |= {"world": seen.world, "witness": asdict(MissionObservations.begin(seen))}
+            changed |= {"world": seen.world, "witness": MissionObservations.begin(seen)}
         outcome = self._teleop.outcome
         if outcome is not None and event.event == outcome.code:
             elapsed = self._teleop.elapsed(now_ns)

@@ -1,40 +1,45 @@
-"""The book of missions: what happens is written down first, and only then counts.
+"""Store missions and their progress in an SQLite file, and give them back after a restart.
 
-Everything that is known of a mission follows from its entries, so that what is known after a
-restart is what was known before. Entries go to `write`, which keeps them: the journal.
+A mission is one row: its order, written once, and its status, written with each event. A waypoint
+is reached once, because mission and index are the key of a row. A transaction is on the disk when
+it returns (`synchronous=FULL`), so a process that is killed at any instant loses at most the event
+under way. The number of missions, and of events of each mission, is bounded.
 
-One mission as teleop remembers it: journal entries come in; what the API shows goes out.
+A disk that is full or fails refuses new missions, but stops no flight: what happens meanwhile stays
+in memory, and is written before anything else once the disk takes it.
 
-What the journal has not taken yet: entries come in; all reach it, in order, once it can write.
-
-A full disk does not stop a flight: what happens meanwhile waits here, and goes before whatever is
-written next. How many can wait is bounded: what tells of a mission's end or of a waypoint reached
-stays, and there are no more of them than missions and waypoints; of all else the newest stay.
+An old and a new teleop can overlap when a pod is replaced. The file is locked for one of them.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
+import os
+import sqlite3
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
-from itertools import islice, takewhile
-from typing import Any
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, TypeAlias
 
-from cloudrc.errors import CloudrcError
+from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.messages import Start
-from cloudrc.teleop.journal import Entry
 from cloudrc.teleop.verdict import Criteria, Failure, MissionObservations, Verdict, judge
 from cloudrc.teleop.wire import Continue, Leg, Outcome, Plan, StartMission
+
+Entry: TypeAlias = dict[str, Any]
+"""An event of a mission, and what it changes."""
 
 QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
 DONE, FAILED, CANCELLED = "done", "failed", "cancelled"
 ENDED = (DONE, FAILED, CANCELLED)
 SHOWN = 100
-"""Events of a mission that are shown, the newest: a mission has some ten, but one that is held can
-be sent elsewhere without end, and every answer has them. The journal keeps the others, too."""
+"""Limit of the events that are kept of one mission, the newest. A mission has about ten, but a held
+one can be sent to other places without end."""
 NEVER_BEGAN = "mission cancelled before it began"
-
 STATES = {
     "queued": QUEUED,
     "starting": STARTING,
@@ -51,19 +56,19 @@ STATES = {
     "taken_over": FAILED,
     "end_lost": FAILED,
 }
-"""State of a mission after an event; one that is not named here changes nothing."""
+"""State of a mission after an event; other events do not change the state."""
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What somebody asks to be flown.
+    """Order of a mission.
 
     Attributes:
-        plan: Checked.
-        name: For people.
-        key: The same key never makes a second mission; "" for none.
+        plan: Checked plan.
+        name: Name for people.
+        key: Key of the request; the same key never makes a second mission. "" for none.
         contact: Whether the arm has to touch the board.
-        queue: Whether to wait for the mission that is under way, in place of being refused.
+        queue: Whether to wait for the mission under way, instead of being refused.
     """
 
     plan: Plan
@@ -75,20 +80,20 @@ class Order:
 
 @dataclass(slots=True)
 class Mission:
-    """Everything that is known of a mission; it follows from its journal entries alone.
+    """A mission and its progress.
 
     Attributes:
-        id: Given by teleop.
-        order: What was asked for.
-        number: Names it on board, where its progress is kept, too; below 2^63, 0 if it is not.
-        state: One of `STATES`.
-        world: Names the world in which it was started; "" before that.
-        elapsed: How long it had lasted at its last event [s].
-        reached: Index of each waypoint reached and when [s].
-        events: The newest of what has happened, as the API shows it.
-        happened: How often each event has, the older ones counted.
+        id: Identifier, such as "m1".
+        order: The order.
+        number: Number of the mission on board; below 2^63.
+        state: One of the values of `STATES`.
+        world: World in which it was started; "" before that.
+        elapsed: Duration at its last event [s].
+        reached: Index and time [s] of each waypoint reached.
+        events: The newest events, as the API shows them.
+        happened: Count of each event, with those that are no longer kept.
         witness: What the robot has touched.
-        verdict: As the API shows it; None until it has ended.
+        verdict: The verdict, as the API shows it; None until the mission has ended.
     """
 
     id: str
@@ -105,57 +110,17 @@ class Mission:
 
     @property
     def ended(self) -> bool:
-        """Whether it is over."""
+        """Whether the mission is over."""
         return self.state in ENDED
 
     @property
     def waypoint(self) -> int:
-        """Index of the waypoint that is flown to, or was at the end."""
+        """Index of the current waypoint, or of the last one at the end."""
         return min(len(self.reached), len(self.order.plan.legs) - 1)
 
-    def apply(self, entry: Entry) -> None:
-        """Take in an entry of kind "event"."""
-        event = {k: entry[k] for k in ("id", "mission", "event", "waypoint", "text", "time_s")}
-        self.events.append(event)
-        self.happened[entry["event"]] += 1
-        self.state = STATES.get(entry["event"], self.state)
-        self.elapsed, self.world = entry["time_s"], entry["world"]
-        if self.world and self.state in (QUEUED, STARTING):
-            self.state = FLYING  # it was started, though a damaged journal has lost what said so
-        self.witness = MissionObservations(**entry["witness"])
-        self.verdict = entry.get("verdict", self.verdict)
-        # A waypoint is reached once, whatever is told how often.
-        if entry["event"] == "reached" and entry["waypoint"] == len(self.reached):
-            self.reached.append({"waypoint": entry["waypoint"], "time_s": entry["time_s"]})
-
-    def in_new_session(self) -> str:
-        """What to say when the controller has another session with the same robot."""
-        where = f"waypoint {self.waypoint + 1} of {len(self.order.plan.legs)}"
-        goes_on = f"is held on the way to {where}" if self.state == HELD else f"goes on to {where}"
-        return f"the controller has a new session, as after a restart; the mission {goes_on}"
-
-    def judged(self, outcome: Outcome, contact_speed_max: float, elapsed: float) -> dict[str, Any]:
-        """The verdict on how it ended, as the API shows it.
-
-        Args:
-            outcome: How that was.
-            contact_speed_max: Below which the arm's tip may meet the board [m/s].
-            elapsed: How long it has lasted [s].
-        """
-        criteria = Criteria(self.order.contact, contact_speed_max)
-        count = len(self.order.plan.legs)
-        return judge(outcome, self.witness, criteria, waypoints=count, elapsed=elapsed).as_json()
-
-    def forsake(self) -> None:
-        """A later mission has begun: this one is over, although nothing kept says how it ended."""
-        text = "how it ended was not kept: the journal was damaged or could not be written"
-        self.state = FAILED
-        self.verdict = Verdict("failure", (Failure("end_lost", text),)).as_json()
-
     def entry(self, number: int, event: str, text: str, **changed: Any) -> Entry:
-        """Make the entry of something that happens to the mission now."""
+        """Make the entry of an event that happens now; `changed` replaces its values."""
         return {
-            "kind": "event",
             "id": number,
             "mission": self.id,
             "event": event,
@@ -163,12 +128,49 @@ class Mission:
             "waypoint": self.waypoint,
             "time_s": round(self.elapsed, 3),
             "world": self.world,
-            "witness": asdict(self.witness),
+            "witness": self.witness,
+            "verdict": self.verdict,
             **changed,
         }
 
+    def apply(self, entry: Entry) -> None:
+        """Change the mission by an event."""
+        event = {k: entry[k] for k in ("id", "mission", "event", "waypoint", "text", "time_s")}
+        self.events.append(event)
+        self.happened[entry["event"]] += 1
+        self.state = STATES.get(entry["event"], self.state)
+        self.elapsed, self.world = entry["time_s"], entry["world"]
+        self.witness, self.verdict = entry["witness"], entry["verdict"]
+        if entry["event"] == "reached" and entry["waypoint"] == len(self.reached):
+            self.reached.append({"waypoint": entry["waypoint"], "time_s": entry["time_s"]})
+
+    def after(self, entry: Entry) -> Mission:
+        """Return the mission as the event changes it; this one stays as it is."""
+        reached, events, happened = [*self.reached], self.events.copy(), self.happened.copy()
+        changed = replace(self, reached=reached, events=events, happened=happened)
+        changed.apply(entry)
+        return changed
+
+    def in_new_session(self) -> str:
+        """Describe that the controller has another session with the same robot."""
+        where = f"waypoint {self.waypoint + 1} of {len(self.order.plan.legs)}"
+        goes_on = f"is held on the way to {where}" if self.state == HELD else f"goes on to {where}"
+        return f"the controller has a new session, as after a restart; the mission {goes_on}"
+
+    def judged(self, outcome: Outcome, contact_speed_max: float, elapsed: float) -> dict[str, Any]:
+        """Judge the mission as the operator has seen it, for the API.
+
+        Args:
+            outcome: How it ended.
+            contact_speed_max: Limit of the arm's tip speed when it touches the board [m/s].
+            elapsed: Duration [s].
+        """
+        criteria = Criteria(self.order.contact, contact_speed_max)
+        count = len(self.order.plan.legs)
+        return judge(outcome, self.witness, criteria, waypoints=count, elapsed=elapsed).as_json()
+
     def summary(self) -> dict[str, Any]:
-        """What a list of missions shows."""
+        """Return what a list of missions shows."""
         return {
             "id": self.id,
             "name": self.order.name,
@@ -181,145 +183,29 @@ class Mission:
         }
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, but no more than `SHOWN` events, as the API shows it."""
+        """Return everything that the API shows."""
         left_out = self.happened.total() - len(self.events)
         return {**self.summary(), "events": list(self.events), "events_left_out": left_out}
 
 
-def order_entry(mission: Mission) -> Entry:
-    """Make the entry that a mission begins with."""
-    order, plan = mission.order, mission.order.plan
-    return {
-        "kind": "mission",
-        "mission": mission.id,
-        "number": mission.number,
-        "name": order.name,
-        "key": order.key,
-        "contact": order.contact,
-        "start": plan.start.name,
-        "time_limit": plan.time_limit,
-        "legs": [
-            [list(leg.position), leg.yaw, leg.tolerance, leg.dwell, leg.time_limit]
-            for leg in plan.legs
-        ],
-    }
-
-
-def from_entry(entry: Entry) -> Mission:
-    """Make the mission that an entry of kind "mission" began."""
-    legs = tuple(Leg(tuple(position), *rest) for position, *rest in entry["legs"])
-    plan = Plan(legs, Start[entry["start"]], entry["time_limit"])
-    order = Order(plan, entry["name"], entry["key"], entry["contact"])
-    return Mission(entry["mission"], order, entry["number"])
-
-
 def number_of(mission_id: str, salt: bytes) -> int:
-    """Name a mission in 63 bits; ids begin again with a new journal, the salt does not.
+    """Compute the number of a mission on board, from 1 to 2^63 - 1.
 
     Args:
-        mission_id: Ours, such as "m1".
-        salt: Bytes that no other journal had.
+        mission_id: Its identifier; these begin again with a new file.
+        salt: Random bytes that no other process has.
     """
     digest = hashlib.sha256(salt + mission_id.encode()).digest()
     return int.from_bytes(digest[:8], "little") >> 1 or 1
 
 
-def never_began() -> dict[str, Any]:
-    """The verdict on a mission that was cancelled before it began, as the API shows it."""
-    return Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
-
-
 def first_verb(mission: Mission) -> StartMission | Continue:
-    """How to begin: anew, or where a teleop before this one left off."""
+    """Return the verb that begins a mission, or continues it after a restart of teleop."""
     plan, number = mission.order.plan, mission.number
     if not mission.world:
         return StartMission(plan, number, again=True)
     held = mission.state == HELD
     return Continue(plan, mission.waypoint, mission.elapsed, mission.world, held, number)
-
-
-PASSING_MAX = 1_000
-"""Entries that wait at most, those that stay in any case not counted."""
-AT_ONCE = 20
-"""Entries written at once: each takes the disk its time, and the flight goes on."""
-
-
-class Backlog:
-    """Stands before a journal and forgets nothing that matters."""
-
-    def __init__(self, write: Callable[[Entry], None]) -> None:
-        """Begin with nothing.
-
-        Args:
-            write: Keeps an entry; raises OSError if it cannot.
-        """
-        self._write = write
-        self._waiting: list[Entry] = []
-
-    def __len__(self) -> int:
-        return len(self._waiting)
-
-    def append(self, entry: Entry) -> None:
-        """Keep an entry, after all that wait, or not at all.
-
-        Raises:
-            OSError: If it is not kept.
-        """
-        while self._waiting:
-            self.flush()
-        self._write(entry)
-
-    def note(self, entry: Entry) -> None:
-        """Keep an entry, after all that wait, now or later.
-
-        Raises:
-            OSError: If the disk refuses; the entry waits then, too.
-        """
-        self._waiting.append(entry)
-        try:
-            self.flush()
-        finally:
-            self._shorten()
-
-    def flush(self) -> None:
-        """Write some of what waits, oldest first.
-
-        Raises:
-            OSError: If the disk refuses; what is left waits on.
-        """
-        for _ in range(min(AT_ONCE, len(self._waiting))):
-            self._write(self._waiting[0])
-            del self._waiting[0]
-
-    def _shorten(self) -> None:
-        """Drop the oldest entry that nothing depends on, if there are too many."""
-        if len(self._waiting) <= PASSING_MAX:
-            return
-        passing = [n for n, entry in enumerate(self._waiting) if _passes(entry)]
-        if len(passing) > PASSING_MAX:
-            newest = {self._waiting[n]["mission"]: n for n in passing if _leads(self._waiting[n])}
-            del self._waiting[next(n for n in passing if n not in newest.values())]
-
-
-def _passes(entry: Entry) -> bool:
-    """Whether newer entries of the mission say all that follows from it, but for its state."""
-    return entry["event"] != "reached" and "verdict" not in entry
-
-
-def _leads(entry: Entry) -> bool:
-    """Whether it tells the mission's state."""
-    return entry["event"] in STATES
-
-
-QUEUE_MAX = 16
-"""Missions that may wait for the one under way."""
-KEPT = 100
-"""Missions that have ended and are still known."""
-KEEP_PERIOD_NS = 1_000_000_000
-"""Between two tries to write what the disk has refused [ns]."""
-LOGGED = 5_000
-"""Events, of all missions together, that can still be asked for: a number and not a time, since a
-mission has some ten, and a reader who was away for a minute is to miss none."""
 
 
 class UnknownMissionError(CloudrcError):
@@ -328,6 +214,10 @@ class UnknownMissionError(CloudrcError):
 
 class UnavailableError(CloudrcError):
     """Not now: the journal cannot be written, another teleop holds it, or this one ends."""
+
+
+class StoreLockedError(CloudrcError):
+    """Another process has the file open."""
 
 
 class ConflictError(CloudrcError):
@@ -341,54 +231,187 @@ class ConflictError(CloudrcError):
 
 
 def busy(mission: Mission, advice: str) -> ConflictError:
-    """What to raise where a mission is in the way."""
+    """Make the error for a mission that is in the way."""
     return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)
+
+
+APPLICATION, VERSION = 0x43524A32, 1
+"""Numbers in the head of the file: that it is ours, and the version of its tables."""
+SCHEMA = f"""
+CREATE TABLE mission (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL);
+CREATE TABLE reached (mission INTEGER REFERENCES mission ON DELETE CASCADE, waypoint INTEGER,
+    time_s REAL NOT NULL, PRIMARY KEY (mission, waypoint)) WITHOUT ROWID;
+CREATE TABLE event (id INTEGER PRIMARY KEY, body TEXT NOT NULL,
+    mission INTEGER NOT NULL REFERENCES mission ON DELETE CASCADE);
+CREATE INDEX event_of ON event (mission);
+PRAGMA application_id = {APPLICATION};
+PRAGMA user_version = {VERSION};
+"""
+SQLITE, OLD_JOURNAL = b"SQLite format 3\0", b"\x93CRJ"
+"""First bytes of a file of SQLite, and of a journal of cloudrc up to version 0.1."""
+NUMBERS = ("application_id", "user_version")
+SIDE_FILES = ("", "-wal", "-shm", "-journal")
+"""Endings of the files that belong to one file of SQLite."""
+
+
+def open_store(path: Path, salt: bytes, factory: Any = sqlite3.Connection) -> MissionStore:
+    """Open the file of missions and lock it; make it if there is none.
+
+    A damaged file, and a journal of an earlier version, is set aside: see `MissionStore.notice`.
+
+    Args:
+        path: Path of the file.
+        salt: Random bytes for the numbers of missions.
+        factory: Class of the connection.
+
+    Raises:
+        StoreLockedError: If another process has it open.
+        BadInputError: If it is something else, of another version, or cannot be made.
+    """
+    head = _head(path)
+    if head.startswith(OLD_JOURNAL):
+        aside = _set_aside(path, "old")
+        text = f"{path}: a journal of an earlier version, which is not read; it is kept as {aside}"
+        return MissionStore(connect(path, factory), salt, notice=text)
+    if head and head != SQLITE:
+        raise BadInputError(f"--journal {path}: is no journal; move it away, or name another file")
+    try:
+        return MissionStore(connect(path, factory), salt)
+    except sqlite3.DatabaseError as error:
+        aside = _set_aside(path, "damaged")
+        reason = " ".join(str(error).split())
+        text = f"journal repaired: {path}: {reason}; its missions are lost, it is kept as {aside}"
+    return MissionStore(connect(path, factory), salt, notice=text, damaged=True)
+
+
+def _head(path: Path) -> bytes:
+    """Read the first bytes of the file; make it, for its owner alone, if there is none."""
+    if path.exists() and not path.is_file():
+        raise BadInputError(f"--journal {path}: is not a file; name another one")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), "rb") as file:
+        return file.read(len(SQLITE))
+
+
+def _set_aside(path: Path, why: str) -> Path:
+    """Rename a file and those that belong to it; return its new path."""
+    aside = path.with_name(f"{path.name}.{why}")
+    for ending in SIDE_FILES:
+        with suppress(FileNotFoundError):
+            Path(f"{path}{ending}").replace(f"{aside}{ending}")
+    return aside
+
+
+def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqlite3.Connection:
+    """Connect to a file of missions, lock and check it.
+
+    Args:
+        path: Path of the file; None for memory.
+        factory: Class of the connection.
+
+    Raises:
+        StoreLockedError: If another process has it open.
+        BadInputError: If it is of another version, or cannot be made.
+        sqlite3.DatabaseError: If it is damaged.
+    """
+    # The thread that serves missions may be another one than that which opens the file.
+    db: sqlite3.Connection = sqlite3.connect(
+        path or ":memory:", timeout=0, isolation_level=None, check_same_thread=False,
+        factory=factory,
+    )  # fmt: skip
+    try:
+        db.executescript(
+            "PRAGMA locking_mode = EXCLUSIVE; PRAGMA journal_mode = WAL; "
+            "PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON; BEGIN EXCLUSIVE; COMMIT;"
+        )
+        if not db.execute("PRAGMA schema_version").fetchone()[0]:
+            db.executescript(f"BEGIN;{SCHEMA}COMMIT;")
+        known = [db.execute(f"PRAGMA {name}").fetchone()[0] for name in NUMBERS]
+        if known != [APPLICATION, VERSION]:
+            text = "this version cannot read it; move it away, or name another file"
+            raise BadInputError(f"--journal {path}: {text}")
+        if (found := db.execute("PRAGMA quick_check").fetchone()[0]) != "ok":
+            raise sqlite3.DatabaseError(found)
+    except BaseException as error:
+        db.close()
+        if isinstance(error, sqlite3.OperationalError):
+            raise _not_opened(path, error) from None
+        raise
+    return db
+
+
+def _not_opened(path: Path | None, error: sqlite3.OperationalError) -> CloudrcError:
+    if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
+        return StoreLockedError(
+            f"{path}: another teleop has this journal open; waiting until it ends"
+        )
+    return BadInputError(f"--journal {path}: {error}; free or repair its volume, or name another")
+
+
+QUEUE_MAX = 16
+"""Limit of the missions that wait for the one under way."""
+KEPT = 100
+"""Limit of the missions that have ended and are still known."""
+KEEP_PERIOD_NS = 1_000_000_000
+"""Time between two attempts to write what the disk has refused [ns]."""
+LOGGED = 5_000
+"""Limit of the events, of all missions together, that a reader can ask for."""
 
 
 class MissionStore:
     """All missions, oldest first.
 
     Attributes:
-        missions: By id.
-        trouble: Why the disk has refused the last entry; "" if it has not.
-        dropped: Events that were asked for by somebody who had some, and are forgotten; each counts
-            once, however often it is asked for.
+        missions: Missions by id.
+        trouble: Why the disk has refused the last event; "" if it has not.
+        dropped: Count of the events that a reader has asked for after they were forgotten.
+        notice: What was wrong with the file and where it is now; "" if nothing.
+        damaged: Whether a damaged file has been set aside.
     """
 
     def __init__(
-        self, write: Callable[[Entry], None], entries: Iterable[Entry], salt: bytes
+        self,
+        connection: sqlite3.Connection,
+        salt: bytes,
+        *,
+        notice: str = "",
+        damaged: bool = False,
     ) -> None:
-        """Read what was written before.
+        """Read the missions of a file.
 
         Args:
-            write: Keeps an entry; raises OSError if it cannot.
-            entries: What was kept, oldest first.
-            salt: Makes numbers of missions that no other book has.
+            connection: Connection by `connect`; it is closed on an error.
+            salt: Random bytes for the numbers of missions.
+            notice: See above.
+            damaged: See above.
+
+        Raises:
+            sqlite3.DatabaseError: If a row cannot be read.
         """
-        self._backlog, self._salt = Backlog(write), salt
+        self._db, self._salt, self.notice, self.damaged = connection, salt, notice, damaged
         self._numbered = self._events = 0
+        self._unsaved: dict[str, int] = {}  # mission -> its first event that is not on the disk
         self.missions: dict[str, Mission] = {}
         self.trouble, self._told, self._keep_ns = "", "", 0
         self.dropped, self._missed = 0, 0
         self._log: deque[dict[str, Any]] = deque(maxlen=LOGGED)
-        for entry in entries:
-            self._apply(entry)
+        try:
+            self._read()
+        except (sqlite3.DatabaseError, BadInputError, LookupError, TypeError, ValueError) as error:
+            connection.close()
+            raise sqlite3.DatabaseError(f"a row cannot be read: {error!r}") from error
 
     @property
     def kept(self) -> bool:
-        """Whether the disk has taken everything."""
-        return not self._backlog
-
-    def knows(self, entry: Entry) -> bool:
-        """Whether an entry is of a mission that is still known."""
-        return entry["mission"] in self.missions
+        """Whether everything is on the disk."""
+        return not self._unsaved
 
     def open(self) -> list[Mission]:
-        """Missions that have not ended; the first is the one to fly."""
+        """Return the missions that have not ended; the first is the one to fly."""
         return [mission for mission in self.missions.values() if not mission.ended]
 
     def stopped(self) -> Mission | None:
-        """Give the mission that the operator has stopped, and not acknowledged since, if any."""
+        """Return the mission that the operator has stopped and not acknowledged since, if any."""
         for mission in reversed(self.missions.values()):
             events = mission.happened
             if "started" in events or "emergency_stopped" in events:
@@ -397,7 +420,7 @@ class MissionStore:
         return None
 
     def waits_for(self, order: Order) -> list[Mission]:
-        """Give the missions that a new one has to wait for.
+        """Return the missions that a new one has to wait for.
 
         Raises:
             ConflictError: If there are any and the order does not want to wait, or too many do.
@@ -410,7 +433,7 @@ class MissionStore:
         return before
 
     def find(self, mission_id: str) -> Mission:
-        """Give a mission.
+        """Return a mission.
 
         Raises:
             UnknownMissionError: If there is none of this id.
@@ -421,75 +444,84 @@ class MissionStore:
         return mission
 
     def has_ended(self, number: int) -> bool:
-        """Whether a mission, by the number under which the robot knows it, is over."""
+        """Whether a mission, by its number on board, is over."""
         return any(mission.number == number and mission.ended for mission in self.missions.values())
 
     def with_key(self, key: str) -> Mission | None:
-        """Give the mission that was ordered under a key, if any."""
-        found = (m for m in self.missions.values() if key and m.order.key == key)
-        return next(found, None)
+        """Return the mission that was ordered with a key, if any."""
+        return next((m for m in self.missions.values() if key and m.order.key == key), None)
 
     def add(self, order: Order) -> Mission:
-        """Write a new mission down.
+        """Store a new mission, and forget the oldest if too many have ended.
 
         Raises:
-            UnavailableError: If it cannot be kept; it then does not exist.
+            UnavailableError: If it cannot be stored; it then does not exist.
         """
         mission_id = f"m{self._numbered + 1}"
-        entry = order_entry(Mission(mission_id, order, number_of(mission_id, self._salt)))
-        self._append(entry, "no mission can start")
-        return self.missions[entry["mission"]]
+        number = number_of(mission_id, self._salt)
+        mission = Mission(mission_id, replace(order, queue=False), number)
+        ended = [each.id for each in self.missions.values() if each.ended]
+        old = ended[: max(0, len(ended) - KEPT)]
+        self._save("no mission can start", mission, new=True, old=old)
+        self._numbered += 1
+        self.missions[mission_id] = mission
+        for each in old:
+            del self.missions[each]
+        return mission
 
     def begin(self, mission: Mission, now_ns: int) -> None:
-        """Write down that a mission that waits is asked to start [ns]; else it waits on."""
+        """Store that a waiting mission is asked to start, at `now_ns` [ns]; else it waits on."""
         if now_ns < self._keep_ns:
             return
+        entry = mission.entry(self._events + 1, "starting", "the robot is asked to start")
         try:
-            text = "the robot is asked to start"
-            self._append(mission.entry(self._events + 1, "starting", text), f"{mission.id} waits")
-            self.trouble = self._told = ""
+            self._save(f"{mission.id} waits", mission.after(entry))
         except UnavailableError as error:
             self.trouble, self._keep_ns = str(error), now_ns + KEEP_PERIOD_NS
+        else:
+            self._apply(mission, entry)
 
     def cancel(self, mission: Mission) -> None:
-        """Write down that a mission that waits will not begin.
+        """Store that a waiting mission will not begin.
 
         Raises:
-            UnavailableError: If it cannot be kept: a teleop after this one would fly it.
+            UnavailableError: If it cannot be stored: a teleop after this one would fly it.
         """
-        entry = mission.entry(self._events + 1, "cancelled", NEVER_BEGAN, verdict=never_began())
-        self._append(entry, f"{mission.id} waits on")
+        verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
+        entry = mission.entry(self._events + 1, "cancelled", NEVER_BEGAN, verdict=verdict)
+        self._save(f"{mission.id} waits on", mission.after(entry))
+        self._apply(mission, entry)
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
-        """Write down what happens to a mission, or as soon as the disk can be written again.
+        """Store what happens to a mission, now or as soon as the disk can be written again.
 
         Args:
-            mission: Which.
+            mission: The mission.
             event: One word.
             text: The same in words.
-            changed: Values of the entry that are not as they were: waypoint, time_s, world,
-                witness, verdict.
+            changed: Values of the entry that change: waypoint, time_s, world, witness, verdict.
         """
         entry = mission.entry(self._events + 1, event, text, **changed)
         if event == "reached" and entry["waypoint"] < len(mission.reached):
-            return  # the last one, which a teleop before has written down
-        self._try(lambda: self._backlog.note(entry))
-        self._apply(entry)
+            return  # an earlier teleop has stored it
+        self._apply(mission, entry)
+        self._unsaved.setdefault(mission.id, entry["id"])
+        self._try_to_save()
 
     def catch_up(self, now_ns: int) -> None:
-        """Write down what waits for the disk, if it is time [ns] for that."""
-        if self._backlog and now_ns >= self._keep_ns:
-            self._try(self._backlog.flush)
+        """Write what the disk has refused, if it is time [ns] for that."""
+        if self._unsaved and now_ns >= self._keep_ns:
+            self._try_to_save()
             self._keep_ns = now_ns + (KEEP_PERIOD_NS if self.trouble else 0)
 
     def news(self) -> str:
-        """Say once what is the trouble; "" if there is none, or it has been told."""
+        """Return the trouble once; "" if there is none, or it has been told."""
         told, self._told = self._told, self.trouble
         return "" if told == self.trouble else self.trouble
 
     def events_after(self, number: int) -> list[dict[str, Any]]:
-        """Give the events of all missions that came after the one of this number."""
-        if number > self._events:  # of a journal that is gone
+        """Return the events of all missions after the one of this number."""
+        if number > self._events:  # of a file that is gone
             number = 0
         if number and self._log:  # without a number nobody has missed anything
             last = self._log[0]["id"] - 1
@@ -498,44 +530,115 @@ class MissionStore:
                 self._missed = last
         return list(takewhile(lambda event: event["id"] > number, reversed(self._log)))[::-1]
 
-    def _append(self, entry: Entry, refused: str) -> None:
+    def close(self) -> None:
+        """Close the file, so that the next teleop can open it."""
+        self._db.close()
+
+    def _apply(self, mission: Mission, entry: Entry) -> None:
+        mission.apply(entry)
+        self._log.append(mission.events[-1])
+        self._events = entry["id"]
+
+    def _try_to_save(self) -> None:
         try:
-            self._backlog.append(entry)
-        except OSError as error:
-            raise UnavailableError(
-                f"{refused}: the journal cannot be written: {error.strerror}; "
-                "free or mend its volume"
-            ) from error
-        self._apply(entry)
+            self._commit()
+        except sqlite3.DatabaseError as error:
+            self.trouble = f"the journal cannot be written: {error}; free its volume"
 
-    def _try(self, write: Callable[[], None]) -> None:
+    def _save(
+        self, refused: str, mission: Mission, *, new: bool = False, old: Iterable[str] = ()
+    ) -> None:
+        """Write a mission and everything before it, or nothing; `refused` tells what that means."""
         try:
-            write()
-            self.trouble = self._told = ""
-        except OSError as error:
-            self.trouble = f"the journal cannot be written: {error.strerror}; free its volume"
+            self._commit(mission, new, old)
+        except sqlite3.DatabaseError as error:
+            text = f"the journal cannot be written: {error}; free or repair its volume"
+            raise UnavailableError(f"{refused}: {text}") from error
 
-    def _apply(self, entry: Entry) -> None:
-        if entry["kind"] == "mission":
-            mission = from_entry(entry)
-            self.missions[mission.id] = mission
-            self._numbered = int(mission.id.removeprefix("m"))
-            self._forget_old()
-        elif (known := self.missions.get(entry["mission"])) is not None:
-            waited = known.state == QUEUED
-            known.apply(entry)
-            if waited and known.state not in (QUEUED, CANCELLED):
-                self._forsake_before(known)
-            self._log.append(known.events[-1])
-            self._events = entry["id"]
+    def _commit(
+        self, mission: Mission | None = None, new: bool = False, old: Iterable[str] = ()
+    ) -> None:
+        db = self._db
+        try:
+            db.execute("BEGIN")
+            for mission_id, first in self._unsaved.items():
+                self._write(self.missions[mission_id], first)
+            if mission is not None and new:
+                row = _row(mission), to_json(mission.order, mission.number), _status(mission)
+                db.execute("INSERT INTO mission VALUES (?, ?, ?)", row)
+            elif mission is not None:
+                self._write(mission, mission.events[-1]["id"])
+            db.executemany("DELETE FROM mission WHERE n = ?", [(int(each[1:]),) for each in old])
+            db.commit()
+        except sqlite3.DatabaseError:
+            with suppress(sqlite3.DatabaseError):
+                db.rollback()
+            raise
+        self._unsaved.clear()
+        self.trouble = self._told = ""
 
-    def _forsake_before(self, begun: Mission) -> None:
-        """Missions are flown one after the other: those before one that has begun are over."""
-        for mission in takewhile(lambda mission: mission is not begun, self.missions.values()):
-            if not mission.ended:
-                mission.forsake()
+    def _write(self, mission: Mission, first: int) -> None:
+        """Write the status of a mission, its events from `first`, and its waypoints."""
+        db, row, events = self._db, _row(mission), mission.events
+        db.execute("UPDATE mission SET status = ? WHERE n = ?", (_status(mission), row))
+        new = [(each["id"], json.dumps(each), row) for each in events if each["id"] >= first]
+        db.executemany("INSERT INTO event VALUES (?, ?, ?)", new)
+        db.execute("DELETE FROM event WHERE mission = ? AND id < ?", (row, events[0]["id"]))
+        (there,) = db.execute("SELECT count(*) FROM reached WHERE mission = ?", (row,)).fetchone()
+        reached = [(row, each["waypoint"], each["time_s"]) for each in mission.reached[there:]]
+        db.executemany("INSERT INTO reached VALUES (?, ?, ?)", reached)
 
-    def _forget_old(self) -> None:
-        ended = [mission.id for mission in self.missions.values() if mission.ended]
-        for mission_id in islice(ended, max(0, len(ended) - KEPT)):
-            del self.missions[mission_id]
+    def _read(self) -> None:
+        for row, order, status in self._db.execute("SELECT * FROM mission ORDER BY n"):
+            mission = from_json(f"m{row}", order, **json.loads(status))
+            self.missions[mission.id], self._numbered = mission, row
+        for row, *reached in self._db.execute("SELECT * FROM reached ORDER BY mission, waypoint"):
+            each = dict(zip(("waypoint", "time_s"), reached, strict=True))
+            self.missions[f"m{row}"].reached.append(each)
+        for number, body, row in self._db.execute("SELECT * FROM event ORDER BY id"):
+            self.missions[f"m{row}"].events.append(event := json.loads(body))
+            self._log.append(event)
+            self._events = number
+
+
+def _row(mission: Mission) -> int:
+    return int(mission.id[1:])
+
+
+def _status(mission: Mission) -> str:
+    status = {name: getattr(mission, name) for name in ("state", "world", "elapsed", "verdict")}
+    return json.dumps({**status, "happened": mission.happened, "witness": asdict(mission.witness)})
+
+
+def to_json(order: Order, number: int) -> str:
+    """Write an order and the number of its mission as JSON."""
+    plan = order.plan
+    legs = [[leg.position, leg.yaw, leg.tolerance, leg.dwell, leg.time_limit] for leg in plan.legs]
+    fields = {"name": order.name, "key": order.key, "contact": order.contact}
+    start = {"start": plan.start.name, "time_limit": plan.time_limit, "legs": legs}
+    return json.dumps({"number": number, **fields, **start})
+
+
+def from_json(
+    mission_id: str, order: str, happened: dict[str, int], witness: dict[str, Any], **status: Any
+) -> Mission:
+    """Read a mission without its events and waypoints.
+
+    Args:
+        mission_id: Its identifier.
+        order: See `to_json`.
+        happened: Count of each event.
+        witness: Attributes of its observations.
+        status: Other attributes of the mission.
+    """
+    read = json.loads(order)
+    legs = tuple(Leg(tuple(position), *rest) for position, *rest in read["legs"])
+    plan = Plan(legs, Start[read["start"]], read["time_limit"])
+    mission = Mission(
+        mission_id,
+        Order(plan, read["name"], read["key"], read["contact"]),
+        read["number"],
+        **status,
+    )
+    mission.happened, mission.witness = Counter(happened), MissionObservations(**witness)
+    return mission

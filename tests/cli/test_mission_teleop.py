@@ -6,15 +6,11 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from cloudrc.cli import extras, teleop
+from cloudrc.cli import extras
 from cloudrc.cli.main import main
-from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError
-from cloudrc.teleop.journal import Journal, to_bytes
 
 WORDS = ["teleop", "--config", "hover", "--socket"]
 
@@ -25,20 +21,6 @@ def test_without_fastapi_the_api_is_refused_and_the_extra_named(
     monkeypatch.setitem(extras.EXTRAS, "api", ("fastapi_is_not_here",))
     assert main([*WORDS, str(tmp_path), "--api", "127.0.0.1:0"]) == 3
     assert "pip install 'cloudrc[api]'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("entry", [{"a": 1}, {"mission": "m1"}, {"entry": "order", "id": 7}])
-def test_a_journal_of_another_format_is_refused_unchanged(
-    entry: dict[str, Any], tmp_path: Path
-) -> None:
-    file = tmp_path / "journal"
-    file.write_bytes(to_bytes([entry]))
-    before = file.read_bytes()
-    journal = Journal(file)
-    with pytest.raises(BadInputError, match=rf"{file}: .* name another file"):
-        teleop._open_service(load_experiment("hover"), journal)
-    journal.close()
-    assert file.read_bytes() == before
 
 
 @pytest.mark.process

@@ -8,7 +8,7 @@ import pytest
 
 from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.drivers.teleop import UnixPeer
-from cloudrc.teleop.journal import parse
+from cloudrc.teleop.store import open_store
 from cloudrc.teleop.wire import ALARM, encode
 from tests.conftest import nightly
 from tests.drivers.conftest import LIMIT, TOKEN, Release
@@ -72,8 +72,10 @@ def test_an_ended_teleop_holds_and_its_successor_resumes(release):
     teleop.communicate(timeout=10)
     assert time.monotonic() - began < 2.0
     assert teleop.returncode == 0
-    entries = parse((release.folder / "journal" / "missions").read_bytes()).entries
-    assert (entries[-1]["event"], "paused by shutdown" in entries[-1]["text"]) == ("paused", True)
+    store = open_store(release.folder / "journal" / "missions", b"")
+    last = store.events_after(0)[-1]
+    store.close()
+    assert (last["event"], "paused by shutdown" in last["text"]) == ("paused", True)
     release.start("teleop")
     release.until(lambda: release.mission()["state"] == "done")
     assert [reached["waypoint"] for reached in release.mission()["reached"]] == [0, 1, 2]

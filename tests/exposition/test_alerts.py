@@ -29,7 +29,6 @@ FIRES = {
     "F25": ["CloudrcCloudRestart", "CloudrcSplitBrain"],
     "F28": ["CloudrcMissionStuck"],
     "F33": ["CloudrcCloudRestart"],
-    "F36": ["CloudrcCloudRestart"],
     "F38": ["CloudrcTagFailures"],
 }
 """Fault -> the alerts that its flight fires; a fault that is not listed fires none."""

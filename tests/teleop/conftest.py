@@ -2,16 +2,12 @@
 
 A robot and a lossy link for teleop to talk to: no world, no tunnel, no clock.
 
-A robot, a lossy link and a journal in memory for the mission service to fly with.
-
-A disk in memory that can be full, refuse, break off at any step, and forget what was not synced.
-
-Names and bytes are kept twice: as the running machine sees them, and as they are on the platter.
+A robot, a lossy link and a store in memory for the mission service to fly with.
 """
 
-import errno
 import json
 import socket
+import sqlite3
 import threading
 import time
 import urllib.error
@@ -25,13 +21,13 @@ from cloudrc.cli.client import Api
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
+from cloudrc.teleop import store
 from cloudrc.teleop.api import ApiServer, Surroundings, create_app
 from cloudrc.teleop.auth import Audit, Gate, Tokens
 from cloudrc.teleop.bridge import STARTING, Bridge
-from cloudrc.teleop.journal import MAGIC, to_record
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import Order
+from cloudrc.teleop.store import MissionStore, Order
 from cloudrc.teleop.wire import Leg, Plan, RobotStatus, StartMission
 
 PERIOD_NS = 10_000_000
@@ -171,25 +167,63 @@ def flying(plan=PLAN):
 SERVICE_PLAN = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)))
 
 
+class KilledError(BaseException):
+    """The process is gone: nothing catches it."""
+
+
+class Disk(sqlite3.Connection):
+    """The database of a `ServiceFlight`, whose commits may fail, or be the last of the process."""
+
+    flight = None
+
+    def commit(self):
+        self.flight.commits += 1
+        if self.flight.killed_before == self.flight.commits:
+            raise KilledError
+        if self.flight.full:
+            raise sqlite3.OperationalError("database or disk is full")
+        super().commit()
+        self.flight.images.append(self.serialize())
+        if self.flight.killed_after == self.flight.commits:
+            raise KilledError
+
+
 class ServiceFlight(Flight):
-    """The harness of the machine, with a service in its place that may be restarted."""
+    """The harness of the machine, with a service in its place that may be restarted.
+
+    Attributes:
+        images: What was on the disk after each commit.
+        full: Whether the disk refuses commits.
+        commits: Attempts to commit.
+        killed_before: Commit before which the process is killed; `killed_after` likewise.
+    """
 
     def __init__(self):
         super().__init__()
-        self.kept = []
-        self.full, self.tries = False, 0
+        self.images, self.full, self.commits = [], False, 0
+        self.killed_before = self.killed_after = None
         self.pipe_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
         self.restart_teleop()
 
-    def restart_teleop(self):
-        """A new process, that has nothing but the journal."""
-        self.teleop = MissionService(0.25, self.write, json.loads(json.dumps(self.kept)), salt=b"")
+    def restart_teleop(self, image=None):
+        """A new process, that has nothing but what is on the disk, or was at a commit."""
+        self.killed_before = self.killed_after = None
+        self.teleop = MissionService(0.25, self.stored(image))
 
-    def write(self, entry):
-        self.tries += 1
-        if self.full:
-            raise OSError(28, "No space left on device")
-        self.kept.append(json.loads(json.dumps(entry)))
+    def stored(self, image=None):
+        """What another process reads from the disk."""
+        disk = store.connect(None, Disk)
+        disk.flight = self
+        if image is None and self.images:
+            image = self.images[-1]
+        if image is not None:
+            disk.deserialize(image)
+        return MissionStore(disk, b"")
+
+    @property
+    def kept(self):
+        """Events that the disk has, oldest first."""
+        return self.stored().events_after(0)
 
     def see(self):
         self.teleop.see(self.seen, self.now_ns)
@@ -372,139 +406,3 @@ def running(**options):
         yield one
     finally:
         one.stop()
-
-
-class KilledError(BaseException):
-    """The process is gone: nothing catches it."""
-
-
-class MemoryDisk:
-    """Stands for `journal_disk.Disk`.
-
-    Attributes:
-        steps: How many operations there have been.
-        kill_at: The operation before which the process is killed; None for never.
-        fault: Called with the name of every operation; may raise OSError.
-    """
-
-    def __init__(self):
-        self.steps, self.kill_at = 0, None
-        self.fault = lambda name: None
-        self.names, self.safe_names = {}, {}  # path -> file
-        self.bytes, self.safe_bytes = [], []  # by file
-        self.handles, self.locked, self.done = {}, set(), []
-
-    def crash(self, *, power=False, kept=0.0):
-        """Begin again after a kill; without power, what was not synced is lost.
-
-        `kept` in [0, 1]: share of the bytes not synced that reached the platter all the same.
-        """
-        self.handles, self.locked, self.kill_at = {}, set(), None
-        self.fault = lambda name: None
-        if power:
-            self.names = dict(self.safe_names)
-            for file, safe in enumerate(self.safe_bytes):
-                now = self.bytes[file]
-                more = round(kept * (len(now) - len(safe))) if now.startswith(safe) else 0
-                self.bytes[file] = safe + now[len(safe) : len(safe) + max(more, 0)]
-        self.safe_names = dict(self.names)
-        self.safe_bytes = list(self.bytes)
-
-    def _step(self, name):
-        if self.kill_at == self.steps:
-            raise KilledError(name)
-        self.steps += 1
-        self.done.append(name)
-        self.fault(name)
-
-    def lock(self, path):
-        if path in self.locked:
-            raise BlockingIOError
-        self.locked.add(path)
-        self.handles[handle := object()] = path
-        return handle
-
-    def open(self, path, *, new=False):
-        self._step("open")
-        if path not in self.names:
-            self.names[path] = len(self.bytes)
-            self.bytes.append(b"")
-            self.safe_bytes.append(b"")
-        file = self.names[path]
-        if new:
-            self.bytes[file] = b""
-        self.handles[handle := object()] = file
-        return handle
-
-    def read(self, path):
-        return self.bytes[self.names[path]] if path in self.names else b""
-
-    def write(self, handle, data):
-        """Half at a time, so that a kill can come between the halves."""
-        self._step("write")
-        taken = data[: (len(data) + 1) // 2]
-        self.bytes[self.handles[handle]] += taken
-        return len(taken)
-
-    def size(self, handle):
-        return len(self.bytes[self.handles[handle]])
-
-    def truncate(self, handle, size):
-        self._step("truncate")
-        file = self.handles[handle]
-        self.bytes[file] = self.bytes[file][:size]
-
-    def sync(self, handle):
-        self._step("sync")
-        file = self.handles[handle]
-        self.safe_bytes[file] = self.bytes[file]
-
-    def replace(self, new, path):
-        self._step("replace")
-        self.names[path] = self.names.pop(new)
-
-    def sync_folder(self, folder):
-        self._step("sync_folder")
-        self.safe_names = dict(self.names)
-
-    def remove(self, path):
-        self._step("remove")
-        self.names.pop(path, None)
-
-    def close(self, handle):
-        self.locked.discard(self.handles.pop(handle))
-
-
-def full(after=0, error=errno.ENOSPC):
-    """A fault: no write succeeds any more, after so many that do."""
-    left = [after]
-
-    def fault(name):
-        if name == "write":
-            left[0] -= 1
-            if left[0] < 0:
-                raise OSError(error, "No space left on device")
-
-    return fault
-
-
-def refusing(*names, error=errno.EROFS):
-    """A fault: these operations are refused."""
-
-    def fault(name):
-        if name in names:
-            raise OSError(error, "Read-only file system")
-
-    return fault
-
-
-PATH = Path("/nowhere/missions.journal")
-SOME = [{"kind": "event", "n": n, "text": f"é\n{n}", "limit": float("inf")} for n in range(4)]
-
-
-def records(some):
-    return [to_record(number, entry) for number, entry in enumerate(some, 1)]
-
-
-def whole(some):
-    return MAGIC + b"".join(records(some))

@@ -7,7 +7,7 @@ from cloudrc.drivers.teleop import serve_teleop
 from cloudrc.messages import GuardState, OperatorRequest, Request
 from cloudrc.teleop import wire
 from cloudrc.teleop.store import UnavailableError
-from tests.teleop.conftest import AWAY, B, C, ServiceFlight, service_flying
+from tests.teleop.conftest import AWAY, B, C, Disk, ServiceFlight, service_flying
 
 HALFWAY = (0.5, 0.0, 1.0)
 
@@ -122,16 +122,16 @@ class Neighbour:
 def test_a_slow_disk_does_not_delay_the_pause_at_shutdown(monkeypatch, fsync_ns):
     """The time for that was over before: the robot flew on to its waypoint."""
     flight, _ = service_flying()
-    clock, write = [flight.now_ns], flight.teleop.book._backlog._write
+    clock, commit = [flight.now_ns], Disk.commit
 
     def sleep(seconds):
         clock[0] += round(seconds * 1e9)
 
-    def keep(entry):
+    def fsync(disk):
         clock[0] += fsync_ns
-        write(entry)
+        commit(disk)
 
-    monkeypatch.setattr(flight.teleop.book._backlog, "_write", keep)
+    monkeypatch.setattr(Disk, "commit", fsync)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
     cloud = Neighbour(flight.teleop.sight.seen)

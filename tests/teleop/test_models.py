@@ -177,3 +177,4 @@ def test_a_mission_from_here_begins_with_a_free_way(api):
     assert api.post("/v1/missions", order)[0] == 201
     at(api, EAST)
     assert api.post("/v1/missions", order)[0] == 200, "the mission is known, whatever the place"
+    assert api.post("/v1/missions", {**order, "start": "spawn"})[0] == 409, "another plan"

@@ -19,7 +19,6 @@ from tests.teleop.conftest import (
     THREE,
     A,
     B,
-    C,
     Flight,
     ServiceFlight,
     service_flying,
@@ -200,20 +199,6 @@ def test_a_held_mission_records_no_resume_after_a_restart():
     flight.step(seconds=0.3)
     assert flight.view(mission_id)["state"] == "held"
     assert "resumed" not in flight.names(mission_id)
-
-
-def test_a_queued_mission_waits_until_the_first_is_recorded():
-    flight, first = service_flying()
-    second = flight.create(queue=True)
-    flight.full = True
-    for point in (B, C):
-        flight.step(position=point, seconds=0.1)
-    assert flight.view(first)["state"] == "done"
-    flight.step(seconds=3.0)
-    assert flight.view(second)["state"] == "queued"
-    flight.full = False
-    flight.step(seconds=1.5)
-    assert flight.view(second)["state"] in ("starting", "flying")
 
 
 def test_what_waits_is_not_begun_before_the_robot_is_seen():

@@ -130,12 +130,20 @@ class Processes:
 
     def events(self) -> list[str]:
         """What has happened to the mission, as the journal has it."""
-        from cloudrc.teleop.journal import parse
+        import json
+        import shutil
+        import sqlite3
 
-        path = self.folder / "journal"
-        if not path.exists():
-            return []
-        return [str(e["event"]) for e in parse(path.read_bytes()).entries if e["kind"] == "event"]
+        with tempfile.TemporaryDirectory() as folder:  # teleop has the files locked
+            for path in self.folder.glob("journal*"):
+                shutil.copy(path, folder)
+            try:
+                database = sqlite3.connect(Path(folder) / "journal")
+                rows = database.execute("SELECT body FROM event ORDER BY id").fetchall()
+                database.close()
+            except sqlite3.DatabaseError:
+                return []
+        return [str(json.loads(body)["event"]) for (body,) in rows]
 
     def until(self, text: str, condition: Callable[[], bool], limit: float = LIMIT) -> None:
         """Wait until something has come about.

@@ -1,10 +1,9 @@
-"""Faults of disks: full, read-only and slow ones, a killed recorder, a torn journal."""
+"""Faults of disks: full, read-only and slow ones, a killed recorder."""
 
 from __future__ import annotations
 
 import errno
 import tempfile
-from collections.abc import Callable
 from math import nan
 from pathlib import Path
 
@@ -12,9 +11,7 @@ from cloudrc.faults import asks
 from cloudrc.faults import asks as meters
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, Scenario, generator
-from cloudrc.faults.scenarios.link import instant
 from cloudrc.faults.scribe import ForgetfulWriter, FullDisk, Scribe, SlowWriter
-from cloudrc.faults.toll import Generator
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
@@ -182,49 +179,6 @@ def _judge_remains(
     outcome.least("of them after a power cut that has forgotten something", len(copies) - 20, 4)
 
 
-def _torn_journal(seed: int) -> Outcome:
-    """The pod dies in the middle of a transition; then a bit of its journal is wrong."""
-    outcome = Outcome()
-    for damage in (_tear, _rot):
-        with tempfile.TemporaryDirectory() as folder:
-            _damage_journal(outcome, seed, Path(folder) / "missions.journal", damage)
-    return outcome
-
-
-Damage = Callable[[bytearray, Generator], None]
-
-
-def _tear(data: bytearray, rng: Generator) -> None:
-    del data[-int(rng.integers(1, 40)) :]
-
-
-def _rot(data: bytearray, rng: Generator) -> None:
-    data[-int(rng.integers(10, 60))] ^= 4
-
-
-def _damage_journal(outcome: Outcome, seed: int, path: Path, damage: Damage) -> None:
-    at, rng = instant(seed, 8.0, 22.0), generator(seed, 36)
-    flight = Flight(seed=seed, journal=path)
-
-    def die(now_ns: int) -> None:
-        flight.kill_cloud_pod(now_ns, 1.0)
-        data = bytearray(path.read_bytes())
-        damage(data, rng)
-        path.write_bytes(data)
-
-    flight.cloud.at(at, die)
-    flight.fly_mission()
-    asks.safe(outcome, flight)
-    outcome.true("mission done", flight.mission.state == "done")
-    outcome.true("journal repaired, it says", "repaired" in " ".join(flight.desk.repairs))
-    repaired = sum("repaired" in text for text in flight.desk.repairs)
-    meters.counts(outcome, "teleop", "journal_repaired", repaired, "journal_repaired_total")
-    reached = [each["waypoint"] for each in flight.mission.reached]
-    every = list(range(len(flight.mission.order.plan.legs)))
-    outcome.true("in the journal, too, each waypoint was reached once", reached == every)
-    flight.desk.kill()
-
-
 SCENARIOS = (
     Scenario(
         29,
@@ -244,14 +198,5 @@ SCENARIOS = (
         "cloudrc recover: kept 99 % after SIGKILL; before, what a power cut would take: "
         "cloudrc_recorder_sync_age_seconds",
         _recorder_killed,
-    ),
-    Scenario(
-        36,
-        "torn-journal",
-        "the journal's end is torn off, or has a wrong bit",
-        "the last whole entry counts, the robot is the second witness",
-        "at most one transition, which is found again",
-        "journal repaired, cloudrc_journal_repaired_total",
-        _torn_journal,
     ),
 )

@@ -17,8 +17,7 @@ from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.faults.scenarios.link import instant
 from cloudrc.messages import GuardState
 from cloudrc.teleop.bridge import Bridge
-from cloudrc.teleop.journal import Entry, parse
-from cloudrc.teleop.store import LOGGED, Order, UnavailableError
+from cloudrc.teleop.store import LOGGED, Entry, Order, UnavailableError
 
 PER_PERIOD = 10
 """Requests in every 10 ms: 1,000 in a second."""
@@ -107,12 +106,12 @@ def _shutdown(seed: int) -> Outcome:
     """SIGTERM of the cloud pod: teleop and cloud, each a process, are asked at once."""
     outcome, at, left = Outcome(), instant(seed, 6.0, 20.0), list[Entry]()
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "missions.journal"
+        path = Path(folder) / "missions"
         flight = Flight(seed=seed, journal=path, apart=True)
 
         def gone(now_ns: int) -> None:
             flight.kill_cloud_pod(now_ns, AWAY)
-            left.extend(parse(path.read_bytes()).entries)
+            left.extend(flight.desk.entries)
 
         ended = _shut_down(flight, at, gone)
         flight.fly_mission()

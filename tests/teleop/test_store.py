@@ -1,0 +1,392 @@
+"""The store of missions: what is on the disk is known, whatever happens to process and disk."""
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.errors import BadInputError
+from cloudrc.messages import Start
+from cloudrc.teleop import models
+from cloudrc.teleop.store import (
+    KEPT,
+    LOGGED,
+    QUEUE_MAX,
+    SHOWN,
+    ConflictError,
+    MissionStore,
+    Order,
+    StoreLockedError,
+    UnavailableError,
+    UnknownMissionError,
+    connect,
+    number_of,
+    open_store,
+)
+from cloudrc.teleop.wire import Leg, Plan
+from tests.teleop.conftest import A, B, C, KilledError, ServiceFlight, service_flying
+
+PLAN = Plan((Leg(A, 0.1, float("inf"), 0.5, 3.0), Leg(B)), Start.HERE, 12.5)
+ORDER = Order(PLAN, "näme", "key", contact=True)
+FULL = "the journal cannot be written: database or disk is full"
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "volume" / "missions"
+
+
+def begun(path):
+    """A file with one mission under way; it is closed."""
+    store = open_store(path, b"salt")
+    mission = store.add(ORDER)
+    store.begin(mission, 0)
+    store.note(mission, "reached", "waypoint 1", waypoint=0, time_s=1.5, world="w")
+    store.close()
+    return mission
+
+
+def test_missions_are_read_back_exactly(path):
+    mission = begun(path)
+    store = open_store(path, b"other")
+    assert store.missions == {"m1": mission}
+    assert [event["event"] for event in store.events_after(0)] == ["starting", "reached"]
+    assert store.add(ORDER).number != mission.number
+    assert (path.stat().st_mode & 0o777, store.notice, store.damaged) == (0o600, "", False)
+    store.close()
+    assert os.listdir(path.parent) == ["missions"]
+
+
+def test_a_second_store_is_refused_until_the_first_is_closed(path):
+    first = open_store(path, b"")
+    with pytest.raises(StoreLockedError, match="another teleop has this journal open"):
+        open_store(path, b"")
+    first.add(ORDER)
+    first.close()
+    assert list(open_store(path, b"").missions) == ["m1"]
+
+
+def overwrite(path, at, data):
+    with path.open("r+b") as file:
+        file.seek(at)
+        file.write(data)
+
+
+def scribble(path):
+    overwrite(path, 4096, os.urandom(9000))
+
+
+def empty_page(path):
+    overwrite(path, path.stat().st_size - 4096, bytes(4096))
+
+
+def bad_row(path):
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE mission SET status = '{'")
+    database.close()
+
+
+@pytest.mark.parametrize("damage", [scribble, empty_page, bad_row])
+def test_a_damaged_file_is_set_aside_and_named(path, damage):
+    begun(path)
+    damage(path)
+    before = path.read_bytes()
+    store = open_store(path, b"")
+    aside = path.with_name("missions.damaged")
+    assert store.damaged
+    assert store.notice.startswith(f"journal repaired: {path}: ")
+    assert store.notice.endswith(f"its missions are lost, it is kept as {aside}")
+    assert "\n" not in store.notice
+    assert aside.read_bytes() == before
+    assert store.missions == {}
+    assert store.add(ORDER).id == "m1"
+
+
+def test_an_old_journal_is_named_and_not_read(path):
+    path.parent.mkdir()
+    path.write_bytes(old := b"\x93CRJ\r\n\x1a\n" + bytes(40))
+    store = open_store(path, b"")
+    assert "a journal of an earlier version, which is not read" in store.notice
+    assert (store.missions, store.damaged) == ({}, False)
+    assert path.with_name("missions.old").read_bytes() == old
+
+
+def another_version(path):
+    begun(path)
+    with sqlite3.connect(path) as database:
+        database.execute("PRAGMA user_version = 2")
+    database.close()
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda path: path.write_bytes(b"a recording of somebody else"), "is no journal"),
+        (lambda path: path.write_bytes(b"SQLite"), "is no journal"),
+        (lambda path: path.mkdir(), "is not a file"),
+        (lambda path: os.mkfifo(path), "is not a file"),
+        (another_version, "this version cannot read it"),
+        (lambda path: sqlite3.connect(path).execute("CREATE TABLE a (b)"), "cannot read it"),
+        (lambda path: path.with_name("missions-wal").mkdir(), "disk I/O error"),
+    ],
+)
+def test_anything_else_is_refused_and_left_alone(path, make, said):
+    path.parent.mkdir()
+    make(path)
+    with pytest.raises(BadInputError, match=f"--journal {path}: .*{said}.*another"):
+        open_store(path, b"")
+    assert {"missions", "missions-wal"} >= set(os.listdir(path.parent))
+
+
+def killed_writer(path):
+    """A process that stores waypoints, until it is killed."""
+    code = f"""
+from pathlib import Path
+from cloudrc.teleop.store import Order, open_store
+from cloudrc.teleop.wire import Leg, Plan
+store = open_store(Path({str(path)!r}), b"")
+mission = store.add(Order(Plan(tuple(Leg((float(n), 0.0, 1.0)) for n in range(100_000)))))
+for n in range(100_000):
+    store.note(mission, "reached", "r", waypoint=n, time_s=n / 2, world="w")
+    print(n, flush=True)
+"""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    return subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment
+    )
+
+
+@pytest.mark.process
+@pytest.mark.promise("waypoints-once-in-order")
+@pytest.mark.parametrize("at", [0, 7, 300])
+def test_what_was_told_is_there_after_a_sigkill(path, at):
+    with killed_writer(path) as writer:
+        told = [int(next(writer.stdout)) for _ in range(at + 1)][-1]
+        writer.send_signal(signal.SIGKILL)
+        told = max([told, *map(int, writer.stdout.read().split())])
+    mission = open_store(path, b"").find("m1")
+    reached = [each["waypoint"] for each in mission.reached]
+    assert reached == list(range(len(reached)))
+    assert told + 1 <= len(reached) <= told + 2
+
+
+def test_a_torn_end_costs_the_last_event_alone(path):
+    store = open_store(path, b"")
+    mission = store.add(ORDER)
+    store.note(mission, "held", "held")
+    store.note(mission, "resumed", "resumed")
+    wal = path.with_name("missions-wal")
+    files = {each: each.read_bytes() for each in (path, wal)}
+    store.close()
+    for cut in (1, 24, 4000):
+        path.write_bytes(files[path])
+        wal.write_bytes(files[wal][:-cut])
+        again = open_store(path, b"")
+        assert [event["event"] for event in again.events_after(0)] == ["held"]
+        again.close()
+
+
+def test_the_number_of_missions_and_events_is_bounded():
+    store, quick = MissionStore(connect(), b""), Order(Plan((Leg(A),)))
+    size = {}
+    for n in range(1, 3 * KEPT + 1):
+        mission = store.add(quick)
+        for _ in range(SHOWN // 10):
+            store.note(mission, "goto", "there")
+        store.cancel(mission)
+        size[n] = store._db.execute("PRAGMA page_count").fetchone()[0]
+    assert list(store.missions) == [f"m{n}" for n in range(2 * KEPT, 3 * KEPT + 1)]
+    assert size[3 * KEPT] <= size[KEPT + 10] * 1.05
+    mission = store.add(quick)
+    for _ in range(2 * SHOWN):
+        store.note(mission, "goto", "there")
+    count = "SELECT count(*) FROM event WHERE mission = ?"
+    assert store._db.execute(count, (3 * KEPT + 1,)).fetchone() == (SHOWN,)
+    assert mission.as_json()["events_left_out"] == SHOWN
+    models.MissionView.model_validate(mission.as_json())
+
+
+def test_a_reader_that_was_away_misses_what_was_forgotten_once():
+    store = MissionStore(connect(), b"")
+    mission = store.add(ORDER)
+    for _ in range(LOGGED + 5):
+        store.note(mission, "goto", "there")
+    assert store.events_after(LOGGED)[0]["id"] == LOGGED + 1
+    assert [len(store.events_after(2)), store.dropped] == [LOGGED, 3]
+    assert [len(store.events_after(2)), store.dropped] == [LOGGED, 3]
+    assert [len(store.events_after(0)), store.dropped] == [LOGGED, 3]
+    assert len(store.events_after(10**9)) == LOGGED, "of a file that is gone"
+
+
+def test_numbers_on_board_do_not_repeat_with_a_new_file():
+    numbers = {number_of(f"m{n}", salt) for n in range(100) for salt in (b"a", b"b")}
+    assert len(numbers) == 200
+    assert all(0 < number < 2**63 for number in numbers)
+
+
+def test_what_is_not_there_or_in_the_way_is_named():
+    store = MissionStore(connect(), b"")
+    with pytest.raises(UnknownMissionError, match="no mission 'm7'"):
+        store.find("m7")
+    first = store.add(ORDER)
+    with pytest.raises(ConflictError, match="m1 is queued; cancel it first") as refused:
+        store.waits_for(ORDER)
+    assert refused.value.mission == "m1"
+    waits = Order(PLAN, queue=True)
+    for _ in range(QUEUE_MAX):
+        assert store.waits_for(waits)[0] is first
+        store.add(waits)
+    with pytest.raises(ConflictError, match="cancel one"):
+        store.waits_for(waits)
+    assert (store.with_key("key"), store.with_key("")) == (first, None)
+
+
+def finish(flight):
+    for point in (B, C):
+        flight.step(position=point, seconds=0.1)
+
+
+def test_a_full_disk_stops_no_flight_and_is_told_once():
+    flight, mission_id = service_flying()
+    before = flight.kept
+    flight.full = True
+    finish(flight)
+    assert (flight.view(mission_id)["state"], flight.kept) == ("done", before)
+    tried = flight.commits
+    flight.step(seconds=3.0)
+    assert 2 <= flight.commits - tried <= 4
+    assert [fault.text for fault in flight.faults] == [f"{FULL}; free its volume"]
+    with pytest.raises(UnavailableError, match=f"no mission can start: {FULL}"):
+        flight.create()
+    assert list(flight.teleop.book.missions) == ["m1"]
+    flight.full = False
+    flight.step(seconds=1.05)
+    assert flight.kept[-1]["event"] == "done"
+    assert [event["id"] for event in flight.kept] == list(range(1, len(flight.kept) + 1))
+    assert flight.stored().missions == flight.teleop.book.missions
+
+
+def test_what_was_refused_is_stored_with_the_next_mission():
+    flight, mission_id = service_flying()
+    flight.full = True
+    finish(flight)
+    flight.full = False
+    second = flight.create()
+    flight.restart_teleop()
+    assert flight.view(mission_id)["verdict"]["exit_code"] == 0
+    assert [mission.id for mission in flight.teleop.book.open()] == [second]
+
+
+def test_a_waiting_mission_changes_only_with_the_disk():
+    flight, _ = service_flying()
+    waits = flight.create(queue=True)
+    flight.full = True
+    with pytest.raises(UnavailableError, match=f"m2 waits on: {FULL}"):
+        flight.teleop.cancel(waits, flight.now_ns)
+    finish(flight)
+    flight.step(seconds=3.0)
+    assert flight.view(waits)["state"] == "queued", "it does not begin before the end is stored"
+    flight.full = False
+    flight.step(seconds=1.5)
+    assert flight.view(waits)["state"] == "flying"
+
+
+def test_a_disk_found_full_at_the_start_begins_nothing():
+    flight = ServiceFlight()
+    store = flight.teleop.book
+    waits = store.add(ORDER)
+    flight.full = True
+    for now_ns, tries in ((0, 1), (1, 0), (10**9, 1)):
+        tried = flight.commits
+        store.begin(waits, now_ns)
+        assert (flight.commits - tried, waits.state) == (tries, "queued")
+    assert store.news() == f"m1 waits: {FULL}; free or repair its volume"
+    assert store.news() == ""
+
+
+def flown(kill, **when):
+    """Fly a mission whose process is killed once; say whether it was."""
+    flight = ServiceFlight()
+    setattr(flight, kill, when["at"])
+    killed = False
+    for position in (A, A, B, C, C):
+        try:
+            flight.step()
+            flight.create(key="uid")
+            flight.step(position=position, seconds=0.1)
+        except KilledError:
+            killed = True
+            flight.restart_teleop()
+            flight.step(seconds=0.1)
+            flight.create(key="uid")
+            flight.step(position=position, seconds=0.1)
+    return flight, killed
+
+
+@pytest.mark.promise("waypoints-once-in-order")
+@pytest.mark.parametrize("kill", ["killed_before", "killed_after"])
+def test_killed_at_any_commit_waypoints_are_reached_once_in_order(kill):
+    killed, at = True, 0
+    while killed:
+        at += 1
+        flight, killed = flown(kill, at=at)
+        view = flight.view("m1")
+        assert [each["waypoint"] for each in view["reached"]] == [0, 1, 2], at
+        assert (view["state"], view["verdict"]["exit_code"]) == ("done", 0), at
+        assert flight.names("m1").count("started") == 1
+        assert flight.stored().missions == flight.teleop.book.missions
+        assert list(flight.teleop.book.missions) == ["m1"]
+    assert at > 6
+
+
+WORDS = "A B C away hold resume create goto cancel cloud full free stop_rotors acknowledge restart"
+steps = st.sampled_from(WORDS.split())
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(steps, max_size=14), st.integers(0, 40))
+def test_the_disk_says_all_that_is_known_whatever_happens(actions, at):
+    """Also killed after any commit: each mission then has reached its waypoints once, in order."""
+    flight, _ = service_flying()
+    for action in actions:
+        do(flight, action)
+    flight.full = False
+    flight.step(seconds=1.1)
+    known, stored = flight.teleop.book, flight.stored()
+    assert stored.missions == known.missions
+    events = {event["id"] for event in stored.events_after(0)}
+    assert events <= {event["id"] for event in known.events_after(0)}
+    flight.restart_teleop(flight.images[min(at, len(flight.images) - 1)])
+    flight.step(seconds=0.3)
+    for mission in flight.teleop.book.missions.values():
+        reached = [each["waypoint"] for each in mission.reached]
+        assert reached == list(range(len(reached)))
+
+
+def do(flight, action):
+    points = {"A": A, "B": B, "C": C, "away": (0.0, -5.0, 1.0)}
+    try:
+        if action in points:
+            flight.step(position=points[action], seconds=0.05)
+        elif action == "create":
+            flight.create(queue=True)
+        elif action == "goto":
+            flight.teleop.go_to(A, 0.0, flight.now_ns)
+        elif action == "cancel":
+            flight.teleop.cancel(next(reversed(flight.teleop.book.missions)), flight.now_ns)
+        elif action == "cloud":
+            flight.restart_cloud()
+        elif action == "restart":
+            flight.restart_teleop()
+        elif action in ("full", "free"):
+            flight.full = action == "full"
+        else:
+            getattr(flight.teleop, action)(flight.now_ns)
+    except (ConflictError, UnavailableError):
+        pass
