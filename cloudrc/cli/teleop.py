@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import resource
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,16 +35,14 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 FILES_MAX = 8_192
-"""Limit of open files: idle connections of strangers leave room for that of an emergency stop."""
+"""Limit of open files: idle connections leave room for the one of an emergency stop, and take at
+most 64 MB."""
 
 
 def serve_api(
     options: argparse.Namespace, experiment: ResolvedExperiment, bridge: Bridge
 ) -> ApiServer:
     """Start the API; it answers that teleop is not ready until the bridge is opened."""
-    import json
-    from functools import partial
-
     from cloudrc import assembly
     from cloudrc.geometry.scene import load_scene
     from cloudrc.link.state import publish
@@ -57,10 +58,9 @@ def serve_api(
     audit = Audit(options.audit, log_line) if options.audit else None
     gate = Gate(create_app(bridge, surroundings, log_line), tokens, audit)
     server = ApiServer(gate, bridge, options.api)
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if 0 <= soft < FILES_MAX:  # negative: no limit
-        files = min(hard, FILES_MAX) if hard >= 0 else FILES_MAX
-        resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
     server.start()
     if options.api_file is not None:
         publish(options.api_file, json.dumps({"schemaVersion": 1, "url": server.url}) + "\n")
@@ -189,15 +189,11 @@ class _Ending:
         self._since_ns: int | None = None
 
     def __call__(self) -> bool:
-        import time
-
         if not self._stop_asked():
             return False
         if self._since_ns is None:
             self._service.pause(time.monotonic_ns())
-            self._since_ns = (
-                time.monotonic_ns()
-            )  # again: pausing writes to the disk, which may take long
+            self._since_ns = time.monotonic_ns()  # the disk may have taken long
         return self._service.settled or time.monotonic_ns() - self._since_ns > PAUSE_LIMIT_NS
 
 
@@ -249,8 +245,6 @@ def _fly(
 
 def _open_store(path: Path | None, stop: Callable[[], bool], bridge: Bridge) -> MissionStore | None:
     """Open the store once no other teleop holds it; None if stopped before."""
-    import os
-
     from cloudrc.teleop.store import MissionStore, StoreLockedError, connect, open_store
 
     salt, reported = os.urandom(SALT_SIZE), False
@@ -276,8 +270,6 @@ def _start(
     options: argparse.Namespace, experiment: ResolvedExperiment, service: MissionService
 ) -> bool:
     """Start the mission of the command line, if any; return whether there is one."""
-    import time
-
     from cloudrc import assembly
     from cloudrc.teleop.store import ConflictError, Order
 
@@ -294,7 +286,7 @@ def _start(
     except ConflictError as error:
         if not options.api:
             raise
-        print(f"cloudrc teleop: {error}", file=sys.stderr, flush=True)
+        log_line(str(error))
         return False  # the operator can solve the conflict through the API
     return True
 

@@ -1,5 +1,6 @@
 """The API over HTTP, as its clients meet it."""
 
+import argparse
 import concurrent.futures
 import json
 import socket
@@ -14,7 +15,8 @@ from collections import deque
 import pytest
 
 from cloudrc.cli.client import Api, UnreachableError
-from cloudrc.cli.teleop import api_counts
+from cloudrc.cli.teleop import api_address, api_counts, serve_api
+from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.messages import GuardState
@@ -23,6 +25,7 @@ from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
 from cloudrc.teleop.api import ApiServer
 from cloudrc.teleop.auth import LOCAL
+from cloudrc.teleop.bridge import Bridge
 from cloudrc.teleop.store import Order
 from tests.teleop.conftest import (
     DIRECT,
@@ -446,6 +449,23 @@ def test_the_api_and_its_client_speak_ipv6(host):
         if host == "[::]":
             url = api.url.replace("[::]", "127.0.0.1")
             assert Api(url, lambda: OPERATOR).get("/v1/state")
+
+
+@pytest.mark.parametrize(
+    ("where", "host", "warns"),
+    [
+        ("0", "127.0.0.1", False),
+        ("localhost:0", "localhost", False),
+        ("[::1]:0", "[::1]", False),
+        ("0.0.0.0:0", "0.0.0.0", True),
+    ],
+)
+def test_a_network_address_needs_tokens(where, host, warns, capsys):
+    options = argparse.Namespace(api=api_address(where), tokens=None, audit=None, api_file=None)
+    assert options.api == (host, 0)
+    with pytest.raises(BadInputError, match="needs --tokens DIR"):
+        serve_api(options, load_experiment("hover"), Bridge())
+    assert ("can be reached from outside" in capsys.readouterr().err) is warns
 
 
 def test_an_address_that_cannot_be_bound_is_one_sentence(api, tmp_path):
