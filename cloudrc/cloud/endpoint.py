@@ -328,6 +328,8 @@ class CloudEndpoint:
         if request.number == 0 and request.request is Request.ESTOP:
             self._alarm.sound()
         elif self._session.epoch and (may_start or request.request is not Request.START):
+            if request.request is Request.ACKNOWLEDGE:
+                self._alarm.acknowledge()
             self._asked = max(self._asked, request.number)
             stamped = request._replace(basis_stamp_ns=self._loop.basis_stamp_ns)
             self._send(Kind.OPERATOR, codec.encode_operator(stamped))

@@ -1,4 +1,4 @@
-"""Connect cloud's end to teleop by messages, and repeat an emergency stop without teleop's help."""
+"""Connect cloud's end to teleop by messages, and repeat an emergency stop until it is seen."""
 
 from __future__ import annotations
 
@@ -87,17 +87,18 @@ def make_robot_status(
 
 
 class EmergencyStopRepeater:
-    """Repeat an emergency stop until telemetry shows that the guard is in ESTOP.
+    """Repeat an emergency stop until telemetry shows that the robot has acted on it.
 
-    Cloud repeats the stop itself, because teleop may wait for its disk. Without a session it
-    waits, and it continues in the next one.
+    This is the only place that numbers and repeats the stop towards the robot. Teleop, or its API
+    past teleop's loop, asks for it as often as it likes. Without a session the stop waits, and it
+    continues in the next one.
 
     Attributes:
         sounds: Whether the stop is being repeated.
     """
 
     def __init__(self) -> None:
-        self.sounds = False
+        self.sounds = self._stopped = False
         self._number = self._acted_on = self._due_ns = 0
 
     def sound(self) -> None:
@@ -111,9 +112,13 @@ class EmergencyStopRepeater:
 
     def see(self, guard: GuardState, acted_on: int) -> None:
         """Note the guard's state and the number of the last request that world has acted on."""
-        self._acted_on = acted_on
-        if guard is GuardState.ESTOP:
+        self._acted_on, self._stopped = acted_on, guard is GuardState.ESTOP
+        if self._stopped and 0 < self._number <= acted_on:
             self.sounds = False
+
+    def acknowledge(self) -> None:
+        """End the stop of a robot that is stopped: teleop has seen that, and then acknowledges."""
+        self.sounds = self.sounds and not self._stopped
 
     def due(self, asked: int, now_ns: int) -> OperatorRequest | None:
         """Return the request if a copy of it is due.

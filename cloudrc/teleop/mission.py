@@ -10,6 +10,9 @@
 A `Setpoint` is valid until the next one, within its session. An `OperatorRequest` is repeated at
 10 Hz until telemetry shows that the robot has acted on it. Each `MissionEvent` is sent once.
 
+An emergency stop is the request `ALARM`, without a number: cloud numbers and repeats it. Teleop
+tells cloud so, also at 10 Hz and before everything else, until telemetry shows the stop.
+
               StartMission             start seen             every waypoint reached
         IDLE -------------> STARTING -------------> FLYING --------------------------> DONE
     (or any end)                                Hold | ^ Resume
@@ -37,8 +40,9 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
 from cloudrc.messages import MISSION_OVER, NEVER_NS, GuardState, Request, Setpoint, Start, Vector
 from cloudrc.records import MissionEvent
-from cloudrc.teleop.requests import RequestSender
+from cloudrc.teleop.requests import REPEAT_NS, RequestSender
 from cloudrc.teleop.wire import (
+    ALARM,
     NO_PLAN,
     Acknowledge,
     Cancel,
@@ -352,6 +356,7 @@ class Teleop:
         leg: Index of the current waypoint; the number of waypoints once all are reached.
         outcome: How the mission ended; None while there is none or it is under way.
         requests: Requests to the robot.
+        stopping: Whether an emergency stop is pending: telemetry does not show it yet.
         outputs: Messages since the last `take_outputs`.
     """
 
@@ -360,6 +365,9 @@ class Teleop:
         self.state = State.IDLE
         self.outcome: Outcome | None = None
         self.requests = RequestSender()
+        self.stopping = False
+        self._stop_ns = 0
+        self._stopped_before: tuple[int, int] | None = None  # see `_stop`
         self.outputs: list[Output] = []
         self.leg = 0
         self._is_ended = ended
@@ -380,7 +388,7 @@ class Teleop:
     @property
     def settled(self) -> bool:
         """Whether telemetry shows that the robot has acted on the last request."""
-        return self.requests.settled
+        return self.requests.settled and not self.stopping
 
     def elapsed(self, now_ns: int) -> float:
         """Return the time since the mission began [s]."""
@@ -416,9 +424,7 @@ class Teleop:
             case GoTo(position, yaw, mission_id):
                 self._go_to(Leg(position, yaw), mission_id, now_ns)
             case EmergencyStop():
-                if self.state in UNDER_WAY:
-                    self._end("emergency_stopped", f"emergency stop {self._where()}", now_ns)
-                self.requests.ask(Request.ESTOP)
+                self._stop(now_ns)
             case Acknowledge():
                 self.requests.ask(Request.ACKNOWLEDGE, after=True)
             case Pause():
@@ -429,6 +435,8 @@ class Teleop:
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry at its arrival `now_ns` [ns]."""
         before, self._seen = self._seen, seen
+        if seen.guard is GuardState.ESTOP and (seen.epoch, seen.mission) != self._stopped_before:
+            self.stopping = False
         new_session = self._setpoints.see(seen)
         last = self._setpoints.setpoint
         onboard, legs = reached_on_board(seen, self._mission_id), self._plan.legs
@@ -464,14 +472,32 @@ class Teleop:
             elapsed, flown = self.elapsed(now_ns), self._watch.flown
             if timeout := find_timeout(self._plan, self.leg, self.state, elapsed, flown):
                 self._end(*timeout, now_ns)
-        if (request := self.requests.due(now_ns)) is not None:
+        if self.stopping:
+            if now_ns >= self._stop_ns:
+                self._stop_ns = now_ns + REPEAT_NS
+                self.outputs.append(ALARM)
+        elif (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
+
+    def _stop(self, now_ns: int) -> None:
+        """Stop the rotors; what was asked of the robot before does not count any more.
+
+        A robot that is stopped already may be about to act on an acknowledgement. Then its state
+        alone is not enough, and telemetry has to show a new request.
+        """
+        if self.state in UNDER_WAY:
+            self._end("emergency_stopped", f"emergency stop {self._where()}", now_ns)
+        self.requests.forget()
+        seen = self._seen
+        stopped = seen is not None and seen.guard is GuardState.ESTOP
+        self._stopped_before = (seen.epoch, seen.mission) if seen and stopped else None
+        self.stopping, self._stop_ns = True, 0
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
         """Hold a robot that flies without a mission here, and keep a standing one on the ground."""
         mission_id = seen.mission_id
         over = self._is_ended(mission_id) or may_take_off(seen)
-        if mission_id != self._mission_id and over and not self.requests.stopping:
+        if mission_id != self._mission_id and over and not self.stopping:
             self.requests.ask(Request.END, after=True)
         self._setpoints.select_here()
 

@@ -30,9 +30,10 @@ class RequestSender:
     """Repeat the newest request at 10 Hz until telemetry shows that the robot has acted on it.
 
     A new request replaces the one before, acknowledged or not: its number is higher, and the robot
-    acts on rising numbers only. Nothing replaces an emergency stop. The numbers continue well above
-    the one in telemetry, because an earlier teleop may have sent higher ones; before the first
-    telemetry nothing is sent. Every copy has the epoch of the newest telemetry.
+    acts on rising numbers only. The numbers continue well above the one in telemetry, because an
+    earlier teleop may have sent higher ones; before the first telemetry nothing is sent. Every copy
+    has the epoch of the newest telemetry. The emergency stop is none of these requests: cloud
+    repeats it.
 
     Without a request, this sends the progress of the mission until the robot has stored it.
     """
@@ -55,11 +56,6 @@ class RequestSender:
         return self._pending is None
 
     @property
-    def stopping(self) -> bool:
-        """Whether an emergency stop is pending."""
-        return self._pending is not None and self._pending.request is Request.ESTOP
-
-    @property
     def waits(self) -> bool:
         """Whether the robot is seen to fly on no command: on the ground, or after an end."""
         seen = self._seen
@@ -79,24 +75,15 @@ class RequestSender:
         self._is_started = False
         if self._pending is not None and self._pending.request is Request.START:
             self._ended = NOT_ENDED  # the robot may have acted on the start
-        if self._pending is not None and (after or self.stopping):
-            if self._pending.request is not request:
-                self._next = asked
-            elif not after:
-                self._next = None
-        else:
+        if self._pending is None or not after:
             self._pending, self._next = asked, None
+        elif self._pending.request is not request:
+            self._next = asked
 
     def forget(self) -> None:
-        """Drop all requests except an emergency stop, because another sender has the robot."""
+        """Drop all requests, because another sender has the robot, or it is stopped."""
         self._is_started = False
-        if not self.stopping:
-            self._pending = self._next = None
-
-    def withdraw_stop(self) -> None:
-        """Drop an emergency stop, because the robot flies another mission or is another one."""
-        if self.stopping:
-            self._pending, self._next = self._next, None
+        self._pending = self._next = None
 
     def report(self, mission_id: int, reached: int) -> None:
         """Set the progress that every request carries.
@@ -146,8 +133,8 @@ class RequestSender:
             return None
         if pending is None:
             return self._progress_due(seen, now_ns)
-        # The robot has acted on a higher number, for example cloud's own emergency stop, or on the
-        # same number from an earlier teleop: ours would be acknowledged by now.
+        # The robot has acted on a higher number, for example an emergency stop, or on the same
+        # number from an earlier teleop: ours would be acknowledged by now.
         if pending.number == UNNUMBERED or seen.mission >= pending.number:
             rise = 1 if self._number else PREDECESSORS + now_ns // REPEAT_NS % CLOCK_MAX
             self._number = max(self._number, seen.mission) + rise
@@ -170,8 +157,6 @@ class RequestSender:
     def _is_acknowledged(self, pending: OperatorRequest, seen: RobotStatus) -> bool:
         if pending.number == UNNUMBERED or seen.mission != pending.number:
             return False
-        if pending.request is Request.ESTOP:  # the number alone is not enough
-            return seen.guard is GuardState.ESTOP
         if pending.request is Request.START and pending.start is Start.SPAWN:
             # Until the epoch changes, telemetry is from before the reset.
             return seen.epoch != self._asked_epoch

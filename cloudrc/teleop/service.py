@@ -39,50 +39,6 @@ from cloudrc.teleop.wire import (
     Verb,
 )
 
-
-class PersistentStop:
-    """Send the emergency stop, also after a restart of teleop, until it is acknowledged."""
-
-    def __init__(self, book: MissionStore, teleop: Teleop) -> None:
-        """Send a stop again that an earlier teleop has sent."""
-        self._book, self._teleop = book, teleop
-        self._is_released = False
-        self._is_inherited = book.stopped() is not None  # until this process is asked for a stop
-        if self._is_inherited:
-            teleop.operate(EmergencyStop(), 0)
-
-    @property
-    def is_asked(self) -> bool:
-        """Whether a stop is pending: telemetry does not show it yet."""
-        return self._teleop.requests.stopping
-
-    def ask(self, now_ns: int) -> None:
-        """Stop the rotors at once, at `now_ns` [ns]."""
-        self._is_released = self._is_inherited = False
-        self._teleop.operate(EmergencyStop(), now_ns)
-
-    def release(self, now_ns: int) -> None:
-        """Acknowledge the stop; the robot is told after it has stopped."""
-        self._teleop.operate(Acknowledge(), now_ns)
-        self._is_released = True
-
-    def check_first(self, seen: RobotStatus) -> None:
-        """Check the first telemetry: withdraw a stop that was meant for another robot or mission.
-
-        Call it before teleop gets the telemetry.
-        """
-        stopped = self._book.stopped()
-        if self._is_inherited and stopped is not None and seen.mission_id != stopped.number:
-            self._teleop.requests.withdraw_stop()
-
-    def released(self) -> Mission | None:
-        """Return the stopped mission once, when the robot has acted on the acknowledgement."""
-        if not self._is_released or not self._teleop.settled:
-            return None
-        self._is_released = False
-        return self._book.stopped()
-
-
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED = (LAND, ESTOP)
 """States of the guard that end only when the operator acknowledges them."""
@@ -240,7 +196,9 @@ class MissionService:
         self._ends = False  # whether this process ends; the next one starts the queued missions
         self.book = book
         self._teleop = Teleop(self.book.has_ended)
-        self._stop = PersistentStop(self.book, self._teleop)
+        # Whether an earlier teleop has sent a stop; until this process is asked for one.
+        self._inherits_stop = book.stopped() is not None
+        self._acknowledges = False  # whether the robot has still to act on an acknowledgement
 
     @property
     def over(self) -> bool:
@@ -330,7 +288,8 @@ class MissionService:
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state, and return the mission that failed, if any."""
         mission = self._start_next(now_ns)
-        self._stop.ask(now_ns)
+        self._inherits_stop = self._acknowledges = False
+        self._teleop.operate(EmergencyStop(), now_ns)
         self._collect(now_ns)
         return mission
 
@@ -338,7 +297,8 @@ class MissionService:
         """Let a robot fly again that has landed or was stopped; ConflictError in a mission."""
         if self._current is not None:
             raise busy(self._current, "there is nothing to acknowledge")
-        self._stop.release(now_ns)
+        self._teleop.operate(Acknowledge(), now_ns)
+        self._acknowledges = True
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
@@ -359,17 +319,32 @@ class MissionService:
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry at `now_ns` [ns]."""
         mission = self._current
-        if self.sight.seen is None:
-            self._stop.check_first(seen)
+        if self._inherits_stop:
+            self._repeat_stop(seen, now_ns)
         is_new_session = self.sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
             self._note_contacts(mission, seen, now_ns)
             if is_new_session:
                 self._note(mission, "new_session", mission.in_new_session(), now_ns)
         self._teleop.see(seen, now_ns)
-        if (stopped := self._stop.released()) is not None:
-            self._note(stopped, "acknowledged", "the operator has acknowledged the stop", now_ns)
+        if self._acknowledges and self._teleop.settled:
+            self._acknowledges = False
+            if (stopped := self.book.stopped()) is not None:
+                text = "the operator has acknowledged the stop"
+                self._note(stopped, "acknowledged", text, now_ns)
         self._collect(now_ns)
+
+    def _repeat_stop(self, seen: RobotStatus, now_ns: int) -> None:
+        """Repeat the stop of an earlier teleop, unless the first telemetry is of another mission.
+
+        It is not, if the robot has flown since, or is another one.
+        """
+        self._inherits_stop = False
+        stopped = self.book.stopped()
+        if stopped is not None and seen.mission_id == stopped.number:
+            self._teleop.operate(EmergencyStop(), now_ns)
+            if self._acknowledges:  # meanwhile
+                self._teleop.operate(Acknowledge(), now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
         """Start a waiting mission, check time limits, and repeat what is due at `now_ns` [ns]."""
@@ -401,7 +376,7 @@ class MissionService:
     @property
     def _blocked(self) -> str:
         """Why nothing can fly before the operator acknowledges it; "" if it can."""
-        if self._stop.is_asked:
+        if self._teleop.stopping or self._inherits_stop:
             return "an emergency stop is on its way to the robot"
         return self.sight.latched
 

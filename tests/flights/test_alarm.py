@@ -9,7 +9,7 @@ from cloudrc.cloud.endpoint import CloudIdentity
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request
 from cloudrc.records import GuardChange
-from cloudrc.teleop.wire import ALARM
+from cloudrc.teleop.wire import ALARM, Acknowledge, EmergencyStop
 from cloudrc.tunnel.codec import Kind, peek
 from tests.flights.conftest import SHARED_CLOCK, Ends, join
 
@@ -65,3 +65,18 @@ def test_an_acknowledgement_ends_the_alarm() -> None:
     fly(ends, 5 * S)
     ends.cloud.teleop.requests.ask(Request.ACKNOWLEDGE)
     assert fly(ends, 9 * S) == [GuardState.GROUND]
+
+
+def test_a_stop_after_an_acknowledgement_holds_and_one_before_is_undone() -> None:
+    """The robot still shows the first stop, when the second is asked for."""
+    ends = join(HOVER)
+    fly(ends, 4 * S)
+    ends.cloud.teleop.outputs.append(ALARM)
+    fly(ends, 5 * S)
+    ends.cloud.teleop.operate(Acknowledge(), 5 * S)
+    ends.cloud.teleop.handle_deadline(5 * S)
+    ends.cloud.teleop.operate(EmergencyStop(), 5 * S)
+    assert fly(ends, 7 * S)[-1] is GuardState.ESTOP
+    ends.cloud.teleop.outputs.append(ALARM)  # late, of before
+    ends.cloud.teleop.requests.ask(Request.ACKNOWLEDGE)
+    assert fly(ends, 9 * S)[-1] is GuardState.GROUND

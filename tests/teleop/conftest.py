@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 
 from cloudrc import assembly
 from cloudrc.cli.client import Api
+from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
@@ -28,7 +29,7 @@ from cloudrc.teleop.bridge import STARTING, Bridge
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionStore, Order
-from cloudrc.teleop.wire import Leg, Plan, RobotStatus, StartMission
+from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus, StartMission
 
 PERIOD_NS = 10_000_000
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
@@ -55,6 +56,7 @@ class Flight:
         self.first_shown_ns = {}  # number of a request -> when telemetry first showed it
         self.said = []
         self.said_at = []
+        self.stop = EmergencyStopRepeater()  # cloud's
 
     def step(self, position=None, seconds=0.01):
         """Let time pass in periods of 10 ms, telemetry and deadline in each."""
@@ -62,9 +64,13 @@ class Flight:
         for _ in range(round(seconds * 100)):
             self.now_ns += PERIOD_NS
             if self.uplink:
+                self.stop.see(self.guard, self.mission)
                 self.see()
             self.teleop.handle_deadline(self.now_ns)
             self._collect()
+            stop = self.stop.due(self.mission, self.now_ns) if self.stop.sounds else None
+            if stop is not None and self.downlink:
+                self._obey(stop)
 
     def see(self):
         seen = RobotStatus(
@@ -97,6 +103,7 @@ class Flight:
         self.epoch += 1
         self.mission = 0
         self.guard = GuardState.HOLD
+        self.stop = EmergencyStopRepeater()
 
     @property
     def state(self):
@@ -120,8 +127,13 @@ class Flight:
             said = output._replace(epoch=0) if for_session else output
             self.said.append(said)
             self.said_at.append(self.now_ns)
-            if isinstance(said, OperatorRequest) and self.downlink:
-                self._obey(said)
+            if said == ALARM:
+                self.stop.sound()
+            elif isinstance(said, OperatorRequest):
+                if said.request is Request.ACKNOWLEDGE:
+                    self.stop.acknowledge()
+                if self.downlink:
+                    self._obey(said)
 
     def _obey(self, request):
         """Act on it as world does: rising numbers only; a start from the spawn restarts."""

@@ -10,7 +10,7 @@ from cloudrc.messages import GuardState, Request
 from cloudrc.teleop import wire
 from cloudrc.teleop.bridge import Bridge
 from cloudrc.teleop.store import ConflictError
-from cloudrc.teleop.wire import Acknowledge, EmergencyStop, GoTo, Pause, StartMission
+from cloudrc.teleop.wire import ALARM, Acknowledge, EmergencyStop, GoTo, Pause, StartMission
 from tests.teleop.conftest import AWAY, SERVICE_PLAN, B, Flight, ServiceFlight, service_flying
 from tests.teleop.conftest import flying as machine_flying
 
@@ -32,13 +32,19 @@ def test_a_flight_is_stopped_and_its_mission_has_failed():
     assert flight.teleop.settled
 
 
-def test_it_leaves_at_once_with_a_number_above_all_others():
+def test_it_leaves_at_once_and_is_told_until_it_is_seen():
+    """Cloud gives it a number, above all others, and repeats it towards the robot."""
     flight = machine_flying()
-    highest = flight.requests[-1].number
+    flight.uplink = False
     flight.operate(EmergencyStop())
     flight.teleop.handle_deadline(flight.now_ns)
-    (stop,) = [o for o in flight.teleop.take_outputs() if getattr(o, "request", None) is not None]
-    assert (stop.request, stop.number) == (Request.ESTOP, highest + 1)
+    assert ALARM in flight.teleop.take_outputs()
+    flight.step(seconds=1.0)
+    assert 10 <= flight.said.count(ALARM) <= 11
+    flight.uplink = True
+    flight.step(seconds=0.5)
+    assert flight.said.count(ALARM) <= 11
+    assert flight.guard is GuardState.ESTOP
 
 
 def test_without_a_mission_it_is_asked_all_the_same():
@@ -70,17 +76,6 @@ def test_after_a_stall_the_stop_belongs_to_the_stopped_mission(stops):
     flight.step(seconds=0.1)
     assert flight.names(mission_id)[-1] == "emergency_stopped"
     assert flight.teleop.settled
-
-
-def test_it_is_repeated_until_it_is_seen():
-    flight, _ = service_flying()
-    flight.downlink = False
-    flight.teleop.stop_rotors(flight.now_ns)
-    flight.step(seconds=3.0)
-    assert asked(flight)[-25:] == [Request.ESTOP] * 25
-    flight.downlink = True
-    flight.step(seconds=0.2)
-    assert flight.guard is GuardState.ESTOP
 
 
 @pytest.mark.promise("emergency-stop-gets-through")

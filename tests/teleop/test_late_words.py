@@ -169,17 +169,6 @@ def test_each_copy_of_a_request_names_the_current_session():
     assert len({each.number for each in said}) == 1
 
 
-def test_a_waiting_request_names_the_first_session_seen():
-    flight = Flight()
-    flight.operate(EmergencyStop())
-    assert flight.teleop.take_outputs() == []
-    flight.epoch = 3
-    flight.see()
-    flight.teleop.handle_deadline(0)
-    said = [each for each in flight.teleop.take_outputs() if isinstance(each, OperatorRequest)]
-    assert [(each.request, each.epoch) for each in said] == [(Request.ESTOP, 3)]
-
-
 @pytest.mark.parametrize("verb", [Cancel(), EmergencyStop(), Pause()])
 def test_who_has_ended_its_mission_does_not_start_again(verb):
     flight = started()

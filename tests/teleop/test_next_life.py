@@ -49,9 +49,9 @@ def test_a_start_with_the_stops_number_does_not_confirm_the_stop():
     flight.downlink = False
     flight.operate(EmergencyStop())
     flight.step(seconds=0.2)
-    held_back(flight, flight.requests[-1].number)
+    held_back(flight, flight.mission + 1)
     flight.step(seconds=0.05)
-    assert flight.teleop.requests.stopping
+    assert flight.teleop.stopping
     flight.downlink = True
     flight.step(seconds=0.2)
     assert flight.guard is GuardState.ESTOP
