@@ -377,10 +377,11 @@ class Running:
 
     def send(self, request):
         try:
-            with DIRECT.open(request, timeout=LIMIT) as answer:
-                return answer.status, json.loads(answer.read())
+            answer = DIRECT.open(request, timeout=LIMIT)
         except urllib.error.HTTPError as error:
-            return error.code, json.loads(error.read())
+            answer = error
+        with answer:
+            return answer.status, json.loads(answer.read() or "null")
 
     def audited(self):
         """What the audit log has, once every request is done with; nothing is served after."""
