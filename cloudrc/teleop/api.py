@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import uvicorn
-from fastapi import APIRouter, Depends, FastAPI, Request
+from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import BaseModel
@@ -65,33 +65,17 @@ STOP_LIMIT = 1
 """Time for requests to end when the server stops [s]."""
 
 
-class TooLargeError(CloudrcError):
-    """The body of a request is too long."""
+STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
+"""Error -> status of the answer."""
 
 
-class TooSlowError(CloudrcError):
-    """The body of a request does not arrive."""
-
-
-STATUSES = (
-    (BadInputError, 422),
-    (ConflictError, 409),
-    (UnknownMissionError, 404),
-    (TooLargeError, 413),
-    (TooSlowError, 408),
-    (UnavailableError, 503),
-    (CloudrcError, 500),
-)
-"""Error -> status of the answer; the first that fits counts."""
-
-
-def handle_errors(app: FastAPI, complain: Callable[[str], None]) -> None:
+def _handle_errors(app: FastAPI, complain: Callable[[str], None]) -> None:
     """Make an application answer with `Refusal` whatever cannot be done."""
 
     @app.exception_handler(CloudrcError)
     async def refuse(request: Request, error: CloudrcError) -> JSONResponse:
-        status = next(code for kind, code in STATUSES if isinstance(error, kind))
-        body: dict[str, Any] = {"detail": str(error) or models.REFUSALS[status]["description"]}
+        status = next((code for kind, code in STATUSES.items() if isinstance(error, kind)), 500)
+        body: dict[str, Any] = {"detail": str(error)}
         if isinstance(error, RefusedError):
             body["problems"] = [models.as_json(problem) for problem in error.problems]
         if isinstance(error, ConflictError):
@@ -111,13 +95,10 @@ def handle_errors(app: FastAPI, complain: Callable[[str], None]) -> None:
         text = "teleop did not answer in time, but may do it yet: look before you try again"
         return JSONResponse({"detail": text}, 503)
 
-    @app.exception_handler(ClientDisconnect)
-    async def note_gone(request: Request, error: ClientDisconnect) -> JSONResponse:
-        return JSONResponse({"detail": "the client has left"}, 400)  # for the audit log alone
-
     @app.exception_handler(Exception)
     async def fail(request: Request, error: Exception) -> JSONResponse:
-        complain(f"the API failed at {request.url.path}: {error!r}")
+        if not isinstance(error, ClientDisconnect):
+            complain(f"the API failed at {request.url.path}: {error!r}")
         return JSONResponse({"detail": "the API failed; see teleop's log"}, 500)
 
 
@@ -156,7 +137,7 @@ def create_app(
         redoc_url=None,
         redirect_slashes=False,
     )
-    handle_errors(app, complain)
+    _handle_errors(app, complain)
     router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=models.REFUSALS)
     _add_missions(router, bridge, surroundings)
     _add_operator(router, bridge, surroundings)
@@ -177,18 +158,20 @@ async def _urgent_answer(asked: Future[Any]) -> Any:
 
 async def _body(request: Request) -> bytes:
     """Read a body; one that is too long or too slow is not read to its end."""
-    said = request.headers.get("content-length", "0")
-    if said.isdecimal() and int(said[:12]) > models.BODY_MAX:
-        raise TooLargeError
+    too_long = HTTPException(413, models.REFUSALS[413]["description"])
+    if (
+        int(request.headers.get("content-length", "0")) > models.BODY_MAX
+    ):  # h11 knows it is a number
+        raise too_long
     body = b""
     try:
         async with asyncio.timeout(models.BODY_LIMIT):
             async for chunk in request.stream():
                 body += chunk
                 if len(body) > models.BODY_MAX:
-                    raise TooLargeError
+                    raise too_long
     except TimeoutError:
-        raise TooSlowError from None
+        raise HTTPException(408, models.REFUSALS[408]["description"]) from None
     return body
 
 
@@ -421,8 +404,8 @@ class ApiServer:
             )
         )
         # A daemon, so that a client that hangs cannot keep the process from ending.
-        run, sockets = self._server.run, [self._socket]
-        self._thread = threading.Thread(target=run, args=(sockets,), name="api", daemon=True)
+        run = self._server.run
+        self._thread = threading.Thread(target=run, args=([self._socket],), daemon=True)
 
     @property
     def counts(self) -> dict[str, int]:
