@@ -56,9 +56,7 @@ class Api:
             BadInputError: If the address is invalid.
         """
         self.url, self._token = url.rstrip("/"), token
-        parts = urlsplit(self.url)
-        valid = parts.scheme in ("http", "https") and parts.hostname and not parts.username
-        if not (valid or (url.startswith(UNIX) and len(url) > len(UNIX))):
+        if not (_is_http(self.url) or (url.startswith(UNIX) and len(url) > len(UNIX))):
             raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH")
 
     def get(self, path: str) -> Any:
@@ -131,6 +129,15 @@ class Api:
         secure = parts.scheme == "https"
         kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
         return kind(parts.hostname or "", parts.port, timeout=limit)
+
+
+def _is_http(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        named = bool(parts.hostname) and parts.port != 0 and not parts.username
+    except ValueError:  # an address without its bracket, or a port that is no number
+        return False
+    return named and parts.scheme in ("http", "https")
 
 
 def mission_path(mission_id: str) -> str:

@@ -148,7 +148,10 @@ def test_an_api_that_is_not_there_ends_with_4_or_5(capsys: pytest.CaptureFixture
     assert captured.out.count("waiting") == 1
 
 
-@pytest.mark.parametrize("url", ["here", "unix:", "ftp://h:1", "http://me@h:1", "http://"])
+@pytest.mark.parametrize(
+    "url",
+    ["here", "unix:", "ftp://h:1", "http://me@h:1", "http://", "http://[::1", "http://h:x"],
+)
 def test_an_invalid_url_of_the_api_is_an_error(
     url: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
