@@ -47,7 +47,8 @@ def serve_api(
     from cloudrc.geometry.scene import load_scene
     from cloudrc.link.state import publish
     from cloudrc.teleop.api import ApiServer, Surroundings, create_app
-    from cloudrc.teleop.auth import Audit, Gate, Tokens
+    from cloudrc.teleop.audit import Audit
+    from cloudrc.teleop.auth import Gate, Tokens
 
     if not isinstance(options.api, Path):
         warn_if_exposed(options.api)

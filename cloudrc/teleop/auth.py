@@ -1,4 +1,4 @@
-"""Admit callers to the API by bearer token, count their requests, and log their commands.
+"""Admit callers to the API by bearer token, and count their requests.
 
 An operator's token may do everything, a reader's may only read. Only digests of tokens are kept in
 memory. An operator's emergency stop and hold are never refused as too many.
@@ -8,21 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import json
-import logging
-import os
-import queue
 import re
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from datetime import UTC, datetime
-from io import TextIOWrapper
-from logging.handlers import QueueHandler, QueueListener, RotatingFileHandler
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPBearer
@@ -31,6 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import read, readable_by_others
+from cloudrc.teleop.audit import Audit
 from cloudrc.teleop.bridge import WAITING_MAX
 
 OPERATOR, READER = "operator", "reader"
@@ -52,8 +45,6 @@ COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
 IN_FLIGHT_MAX = WAITING_MAX // 2
 """Limit of the requests of one role that are answered at the same time, streams included: readers
 cannot take the operators' room on the bridge."""
-AUDIT_SIZE_MAX = 8 << 20
-"""Size of the audit log at which it replaces the one before it [bytes]."""
 
 
 class Caller(NamedTuple):
@@ -126,7 +117,7 @@ class Gate:
 
     Attributes:
         tokens: The known tokens; None if everybody who can connect may command.
-        audit: Logs operators' commands, each as a line of JSON; None if nothing does.
+        audit: Logs operators' commands; None if nothing does.
         counts: Number of requests by outcome; "served" for those that reached the application.
     """
 
@@ -187,64 +178,4 @@ class Gate:
             if scope["path"] in ORDERS and answer["status"] in COUNTED:
                 self.counts[COUNTED[answer["status"]]] += 1
             if self.audit is not None and scope["method"] not in READS:
-                self.audit.note(_line(caller, scope, answer))
-
-
-def _line(caller: Caller, scope: Scope, answer: Message) -> str:
-    """Write the line of the audit log about a command."""
-    said: Any = None
-    with suppress(ValueError):
-        said = json.loads(answer.get("body", b""))
-    said = said if isinstance(said, dict) else {}
-    line = {
-        "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
-        "role": caller.role,
-        "token": caller.name,
-        "client": ":".join(map(str, scope.get("client") or ("local",))),
-        "action": f"{scope['method']} {scope['path']}"[:200],
-        "mission": said.get("id"),
-        "status": answer["status"],
-        "outcome": said.get("detail") or said.get("state") or "",
-    }
-    return json.dumps(line, separators=(",", ":"))
-
-
-class Audit(RotatingFileHandler):
-    """Write the audit log, on a thread: two files of limited size that only their owner can read.
-
-    Attributes:
-        dropped: Number of lines that could not be written.
-    """
-
-    def __init__(self, path: Path, complain: Callable[[str], None]) -> None:
-        """Start the thread; `complain` gets one line if the file cannot be written."""
-        super().__init__(path, maxBytes=AUDIT_SIZE_MAX, backupCount=1, encoding="utf-8", delay=True)
-        self.dropped, self._complain = 0, complain
-        waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._queue, self._listener = QueueHandler(waiting), QueueListener(waiting, self)
-        self._listener.start()
-
-    def note(self, line: str) -> None:
-        """Have a line written, without waiting for the disk."""
-        self._queue.handle(logging.makeLogRecord({"msg": line}))
-
-    def stop(self) -> None:
-        """Write what waits, and close the file."""
-        self._listener.stop()
-        with suppress(OSError):
-            self.close()
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
-        """Count a line that is lost."""
-        if not self.dropped:
-            self._complain(
-                f"the audit log {self.baseFilename} cannot be written: {sys.exception()}"
-            )
-        self.dropped += 1
-
-    def _open(self) -> TextIOWrapper:
-        return open(self.baseFilename, "a", encoding="utf-8", opener=_private)
-
-
-def _private(path: str, flags: int) -> int:
-    return os.open(path, flags, 0o600)
+                self.audit.note(*caller, scope, answer)

@@ -24,7 +24,8 @@ from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoi
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
 from cloudrc.teleop.api import ApiServer, Surroundings, create_app
-from cloudrc.teleop.auth import Audit, Gate, Tokens
+from cloudrc.teleop.audit import Audit
+from cloudrc.teleop.auth import Gate, Tokens
 from cloudrc.teleop.bridge import STARTING, Bridge
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.service import MissionService

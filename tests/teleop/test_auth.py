@@ -1,4 +1,4 @@
-"""Who may do what: tokens, the gate before the API, and the audit log."""
+"""Who may do what: tokens, and the gate before the API."""
 
 import json
 import os
@@ -8,7 +8,7 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.teleop import auth
-from cloudrc.teleop.auth import Audit, Tokens
+from cloudrc.teleop.auth import Tokens
 from tests.teleop.conftest import OPERATOR, READER, connect, running
 
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
@@ -181,57 +181,3 @@ def test_a_reader_may_look_and_nothing_else(idle):
         status, _ = idle.send(idle.request(path, data, READER, method))
         assert status in ((200, 404, 405) if method == "GET" else (403,)), (method, path)
     assert effects(idle) == before
-
-
-# The audit log
-
-
-def test_commands_are_audited_with_caller_and_result():
-    with running() as api:
-        api.post("/v1/missions", {**A_MISSION, "key": "uid"})
-        api.post("/v1/missions", A_MISSION)
-        api.post("/v1/hold", token=READER)
-        api.post("/v1/hold", token="a-wrong-token-of-some-length")
-        api.get("/v1/state")
-        api.post("/v1/estop/")
-        lines = api.audited()
-        text = api.audit_file.read_text()
-        assert stat.S_IMODE(api.audit_file.stat().st_mode) == 0o600
-    assert [(w["role"], w["action"], w["mission"], w["status"]) for w in lines] == [
-        ("operator", "POST /v1/missions", "m1", 201),
-        ("operator", "POST /v1/missions", "m1", 409),
-        ("operator", "POST /v1/estop", "m1", 200),
-    ]
-    assert "cancel it first" in lines[1]["outcome"]
-    assert {w["client"].partition(":")[0] for w in lines} == {"127.0.0.1"}
-    assert all(w["time"].endswith("+00:00") for w in lines)
-    assert OPERATOR not in text
-    assert READER not in text
-
-
-def test_the_audit_log_has_two_files_of_limited_size(tmp_path, monkeypatch):
-    monkeypatch.setattr(auth, "AUDIT_SIZE_MAX", 100)
-    path, said = tmp_path / "audit.jsonl", []
-    audit = Audit(path, said.append)
-    for number in range(20):
-        audit.note(json.dumps({"number": number}))
-    audit.stop()
-    kept = [tmp_path / "audit.jsonl.1", path]
-    assert sorted(tmp_path.iterdir()) == sorted(kept)
-    assert max(file.stat().st_size for file in kept) <= 100
-    lines = "".join(file.read_text() for file in kept).splitlines()
-    assert json.loads(lines[-1]) == {"number": 19}
-    assert (audit.dropped, said) == (0, [])
-
-
-@pytest.mark.parametrize("where", ["no/folder", "a folder"])
-def test_lines_that_cannot_be_written_are_counted(tmp_path, where):
-    (tmp_path / "a folder").mkdir()
-    said = []
-    audit = Audit(tmp_path / where, said.append)
-    for number in range(3):
-        audit.note(str(number))
-    audit.stop()
-    assert audit.dropped == 3
-    (complaint,) = said
-    assert complaint.startswith(f"the audit log {tmp_path / where} cannot be written: [Errno")
