@@ -63,8 +63,6 @@ BACKLOG = 1_024
 """Limit of the connections that wait to be accepted."""
 STOP_LIMIT = 1
 """Time for requests to end when the server stops [s]."""
-
-
 STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
 """Error -> status of the answer."""
 
@@ -442,10 +440,10 @@ def _bind(address: Address) -> tuple[socket.socket, str]:
         tcp.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)  # [::] serves IPv4, too
     try:
         tcp.bind((host, port))
-    except OSError as error:
+    except (OSError, UnicodeError) as error:  # no host has a name with an empty label
         tcp.close()
-        text = f"--api {shown}:{port}: {error.strerror or error}; choose another address"
-        raise BadInputError(text) from error
+        reason = getattr(error, "strerror", None) or error
+        raise BadInputError(f"--api {shown}:{port}: {reason}; choose another address") from error
     return tcp, f"http://{shown}:{tcp.getsockname()[1]}"
 
 
