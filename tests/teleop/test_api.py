@@ -205,16 +205,18 @@ def test_an_event_arrives_while_it_happens(api):
         assert [event["event"] for event in arrived.result()[1]] == ["starting", "started"]
 
 
-def test_a_withdrawn_token_ends_its_stream(monkeypatch):
+def test_a_stream_shows_its_life_until_its_token_is_withdrawn(monkeypatch):
     monkeypatch.setattr(auth, "READ_PERIOD", 0.0)
+    monkeypatch.setattr(api_module, "ALIVE_PERIOD", 0.05)
     monkeypatch.setattr(api_module, "LOOK_PERIOD", 0.01)
     with running() as api, connect(api) as stream:
         stream.sendall(head("GET", "/v1/events", token=READER))
         said = b""
-        while b": cloudrc" not in said:
+        while b": alive" not in said:
             said += stream.recv(4096)
         api.token_file.with_name("reader").unlink()
-        assert stream.recv(4096) == b"0\r\n\r\n"  # the end
+        while not said.endswith(b"\r\n0\r\n\r\n"):  # the end
+            said += stream.recv(4096)
 
 
 def test_an_open_stream_does_not_keep_the_server_from_ending():
@@ -457,7 +459,7 @@ def test_a_network_address_needs_tokens(where, host, warns, capsys):
     assert ("can be reached from outside" in capsys.readouterr().err) is warns
 
 
-def test_an_address_that_cannot_be_bound_is_one_sentence(api, tmp_path):
+def test_an_unusable_address_is_one_sentence(api, tmp_path):
     port = int(api.url.rpartition(":")[2])
     with pytest.raises(BadInputError, match=r"--api 127.0.0.1:\d+: Address already in use"):
         ApiServer(api.gate, api.bridge, ("127.0.0.1", port))
@@ -469,6 +471,11 @@ def test_an_address_that_cannot_be_bound_is_one_sentence(api, tmp_path):
     with pytest.raises(BadInputError, match="in use; choose another"):
         ApiServer(api.gate, api.bridge, tmp_path / "thesis")
     assert (tmp_path / "thesis").read_text() == "mine"
+    with socket.socket(socket.AF_UNIX) as left_over:
+        left_over.bind(str(tmp_path / "api.sock"))
+    server = ApiServer(api.gate, api.bridge, tmp_path / "api.sock")
+    assert server.url == f"unix:{tmp_path}/api.sock"
+    server._socket.close()
 
 
 def test_a_socket_file_is_for_its_owner_and_needs_no_token(tmp_path):
