@@ -15,6 +15,7 @@ import re
 import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
@@ -115,7 +116,7 @@ class Api:
             connection.close()
             why = getattr(error, "strerror", None) or error
             raise UnreachableError(f"the API at {self.url} does not answer ({why})") from None
-        if answer.status >= 400:
+        if not 200 <= answer.status < 300:
             refusal = _refusal(answer, with_token=bool(token))
             connection.close()
             raise refusal
@@ -157,10 +158,10 @@ class _UnixConnection(http.client.HTTPConnection):
 
 
 def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcError:
-    try:
+    body: Any = None
+    with suppress(OSError, ValueError, http.client.HTTPException):
         body = json.loads(answer.read())
-    except (OSError, ValueError, http.client.HTTPException):
-        body = {}
+    body = body if isinstance(body, dict) else {}  # it may be another server that answers
     detail = body.get("detail") or f"the API answered {answer.status} {answer.reason}"
     detail = escape(str(detail))
     problems = body.get("problems") or []
