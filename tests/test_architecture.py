@@ -31,7 +31,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "config": {"plugins", "geometry", "link", "files"},
     "world": {"endpoint", "tunnel", "config", "plugins", "geometry"},
     "cloud": {"endpoint", "tunnel", "config", "plugins", "teleop"},
-    "teleop": {"config", "files", "geometry"},
+    "teleop": {"config", "files", "geometry", "metrics"},
     "exposition": set(),
     "drivers": {"endpoint", "tunnel", "link", "metrics", "config", "exposition", "files"},
     "record": {"endpoint", "files"},

@@ -44,7 +44,6 @@ from cloudrc.teleop.bridge import WAITING_MAX, Call
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import (
     ConflictError,
-    Entry,
     Mission,
     MissionStore,
     Order,
@@ -326,7 +325,7 @@ class Desk:
         self._outputs.clear()
 
     @property
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[dict[str, Any]]:
         """Events that the disk holds, oldest first."""
         if self.service is not None and self._path is not None:
             return self.service.book.events_after(0)

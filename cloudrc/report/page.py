@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 from cloudrc import __version__
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.metrics import Flight, Number
-from cloudrc.report.document import Failure, Run, Verdict
+from cloudrc.metrics.verdict import Failure, Verdict
+from cloudrc.report.document import Run
 from cloudrc.report.numbers import table_rows
 
 if TYPE_CHECKING:

@@ -14,17 +14,18 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError, describe_err
 from cloudrc.files import read, write_atomically
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import METRIC_NOTE, Flight, Number, measure_all
+from cloudrc.metrics.verdict import Verdict, flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import (
     Run,
-    Verdict,
     clock_offset_document,
     environment_document,
-    judge,
     report_document,
     write_json,
 )
 
+DIFFERS = "By what telemetry had shown when the mission ended, the operator's verdict is "
+"""Beginning of the note on an operator's verdict that differs."""
 REPORT_BYTES_MAX = 16 << 20
 """Largest report.json that is read [bytes]; it may have many notes."""
 
@@ -83,15 +84,21 @@ def assess(
     flight = Flight(recording, experiment.criteria, waypoints, scene)
     numbers, metric_notes = measure_all(flight, own)
     torn = not recording.complete
-    verdict = judge(
+    evidence = flight_evidence(
         flight,
         numbers,
         real_time=run.mode != "virtual",
         interrupted=run.interrupted or torn,
     )
+    verdict, operator = judge(evidence), None
+    if flight.ending is not None:
+        operator = operator_verdict(flight, evidence, numbers)
+    if operator is not None and operator.outcome == verdict.outcome:
+        operator = None
     incomplete = (f"The recording is incomplete: {recording.note}.",) if torn else ()
     faults = tuple(f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text)
-    notes = tuple(dict.fromkeys((*run.notes, *incomplete, *faults, *metric_notes)))
+    differs = () if operator is None else (f"{DIFFERS}{operator.outcome}. This report's counts.",)
+    notes = tuple(dict.fromkeys((*run.notes, *incomplete, *faults, *differs, *metric_notes)))
     document = report_document(
         run,
         experiment,
@@ -100,6 +107,7 @@ def assess(
         notes,
         clock_offset=clock_offset_document(recording.metadata),
         complete=not torn,
+        operator=operator,
     )
     return Assessment(run, experiment, flight, numbers, verdict, notes, document)
 
@@ -186,8 +194,8 @@ def _read_run(folder: Path, recording: Recording) -> Run:
     except (OSError, ValueError):
         real_time = len(recording["/lateness"]) > 0
         return Run("local", "relay") if real_time else Run("virtual", "virtual")
-    # Metrics are measured again and write their notes anew.
-    notes = tuple(note for note in earlier.notes if not note.startswith(METRIC_NOTE))
+    # Metrics and verdicts are made again and write their notes anew.
+    notes = tuple(note for note in earlier.notes if not note.startswith((METRIC_NOTE, DIFFERS)))
     interrupted = earlier.verdict == "interrupted"
     return Run(earlier.mode, earlier.shaper, earlier.records_sha256, interrupted, notes)
 

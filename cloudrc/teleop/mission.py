@@ -92,61 +92,9 @@ _RULES: dict[type[Verb], tuple[str, tuple[State, ...], str]] = {
 emergency stop is always allowed."""
 
 
-def check_state(verb: Verb, state: State) -> None:
-    """Check that the state of the mission allows a verb.
-
-    Raises:
-        BadInputError: If it does not.
-    """
-    name, allowed, why = _RULES.get(type(verb), ("", (state,), ""))
-    if state not in allowed:
-        raise BadInputError(f"{name}: the mission is {state.name}; {why}")
-
-
-def make_hold_setpoint(seen: RobotStatus, last: Setpoint | None) -> Setpoint:
-    """Make a setpoint at the robot's position, with the yaw of the last setpoint."""
-    x, y, z = seen.position
-    yaw = 0.0 if last is None else last.yaw
-    return Setpoint((x, y, max(z, HELD_LOWEST)), yaw, NO_WAYPOINT)
-
-
 def reached_on_board(seen: RobotStatus, mission_id: int) -> int:
     """Return how many waypoints of a mission the robot has stored as reached."""
     return seen.reached if seen.mission_id == mission_id != 0 else 0
-
-
-def is_over(seen: RobotStatus, mission_id: int, over: int) -> bool:
-    """Whether the robot has stored that a mission is over: at least `over` waypoints reached."""
-    return reached_on_board(seen, mission_id) >= over
-
-
-def may_take_off(seen: RobotStatus) -> bool:
-    """Whether the robot stands on the ground and has a mission, for which it may take off."""
-    return seen.guard is GuardState.GROUND and seen.mission_id != 0
-
-
-def find_failure(
-    seen: RobotStatus, mission_id: int, world: str, expected: tuple[int, ...], over: int
-) -> tuple[str, str] | None:
-    """Return code and text of a failure that telemetry shows and that ends the mission, if any.
-
-    Args:
-        seen: The newest telemetry.
-        mission_id: Number of the mission.
-        world: World in which it was started, or `ANY_WORLD`.
-        expected: Missions that may be on board: this one, and before its start the one that a
-            mission from here has found there; empty if it may be any.
-        over: See `is_over`.
-    """
-    if world not in (ANY_WORLD, seen.world):
-        return "world_restarted", "world restarted"
-    if expected and seen.mission_id not in expected:
-        return "taken_over", "somebody else has started another mission"
-    if is_over(seen, mission_id, over):
-        return END_LOST
-    if seen.guard > WORST_GUARD:
-        return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
-    return None
 
 
 class SetpointSelector:
@@ -245,7 +193,9 @@ class SetpointSelector:
     def select_here(self) -> None:
         """Select the robot's position, if telemetry has arrived."""
         if self._seen is not None:
-            self._select(make_hold_setpoint(self._seen, self.setpoint))
+            x, y, z = self._seen.position
+            yaw = 0.0 if self.setpoint is None else self.setpoint.yaw
+            self.select_point((x, y, max(z, HELD_LOWEST)), yaw)
 
     def stay(self) -> None:
         """Select the robot's position and ignore all waypoints from now on."""
@@ -316,34 +266,6 @@ class LegWatch:
         return now_ns - self._near_since_ns >= leg.dwell * 1e9
 
 
-def name_leg(plan: Plan, leg: int) -> str:
-    """Name the waypoint of a leg in words."""
-    return f"waypoint {leg + 1} of {len(plan.legs)}"
-
-
-def find_timeout(
-    plan: Plan, leg: int, state: State, elapsed: float, flown: float
-) -> tuple[str, str] | None:
-    """Return code and text of an exceeded time limit, if any.
-
-    Args:
-        plan: Plan of the mission.
-        leg: Index of the current waypoint.
-        state: State of the mission, which is under way.
-        elapsed: Time since the mission began [s]; before the robot starts, since it was asked for.
-        flown: Time for which the leg has been flown [s].
-    """
-    limit, leg_limit = plan.time_limit, plan.legs[leg].time_limit
-    if elapsed >= limit and state is State.STARTING:
-        return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
-    if elapsed >= limit:
-        text = f"mission not done within {limit:g} s: on the way to {name_leg(plan, leg)}"
-        return "timed_out", text
-    if flown >= leg_limit and state is State.FLYING:
-        return "leg_timed_out", f"{name_leg(plan, leg)} not reached in {leg_limit:g} s"
-    return None
-
-
 # Looking up an enum's member is slow, and these are used in every period.
 FLYING, STARTING = State.FLYING, State.STARTING
 
@@ -409,7 +331,9 @@ class Teleop:
             BadInputError: If the state does not allow the verb or a value is invalid; nothing
                 changes then.
         """
-        check_state(verb, self.state)
+        name, allowed, why = _RULES.get(type(verb), ("", (self.state,), ""))
+        if self.state not in allowed:
+            raise BadInputError(f"{name}: the mission is {self.state.name}; {why}")
         match verb:
             case StartMission(plan, mission_id, again):
                 self._start(plan, mission_id, now_ns, again=again)
@@ -447,9 +371,7 @@ class Teleop:
         if self.state not in UNDER_WAY:
             if new_session or (before and before.mission_id != seen.mission_id):
                 self._stop_foreign_mission(seen)
-        elif failure := find_failure(
-            seen, self._mission_id, self._world, self._expected, self._over
-        ):
+        elif failure := self._find_failure(seen):
             code, text = failure
             self._end(code, f"{text} {self._where()}", now_ns)
         elif started:
@@ -468,16 +390,37 @@ class Teleop:
 
     def handle_deadline(self, now_ns: int) -> None:
         """Check the time limits and repeat the request that is due at `now_ns` [ns]."""
-        if self.state in UNDER_WAY:
-            elapsed, flown = self.elapsed(now_ns), self._watch.flown
-            if timeout := find_timeout(self._plan, self.leg, self.state, elapsed, flown):
-                self._end(*timeout, now_ns)
+        if self.state in UNDER_WAY and (timeout := self._find_timeout(now_ns)):
+            self._end(*timeout, now_ns)
         if self.stopping:
             if now_ns >= self._stop_ns:
                 self._stop_ns = now_ns + REPEAT_NS
                 self.outputs.append(ALARM)
         elif (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
+
+    def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
+        """Return code and text of a failure that telemetry shows and that ends the mission."""
+        if self._world not in (ANY_WORLD, seen.world):
+            return "world_restarted", "world restarted"
+        if self._expected and seen.mission_id not in self._expected:
+            return "taken_over", "somebody else has started another mission"
+        if reached_on_board(seen, self._mission_id) >= self._over:
+            return END_LOST
+        if seen.guard > WORST_GUARD:
+            return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
+        return None
+
+    def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
+        """Return code and text of an exceeded time limit, if any."""
+        limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
+        if self.elapsed(now_ns) >= limit and self.state is STARTING:
+            return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
+        if self.elapsed(now_ns) >= limit:
+            return "timed_out", f"mission not done within {limit:g} s: {self._where()}"
+        if self._watch.flown >= leg_limit and self.state is FLYING:
+            return "leg_timed_out", f"{self._leg_name()} not reached in {leg_limit:g} s"
+        return None
 
     def _stop(self, now_ns: int) -> None:
         """Stop the rotors; what was asked of the robot before does not count any more.
@@ -496,25 +439,20 @@ class Teleop:
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
         """Hold a robot that flies without a mission here, and keep a standing one on the ground."""
         mission_id = seen.mission_id
-        over = self._is_ended(mission_id) or may_take_off(seen)
+        may_take_off = seen.guard is GROUND and mission_id != 0
+        over = self._is_ended(mission_id) or may_take_off
         if mission_id != self._mission_id and over and not self.stopping:
             self.requests.ask(Request.END, after=True)
         self._setpoints.select_here()
 
     def _start(self, plan: Plan, mission_id: int, now_ns: int, *, again: bool = False) -> None:
-        self.state = STARTING
-        self.outcome = None
-        self.leg = 0
-        self._plan = plan
-        self._mission_id = mission_id
-        self._continued = None
+        self._order(plan, mission_id, now_ns)
         # A mission from here keeps the waypoints that were reached.
         self._may_be_flown = again and plan.start is Start.SPAWN
-        self._began_ns = now_ns
         here = None if plan.start is Start.SPAWN else self._seen
         self._world = here.world if here else ANY_WORLD
         self._expected = (here.mission_id, mission_id) if here else ()
-        if self._seen and again and is_over(self._seen, mission_id, self._over):
+        if self._seen and again and reached_on_board(self._seen, mission_id) >= self._over:
             code, text = END_LOST
             self._end(code, f"{text} {self._where()}", now_ns)
             return
@@ -525,20 +463,20 @@ class Teleop:
 
     def _continue(self, before: Continue, now_ns: int) -> None:
         """Start from here again, with the waypoint that was the current one."""
-        self.state = STARTING
-        self.outcome = None
-        self.leg = before.leg
-        self._plan = before.plan
-        self._mission_id = before.mission_id
-        self._continued = before
-        self._began_ns = now_ns - round(before.elapsed * 1e9)
-        self._world = before.world
+        self._order(before.plan, before.mission_id, now_ns - round(before.elapsed * 1e9))
+        self.leg, self._continued, self._world = before.leg, before, before.world
         self._expected = (before.mission_id,)
         self.requests.report(self._mission_id, self.leg)
         self.requests.ask(Request.START, Start.HERE)
         self._setpoints.begin(before.plan, before.mission_id, before)
         if self._seen:
             self.see(self._seen, now_ns)  # the mission may be over, or the world another one
+
+    def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
+        """Note a mission that begins: its plan, its number, and since when its time counts."""
+        self.state, self.outcome, self.leg = STARTING, None, 0
+        self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
+        self._continued, self._may_be_flown = None, False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission after telemetry shows its start: start its clock and the leg's."""
@@ -562,7 +500,7 @@ class Teleop:
 
     def _advance(self, how: str, now_ns: int, *, select: bool = True) -> None:
         """Go on to the next waypoint or end the mission; `select` tells whether to select it."""
-        text = f"{name_leg(self._plan, self.leg)} {how} at {self.elapsed(now_ns):.2f} s"
+        text = f"{self._leg_name()} {how} at {self.elapsed(now_ns):.2f} s"
         self._report("reached", self.leg, text, now_ns)
         self.leg += 1
         self.requests.report(self._mission_id, self.leg)
@@ -617,4 +555,7 @@ class Teleop:
         self.outputs.append(MissionEvent(now_ns, event, waypoint, text))
 
     def _where(self) -> str:
-        return f"on the way to {name_leg(self._plan, self.leg)}"
+        return f"on the way to {self._leg_name()}"
+
+    def _leg_name(self) -> str:
+        return f"waypoint {self.leg + 1} of {len(self._plan.legs)}"

@@ -17,11 +17,11 @@ from typing import Any
 
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
+from cloudrc.metrics.verdict import Ending, Observations, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError, busy
-from cloudrc.teleop.verdict import MissionObservations
 from cloudrc.teleop.wire import (
     Acknowledge,
     Cancel,
@@ -166,6 +166,18 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
 def _known(value: float) -> float | None:
     """Replace NaN and infinity, which JSON does not have, by None."""
     return value if isfinite(value) else None
+
+
+def describe_session(mission: Mission) -> str:
+    """Describe that the controller has another session with the same robot."""
+    where = f"waypoint {mission.waypoint + 1} of {len(mission.order.plan.legs)}"
+    is_held = mission.state == store.HELD
+    goes_on = f"is held on the way to {where}" if is_held else f"goes on to {where}"
+    return f"the controller has a new session, as after a restart; the mission {goes_on}"
+
+
+def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
+    return seen.pipe_contacts, seen.touch_speed, seen.slip_ns
 
 
 SETPOINT_PERIOD_NS = 100_000_000
@@ -325,7 +337,7 @@ class MissionService:
         if mission is not None and mission.world and mission.world == seen.world:
             self._note_contacts(mission, seen, now_ns)
             if is_new_session:
-                self._note(mission, "new_session", mission.in_new_session(), now_ns)
+                self._note(mission, "new_session", describe_session(mission), now_ns)
         self._teleop.see(seen, now_ns)
         if self._acknowledges and self._teleop.settled:
             self._acknowledges = False
@@ -423,7 +435,7 @@ class MissionService:
     def _note_contacts(self, mission: Mission, seen: RobotStatus, now_ns: int) -> None:
         """Store new contacts of the robot at once."""
         before = mission.witness
-        mission.witness = before.see(seen)
+        mission.witness = before.see(*_contacts(seen))
         for event, text in mission.witness.news(before, self._teleop.elapsed(now_ns)):
             self._note(mission, event, text, now_ns)
 
@@ -442,16 +454,23 @@ class MissionService:
         assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
-            changed |= {"world": seen.world, "witness": MissionObservations.begin(seen)}
+            changed |= {"world": seen.world, "witness": Observations.begin(*_contacts(seen))}
         outcome = self._teleop.outcome
         if outcome is not None and event.event == outcome.code:
-            elapsed = self._teleop.elapsed(now_ns)
-            changed["verdict"] = mission.judged(outcome, self._contact_speed_max, elapsed)
+            evidence = mission.witness.evidence(
+                Ending(outcome.code, outcome.text),
+                self._teleop.elapsed(now_ns),
+                waypoints=len(mission.order.plan.legs),
+                reached=outcome.reached,
+                contact=mission.order.contact,
+                contact_speed_max=self._contact_speed_max,
+            )
+            changed["verdict"] = judge(evidence).as_json()
         self._note(mission, event.event, event.text, now_ns, **changed)
         if mission.ended:
             self._current = None
 
     def _note(self, mission: Mission, event: str, text: str, now_ns: int, **changed: Any) -> None:
         if mission is self._current:
-            changed["time_s"] = round(self._teleop.elapsed(now_ns), 3)
+            changed["elapsed"] = round(self._teleop.elapsed(now_ns), 3)
         self.book.note(mission, event, text, **changed)

@@ -20,18 +20,18 @@ import sqlite3
 from collections import Counter, deque
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.messages import Start
-from cloudrc.teleop.verdict import Criteria, Failure, MissionObservations, Verdict, judge
-from cloudrc.teleop.wire import Continue, Leg, Outcome, Plan, StartMission
+from cloudrc.metrics.verdict import Failure, Observations, Verdict
+from cloudrc.teleop.wire import Continue, Leg, Plan, StartMission
 
-Entry: TypeAlias = dict[str, Any]
-"""An event of a mission, and what it changes."""
+Event: TypeAlias = dict[str, Any]
+"""An event of a mission, as the API shows it."""
 
 QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
 DONE, FAILED, CANCELLED = "done", "failed", "cancelled"
@@ -103,9 +103,9 @@ class Mission:
     world: str = ""
     elapsed: float = 0.0
     reached: list[dict[str, Any]] = field(default_factory=list)
-    events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=SHOWN))
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=SHOWN))
     happened: Counter[str] = field(default_factory=Counter)
-    witness: MissionObservations = field(default_factory=MissionObservations)
+    witness: Observations = field(default_factory=Observations)
     verdict: dict[str, Any] | None = None
 
     @property
@@ -118,56 +118,32 @@ class Mission:
         """Index of the current waypoint, or of the last one at the end."""
         return min(len(self.reached), len(self.order.plan.legs) - 1)
 
-    def entry(self, number: int, event: str, text: str, **changed: Any) -> Entry:
-        """Make the entry of an event that happens now; `changed` replaces its values."""
-        return {
-            "id": number,
-            "mission": self.id,
-            "event": event,
-            "text": text,
-            "waypoint": self.waypoint,
-            "time_s": round(self.elapsed, 3),
-            "world": self.world,
-            "witness": self.witness,
-            "verdict": self.verdict,
-            **changed,
-        }
-
-    def apply(self, entry: Entry) -> None:
-        """Change the mission by an event."""
-        event = {k: entry[k] for k in ("id", "mission", "event", "waypoint", "text", "time_s")}
-        self.events.append(event)
-        self.happened[entry["event"]] += 1
-        self.state = STATES.get(entry["event"], self.state)
-        self.elapsed, self.world = entry["time_s"], entry["world"]
-        self.witness, self.verdict = entry["witness"], entry["verdict"]
-        if entry["event"] == "reached" and entry["waypoint"] == len(self.reached):
-            self.reached.append({"waypoint": entry["waypoint"], "time_s": entry["time_s"]})
-
-    def after(self, entry: Entry) -> Mission:
-        """Return the mission as the event changes it; this one stays as it is."""
-        reached, events, happened = [*self.reached], self.events.copy(), self.happened.copy()
-        changed = replace(self, reached=reached, events=events, happened=happened)
-        changed.apply(entry)
-        return changed
-
-    def in_new_session(self) -> str:
-        """Describe that the controller has another session with the same robot."""
-        where = f"waypoint {self.waypoint + 1} of {len(self.order.plan.legs)}"
-        goes_on = f"is held on the way to {where}" if self.state == HELD else f"goes on to {where}"
-        return f"the controller has a new session, as after a restart; the mission {goes_on}"
-
-    def judged(self, outcome: Outcome, contact_speed_max: float, elapsed: float) -> dict[str, Any]:
-        """Judge the mission as the operator has seen it, for the API.
+    def apply(
+        self, number: int, event: str, text: str, *, waypoint: int | None = None, **changed: Any
+    ) -> None:
+        """Change the mission by an event.
 
         Args:
-            outcome: How it ended.
-            contact_speed_max: Limit of the arm's tip speed when it touches the board [m/s].
-            elapsed: Duration [s].
+            number: Number of the event.
+            event: One word.
+            text: The same in words.
+            waypoint: Index of the waypoint that the event is about; None for the current one.
+            changed: New values of attributes: elapsed, world, witness, verdict.
         """
-        criteria = Criteria(self.order.contact, contact_speed_max)
-        count = len(self.order.plan.legs)
-        return judge(outcome, self.witness, criteria, waypoints=count, elapsed=elapsed).as_json()
+        waypoint = self.waypoint if waypoint is None else waypoint
+        for name, value in changed.items():
+            setattr(self, name, value)
+        shown = {"id": number, "mission": self.id, "event": event, "waypoint": waypoint}
+        self.events.append({**shown, "text": text, "time_s": self.elapsed})
+        self.happened[event] += 1
+        self.state = STATES.get(event, self.state)
+        if event == "reached" and waypoint == len(self.reached):
+            self.reached.append({"waypoint": waypoint, "time_s": self.elapsed})
+
+    def copy(self) -> Mission:
+        """Copy the mission, so that an event changes only the copy."""
+        reached, events, happened = [*self.reached], self.events.copy(), self.happened.copy()
+        return replace(self, reached=reached, events=events, happened=happened)
 
     def summary(self) -> dict[str, Any]:
         """Return what a list of missions shows."""
@@ -394,7 +370,7 @@ class MissionStore:
         self.missions: dict[str, Mission] = {}
         self.trouble, self._told, self._keep_ns = "", "", 0
         self.dropped, self._missed = 0, 0
-        self._log: deque[dict[str, Any]] = deque(maxlen=LOGGED)
+        self._log: deque[Event] = deque(maxlen=LOGGED)
         try:
             self._read()
         except (sqlite3.DatabaseError, BadInputError, LookupError, TypeError, ValueError) as error:
@@ -462,7 +438,7 @@ class MissionStore:
         mission = Mission(mission_id, replace(order, queue=False), number)
         ended = [each.id for each in self.missions.values() if each.ended]
         old = ended[: max(0, len(ended) - KEPT)]
-        self._save("no mission can start", mission, new=True, old=old)
+        self._commit("no mission can start", mission, old)
         self._numbered += 1
         self.missions[mission_id] = mission
         for each in old:
@@ -473,13 +449,10 @@ class MissionStore:
         """Store that a waiting mission is asked to start, at `now_ns` [ns]; else it waits on."""
         if now_ns < self._keep_ns:
             return
-        entry = mission.entry(self._events + 1, "starting", "the robot is asked to start")
         try:
-            self._save(f"{mission.id} waits", mission.after(entry))
+            self._save(f"{mission.id} waits", mission, "starting", "the robot is asked to start")
         except UnavailableError as error:
             self.trouble, self._keep_ns = str(error), now_ns + KEEP_PERIOD_NS
-        else:
-            self._apply(mission, entry)
 
     def cancel(self, mission: Mission) -> None:
         """Store that a waiting mission will not begin.
@@ -488,9 +461,8 @@ class MissionStore:
             UnavailableError: If it cannot be stored: a teleop after this one would fly it.
         """
         verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
-        entry = mission.entry(self._events + 1, "cancelled", NEVER_BEGAN, verdict=verdict)
-        self._save(f"{mission.id} waits on", mission.after(entry))
-        self._apply(mission, entry)
+        waits = f"{mission.id} waits on"
+        self._save(waits, mission, "cancelled", NEVER_BEGAN, verdict=verdict)
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
         """Store what happens to a mission, now or as soon as the disk can be written again.
@@ -499,13 +471,12 @@ class MissionStore:
             mission: The mission.
             event: One word.
             text: The same in words.
-            changed: Values of the entry that change: waypoint, time_s, world, witness, verdict.
+            changed: See `Mission.apply`.
         """
-        entry = mission.entry(self._events + 1, event, text, **changed)
-        if event == "reached" and entry["waypoint"] < len(mission.reached):
+        if event == "reached" and changed["waypoint"] < len(mission.reached):
             return  # an earlier teleop has stored it
-        self._apply(mission, entry)
-        self._unsaved.setdefault(mission.id, entry["id"])
+        self._unsaved.setdefault(mission.id, self._events + 1)
+        self._apply(mission, event, text, **changed)
         self._try_to_save()
 
     def catch_up(self, now_ns: int) -> None:
@@ -519,7 +490,7 @@ class MissionStore:
         told, self._told = self._told, self.trouble
         return "" if told == self.trouble else self.trouble
 
-    def events_after(self, number: int) -> list[dict[str, Any]]:
+    def events_after(self, number: int) -> list[Event]:
         """Return the events of all missions after the one of this number."""
         if number > self._events:  # of a file that is gone
             number = 0
@@ -534,46 +505,52 @@ class MissionStore:
         """Close the file, so that the next teleop can open it."""
         self._db.close()
 
-    def _apply(self, mission: Mission, entry: Entry) -> None:
-        mission.apply(entry)
+    def _apply(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
+        self._events += 1
+        mission.apply(self._events, event, text, **changed)
         self._log.append(mission.events[-1])
-        self._events = entry["id"]
+
+    def _save(self, refused: str, mission: Mission, event: str, text: str, **changed: Any) -> None:
+        """Store an event of a mission, or let it not happen."""
+        after = mission.copy()
+        after.apply(self._events + 1, event, text, **changed)
+        self._commit(refused, after)
+        self._apply(mission, event, text, **changed)
 
     def _try_to_save(self) -> None:
-        try:
-            self._commit()
-        except sqlite3.DatabaseError as error:
-            self.trouble = f"the journal cannot be written: {error}; free its volume"
-
-    def _save(
-        self, refused: str, mission: Mission, *, new: bool = False, old: Iterable[str] = ()
-    ) -> None:
-        """Write a mission and everything before it, or nothing; `refused` tells what that means."""
-        try:
-            self._commit(mission, new, old)
-        except sqlite3.DatabaseError as error:
-            text = f"the journal cannot be written: {error}; free or repair its volume"
-            raise UnavailableError(f"{refused}: {text}") from error
+        with suppress(UnavailableError):
+            self._commit("")
 
     def _commit(
-        self, mission: Mission | None = None, new: bool = False, old: Iterable[str] = ()
+        self, refused: str, changed: Mission | None = None, old: Iterable[str] | None = None
     ) -> None:
+        """Write what is not on the disk yet and then a mission, or nothing.
+
+        Args:
+            refused: What follows if the disk refuses, in words.
+            changed: A mission with one event that is new, or a new mission.
+            old: Missions to forget; given with a new mission.
+
+        Raises:
+            UnavailableError: If the disk refuses.
+        """
         db = self._db
         try:
             db.execute("BEGIN")
             for mission_id, first in self._unsaved.items():
                 self._write(self.missions[mission_id], first)
-            if mission is not None and new:
-                row = _row(mission), to_json(mission.order, mission.number), _status(mission)
+            if changed is not None and old is not None:
+                row = _row(changed), to_json(changed.order, changed.number), _status(changed)
                 db.execute("INSERT INTO mission VALUES (?, ?, ?)", row)
-            elif mission is not None:
-                self._write(mission, mission.events[-1]["id"])
-            db.executemany("DELETE FROM mission WHERE n = ?", [(int(each[1:]),) for each in old])
+                db.executemany("DELETE FROM mission WHERE n = ?", [(int(e[1:]),) for e in old])
+            elif changed is not None:
+                self._write(changed, changed.events[-1]["id"])
             db.commit()
-        except sqlite3.DatabaseError:
+        except sqlite3.DatabaseError as error:
             with suppress(sqlite3.DatabaseError):
                 db.rollback()
-            raise
+            self.trouble = f"the journal cannot be written: {error}; free or repair its volume"
+            raise UnavailableError(f"{refused}: {self.trouble}") from error
         self._unsaved.clear()
         self.trouble = self._told = ""
 
@@ -607,7 +584,9 @@ def _row(mission: Mission) -> int:
 
 def _status(mission: Mission) -> str:
     status = {name: getattr(mission, name) for name in ("state", "world", "elapsed", "verdict")}
-    return json.dumps({**status, "happened": mission.happened, "witness": asdict(mission.witness)})
+    return json.dumps(
+        {**status, "happened": mission.happened, "witness": mission.witness.as_json()}
+    )
 
 
 def to_json(order: Order, number: int) -> str:
@@ -640,5 +619,5 @@ def from_json(
         read["number"],
         **status,
     )
-    mission.happened, mission.witness = Counter(happened), MissionObservations(**witness)
+    mission.happened, mission.witness = Counter(happened), Observations(**witness)
     return mission

@@ -51,10 +51,13 @@ def test_failures_say_code_text_time_and_place() -> None:
     experiment, recording = paper()
     strict = experiment.criteria.model_copy(update={"time_limit_s": 5.0})
     failed = experiment.model_copy(update={"criteria": strict})
-    (failure,) = assess(recording, failed, RUN).document["failures"]
+    report = assess(recording, failed, RUN).document
+    (failure,) = report["failures"]
     assert set(failure) == {"code", "text", "time", "place"}
     assert failure["code"] == "time_limit_exceeded"
     assert len(failure["place"]) == 3
+    assert report["operator_verdict"] == {"verdict": "success", "failures": []}
+    assert "the operator's verdict is success. This report's counts." in report["notes"][-1]
 
 
 def test_the_same_flight_gives_the_same_document() -> None:

@@ -11,7 +11,8 @@ import matplotlib
 import pytest
 
 from cloudrc.metrics import Number
-from cloudrc.report.document import Failure, Run, Verdict, environment_document
+from cloudrc.metrics.verdict import Failure, Verdict
+from cloudrc.report.document import Run, environment_document
 from cloudrc.report.figures import NAMES, Picture
 from cloudrc.report.numbers import readable
 from cloudrc.report.page import render, summary

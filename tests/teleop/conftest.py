@@ -283,6 +283,17 @@ def service_flying(**order):
     return flight, mission_id
 
 
+def finish(flight):
+    """Fly to all waypoints of `SERVICE_PLAN`."""
+    for point in (A, B, C):
+        flight.step(position=point, seconds=0.05)
+
+
+def asked(flight, since=0):
+    """Requests since an index, without those that only carry progress."""
+    return [r.request for r in flight.requests[since:] if r.request is not Request.PROGRESS]
+
+
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """Never by a proxy: `urlopen` keeps the one that was named when a process first called it."""
 LIMIT = 5.0

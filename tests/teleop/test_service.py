@@ -1,28 +1,53 @@
-"""Missions as a service: ids, keys, the queue, the operator's hand, verdicts."""
+"""Missions as a service: keys, the queue, the operator's hand, restarts, and what is shown."""
+
+from argparse import Namespace
+from types import SimpleNamespace
 
 import pytest
 
+from cloudrc.cli.teleop import _start
+from cloudrc.config.load import load_experiment
+from cloudrc.drivers.teleop import turn
 from cloudrc.exposition.table import MISSION_OUTCOMES
-from cloudrc.messages import GuardState, Request, Setpoint, Start
-from cloudrc.teleop.store import (
-    ENDED,
-    STATES,
-    ConflictError,
-    Order,
+from cloudrc.messages import (
+    MISSION_OVER,
+    GuardState,
+    Request,
+    Setpoint,
+    Start,
 )
+from cloudrc.teleop import wire
+from cloudrc.teleop.bridge import Bridge
+from cloudrc.teleop.store import ENDED, SHOWN, STATES, ConflictError, Order
 from cloudrc.teleop.wire import Leg, Plan
-from tests.teleop.conftest import AWAY, SERVICE_PLAN, A, B, C, ServiceFlight, service_flying
+from tests.teleop.conftest import (
+    AWAY,
+    ID,
+    SERVICE_PLAN,
+    A,
+    B,
+    C,
+    ServiceFlight,
+    asked,
+    finish,
+    service_flying,
+)
 
 QUICK = Plan((Leg(A, dwell=0.0),), Start.HERE)
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
 
-def finish(flight):
-    for point in (A, B, C):
-        flight.step(position=point, seconds=0.05)
+def state(flight, mission_id="m1"):
+    return flight.view(mission_id)["state"]
+
+
+def first_failure(flight, mission_id="m1"):
+    return flight.view(mission_id)["verdict"]["failures"][0]["code"]
 
 
 def test_a_mission_is_flown_and_every_waypoint_noted_once():
     flight, mission_id = service_flying(name="round")
+    assert not flight.teleop.over
     finish(flight)
     view = flight.view(mission_id)
     assert (view["id"], view["name"], view["state"]) == ("m1", "round", "done")
@@ -30,6 +55,7 @@ def test_a_mission_is_flown_and_every_waypoint_noted_once():
     assert [reached["waypoint"] for reached in view["reached"]] == [0, 1, 2]
     assert [event["id"] for event in view["events"]] == [1, 2, 3, 4, 5, 6]
     assert view["verdict"] == {"outcome": "success", "exit_code": 0, "failures": []}
+    assert flight.teleop.over
 
 
 def test_every_end_of_a_mission_is_counted_under_its_own_name():
@@ -37,36 +63,33 @@ def test_every_end_of_a_mission_is_counted_under_its_own_name():
     assert ends <= set(MISSION_OUTCOMES)
 
 
-def test_the_same_key_is_answered_with_the_same_mission_for_ever():
+def test_a_key_is_that_of_one_order_for_ever():
     flight, mission_id = service_flying(key="uid")
-    assert flight.create(key="uid") == mission_id
     finish(flight)
-    assert flight.create(key="uid") == mission_id
-    other = Plan((Leg(AWAY),), Start.HERE)
-    for order in (Order(other, key="uid"), Order(SERVICE_PLAN, key="uid", contact=True)):
-        with pytest.raises(ConflictError, match="'uid' is that of mission m1, with another plan"):
-            flight.teleop.create(order, flight.now_ns)
-    flight.restart_teleop()
-    assert flight.create(key="uid") == mission_id
+    for _ in range(2):
+        assert flight.create(key="uid") == mission_id
+        for order in (Order(QUICK, key="uid"), Order(SERVICE_PLAN, key="uid", contact=True)):
+            with pytest.raises(ConflictError, match="'uid' is that of mission m1, with another"):
+                flight.teleop.create(order, flight.now_ns)
+        flight.restart_teleop()
     assert flight.create(key="another") == "m2"
 
 
-def test_a_second_mission_is_refused_and_names_the_first():
-    flight, mission_id = service_flying()
+def test_a_second_mission_is_refused_or_waits_for_the_first():
+    flight, first = service_flying()
     with pytest.raises(ConflictError, match="m1 is flying") as refused:
         flight.create()
-    assert refused.value.mission == mission_id
-    assert list(flight.teleop.book.missions) == [mission_id]
-
-
-def test_a_queued_mission_starts_when_the_first_has_ended():
-    flight, first = service_flying()
+    assert refused.value.mission == first
     second, third = flight.create(QUICK, queue=True), flight.create(QUICK, queue=True)
     assert flight.teleop.state(0)["queue"] == [second, third]
-    assert flight.view(second)["state"] == "queued"
+    assert state(flight, second) == "queued"
+    flight.restart_teleop()
+    with pytest.raises(ConflictError):
+        flight.create()
+    flight.step(seconds=0.05)
     finish(flight)
     flight.step(position=A, seconds=0.2)
-    assert [flight.view(m)["state"] for m in (first, second, third)] == ["done"] * 3
+    assert [state(flight, mission) for mission in (first, second, third)] == ["done"] * 3
     assert flight.names(second) == ["queued", "starting", "started", "reached", "done"]
 
 
@@ -77,41 +100,38 @@ def test_between_two_missions_the_robot_is_seen_to_hold():
     flight.downlink = False
     finish(flight)
     flight.step(seconds=1.0)
-    assert (flight.view(first)["state"], flight.view(second)["state"]) == ("done", "starting")
+    assert (state(flight, first), state(flight, second)) == ("done", "starting")
     assert flight.requests[-1].request is Request.END
     assert flight.setpoints[-1].waypoint == -1
     flight.downlink = True
     flight.step(seconds=0.12)
     assert flight.requests[-1].request is Request.START
-    assert flight.setpoints[-1] == Setpoint(A, 0.0, 0)
-    assert flight.view(second)["state"] == "flying"
+    assert (flight.setpoints[-1], state(flight, second)) == (Setpoint(A, 0.0, 0), "flying")
 
 
-def test_cancelling_a_queued_mission_leaves_the_first_alone():
+def test_a_cancelled_mission_is_interrupted_and_the_robot_holds():
     flight, first = service_flying()
     second = flight.create(queue=True)
     flight.teleop.cancel(second, flight.now_ns)
-    view = flight.view(second)
-    assert (view["state"], view["verdict"]["exit_code"]) == ("cancelled", 130)
-    assert flight.view(first)["state"] == "flying"
+    assert flight.view(second)["verdict"]["exit_code"] == 130
+    assert state(flight, first) == "flying"
+    flight.teleop.cancel(first, flight.now_ns)
+    flight.step(seconds=0.05)
+    assert flight.view(first)["verdict"]["outcome"] == "interrupted"
+    assert [state(flight, each) for each in (first, second)] == ["cancelled"] * 2
+    assert (flight.guard, flight.requests[-1].request) == (HOLD, Request.END)
     with pytest.raises(ConflictError, match="has ended"):
         flight.teleop.cancel(second, flight.now_ns)
 
 
-def test_a_cancelled_mission_is_interrupted_and_the_robot_holds():
-    flight, mission_id = service_flying()
-    flight.teleop.cancel(mission_id, flight.now_ns)
-    flight.step(seconds=0.05)
-    view = flight.view(mission_id)
-    assert (view["state"], view["verdict"]["outcome"]) == ("cancelled", "interrupted")
-    assert flight.guard is GuardState.HOLD
-    assert flight.requests[-1].request is Request.END
-
-
 def test_the_operator_holds_moves_and_resumes():
+    flight = ServiceFlight()
+    for verb in (flight.teleop.hold, flight.teleop.resume):
+        with pytest.raises(ConflictError, match="no mission"):
+            verb(0)
     flight, mission_id = service_flying()
     flight.teleop.hold(flight.now_ns)
-    assert flight.view(mission_id)["state"] == "held"
+    assert state(flight) == "held"
     flight.teleop.go_to(AWAY, 0.5, flight.now_ns)
     flight.step()
     assert flight.setpoints[-1] == Setpoint(AWAY, 0.5, -1)
@@ -126,19 +146,12 @@ def test_the_operator_holds_moves_and_resumes():
 def test_go_to_is_a_mission_of_its_own_if_none_is_under_way():
     flight = ServiceFlight()
     flight.step()
-    mission = flight.teleop.go_to(A, 0.0, flight.now_ns)
+    flight.teleop.go_to(A, 0.0, flight.now_ns)
     flight.step(seconds=0.05)
     with pytest.raises(ConflictError, match="hold or cancel"):
         flight.teleop.go_to(B, 0.0, flight.now_ns)
     flight.step(position=A, seconds=0.6)
-    view = flight.view(mission.id)
-    assert (view["name"], view["state"], view["verdict"]["exit_code"]) == ("goto", "done", 0)
-
-
-@pytest.mark.parametrize("verb", ["hold", "resume"])
-def test_without_a_mission_there_is_nothing_to_hold(verb):
-    with pytest.raises(ConflictError, match="no mission"):
-        getattr(ServiceFlight().teleop, verb)(0)
+    assert (flight.view("m1")["name"], state(flight)) == ("goto", "done")
 
 
 def test_the_setpoint_is_repeated_at_10_hz():
@@ -149,35 +162,383 @@ def test_the_setpoint_is_repeated_at_10_hz():
 
 
 @pytest.mark.parametrize(
-    ("seen", "code", "exit_code"),
+    ("seen", "codes", "exit_code"),
     [
-        ({"pipe_contacts": 2}, "pipe_touched", 1),
-        ({"touch_speed": 0.3}, "contact_too_fast", 1),
-        ({}, "board_not_touched", 1),
-        ({"slip_ns": 1_000_000_000, "touch_speed": 0.1}, "not_real_time", 6),
+        ({"pipe_contacts": 2, "touch_speed": 0.1}, ["pipe_touched"], 1),
+        ({"touch_speed": 0.3}, ["contact_too_fast"], 1),
+        ({}, ["board_not_touched"], 1),
+        ({"slip_ns": 1_000_000_000, "touch_speed": 0.1}, ["not_real_time"], 6),
+        ({"touch_speed": 0.12}, [], 0),
     ],
 )
-def test_what_the_robot_touched_decides(seen, code, exit_code):
+def test_what_the_robot_touched_decides(seen, codes, exit_code):
     flight, mission_id = service_flying(contact=True)
     for name, value in seen.items():
         setattr(flight, name, value)
+    flight.step()
+    assert ("board_touched" in flight.names(mission_id)) == ("touch_speed" in seen)
     finish(flight)
     verdict = flight.view(mission_id)["verdict"]
     assert verdict["exit_code"] == exit_code
-    assert verdict["failures"][0]["code"] == code
+    assert [failure["code"] for failure in verdict["failures"]] == codes
 
 
-def test_a_gentle_touch_is_a_success_and_noted_when_it_happens():
-    flight, mission_id = service_flying(contact=True)
-    flight.touch_speed = 0.12
-    finish(flight)
-    assert flight.view(mission_id)["verdict"]["outcome"] == "success"
-    (touch,) = (e for e in flight.view(mission_id)["events"] if e["event"] == "board_touched")
-    assert "0.12 m/s" in touch["text"]
-
-
-def test_it_is_over_when_all_has_ended_and_the_robot_holds():
+def test_the_robot_is_told_of_every_waypoint_reached_until_it_knows():
     flight, _ = service_flying()
-    assert not flight.teleop.over
+    number = flight.teleop.book.find("m1").number
+    flight.step(seconds=0.05)
+    assert flight.onboard == (number, 1)
+    flight.downlink = False
+    told = len(flight.requests)
+    flight.step(position=B, seconds=1.0)
+    copies = flight.requests[told:]
+    assert {(c.request, c.reached, c.number) for c in copies} == {(Request.PROGRESS, 2, 0)}
+    assert 8 <= len(copies) <= 12
+    flight.downlink = True
+    flight.step(seconds=0.2)
+    assert flight.onboard == (number, 2)
+    told = len(flight.requests)
+    flight.step(seconds=1.0)
+    assert len(flight.requests) == told
+
+
+def test_with_a_full_disk_the_robot_remembers_its_waypoints():
+    flight, _ = service_flying(key="uid")
+    flight.full = True
+    flight.step(position=B, seconds=0.1)
+    flight.restart_teleop()  # what was not written is gone
+    flight.full = False
+    assert [each["waypoint"] for each in flight.view("m1")["reached"]] == [0]
+    flight.step(position=AWAY, seconds=0.1)
+    flight.step(position=C, seconds=0.1)
+    view = flight.view("m1")
+    assert [each["waypoint"] for each in view["reached"]] == [0, 1, 2]
+    assert "reached, as the robot reports," in str(view["events"])
+    assert view["verdict"]["exit_code"] == 0
+
+
+def test_a_cancelled_mission_whose_end_is_lost_is_not_flown_again():
+    flight, mission_id = service_flying()
+    flight.full = True
+    flight.teleop.cancel(mission_id, flight.now_ns)
+    flight.step(seconds=0.3)
+    flight.full = False
+    flight.restart_teleop()
+    count = len(flight.requests)
+    flight.step(position=AWAY, seconds=1.0)
+    assert Request.START not in asked(flight, count)
+    assert (flight.guard, first_failure(flight)) == (HOLD, "end_lost")
+
+
+def test_after_a_restart_the_mission_continues_at_its_waypoint():
+    flight, mission_id = service_flying(key="uid")
+    flight.step(position=AWAY, seconds=5.0)
+    flight.slip_ns = 900_000_000  # while teleop is away it does not count
+    flight.restart_teleop()
+    flight.step(seconds=0.05)
+    assert state(flight) == "flying"
+    assert (flight.requests[-1].request, flight.requests[-1].start) == (Request.START, Start.HERE)
+    assert flight.setpoints[-1].position == B
+    assert flight.create(key="uid") == mission_id
     finish(flight)
-    assert flight.teleop.over
+    view = flight.view(mission_id)
+    assert [reached["waypoint"] for reached in view["reached"]] == [0, 1, 2]
+    assert view["verdict"]["exit_code"] == 0
+    assert flight.names(mission_id).count("started") == 1
+
+
+def test_a_mission_before_take_off_survives_a_teleop_restart():
+    """The new teleop sees a robot that stands, told of a mission, before it takes that up."""
+    flight, _ = service_flying()
+    flight.guard = GROUND
+    before = len(flight.requests)
+    flight.restart_teleop()
+    flight.see()
+    flight.step(seconds=0.3)
+    assert state(flight) == "flying"
+    assert set(asked(flight, before)) == {Request.START}
+
+
+def test_a_cancel_right_after_a_restart_is_a_cancel_in_flight():
+    flight, mission_id = service_flying()
+    flight.restart_teleop()
+    flight.teleop.cancel(mission_id, flight.now_ns)
+    flight.step(seconds=0.3)
+    assert state(flight) == "cancelled"
+    assert "before it began" not in flight.view(mission_id)["events"][-1]["text"]
+    assert (flight.onboard[1], flight.guard) == (MISSION_OVER, HOLD)
+
+
+def test_a_cancel_does_not_hide_a_failure_by_world_restart():
+    flight, mission_id = service_flying()
+    flight.restart()
+    flight.restart_teleop()
+    flight.see()
+    with pytest.raises(ConflictError, match=f"mission {mission_id} has ended: failed"):
+        flight.teleop.cancel(mission_id, flight.now_ns)
+    assert first_failure(flight) == "world_restarted"
+
+
+@pytest.mark.parametrize("teleop_too", [False, True])
+def test_a_restart_of_cloud_asks_nothing_of_the_robot_unless_teleop_is_new(teleop_too):
+    flight, mission_id = service_flying()
+    before = len(flight.requests)
+    flight.restart_cloud()
+    if teleop_too:
+        flight.restart_teleop()
+    flight.step(seconds=0.2)
+    assert (state(flight), flight.view(mission_id)["waypoint"]) == ("flying", 1)
+    assert set(asked(flight, before)) == ({Request.START} if teleop_too else set())
+    names = flight.names(mission_id)
+    assert names[-1] == ("resumed" if teleop_too else "new_session")
+    assert ("new_session" in names) is not teleop_too, "a new teleop knows no other session"
+
+
+def test_an_unstarted_mission_starts_in_the_new_world():
+    flight = ServiceFlight()
+    flight.step()
+    flight.downlink = False
+    flight.create()
+    flight.step(seconds=0.2)
+    flight.restart()
+    flight.restart_teleop()
+    flight.downlink = True
+    flight.step(seconds=0.05)
+    assert state(flight) == "flying"
+    assert flight.requests[-1].start is Start.SPAWN
+
+
+def test_a_held_mission_stays_held_through_restarts():
+    flight, mission_id = service_flying()
+    flight.teleop.hold(flight.now_ns)
+    flight.restart_teleop()
+    flight.teleop.handle_deadline(flight.now_ns)  # and again, before the robot was seen
+    flight.restart_teleop()
+    before = len(flight.setpoints)
+    flight.step(position=AWAY, seconds=0.1)
+    assert state(flight) == "held"
+    assert "resumed" not in flight.names(mission_id)
+    assert {setpoint.position for setpoint in flight.setpoints[before:]} == {AWAY}
+    flight.teleop.resume(flight.now_ns)
+    flight.step()
+    assert flight.setpoints[-1].position == B
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_time_goes_on_where_it_stood(seen):
+    flight, mission_id = service_flying()
+    flight.step(position=AWAY, seconds=10.0)
+    flight.step(position=B)  # noted at 10 s
+    flight.uplink = seen
+    flight.restart_teleop()
+    flight.step(position=AWAY, seconds=0.05)
+    elapsed = flight.view(mission_id)["events"][-1]["time_s"]
+    assert elapsed == pytest.approx(10.1, abs=0.1)
+    flight.step(seconds=50.0)
+    assert first_failure(flight) == "timed_out"
+
+
+def test_a_pipe_touched_while_teleop_was_away_counts():
+    flight, _ = service_flying()
+    flight.restart_teleop()
+    flight.pipe_contacts = 1
+    flight.step(seconds=0.05)
+    finish(flight)
+    assert first_failure(flight) == "pipe_touched"
+
+
+def test_what_waits_is_not_begun_before_the_robot_is_seen():
+    """It may be latched, and would fail it."""
+    flight, _ = service_flying()
+    waiting = flight.create(queue=True)
+    flight.guard = LAND
+    flight.step(position=AWAY, seconds=0.2)
+    for _ in range(2):
+        flight.restart_teleop()
+        flight.teleop.handle_deadline(flight.now_ns)
+        flight.step(seconds=0.2)
+        assert state(flight, waiting) == "queued"
+
+
+def test_a_restart_with_the_same_options_continues_the_mission():
+    flight, flags = ServiceFlight(), Namespace(start=True, mission=None, api=None)
+    flight.step()
+    for _ in range(2):
+        assert _start(flags, load_experiment("hover"), flight.teleop)
+        assert list(flight.teleop.book.missions) == ["m1"]
+        flight.restart_teleop()
+    with pytest.raises(ConflictError, match="mission m1 is"):
+        _start(flags, load_experiment("paper"), flight.teleop)
+    flight.teleop.cancel("m1", flight.now_ns)
+    assert _start(flags, load_experiment("hover"), flight.teleop)
+    assert len(flight.teleop.book.missions) == 2
+
+
+@pytest.mark.parametrize("flies", [True, False])
+def test_a_stop_fails_the_mission_if_there_is_one(flies):
+    flight = service_flying()[0] if flies else ServiceFlight()
+    flight.step()
+    count = len(flight.requests)
+    mission = flight.teleop.stop_rotors(flight.now_ns)
+    flight.step(seconds=0.05)
+    assert (flight.guard, set(asked(flight, count))) == (ESTOP, {Request.ESTOP})
+    assert flight.teleop.settled
+    assert (mission and mission.id) == ("m1" if flies else None)
+    if flies:
+        assert (state(flight), first_failure(flight)) == ("failed", "emergency_stopped")
+        assert "emergency stop on the way to waypoint 2 of 3" in str(flight.view("m1")["events"])
+
+
+@pytest.mark.parametrize("stops", [1, 2])
+def test_after_a_stall_the_stop_belongs_to_the_stopped_mission(stops):
+    """Past teleop's loop: it saw the robot stopped, and that was why the mission had failed."""
+    (flight, mission_id), bridge = service_flying(), Bridge()
+    bridge.open(flight.teleop)
+    urgent = [
+        bridge.submit(lambda service, now_ns: service.stop_rotors(now_ns), "stop")
+        for _ in range(stops)
+    ]
+    looked = bridge.submit(lambda service, now_ns: service.state(now_ns)["seen"]["guard"])
+    flight.guard = ESTOP
+    cloud = SimpleNamespace(receive=lambda: [wire.encode(flight.seen)])
+    blind = {"blind": 2, "late_ns": 0, "now_ns": flight.now_ns + 5_000_000_000}
+    turn(flight.teleop, cloud, wire.decode, bridge.take, stops=bridge.take_urgent, **blind)
+    assert {each.result().id for each in urgent} == {mission_id}, "all are one stop"
+    assert looked.result() == "ESTOP", "what is no stop is asked of the present"
+    flight.step(seconds=0.1)
+    assert flight.names(mission_id)[-1] == "emergency_stopped"
+    assert flight.teleop.settled
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_no_mission_starts_before_the_stop_is_acknowledged(restarted):
+    """Also if teleop died before the robot has heard of the stop: the next one repeats it."""
+    flight, mission_id = service_flying()
+    queued = flight.create(queue=True)
+    flight.downlink = False
+    flight.teleop.stop_rotors(flight.now_ns)
+    flight.step(seconds=0.2)
+    if restarted:
+        flight.restart_teleop()
+    with pytest.raises(ConflictError, match="an emergency stop is on its way to the robot; find"):
+        flight.create(queue=True)
+    flight.stop.sounds = False  # cloud restarts, too
+    flight.downlink = True
+    flight.step(seconds=0.3)
+    assert flight.guard is ESTOP
+    why = r"the guard is in ESTOP \(emergency stop\) and lets nothing fly"
+    with pytest.raises(ConflictError, match=why):
+        flight.create(queue=True)
+    assert state(flight, queued) == "queued"
+    flight.teleop.acknowledge(flight.now_ns)
+    flight.step(seconds=0.5)
+    assert flight.names(mission_id)[-1] == "acknowledged"
+    assert (state(flight, mission_id), state(flight, queued)) == ("failed", "flying")
+    with pytest.raises(ConflictError, match="m2 is flying; there is nothing to acknowledge"):
+        flight.teleop.acknowledge(flight.now_ns)
+
+
+def test_an_early_stop_stops_the_current_mission():
+    """It stopped nobody's mission: if the robot did not hear, the next teleop flew on."""
+    flight, mission_id = service_flying()
+    flight.downlink = False
+    flight.restart_teleop()
+    assert flight.teleop.stop_rotors(flight.now_ns).id == mission_id
+    flight.step(seconds=0.2)
+    flight.restart_teleop()
+    flight.downlink = True
+    flight.step(seconds=0.5)
+    assert flight.guard is ESTOP
+    assert flight.names(mission_id)[-1] == "emergency_stopped"
+
+
+@pytest.mark.parametrize("since", ["other mission", "other world", "acknowledged", "flown"])
+def test_a_stop_is_not_repeated_after_a_later_flight_or_acknowledgement(since):
+    flight, _ = service_flying()
+    flight.teleop.stop_rotors(flight.now_ns)
+    flight.step(seconds=0.2)
+    if since == "other world":
+        flight.restart()
+    elif since == "other mission":
+        flight.guard, flight.onboard = TRACK, (ID, 1)
+    else:
+        flight.teleop.acknowledge(flight.now_ns)
+        flight.step(seconds=0.2)
+    if since == "flown":
+        flight.create()
+        flight.step(seconds=0.2)
+    count = len(flight.requests)
+    flight.restart_teleop()
+    flight.step(seconds=0.5)
+    assert Request.ESTOP not in asked(flight, count)
+
+
+@pytest.mark.parametrize("since", ["other mission", "other world"])
+def test_a_stop_before_first_telemetry_stops_any_flight(since):
+    """It is not one of the teleop before, which is not asked again of another robot."""
+    flight, mission_id = service_flying()
+    if since == "other world":
+        flight.restart()
+    flight.guard, flight.onboard = TRACK, (ID, 1)
+    flight.restart_teleop()
+    assert flight.teleop.stop_rotors(flight.now_ns).id == mission_id
+    flight.step(seconds=0.2)
+    assert flight.guard is ESTOP
+
+
+def test_a_stop_is_acknowledged_once_the_robot_is_released():
+    """Written down before, it would count for a stop that has yet to act."""
+    flight, mission_id = service_flying()
+    flight.downlink = False
+    for ask in (flight.teleop.stop_rotors, flight.teleop.acknowledge):
+        ask(flight.now_ns)
+        flight.step(seconds=0.2)
+    assert flight.names(mission_id)[-1] == "emergency_stopped"
+    flight.restart_teleop()
+    flight.teleop.acknowledge(flight.now_ns)  # before the robot is seen
+    flight.downlink = True
+    flight.step(seconds=0.5)
+    assert (flight.guard, flight.names(mission_id)[-1]) == (GROUND, "acknowledged")
+
+
+def test_a_stop_after_an_acknowledgement_counts():
+    flight, mission_id = service_flying()
+    for ask in (flight.teleop.stop_rotors, flight.teleop.acknowledge, flight.teleop.stop_rotors):
+        ask(flight.now_ns)
+    flight.step(seconds=0.3)
+    assert (flight.guard, flight.names(mission_id)[-1]) == (ESTOP, "emergency_stopped")
+    for _ in range(SHOWN):
+        flight.teleop.book.note(flight.teleop.book.find(mission_id), "new_session", "")
+    assert flight.stored().stopped().id == mission_id, "though its event is not kept"
+
+
+def test_a_landed_robot_flies_again_once_acknowledged():
+    flight, _ = service_flying()
+    flight.guard = LAND
+    flight.step(seconds=0.05)
+    assert first_failure(flight) == "guard_stopped"
+    for order in (flight.create, lambda: flight.teleop.go_to(AWAY, 0.0, flight.now_ns)):
+        with pytest.raises(ConflictError, match="the guard is in LAND"):
+            order()
+    flight.teleop.acknowledge(flight.now_ns)
+    flight.step(seconds=0.3)
+    second = flight.create()
+    flight.step(seconds=0.1)
+    assert state(flight, second) == "flying"
+
+
+@pytest.mark.parametrize("guard", [LAND, ESTOP])
+@pytest.mark.parametrize("begun", [0, 1], ids=["starting", "flying"])
+def test_a_landing_without_teleop_fails_the_mission(guard, begun):
+    flight = ServiceFlight()
+    flight.downlink = bool(begun)
+    mission_id = flight.create()
+    flight.step(seconds=0.1)
+    assert state(flight) == ("flying" if begun else "starting")
+    waits = flight.create(queue=True)
+    flight.guard = guard
+    flight.restart_teleop()
+    flight.see()  # before teleop does anything
+    flight.step(seconds=0.2)
+    assert first_failure(flight, mission_id) == "guard_stopped"
+    assert state(flight, waits) == "queued"

@@ -47,7 +47,7 @@ def begun(path):
     store = open_store(path, b"salt")
     mission = store.add(ORDER)
     store.begin(mission, 0)
-    store.note(mission, "reached", "waypoint 1", waypoint=0, time_s=1.5, world="w")
+    store.note(mission, "reached", "waypoint 1", waypoint=0, elapsed=1.5, world="w")
     store.close()
     return mission
 
@@ -153,7 +153,7 @@ from cloudrc.teleop.wire import Leg, Plan
 store = open_store(Path({str(path)!r}), b"")
 mission = store.add(Order(Plan(tuple(Leg((float(n), 0.0, 1.0)) for n in range(100_000)))))
 for n in range(100_000):
-    store.note(mission, "reached", "r", waypoint=n, time_s=n / 2, world="w")
+    store.note(mission, "reached", "r", waypoint=n, elapsed=n / 2, world="w")
     print(n, flush=True)
 """
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
@@ -261,7 +261,7 @@ def test_a_full_disk_stops_no_flight_and_is_told_once():
     tried = flight.commits
     flight.step(seconds=3.0)
     assert 2 <= flight.commits - tried <= 4
-    assert [fault.text for fault in flight.faults] == [f"{FULL}; free its volume"]
+    assert [fault.text for fault in flight.faults] == [f"{FULL}; free or repair its volume"]
     with pytest.raises(UnavailableError, match=f"no mission can start: {FULL}"):
         flight.create()
     assert list(flight.teleop.book.missions) == ["m1"]

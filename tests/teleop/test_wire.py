@@ -6,10 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.errors import BadInputError
 from cloudrc.messages import MISSION_OVER, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop.wire import RobotStatus, decode, encode
+from cloudrc.teleop.wire import Leg, Plan, RobotStatus, decode, encode
 from cloudrc.tunnel.codec import NUMBER_MAX, encode_operator
+from tests.teleop.conftest import A
 
 numbers = st.floats(allow_nan=False)
 vectors = st.tuples(numbers, numbers, numbers)
@@ -83,6 +85,7 @@ def test_what_is_not_known_comes_back_unknown():
         b"[" * 5000,
         b"\xff\xfe",
         encode(Fault(0, "x", "y")),
+        *(bytes([n]) * 9 for n in range(0, 256, 25)),
     ],
 )
 def test_what_is_no_message_is_refused(data):
@@ -90,11 +93,23 @@ def test_what_is_no_message_is_refused(data):
         decode(data)
 
 
-@settings(max_examples=200, deadline=None)
-@given(st.binary(max_size=80))
-def test_bytes_that_are_no_message_are_refused_in_one_way(data):
-    with pytest.raises(ValueError, match="not a message"):
-        decode(data)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Leg((math.nan, 0.0, 1.0)), "finite"),
+        (lambda: Leg(A, yaw=math.inf), "finite"),
+        (lambda: Leg(A, tolerance=0.0), "tolerance 0.0 m"),
+        (lambda: Leg(A, tolerance=math.nan), "tolerance nan m"),
+        (lambda: Leg(A, dwell=-1.0), "dwell -1.0 s"),
+        (lambda: Leg(A, dwell=math.nan), "dwell nan s"),
+        (lambda: Leg(A, time_limit=0.0), "limit 0.0 s"),
+        (lambda: Plan(()), "at least one waypoint"),
+        (lambda: Plan((Leg(A),), time_limit=math.inf), "limit inf s"),
+    ],
+)
+def test_a_plan_that_cannot_be_flown_is_refused(make, message):
+    with pytest.raises(BadInputError, match=message):
+        make()
 
 
 integers = st.integers(-(2**70), 2**70)

@@ -17,7 +17,7 @@ from cloudrc.faults.scenario import Outcome, Scenario
 from cloudrc.faults.scenarios.link import instant
 from cloudrc.messages import GuardState
 from cloudrc.teleop.bridge import Bridge
-from cloudrc.teleop.store import LOGGED, Entry, Order, UnavailableError
+from cloudrc.teleop.store import LOGGED, Event, Order, UnavailableError
 
 PER_PERIOD = 10
 """Requests in every 10 ms: 1,000 in a second."""
@@ -104,7 +104,7 @@ def _gapless(numbers: list[int]) -> bool:
 
 def _shutdown(seed: int) -> Outcome:
     """SIGTERM of the cloud pod: teleop and cloud, each a process, are asked at once."""
-    outcome, at, left = Outcome(), instant(seed, 6.0, 20.0), list[Entry]()
+    outcome, at, left = Outcome(), instant(seed, 6.0, 20.0), list[Event]()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "missions"
         flight = Flight(seed=seed, journal=path, apart=True)

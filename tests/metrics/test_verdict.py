@@ -8,6 +8,16 @@ import pytest
 
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Flight, Number
+from cloudrc.metrics.verdict import (
+    EXIT_CODES,
+    SLIP_MAX,
+    Ending,
+    Observations,
+    Verdict,
+    flight_evidence,
+    judge,
+    operator_verdict,
+)
 from cloudrc.records import (
     REAL_TIME_FACTOR_MIN,
     Arrival,
@@ -16,9 +26,9 @@ from cloudrc.records import (
     GuardChange,
     Lateness,
     MissionEvent,
+    Record,
     SessionOpened,
 )
-from cloudrc.report.document import SLIP_MAX, Verdict, judge
 from tests.metrics.conftest import ONE_PIPE, SECOND, Log, at, flown, touch
 
 
@@ -28,13 +38,23 @@ def good() -> Log:
     return log
 
 
-def judged(flight: Flight, *, real_time: bool = False, interrupted: bool = False) -> Verdict:
-    numbers = {
+def measured(flight: Flight) -> dict[str, Number]:
+    return {
         name: Number(value, "", "")
         for name in ("waypoints_reached", "real_time_factor", "world_slip")
         if (value := SHIPPED[name].measure(flight)) is not None
     }
-    return judge(flight, numbers, real_time=real_time, interrupted=interrupted)
+
+
+def judged(flight: Flight, *, real_time: bool = False, interrupted: bool = False) -> Verdict:
+    how = {"real_time": real_time, "interrupted": interrupted}
+    return judge(flight_evidence(flight, measured(flight), **how))
+
+
+def judged_by_operator(flight: Flight) -> Verdict:
+    numbers = measured(flight)
+    evidence = flight_evidence(flight, numbers, real_time=True, interrupted=False)
+    return operator_verdict(flight, evidence, numbers)
 
 
 def codes(verdict: Verdict) -> list[str]:
@@ -108,12 +128,49 @@ def test_world_restarted() -> None:
     assert failure.time == pytest.approx(6.0)
 
 
-@pytest.mark.parametrize("event", ["cancelled", "timed_out", "leg_timed_out", "guard_stopped"])
-def test_the_mission_failed(event: str) -> None:
+def ended(event: str) -> Log:
     log = good()
     log.change(MissionEvent, lambda n, e: e._replace(event=event, text="why") if n == 2 else e)
-    (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
-    assert (failure.code, failure.text) == (event, "why")
+    return log
+
+
+@pytest.mark.parametrize("event", ["timed_out", "leg_timed_out", "guard_stopped"])
+def test_the_mission_failed(event: str) -> None:
+    verdict = judged(ended(event).flight(ONE_PIPE, contact=True))
+    (failure,) = verdict.failures
+    assert (verdict.outcome, failure.code, failure.text) == ("failure", event, "why")
+
+
+def test_a_cancelled_mission_is_interrupted_and_lists_what_went_wrong() -> None:
+    log = ended("cancelled")
+    log.world.append(touch(3, "pipe_1"))
+    verdict = judged(log.flight(ONE_PIPE, contact=True, waypoints=7))
+    assert verdict.outcome == "interrupted"
+    assert codes(verdict) == ["cancelled", "pipe_touched"]
+
+
+@pytest.mark.parametrize(
+    ("late", "outcomes"),
+    [
+        ([touch(3, "pipe_1")], ("failure", "failure")),
+        ([touch(9.99, "pipe_1")], ("failure", "success")),
+        ([GuardChange(at(9.99), GuardState.LAND, "")], ("failure", "success")),
+        ([], ("success", "success")),
+    ],
+)
+def test_the_operator_knows_what_had_arrived(late: list[Record], outcomes: tuple[str, str]) -> None:
+    log = good()
+    log.world += late
+    flight = log.flight(ONE_PIPE, contact=True)
+    assert (judged(flight).outcome, judged_by_operator(flight).outcome) == outcomes
+
+
+def test_the_operator_misses_a_touch_at_the_very_end() -> None:
+    log = flown()
+    log.world.append(touch(9.99))
+    flight = log.flight(ONE_PIPE, contact=True)
+    assert judged(flight).outcome == "success"
+    assert codes(judged_by_operator(flight)) == ["board_not_touched"]
 
 
 def without_end(log: Log) -> Log:
@@ -203,11 +260,12 @@ def in_time(slip: float, factor: float) -> dict[str, Number]:
 )
 def test_real_time_is_kept_or_the_run_is_invalid(slip: float, factor: float, outcome: str) -> None:
     flight = good().flight(ONE_PIPE, contact=True)
-    verdict = judge(flight, in_time(slip, factor), real_time=True, interrupted=False)
+    numbers = in_time(slip, factor)
+    verdict = judge(flight_evidence(flight, numbers, real_time=True, interrupted=False))
     assert verdict.outcome == outcome
     assert codes(verdict) == ([] if outcome == "success" else ["not_real_time"])
     # Virtual time does not depend on the machine.
-    verdict = judge(flight, in_time(slip, factor), real_time=False, interrupted=False)
+    verdict = judge(flight_evidence(flight, numbers, real_time=False, interrupted=False))
     assert verdict.outcome == "success"
 
 
@@ -222,3 +280,67 @@ def test_a_slow_run_is_invalid_from_its_records() -> None:
 def test_without_proof_of_real_time_a_run_is_invalid() -> None:
     verdict = judged(good().flight(ONE_PIPE, contact=True), real_time=True)
     assert verdict.outcome == "invalid"
+
+
+NAN = float("nan")
+DONE = Ending("done", "mission done")
+LATE = Ending("timed_out", "mission not done within 60 s")
+
+
+def by_telemetry(
+    seen: Observations, *, ending: Ending = DONE, contact: bool = True, reached: int = 3
+) -> Verdict:
+    known = {"waypoints": 3, "contact_speed_max": 0.25, "contact": contact, "reached": reached}
+    return judge(seen.evidence(ending, 30.0, **known))
+
+
+@pytest.mark.parametrize(
+    ("seen", "contact", "outcome", "found"),
+    [
+        (Observations(touch_speed=0.12), True, "success", []),
+        (Observations(), False, "success", []),
+        (Observations(touch_speed=9.0), False, "success", []),
+        (Observations(), True, "failure", ["board_not_touched"]),
+        (Observations(touch_speed=0.25), True, "failure", ["contact_too_fast"]),
+        (Observations(pipe_touches=2), False, "failure", ["pipe_touched"]),
+        # 5 % of 30 s are 1.5 s.
+        (Observations(slip_began_ns=7, slip_ns=1_490_000_007), False, "success", []),
+        (Observations(slip_began_ns=7, slip_ns=1_510_000_007), False, "invalid", ["not_real_time"]),
+    ],
+)
+def test_the_same_rules_judge_what_telemetry_shows(
+    seen: Observations, contact: bool, outcome: str, found: list[str]
+) -> None:
+    verdict = by_telemetry(seen, contact=contact)
+    assert (verdict.outcome, codes(verdict)) == (outcome, found)
+    assert verdict.as_json()["exit_code"] == EXIT_CODES[outcome]
+
+
+def test_an_early_end_comes_first() -> None:
+    verdict = by_telemetry(Observations(pipe_touches=1), ending=LATE, reached=1)
+    assert codes(verdict) == [
+        "timed_out",
+        "waypoint_not_reached",
+        "pipe_touched",
+        "board_not_touched",
+    ]
+    assert verdict.failures[2].text == "the robot touched a pipe"
+
+
+def test_only_what_telemetry_shows_during_the_mission_counts() -> None:
+    seen = Observations.begin(3, 0.9, 5)
+    assert seen.see(3, 0.9, 5) is seen
+    after = seen.see(5, 0.1, 9).see(5, 0.4, 9)
+    assert (after.pipe_touches, after.touch_speed) == (2, 0.1), "the first touch stays"
+    assert after.slip_ns - after.slip_began_ns == 4
+    assert Observations.begin(4, NAN, 0).see(1, NAN, 0).pipe_touches == 1, "it begins again at 0"
+    assert [event for event, _ in after.news(seen, 1.0)] == ["pipe_touched", "board_touched"]
+
+
+def test_slip_while_teleop_is_down_does_not_count() -> None:
+    seen = Observations.begin(0, NAN, 5).see(0, NAN, 9)
+    for shown in (1_000, 5_000):
+        seen = seen.after_restart().see(0, NAN, shown)
+        assert seen.slip_ns - seen.slip_began_ns == 4
+    seen = seen.see(0, NAN, 5_003)
+    assert seen.slip_ns - seen.slip_began_ns == 7

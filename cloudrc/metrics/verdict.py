@@ -1,0 +1,431 @@
+"""Judge a mission by one set of rules, from what the operator or what the recording has seen.
+
+The verdict is the first of these that applies:
+
+- `interrupted`: the run was stopped, the mission was cancelled, or the recording ends before it;
+- `invalid`: the run did not keep real time although it had to, so its numbers mean nothing;
+- `failure`: a criterion of success is not met; each one is listed with time and place;
+- `success`: all waypoints reached within the time limit, the board touched slowly enough, no pipe
+  touched, the guard only in TRACK or HOLD, world never restarted.
+
+The rules judge `Evidence`. The report takes it from the recorded truth (`flight_evidence`), teleop
+from telemetry (`Observations`). Telemetry arrives late and shows less, so the verdicts can differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from math import inf, isfinite
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from cloudrc.messages import GuardState, Vector
+from cloudrc.metrics import Flight, Number
+from cloudrc.metrics.mission import first_touch
+from cloudrc.records import REAL_TIME_FACTOR_MIN
+
+SLIP_MAX = 0.25
+"""Most time that world's clock may lose in a valid flight [s]: the guard's default limit on the age
+of a command. Above it a slow machine, not the network, could decide what the guard does."""
+EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
+"""Exit code of each outcome. Source: docs/reference/control.md, "Exit codes"."""
+ADVICE = "close other programs or give the run more cores"
+
+Outcome = Literal["success", "failure", "invalid", "interrupted"]
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A criterion of success that is not met.
+
+    Attributes:
+        code: One word, for programs.
+        text: Description for people.
+        time: Time since the start of the mission [s]; None if there is no instant.
+        place: True position of the base at that time [m], shape (3,); None if unknown.
+    """
+
+    code: str
+    text: str
+    time: float | None = None
+    place: Vector | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Verdict on a mission: the outcome and all failures, the earliest first."""
+
+    outcome: Outcome
+    failures: tuple[Failure, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the verdict for the API, without times and places."""
+        failures = [{"code": each.code, "text": each.text} for each in self.failures]
+        return {
+            "outcome": self.outcome,
+            "exit_code": EXIT_CODES[self.outcome],
+            "failures": failures,
+        }
+
+
+class Moment(NamedTuple):
+    """Time since the start of the mission [s] and place [m], as in `Failure`; None if unknown."""
+
+    time: float | None = None
+    place: Vector | None = None
+
+
+UNKNOWN = Moment()
+
+
+class Ending(NamedTuple):
+    """How a mission ended: code, text and moment of its last event."""
+
+    code: str
+    text: str
+    moment: Moment = UNKNOWN
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What is known of a mission that is over.
+
+    Attributes:
+        waypoints: Number of its waypoints.
+        reached: Number of waypoints reached.
+        contact: Whether the arm's tip has to touch the board.
+        contact_speed_max: Limit of the speed at the touch [m/s].
+        ending: How it ended; None if its last event is unknown.
+        end: End of the flight.
+        interrupted: Why the run is over, if somebody has stopped it before the mission's end; "" if
+            nobody has.
+        grounded: Why the robot never flew; "" if it did.
+        duration: Duration [s], or None; `time_limit` is its limit [s].
+        touch: Speed of the first touch of the board [m/s] and its moment; None without a touch.
+        pipes: Name, number of contacts and first moment of each pipe that was touched.
+        guard: State, cause and moment of each change of the guard beyond HOLD.
+        restarts: Cause and moment of each session that world has opened in flight.
+        slow: Why the run did not keep real time; "" if it did, or did not have to.
+    """
+
+    waypoints: int
+    reached: int
+    contact: bool
+    contact_speed_max: float
+    ending: Ending | None
+    end: Moment = UNKNOWN
+    interrupted: str = ""
+    grounded: str = ""
+    duration: float = 0.0
+    time_limit: float = inf
+    touch: tuple[float, Moment] | None = None
+    pipes: tuple[tuple[str, int, Moment], ...] = ()
+    guard: tuple[tuple[str, str, Moment], ...] = ()
+    restarts: tuple[tuple[str, Moment], ...] = ()
+    slow: str = ""
+
+
+def judge(evidence: Evidence) -> Verdict:
+    """Judge a mission."""
+    violations, ending = tuple(_violations(evidence)), evidence.ending
+    if ending is None and evidence.interrupted:
+        stopped = Failure("interrupted", evidence.interrupted, *evidence.end)
+        return Verdict("interrupted", (stopped, *violations))
+    if ending is not None and ending.code == "cancelled":  # its unmet goals are no failure
+        cancelled = Failure(ending.code, ending.text, *ending.moment)
+        return Verdict("interrupted", (cancelled, *violations))
+    codes = {failure.code for failure in violations}
+    failures = [*violations, *(f for f in _unmet_goals(evidence) if f.code not in codes)]
+    failures.sort(key=lambda failure: inf if failure.time is None else failure.time)
+    slow = (Failure("not_real_time", evidence.slow),) if evidence.slow else ()
+    outcome: Outcome = "invalid" if slow else "failure" if failures else "success"
+    return Verdict(outcome, (*slow, *failures))
+
+
+def _violations(evidence: Evidence) -> Iterator[Failure]:
+    """Yield events that must not happen at any time of the flight."""
+    limit = evidence.contact_speed_max
+    if evidence.contact and evidence.touch is not None and evidence.touch[0] >= limit:
+        speed, moment = evidence.touch
+        text = f"the tip met the board at {speed:.2f} m/s, not below {limit:g} m/s"
+        yield Failure("contact_too_fast", text, *moment)
+    for name, count, moment in evidence.pipes:
+        times = f" ({count} times)" if count > 1 else ""
+        yield Failure("pipe_touched", f"the robot touched {name}{times}", *moment)
+    for state, cause, moment in evidence.guard:
+        yield Failure("guard_intervened", f"the guard went to {state}: {cause}", *moment)
+    for cause, moment in evidence.restarts:
+        text = f"world opened a new session in flight: {cause}"
+        yield Failure("world_restarted", text, *moment)
+
+
+def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
+    """Yield the goals of the mission that it did not reach."""
+    if evidence.grounded:
+        yield Failure("not_started", f"the robot never left the ground: {evidence.grounded}")
+        return
+    ending, end = evidence.ending, evidence.end
+    if ending is None:
+        yield Failure("mission_not_ended", "the mission did not end", *end)
+    elif ending.code != "done":
+        yield Failure(ending.code, ending.text, *ending.moment)
+    if evidence.reached < evidence.waypoints:
+        text = f"{evidence.reached} of {evidence.waypoints} waypoints reached"
+        yield Failure("waypoint_not_reached", text, *end)
+    if evidence.contact and evidence.touch is None:
+        yield Failure("board_not_touched", "the arm never touched the board")
+    if evidence.duration > evidence.time_limit:
+        text = f"the mission took {evidence.duration:.1f} s, more than {evidence.time_limit:g} s"
+        yield Failure("time_limit_exceeded", text, *end)
+
+
+def _too_slow(factor: float) -> str:
+    if factor >= REAL_TIME_FACTOR_MIN:
+        return ""
+    return f"real-time factor {factor:.3f} is below {REAL_TIME_FACTOR_MIN}: {ADVICE}"
+
+
+def flight_evidence(
+    flight: Flight, numbers: Mapping[str, Number], *, real_time: bool, interrupted: bool
+) -> Evidence:
+    """Take the evidence of a recorded flight, with the recorded truth.
+
+    Args:
+        flight: The recorded flight.
+        numbers: Its measured numbers.
+        real_time: True if the run had to keep real time: any mode except virtual.
+        interrupted: True if the run was stopped, or if its recording is torn.
+    """
+    criteria, end_ns, why = flight.criteria, flight.end_ns, ""
+    if interrupted:
+        before = "the run was stopped before the mission started"
+        why = before if end_ns is None else "the run ended before the mission"
+    touch, ending = first_touch(flight), None
+    if flight.ending is not None:
+        ending = Ending(flight.ending[1], flight.ending[2], _moment(flight, flight.ending[0]))
+    reached = numbers.get("waypoints_reached")
+    return Evidence(
+        waypoints=flight.waypoints,
+        reached=0 if reached is None else round(reached.value),
+        contact=criteria.contact,
+        contact_speed_max=criteria.contact_speed_max_mps,
+        ending=ending,
+        end=UNKNOWN if end_ns is None else _moment(flight, end_ns),
+        interrupted=why,
+        grounded=_why_grounded(flight) if end_ns is None else "",
+        duration=0.0 if end_ns is None else float(flight.seconds(end_ns)),
+        time_limit=criteria.time_limit_s,
+        touch=None if touch is None else _touch(flight, touch),
+        pipes=tuple(_pipes(flight)),
+        guard=tuple(_interventions(flight)),
+        restarts=tuple(_restarts(flight)),
+        slow=_not_real_time(numbers) if real_time else "",
+    )
+
+
+def _moment(flight: Flight, stamp_ns: int) -> Moment:
+    """Give time and place of an instant [ns]."""
+    x, y, z = flight.true_position(np.array([stamp_ns]))[0]
+    place = (float(x), float(y), float(z)) if np.isfinite((x, y, z)).all() else None
+    return Moment(float(flight.seconds(stamp_ns)), place)
+
+
+def _touch(flight: Flight, touch: Mapping[str, Any]) -> tuple[float, Moment]:
+    speed = float(np.linalg.norm(touch["tip_velocity"]))
+    return speed, _moment(flight, int(touch["stamp_ns"]))
+
+
+def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[tuple[str, int, Moment]]:
+    """Yield the pipes that were touched until an instant [ns]."""
+    contact = flight.during("/contact")
+    for body in sorted({str(body) for body in contact["body"] if str(body).startswith("pipe")}):
+        stamps = contact["stamp_ns"][contact["body"] == body]
+        stamps = stamps[stamps <= until_ns]
+        if len(stamps):
+            yield body, len(stamps), _moment(flight, int(stamps[0]))
+
+
+def _interventions(flight: Flight) -> Iterator[tuple[str, str, Moment]]:
+    guard, before = flight.during("/guard"), None
+    for stamp_ns, state, cause in zip(
+        guard["stamp_ns"], guard["state"], guard["cause"], strict=True
+    ):
+        before, repeated = state, state == before  # a touch-down repeats LAND
+        if state not in (GuardState.TRACK, GuardState.HOLD) and not repeated:
+            yield GuardState(state).name, str(cause), _moment(flight, int(stamp_ns))
+
+
+def _restarts(flight: Flight) -> Iterator[tuple[str, Moment]]:
+    session = flight.during("/session")
+    for stamp_ns, end, cause in zip(
+        session["stamp_ns"], session["end"], session["cause"], strict=True
+    ):
+        # The session that the mission itself opens may have the stamp of the start.
+        if end == "world" and stamp_ns > (flight.start_ns or 0):
+            yield str(cause), _moment(flight, int(stamp_ns))
+
+
+def _not_real_time(numbers: Mapping[str, Number]) -> str:
+    factor, slip = numbers.get("real_time_factor"), numbers.get("world_slip")
+    if factor is None or slip is None:
+        return "the recording does not prove that the run kept real time"
+    if slow := _too_slow(factor.value):
+        return slow
+    if slip.value > SLIP_MAX:
+        return f"world's clock lost {slip.value:.3f} s, more than {SLIP_MAX} s: {ADVICE}"
+    return ""
+
+
+def _why_grounded(flight: Flight) -> str:
+    """Say why the guard never applied a command in a flight that did not start."""
+    arrivals, control = flight.recording["/downlink_delay"], flight.recording["/delay_estimate"]
+    if not len(control):
+        return "its telemetry or cloud's answers were lost, so cloud computed no command"
+    if not len(arrivals):
+        return "no command arrived"
+    # The start of a mission opens a new session: commands of older sessions do not count.
+    last = arrivals["epoch"] == arrivals["epoch"].max()
+    if arrivals["used"][last].any():
+        return "fresh commands arrived, but no request to start"
+    keys = zip(control["epoch"], control["counter"], strict=True)
+    basis_ns = dict(zip(keys, control["basis_stamp_ns"], strict=True))
+    rows = (arrivals[name][last] for name in ("epoch", "counter", "stamp_ns"))
+    ages_ns = [
+        stamp_ns - basis_ns[epoch, counter]
+        for epoch, counter, stamp_ns in zip(*rows, strict=True)
+        if (epoch, counter) in basis_ns
+    ]
+    if not ages_ns:
+        return "no fresh command arrived"
+    return (
+        f"the odometry behind each command was {min(ages_ns) * 1e-9:.3f} s old or older when the"
+        " command arrived, above the limit guard.command_age_max_ms; shorten the delay or raise"
+        " the limit"
+    )
+
+
+def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
+    """Judge a recorded mission that has ended as the operator does at its end.
+
+    The operator knows contacts only from telemetry that had arrived by then, does not know the
+    report's time limit, and of the timing only the real-time factor.
+
+    Args:
+        flight: The recorded flight.
+        evidence: Evidence by `flight_evidence`.
+        numbers: Measured numbers of the flight.
+    """
+    stamps, basis = flight.control["stamp_ns"], flight.control["basis_stamp_ns"]
+    before = basis[stamps <= (flight.end_ns or 0)]
+    seen_ns = int(before[-1]) if len(before) else 0
+    touch = first_touch(flight)
+    shown = evidence.touch if touch is not None and touch["stamp_ns"] <= seen_ns else None
+    factor = numbers.get("real_time_factor")
+    seen = replace(
+        evidence,
+        touch=shown,
+        pipes=tuple(_pipes(flight, seen_ns)),
+        guard=(),
+        restarts=(),
+        time_limit=inf,
+        slow=_too_slow(factor.value) if evidence.slow and factor is not None else "",
+    )
+    return judge(seen)
+
+
+AWAY = -1
+"""Value that replaces a slip [ns] until this teleop process has received telemetry from world."""
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """Contacts and slip during a mission, as telemetry shows them.
+
+    Attributes:
+        pipe_contacts: Last count of contacts in telemetry.
+        pipe_touches: Number of contacts since the mission began.
+        touch_before: Speed of an earlier mission's touch in telemetry [m/s]; None if none.
+        touch_speed: Speed of this mission's touch [m/s]; None if the board was not touched.
+        slip_began_ns: World's slip when the mission began [ns], plus the slip while teleop was
+            away, which does not count.
+        slip_ns: World's slip in the last telemetry [ns]; AWAY after a restart of teleop.
+    """
+
+    pipe_contacts: int = 0
+    pipe_touches: int = 0
+    touch_before: float | None = None
+    touch_speed: float | None = None
+    slip_began_ns: int = 0
+    slip_ns: int = 0
+
+    @classmethod
+    def begin(cls, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
+        """Begin with the telemetry at the start of the mission; see `see`."""
+        return cls(pipe_contacts, 0, _known(touch_speed), None, slip_ns, slip_ns)
+
+    def see(self, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
+        """Process new telemetry; return the same object if nothing has changed.
+
+        Args:
+            pipe_contacts: Number of contacts with pipes since the robot was reset.
+            touch_speed: Speed of the arm's tip when it touched the board [m/s]; NaN before that.
+            slip_ns: Lag of world's clock behind its machine's clock [ns].
+        """
+        touch = _known(touch_speed)
+        if self.touch_speed is not None or touch == self.touch_before:
+            touch = self.touch_speed
+        new = pipe_contacts - self.pipe_contacts
+        if new < 0:  # the robot was reset to its spawn and counts from 0
+            new = pipe_contacts
+        if not new and touch == self.touch_speed and slip_ns == self.slip_ns:
+            return self
+        return replace(
+            self,
+            pipe_contacts=pipe_contacts,
+            pipe_touches=self.pipe_touches + new,
+            touch_speed=touch,
+            slip_began_ns=self.slip_began_ns + (slip_ns if self.slip_ns == AWAY else 0),
+            slip_ns=slip_ns,
+        )
+
+    def after_restart(self) -> Observations:
+        """Continue after a restart of teleop; the slip in between does not count."""
+        return replace(self, slip_began_ns=self.slip_began_ns - self.slip_ns, slip_ns=AWAY)
+
+    def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
+        """Yield event and text of each new contact at `elapsed` [s]."""
+        if self.pipe_touches > before.pipe_touches:
+            yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
+        if self.touch_speed != before.touch_speed:
+            text = f"board touched at {elapsed:.2f} s with {self.touch_speed:.2f} m/s"
+            yield "board_touched", text
+
+    def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
+        """Return the evidence of a mission that has ended.
+
+        Args:
+            ending: How it ended.
+            elapsed: Duration [s].
+            known: Other attributes of the evidence.
+        """
+        end = Moment(elapsed)
+        slipped = (self.slip_ns - self.slip_began_ns) * 1e-9
+        pipes = (("a pipe", self.pipe_touches, UNKNOWN),) if self.pipe_touches else ()
+        return Evidence(
+            ending=ending._replace(moment=end),
+            end=end,
+            touch=None if self.touch_speed is None else (self.touch_speed, UNKNOWN),
+            pipes=pipes,
+            slow=_too_slow(1.0 - slipped / elapsed) if elapsed > 0 else "",
+            **known,
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the attributes, to store them."""
+        return asdict(self)
+
+
+def _known(speed: float) -> float | None:
+    return speed if isfinite(speed) else None

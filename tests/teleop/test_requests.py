@@ -1,0 +1,217 @@
+"""Requests and the emergency stop: repeated until the robot has acted on them, and no others."""
+
+from itertools import pairwise
+
+import pytest
+
+from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.teleop.mission import Teleop
+from cloudrc.teleop.requests import PREDECESSORS, REPEAT_NS, RequestSender
+from cloudrc.teleop.wire import (
+    ALARM,
+    Acknowledge,
+    EmergencyStop,
+    GoTo,
+    RobotStatus,
+    StartMission,
+)
+from cloudrc.tunnel.codec import NUMBER_MAX
+from tests.teleop.conftest import FROM_SPAWN, ID, PLAN, A, B, Flight, asked, flying
+
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
+
+
+def test_a_request_repeats_at_10_hz_until_acknowledged():
+    flight = Flight()
+    flight.downlink = False
+    flight.step()
+    flight.operate(StartMission(PLAN))
+    flight.step(seconds=1.0)
+    said = zip(flight.said_at, flight.said, strict=True)
+    times = [when for when, each in said if each in flight.requests]
+    assert len(times) == 10
+    assert all(later - earlier == REPEAT_NS for earlier, later in pairwise(times))
+    assert {request.number for request in flight.requests} == {PREDECESSORS}
+    flight.downlink, flight.uplink = True, False
+    flight.step(seconds=0.5)
+    assert flight.state == "STARTING", "its acknowledgement is lost"
+    flight.uplink = True
+    flight.step(seconds=0.05)
+    assert flight.state == "FLYING"
+    count = len(flight.requests)
+    flight.step(seconds=2.0)
+    assert len(flight.requests) == count
+
+
+def test_a_mission_may_be_asked_for_before_the_robot_is_in_sight():
+    flight = Flight()
+    flight.uplink = False
+    flight.operate(StartMission(PLAN))
+    flight.step(seconds=1.0)
+    assert flight.requests == []
+    flight.uplink = True
+    flight.step(seconds=0.03)
+    assert flight.state == "FLYING"
+
+
+def test_numbers_go_on_well_above_what_the_robot_shows():
+    flight = Flight()
+    flight.mission = 41  # a cloud that has been restarted since has asked for these
+    flight.step()
+    flight.operate(GoTo(B))
+    flight.step(seconds=0.05)
+    assert flight.requests[0].number == 41 + PREDECESSORS
+    assert flight.state == "FLYING"
+
+
+def first_request(seen, now_ns):
+    sender = RequestSender()
+    sender.see(seen, now_ns)
+    sender.ask(Request.END)
+    return sender.due(now_ns)
+
+
+def test_whoever_begins_later_begins_higher_and_numbers_last():
+    """Though both see a robot that has been asked nothing; for a thousand restarts."""
+    seen = RobotStatus(1, A, GROUND, 0)
+    numbers = [first_request(seen, REPEAT_NS * n).number for n in (5_000, 5_010, 0)]
+    assert numbers == [PREDECESSORS + 5_000, PREDECESSORS + 5_010, PREDECESSORS]
+    for _ in range(1_000):
+        seen = seen._replace(mission=first_request(seen, 10 * 365 * 86_400 * 10**9).number)
+    assert seen.mission < NUMBER_MAX / 10
+
+
+def test_a_predecessors_request_does_not_acknowledge_our_start():
+    """It asked for the mission's end, was gone at once, and the robot shows that only now."""
+    sender, seen = RequestSender(), RobotStatus(1, A, TRACK, 41)
+    sender.see(seen, 0)
+    sender.ask(Request.START, Start.HERE)
+    own = sender.due(0).number
+    assert sender.see(seen._replace(mission=42), 0) is None
+    assert sender.see(seen._replace(mission=own), 0) is Request.START
+
+
+def held_back(flight, number):
+    """A start of the teleop before reaches the robot only now."""
+    flight._obey(OperatorRequest(number, Request.START, Start.HERE, mission_id=ID))
+
+
+def test_a_start_that_becomes_visible_later_is_ended():
+    """Nobody flies that mission any more."""
+    flight = Flight()
+    flight.teleop = Teleop(ended=lambda number: number == ID)
+    flight.step(seconds=0.5)
+    assert flight.requests == []
+    held_back(flight, 1)
+    flight.step(seconds=0.1)
+    assert flight.requests[-1].request is Request.END
+    assert flight.guard is HOLD
+
+
+def test_progress_waits_for_what_is_asked():
+    sender = RequestSender()
+    seen = RobotStatus(1, A, TRACK, 4, mission_id=ID, reached=0)
+    sender.see(seen, 0)
+    sender.report(ID, 2)
+    sender.ask(Request.END)
+    assert sender.due(0).request is Request.END
+    assert sender.due(50_000_000) is None
+    sender.see(seen._replace(mission=4 + PREDECESSORS), 0)
+    assert sender.due(99_999_999) is None
+    told = OperatorRequest(0, Request.PROGRESS, Start.SPAWN, ID, 2, epoch=seen.epoch)
+    assert sender.due(100_000_000) == told
+
+
+def test_each_copy_of_a_setpoint_or_request_names_the_current_session():
+    flight, said = Flight(), []
+    flight.step()
+    flight.operate(StartMission(FROM_SPAWN, ID))
+    for epoch in (1, 1, 2):
+        flight.epoch = epoch
+        flight.now_ns += REPEAT_NS
+        flight.see()
+        flight.teleop.handle_deadline(flight.now_ns)
+        said += flight.teleop.take_outputs()
+    requests = [each for each in said if isinstance(each, OperatorRequest)]
+    assert len({(each.request, each.number) for each in requests}) == 1
+    assert [each.epoch for each in requests] == [1, 1, 2]
+    assert [each.epoch for each in said if isinstance(each, Setpoint)] == [2]
+
+
+def test_a_stop_leaves_at_once_and_is_told_until_it_is_seen():
+    """Cloud gives it a number, above all others, and repeats it towards the robot."""
+    flight = flying()
+    flight.uplink = False
+    flight.operate(EmergencyStop())
+    flight.teleop.handle_deadline(flight.now_ns)
+    assert ALARM in flight.teleop.take_outputs()
+    flight.step(seconds=1.0)
+    assert 10 <= flight.said.count(ALARM) <= 11
+    flight.uplink = True
+    flight.step(seconds=0.5)
+    assert flight.said.count(ALARM) <= 11
+    assert flight.guard is ESTOP
+
+
+@pytest.mark.promise("emergency-stop-gets-through")
+def test_nothing_supersedes_a_stop():
+    flight = flying()
+    flight.downlink = False
+    flight.operate(EmergencyStop())
+    flight.step(seconds=0.2)
+    count = len(flight.requests)
+    flight.operate(GoTo((1.0, 0.0, 1.0)))
+    flight.step(seconds=1.0)
+    assert {r.request for r in flight.requests[count:]} == {Request.ESTOP}
+    flight.downlink = True
+    flight.step(seconds=0.3)
+    assert flight.guard is ESTOP  # and the mission that wanted to start has failed
+    assert flight.teleop.outcome.code == "guard_stopped"
+
+
+def test_a_start_with_the_stops_number_does_not_confirm_the_stop():
+    flight = Flight()
+    flight.step()
+    flight.downlink = False
+    flight.operate(EmergencyStop())
+    flight.step(seconds=0.2)
+    held_back(flight, flight.mission + 1)
+    flight.step(seconds=0.05)
+    assert flight.teleop.stopping
+    flight.downlink = True
+    flight.step(seconds=0.2)
+    assert flight.guard is ESTOP
+    assert flight.teleop.settled
+
+
+@pytest.mark.parametrize("in_sight", [True, False])
+@pytest.mark.parametrize(
+    ("verbs", "guard"),
+    [
+        ([EmergencyStop(), Acknowledge(), Acknowledge()], GROUND),
+        ([EmergencyStop(), Acknowledge(), EmergencyStop()], ESTOP),
+    ],
+)
+def test_an_acknowledgement_waits_for_the_stop_before_and_not_for_one_after(
+    verbs, guard, in_sight
+):  # fmt: skip
+    flight = flying() if in_sight else Flight()
+    flight.downlink = False
+    for verb in verbs:
+        flight.operate(verb)
+    flight.downlink = True
+    flight.step(seconds=0.5)
+    assert flight.guard is guard
+    assert flight.teleop.settled
+    if guard is GROUND:
+        assert asked(flight)[-2:] == [Request.ESTOP, Request.ACKNOWLEDGE]
+
+
+@pytest.mark.parametrize("verb", [EmergencyStop(), Acknowledge()])
+def test_an_operators_word_precedes_ending_a_lost_mission(verb):
+    flight = Flight()
+    flight.operate(verb)
+    flight.onboard = (ID, 0)
+    flight.step(seconds=0.3)
+    stops = isinstance(verb, EmergencyStop)  # a stop ends it, too
+    assert asked(flight) == ([Request.ESTOP] if stops else [Request.ACKNOWLEDGE, Request.END])
