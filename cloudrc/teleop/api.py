@@ -149,6 +149,11 @@ async def _ask(bridge: Bridge, call: Call) -> Any:
     return await asyncio.wait_for(asyncio.wrap_future(bridge.submit(call)), ANSWER_LIMIT)
 
 
+async def _move(bridge: Bridge, call: Call) -> Any:
+    """Ask for something that lets the robot move."""
+    return await _ask(bridge, bridge.unless_overtaken(call))
+
+
 async def _urgent_answer(asked: Future[Any]) -> Any:
     """Wait for an urgent call, which is made however late, and for which others may wait, too."""
     return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(asked)), ANSWER_LIMIT)
@@ -204,7 +209,7 @@ def _add_missions(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
             mission, new = service.create(order, now_ns)
             return mission.as_json(), new
 
-        view, new = await _ask(bridge, call)
+        view, new = await _move(bridge, call)
         return JSONResponse(view, 201 if new else 200)
 
     @router.get("/missions", summary="All missions", **_gives(models.MissionList, "Oldest first"))
@@ -242,7 +247,7 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
             check_way(service, None, surroundings.scene)
             return service.resume(now_ns).as_json()
 
-        return JSONResponse(await _ask(bridge, call))
+        return JSONResponse(await _move(bridge, call))
 
     @router.post(
         "/goto",
@@ -260,7 +265,7 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
             check_way(service, point.position_m, surroundings.scene)
             return service.go_to(point.position_m, radians(point.yaw_deg), now_ns).as_json()
 
-        return JSONResponse(await _ask(bridge, call))
+        return JSONResponse(await _move(bridge, call))
 
 
 def _add_stop(router: APIRouter, bridge: Bridge) -> None:
@@ -296,7 +301,7 @@ def _add_stop(router: APIRouter, bridge: Bridge) -> None:
         **_gives(models.Acknowledged, "The robot is told until it obeys"),
     )
     async def acknowledge() -> JSONResponse:
-        await _ask(bridge, bridge.unless_stopped(lambda s, now_ns: s.acknowledge(now_ns)))
+        await _move(bridge, lambda s, now_ns: s.acknowledge(now_ns))
         return JSONResponse({"state": "acknowledged"})
 
 

@@ -32,13 +32,13 @@ class Bridge:
         closed: Why no call is accepted, in words; "" if calls are accepted.
         alarm: Sends an emergency stop directly to cloud and returns whether cloud has accepted it.
             It bypasses teleop's loop, does not block, and may be called from any thread.
-        stops: Number of emergency stops so far.
+        overtakings: Number of stops and holds so far.
     """
 
     def __init__(self) -> None:
         self.closed = STARTING
         self.alarm: Callable[[], bool] = lambda: True
-        self.stops = 0
+        self.overtakings = 0
         self._urgent: dict[Urgent, Waiting] = {}
         self._waiting: deque[Waiting] = deque()
         self._lock = threading.Lock()
@@ -71,7 +71,7 @@ class Bridge:
             if self.closed and not (urgent == "stop" and self.closed == STARTING):
                 raise UnavailableError(self.closed)
             if urgent is not None:
-                self.stops += urgent == "stop"
+                self.overtakings += 1
                 return self._urgent.setdefault(urgent, (call, future))[1]
             if len(self._waiting) >= WAITING_MAX:  # remove those whose client no longer waits
                 self._waiting = deque(each for each in self._waiting if not each[1].cancelled())
@@ -80,13 +80,13 @@ class Bridge:
             self._waiting.append((call, future))
         return future
 
-    def unless_stopped(self, call: Call) -> Call:
-        """Make a call that is refused if an emergency stop overtakes it."""
-        known = self.stops
+    def unless_overtaken(self, call: Call) -> Call:
+        """Make a call that is refused if a stop or a hold overtakes it: the robot must not move."""
+        known = self.overtakings
 
         def checked(service: MissionService, now_ns: int) -> Any:
-            if self.stops != known:
-                raise ConflictError("an emergency stop was asked for since; acknowledge it anew")
+            if self.overtakings != known:
+                raise ConflictError("a stop or a hold was asked for since; look, then ask again")
             return call(service, now_ns)
 
         return checked

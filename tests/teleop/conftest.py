@@ -338,7 +338,7 @@ class Running:
         """Begin again with another robot and service, and keep the server."""
         for replaced in ("take", "submit"):
             vars(self.bridge).pop(replaced, None)
-        self.bridge.alarm, self.bridge.stops = self.note_alarm, 0
+        self.bridge.alarm, self.bridge.overtakings = self.note_alarm, 0
         self.until(lambda: not self.gate._in_flight.total())
         for kept in (self.alarms, self.complaints, self.gate.counts):
             kept.clear()

@@ -319,7 +319,7 @@ def test_teleop_is_asked_before_the_alarm_is_sent(api):
 def test_a_stop_during_the_start_is_the_first_call():
     with running(ready=False) as api, concurrent.futures.ThreadPoolExecutor(1) as pool:
         answer = pool.submit(api.post, "/v1/estop")
-        api.until(lambda: api.bridge.stops == 1)
+        api.until(lambda: api.bridge.overtakings == 1)
         with pytest.raises(urllib.error.HTTPError, match="503"):
             api.get("/v1/state")
         before = len(api.alarms)
@@ -331,24 +331,35 @@ def test_a_stop_during_the_start_is_the_first_call():
 def test_while_another_teleop_flies_even_a_stop_is_refused():
     with running(ready=False) as api, concurrent.futures.ThreadPoolExecutor(1) as pool:
         answer = pool.submit(api.post, "/v1/estop")
-        api.until(lambda: api.bridge.stops == 1)
+        api.until(lambda: api.bridge.overtakings == 1)
         api.bridge.close("another teleop has this journal open")
         refusal = 503, {"detail": "another teleop has this journal open"}
         assert answer.result() == refusal
         assert api.post("/v1/hold") == api.post("/v1/missions", A_MISSION) == refusal
 
 
-def test_a_stop_overtakes_an_acknowledgement(api):
-    free = threading.Event()
+@pytest.mark.parametrize("urgent", ["estop", "hold"])
+@pytest.mark.parametrize("overtaken", ["acknowledge", "resume", "goto", "missions"])
+def test_what_a_stop_or_a_hold_overtakes_does_not_move_the_robot(api, urgent, overtaken):
+    """They overtake it while the loop waits for its disk."""
+    if overtaken in ("resume", "goto"):
+        fly(api)
+        api.post("/v1/hold")
+    api.bridge.overtakings, free = 0, threading.Event()
     api.bridge.take = lambda take=api.bridge.take: take() if free.is_set() else []
-    with connect(api) as early, connect(api) as stop:
-        early.sendall(head("POST", "/v1/acknowledge", "Content-Length: 0"))
+    body = json.dumps(A_MISSION if overtaken == "missions" else A_MISSION["waypoints"][0]).encode()
+    with connect(api) as early, connect(api) as late:
+        length = f"Content-Length: {len(body)}"
+        early.sendall(head("POST", f"/v1/{overtaken}", length) + body)
         api.until(lambda: api.bridge._waiting)
-        stop.sendall(head("POST", "/v1/estop", "Content-Length: 0"))
-        api.until(lambda: api.bridge.stops == 1)
+        late.sendall(head("POST", f"/v1/{urgent}", "Content-Length: 0"))
+        api.until(lambda: api.bridge.overtakings == 1)
         free.set()
-        assert (early.recv(4096)[9:12], stop.recv(4096)[9:12]) == (b"409", b"200")
-    assert api.post("/v1/acknowledge")[0] == 200
+        answer = early.recv(4096)
+        assert answer[9:12] == b"409"
+        assert late.recv(4096)
+    mission = api.get("/v1/state")["mission"]
+    assert mission is None or mission["state"] in ("held", "failed")
 
 
 # Bodies and heads

@@ -32,7 +32,7 @@ def test_stop_and_hold_overtake_a_full_queue_of_calls(bridge):
     others = [number for number in range(WAITING_MAX) if number != 5]
     assert made == ["stop", "hold", *others, "another"]
     assert all(each.done() for each in (*holds, *stops)), "all who asked get the answer"
-    assert bridge.stops == 1000
+    assert bridge.overtakings == 2000
 
 
 def test_only_a_stop_is_taken_before_new_telemetry(bridge):
