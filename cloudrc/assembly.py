@@ -25,7 +25,7 @@ from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElli
 from cloudrc.link.traces import SIZE_MAX, read_table, read_trace
 from cloudrc.messages import Start
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.wire import Leg, Plan, StartMission
+from cloudrc.teleop.wire import Leg, Plan
 
 if TYPE_CHECKING:
     from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
@@ -112,7 +112,7 @@ def build_cloud(
     start_ns = clock()
     if teleop is None:
         teleop = Teleop()
-        teleop.operate(StartMission(build_plan(experiment), ONLY_MISSION), start_ns)
+        teleop.start(start_ns, build_plan(experiment), ONLY_MISSION)
     newest_wins = experiment.tunnel.order == "newest"
     return CloudEndpoint(loop, teleop, identity, newest_wins=newest_wins, start_ns=start_ns)
 

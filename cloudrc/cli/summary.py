@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.output import escape, paint, print_line, table
+from cloudrc.metrics.verdict import EXIT_CODES
 
-EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
 
 # The most important numbers -> their labels; report.html and report.json show all numbers.

@@ -23,7 +23,7 @@ from typing import Any, TypeAlias
 from cloudrc.cli.find_run import new_folder
 from cloudrc.cli.output import format_document, format_number, ignore_closed_pipe, print_line, table
 from cloudrc.cli.pool import BATCH_MAX, WORKER_KILLED, WorkerDiedError, exit_with_parent
-from cloudrc.cli.summary import EXIT_CODES
+from cloudrc.metrics.verdict import EXIT_CODES
 
 Report: TypeAlias = Mapping[str, Any]
 """The content of a `report.json`."""

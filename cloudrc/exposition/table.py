@@ -238,7 +238,7 @@ MISSIONS = (
     ),
     counter(
         "cloudrc_journal_repaired_total",
-        "Times that the journal was found damaged and repaired.",
+        "Times that a damaged journal was set aside and a new one begun.",
         (TELEOP,),
     ),
 )

@@ -71,7 +71,12 @@ class Verdict:
 
 
 class Moment(NamedTuple):
-    """Time since the start of the mission [s] and place [m], as in `Failure`; None if unknown."""
+    """When and where something happened; see `Failure`.
+
+    Attributes:
+        time: Time since the start of the mission [s].
+        place: True position of the base [m], shape (3,).
+    """
 
     time: float | None = None
     place: Vector | None = None
@@ -102,7 +107,8 @@ class Evidence:
         interrupted: Why the run is over, if somebody has stopped it before the mission's end; "" if
             nobody has.
         grounded: Why the robot never flew; "" if it did.
-        duration: Duration [s], or None; `time_limit` is its limit [s].
+        duration: Duration [s]; 0 if its limit is not judged.
+        time_limit: Limit of the duration [s].
         touch: Speed of the first touch of the board [m/s] and its moment; None without a touch.
         pipes: Name, number of contacts and first moment of each pipe that was touched.
         guard: State, cause and moment of each change of the guard beyond HOLD.
@@ -362,7 +368,13 @@ class Observations:
 
     @classmethod
     def begin(cls, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Begin with the telemetry at the start of the mission; see `see`."""
+        """Begin with the telemetry at the start of the mission.
+
+        Args:
+            pipe_contacts: See `see`.
+            touch_speed: See `see` [m/s].
+            slip_ns: See `see` [ns].
+        """
         return cls(pipe_contacts, 0, _known(touch_speed), None, slip_ns, slip_ns)
 
     def see(self, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:

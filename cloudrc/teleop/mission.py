@@ -3,7 +3,7 @@
 `Teleop` is a pure state machine (`State`) that exchanges only messages with controller and robot:
 
     teleop.see(seen, now_ns)            for every new telemetry
-    teleop.operate(verb, now_ns)        for every verb of the operator
+    teleop.start(now_ns, plan), ...     for every verb of the operator
     teleop.handle_deadline(now_ns)      regularly, at 10 Hz or faster
     teleop.take_outputs()               after each of them: Setpoint, OperatorRequest, MissionEvent
 
@@ -13,9 +13,9 @@ A `Setpoint` is valid until the next one, within its session. An `OperatorReques
 An emergency stop is the request `ALARM`, without a number: cloud numbers and repeats it. Teleop
 tells cloud so, also at 10 Hz and before everything else, until telemetry shows the stop.
 
-              StartMission             start seen             every waypoint reached
+              start                    start seen             every waypoint reached
         IDLE -------------> STARTING -------------> FLYING --------------------------> DONE
-    (or any end)                                Hold | ^ Resume
+    (or any end)                                hold | ^ resume
                                                      v |
                                                      HELD
 
@@ -44,22 +44,13 @@ from cloudrc.teleop.requests import REPEAT_NS, RequestSender
 from cloudrc.teleop.wire import (
     ALARM,
     NO_PLAN,
-    Acknowledge,
-    Cancel,
     Continue,
-    EmergencyStop,
-    GoTo,
-    Hold,
     Leg,
     Outcome,
     Output,
-    Pause,
     Plan,
-    Resume,
     RobotStatus,
-    StartMission,
     State,
-    Verb,
 )
 
 WORST_GUARD = GuardState.HOLD
@@ -78,18 +69,18 @@ ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
 END_LOST = "end_lost", "the robot reports that the mission is over, but its outcome is lost;"
 INACTIVE = tuple(state for state in State if state not in UNDER_WAY)
 
-_RULES: dict[type[Verb], tuple[str, tuple[State, ...], str]] = {
-    StartMission: ("start", INACTIVE, "cancel it first"),
-    Continue: ("continue", (State.IDLE,), "teleop has already flown a mission"),
-    Hold: ("hold", (State.FLYING,), "it must be flying"),
-    Resume: ("resume", (State.HELD,), "it must be held"),
-    Cancel: ("cancel", UNDER_WAY, "no mission is under way"),
-    GoTo: ("goto", (State.HELD, *INACTIVE), "hold or cancel it first"),
-    Acknowledge: ("acknowledge", INACTIVE, "the robot flies a mission"),
-    Pause: ("pause", UNDER_WAY, "no mission is under way"),
+_RULES: dict[str, tuple[tuple[State, ...], str]] = {
+    "start": (INACTIVE, "cancel it first"),
+    "continue": ((State.IDLE,), "teleop has already flown a mission"),
+    "hold": ((State.FLYING,), "it must be flying"),
+    "resume": ((State.HELD,), "it must be held"),
+    "cancel": (UNDER_WAY, "no mission is under way"),
+    "goto": ((State.HELD, *INACTIVE), "hold or cancel it first"),
+    "acknowledge": (INACTIVE, "the robot flies a mission"),
+    "pause": (UNDER_WAY, "no mission is under way"),
 }
-"""Name of each verb, the states that allow it, and the reason for a refusal in the others; an
-emergency stop is always allowed."""
+"""For each verb the states that allow it, and the reason for a refusal in the others; an emergency
+stop is always allowed."""
 
 
 def reached_on_board(seen: RobotStatus, mission_id: int) -> int:
@@ -289,7 +280,7 @@ class Teleop:
         self.requests = RequestSender()
         self.stopping = False
         self._stop_ns = 0
-        self._stopped_before: tuple[int, int] | None = None  # see `_stop`
+        self._stopped_before: tuple[int, int] | None = None  # see `stop`
         self.outputs: list[Output] = []
         self.leg = 0
         self._is_ended = ended
@@ -321,40 +312,115 @@ class Teleop:
         outputs, self.outputs = self.outputs, []
         return outputs
 
-    def operate(self, verb: Verb, now_ns: int) -> None:
-        """Carry out a verb of the operator.
+    # The operator's verbs: each raises a BadInputError, and changes nothing, if the state of the
+    # mission does not allow it.
 
-        GoTo is a mission of one waypoint that starts from here. While a mission is held, GoTo moves
-        only the point where it is held, and Resume continues the leg as before.
+    def start(self, now_ns: int, plan: Plan, mission_id: int = 0, *, again: bool = False) -> None:
+        """Fly a plan.
 
-        Raises:
-            BadInputError: If the state does not allow the verb or a value is invalid; nothing
-                changes then.
+        Args:
+            now_ns: Own clock [ns].
+            plan: Plan of the mission.
+            mission_id: Number under which the robot stores the progress; 0 to store none.
+            again: Whether an earlier teleop may have flown it; if it is over, it is not flown
+                again.
         """
-        name, allowed, why = _RULES.get(type(verb), ("", (self.state,), ""))
+        self._check("start")
+        self._order(plan, mission_id, now_ns)
+        # A mission from here keeps the waypoints that were reached.
+        self._may_be_flown = again and plan.start is Start.SPAWN
+        here = None if plan.start is Start.SPAWN else self._seen
+        self._world = here.world if here else ANY_WORLD
+        self._expected = (here.mission_id, mission_id) if here else ()
+        if self._seen and again and reached_on_board(self._seen, mission_id) >= self._over:
+            code, text = END_LOST
+            self._end(code, f"{text} {self._where()}", now_ns)
+            return
+        self.requests.report(mission_id, 0)
+        self.requests.ask(Request.START, plan.start, after=True)
+        self._setpoints.begin(plan, mission_id)
+        self._setpoints.select_early(0)
+
+    def continue_mission(self, now_ns: int, before: Continue) -> None:
+        """Continue a mission of an earlier teleop from here, with its current waypoint."""
+        self._check("continue")
+        self._order(before.plan, before.mission_id, now_ns - round(before.elapsed * 1e9))
+        self.leg, self._continued, self._world = before.leg, before, before.world
+        self._expected = (before.mission_id,)
+        self.requests.report(self._mission_id, self.leg)
+        self.requests.ask(Request.START, Start.HERE)
+        self._setpoints.begin(before.plan, before.mission_id, before)
+        if self._seen:
+            self.see(self._seen, now_ns)  # the mission may be over, or the world another one
+
+    def go_to(self, now_ns: int, position: Vector, yaw: float = 0.0, mission_id: int = 0) -> None:
+        """Fly to a point: as a mission of one waypoint from here, or as another place to hold.
+
+        Args:
+            now_ns: Own clock [ns].
+            position: The point [m], world frame, shape (3,).
+            yaw: Heading to hold [rad].
+            mission_id: See `start`.
+        """
+        self._check("goto")
+        leg, (x, y, z) = Leg(position, yaw), position
+        self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
+        if self.state is State.HELD:
+            self._setpoints.select_point(position, yaw)
+        else:
+            self.start(now_ns, Plan((leg,), Start.HERE, leg.time_limit), mission_id)
+
+    def hold(self, now_ns: int) -> None:
+        """Stop the robot where it is and wait, at `now_ns` [ns]."""
+        self._check("hold")
+        self._hold(now_ns)
+
+    def resume(self, now_ns: int) -> None:
+        """Continue the held leg, at `now_ns` [ns]."""
+        self._check("resume")
+        self.state = State.FLYING
+        self._watch.pause()
+        self._setpoints.select_leg(self.leg)
+        self._report("resumed", self.leg, f"resumed {self._where()}", now_ns)
+
+    def cancel(self, now_ns: int) -> None:
+        """End the mission, at `now_ns` [ns]."""
+        self._check("cancel")
+        self._end("cancelled", "mission cancelled", now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        """Stop the rotors at once; what was asked of the robot before does not count any more.
+
+        A robot that is stopped already may be about to act on an acknowledgement. Then its state
+        alone is not enough, and telemetry has to show a new request.
+
+        Args:
+            now_ns: Own clock [ns].
+        """
+        if self.state in UNDER_WAY:
+            self._end("emergency_stopped", f"emergency stop {self._where()}", now_ns)
+        self.requests.forget()
+        seen = self._seen
+        stopped = seen is not None and seen.guard is GuardState.ESTOP
+        self._stopped_before = (seen.epoch, seen.mission) if seen and stopped else None
+        self.stopping, self._stop_ns = True, 0
+
+    def acknowledge(self, now_ns: int) -> None:
+        """Let a robot fly again that has landed or was stopped, at `now_ns` [ns]."""
+        self._check("acknowledge")
+        self.requests.ask(Request.ACKNOWLEDGE, after=True)
+
+    def pause(self, now_ns: int) -> None:
+        """Let the robot hold, at `now_ns` [ns], until the next teleop continues the mission."""
+        self._check("pause")
+        self._report("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
+        self.requests.ask(Request.END)
+        self._setpoints.stay()  # cloud keeps this setpoint if the request is lost
+
+    def _check(self, verb: str) -> None:
+        allowed, why = _RULES[verb]
         if self.state not in allowed:
-            raise BadInputError(f"{name}: the mission is {self.state.name}; {why}")
-        match verb:
-            case StartMission(plan, mission_id, again):
-                self._start(plan, mission_id, now_ns, again=again)
-            case Continue():
-                self._continue(verb, now_ns)
-            case Hold():
-                self._hold(now_ns)
-            case Resume():
-                self._resume(now_ns)
-            case Cancel():
-                self._end("cancelled", "mission cancelled", now_ns)
-            case GoTo(position, yaw, mission_id):
-                self._go_to(Leg(position, yaw), mission_id, now_ns)
-            case EmergencyStop():
-                self._stop(now_ns)
-            case Acknowledge():
-                self.requests.ask(Request.ACKNOWLEDGE, after=True)
-            case Pause():
-                self._report("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
-                self.requests.ask(Request.END)
-                self._setpoints.stay()  # cloud keeps this setpoint if the request is lost
+            raise BadInputError(f"{verb}: the mission is {self.state.name}; {why}")
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry at its arrival `now_ns` [ns]."""
@@ -422,20 +488,6 @@ class Teleop:
             return "leg_timed_out", f"{self._leg_name()} not reached in {leg_limit:g} s"
         return None
 
-    def _stop(self, now_ns: int) -> None:
-        """Stop the rotors; what was asked of the robot before does not count any more.
-
-        A robot that is stopped already may be about to act on an acknowledgement. Then its state
-        alone is not enough, and telemetry has to show a new request.
-        """
-        if self.state in UNDER_WAY:
-            self._end("emergency_stopped", f"emergency stop {self._where()}", now_ns)
-        self.requests.forget()
-        seen = self._seen
-        stopped = seen is not None and seen.guard is GuardState.ESTOP
-        self._stopped_before = (seen.epoch, seen.mission) if seen and stopped else None
-        self.stopping, self._stop_ns = True, 0
-
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
         """Hold a robot that flies without a mission here, and keep a standing one on the ground."""
         mission_id = seen.mission_id
@@ -444,33 +496,6 @@ class Teleop:
         if mission_id != self._mission_id and over and not self.stopping:
             self.requests.ask(Request.END, after=True)
         self._setpoints.select_here()
-
-    def _start(self, plan: Plan, mission_id: int, now_ns: int, *, again: bool = False) -> None:
-        self._order(plan, mission_id, now_ns)
-        # A mission from here keeps the waypoints that were reached.
-        self._may_be_flown = again and plan.start is Start.SPAWN
-        here = None if plan.start is Start.SPAWN else self._seen
-        self._world = here.world if here else ANY_WORLD
-        self._expected = (here.mission_id, mission_id) if here else ()
-        if self._seen and again and reached_on_board(self._seen, mission_id) >= self._over:
-            code, text = END_LOST
-            self._end(code, f"{text} {self._where()}", now_ns)
-            return
-        self.requests.report(mission_id, 0)
-        self.requests.ask(Request.START, plan.start, after=True)
-        self._setpoints.begin(plan, mission_id)
-        self._setpoints.select_early(0)
-
-    def _continue(self, before: Continue, now_ns: int) -> None:
-        """Start from here again, with the waypoint that was the current one."""
-        self._order(before.plan, before.mission_id, now_ns - round(before.elapsed * 1e9))
-        self.leg, self._continued, self._world = before.leg, before, before.world
-        self._expected = (before.mission_id,)
-        self.requests.report(self._mission_id, self.leg)
-        self.requests.ask(Request.START, Start.HERE)
-        self._setpoints.begin(before.plan, before.mission_id, before)
-        if self._seen:
-            self.see(self._seen, now_ns)  # the mission may be over, or the world another one
 
     def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
         """Note a mission that begins: its plan, its number, and since when its time counts."""
@@ -515,20 +540,6 @@ class Teleop:
         self.state = State.HELD
         self._setpoints.select_here()
         self._report("held", self.leg, f"held {self._where()}", now_ns)
-
-    def _resume(self, now_ns: int) -> None:
-        self.state = State.FLYING
-        self._watch.pause()
-        self._setpoints.select_leg(self.leg)
-        self._report("resumed", self.leg, f"resumed {self._where()}", now_ns)
-
-    def _go_to(self, leg: Leg, mission_id: int, now_ns: int) -> None:
-        x, y, z = leg.position
-        self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
-        if self.state is State.HELD:
-            self._setpoints.select_point(leg.position, leg.yaw)
-        else:
-            self._start(Plan((leg,), Start.HERE, leg.time_limit), mission_id, now_ns)
 
     def _end(self, code: str, text: str, now_ns: int) -> None:
         """End the mission, and ask the robot to hold where it is."""

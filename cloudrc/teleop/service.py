@@ -12,6 +12,8 @@ the robot has flown another mission since or is another one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from math import isfinite
 from typing import Any
 
@@ -22,22 +24,7 @@ from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError, busy
-from cloudrc.teleop.wire import (
-    Acknowledge,
-    Cancel,
-    Continue,
-    EmergencyStop,
-    GoTo,
-    Hold,
-    Leg,
-    Output,
-    Pause,
-    Plan,
-    Resume,
-    RobotStatus,
-    StartMission,
-    Verb,
-)
+from cloudrc.teleop.wire import Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED = (LAND, ESTOP)
@@ -240,7 +227,9 @@ class MissionService:
         if waiting:
             self._note(mission, "queued", f"mission waits for {waiting[-1].id}", now_ns)
         else:
-            self._launch(mission, StartMission(order.plan, mission.number), now_ns)
+            self._current = mission
+            self._teleop.start(now_ns, order.plan, mission.number)
+            self._note_start(mission, now_ns)
         return mission, True
 
     def cancel(self, mission_id: str, now_ns: int) -> Mission:
@@ -253,7 +242,7 @@ class MissionService:
         """
         mission = self.book.find(mission_id)
         if not mission.ended and mission is self._start_next(now_ns):
-            return self._operate(Cancel(), now_ns)
+            return self._operate(self._teleop.cancel, now_ns)
         if mission.ended:  # also if it has just failed, because world restarted
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         self.book.cancel(mission)
@@ -261,7 +250,7 @@ class MissionService:
 
     def hold(self, now_ns: int) -> Mission:
         """Stop the robot where it is; raises ConflictError unless it flies a mission."""
-        return self._operate(Hold(), now_ns)
+        return self._operate(self._teleop.hold, now_ns)
 
     def resume(self, now_ns: int) -> Mission:
         """Continue the held mission.
@@ -271,7 +260,7 @@ class MissionService:
             UnavailableError: If this process ends.
         """
         self._check_can_fly()
-        return self._operate(Resume(), now_ns)
+        return self._operate(self._teleop.resume, now_ns)
 
     def go_to(self, position: Vector, yaw: float, now_ns: int) -> Mission:
         """Fly to a point: as a new mission, or as another place to hold the current one.
@@ -291,17 +280,19 @@ class MissionService:
         if waiting and waiting[0].state != store.HELD:
             raise busy(waiting[0], "hold or cancel it first")
         if waiting:
-            return self._operate(GoTo(position, yaw), now_ns)
+            return self._operate(partial(self._teleop.go_to, position=position, yaw=yaw), now_ns)
         leg = Leg(position, yaw)
         mission = self.book.add(Order(Plan((leg,), Start.HERE, leg.time_limit), "goto"))
-        self._launch(mission, GoTo(position, yaw, mission.number), now_ns)
+        self._current = mission
+        self._teleop.go_to(now_ns, position, yaw, mission.number)
+        self._note_start(mission, now_ns)
         return mission
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state, and return the mission that failed, if any."""
         mission = self._start_next(now_ns)
         self._inherits_stop = self._acknowledges = False
-        self._teleop.operate(EmergencyStop(), now_ns)
+        self._teleop.stop(now_ns)
         self._collect(now_ns)
         return mission
 
@@ -309,7 +300,7 @@ class MissionService:
         """Let a robot fly again that has landed or was stopped; ConflictError in a mission."""
         if self._current is not None:
             raise busy(self._current, "there is nothing to acknowledge")
-        self._teleop.operate(Acknowledge(), now_ns)
+        self._teleop.acknowledge(now_ns)
         self._acknowledges = True
         self._collect(now_ns)
 
@@ -317,7 +308,7 @@ class MissionService:
         """Hold the mission under way before this process ends; the next process continues it."""
         self._ends = True
         if self._start_next(now_ns) is not None:
-            self._operate(Pause(), now_ns)
+            self._operate(self._teleop.pause, now_ns)
 
     @property
     def settled(self) -> bool:
@@ -354,9 +345,9 @@ class MissionService:
         self._inherits_stop = False
         stopped = self.book.stopped()
         if stopped is not None and seen.mission_id == stopped.number:
-            self._teleop.operate(EmergencyStop(), now_ns)
+            self._teleop.stop(now_ns)
             if self._acknowledges:  # meanwhile
-                self._teleop.operate(Acknowledge(), now_ns)
+                self._teleop.acknowledge(now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
         """Start a waiting mission, check time limits, and repeat what is due at `now_ns` [ns]."""
@@ -400,12 +391,12 @@ class MissionService:
                 f"{self._blocked}; find the cause, then: cloudrc mission acknowledge"
             )
 
-    def _operate(self, verb: Verb, now_ns: int) -> Mission:
+    def _operate(self, verb: Callable[[int], None], now_ns: int) -> Mission:
         mission = self._current
         if mission is None:
             raise ConflictError("no mission is under way")
         try:
-            self._teleop.operate(verb, now_ns)
+            verb(now_ns)
         except BadInputError as error:
             raise ConflictError(str(error), mission.id) from None
         self._collect(now_ns)
@@ -418,18 +409,23 @@ class MissionService:
             if queued and waiting[0].state == store.QUEUED:
                 self.book.begin(waiting[0], now_ns)
             if waiting[0].state != store.QUEUED:
-                self._launch(waiting[0], store.first_verb(waiting[0]), now_ns)
+                self._take_over(waiting[0], now_ns)
         return self._current
 
-    def _launch(self, mission: Mission, verb: Verb, now_ns: int) -> None:
-        self._current = mission
-        self._teleop.operate(verb, now_ns)
-        if isinstance(verb, Continue):
+    def _take_over(self, mission: Mission, now_ns: int) -> None:
+        """Fly a mission that this or an earlier teleop has begun."""
+        self._current, before = mission, mission.before()
+        if before is None:
+            self._teleop.start(now_ns, mission.order.plan, mission.number, again=True)
+        else:
+            self._teleop.continue_mission(now_ns, before)
             mission.witness = mission.witness.after_restart()
             text = "teleop has restarted; the robot is asked to go on"
             self._note(mission, "restarted", text, now_ns)
-        elif mission.state == store.QUEUED:
-            self._note(mission, "starting", "the robot is asked to start", now_ns)
+        self._collect(now_ns)
+
+    def _note_start(self, mission: Mission, now_ns: int) -> None:
+        self._note(mission, "starting", "the robot is asked to start", now_ns)
         self._collect(now_ns)
 
     def _note_contacts(self, mission: Mission, seen: RobotStatus, now_ns: int) -> None:

@@ -28,7 +28,7 @@ from typing import Any, TypeAlias
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.messages import Start
 from cloudrc.metrics.verdict import Failure, Observations, Verdict
-from cloudrc.teleop.wire import Continue, Leg, Plan, StartMission
+from cloudrc.teleop.wire import Continue, Leg, Plan
 
 Event: TypeAlias = dict[str, Any]
 """An event of a mission, as the API shows it."""
@@ -140,6 +140,13 @@ class Mission:
         if event == "reached" and waypoint == len(self.reached):
             self.reached.append({"waypoint": waypoint, "time_s": self.elapsed})
 
+    def before(self) -> Continue | None:
+        """Return what a new teleop continues; None if the mission has not begun to fly."""
+        if not self.world:
+            return None
+        held, plan = self.state == HELD, self.order.plan
+        return Continue(plan, self.waypoint, self.elapsed, self.world, held, self.number)
+
     def copy(self) -> Mission:
         """Copy the mission, so that an event changes only the copy."""
         reached, events, happened = [*self.reached], self.events.copy(), self.happened.copy()
@@ -173,15 +180,6 @@ def number_of(mission_id: str, salt: bytes) -> int:
     """
     digest = hashlib.sha256(salt + mission_id.encode()).digest()
     return int.from_bytes(digest[:8], "little") >> 1 or 1
-
-
-def first_verb(mission: Mission) -> StartMission | Continue:
-    """Return the verb that begins a mission, or continues it after a restart of teleop."""
-    plan, number = mission.order.plan, mission.number
-    if not mission.world:
-        return StartMission(plan, number, again=True)
-    held = mission.state == HELD
-    return Continue(plan, mission.waypoint, mission.elapsed, mission.world, held, number)
 
 
 class UnknownMissionError(CloudrcError):

@@ -137,23 +137,8 @@ class RobotStatus(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class StartMission:
-    """Verb: fly this plan.
-
-    Attributes:
-        plan: Plan of the mission.
-        mission_id: Number under which the robot stores the progress; 0 to store none.
-        again: Whether an earlier teleop may have flown it; if it is over, it is not flown again.
-    """
-
-    plan: Plan
-    mission_id: int = 0
-    again: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Continue:
-    """Verb of a restarted teleop: continue a mission that was under way.
+    """State of a mission that was under way before a restart of teleop.
 
     Attributes:
         plan: Plan of the mission.
@@ -171,56 +156,6 @@ class Continue:
     held: bool = False
     mission_id: int = 0
 
-
-@dataclass(frozen=True, slots=True)
-class Hold:
-    """Verb: stop the robot where it is and wait."""
-
-
-@dataclass(frozen=True, slots=True)
-class Resume:
-    """Verb: continue the held leg."""
-
-
-@dataclass(frozen=True, slots=True)
-class Cancel:
-    """Verb: end the mission."""
-
-
-@dataclass(frozen=True, slots=True)
-class GoTo:
-    """Verb: fly to one point.
-
-    Attributes:
-        position: The point [m], world frame, shape (3,).
-        yaw: Heading to hold [rad].
-        mission_id: Number under which the robot stores the progress; 0 to store none.
-    """
-
-    position: Vector
-    yaw: float = 0.0
-    mission_id: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class EmergencyStop:
-    """Verb: stop the rotors at once in any state."""
-
-
-@dataclass(frozen=True, slots=True)
-class Acknowledge:
-    """Verb: let a robot fly again that has landed or was stopped."""
-
-
-@dataclass(frozen=True, slots=True)
-class Pause:
-    """Verb of a teleop that ends: let the robot hold until the next teleop continues."""
-
-
-Verb: TypeAlias = (
-    StartMission | Continue | Hold | Resume | Cancel | GoTo | EmergencyStop | Acknowledge | Pause
-)
-"""Verbs of the operator; only teleop itself uses `Continue` and `Pause`."""
 
 Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 """Messages from teleop."""

@@ -9,7 +9,7 @@ from cloudrc.cloud.endpoint import CloudIdentity
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request
 from cloudrc.records import GuardChange
-from cloudrc.teleop.wire import ALARM, Acknowledge, EmergencyStop
+from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel.codec import Kind, peek
 from tests.flights.conftest import SHARED_CLOCK, Ends, join
 
@@ -73,10 +73,14 @@ def test_a_stop_after_an_acknowledgement_holds_and_one_before_is_undone() -> Non
     fly(ends, 4 * S)
     ends.cloud.teleop.outputs.append(ALARM)
     fly(ends, 5 * S)
-    ends.cloud.teleop.operate(Acknowledge(), 5 * S)
+    ends.cloud.teleop.acknowledge(5 * S)
     ends.cloud.teleop.handle_deadline(5 * S)
-    ends.cloud.teleop.operate(EmergencyStop(), 5 * S)
-    assert fly(ends, 7 * S)[-1] is GuardState.ESTOP
+    ends.cloud.teleop.stop(5 * S)
+    assert fly(ends, 6 * S)[-1] is GuardState.ESTOP
+    assert ends.cloud.teleop.settled
+    ends.cloud.teleop.stop(6 * S)  # of a robot that is stopped
+    assert fly(ends, 7 * S) == []
+    assert ends.cloud.teleop.settled
     ends.cloud.teleop.outputs.append(ALARM)  # late, of before
     ends.cloud.teleop.requests.ask(Request.ACKNOWLEDGE)
     assert fly(ends, 9 * S)[-1] is GuardState.GROUND

@@ -152,13 +152,13 @@ def test_a_start_from_the_spawn_begins_a_new_epoch():
 
 def test_one_mission_can_follow_another_from_here():
     from cloudrc.messages import Start
-    from cloudrc.teleop.wire import Leg, Plan, StartMission
+    from cloudrc.teleop.wire import Leg, Plan
 
     ends = join(load_experiment("hover", ["mission.waypoints.0.dwell_s=0.5"]))
     done = lambda: ends.cloud.mission_over  # noqa: E731
     ends.run.fly(done, 20_000 * MS, lambda w, c: None)
     plan = Plan((Leg((0.5, 0.0, 1.0)),), Start.HERE)
-    ends.cloud.teleop.operate(StartMission(plan), ends.run.now_ns)
+    ends.cloud.teleop.start(ends.run.now_ns, plan)
     of_world = []
     ends.run.fly(done, 40_000 * MS, lambda w, c: of_world.extend(w))
     assert ends.cloud.teleop.outcome.success

@@ -30,7 +30,7 @@ from cloudrc.teleop.bridge import STARTING, Bridge
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionStore, Order
-from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus, StartMission
+from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
 
 PERIOD_NS = 10_000_000
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
@@ -84,9 +84,9 @@ class Flight:
         told = (*self.onboard, self.cause)
         return dict(zip(("mission_id", "reached", "cause"), told, strict=True))
 
-    def operate(self, verb):
+    def operate(self, verb, *words, **more):
         try:
-            self.teleop.operate(verb, self.now_ns)
+            getattr(self.teleop, verb)(self.now_ns, *words, **more)
         finally:
             self._collect()
 
@@ -171,7 +171,7 @@ def flying(plan=PLAN):
     """A flight whose mission has just started."""
     flight = Flight()
     flight.step()
-    flight.operate(StartMission(plan))
+    flight.operate("start", plan)
     flight.step(seconds=0.03)
     assert flight.state == "FLYING"
     return flight
