@@ -68,6 +68,20 @@ def open_file(path: Path) -> FileIO:
     raise ValueError(f"{path}: not a file")
 
 
+def readable_by_others(path: Path) -> bool:
+    """Check whether other users can read one's own file; a missing file is not readable.
+
+    Kubernetes gives a Secret's files to root, and lets the pod's group read them: only a file that
+    belongs to this user must also be closed to the group.
+    """
+    try:
+        status = path.stat()
+    except OSError:
+        return False
+    group = stat.S_IRGRP if status.st_uid == os.geteuid() else 0
+    return bool(status.st_mode & (stat.S_IROTH | group))
+
+
 @contextmanager
 def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
     """Write a file under a temporary name and rename it to `path` once it is complete.

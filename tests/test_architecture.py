@@ -48,7 +48,7 @@ ALWAYS = {"errors", "messages", "records", "__version__"}
 
 # Parts that run in real time besides the drivers: link shapers and teleop's API.
 SHAPERS = ("link/relay", "link/lateness", "link/verify/probe", "link/verify/monitor")
-API = ("teleop/api", "teleop/auth", "teleop/bridge", "teleop/server")
+API = ("teleop/api", "teleop/auth", "teleop/bridge")
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it.
 RESERVED: dict[str, tuple[str, ...]] = {
@@ -60,7 +60,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
         *("config/", "link/", "cli/", "teleop/", "report/folder"),
         "faults/schedule",
     ),
-    **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/server")),
+    **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/auth")),
     "fcntl": ("drivers/local",),
     "matplotlib": ("report/",),
     "mcap": ("record/",),

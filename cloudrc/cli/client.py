@@ -13,14 +13,16 @@ import json
 import os
 import re
 import socket
+import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
 
-from cloudrc.cli.output import escape
+from cloudrc.cli.output import escape, print_line
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.files import read
+from cloudrc.files import read, readable_by_others
 
 REQUEST_TIMEOUT = 10.0
 """Time limit of one request [s]."""
@@ -55,9 +57,7 @@ class Api:
             BadInputError: If the address is invalid.
         """
         self.url, self._token = url.rstrip("/"), token
-        parts = urlsplit(self.url)
-        valid = parts.scheme in ("http", "https") and parts.hostname and not parts.username
-        if not (valid or (url.startswith(UNIX) and len(url) > len(UNIX))):
+        if not (_is_http(self.url) or (url.startswith(UNIX) and len(url) > len(UNIX))):
             raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH")
 
     def get(self, path: str) -> Any:
@@ -116,7 +116,7 @@ class Api:
             connection.close()
             why = getattr(error, "strerror", None) or error
             raise UnreachableError(f"the API at {self.url} does not answer ({why})") from None
-        if answer.status >= 400:
+        if not 200 <= answer.status < 300:
             refusal = _refusal(answer, with_token=bool(token))
             connection.close()
             raise refusal
@@ -130,6 +130,15 @@ class Api:
         secure = parts.scheme == "https"
         kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
         return kind(parts.hostname or "", parts.port, timeout=limit)
+
+
+def _is_http(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        named = bool(parts.hostname) and parts.port != 0 and not parts.username
+    except ValueError:  # an address without its bracket, or a port that is no number
+        return False
+    return named and parts.scheme in ("http", "https")
 
 
 def mission_path(mission_id: str) -> str:
@@ -149,10 +158,10 @@ class _UnixConnection(http.client.HTTPConnection):
 
 
 def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcError:
-    try:
+    body: Any = None
+    with suppress(OSError, ValueError, http.client.HTTPException):
         body = json.loads(answer.read())
-    except (OSError, ValueError, http.client.HTTPException):
-        body = {}
+    body = body if isinstance(body, dict) else {}  # it may be another server that answers
     detail = body.get("detail") or f"the API answered {answer.status} {answer.reason}"
     detail = escape(str(detail))
     problems = body.get("problems") or []
@@ -192,8 +201,15 @@ def token_file(options: argparse.Namespace) -> Path | None:
 
 
 def token_reader(path: Path | None) -> Callable[[], str]:
-    """Make the function that reads the token anew for each request; "" without a file."""
-    return (lambda: "") if path is None else (lambda: _read(path))
+    """Make the function that reads the token anew for each request; "" without a file.
+
+    Warn now if others can read the file.
+    """
+    if path is None:
+        return lambda: ""
+    if readable_by_others(path):
+        print_line(f"cloudrc: warning: {path} can be read by others: chmod 600 {path}", sys.stderr)
+    return lambda: _read(path)
 
 
 def _read(path: Path) -> str:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import resource
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,90 +26,54 @@ from cloudrc.cli.runtime import (
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.drivers.teleop import Calls
     from cloudrc.records import Counted
-    from cloudrc.teleop.auth import Audit
+    from cloudrc.teleop.api import ApiServer
     from cloudrc.teleop.bridge import Bridge
-    from cloudrc.teleop.server import ApiServer
     from cloudrc.teleop.service import MissionService
     from cloudrc.teleop.store import MissionStore
 
 
 LOOPBACK = "127.0.0.1"
-COUNT_PERIOD_NS = 1_000_000_000
-"""Time between two updates of the metrics from the API's counts [ns]."""
+FILES_MAX = 8_192
+"""Limit of open files: idle connections leave room for the one of an emergency stop, and take at
+most 64 MB."""
 
 
-class ServedApi:
-    """Serve the API; until `open` it answers that teleop is not ready.
-
-    Attributes:
-        bridge: Passes calls from the API's threads to teleop's loop.
-    """
-
-    def __init__(self, bridge: Bridge, server: ApiServer, audit: Audit) -> None:
-        self.bridge, self._server, self._audit = bridge, server, audit
-        self._service: MissionService | None = None
-        self._counted_ns = 0
-
-    def open(self, service: MissionService, alarm: Callable[[], object]) -> None:
-        """Start to serve missions.
-
-        Args:
-            service: The service that flies them.
-            alarm: Sends an emergency stop directly to cloud; called from any thread.
-        """
-        self.bridge.alarm, self._service = alarm, service
-        self.bridge.open(service)
-
-    def counted(self) -> list[Counted]:
-        """Return the counts of requests once a second, else an empty list."""
-        import time
-
-        from cloudrc.records import Counted
-
-        now_ns = time.monotonic_ns()
-        if now_ns - self._counted_ns < COUNT_PERIOD_NS:
-            return []
-        self._counted_ns = now_ns
-        counts = {**self._server.counts, "audit_dropped": self._audit.dropped}
-        if self._service is not None:
-            counts["events_dropped"] = self._service.book.dropped
-        return [Counted(now_ns, "teleop", f"api_{name}", n) for name, n in sorted(counts.items())]
-
-    def stop(self) -> None:
-        """Finish the open requests and stop."""
-        self._server.stop()
-        self._audit.close()
-
-
-def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> ServedApi:
-    """Start the API; it answers that teleop is not ready until it is opened."""
-    import json
-    from functools import partial
-
+def serve_api(
+    options: argparse.Namespace, experiment: ResolvedExperiment, bridge: Bridge
+) -> ApiServer:
+    """Start the API; it answers that teleop is not ready until the bridge is opened."""
     from cloudrc import assembly
     from cloudrc.geometry.scene import load_scene
     from cloudrc.link.state import publish
-    from cloudrc.teleop.api import Surroundings, create_app
-    from cloudrc.teleop.auth import Audit, Tokens
-    from cloudrc.teleop.bridge import Bridge
-    from cloudrc.teleop.server import ApiServer, Gate
+    from cloudrc.teleop.api import ApiServer, Surroundings, create_app
+    from cloudrc.teleop.audit import Audit
+    from cloudrc.teleop.auth import Gate, Tokens
 
     if not isinstance(options.api, Path):
         warn_if_exposed(options.api)
-    criteria, bridge = experiment.criteria, Bridge()
-    scene = load_scene(experiment.world.scene)
+    criteria, scene = experiment.criteria, load_scene(experiment.world.scene)
     plan = partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps)
     surroundings = Surroundings(scene, criteria.time_limit_s, criteria.contact, plan)
-    tokens = Tokens(options.tokens) if options.tokens else None
-    audit = Audit(options.audit, log_line)
-    gate = Gate(create_app(bridge, surroundings), tokens, audit, complain=log_line)
+    tokens = Tokens(options.tokens, log_line) if options.tokens else None
+    audit = Audit(options.audit, log_line) if options.audit else None
+    gate = Gate(create_app(bridge, surroundings, log_line), tokens, audit)
     server = ApiServer(gate, bridge, options.api)
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
     server.start()
     if options.api_file is not None:
         publish(options.api_file, json.dumps({"schemaVersion": 1, "url": server.url}) + "\n")
-    return ServedApi(bridge, server, audit)
+    return server
+
+
+def api_counts(server: ApiServer, service: MissionService) -> list[Counted]:
+    """Return the counts of the API for the metrics."""
+    from cloudrc.records import Counted
+
+    counts, now_ns = {**server.counts, "events_dropped": service.book.dropped}, time.monotonic_ns()
+    return [Counted(now_ns, "teleop", f"api_{name}", number) for name, number in counts.items()]
 
 
 def log_line(text: str) -> None:
@@ -129,8 +97,9 @@ and when its parent process has ended. A flying robot then holds; a new teleop
 with the same --journal resumes the mission.
 
 /openapi.json describes the API. The API asks for a token, except on a socket
-file, which only its owner can open. To make a token:
-openssl rand -hex 32 > DIR/operator. The token in DIR/reader may only read."""
+file, which only its owner can open. To make a token that only you can read:
+(umask 077; openssl rand -hex 32 > DIR/operator). A token in DIR/reader may only
+read."""
 LOCK_PERIOD = 0.2
 """Pause between two attempts to open a journal that another teleop has open [s]."""
 PAUSE_LIMIT_NS = 500_000_000
@@ -182,6 +151,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.process import StopSignal
     from cloudrc.records import Counted
+    from cloudrc.teleop.bridge import Bridge
     from cloudrc.teleop.service import MissionService
 
     if options.api:
@@ -190,10 +160,11 @@ def execute(options: argparse.Namespace) -> int:
     experiment = read_experiment(str(options.config))
     if exporter is not None:
         exporter.runs(fingerprint(experiment))
-    served = serve_api(options, experiment) if options.api else None
+    bridge = Bridge()
+    server = serve_api(options, experiment, bridge) if options.api else None
     book = None
     try:
-        book = _open_store(options.journal, stop, served.bridge if served else None)
+        book = _open_store(options.journal, stop, bridge)
         if book is None:
             return 0  # stopped while another teleop held the journal
         service = MissionService(experiment.criteria.contact_speed_max_mps, book)
@@ -202,10 +173,10 @@ def execute(options: argparse.Namespace) -> int:
         over = lambda: ending() or (single_mission and service.over)  # noqa: E731
         if exporter is not None and book.damaged:
             exporter.see([Counted(0, "teleop", "journal_repaired", 1)])
-        _fly(options, service, served, exporter, over)
+        _fly(options, service, bridge, server, exporter, over)
     finally:
-        if served is not None:
-            served.stop()
+        if server is not None:
+            server.stop()
         if book is not None:
             book.close()
     return 0
@@ -219,38 +190,32 @@ class _Ending:
         self._since_ns: int | None = None
 
     def __call__(self) -> bool:
-        import time
-
         if not self._stop_asked():
             return False
         if self._since_ns is None:
             self._service.pause(time.monotonic_ns())
-            self._since_ns = (
-                time.monotonic_ns()
-            )  # again: pausing writes to the disk, which may take long
+            self._since_ns = time.monotonic_ns()  # the disk may have taken long
         return self._service.settled or time.monotonic_ns() - self._since_ns > PAUSE_LIMIT_NS
 
 
 def _fly(
     options: argparse.Namespace,
     service: MissionService,
-    served: ServedApi | None,
+    bridge: Bridge,
+    server: ApiServer | None,
     exporter: Exporter | None,
     stop: Callable[[], bool],
 ) -> None:
     """Run the service until `stop()`."""
     from cloudrc.drivers.feed import Feed
-    from cloudrc.drivers.teleop import EmergencyStopSender, UnixPeer, serve_teleop
+    from cloudrc.drivers.teleop import UnixPeer, serve_teleop
     from cloudrc.records import Fault
     from cloudrc.teleop import wire
 
     feed = Feed.on_stdout(watched=options.feed)
     peer = UnixPeer(options.socket / "teleop.sock", options.socket / "cloud.sock")
-    calls: Calls = list
-    stops: Calls = list
-    if served is not None:
-        served.open(service, EmergencyStopSender(lambda: peer.send(wire.encode(wire.ALARM))))
-        calls, stops = served.bridge.take, served.bridge.take_urgent
+    bridge.alarm = lambda: peer.send(wire.encode(wire.ALARM))
+    bridge.open(service)
     feed.ready()
 
     def publish(records: list[Any]) -> None:
@@ -261,8 +226,8 @@ def _fly(
     def update_and_check() -> bool:
         if exporter is not None:
             exporter.ready(service.sight.seen is not None)
-            if served is not None:
-                exporter.see(served.counted())
+            if server is not None:
+                exporter.see(api_counts(server, service))
         return stop()
 
     if notice := service.book.notice:
@@ -272,19 +237,15 @@ def _fly(
         peer,
         wire.encode,
         wire.decode,
-        calls=calls,
-        stops=stops,
+        calls=bridge.take,
+        stops=bridge.take_urgent,
         tell=publish,
         stop=feed.alive_while(update_and_check),
     )
 
 
-def _open_store(
-    path: Path | None, stop: Callable[[], bool], bridge: Bridge | None
-) -> MissionStore | None:
+def _open_store(path: Path | None, stop: Callable[[], bool], bridge: Bridge) -> MissionStore | None:
     """Open the store once no other teleop holds it; None if stopped before."""
-    import os
-
     from cloudrc.teleop.store import MissionStore, StoreLockedError, connect, open_store
 
     salt, reported = os.urandom(SALT_SIZE), False
@@ -297,8 +258,7 @@ def _open_store(
             if not reported:
                 log_line(str(error))
                 reported = True
-            if bridge is not None:
-                bridge.close(str(error))
+            bridge.close(str(error))
             time.sleep(LOCK_PERIOD)
             continue
         if book.notice:
@@ -311,8 +271,6 @@ def _start(
     options: argparse.Namespace, experiment: ResolvedExperiment, service: MissionService
 ) -> bool:
     """Start the mission of the command line, if any; return whether there is one."""
-    import time
-
     from cloudrc import assembly
     from cloudrc.teleop.store import ConflictError, Order
 
@@ -329,7 +287,7 @@ def _start(
     except ConflictError as error:
         if not options.api:
             raise
-        print(f"cloudrc teleop: {error}", file=sys.stderr, flush=True)
+        log_line(str(error))
         return False  # the operator can solve the conflict through the API
     return True
 

@@ -144,8 +144,9 @@ def missing_secret(release: Release, pod: Any) -> str | None:
         if found and not _has_secret(release, found[2]):
             file, content = SECRETS[found[1]]
             return (
-                f"there is no Secret '{found[2]}'; make it: {content} >{file} && kubectl "
-                f"{' '.join(release.flags)} create secret generic {found[2]} --from-file={file}"
+                f"there is no Secret '{found[2]}'; make it: (umask 077; {content} >{file}) && "
+                f"kubectl {' '.join(release.flags)} create secret generic {found[2]} "
+                f"--from-file={file}"
             )
     return None
 

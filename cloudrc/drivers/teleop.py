@@ -10,7 +10,6 @@ requests are repeated, and events wait until cloud is back.
 from __future__ import annotations
 
 import socket
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -80,45 +79,6 @@ class UnixPeer:
     def close(self) -> None:
         """Close the socket; its path stays, since a successor may already have bound it."""
         self._socket.close()
-
-
-STOP_PERIOD = 0.02
-"""Pause between two attempts to hand an emergency stop to cloud [s]."""
-STOP_LIMIT = 2.0
-"""Time for which these attempts last [s]. If cloud is blocked for that long, the robot holds."""
-
-
-class EmergencyStopSender:
-    """Hand an emergency stop to cloud from any thread, without blocking it.
-
-    It bypasses teleop's loop, which may be waiting for its disk. The socket of a blocked cloud
-    queues a few datagrams and refuses more; then one thread tries again until cloud accepts it.
-    """
-
-    def __init__(self, send: Callable[[], bool]) -> None:
-        """Store how to send.
-
-        Args:
-            send: Sends the stop once; returns whether cloud accepted it. Must not block.
-        """
-        self._send = send
-        self._tries = threading.Lock()  # held while a thread tries again
-
-    def __call__(self) -> None:
-        """Send the stop, now or as soon as cloud accepts it."""
-        if self._send() or not self._tries.acquire(blocking=False):
-            return
-        try:
-            threading.Thread(target=self._try_again, name="alarm", daemon=True).start()
-        except RuntimeError:  # no more threads: teleop's loop repeats the stop
-            self._tries.release()
-
-    def _try_again(self) -> None:
-        for _ in range(round(STOP_LIMIT / STOP_PERIOD)):
-            time.sleep(STOP_PERIOD)
-            if self._send():
-                break
-        self._tries.release()
 
 
 PERIOD_NS = 20_000_000

@@ -63,7 +63,7 @@ MISSION_OUTCOMES = (
 )
 API_REFUSALS = ("token", "role", "busy", "slow")
 """Reasons for which the API rejects a request: no valid token; a reader's token for an operator's
-request; too many requests or connections; a client that sends too slowly."""
+request; too many requests at the same time; a body that arrives too slowly."""
 ORDER_REFUSALS = ("invalid", "conflict")
 """Reasons for which the API refuses an order: an invalid value; another mission is active."""
 BODIES = ("pipe", "board", "floor", "other")
@@ -216,7 +216,7 @@ MISSIONS = (
     counter("cloudrc_api_requests_total", "Requests that the API has served.", (TELEOP,)),
     counter(
         "cloudrc_api_rejected_total",
-        "Requests rejected and connections closed by the API, by reason.",
+        "Requests that the API rejected, by reason.",
         (TELEOP,),
         reason=API_REFUSALS,
     ),
@@ -233,7 +233,7 @@ MISSIONS = (
     ),
     counter(
         "cloudrc_audit_dropped_total",
-        "Lines of the audit log that were dropped because the disk was slow or full.",
+        "Lines of the audit log that the disk refused.",
         (TELEOP,),
     ),
     counter(

@@ -1,26 +1,28 @@
-"""The API of teleop: HTTP requests come in; verbs go to the mission service, JSON goes out.
+"""Serve teleop's API over HTTP: carry requests to the mission service, and answer in JSON.
 
-Handlers wait for the service on the bridge and touch nothing else of it. Errors are one line of
-`detail`; a mission that is in the way is named, and so is every value that cannot be used.
-
-Server-sent events: the book's events go out as they come, numbered, so that one can resume.
-
-What the API answers when it does not do what was asked: an exception comes in, JSON goes out.
+The handlers ask the service through the bridge. A refusal is one line of `detail`; it names the
+mission that is in the way, or each value that cannot be used. Events are sent as they happen, as
+server-sent events; each has a number, so that a client can resume.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Awaitable, Callable
+import os
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from math import radians
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
-from fastapi import APIRouter, Depends, FastAPI, Request
+import uvicorn
+from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, StreamingResponse
-from fastapi.security import HTTPBearer
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
@@ -31,12 +33,10 @@ from cloudrc.config.schema import Mission as MissionSection
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.geometry.scene import Scene
 from cloudrc.teleop import models
-from cloudrc.teleop.auth import RevokedError
+from cloudrc.teleop.auth import BEARER, Gate
 from cloudrc.teleop.bridge import Bridge, Call
 from cloudrc.teleop.models import (
-    Refusal,
     RefusedError,
-    as_json,
     check_first_way,
     check_way,
     leads_to_board,
@@ -48,108 +48,37 @@ from cloudrc.teleop.store import ConflictError, Order, UnavailableError, Unknown
 from cloudrc.teleop.wire import Plan
 
 LOOK_PERIOD = 0.1
-"""Between two looks at the book [s]."""
+"""Time between two checks for new events [s]."""
 ALIVE_PERIOD = 10.0
-"""After so long without an event a comment is sent, so that no proxy closes the stream [s]."""
+"""Time without an event after which a stream gets a comment, so that no proxy closes it [s]."""
+ANSWER_LIMIT = 2.0
+"""Time limit for the mission service to answer [s]."""
+ALARM_PERIOD, ALARM_REPEATS = 0.02, 100
+"""Time between two attempts to tell a blocked cloud of an emergency stop [s], and their number."""
+HEAD_MAX = 4_096
+"""Longest head of a request [bytes]."""
+KEEP_ALIVE = 5
+"""Time after which a connection without a request is closed [s]."""
+BACKLOG = 1_024
+"""Limit of the connections that wait to be accepted."""
+STOP_LIMIT = 1
+"""Time for requests to end when the server stops [s]."""
+STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
+"""Error -> status of the answer."""
 
 
-def last_event_id(request: Request) -> int:
-    """Where a client that was cut off left; 0 if it does not say."""
-    text = request.headers.get("last-event-id", "")
-    return int(text) if text.isdecimal() and len(text) < 16 else 0
-
-
-async def stream(
-    request: Request,
-    ask: Callable[[Call], Awaitable[Any]],
-    closed: Callable[[], bool],
-    after: int,
-) -> AsyncIterator[str]:
-    """Give the text of the stream, until the client leaves or teleop ends.
-
-    Args:
-        request: Of the client.
-        ask: Has a call made on the service.
-        closed: Whether teleop ends.
-        after: Number of the last event that the client has.
-    """
-    looks = 0
-    yield ": cloudrc\n\n"
-    while not closed() and not await request.is_disconnected():
-        try:
-            events = await ask(_after(after))
-        except (CloudrcError, TimeoutError):
-            return
-        for event in events:
-            after = event["id"]
-            yield f"id: {after}\nevent: mission\ndata: {json.dumps(event)}\n\n"
-        looks = 0 if events else looks + 1
-        if looks * LOOK_PERIOD >= ALIVE_PERIOD:
-            looks = 0
-            yield ": alive\n\n"
-        await asyncio.sleep(LOOK_PERIOD)
-
-
-def _after(number: int) -> Call:
-    return lambda service, now_ns: service.book.events_after(number)
-
-
-BODY_MAX = 256 * 1024
-"""Length of a request's body [bytes]."""
-BODY_LIMIT = 5.0
-"""For a request's body to arrive [s]."""
-
-REFUSALS: dict[int | str, dict[str, Any]] = {
-    code: {"model": Refusal, "description": text}
-    for code, text in {
-        401: "There is no valid token in the request",
-        403: "The token is a reader's",
-        404: "There is no such mission",
-        408: f"The body did not arrive within {BODY_LIMIT:g} s",
-        409: "The state does not allow it; `id` names the mission in the way",
-        413: f"The body is longer than {BODY_MAX // 1024} KiB",
-        422: "A value cannot be used; `problems` has every one",
-        429: "Too many requests; try again in a second",
-        503: "Not now: teleop starts or ends, another has the journal, it cannot be written, or "
-        "too much waits: try again. Or teleop did not answer within 2 s, and may do it yet: look. "
-        "An emergency stop is told all the same, unless another teleop flies the robot",
-    }.items()
-}
-
-
-class TooLargeError(CloudrcError):
-    """The body of a request is too long."""
-
-
-class TooSlowError(CloudrcError):
-    """The body of a request does not arrive."""
-
-
-def handle_errors(app: FastAPI) -> None:
-    """Let an application answer with `Refusal` for everything that cannot be done."""
+def _handle_errors(app: FastAPI, complain: Callable[[str], None]) -> None:
+    """Make an application answer with `Refusal` whatever cannot be done."""
 
     @app.exception_handler(CloudrcError)
     async def refuse(request: Request, error: CloudrcError) -> JSONResponse:
-        match error:
-            case RefusedError():
-                problems = [as_json(problem) for problem in error.problems]
-                return JSONResponse({"detail": str(error), "problems": problems}, 422)
-            case BadInputError():
-                return JSONResponse({"detail": str(error)}, 422)
-            case ConflictError():
-                return JSONResponse({"detail": str(error), "id": error.mission or None}, 409)
-            case UnknownMissionError():
-                return JSONResponse({"detail": str(error)}, 404)
-            case RevokedError():
-                text = REFUSALS[401]["description"]
-                return JSONResponse({"detail": text}, 401, {"WWW-Authenticate": "Bearer"})
-            case TooLargeError():
-                return JSONResponse({"detail": REFUSALS[413]["description"]}, 413)
-            case TooSlowError():
-                return JSONResponse({"detail": REFUSALS[408]["description"]}, 408)
-            case UnavailableError():
-                return JSONResponse({"detail": str(error)}, 503, {"Retry-After": "1"})
-        return JSONResponse({"detail": str(error)}, 500)
+        status = next((code for kind, code in STATUSES.items() if isinstance(error, kind)), 500)
+        body: dict[str, Any] = {"detail": str(error)}
+        if isinstance(error, RefusedError):
+            body["problems"] = [models.as_json(problem) for problem in error.problems]
+        if isinstance(error, ConflictError):
+            body["id"] = error.mission or None
+        return JSONResponse(body, status, {"Retry-After": "1"} if status == 503 else None)
 
     @app.exception_handler(RequestValidationError)
     async def refuse_query(request: Request, error: RequestValidationError) -> JSONResponse:
@@ -159,30 +88,16 @@ def handle_errors(app: FastAPI) -> None:
         ]
         return await refuse(request, RefusedError(found))
 
-    @app.exception_handler(Exception)
-    async def fail(request: Request, error: Exception) -> JSONResponse:
-        return JSONResponse({"detail": "the API failed; see teleop's log"}, 500)
-
-    @app.exception_handler(ClientDisconnect)
-    async def gone(request: Request, error: ClientDisconnect) -> JSONResponse:
-        return JSONResponse({"detail": "the client has left"}, 400)  # for the audit log alone
-
     @app.exception_handler(TimeoutError)
-    async def too_late(request: Request, error: TimeoutError) -> JSONResponse:
+    async def answer_late(request: Request, error: TimeoutError) -> JSONResponse:
         text = "teleop did not answer in time, but may do it yet: look before you try again"
         return JSONResponse({"detail": text}, 503)
 
-
-ABOUT = """\
-Fly missions, or steer by hand. One mission is flown at a time; a second one is refused with the
-id of the first, or waits if it says `queue`. A mission posted again under the same `key` is not
-made again. Positions are in metres, x forward, y left, z up.
-
-Every request needs a token: `Authorization: Bearer TOKEN`. A reader's may look, an operator's may
-command. `POST /v1/estop` stops the rotors at once and is served even while a flood is refused.
-"""
-ANSWER_LIMIT = 2.0
-"""For the mission service to answer [s]."""
+    @app.exception_handler(Exception)
+    async def fail(request: Request, error: Exception) -> JSONResponse:
+        if not isinstance(error, ClientDisconnect):
+            complain(f"the API failed at {request.url.path}: {error!r}")
+        return JSONResponse({"detail": "the API failed; see teleop's log"}, 500)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,10 +105,10 @@ class Surroundings:
     """What the API needs to know of the experiment.
 
     Attributes:
-        scene: That waypoints are checked against.
-        time_limit: Of missions that do not say theirs [s].
+        scene: The scene that waypoints are checked against.
+        time_limit: Time limit of missions that do not give one [s].
         contact: Whether missions that do not say, and lead to the board, have to touch it.
-        plan: Turns a checked mission and its limit of time [s] into a plan.
+        plan: Makes a plan from a checked mission and its time limit [s].
     """
 
     scene: Scene
@@ -202,62 +117,75 @@ class Surroundings:
     plan: Callable[[MissionSection, float], Plan]
 
 
-BEARER = HTTPBearer(auto_error=False, description="An operator's token, or a reader's for GET")
-"""For the description alone: the gate before the application checks every token."""
+def create_app(
+    bridge: Bridge, surroundings: Surroundings, complain: Callable[[str], None]
+) -> FastAPI:
+    """Make the ASGI application, which belongs behind a `Gate`.
 
-
-def create_app(bridge: Bridge, surroundings: Surroundings) -> FastAPI:
-    """Make the ASGI application; it belongs behind a gate."""
+    Args:
+        bridge: Leads to the mission service.
+        surroundings: The experiment.
+        complain: Gets one line about each internal error.
+    """
     app = FastAPI(
         title="cloudrc teleop",
         version=__version__,
-        description=ABOUT,
-        docs_url=None,  # their pages load scripts from elsewhere
+        description=models.ABOUT,
+        docs_url=None,  # the pages load scripts from elsewhere
         redoc_url=None,
+        redirect_slashes=False,
     )
-    handle_errors(app)
-    router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUSALS)
+    _handle_errors(app, complain)
+    router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=models.REFUSALS)
     _add_missions(router, bridge, surroundings)
     _add_operator(router, bridge, surroundings)
-    _add_stops(router, bridge)
+    _add_stop(router, bridge)
     _add_views(router, bridge)
     app.include_router(router)
     return app
 
 
 async def _ask(bridge: Bridge, call: Call) -> Any:
-    return await _answer(asyncio.wrap_future(bridge.submit(call)))
+    return await asyncio.wait_for(asyncio.wrap_future(bridge.submit(call)), ANSWER_LIMIT)
 
 
-async def _answer(future: asyncio.Future[Any]) -> Any:
-    return await asyncio.wait_for(future, ANSWER_LIMIT)
+async def _move(bridge: Bridge, call: Call) -> Any:
+    """Ask for something that lets the robot move."""
+    return await _ask(bridge, bridge.unless_overtaken(call))
+
+
+async def _urgent_answer(asked: Future[Any]) -> Any:
+    """Wait for an urgent call, which is made however late, and for which others may wait, too."""
+    return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(asked)), ANSWER_LIMIT)
 
 
 async def _body(request: Request) -> bytes:
-    """Read a body that is neither too long nor too slow; another one is not read to its end."""
-    said = request.headers.get("content-length", "0")
-    if said.isdecimal() and int(said[:12]) > BODY_MAX:
-        raise TooLargeError
+    """Read a body; one that is too long or too slow is not read to its end."""
+    too_long = HTTPException(413, models.REFUSALS[413]["description"])
+    if (
+        int(request.headers.get("content-length", "0")) > models.BODY_MAX
+    ):  # h11 knows it is a number
+        raise too_long
     body = b""
     try:
-        async with asyncio.timeout(BODY_LIMIT):
+        async with asyncio.timeout(models.BODY_LIMIT):
             async for chunk in request.stream():
                 body += chunk
-                if len(body) > BODY_MAX:
-                    raise TooLargeError
+                if len(body) > models.BODY_MAX:
+                    raise too_long
     except TimeoutError:
-        raise TooSlowError from None
+        raise HTTPException(408, models.REFUSALS[408]["description"]) from None
     return body
 
 
 def _takes(model: type[BaseModel], example: dict[str, Any]) -> dict[str, Any]:
-    """Describe a body that is read by `_body`."""
+    """Describe a body that `_body` reads."""
     content = {"application/json": {"schema": models.inlined(model), "example": example}}
     return {"requestBody": {"required": True, "content": content}}
 
 
-def _gives(model: type[BaseModel], text: str, code: int = 200) -> dict[str, Any]:
-    return {"response_model": None, "responses": {code: {"model": model, "description": text}}}
+def _gives(model: type[BaseModel], text: str) -> dict[str, Any]:
+    return {"response_model": None, "responses": {200: {"model": model, "description": text}}}
 
 
 def _add_missions(router: APIRouter, bridge: Bridge, surroundings: Surroundings) -> None:
@@ -281,7 +209,7 @@ def _add_missions(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
             mission, new = service.create(order, now_ns)
             return mission.as_json(), new
 
-        view, new = await _ask(bridge, call)
+        view, new = await _move(bridge, call)
         return JSONResponse(view, 201 if new else 200)
 
     @router.get("/missions", summary="All missions", **_gives(models.MissionList, "Oldest first"))
@@ -305,7 +233,8 @@ def _add_missions(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
 def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings) -> None:
     @router.post("/hold", summary="Stop, 0.35 m up at least", **_gives(models.MissionView, "Held"))
     async def hold() -> JSONResponse:
-        return JSONResponse(await _ask(bridge, lambda s, now_ns: s.hold(now_ns).as_json()))
+        asked = bridge.submit(lambda s, now_ns: s.hold(now_ns).as_json(), "hold")
+        return JSONResponse(await _urgent_answer(asked))
 
     @router.post(
         "/resume",
@@ -318,14 +247,14 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
             check_way(service, None, surroundings.scene)
             return service.resume(now_ns).as_json()
 
-        return JSONResponse(await _ask(bridge, call))
+        return JSONResponse(await _move(bridge, call))
 
     @router.post(
         "/goto",
         summary="Fly to a point",
         description="A mission of its own, or another place for a mission that is held. The way "
         "there is straight: a pipe's wall in it is refused (409).",
-        openapi_extra=_takes(models.GoToRequest, {"position_m": [0.5, 0.0, 1.2], "yaw_deg": 0.0}),
+        openapi_extra=_takes(models.GoToRequest, models.GOTO_EXAMPLE),
         **_gives(models.MissionView, "On its way"),
     )
     async def go_to(request: Request) -> JSONResponse:
@@ -336,10 +265,18 @@ def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
             check_way(service, point.position_m, surroundings.scene)
             return service.go_to(point.position_m, radians(point.yaw_deg), now_ns).as_json()
 
-        return JSONResponse(await _ask(bridge, call))
+        return JSONResponse(await _move(bridge, call))
 
 
-def _add_stops(router: APIRouter, bridge: Bridge) -> None:
+def _add_stop(router: APIRouter, bridge: Bridge) -> None:
+    repeating: list[asyncio.Task[None]] = []
+
+    async def repeat_alarm() -> None:
+        for _ in range(ALARM_REPEATS):
+            await asyncio.sleep(ALARM_PERIOD)
+            if bridge.alarm():
+                return
+
     @router.post(
         "/estop",
         summary="Stop the rotors at once",
@@ -347,11 +284,14 @@ def _add_stops(router: APIRouter, bridge: Bridge) -> None:
         **_gives(models.Stopped, "The robot is told until it obeys"),
     )
     async def stop() -> JSONResponse:
-        try:  # the call is there before the robot can be seen to have stopped
-            stopped = bridge.submit(lambda s, now_ns: s.stop_rotors(now_ns), urgent=True)
+        try:  # the call is queued before the robot can be seen to have stopped
+            asked = bridge.submit(lambda s, now_ns: s.stop_rotors(now_ns), "stop")
         finally:
-            bridge.alarm()
-        mission = await _answer(asyncio.shield(asyncio.wrap_future(stopped)))  # made, however late
+            while repeating:
+                repeating.pop().cancel()
+            if not bridge.alarm():  # cloud is blocked
+                repeating.append(asyncio.create_task(repeat_alarm()))
+        mission = await _urgent_answer(asked)
         return JSONResponse({"id": mission.id if mission else None, "state": "stopping"})
 
     @router.post(
@@ -361,7 +301,7 @@ def _add_stops(router: APIRouter, bridge: Bridge) -> None:
         **_gives(models.Acknowledged, "The robot is told until it obeys"),
     )
     async def acknowledge() -> JSONResponse:
-        await _ask(bridge, bridge.unless_stopped(lambda s, now_ns: s.acknowledge(now_ns)))
+        await _move(bridge, lambda s, now_ns: s.acknowledge(now_ns))
         return JSONResponse({"state": "acknowledged"})
 
 
@@ -379,14 +319,38 @@ def _add_views(router: APIRouter, bridge: Bridge) -> None:
         responses={200: {"content": {"text/event-stream": {}}, "description": "A stream"}},
     )
     async def events(request: Request, after: int = 0) -> StreamingResponse:
-        began = max(after, last_event_id(request))
-        await _ask(bridge, lambda s, now_ns: None)  # is it there?
-        ask = lambda call: _ask(bridge, call)  # noqa: E731
-        return StreamingResponse(
-            stream(request, ask, lambda: bool(bridge.closed), began),
-            media_type="text/event-stream",
-            headers={"Cache-Control": "no-store"},
-        )
+        last = request.headers.get("last-event-id", "")
+        if last.isdecimal() and len(last) < 16:
+            after = max(after, int(last))
+        await _ask(bridge, lambda s, now_ns: None)  # refuse now what cannot be served
+        stream = _stream(request, bridge, after)
+        headers = {"Cache-Control": "no-store"}
+        return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
+
+
+async def _stream(request: Request, bridge: Bridge, after: int) -> AsyncIterator[str]:
+    """Write events, until the client leaves, its token is withdrawn, or teleop ends."""
+    looks = 0
+    yield ": cloudrc\n\n"
+    while not (bridge.closed or await request.is_disconnected()):
+        if await request.scope["caller"]() is None:
+            return
+        try:
+            events = await _ask(bridge, _events_after(after))
+        except (CloudrcError, TimeoutError):
+            return
+        for event in events:
+            after = event["id"]
+            yield f"id: {after}\nevent: mission\ndata: {json.dumps(event)}\n\n"
+        looks = 0 if events else looks + 1
+        if looks * LOOK_PERIOD >= ALIVE_PERIOD:
+            looks = 0
+            yield ": alive\n\n"
+        await asyncio.sleep(LOOK_PERIOD)
+
+
+def _events_after(number: int) -> Call:
+    return lambda service, now_ns: service.book.events_after(number)
 
 
 def _order(body: bytes, surroundings: Surroundings) -> Order:
@@ -397,3 +361,107 @@ def _order(body: bytes, surroundings: Surroundings) -> Order:
         contact = surroundings.contact and leads_to_board(mission, surroundings.scene)
     plan = surroundings.plan(mission, limit)
     return Order(plan, request.name, request.key, contact, request.queue)
+
+
+Address: TypeAlias = tuple[str, int] | Path
+"""Host and port, or the path of a Unix socket."""
+
+
+class ApiServer:
+    """Serve the API on a thread of its own, from `start` to `stop`.
+
+    Attributes:
+        url: "http://HOST:PORT", or "unix:PATH" for a Unix socket.
+        gate: Admits the callers, and counts their requests.
+    """
+
+    def __init__(self, gate: Gate, bridge: Bridge, address: Address) -> None:
+        """Bind the address; port 0 lets the kernel choose.
+
+        Raises:
+            BadInputError: If the address cannot be bound, or anybody there could command.
+        """
+        if gate.tokens is None and not isinstance(address, Path):
+            raise BadInputError(
+                "--api HOST:PORT needs --tokens DIR, with a file 'operator' in it; "
+                "without tokens only a socket file is served: --api unix:PATH"
+            )
+        self.gate, self._bridge = gate, bridge
+        self._socket, self.url = _bind(address)
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                gate,
+                loop="asyncio",
+                http="h11",
+                ws="none",
+                lifespan="off",
+                log_level="critical",  # a flood does not fill the log
+                access_log=False,  # the audit log has the commands
+                server_header=False,
+                proxy_headers=False,  # the audit log names whoever connects
+                # No limit_concurrency: uvicorn would refuse an emergency stop, too.
+                backlog=BACKLOG,
+                h11_max_incomplete_event_size=HEAD_MAX,
+                timeout_keep_alive=KEEP_ALIVE,
+                timeout_graceful_shutdown=STOP_LIMIT,
+            )
+        )
+        # A daemon, so that a client that hangs cannot keep the process from ending.
+        run = self._server.run
+        self._thread = threading.Thread(target=run, args=([self._socket],), daemon=True)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of requests by outcome, and of lost lines of the audit log."""
+        audit = self.gate.audit
+        return {**self.gate.counts, "audit_dropped": audit.dropped if audit else 0}
+
+    def start(self) -> None:
+        """Begin to serve; clients can connect from now on."""
+        self._socket.listen(BACKLOG)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Answer the open requests, end the streams, and stop."""
+        self._bridge.closed = "teleop ends"
+        self._server.should_exit = True
+        self._thread.join(STOP_LIMIT)
+        self._socket.close()
+        if self.gate.audit is not None:
+            self.gate.audit.stop()
+
+
+def _bind(address: Address) -> tuple[socket.socket, str]:
+    """Return a socket that is bound to an address, and its URL."""
+    if isinstance(address, Path):
+        return _bind_file(address), f"unix:{address}"
+    host, port = address[0].strip("[]"), address[1]
+    shown = f"[{host}]" if ":" in host else host
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    # asyncio disables Nagle's algorithm only if the socket names its protocol.
+    tcp = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    if family == socket.AF_INET6:
+        tcp.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)  # [::] serves IPv4, too
+    try:
+        tcp.bind((host, port))
+    except (OSError, UnicodeError) as error:  # no host has a name with an empty label
+        tcp.close()
+        reason = getattr(error, "strerror", None) or error
+        raise BadInputError(f"--api {shown}:{port}: {reason}; choose another address") from error
+    return tcp, f"http://{shown}:{tcp.getsockname()[1]}"
+
+
+def _bind_file(path: Path) -> socket.socket:
+    """Return a Unix socket that only its owner can connect to, from the start."""
+    unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
+    try:
+        if path.is_socket():  # an earlier server left it there
+            path.unlink()
+        unix.bind(str(path))
+    except OSError as error:
+        unix.close()
+        text = f"--api unix:{path}: {error.strerror or error}; choose another path"
+        raise BadInputError(text) from error
+    return unix

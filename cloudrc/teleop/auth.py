@@ -1,136 +1,109 @@
-"""Who may do what: a folder of token files and a request's header come in, a role goes out.
+"""Admit callers to the API by bearer token, and count their requests.
 
-Only digests of the tokens are kept: nothing that this process shows, logs or leaves in a core file
-holds a token. The files are read again when they change, so a Secret can be rotated in flight.
-
-The audit log: who commanded what, and what became of it; one line of JSON each, never a token.
-
-Requests do not wait for the disk: lines are written by a thread of its own, in order. What a slow
-disk makes too many is dropped and counted. The file is cut in two by size, so that it cannot fill
-the volume that the journal needs. What readers are refused is written down now and then only, or it
-would push what operators did out of both files.
+An operator's token may do everything, a reader's may only read. Only digests of tokens are kept in
+memory. An operator's emergency stop and hold are never refused as too many.
 """
 
 from __future__ import annotations
 
 import hashlib
 import hmac
-import json
-import os
-import queue
 import re
-import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import NamedTuple
 
-from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.files import read, version
+from fastapi.responses import JSONResponse
+from fastapi.security import HTTPBearer
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-Role: TypeAlias = Literal["operator", "reader"]
-OPERATOR: Role = "operator"
-READER: Role = "reader"
-ROLES: tuple[Role, ...] = (OPERATOR, READER)
-"""A token file has the name of its role. Operators may do everything, readers may look."""
+from cloudrc.errors import BadInputError
+from cloudrc.files import read, readable_by_others
+from cloudrc.teleop.audit import Audit
+from cloudrc.teleop.bridge import WAITING_MAX
 
-LOOK_PERIOD = 1.0
-"""Between two looks whether the files have changed [s]."""
+OPERATOR, READER = "operator", "reader"
+"""Roles; a token file has the name of its role."""
+BEARER = HTTPBearer(auto_error=False, description="An operator's token, or a reader's for GET")
+READ_PERIOD = 1.0
+"""Time after which the token files are read again [s]."""
 TOKEN_SIZE_MAX = 4096
-"""Of a token file [bytes]: whitespace around the token is passed over."""
+"""Largest token file [bytes], with white space around the token."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
-_BEARER = b"bearer "
+
+READS = ("GET", "HEAD")
+URGENT = ("/v1/estop", "/v1/hold")
+"""Commands that are never refused as too many."""
+ORDERS = ("/v1/missions", "/v1/goto")
+"""Commands whose refusals are counted: orders to fly a mission, or to a point."""
+COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
+"""Status of a refused order -> name of its count."""
+IN_FLIGHT_MAX = WAITING_MAX // 2
+"""Limit of the requests of one role that are answered at the same time, streams included: readers
+cannot take the operators' room on the bridge."""
 
 
-class RevokedError(CloudrcError):
-    """The token of a request is taken away while its body arrives."""
+class Caller(NamedTuple):
+    """A known caller: the role, and a name that does not reveal the token."""
 
-
-@dataclass(frozen=True, slots=True)
-class Caller:
-    """Somebody who is known.
-
-    Attributes:
-        role: What they may do.
-        name: Tells their token from others without giving it away.
-    """
-
-    role: Role
+    role: str
     name: str
 
 
 LOCAL = Caller(OPERATOR, "local")
-"""Who can open a socket file that its owner alone can open."""
+"""The caller over a socket file, which only its owner can open."""
 
 
 class Tokens:
-    """The tokens of a folder; `repr` shows none."""
+    """Know the tokens in a folder: the file `operator` and, if that role is used, `reader`."""
 
-    def __init__(self, folder: Path) -> None:
-        """Read them.
-
-        Args:
-            folder: Has a file `operator` and, if there shall be such a role, `reader`.
+    def __init__(self, folder: Path, warn: Callable[[str], None] = lambda text: None) -> None:
+        """Read the tokens; `warn` gets one line for each file that others can read.
 
         Raises:
-            BadInputError: If one cannot be used; its text has no token in it.
+            BadInputError: If a file cannot be used; the text does not contain the token.
         """
-        self._folder = folder
-        self._state, self._looked = self._look(), time.monotonic()  # first: what changes since
+        self._folder, self._read_at = folder, time.monotonic()
         self._known = self._read()
+        for path in (folder / OPERATOR, folder / READER):
+            if readable_by_others(path):
+                warn(f"warning: {path} can be read by others: chmod 600 {path}")
 
-    def caller(self, header: bytes | None) -> Caller | None:
-        """Say who sends this Authorization header; None if nobody who is known."""
-        self._follow()
-        if header is None or header[: len(_BEARER)].lower() != _BEARER:
-            return None
-        given = hashlib.sha256(header[len(_BEARER) :].strip()).digest()
-        found = None
-        for digest, caller in self._known:  # all of them, so that time tells nothing
+    def caller(self, token: str) -> Caller | None:
+        """Return who has this token; nobody does while a file cannot be used."""
+        if time.monotonic() - self._read_at >= READ_PERIOD:
+            self._read_at, self._known = time.monotonic(), {}
+            with suppress(BadInputError):
+                self._known = self._read()
+        given, found = hashlib.sha256(token.encode()).digest(), None
+        for digest, caller in self._known.items():  # all of them, so that the time reveals nothing
             if hmac.compare_digest(digest, given):
                 found = caller
         return found
 
-    def _follow(self) -> None:
-        """Read the files again if they have changed; one that cannot be used admits nobody."""
-        now = time.monotonic()
-        if now - self._looked < LOOK_PERIOD:
-            return
-        self._looked, state = now, self._look()
-        if state == self._state:
-            return
-        self._state = state
-        try:
-            self._known = self._read()
-        except BadInputError:
-            self._known = ()
-
-    def _look(self) -> list[tuple[int, int, int] | None]:
-        return [version(self._folder / role) for role in ROLES]
-
-    def _read(self) -> tuple[tuple[bytes, Caller], ...]:
-        known = []
-        for role in ROLES:
+    def _read(self) -> dict[bytes, Caller]:
+        known: dict[bytes, Caller] = {}
+        for role in (OPERATOR, READER):
             path = self._folder / role
-            if role == READER and not path.exists():
-                continue
-            digest = hashlib.sha256(_read_token(path)).digest()
-            known.append((digest, Caller(role, f"{role}-{digest.hex()[:8]}")))
-        if len({digest for digest, _ in known}) < len(known):
-            raise BadInputError(f"--tokens {self._folder}: both roles have the same token")
-        return tuple(known)
+            if role == OPERATOR or path.exists():
+                digest = hashlib.sha256(_read_token(path)).digest()
+                if digest in known:
+                    raise BadInputError(f"--tokens {self._folder}: both roles have the same token")
+                known[digest] = Caller(role, f"{role}-{digest.hex()[:8]}")
+        return known
 
 
 def _read_token(path: Path) -> bytes:
-    make = f"make one: openssl rand -hex 32 > {path}"
+    make = f"make one: (umask 077; openssl rand -hex 32 > {path})"
     try:
         token = read(path, TOKEN_SIZE_MAX).strip()
     except OSError as error:
         raise BadInputError(f"--tokens: {path}: {error.strerror}; {make}") from None
-    except ValueError as error:  # which names the file
+    except ValueError as error:  # names the file
         raise BadInputError(f"--tokens: {error}; remove it and {make}") from None
     if not _TOKEN.fullmatch(token):
         raise BadInputError(
@@ -139,125 +112,70 @@ def _read_token(path: Path) -> bytes:
     return token
 
 
-WAITING_MAX = 1_000
-"""Lines that wait for the disk."""
-AUDIT_SIZE_MAX = 8 << 20
-"""Of the file [bytes]; then it is renamed, in the place of the one before it, or grows no more."""
-STOP_LIMIT = 1.0
-"""For the last lines to be written [s]."""
-
-
-class Audit:
-    """An audit log that is written while it is open.
+class Gate:
+    """Admit callers to an application, whatever path they ask for.
 
     Attributes:
-        dropped: How many lines were not written.
+        tokens: The known tokens; None if everybody who can connect may command.
+        audit: Logs operators' commands; None if nothing does.
+        counts: Number of requests by outcome; "served" for those that reached the application.
     """
 
-    def __init__(
-        self,
-        path: Path | None,
-        complain: Callable[[str], None] = lambda text: None,
-        size_max: int = AUDIT_SIZE_MAX,
-    ) -> None:
-        """Begin.
+    def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit | None = None) -> None:
+        """Protect an application."""
+        self._app, self.tokens, self.audit = app, tokens, audit
+        self._in_flight: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()
 
-        Args:
-            path: Where to; None for nowhere.
-            complain: Gets one line when it cannot be written, once.
-            size_max: When to begin a new file [bytes].
-        """
-        self.dropped = 0
-        self._path, self._complain, self._size_max = path, complain, size_max
-        self._waiting: queue.Queue[bytes | None] = queue.Queue(WAITING_MAX)
-        self._left_out = 0
-        self._troubled = False
-        self._writing = 0  # lines that the disk is given just now
-        self._thread = threading.Thread(target=self._write_all, name="audit", daemon=True)
-        if path is not None:
-            self._thread.start()
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request; a slash at the end of its path means nothing."""
+        scope["path"] = path = scope["path"].rstrip("/") or "/"
+        caller, is_command = await self.caller(scope), scope["method"] not in READS
+        if caller is None:
+            detail = "a valid token is needed: Authorization: Bearer TOKEN"
+            await self._refuse("token", 401, detail)(scope, receive, send)
+        elif is_command and caller.role != OPERATOR:
+            detail = "this token may look, not command: an operator's is needed"
+            await self._refuse("role", 403, detail)(scope, receive, send)
+        elif is_command and path in URGENT:
+            await self._serve(caller, scope, receive, send)
+        elif self._in_flight[caller.role] >= IN_FLIGHT_MAX:
+            detail = "too many requests; try again in a second"
+            await self._refuse("busy", 429, detail)(scope, receive, send)
+        else:
+            self._in_flight[caller.role] += 1
+            try:
+                await self._serve(caller, scope, receive, send)
+            finally:
+                self._in_flight[caller.role] -= 1
 
-    def note(self, **what: Any) -> None:
-        """Write down what somebody commanded, with the time; never waits."""
-        self._tell_left_out()
-        self._put(what)
+    async def caller(self, scope: Scope) -> Caller | None:
+        """Return who has sent a request; None for a stranger."""
+        if self.tokens is None:
+            return LOCAL
+        sent = await BEARER(Request(scope))
+        return None if sent is None else self.tokens.caller(sent.credentials)
 
-    def leave_out(self) -> None:
-        """Count what is not worth a line of its own; the next line says how many there were."""
-        self._left_out += 1
+    def _refuse(self, reason: str, status: int, detail: str) -> JSONResponse:
+        self.counts[reason] += 1
+        headers = {401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "1"}}.get(status)
+        return JSONResponse({"detail": detail}, status, headers)
 
-    def _tell_left_out(self) -> None:
-        if self._left_out:
-            self._put({"left_out": self._left_out, "outcome": "refused, and not written down each"})
-            self._left_out = 0
+    async def _serve(self, caller: Caller, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, count it, and log what has come of a command."""
+        answer: Message = {"status": 500}
 
-    def _put(self, what: dict[str, Any]) -> None:
-        if self._path is None:
-            return
-        now = datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="milliseconds")
-        line = json.dumps({"time": now, **what}, separators=(",", ":")).encode() + b"\n"
+        async def keep(message: Message) -> None:
+            answer.update(message)
+            await send(message)
+
+        scope["caller"] = lambda: self.caller(scope)  # for a stream, which may outlive its token
         try:
-            self._waiting.put_nowait(line)
-        except queue.Full:
-            self.dropped += 1
-
-    def close(self) -> None:
-        """Write what waits, and end; what a disk that hangs does not take is given up."""
-        if self._path is None:
-            return
-        self._tell_left_out()
-        with suppress(queue.Full):
-            self._waiting.put(None, timeout=STOP_LIMIT)
-        self._thread.join(STOP_LIMIT)
-        if self._thread.is_alive():
-            self._give_up()
-
-    def _give_up(self) -> None:
-        lost, self._writing = self._writing, 0
-        with suppress(queue.Empty):
-            while True:
-                lost += self._waiting.get_nowait() is not None
-        self._waiting.put_nowait(None)  # should the disk come back
-        self.dropped += lost
-        if lost:
-            self._complain(f"the audit log {self._path}: the disk hangs; {lost} lines are lost")
-
-    def _write_all(self) -> None:
-        assert self._path is not None, "the thread is started for a file"
-        ends = False
-        while not ends:
-            lines = [self._waiting.get()]
-            while not self._waiting.empty():
-                lines.append(self._waiting.get())
-            ends = None in lines
-            data = [line for line in lines if line is not None]
-            self._writing = len(data)
-            try:
-                self._write(self._path, b"".join(data))
-                self._troubled = False
-            except OSError as error:
-                self.dropped += len(data)
-                if not self._troubled:
-                    self._complain(f"the audit log {self._path} cannot be written: {error}")
-                self._troubled = True
-            self._writing = 0
-
-    def _write(self, path: Path, data: bytes) -> None:
-        with suppress(FileNotFoundError):
-            if path.stat().st_size > self._size_max:
-                path.replace(path.with_name(f"{path.name}.1"))
-        # Unbuffered, since what a full disk has torn must not be tried again by `close`.
-        with open(path, "ab", buffering=0, opener=_private) as file:
-            began = file.tell()
-            try:
-                while data:
-                    data = data[file.write(data) or 0 :]
-                os.fsync(file.fileno())
-            except OSError:
-                with suppress(OSError):
-                    file.truncate(began)  # half a line would swallow the next one
-                raise
-
-
-def _private(path: str, flags: int) -> int:
-    return os.open(path, flags, 0o600)
+            await self._app(scope, receive, keep)
+        finally:
+            self.counts["served"] += 1
+            self.counts["slow"] += answer["status"] == 408
+            if scope["path"] in ORDERS and answer["status"] in COUNTED:
+                self.counts[COUNTED[answer["status"]]] += 1
+            if self.audit is not None and scope["method"] not in READS:
+                self.audit.note(*caller, scope, answer)

@@ -1,10 +1,7 @@
-"""What the API takes and gives, with units, ranges and examples: the OpenAPI schema is made of it.
+"""Define what the API takes and gives, and check the orders that it takes.
 
-Requests are sections like those of a configuration file, and are checked by the same code.
-
-Checks what is posted to the API: bytes come in; a mission that can be flown, or problems go out.
-
-The same code that checks an experiment's file, so that the words are the same.
+The OpenAPI document comes from these models. Orders are sections like those of a configuration
+file: the same code checks them and words the problems.
 """
 
 from __future__ import annotations
@@ -29,10 +26,16 @@ from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import HELD, SHOWN, ConflictError, Order
 
 Position = tuple[Finite, Finite, Finite]
+BODY_MAX = 256 * 1024
+"""Longest body of a request [bytes]."""
+BODY_LIMIT = 5.0
+"""Time limit for a body to arrive [s]."""
+PROBLEMS_MAX = 50
+"""Limit of the problems of one request that are put into words."""
 
 
 def _printable(text: str) -> str:
-    """Refuse what would steer the terminals, or break the lines, of all who are shown it."""
+    """Refuse control characters: they would steer the terminals of those who read the text."""
     if not text.isprintable():
         raise PydanticCustomError("unprintable", "must be one line of printable characters")
     return text
@@ -49,10 +52,11 @@ MISSION_EXAMPLE = {
         {"position_m": [0.5, 3.6, 0.7]},
     ],
 }
+GOTO_EXAMPLE = {"position_m": [0.5, 0.0, 1.2], "yaw_deg": 0.0}
 
 
 class MissionRequest(Section):
-    """A mission to fly."""
+    """Order to fly a mission."""
 
     name: Text = Field("", description="For people: one line of printable characters")
     description: str = Field("", description="One line, not kept")
@@ -77,7 +81,7 @@ class MissionRequest(Section):
 
 
 class GoToRequest(Section):
-    """A point to fly to."""
+    """Order to fly to a point."""
 
     position_m: Position = Field(description="Base position [m], world frame")
     yaw_deg: Finite = Field(0.0, description="Heading [deg]")
@@ -88,7 +92,7 @@ class _Answer(BaseModel):
 
 
 class Reached(_Answer):
-    """A waypoint that was reached."""
+    """Waypoint that was reached."""
 
     waypoint: int = Field(description="Its index, from 0")
     time_s: float = Field(description="When, since the mission began [s]")
@@ -224,8 +228,35 @@ class Refusal(_Answer):
     problems: list[Problem] | None = Field(None, description="Every value that cannot be used")
 
 
+REFUSALS: dict[int | str, dict[str, Any]] = {
+    code: {"model": Refusal, "description": text}
+    for code, text in {
+        401: "There is no valid token in the request",
+        403: "The token is a reader's",
+        404: "There is no such mission",
+        408: f"The body did not arrive within {BODY_LIMIT:g} s",
+        409: "The state does not allow it; `id` names the mission in the way",
+        413: f"The body is longer than {BODY_MAX // 1024} KiB",
+        422: "A value cannot be used; `problems` has every one",
+        429: "Too many requests at the same time; try again in a second",
+        503: "Not now: teleop starts or ends, another has the journal, it cannot be written, or "
+        "too much waits: try again. Or teleop did not answer within 2 s, and may do it yet: look. "
+        "An emergency stop is told all the same, unless another teleop flies the robot",
+    }.items()
+}
+ABOUT = """\
+Fly missions, or steer by hand. One mission is flown at a time; a second one is refused with the
+id of the first, or waits if it says `queue`. A mission posted again under the same `key` is not
+made again. Positions are in metres, x forward, y left, z up.
+
+Every request needs a token: `Authorization: Bearer TOKEN`. A reader's may look, an operator's may
+command. `POST /v1/estop` stops the rotors at once. It and `POST /v1/hold` are served even while
+other requests are refused as too many.
+"""
+
+
 def inlined(model: type[BaseModel]) -> dict[str, Any]:
-    """Give a model's JSON schema without references, as the body of a request wants it."""
+    """Return a model's JSON schema without references, as the body of a request needs it."""
     schema = model.model_json_schema()
     parts = schema.pop("$defs", {})
 
@@ -241,14 +272,11 @@ def inlined(model: type[BaseModel]) -> dict[str, Any]:
     return dict(resolve(schema))
 
 
-PROBLEMS_MAX = 50
-"""Of one request, that are put into words."""
-
 _Request = TypeVar("_Request", bound=Section)
 
 
 class RefusedError(BadInputError):
-    """A request that cannot be used; `problems` say why."""
+    """Report a request that cannot be used; `problems` say why."""
 
     def __init__(self, problems: list[ConfigProblem]) -> None:
         super().__init__("; ".join(map(str, problems[:3])))
@@ -259,7 +287,7 @@ def read_mission(body: bytes, scene: Scene) -> tuple[MissionRequest, Mission]:
     """Read a mission and check it against the scene.
 
     Raises:
-        RefusedError: With everything that is wrong.
+        RefusedError: With all problems.
     """
     _refuse_too_many(body)
     request = _parse(body, MissionRequest)
@@ -274,7 +302,7 @@ def read_goto(body: bytes, scene: Scene) -> GoToRequest:
     """Read a point and check it against the scene.
 
     Raises:
-        RefusedError: With everything that is wrong.
+        RefusedError: With all problems.
     """
     request = _parse(body, GoToRequest)
     waypoint = Waypoint(position_m=request.position_m, yaw_deg=request.yaw_deg)
@@ -302,7 +330,7 @@ def check_way(service: MissionService, target: Vector | None, scene: Scene) -> N
         legs, count = mission.order.plan.legs, len(mission.reached)
         target = legs[count].position if count < len(legs) else None
     if seen is None or target is None or (mission is not None and mission.state != HELD):
-        return  # what else is in the way is for others to say
+        return  # the service refuses it for another reason, or there is nothing to check
     through = int(find_crossed_pipe(scene, np.array([seen.position]), np.array([target]))[0])
     if through >= 0:
         here, there = (f"[{', '.join(f'{v:.2f}' for v in p)}]" for p in (seen.position, target))
@@ -314,14 +342,14 @@ def check_way(service: MissionService, target: Vector | None, scene: Scene) -> N
 
 
 def check_first_way(service: MissionService, order: Order, scene: Scene) -> None:
-    """Likewise of the way to the first waypoint, where a new mission begins from here and now."""
+    """Check the way to the first waypoint of a new mission that begins at once, from here."""
     begins = not service.book.open() and service.book.with_key(order.key) is None
     if begins and order.plan.start is Start.HERE:
         check_way(service, order.plan.legs[0].position, scene)
 
 
 def leads_to_board(mission: Mission, scene: Scene) -> bool:
-    """Say whether the arm's tip is at the board or behind its face at some waypoint."""
+    """Check whether the arm's tip is at the board or behind its face at some waypoint."""
     board = scene.board
     if board is None:
         return False
@@ -334,7 +362,7 @@ def leads_to_board(mission: Mission, scene: Scene) -> bool:
 
 
 def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:
-    """Show a problem as the API does."""
+    """Return a problem as the API shows it."""
     index = next((int(key) for key in problem.path if key.isdecimal()), None)
     return {
         "path": ".".join(problem.path),
@@ -345,11 +373,11 @@ def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:
 
 
 def _refuse_too_many(body: bytes) -> None:
-    """Count before anything is checked: what is wrong with each of too many would take long."""
+    """Refuse too many waypoints before they are checked: to word the problems of all takes long."""
     try:
         points = from_json(body)["waypoints"]
     except (ValueError, TypeError, KeyError):
-        return  # whatever it is, the model says it in words
+        return  # the model words the problem
     if isinstance(points, list) and len(points) > MAX_WAYPOINTS:
         reason = f"at most {MAX_WAYPOINTS}; split the mission"
         _refuse([ConfigProblem(("waypoints",), str(len(points)), reason)])
@@ -364,7 +392,7 @@ def _parse(body: bytes, model: type[_Request]) -> _Request:
             problems = [ConfigProblem((), "", f"not JSON: {first['ctx']['error']}")]
         elif not first["loc"]:
             problems = [ConfigProblem((), "", "must be a mapping of keys")]
-        else:  # words take time: a hostile mission must not cost more of it than an honest one
+        else:
             problems = from_pydantic(error, model, limit=PROBLEMS_MAX)
         raise RefusedError(problems) from None
 

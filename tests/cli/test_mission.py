@@ -148,7 +148,10 @@ def test_an_api_that_is_not_there_ends_with_4_or_5(capsys: pytest.CaptureFixture
     assert captured.out.count("waiting") == 1
 
 
-@pytest.mark.parametrize("url", ["here", "unix:", "ftp://h:1", "http://me@h:1", "http://"])
+@pytest.mark.parametrize(
+    "url",
+    ["here", "unix:", "ftp://h:1", "http://me@h:1", "http://", "http://[::1", "http://h:x"],
+)
 def test_an_invalid_url_of_the_api_is_an_error(
     url: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -251,11 +254,17 @@ def test_the_token_file_comes_from_flag_or_environment(
     assert main(command) == 5
     assert "asks for a token; name its file: --token-file FILE" in capsys.readouterr().err
     (folder / "wrong").write_text("not-the-operators-token\n")
+    (folder / "wrong").chmod(0o644)
     monkeypatch.setenv("CLOUDRC_TOKEN_FILE", str(folder / "wrong"))
     assert main(command) == 5
-    assert "does not know this token" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "does not know this token" in error
+    path = folder / "wrong"
+    assert f"warning: {path} can be read by others: chmod 600 {path}\n" in error
     assert main([*command, "--token-file", str(api.folder.name) + "/reader"]) == 5
-    assert "may look, not command" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "may look, not command" in error
+    assert "warning" not in error
     assert main([*command, "--token-file", str(api.token_file)]) == 5
     assert "no mission is under way" in capsys.readouterr().err
     (folder / "wrong").write_text("two words")

@@ -1,105 +1,53 @@
-"""Flood teleop's API with requests and slow clients, as a separate process.
+"""Flood teleop's API with requests, as a separate process.
 
     python api_flood.py URL TOKEN SECONDS RATE
 
-Half of the requests read with a token, a quarter has none, a quarter sends rejected commands. It
-prints the number of requests and of the answers by status, as JSON.
+Half of the requests read with a token, a quarter has none, a quarter sends commands that are
+refused. It prints the number of requests and of the answers by status, as JSON.
 """
 
+import asyncio
 import json
-import selectors
-import socket
 import sys
 import time
 from collections import Counter
 
-CONNECTIONS = 16
-DAWDLERS = 50
+CONNECTIONS = 64
 
 
-def request(method, path, token, body=b""):
-    lines = [f"{method} {path} HTTP/1.1", "Host: x", f"Content-Length: {len(body)}"]
+def request(method, path, token=""):
+    lines = [f"{method} {path} HTTP/1.1", "Host: x", "Content-Length: 0"]
     if token:
         lines.append(f"Authorization: Bearer {token}")
-    return ("\r\n".join(lines) + "\r\n\r\n").encode() + body
+    return ("\r\n".join(lines) + "\r\n\r\n").encode()
 
 
-class Flood:
-    """Open connections that send in turns without waiting for answers."""
-
-    def __init__(self, address, token):
-        self.address, self.asked, self.sent, self.answers = address, 0, 0, Counter()
-        self.selector = selectors.DefaultSelector()
-        look, none = request("GET", "/v1/state", token), request("GET", "/v1/state", "")
-        self.requests = [look, none, look, request("POST", "/v1/resume", token)]
-        self.free = {self.connect() for _ in range(CONNECTIONS)}
-        self.dawdlers = [socket.create_connection(address) for _ in range(DAWDLERS)]
-
-    def connect(self):
-        connection = socket.create_connection(self.address, timeout=1.0)
-        self.selector.register(connection, selectors.EVENT_READ)
-        return connection
-
-    def ask(self):
-        self.asked += 1
-        try:
-            connection = self.free.pop() if self.free else self.connect()
-        except OSError:
-            self.answers["no connection"] += 1
-            return
-        try:
-            connection.sendall(self.requests[self.asked % len(self.requests)])
-        except OSError:
-            self.forget(connection)
-            return
-        self.sent += 1
-
-    def listen(self, wait):
-        for key, _ in self.selector.select(wait):
-            connection = key.fileobj
-            try:
-                data = connection.recv(65_536)
-            except OSError:
-                data = b""
-            if not data:
-                self.forget(connection)
-                continue
-            if data.startswith(b"HTTP/1.1 "):
-                self.answers[data[9:12].decode()] += 1
-                self.free.add(connection)
-
-    def forget(self, connection):
-        self.free.discard(connection)
-        self.selector.unregister(connection)
-        connection.close()
-        self.answers["closed"] += 1
-
-    def dawdle(self):
-        """Send a byte on each; reopen closed connections."""
-        for number, dawdler in enumerate(self.dawdlers):
-            try:
-                dawdler.sendall(b"G")
-            except OSError:
-                dawdler.close()
-                self.answers["cut off"] += 1
-                self.dawdlers[number] = socket.create_connection(self.address, timeout=5.0)
+async def ask(address, requests, due, answers):
+    """Send the requests one after the other, each when it is due [s], and read the answers."""
+    reader, writer = await asyncio.open_connection(*address)
+    for instant in due:
+        await asyncio.sleep(instant - time.monotonic())
+        answers["sent"] += 1
+        writer.write(requests[answers["sent"] % len(requests)])
+        head = await reader.readuntil(b"\r\n\r\n")
+        await reader.readexactly(int(head.lower().partition(b"content-length: ")[2].split()[0]))
+        answers[head[9:12].decode()] += 1
+    writer.close()
 
 
-def main():
-    url, token, seconds, rate = sys.argv[1], sys.argv[2], float(sys.argv[3]), float(sys.argv[4])
+async def flood(url, token, seconds, rate):
     host, _, port = url.removeprefix("http://").partition(":")
-    flood = Flood((host, int(port)), token)
-    began = dawdled = time.monotonic()
-    while (now := time.monotonic()) - began < seconds:
-        for _ in range(min(50, int((now - began) * rate) - flood.asked)):
-            flood.ask()
-        flood.listen(0.002)
-        if now - dawdled > 0.5:
-            dawdled = now
-            flood.dawdle()
-    flood.listen(0.2)
-    print(json.dumps({"sent": flood.sent, "seconds": seconds, **flood.answers}))
+    look, order = request("GET", "/v1/state", token), request("POST", "/v1/resume", token)
+    requests, answers = [look, request("GET", "/v1/state"), look, order], Counter()
+    began = time.monotonic()
+    due = [began + number / rate for number in range(int(seconds * rate))]
+    connections = [
+        ask((host, int(port)), requests, due[number::CONNECTIONS], answers)
+        for number in range(CONNECTIONS)
+    ]
+    await asyncio.gather(*connections)
+    return answers | {"seconds": time.monotonic() - began}
 
 
 if __name__ == "__main__":
-    main()
+    print(json.dumps(asyncio.run(flood(*sys.argv[1:3], *map(float, sys.argv[3:])))))

@@ -92,6 +92,7 @@ class Release:
         (folder / "key").write_bytes(KEY)
         (folder / "mission.yaml").write_text(MISSION)
         (folder / "operator").write_text(TOKEN)
+        (folder / "operator").chmod(0o600)
         for name in ("world", "cloud", "teleop"):
             self.start(name)
         self.until(lambda: self.ask("/v1/state")["seen"] is not None)

@@ -6,6 +6,7 @@ import time
 import pytest
 
 from cloudrc.drivers.teleop import (
+    ALIVE_NS,
     BLIND_WAKES,
     EVENTS_KEPT,
     STALL_NS,
@@ -19,12 +20,15 @@ from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.wire import decode, encode
 
-SECOND = 1_000_000_000
+SECOND, PERIOD_NS = 1_000_000_000, 10_000_000
 POINT, PAST = Setpoint((1.0, 2.0, 3.0)), Setpoint((0.0, 0.0, 3.0))
 
 
 def event(number):
     return MissionEvent(number, "reached", number, "there")
+
+
+# Sockets
 
 
 def test_a_full_socket_drops_and_never_blocks(peers):
@@ -64,20 +68,22 @@ def test_a_path_that_is_too_long_is_named(tmp_path):
         UnixPeer(tmp_path / ("x" * 120), tmp_path / "b")
 
 
-def remote(peer):
-    return RemoteTeleop(peer, encode, decode, 0)
+# Cloud's side
+
+
+def remote(peer, start_ns=0):
+    return RemoteTeleop(peer, encode, decode, start_ns)
 
 
 def test_cloud_reports_each_silence_of_teleop_once(peers):
     one, other = peers
     teleop = remote(one)
-    for now_ns in range(0, 3 * SECOND, 10_000_000):
+    for now_ns in range(0, 3 * SECOND, PERIOD_NS):
         teleop.handle_deadline(now_ns)
     (fault,) = teleop.take_outputs()
     assert (type(fault), fault.code) == (Fault, "teleop_silent")
-    assert "last setpoint is kept" in fault.text
     other.send(encode(POINT))
-    for now_ns in range(3 * SECOND, 6 * SECOND, 10_000_000):
+    for now_ns in range(3 * SECOND, 6 * SECOND, PERIOD_NS):
         teleop.handle_deadline(now_ns)
     assert [type(output) for output in teleop.take_outputs()] == [Setpoint, Fault]
 
@@ -86,20 +92,29 @@ def test_teleop_is_told_of_every_second_telemetry(peers):
     one, other = peers
     teleop = remote(one)
     for number in range(10):
-        teleop.see(POINT._replace(waypoint=number), 10_000_000 * number)
+        teleop.see(POINT._replace(waypoint=number), PERIOD_NS * number)
     assert [decode(data).waypoint for data in other.receive()] == [0, 2, 4, 6, 8]
 
 
-def request(number, what):
-    return OperatorRequest(number, what, mission_id=7)
+def test_cloud_shows_its_life_only_without_telemetry(peers):
+    one, other = peers
+    teleop, received = remote(one), []
+    for now_ns in range(0, 2 * SECOND, PERIOD_NS):
+        if now_ns < SECOND:
+            teleop.see(POINT, now_ns)
+        teleop.handle_deadline(now_ns)
+        received += other.receive()
+    assert b"" not in received[:50]
+    assert 4 <= received.count(b"") <= 5
+    assert ALIVE_NS == SECOND // 5
 
 
 @pytest.mark.parametrize("stalled", [False, True])
 def test_after_a_stall_cloud_forwards_stops_but_not_waypoints(peers, stalled):
-    """The withdrawal was lost at a full socket."""
+    """Teleop may have withdrawn the waypoints in a datagram that a full socket refused."""
     one, other = peers
-    teleop = RemoteTeleop(one, encode, decode, SECOND)
-    words = [request(n, each) for n, each in enumerate(Request, 1)]
+    teleop = remote(one, SECOND)
+    words = [OperatorRequest(n, each, mission_id=7) for n, each in enumerate(Request, 1)]
     words += [POINT, POINT._replace(waypoint=0), event(0)]
     for said in words:
         other.send(encode(said))
@@ -107,7 +122,7 @@ def test_after_a_stall_cloud_forwards_stops_but_not_waypoints(peers, stalled):
     leads = [words[0], words[-2]] if stalled else []
     assert teleop.take_outputs() == [said for said in words if said not in leads]
     other.send(encode(words[0]))  # the repeat must pass, even to a cloud that is always late
-    teleop.handle_deadline(3 * SECOND if stalled else SECOND + STALL_NS + 10_000_000)
+    teleop.handle_deadline(3 * SECOND if stalled else SECOND + STALL_NS + PERIOD_NS)
     assert teleop.take_outputs() == words[:1]
 
 
@@ -117,18 +132,20 @@ def test_what_is_no_message_is_counted(peers):
     other.send(b"rubbish")
     other.send(encode(POINT))
     teleop.handle_deadline(0)
-    assert teleop.take_outputs() == [POINT]
-    assert teleop.malformed == 1
+    assert (teleop.take_outputs(), teleop.malformed) == ([POINT], 1)
+
+
+# Teleop's side
 
 
 class Machine:
-    """A machine with given outputs that stores the states it sees."""
+    """A machine with given outputs that stores what it hears and sees."""
 
     def __init__(self):
-        self.outputs, self.seen, self.deadlines = [], [], 0
+        self.outputs, self.heard, self.seen, self.deadlines = [], [], [], 0
 
     def hear(self, now_ns):
-        self.heard_ns = now_ns
+        self.heard.append(now_ns)
 
     def see(self, seen, now_ns):
         self.seen.append(seen)
@@ -141,66 +158,36 @@ class Machine:
         return outputs
 
 
-class Service:
-    """Run `serve_teleop` on a thread."""
-
-    def __init__(self, peer):
-        self.machine, self.told, self.calls = Machine(), [], []
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, args=(peer,))
-        self._thread.start()
-
-    def _run(self, peer):
-        how = {"calls": self._take, "tell": self.told.extend, "stop": self._stop.is_set}
-        serve_teleop(self.machine, peer, encode, decode, **how)
-
-    def _take(self):
-        calls, self.calls = self.calls, []
-        return calls
-
-    def stop(self):
-        self._stop.set()
-        self._thread.join(1.0)
-        assert not self._thread.is_alive()
+def serve(machine, peer, wakes, calls=list, told=None):
+    """Serve for so many wakes."""
+    left = iter(range(wakes))
+    serve_teleop(
+        machine,
+        peer,
+        encode,
+        decode,
+        calls=calls,
+        tell=[].extend if told is None else told.extend,
+        stop=lambda: next(left, None) is None,
+    )
 
 
-def until(condition):
-    limit = time.monotonic() + 5.0
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(0.005)
-
-
-@pytest.fixture
-def service(peers):
-    running = Service(peers[0])
-    yield running
-    running.stop()
-
-
-def test_deadlines_calls_and_messages_meet_in_one_loop(peers, service):
-    instants = []
-    service.calls = [instants.append]
-    peers[1].send(b"rubbish")
-    peers[1].send(encode(POINT))
-    until(lambda: service.machine.deadlines > 3 and service.machine.seen and instants)
-    assert service.machine.seen == [POINT]
-
-
-def serve(machine, peer, wakes, calls=list):
-    """Run the loop for a number of wakes."""
-    stops = iter([False] * wakes + [True])
-    how = {"calls": calls, "tell": lambda told: None, "stop": lambda: next(stops)}
-    serve_teleop(machine, peer, encode, decode, **how)
-
-
-def test_what_is_asked_for_comes_before_the_newest_that_has_arrived(peers):
-    """The emergency stop is made before the state that shows its effect."""
+def test_calls_are_made_before_the_newest_state_is_seen(peers):
+    """A stop is made before the state that shows its effect."""
     machine, newest = Machine(), Setpoint((3.0, 2.0, 1.0))
     for data in (encode(POINT), encode(newest), b"rubbish"):
         peers[1].send(data)
     serve(machine, peers[0], 1, lambda: [lambda now_ns: machine.seen.append("asked")])
     assert (machine.seen, machine.deadlines) == (["asked", newest], 1)
+
+
+def test_teleop_hears_of_cloud_whatever_it_says(peers):
+    machine = Machine()
+    for now_ns, data in enumerate((b"", b"rubbish", encode(POINT))):
+        turn(machine, peers[0], decode, list, blind=0, late_ns=0, now_ns=100 + now_ns)
+        peers[1].send(data)
+        turn(machine, peers[0], decode, list, blind=0, late_ns=0, now_ns=now_ns)
+    assert (machine.heard, machine.seen) == ([0, 1, 2], [POINT])
 
 
 @pytest.mark.parametrize(
@@ -219,8 +206,7 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
 
     At each wake a new state has arrived (p), or the wake follows a stall (s) with an old one.
     """
-    machine, clock = Machine(), [SECOND]
-    coming = iter(wakes)
+    machine, clock, coming = Machine(), [SECOND], iter(wakes)
     calls = [[lambda now_ns: machine.seen.append("asked")]]
     if wakes == "-":
         peers[1].send(encode(PAST))
@@ -235,55 +221,28 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
     monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
     serve(machine, peers[0], len(wakes), lambda: calls.pop() if calls else [])
     assert machine.seen == done
+    assert bool(machine.heard) == bool({POINT, PAST} & set(done)), "old signs of life do not count"
 
 
-def test_events_wait_for_an_absent_cloud_bounded_and_in_order(peers, service, tmp_path):
-    _, cloud = peers
+def test_events_wait_for_an_absent_cloud_in_order_and_bounded(peers, tmp_path):
+    teleop, cloud = peers
     cloud.close()
     (tmp_path / "b.sock").unlink()
     events = [event(number) for number in range(EVENTS_KEPT + 50)]
-    service.machine.outputs = [POINT, *events, Fault(0, "journal", "full")]
-    until(lambda: len(service.told) == len(events) + 1)
+    machine, told = Machine(), []
+    machine.outputs = [POINT, *events, Fault(0, "journal", "full")]
+    server = threading.Thread(target=serve, args=(machine, teleop, 40, list, told))
+    server.start()
+    limit = time.monotonic() + 5.0
+    while len(told) < len(events) + 1:
+        assert time.monotonic() < limit
+        time.sleep(0.005)
     back = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
     received = []
-    until(lambda: received.extend(map(decode, back.receive())) or len(received) >= EVENTS_KEPT)
-    assert received == events[50:]  # setpoints are repeated anyway; faults are not for cloud
+    while len(received) < EVENTS_KEPT:
+        assert time.monotonic() < limit
+        received += map(decode, back.receive())
+        time.sleep(0.005)
+    server.join()
     back.close()
-
-
-def told(cloud, teleop, seconds, telemetry):
-    """Return what cloud sends in `seconds` [s] after the end of its telemetry."""
-    cloud, received = remote(cloud), []
-    for now_ns in range(0, round(seconds * 1e9), 10_000_000):
-        if now_ns < telemetry * 1e9:
-            cloud.see(POINT, now_ns)
-        cloud.handle_deadline(now_ns)
-        received += teleop.receive()
-    return received
-
-
-def test_without_telemetry_cloud_signals_life_5_times_a_second(peers):
-    assert told(*peers, seconds=1.0, telemetry=0.0) == [b""] * 5
-    received = told(*peers, seconds=2.0, telemetry=1.0)
-    assert b"" not in received[:50]
-    assert 4 <= received.count(b"") <= 5
-
-
-def test_teleop_hears_of_cloud_whatever_it_says_but_after_a_stall(peers):
-    cloud, teleop = peers
-    machine, heard = Machine(), []
-
-    def wake(now_ns, *, data=None, blind=0, late_ns=0):
-        if data is not None:
-            cloud.send(data)
-        how = {"blind": blind, "late_ns": late_ns, "now_ns": now_ns}
-        return turn(machine, teleop, decode, list, **how)
-
-    machine.hear = heard.append
-    for now_ns, data in enumerate((None, b"", b"rubbish", encode(POINT))):
-        wake(now_ns, data=data)
-    assert (heard, machine.seen) == ([1, 2, 3], [POINT])
-    assert wake(4, data=b"", late_ns=STALL_NS + 1) == BLIND_WAKES
-    assert wake(5, data=b"", blind=BLIND_WAKES) == BLIND_WAKES - 1
-    assert wake(6, data=encode(POINT), blind=BLIND_WAKES - 1) == 0
-    assert (heard, machine.seen) == ([1, 2, 3, 6], [POINT, POINT])
+    assert received == events[50:]  # setpoints are repeated anyway; faults are not for cloud

@@ -1,7 +1,6 @@
 """The API under load does not disturb the control loop in another process."""
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -20,13 +19,12 @@ start: spawn
 waypoints:
   - {position_m: [0.5, 0.0, 0.7], tolerance_m: 0.2, dwell_s: 55.0, time_limit_s: 60}
 """
-RATE = 1000.0
+RATE = 1000
+"""Requests in a second [1/s]."""
 TRIES = 3
 """Number of attempts, of which the best counts: the machine may be busy."""
-DAWDLERS, DAWDLED = 50, 15.0
-"""Number of slow clients, and the time after which they must be disconnected [s]."""
-COMMAND = "/cmd_vel"
 PERIOD = 0.010
+"""Period of the control loop [s]."""
 
 
 class Recorded(Release):
@@ -37,17 +35,17 @@ class Recorded(Release):
         return super().run(*words)
 
 
-def errors(folder: Path, began_ns: int, ended_ns: int):
-    """Return the deviation of each period of the control loop from 10 ms [s]."""
+def p99(folder: Path, began_ns: int, ended_ns: int):
+    """Return the 99 % quantile of the control period's error within an interval [ms]."""
     messages = read_contents(folder / "cloud.mcap").messages
-    stamps = np.array([stamp for topic, stamp, _ in messages if topic == COMMAND])
+    stamps = np.array([stamp for topic, stamp, _ in messages if topic == "/cmd_vel"])
     stamps = stamps[(stamps >= began_ns) & (stamps < ended_ns)]
     assert len(stamps) > 0.5 * (ended_ns - began_ns) * 1e-9 / PERIOD
-    return np.abs(np.diff(stamps) * 1e-9 - PERIOD)
+    return float(np.percentile(np.abs(np.diff(stamps) * 1e-9 - PERIOD), 99)) * 1e3
 
 
 def flood(folder: Path, seconds: float):
-    """Run a calm and a flooded interval [s]; return the API's answers and the loop's errors."""
+    """Fly a calm and a flooded interval [s]; return the answers and the p99 in both [ms]."""
     folder.mkdir()
     release = Recorded(folder)
     try:
@@ -59,49 +57,31 @@ def flood(folder: Path, seconds: float):
         calm = time.monotonic_ns()
         time.sleep(seconds)
         began = time.monotonic_ns()
-        script = Path(__file__).with_name("api_flood.py")
-        command = [sys.executable, str(script), url, TOKEN, str(seconds), str(RATE)]
-        flooded = subprocess.run(command, capture_output=True, text=True)
-        assert flooded.returncode == 0, flooded.stderr
+        script = str(Path(__file__).with_name("api_flood.py"))
+        command = [sys.executable, script, url, TOKEN, str(seconds), str(RATE)]
+        answers = json.loads(subprocess.check_output(command))
         ended = time.monotonic_ns()
         release.post("/v1/estop")
         release.until(lambda: release.ask("/v1/state")["seen"]["guard"] == "ESTOP")
         release.stop()
     finally:
         release.end()
-    return json.loads(flooded.stdout), errors(folder, calm, began), errors(folder, began, ended)
-
-
-def is_undisturbed(folder: Path, seconds: float, figure, tries: int, is_last: bool):
-    """Check that a flood does not disturb the loop and the answers are correct."""
-    answers, quiet, loud = flood(folder, seconds)
-    assert answers.get("429", 0) > 0
-    assert seconds < DAWDLED or answers.get("cut off", 0) >= DAWDLERS
-    assert not [status for status in answers if status.startswith("5")]
-    answered = sum(count for status, count in answers.items() if status.isdigit())
-    sent, answered = (count / (seconds * RATE) for count in (answers["sent"], answered))
-    calm_p99, flood_p99 = (float(np.percentile(each, 99)) * 1e3 for each in (quiet, loud))
-    grown = flood_p99 - calm_p99
-    good = min(sent, answered) >= 0.95 and grown <= 2.0
-    if good or is_last:
-        best = f", best of {tries}" if tries > 1 else ""
-        kind, count = f"API flood of {seconds:g} s{best}", answers["sent"]
-        figure(f"{kind}: share of the requests that was sent", sent, ">=", 0.95, count=count)
-        figure(f"{kind}: share that was answered", answered, ">=", 0.95, count=count)
-        figure(f"{kind}: control period error p99 grows by", grown, "<=", 2.0, "ms")
-    if is_last:
-        found = {"requests": answers, "calm_p99_ms": calm_p99, "flood_p99_ms": flood_p99}
-        assert good, {**found, "processors": os.cpu_count()}
-    return good
+    return answers, p99(folder, calm, began), p99(folder, began, ended)
 
 
 @pytest.mark.promise("api-load-spares-the-loop")
-def test_a_slice_of_such_a_flood_does_not_disturb_it(tmp_path, figure):
-    turns = ((tmp_path / str(n), n == TRIES - 1) for n in range(TRIES))
-    assert any(is_undisturbed(folder, 5.0, figure, TRIES, is_last) for folder, is_last in turns)
-
-
-@pytest.mark.full
-@pytest.mark.promise("api-load-spares-the-loop")
-def test_1000_requests_a_second_do_not_disturb_the_control_loop(tmp_path, figure):
-    assert is_undisturbed(tmp_path / "long", 20.0, figure, 1, True)
+@pytest.mark.parametrize(
+    ("seconds", "tries"), [(5.0, TRIES), pytest.param(20.0, 1, marks=pytest.mark.full)]
+)
+def test_a_flood_of_requests_does_not_disturb_the_loop(tmp_path, figure, seconds, tries):
+    for number in range(tries):
+        answers, calm, loud = flood(tmp_path / str(number), seconds)
+        took, sent = answers.pop("seconds"), answers.pop("sent")
+        assert sum(answers.values()) == sent == seconds * RATE
+        assert not [status for status in answers if status.startswith("5")]
+        rate, grown = sent / took, loud - calm
+        if rate >= 0.9 * RATE and grown <= 2.0:
+            break
+    kind = f"API flood of {seconds:g} s, best of {tries}"
+    figure(f"{kind}: answers", rate, ">=", 0.9 * RATE, "1/s", count=sent)
+    figure(f"{kind}: control period error p99 grows by", grown, "<=", 2.0, "ms")

@@ -23,11 +23,11 @@ from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
-from cloudrc.teleop.api import Surroundings, create_app
-from cloudrc.teleop.auth import Audit, Tokens
+from cloudrc.teleop.api import ApiServer, Surroundings, create_app
+from cloudrc.teleop.audit import Audit
+from cloudrc.teleop.auth import Gate, Tokens
 from cloudrc.teleop.bridge import STARTING, Bridge
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.server import ApiServer, Gate, Limits
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionStore, Order
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
@@ -298,28 +298,28 @@ DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """Never by a proxy: `urlopen` keeps the one that was named when a process first called it."""
 LIMIT = 5.0
 OPERATOR, READER = "operator-token-of-the-tests", "reader-token-of-the-tests"
-NO_LIMITS = Limits(1e6, 10**6, 10**6, 10**6)
 
 
 class Running:
     """API, service and robot; `flight.position` is where the robot is."""
 
-    def __init__(self, *, ready=True, limits=NO_LIMITS, unix=False):
+    def __init__(self, *, ready=True, unix=False, host="127.0.0.1"):
         self.folder = TemporaryDirectory(prefix="cloudrc-")
         folder = Path(self.folder.name)
-        (folder / "operator").write_text(OPERATOR + "\n")
-        (folder / "reader").write_text(READER + "\n")
+        for role, token in (("operator", OPERATOR), ("reader", READER)):
+            (folder / role).write_text(token + "\n")
+            (folder / role).chmod(0o600)
         self.flight, self.bridge = ServiceFlight(), Bridge()
         self.alarms, self.complaints = [], []
-        self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
+        self.bridge.alarm = self.note_alarm
         surroundings = Surroundings(load_scene("pipes"), 60.0, True, assembly.mission_plan)
-        app, tokens = create_app(self.bridge, surroundings), Tokens(folder)
-        self.audit = Audit(folder / "audit.jsonl", self.complaints.append)
-        self.gate = Gate(app, None if unix else tokens, self.audit, limits, self.complaints.append)
-        self.address = folder / "api.sock" if unix else ("127.0.0.1", 0)
+        app = create_app(self.bridge, surroundings, self.complaints.append)
+        self.audit_file = folder / "audit.jsonl"
+        audit = Audit(self.audit_file, self.complaints.append)
+        self.gate = Gate(app, None if unix else Tokens(folder), audit)
+        self.address = folder / "api.sock" if unix else (host, 0)
         self.server = ApiServer(self.gate, self.bridge, self.address)
         self.token_file = folder / "operator"
-        self.audit_file = folder / "audit.jsonl"
         self.url = self.server.url
         self.server.start()
         self._stopping = threading.Event()
@@ -329,6 +329,21 @@ class Running:
         self._thread.start()
         if not unix:
             self.until(self.answers)
+
+    def note_alarm(self):
+        self.alarms.append(time.monotonic())
+        return True
+
+    def reset(self):
+        """Begin again with another robot and service, and keep the server."""
+        for replaced in ("take", "submit"):
+            vars(self.bridge).pop(replaced, None)
+        self.bridge.alarm, self.bridge.overtakings = self.note_alarm, 0
+        self.until(lambda: not self.gate._in_flight.total())
+        for kept in (self.alarms, self.complaints, self.gate.counts):
+            kept.clear()
+        self.flight = ServiceFlight()
+        self.bridge.open(self.flight.teleop)
 
     def _fly(self):
         while not self._stopping.wait(0.002):
@@ -347,7 +362,6 @@ class Running:
 
     def stop(self):
         self.server.stop()
-        self.audit.close()
         self._stopping.set()
         self._thread.join(LIMIT)
         self.folder.cleanup()
@@ -375,15 +389,16 @@ class Running:
 
     def send(self, request):
         try:
-            with DIRECT.open(request, timeout=LIMIT) as answer:
-                return answer.status, json.loads(answer.read())
+            answer = DIRECT.open(request, timeout=LIMIT)
         except urllib.error.HTTPError as error:
-            return error.code, json.loads(error.read())
+            answer = error
+        with answer:
+            return answer.status, json.loads(answer.read() or "null")
 
     def audited(self):
         """What the audit log has, once every request is done with; nothing is served after."""
         self.server.stop()
-        self.audit.close()
+        self.server.stop = lambda: None
         lines = self.audit_file.read_text().splitlines() if self.audit_file.exists() else []
         return [json.loads(line) for line in lines]
 

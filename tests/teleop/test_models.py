@@ -1,0 +1,180 @@
+"""Orders to the API: what cannot be used is named, and no way leads through a pipe's wall."""
+
+import json
+import time
+import urllib.error
+
+import pytest
+
+from cloudrc.errors import BadInputError
+from cloudrc.teleop import models
+from tests.teleop.conftest import DIRECT, running
+
+POINT = {"position_m": [0.5, 0.0, 1.0]}
+WEST, BORE, EAST = (-2.5, 0.0, 0.8), (-1.0, 0.0, 0.8), (0.5, 0.0, 0.8)
+"""Beside and in pipe 1, which lies from y = 2.5 to -2.5 at x = -1, z = 0.8, 1.3 m wide [m]."""
+
+
+@pytest.fixture(scope="module")
+def server():
+    with running() as one:
+        yield one
+
+
+@pytest.fixture
+def api(server):
+    server.reset()
+    return server
+
+
+def waypoint(**more):
+    return {"waypoints": [POINT | more]}
+
+
+@pytest.mark.promise("bad-missions-are-refused")
+@pytest.mark.parametrize(
+    ("body", "path", "index", "words"),
+    [
+        ({"waypoints": [POINT, {"position_m": [99, 0, 1]}]},
+         "waypoints.1.position_m", 1, "beyond the fence"),
+        (waypoint(position_m=[-1.0, 2.0, 0.0]), "waypoints.0.position_m", 0, "wall of pipe"),
+        (waypoint(position_m=[0, 0]), "waypoints.0.position_m.2", 0, "is missing"),
+        (waypoint(position_m=[0, 0, "high"]), "waypoints.0.position_m.2", 0, "be a number [m]"),
+        (waypoint(dwell=1), "waypoints.0.dwell", 0, "did you mean dwell_s"),
+        (waypoint(tolerance_m=0), "waypoints.0.tolerance_m", 0, "> 0"),
+        (waypoint(dwell_s=1e308), "waypoints.0.dwell_s", 0, "and <= 1000000"),
+        ({"waypoints": []}, "waypoints", None, "at least one"),
+        ({"name": "nothing"}, "waypoints", None, "none given; give at least one"),
+        ({**waypoint(), "time_limit_s": -1}, "time_limit_s", None, "> 0"),
+        ({**waypoint(), "time_limit_s": 1e308}, "time_limit_s", None, "and <= 1000000"),
+        ({**waypoint(), "start": "there"}, "start", None, "'spawn' or 'here'"),
+        ({**waypoint(), "key": "k" * 201}, "key", None, "must be text of at most 200 characters"),
+        ({**waypoint(), "name": "to \x1b[2J"}, "name", None, "one line of printable characters"),
+        ({**waypoint(), "key": "to \u202e"}, "key", None, "one line of printable characters"),
+        ({**waypoint(), "\u00b3": 1}, "\u00b3", None, ""),  # `int` does not read this digit
+        ({"waypoints": [POINT] * 6000 + [{}]},
+         "waypoints.6000.position_m", 6000, "is missing"),
+        (b'{"waypoints": [{"position_m": [0, 0, NaN]}]}', "waypoints.0.position_m.2", 0, "finite"),
+        (b"nonsense", "", None, "not JSON"),
+        (b"", "", None, "not JSON"),
+        (b"[]", "", None, "mapping"),
+    ],
+)  # fmt: skip
+def test_a_value_that_cannot_be_used_is_named(api, body, path, index, words):
+    status, refusal = api.post("/v1/missions", body)
+    models.Refusal.model_validate(refusal)
+    assert status == 422
+    problem = next(p for p in refusal["problems"] if p["path"] == path)
+    assert problem["index"] == index
+    assert words in problem["reason"]
+    assert path in refusal["detail"] or len(refusal["problems"]) > 3
+    assert refusal["detail"].isprintable()
+    assert api.get("/v1/missions")["missions"] == []
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"[" * 200_000,
+        b'{"waypoints":' + b"[" * 100_000,
+        b'{"waypoints": [' + b"0," * 100_000 + b"0]}",
+        b'{"waypoints": [' + b'{"position_m": [0, 0, 1]},' * 9_000 + b"{}]}",
+        b'{"name": "' + b"x" * 200_000 + b'"}',
+        b'{"time_limit_s": 1' + b"0" * 200_000 + b"}",
+    ],
+)
+def test_deep_long_and_large_orders_are_refused_fast(api, body):
+    began = time.monotonic()
+    status, answer = api.post("/v1/missions", body)
+    assert (status, bool(answer["detail"])) == (422, True)
+    assert time.monotonic() - began < 2.0
+
+
+def test_a_name_may_have_any_printable_characters(api):
+    name = "zum Brett, \N{RIGHTWARDS ARROW} 板"
+    status, made = api.post("/v1/missions", {**waypoint(), "name": name})
+    assert (status, made["name"]) == (201, name)
+
+
+def test_a_point_is_checked_like_a_waypoint(api):
+    status, refusal = api.post("/v1/goto", {"position_m": [0, 0, 99]})
+    assert (status, refusal["problems"][0]["path"]) == (422, "position_m")
+
+
+@pytest.mark.parametrize("value", ["x", "1.5", ""])
+def test_a_bad_query_is_refused_like_a_body(api, value):
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        DIRECT.open(api.request(f"/v1/events?after={value}"), timeout=5.0)
+    refusal = json.loads(caught.value.read())
+    models.Refusal.model_validate(refusal)
+    assert caught.value.code == 422
+    (problem,) = refusal["problems"]
+    assert (problem["path"], problem["value"], problem["index"]) == ("after", repr(value), None)
+    assert "integer" in problem["reason"]
+    assert refusal["detail"].startswith("after: ")
+
+
+def test_what_the_plan_refuses_is_the_senders_fault(api, monkeypatch):
+    def refuse(*args, **kwargs):
+        raise BadInputError("time limit inf s: must be finite and above 0")
+
+    monkeypatch.setattr("cloudrc.teleop.api.check_way", refuse)
+    refusal = 422, {"detail": "time limit inf s: must be finite and above 0"}
+    assert api.post("/v1/goto", POINT) == refusal
+
+
+# Straight ways
+
+
+def at(api, position):
+    def is_seen():
+        seen = api.get("/v1/state")["seen"]
+        return seen is not None and seen["position_m"] == list(position)
+
+    api.flight.position = position
+    api.until(is_seen)
+
+
+def fly(api):
+    _, view = api.post("/v1/missions", waypoint(position_m=EAST))
+    api.until(lambda: api.state_of(view["id"]) == "flying")
+    return view["id"]
+
+
+def test_nobody_is_sent_straight_through_a_pipe(api):
+    mission_id = fly(api)
+    at(api, BORE)
+    for path, body in (("goto", {"position_m": EAST}), ("resume", None)):
+        assert "wall" not in api.post(f"/v1/{path}", body)[1]["detail"], "first hold the mission"
+    api.post("/v1/hold")
+    for here, there in ((WEST, BORE), (WEST, EAST), (BORE, EAST)):
+        at(api, here)
+        status, refusal = api.post("/v1/goto", {"position_m": there})
+        assert (status, refusal["id"]) == (409, mission_id)
+        assert "through the wall of pipe_1; go round it first" in refusal["detail"]
+    status, refusal = api.post("/v1/resume")
+    assert (status, refusal["id"]) == (409, mission_id), "the next waypoint is beyond that wall"
+    assert api.state_of(mission_id) == "held"
+
+
+def test_along_the_bore_and_over_the_pipe_there_is_a_way(api):
+    fly(api)
+    api.post("/v1/hold")
+    for here, there in ((BORE, (-1.0, 2.0, 0.8)), ((-2.5, 0.0, 2.0), (0.5, 0.0, 2.0))):
+        at(api, here)
+        assert api.post("/v1/goto", {"position_m": there})[0] == 200
+    at(api, (0.5, 0.0, 2.0))
+    assert api.post("/v1/resume")[0] == 200
+
+
+def test_a_mission_from_here_begins_with_a_free_way(api):
+    order = {"start": "here", **waypoint(position_m=WEST), "key": "again"}
+    at(api, EAST)
+    status, refusal = api.post("/v1/missions", order)
+    assert status == 409
+    assert "through the wall of pipe_1" in refusal["detail"]
+    at(api, (-2.5, 1.0, 0.8))
+    assert api.post("/v1/missions", order)[0] == 201
+    at(api, EAST)
+    assert api.post("/v1/missions", order)[0] == 200, "the mission is known, whatever the place"
+    assert api.post("/v1/missions", {**order, "start": "spawn"})[0] == 409, "another plan"
