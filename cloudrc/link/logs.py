@@ -38,6 +38,8 @@ GAP = 20
 """Shortest gap that is named, in usual distances of two packets [1]; at least `GAP_MIN`."""
 GAP_MIN = 1.0
 """Shortest gap that is named [s]."""
+STEPS_MAX = 3
+"""Most jumps back in time that are steps of the clock or sessions [1]; more mean shuffled rows."""
 _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
 """Errors that JSON of another layout can raise."""
 HALVE = (
@@ -55,11 +57,13 @@ class Packets:
         sent: When each was sent, on any clock, strictly rising [s], shape (n,).
         delays: One way [s], None for lost packets, shape (n,).
         notes: What was left out, merged or sorted, and how often.
+        halved: Whether the delays are halves of round trips.
     """
 
     sent: tuple[float, ...]
     delays: tuple[float | None, ...]
     notes: tuple[str, ...] = ()
+    halved: bool = False
 
     @property
     def arrived(self) -> list[float]:
@@ -87,6 +91,8 @@ class Log:
         counts: What was left out, merged or changed -> how often.
         unusable: Why a row cannot be used, for each such row.
         facts: Further notes.
+        halved: Whether the delays are halves of round trips.
+        clocks: What to do if the two clocks differ.
     """
 
     name: str
@@ -94,6 +100,8 @@ class Log:
     counts: Counter[str] = field(default_factory=Counter)
     unusable: list[str] = field(default_factory=list)
     facts: list[str] = field(default_factory=list)
+    halved: bool = False
+    clocks: str = _CLOCKS
 
     def packets(self) -> Packets:
         """Check the packets, sort them by the time of sending, and note what was changed.
@@ -110,7 +118,8 @@ class Log:
             )
         if (least := min(arrived)) < 0.0:
             early = f"a packet arrived {-least * 1e3:.4g} ms before it was sent"
-            raise BadInputError(f"{self.name}: {early}: {_CLOCKS}")
+            raise BadInputError(f"{self.name}: {early}: {self.clocks}")
+        self._refuse_steps()
         unique = dict(reversed(self.entries))  # of packets with the same time the first remains
         repeated = len(self.entries) - len(unique)
         same = "have the same time as another one; give times with more digits"
@@ -130,7 +139,20 @@ class Log:
             times,
             tuple(delay for _, delay in ordered),
             (*notes, *self.facts, *_gaps(times)),
+            self.halved,
         )
+
+    def _refuse_steps(self) -> None:
+        """Refuse times that go far back once or twice: sorting would mix what came apart."""
+        steps = [after - before for (before, _), (after, _) in pairwise(self.entries)]
+        far = max(GAP_MIN, GAP * median([abs(step) for step in steps] or [0.0]))
+        back = [row for row, step in enumerate(steps, 1) if step < -far]
+        if 1 <= len(back) <= STEPS_MAX:
+            by = -steps[back[0] - 1]
+            raise BadInputError(
+                f"{self.name}: after row {back[0]} the times go back by {by:.4g} s: a step of "
+                "the clock, or two sessions in one log; give the rows before or after it"
+            )
 
     def _refuse_beyond_limit(self, count: int, reason: str) -> None:
         rows = len(self.entries) + len(self.unusable)
@@ -231,6 +253,7 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
         if not halve:
             _check_clocks(trips, name)
         log.entries = _irtt_entries(trips, "halves" if halve else direction)
+        log.halved = halve
     except _NoStampsError:
         raise refusal(f"{name} (irtt's server sent no stamps)") from None
     except _MISSHAPEN as error:
@@ -370,7 +393,8 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     delay, unit = _find(table.columns, DELAYS, name)
     if not unit:
         raise BadInputError(f"{name}: column {delay} does not say its unit; {_named(delay)}")
-    round_trip = delay.startswith("rtt")
+    log.halved = round_trip = delay.startswith("rtt")
+    log.clocks = "the two clocks differ; synchronise them, or record round trips as rtt_ms"
     if round_trip and not halve:
         raise refusal(f"{name}, column {delay}")
     loss = next((column for column in LOSSES if column in table.columns), None)
