@@ -10,6 +10,7 @@ from collections import deque
 import pytest
 
 from cloudrc.cli.teleop import ServedApi
+from cloudrc.config.load import load_mission
 from cloudrc.errors import BadInputError
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.teleop import models
@@ -132,7 +133,7 @@ def test_the_state_is_told_and_unknown_numbers_are_null(idle):
     [
         ({"waypoints": [A_MISSION["waypoints"][0], {"position_m": [99, 0, 1]}]},
          "waypoints.1.position_m", 1, "beyond the fence"),
-        ({"waypoints": [{"position_m": [-1.0, 2.0, 0.0]}]},
+        ({"waypoints": [{"position_m": [-0.5, 2.0, 0.8]}]},
          "waypoints.0.position_m", 0, "wall of pipe"),
         ({"waypoints": [{"position_m": [0, 0]}]}, "waypoints.0.position_m.2", 0, "is missing"),
         ({"waypoints": [{"position_m": [0, 0, "high"]}]},
@@ -187,7 +188,8 @@ def test_only_a_mission_to_the_board_must_touch_it(api):
     api.post("/v1/missions", A_MISSION)
     assert not api.flight.teleop.book.find("m1").order.contact
     api.post("/v1/missions/m1/cancel")
-    api.post("/v1/missions", {"waypoints": [{"position_m": [8.235, -6.422, 0.7]}]})
+    points = [{"position_m": point.position_m} for point in load_mission("pipes").waypoints]
+    api.post("/v1/missions", {"waypoints": points})
     assert api.flight.teleop.book.find("m2").order.contact
 
 

@@ -31,6 +31,18 @@ def test_nobody_is_sent_straight_through_a_pipe():
         assert api.state_of(mission_id) == "held"
 
 
+def test_the_whole_robot_counts_from_where_it_is():
+    """Straight above the spawn the rear rotor would lift into the outside of pipe 1."""
+    with running() as api:
+        held(api)
+        at(api, (0.0, 0.0, 0.1))
+        status, refusal = api.post("/v1/goto", {"position_m": (0.0, 0.0, 1.2)})
+        assert status == 409
+        assert "wall of pipe_1" in refusal["detail"]
+        at(api, (0.0, 0.0, 1.3))
+        assert api.post("/v1/goto", {"position_m": (0.0, 0.0, 1.2)})[0] == 200
+
+
 def test_along_the_bore_and_over_the_pipe_there_is_a_way():
     with running() as api:
         held(api)
@@ -52,9 +64,9 @@ def test_a_running_mission_is_reported_before_an_obstacle():
 
 
 def test_a_mission_from_here_begins_with_a_way_that_can_be_flown():
-    order = {"start": "here", "waypoints": [{"position_m": WEST}], "key": "again"}
+    order = {"start": "here", "waypoints": [{"position_m": EAST}], "key": "again"}
     with running() as api:
-        at(api, EAST)
+        at(api, WEST)
         status, refusal = api.post("/v1/missions", order)
         assert status == 409
         assert "through the wall of pipe_1" in refusal["detail"]
