@@ -252,10 +252,10 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
         _compare_counts(document.get("stats") or {}, trips, log)
         if not halve:
             _check_clocks(trips, name)
-        log.entries = _irtt_entries(trips, "halves" if halve else direction)
+        log.entries = _irtt_entries(trips, "halves" if halve or not direction else direction)
         log.halved = halve
     except _NoStampsError:
-        raise refusal(f"{name} (irtt's server sent no stamps)") from None
+        raise _refusal(f"{name} (irtt's server sent no stamps)") from None
     except _MISSHAPEN as error:
         raise BadInputError(
             f"{name}: not a log of irtt ({type(error).__name__}: {error}); "
@@ -281,7 +281,9 @@ def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log
 def _check_clocks(trips: list[dict[str, Any]], name: str) -> None:
     """Reject one-way delays of clocks that differ or step; either direction shows it."""
     arrived = [trip for trip in trips if _lost(trip) == "false"]
-    least = min((_delay(trip, key) or 0 for trip in arrived for key in _WAYS), default=0)
+    least = min(
+        (_delay(trip, key) or 0 for trip in arrived for key in ("send", "receive")), default=0
+    )
     if least < 0:
         early = f"a packet arrived {-least * 1e-6:.4g} ms before it was sent"
         raise BadInputError(f"{name}: {early}: {_CLOCKS}")
@@ -299,8 +301,16 @@ def _check_clocks(trips: list[dict[str, Any]], name: str) -> None:
                 )
 
 
+_IRTT_NAMES = {
+    "halves": ("", "rtt"),
+    "uplink": ("true_down", "send"),
+    "downlink": ("true_up", "receive"),
+}
+"""What is read -> kind of loss that is left out, name of the delay."""
+
+
 def _irtt_entries(
-    trips: list[dict[str, Any]], what: Literal["halves", "uplink", "downlink"] | None
+    trips: list[dict[str, Any]], what: Literal["halves", "uplink", "downlink"]
 ) -> list[tuple[float, float | None]]:
     """Read the time of sending and the delay of each packet [s], from the first one on.
 
@@ -309,8 +319,7 @@ def _irtt_entries(
     with the median uplink delay.
     """
     clock = "monotonic" if all("monotonic" in _client(trip) for trip in trips) else "wall"
-    other = {"halves": "", "uplink": "true_down", "downlink": "true_up"}[what or "uplink"]
-    key = {"halves": "rtt", "uplink": "send", "downlink": "receive"}[what or "uplink"]
+    other, key = _IRTT_NAMES[what]
     median_up = 0
     if what == "downlink":
         ups = [_delay(trip, "send") for trip in trips if _lost(trip) == "false"]
@@ -330,9 +339,6 @@ def _irtt_entries(
     ]
 
 
-_WAYS = ("send", "receive")
-
-
 def _client(trip: dict[str, Any]) -> dict[str, Any]:
     return dict(trip["timestamps"]["client"]["send"])
 
@@ -350,7 +356,7 @@ def _delay(trip: dict[str, Any], key: str) -> int | None:
     return int(trip["delay"][key])
 
 
-def refusal(name: str) -> BadInputError:
+def _refusal(name: str) -> BadInputError:
     """Make the error for a source that has only round trips."""
     return BadInputError(f"{name}: has round trips; {HALVE}")
 
@@ -396,7 +402,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     log.halved = round_trip = delay.startswith("rtt")
     log.clocks = "the two clocks differ; synchronise them, or record round trips as rtt_ms"
     if round_trip and not halve:
-        raise refusal(f"{name}, column {delay}")
+        raise _refusal(f"{name}, column {delay}")
     loss = next((column for column in LOSSES if column in table.columns), None)
     raw: list[tuple[float, float | None]] = []
     decimals = 0
@@ -421,21 +427,12 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     del log.counts[""]
     packets = log.packets()
     if not trust_units:
-        check_unit(packets, unit, f"{name}: {delay}")
+        _check_unit(packets, unit, f"{name}: {delay}")
     return packets
 
 
-def check_unit(packets: Packets, unit: str, name: str) -> None:
-    """Reject delays that are probably in another unit.
-
-    Args:
-        packets: The packets of a log.
-        unit: Unit in which the delays were read: s, ms, us or ns.
-        name: Name of the source and its column, for messages.
-
-    Raises:
-        BadInputError: If the delays are implausible; names the probable unit.
-    """
+def _check_unit(packets: Packets, unit: str, name: str) -> None:
+    """Reject delays of a column that are probably in another unit; name that unit."""
     factor = 1 / SCALES[unit]
     top, middle = max(packets.arrived), median(packets.arrived)
     remedy = "name the column after its unit, or say --trust-units"
